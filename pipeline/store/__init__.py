@@ -1,0 +1,31 @@
+"""The seam between the stages: a zarr store that is also a set of flat files.
+
+`schema` says what is in it, `writer` builds it so that a kill loses nothing, `donor` takes rows
+over from an older one, `reader` maps a finished one and gathers batches from it.
+"""
+
+from pipeline.store.batch import Batch
+from pipeline.store.chunks import free_bytes
+from pipeline.store.donor import Donor
+from pipeline.store.lock import build_lock
+from pipeline.store.reader import Episode, FeatureStore
+from pipeline.store.schema import FEATURES, KEY_BYTES, SCHEMA, Sizes, arrays
+from pipeline.store.writer import StoreBuild, part_path, read_plan, recover
+
+__all__ = [
+    "FEATURES",
+    "KEY_BYTES",
+    "SCHEMA",
+    "Batch",
+    "Donor",
+    "Episode",
+    "FeatureStore",
+    "Sizes",
+    "StoreBuild",
+    "arrays",
+    "build_lock",
+    "free_bytes",
+    "part_path",
+    "read_plan",
+    "recover",
+]

@@ -1,0 +1,51 @@
+"""What `gather` hands out."""
+
+from dataclasses import dataclass, fields
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+
+@dataclass
+class Batch:
+    """Everything a policy sees and should do at `batch` ticks.
+
+    Windows are causal and right-aligned: they end at their tick, and where the episode had not
+    begun they are zero on the left; `*_valid` counts the real readings. A stream that the store
+    lacks has width 0. Features and sensor have the dtype they are stored in.
+    """
+
+    features: Float[Tensor, "batch slot dim"]
+    slot_valid: Bool[Tensor, "batch slot"]
+    feature_age: Float[Tensor, " batch"]
+    """Seconds since the newest frame that the features have seen."""
+    sensor: Float[Tensor, "batch sensor_window channel"]
+    sensor_valid: Int64[Tensor, " batch"]
+    state: Float[Tensor, "batch state_window state_dim"]
+    state_valid: Int64[Tensor, " batch"]
+    action: Float[Tensor, "batch horizon action_dim"]
+    action_valid: Bool[Tensor, "batch horizon"]
+
+    def __len__(self) -> int:
+        return len(self.features)
+
+    @property
+    def sizes(self) -> tuple[int, int, int, int]:
+        """(batch, horizon, sensor_window, state_window)."""
+        return len(self), self.action.shape[1], self.sensor.shape[1], self.state.shape[1]
+
+    def to(self, device: torch.device | str, non_blocking: bool = False) -> "Batch":
+        """The same on another device."""
+        return Batch(
+            **{
+                field.name: getattr(self, field.name).to(device, non_blocking=non_blocking)
+                for field in fields(self)
+            }
+        )
+
+    def pin(self) -> "Batch":
+        """The same in page-locked memory, from where copies to a GPU are asynchronous."""
+        return Batch(
+            **{field.name: getattr(self, field.name).pin_memory() for field in fields(self)}
+        )

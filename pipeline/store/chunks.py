@@ -1,0 +1,175 @@
+"""The chunk files of one array, written and read by row with plain system calls.
+
+Never through a map: a full disk must be an error of `pwrite`, not a SIGBUS.
+"""
+
+import errno
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import google_crc32c
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import DiskFull, StoreIncomplete
+from pipeline.store.schema import TRAILER_BYTES, ArraySpec, chunk_paths
+
+_BLOCK = 16 * 2**20
+_MOST_OPEN = 32
+
+
+def row_checksums(rows: NDArray[Any]) -> NDArray[np.uint32]:
+    """The crc32c of each row's bytes, (row,); a true 0 is kept as 1, for 0 says "not written"."""
+    flat = np.ascontiguousarray(rows).reshape(len(rows), -1).view(np.uint8)
+    sums = np.fromiter((google_crc32c.value(row) for row in flat), np.uint32, len(flat))
+    return np.where(sums == 0, np.uint32(1), sums)
+
+
+@contextmanager
+def disk_full_named(path: Path) -> Iterator[None]:
+    """Turn "no space left" and "quota exceeded" into `DiskFull` naming the place."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        free = free_bytes(path)
+        raise DiskFull(
+            f"{path}: no space left on the device ({free / 2**20:.0f} MiB free). What was "
+            "committed is kept: make room and run the same command again."
+        ) from error
+
+
+def free_bytes(path: Path) -> int:
+    """Bytes free on the file system that holds `path` or its nearest existing parent."""
+    while not path.exists():
+        path = path.parent
+    status = os.statvfs(path)
+    return status.f_bavail * status.f_frsize
+
+
+class ChunkFiles:
+    """Row-wise access to the files of one array of a build."""
+
+    def __init__(self, root: Path, spec: ArraySpec) -> None:
+        self.spec = spec
+        self.paths = chunk_paths(root, spec)
+        self._descriptors: dict[int, int] = {}
+        self._unsynced: set[int] = set()
+
+    def allocate(self) -> None:
+        """Reserve the space of every row; chunk files get their full size, without a trailer."""
+        for chunk, path in enumerate(self.paths):
+            if self.is_linked(chunk):
+                continue
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with disk_full_named(path):
+                descriptor = self._descriptor(chunk)
+                used = len(self.spec.chunk_rows_of(chunk)) * self.spec.row_bytes
+                os.posix_fallocate(descriptor, 0, used)
+                os.ftruncate(descriptor, self.spec.chunk_bytes)
+
+    def is_linked(self, chunk: int) -> bool:
+        """Whether this file also belongs to another store and so must not be written."""
+        path = self.paths[chunk]
+        return path.exists() and path.stat().st_nlink > 1
+
+    def link(self, chunk: int, donor: Path) -> None:
+        """Take a chunk over from another store as it is."""
+        self.paths[chunk].parent.mkdir(parents=True, exist_ok=True)
+        os.link(donor, self.paths[chunk])
+
+    def write(self, start: int, values: NDArray[Any]) -> None:
+        """Write consecutive rows from `start`; rows in linked chunks are there already."""
+        if not self.spec.row_bytes or not len(values):
+            return
+        block = np.ascontiguousarray(values, self.spec.dtype)
+        assert block.shape[1:] == self.spec.shape[1:], (block.shape, self.spec)
+        assert start + len(block) <= self.spec.shape[0], (start, len(block), self.spec)
+        raw = block.reshape(len(block), -1).view(np.uint8)
+        for chunk, first, count in self._spans(start, len(block)):
+            if self.is_linked(chunk):
+                continue
+            lines = raw[first - start : first - start + count]
+            with disk_full_named(self.paths[chunk]):
+                _write_all(self._descriptor(chunk), memoryview(lines.ravel()), self._offset(first))
+            self._unsynced.add(chunk)
+
+    def read(self, start: int, count: int) -> NDArray[Any]:
+        """Consecutive rows as they are on disk."""
+        raw = bytearray()
+        for chunk, first, rows in self._spans(start, count):
+            wanted = rows * self.spec.row_bytes
+            part = os.pread(self._descriptor(chunk), wanted, self._offset(first))
+            while len(part) < wanted:
+                more = os.pread(
+                    self._descriptor(chunk), wanted - len(part), self._offset(first) + len(part)
+                )
+                if not more:
+                    raise StoreIncomplete(f"{self.paths[chunk]}: the file ends early; rebuild it")
+                part += more
+            raw += part
+        return np.frombuffer(raw, self.spec.dtype).reshape(count, *self.spec.shape[1:])
+
+    def sync(self) -> None:
+        """Return once everything written has reached the disk."""
+        for chunk in self._unsynced:
+            with disk_full_named(self.paths[chunk]):
+                os.fdatasync(self._descriptor(chunk))
+        self._unsynced.clear()
+
+    def seal(self) -> None:
+        """Write each chunk's trailer; running it again changes nothing."""
+        for chunk, path in enumerate(self.paths):
+            if self.is_linked(chunk):
+                continue
+            trailer = self._crc(chunk).to_bytes(TRAILER_BYTES, "little")
+            with disk_full_named(path):
+                descriptor = self._descriptor(chunk)
+                _write_all(descriptor, memoryview(trailer), self.spec.chunk_bytes)
+                os.fsync(descriptor)
+
+    def close(self) -> None:
+        """Close the files."""
+        for descriptor in self._descriptors.values():
+            os.close(descriptor)
+        self._descriptors.clear()
+
+    def _crc(self, chunk: int) -> int:
+        crc, offset, size = 0, 0, self.spec.chunk_bytes
+        while offset < size:
+            block = os.pread(self._descriptor(chunk), min(_BLOCK, size - offset), offset)
+            if not block:
+                raise StoreIncomplete(f"{self.paths[chunk]}: the file ends early; rebuild it")
+            crc = google_crc32c.extend(crc, block)
+            offset += len(block)
+        return crc
+
+    def _descriptor(self, chunk: int) -> int:
+        if chunk not in self._descriptors:
+            if len(self._descriptors) >= _MOST_OPEN:
+                self.sync()
+                self.close()
+            flags = os.O_RDONLY if self.is_linked(chunk) else os.O_RDWR | os.O_CREAT
+            self._descriptors[chunk] = os.open(self.paths[chunk], flags, 0o644)
+        return self._descriptors[chunk]
+
+    def _offset(self, row: int) -> int:
+        return row % self.spec.chunk_rows * self.spec.row_bytes
+
+    def _spans(self, start: int, count: int) -> Iterator[tuple[int, int, int]]:
+        """The (chunk, first row, rows) that a run of rows falls into."""
+        while count > 0:
+            chunk, inside = divmod(start, self.spec.chunk_rows)
+            taken = min(count, self.spec.chunk_rows - inside)
+            yield chunk, start, taken
+            start, count = start + taken, count - taken
+
+
+def _write_all(descriptor: int, block: memoryview, offset: int) -> None:
+    while len(block):
+        written = os.pwrite(descriptor, block, offset)
+        block, offset = block[written:], offset + written

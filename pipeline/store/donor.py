@@ -1,0 +1,110 @@
+"""Take over what another store or an abandoned build already knows."""
+
+import json
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+
+from pipeline.store.chunks import ChunkFiles, row_checksums
+from pipeline.store.environments import EnvironmentLog
+from pipeline.store.schema import CHECKSUMS, FEATURES, KEYS, ArraySpec, read_specs
+
+
+class Donor:
+    """Known feature rows by key, and streams by episode.
+
+    Works on a finished store and on a laid-out build alike: it reads chunk files, not chunks.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.specs: dict[str, ArraySpec] = read_specs(path)
+        self.attrs: dict[str, Any] = zarr.open_group(path, mode="r").attrs.asdict()
+        self._features = ChunkFiles(path, self.specs[FEATURES])
+
+    @property
+    def spec_digest(self) -> str:
+        """Digest of the feature spec its rows were computed under."""
+        return str(self.attrs["feature_spec"]["digest"])
+
+    @cached_property
+    def episode_digests(self) -> list[str]:
+        """The digest of each episode, in order: equal digest, equal rows."""
+        return [said["digest"] for said in self._said]
+
+    @cached_property
+    def episode_contents(self) -> list[str]:
+        """The content digest of each episode, in order: equal content, equal streams."""
+        return [said["content"] for said in self._said]
+
+    def episode_edges(self, kind: str) -> NDArray[np.int64]:
+        """(episode + 1,) offsets of `tick`, `vl`, `sensor` or `state` rows."""
+        return self._read(f"episode/{kind}_start")
+
+    @cached_property
+    def rows(self) -> dict[bytes, int]:
+        """Where the features of each key are."""
+        done = np.flatnonzero(self._checksums)
+        keys = self._keys
+        return {keys[row].tobytes(): int(row) for row in done}
+
+    def keys_of(self, digest: str) -> list[bytes | None] | None:
+        """The keys of an unchanged episode's rows (None for a row not done), or None if unknown."""
+        if digest not in self.episode_digests:
+            return None
+        episode = self.episode_digests.index(digest)
+        start, stop = self.episode_edges("vl")[episode : episode + 2]
+        return [
+            self._keys[row].tobytes() if self._checksums[row] else None
+            for row in range(start, stop)
+        ]
+
+    def take(self, key: bytes) -> NDArray[Any] | None:
+        """The feature row (slot, dim) of a key; None where it is unknown or fails its checksum."""
+        row = self.rows.get(key)
+        if row is None:
+            return None
+        values = self._features.read(row, 1)
+        return values[0] if row_checksums(values)[0] == self._checksums[row] else None
+
+    def environment_of(self, key: bytes) -> dict[str, Any]:
+        """With which software and hardware a known row was computed; empty where not noted."""
+        row = self.rows[key]
+        for noted in self._environments:
+            if noted["rows"][0] <= row < noted["rows"][1]:
+                return {name: value for name, value in noted.items() if name != "rows"}
+        return {}
+
+    def close(self) -> None:
+        """Close its files."""
+        self._features.close()
+
+    @cached_property
+    def _environments(self) -> list[dict[str, Any]]:
+        log = EnvironmentLog(self.path)
+        return log.ranges() if log.noted else self.attrs.get("environment", [])
+
+    @cached_property
+    def _said(self) -> list[dict[str, Any]]:
+        edges, text = self._read("episode/text_start"), self._read("episode/text").tobytes()
+        return [json.loads(text[start:stop]) for start, stop in pairwise(edges)]
+
+    @cached_property
+    def _checksums(self) -> NDArray[np.uint32]:
+        return self._read(CHECKSUMS)
+
+    @cached_property
+    def _keys(self) -> NDArray[np.uint8]:
+        return self._read(KEYS)
+
+    def _read(self, name: str) -> NDArray[Any]:
+        files = ChunkFiles(self.path, self.specs[name])
+        try:
+            return files.read(0, self.specs[name].shape[0])
+        finally:
+            files.close()

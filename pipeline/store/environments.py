@@ -1,0 +1,66 @@
+"""With which software and hardware each feature row was computed.
+
+Recorded, not part of a feature's identity. While a store is built, a number a row is kept in a
+file of its own; sealing folds it into ranges of rows in the store's attributes.
+"""
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class EnvironmentLog:
+    """The environments of a build's rows, kept beside its arrays until it is sealed."""
+
+    def __init__(self, part: Path) -> None:
+        self._listed = part / ".environments.json"
+        self._of_row = part / ".environment_of_row"
+
+    @property
+    def noted(self) -> bool:
+        """Whether there is anything to fold."""
+        return self._listed.exists()
+
+    def index(self, environment: Mapping[str, Any]) -> int:
+        """The number of an environment, a new one if it is new."""
+        known = self._known()
+        if environment not in known:
+            known.append(dict(environment))
+            temporary = self._listed.with_suffix(".tmp")
+            temporary.write_text(json.dumps(known))
+            temporary.replace(self._listed)
+        return known.index(dict(environment))
+
+    def note(self, start: int, count: int, number: int) -> None:
+        """Say with which environment a run of rows was computed."""
+        descriptor = os.open(self._of_row, os.O_WRONLY | os.O_CREAT, 0o644)
+        try:
+            os.pwrite(descriptor, np.full(count, number, "<u2").tobytes(), start * 2)
+        finally:
+            os.close(descriptor)
+
+    def ranges(self) -> list[dict[str, Any]]:
+        """`[{"rows": [start, stop], **environment}, ...]`, in order."""
+        known, numbers = self._known(), self._numbers()
+        ranges, start = [], 0
+        for run in np.split(numbers, np.flatnonzero(np.diff(numbers)) + 1):
+            if len(run):
+                ranges.append({"rows": [start, start + len(run)], **known[run[0]]})
+                start += len(run)
+        return ranges
+
+    def remove(self) -> None:
+        """Forget it; a kill between the two leaves nothing that would be folded again."""
+        self._listed.unlink(missing_ok=True)
+        self._of_row.unlink(missing_ok=True)
+
+    def _known(self) -> list[dict[str, Any]]:
+        return json.loads(self._listed.read_text()) if self._listed.exists() else []
+
+    def _numbers(self) -> NDArray[np.uint16]:
+        return np.fromfile(self._of_row, "<u2") if self._of_row.exists() else np.zeros(0, "<u2")

@@ -1,0 +1,232 @@
+"""Build a store beside its target, row by row, so that a kill at any instant loses little.
+
+A build lives in `<name>.zarr.part`. What is known beforehand (streams, ticks, episodes) is written
+first; then feature rows with `pwrite` and `fdatasync`, and only then their keys and checksums. A
+row counts as done when its checksum is not 0. Sealing writes the trailers that make plain zarr
+accept the chunks, and one rename puts the build in its place.
+"""
+
+import json
+import os
+import shutil
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+
+from pipeline.errors import StoreIncomplete
+from pipeline.store.chunks import ChunkFiles, disk_full_named, row_checksums
+from pipeline.store.environments import EnvironmentLog
+from pipeline.store.schema import CHECKSUMS, FEATURES, INCREMENTAL, KEYS, ArraySpec
+
+
+def part_path(target: Path) -> Path:
+    """Where a store is built."""
+    return target.with_name(target.name + ".part")
+
+
+class StoreBuild:
+    """An unfinished store.
+
+    `plan` names what it will hold; only a build of the same plan is continued.
+    """
+
+    def __init__(self, target: Path, specs: Mapping[str, ArraySpec], plan: str) -> None:
+        self.target = target
+        self.part = part_path(target)
+        self.specs = dict(specs)
+        self.plan = plan
+        self._files: dict[str, ChunkFiles] = {}
+        self._environments = EnvironmentLog(self.part)
+
+    @property
+    def laid_out(self) -> bool:
+        """Whether everything but the feature rows is written; the plan is noted last."""
+        return read_plan(self.part) == self.plan
+
+    def create(self) -> None:
+        """Begin from nothing: metadata of every array, then the space for its rows."""
+        if self.part.exists():
+            shutil.rmtree(self.part)
+        with disk_full_named(self.part):
+            self.part.mkdir(parents=True)
+            for spec in self.specs.values():
+                spec.create(self.part)
+
+    def allocate(self) -> None:
+        """Reserve the space of everything that is not linked."""
+        for name in self.specs:
+            self.files(name).allocate()
+
+    def link_unchanged(self, name: str, donor: Path, donor_spec: ArraySpec, rows: int) -> int:
+        """Take the chunks that lie wholly in the first `rows` rows from a finished store.
+
+        Returns how many were taken; none where the chunks of the two are cut differently.
+        """
+        spec = self.specs[name]
+        alike = (spec.chunk_rows, spec.row_bytes, spec.dtype) == (
+            donor_spec.chunk_rows,
+            donor_spec.row_bytes,
+            donor_spec.dtype,
+        )
+        taken = min(rows // spec.chunk_rows, spec.chunk_count, donor_spec.chunk_count)
+        if not alike or name in INCREMENTAL:
+            return 0
+        source = ChunkFiles(donor, donor_spec)
+        for chunk in range(taken):
+            self.files(name).link(chunk, source.paths[chunk])
+        return taken
+
+    def write(self, name: str, start: int, values: NDArray[Any]) -> None:
+        """Write consecutive rows of a stream, tick or episode array."""
+        self.files(name).write(start, values)
+
+    def finish_layout(
+        self, attributes: Mapping[str, Any], vl_attributes: Mapping[str, Any]
+    ) -> None:
+        """Note the attributes and, as the last thing, the plan: from here on the build resumes."""
+        for files in self._files.values():
+            files.sync()
+        with disk_full_named(self.part):
+            zarr.open_group(self.part, path="vl", mode="r+").attrs.put(dict(vl_attributes))
+            zarr.open_group(self.part, mode="r+").attrs.put({**attributes, "plan": self.plan})
+
+    def missing(self) -> NDArray[np.int64]:
+        """The feature rows that are not there, in order.
+
+        A row whose bytes do not give its checksum is not there.
+        """
+        rows = self.specs[FEATURES].shape[0]
+        checksums = self.files(CHECKSUMS).read(0, rows).copy()
+        step = max(1, 2**26 // max(1, self.specs[FEATURES].row_bytes))
+        for start in range(0, rows, step):
+            stored = checksums[start : start + step]
+            if stored.any():
+                found = row_checksums(self.files(FEATURES).read(start, len(stored)))
+                stored[found != stored] = 0
+        return np.flatnonzero(checksums == 0)
+
+    def environment_index(self, environment: Mapping[str, Any]) -> int:
+        """Note a set of software and hardware that rows are computed with; returns its number."""
+        with disk_full_named(self.part):
+            return self._environments.index(environment)
+
+    def commit(
+        self,
+        rows: Sequence[int] | NDArray[np.int64],
+        features: NDArray[Any],
+        keys: Sequence[bytes],
+        environment: int,
+    ) -> None:
+        """Write feature rows (row, slot, dim), wait for the disk, then mark them as done."""
+        order = np.argsort(rows, kind="stable")
+        rows = np.asarray(rows, np.int64)[order]
+        features = np.asarray(features)[order]
+        names = np.frombuffer(b"".join(keys), np.uint8).reshape(len(rows), -1)[order]
+        checksums = row_checksums(features)
+        runs = np.split(np.arange(len(rows)), np.flatnonzero(np.diff(rows) != 1) + 1)
+        for run in runs:
+            self.files(FEATURES).write(int(rows[run[0]]), features[run])
+        self.files(FEATURES).sync()
+        for run in runs:
+            start = int(rows[run[0]])
+            with disk_full_named(self.part):
+                self._environments.note(start, len(run), environment)
+            self.files(KEYS).write(start, names[run])
+            self.files(CHECKSUMS).write(start, checksums[run])
+
+    def seal(self) -> None:
+        """Check every row, write the trailers and put the store in its place.
+
+        Idempotent: a kill in the middle is mended by running it again. Raises `StoreIncomplete`
+        when rows are missing.
+        """
+        missing = self.missing()
+        if missing.size:
+            raise StoreIncomplete(
+                f"{self.part}: {missing.size} feature rows are missing, the first is {missing[0]}. "
+                "Run stages.extract again; it computes what is missing."
+            )
+        for name in self.specs:
+            self.files(name).seal()
+        with disk_full_named(self.part):
+            self._note_environments()
+        self.close()
+        _sync_folders(self.part)
+        self._put_in_place()
+
+    def close(self) -> None:
+        """Close every file."""
+        for files in self._files.values():
+            files.close()
+        self._files.clear()
+
+    def files(self, name: str) -> ChunkFiles:
+        """The chunk files of one array."""
+        if name not in self._files:
+            self._files[name] = ChunkFiles(self.part, self.specs[name])
+        return self._files[name]
+
+    def _put_in_place(self) -> None:
+        old = _old_path(self.target)
+        if self.target.exists():
+            shutil.rmtree(old, ignore_errors=True)
+            self.target.rename(old)
+        self.part.rename(self.target)
+        _sync(self.target.parent)
+        if old.exists():
+            shutil.rmtree(old)
+
+    def _note_environments(self) -> None:
+        """Fold the environment of each row into the attributes."""
+        if self._environments.noted:
+            group = zarr.open_group(self.part, mode="r+")
+            ranges = self._environments.ranges()
+            group.attrs.put({**group.attrs.asdict(), "environment": ranges})
+        self._environments.remove()
+
+
+def recover(target: Path) -> None:
+    """Mend what a kill between the two renames of a replacement left behind."""
+    old = _old_path(target)
+    if old.exists():
+        if target.exists():
+            shutil.rmtree(old)
+        else:
+            old.rename(target)
+
+
+def _old_path(target: Path) -> Path:
+    return target.with_name(target.name + ".old")
+
+
+def read_plan(store: Path) -> str | None:
+    """The plan of a store or a laid-out build; None where there is neither."""
+    try:
+        attributes = json.loads((store / "zarr.json").read_text())["attributes"]
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except (json.JSONDecodeError, KeyError, UnicodeDecodeError):
+        raise StoreIncomplete(
+            f"{store / 'zarr.json'}: not a zarr group's metadata. Remove {store} and run "
+            "stages.extract again."
+        ) from None
+    plan = attributes.get("plan")
+    return plan if isinstance(plan, str) else None
+
+
+def _sync_folders(root: Path) -> None:
+    folders: Iterable[str] = (folder for folder, _, _ in os.walk(root))
+    for folder in folders:
+        _sync(Path(folder))
+
+
+def _sync(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

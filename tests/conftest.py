@@ -1,0 +1,170 @@
+"""What tests of every room share: the real recordings, where present, and a small store."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.store import SCHEMA, Sizes, StoreBuild, arrays
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Real recordings beside the project; a user's machine has none."""
+    folder = ROOT.parent / "shared" / "data"
+    if not folder.is_dir():
+        pytest.skip(f"no real recordings at {folder}")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def tiny_store() -> Callable[..., Path]:
+    """`tiny_store(folder, ...)` writes a small finished store and returns its path.
+
+    The action follows from the features (first two channels), the newest sensor reading (third)
+    and the newest state (fourth), so that a policy has something to learn from each.
+    """
+    return write_tiny_store
+
+
+def write_tiny_store(
+    folder: Path,
+    *,
+    name: str = "tiny",
+    episodes: int = 6,
+    ticks: int = 30,
+    slots: int = 3,
+    dim: int = 8,
+    sensor_channels: int = 5,
+    state_dim: int = 4,
+    reuse: int = 3,
+    readings_a_tick: int = 8,
+    states_a_tick: int = 4,
+    dtype: str = "float32",
+    spec_digest: str = "tiny-spec",
+    seed: int = 0,
+) -> Path:
+    """Episodes of equal length from two sources, `left` and `right`, in turn."""
+    rng = np.random.default_rng(seed)
+    rows = -(-ticks // reuse)
+    readings = ticks * readings_a_tick if sensor_channels else 0
+    states = ticks * states_a_tick if state_dim else 0
+    said = [
+        json.dumps(
+            {
+                "id": f"episode_{index:03d}",
+                "path": f"recordings/episode_{index:03d}",
+                "format": "new",
+                "instruction": "touch the dot",
+                "content": f"{seed}-{index}",
+                "digest": f"{seed}-{index}",
+            }
+        ).encode()
+        for index in range(episodes)
+    ]
+    action_names = ["dx", "dy", "dz", "da", "gripper"]
+    streams = {
+        "action": {
+            "names": action_names,
+            "units": ["mm", "mm", "mm", "deg", ""],
+            "kind": "delta",
+        },
+        "sensor": _named("sensor", sensor_channels),
+        "state": _named("joint", state_dim),
+        "views": ["View1"],
+    }
+    count = episodes
+    sizes = Sizes(
+        episodes=count,
+        ticks=count * ticks,
+        vl_rows=count * rows,
+        readings=count * readings,
+        states=count * states,
+        text_bytes=sum(map(len, said)),
+        slots=slots,
+        dim=dim,
+        views=1,
+        action_dim=len(action_names),
+        sensor_channels=sensor_channels,
+        state_dim=state_dim,
+    )
+    target = folder / f"{name}.zarr"
+    build = StoreBuild(target, arrays(sizes, dtype, "float32"), plan=f"{name}-{seed}")
+    build.create()
+    build.allocate()
+
+    features = rng.normal(size=(count * rows, slots, dim)).astype(np.float32)
+    sensor = rng.normal(size=(count * readings, sensor_channels)).astype(np.float32)
+    state = rng.normal(size=(count * states, state_dim)).astype(np.float32)
+    tick = np.arange(count * ticks)
+    episode, inside = np.divmod(tick, ticks)
+    vl_row = episode * rows + inside // reuse
+    sensor_end = episode * readings + (inside + 1) * readings_a_tick * bool(readings)
+    state_end = episode * states + (inside + 1) * states_a_tick * bool(states)
+    action = np.zeros((len(tick), len(action_names)), np.float32)
+    action[:, :2] = features[vl_row, 0, :2]
+    if readings:
+        action[:, 2] = sensor[sensor_end - 1, 0]
+    if states:
+        action[:, 3] = state[state_end - 1, 0]
+    action[:, 4] = 1
+
+    def clock(rows_each: int) -> np.ndarray:
+        return np.tile(np.arange(rows_each) * 0.1 * ticks / max(1, rows_each), count)
+
+    edges = np.arange(count + 1)
+    contents = {
+        "tick/time": clock(ticks),
+        "tick/action": action,
+        "tick/vl_row": vl_row,
+        "tick/sensor_end": sensor_end,
+        "tick/state_end": state_end,
+        "sensor/values": sensor,
+        "sensor/time": clock(readings),
+        "state/values": state,
+        "state/time": clock(states),
+        "vl/slot_valid": np.ones((count * rows, slots), np.uint8),
+        "vl/time": clock(ticks)[::reuse][: count * rows] if ticks % reuse == 0 else clock(rows),
+        "vl/frame_time": np.tile(np.arange(rows) * 0.1 * reuse - 0.02, count)[:, None],
+        "episode/tick_start": edges * ticks,
+        "episode/vl_start": edges * rows,
+        "episode/sensor_start": edges * readings,
+        "episode/state_start": edges * states,
+        "episode/text_start": np.cumsum([0, *map(len, said)]),
+        "episode/source": np.arange(count) % 2,
+        "episode/text": np.frombuffer(b"".join(said), np.uint8),
+    }
+    for array, values in contents.items():
+        build.write(array, 0, np.asarray(values))
+    build.finish_layout(
+        {
+            "schema": SCHEMA,
+            "feature_spec": {"digest": spec_digest, "prompt": "{instruction}"},
+            "sources": ["left", "right"],
+            "streams": streams,
+            "action_hz": 10.0,
+            "vlm_reuse_count": reuse,
+            "environment": [],
+        },
+        {"slots": [{"layer": 0, "norm": True, "pooling": "mean"}] * slots},
+    )
+    keys = [rng.bytes(16) for _ in range(len(features))]
+    stored = features
+    if dtype == "bfloat16":
+        stored = (features.view(np.uint32) >> 16).astype(np.uint16)
+    build.commit(
+        np.arange(len(features)),
+        stored.astype(build.specs["vl/features"].dtype),
+        keys,
+        build.environment_index({"torch": "test"}),
+    )
+    build.seal()
+    return target
+
+
+def _named(prefix: str, width: int) -> dict[str, list[str]]:
+    return {"names": [f"{prefix}_{index}" for index in range(width)], "units": [""] * width}
