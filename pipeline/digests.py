@@ -1,0 +1,90 @@
+"""Content digests of files, remembered by path, size and mtime.
+
+A file is read once; as long as its size and modification time (ns) stay, its digest is looked up.
+The ledger only saves reading: losing it costs time, never correctness.
+"""
+
+import hashlib
+import sqlite3
+from pathlib import Path
+from types import TracebackType
+
+from pipeline.errors import RecordingError
+
+_BLOCK = 4 * 2**20
+
+
+class ContentDigests:
+    """Digests of files, kept in one SQLite file."""
+
+    def __init__(self, ledger: Path) -> None:
+        ledger.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            self._open(ledger)
+        except sqlite3.DatabaseError:
+            ledger.unlink()
+            self._open(ledger)
+
+    def _open(self, ledger: Path) -> None:
+        self._database = sqlite3.connect(ledger, isolation_level=None)
+        self._database.execute("PRAGMA journal_mode = WAL")
+        self._database.execute("PRAGMA synchronous = OFF")
+        self._database.execute(
+            "CREATE TABLE IF NOT EXISTS file "
+            "(path TEXT PRIMARY KEY, size INTEGER, mtime_ns INTEGER, digest TEXT)"
+        )
+        self._database.execute(
+            "CREATE TABLE IF NOT EXISTS rate (what TEXT PRIMARY KEY, rows_per_s REAL)"
+        )
+
+    def __enter__(self) -> "ContentDigests":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._database.close()
+
+    def of(self, path: Path) -> str:
+        """The digest of a file's content, 32 hex digits of BLAKE2b.
+
+        Raises `RecordingError` when the file cannot be read.
+        """
+        try:
+            place, status = str(path.resolve()), path.stat()
+            known = self._database.execute(
+                "SELECT digest FROM file WHERE path = ? AND size = ? AND mtime_ns = ?",
+                (place, status.st_size, status.st_mtime_ns),
+            ).fetchone()
+            if known:
+                return str(known[0])
+            digest = _digest(path)
+        except OSError as error:
+            raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
+        self._database.execute(
+            "INSERT OR REPLACE INTO file VALUES (?, ?, ?, ?)",
+            (place, status.st_size, status.st_mtime_ns, digest),
+        )
+        return digest
+
+    def note_rate(self, what: str, rows_per_s: float) -> None:
+        """Remember how fast rows were computed, for the estimate of a later plan."""
+        self._database.execute("INSERT OR REPLACE INTO rate VALUES (?, ?)", (what, rows_per_s))
+
+    def rate(self, what: str) -> float | None:
+        """Rows a second of the last session under that name."""
+        row = self._database.execute(
+            "SELECT rows_per_s FROM rate WHERE what = ?", (what,)
+        ).fetchone()
+        return float(row[0]) if row else None
+
+
+def _digest(path: Path) -> str:
+    hasher = hashlib.blake2b(digest_size=16)
+    with path.open("rb") as file:
+        while block := file.read(_BLOCK):
+            hasher.update(block)
+    return hasher.hexdigest()

@@ -1,0 +1,98 @@
+"""What an extraction would do, and why; said before anything is done."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from pipeline.extraction.survey import Survey
+from pipeline.store import FEATURES, Donor
+from pipeline.store.schema import ArraySpec
+from pipeline.vlm.feature_spec import differences
+
+
+@dataclass(frozen=True)
+class ExtractionPlan:
+    """Rows, bytes and reasons."""
+
+    episodes: int
+    unchanged: int
+    rows: int
+    known: int
+    """Rows that are there already: of the interrupted build, or of unchanged episodes."""
+    bytes: int
+    free: int
+    rows_per_s: float | None
+    """As measured in the last session with this model, resolution and device."""
+    reasons: tuple[str, ...]
+
+    def lines(self) -> list[str]:
+        """For people."""
+        left = self.rows - self.known
+        if not left:
+            time = "none, the model is not needed"
+        elif self.rows_per_s is None:
+            time = "not known before a first session with this model and device"
+        else:
+            seconds = left / self.rows_per_s
+            time = f"about {_duration(seconds)} at {self.rows_per_s:.1f} rows/s, as last measured"
+        return [
+            *(f"why: {reason}" for reason in self.reasons),
+            f"episodes: {self.episodes}, {self.unchanged} of them unchanged",
+            f"rows: {self.rows}, {self.known} known, {left} to compute"
+            + (" (fewer where a key is known)" if left and self.unchanged < self.episodes else ""),
+            f"disk: {_size(self.bytes)} for the whole store, {_size(self.free)} free",
+            f"time: {time}",
+        ]
+
+
+def store_bytes(specs: dict[str, ArraySpec]) -> int:
+    """Bytes that a store's rows take."""
+    return sum(spec.data_bytes for spec in specs.values())
+
+
+def reasons(survey: Survey, store: Donor | None, specs: dict[str, ArraySpec]) -> tuple[str, ...]:
+    """Why the store that is there, if any, will not do."""
+    if store is None:
+        return ("there is no store yet",)
+    why = [
+        f"feature spec, {line}"
+        for line in differences(store.attrs["feature_spec"], survey.spec.attrs())
+    ]
+    before, now = set(store.episode_digests), {one.digest for one in survey.episodes}
+    contents = set(store.episode_contents)
+    changed = [one for one in survey.episodes if one.digest not in before]
+    new = sum(one.content not in contents for one in changed)
+    if new:
+        why.append(f"{new} episode(s) are new or their files changed")
+    if len(changed) > new:
+        why.append(
+            f"{len(changed) - new} episode(s) have another instruction, name, place, action_hz or "
+            "vlm_reuse_count"
+        )
+    if before - now:
+        why.append(f"{len(before - now)} episode(s) of the store are gone or changed")
+    for name, spec in specs.items():
+        if name != FEATURES and store.specs[name].dtype != spec.dtype:
+            why.append(f"{name} was {store.specs[name].dtype}, is to be {spec.dtype}")
+    return tuple(why) or ("the order of episodes, or how actions are derived, changed",)
+
+
+def unchanged_rows(survey: Survey, donors: Sequence[Donor]) -> tuple[int, int]:
+    """(episodes, rows) that a donor of the same spec has whole."""
+    episodes = rows = 0
+    for one in survey.episodes:
+        found = [keys for donor in donors if (keys := donor.keys_of(one.digest)) is not None]
+        if found:
+            episodes += 1
+            rows += max(sum(key is not None for key in keys) for keys in found)
+    return episodes, rows
+
+
+def _duration(seconds: float) -> str:
+    minutes, hours = seconds / 60, seconds / 3600
+    if hours >= 1.5:
+        return f"{hours:.1f} h"
+    return f"{minutes:.0f} min" if minutes >= 1.5 else f"{seconds:.0f} s"
+
+
+def _size(count: int) -> str:
+    return f"{count / 2**30:.1f} GiB" if count >= 2**30 else f"{count / 2**20:.1f} MiB"

@@ -1,0 +1,128 @@
+"""Which episodes there are and what they are, without reading a stream or decoding a frame.
+
+The survey's plan digest names everything that decides what a store holds. Where a finished store
+carries the same, there is nothing to do.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from tqdm import tqdm
+
+from pipeline.config import DataParams, Params
+from pipeline.digests import ContentDigests
+from pipeline.errors import RecordingError
+from pipeline.recordings import BadEpisode, Recording, open_recordings
+from pipeline.timeline import ActionRotation, choose_action_rotation
+from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
+
+
+@dataclass(frozen=True)
+class SurveyedEpisode:
+    """A recording and what its files hold."""
+
+    recording: Recording
+    content: str
+    """Digest of its files: equal content means equal streams."""
+    digest: str
+    """Digest of content and of everything else that decides its rows."""
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What is to be in the store."""
+
+    episodes: tuple[SurveyedEpisode, ...]
+    missing: tuple[str, ...]
+    """Listed by a data set's metadata, absent from its files."""
+    bad: tuple[BadEpisode, ...]
+    spec: FeatureSpec
+    action_rotation: ActionRotation
+    plan: str
+    """Digest of all that decides what the store holds."""
+
+
+def survey(params: Params, digests: ContentDigests) -> Survey:
+    """Open every source, take the content digest of its files and name the feature spec.
+
+    Raises `RecordingError` when no episode is usable, and whatever a source as a whole is refused
+    for.
+    """
+    data = params.data
+    opened = open_recordings(data.sources, data.root, data.views)
+    rotation = choose_action_rotation(data.action_rotation, opened.recordings)
+    episodes: list[SurveyedEpisode] = []
+    bad = list(opened.bad)
+    views: set[str] = set()
+    for recording in tqdm(opened.recordings, "survey", unit="episode", disable=None, leave=False):
+        try:
+            content = _content(recording, digests)
+            views |= set(recording.cameras())
+        except RecordingError as error:
+            bad.append(BadEpisode(recording.source, recording.path, str(error)))
+            continue
+        episodes.append(SurveyedEpisode(recording, content, _digest(recording, content, data)))
+    if not episodes:
+        refuse_bad(bad, of=len(bad))
+    spec = feature_spec(params.vlm, params.extract.dtype, sorted(views), digests.of)
+    plan = _hash(
+        spec.digest,
+        params.extract.sensor_dtype,
+        rotation,
+        data.on_bad_episode,
+        repr([(source.name, source.action_kind) for source in data.sources]),
+        *(episode.digest for episode in episodes),
+    )
+    return Survey(tuple(episodes), opened.missing, tuple(bad), spec, rotation, plan)
+
+
+def refuse_bad(bad: Sequence[BadEpisode], of: int) -> None:
+    """Raise one `RecordingError` that lists every bad episode."""
+    lines = [f"{len(bad)} of {of} episodes cannot be used:"]
+    lines += [f"  {one.source}: {_reason(one)}" for one in bad]
+    lines.append("Mend or remove them, or leave them out with --set data.on_bad_episode=skip.")
+    raise RecordingError("\n".join(lines))
+
+
+def _reason(bad: BadEpisode) -> str:
+    where = str(bad.where)
+    return bad.reason if where in bad.reason else f"{where}: {bad.reason}"
+
+
+def shown_path(path: Path, root: Path) -> str:
+    """A path relative to the data root where it lies below, so that a store can move."""
+    try:
+        return Path(os.path.abspath(path)).relative_to(os.path.abspath(root)).as_posix()
+    except ValueError:
+        return os.path.abspath(path)
+
+
+def _content(recording: Recording, digests: ContentDigests) -> str:
+    # Frame times stand in file names, so a name is content too; where the folder lies is not.
+    named = (
+        (os.path.relpath(file, recording.path), digests.of(file)) for file in recording.files()
+    )
+    return _hash(recording.identity(), json.dumps(sorted(named)))
+
+
+def _digest(recording: Recording, content: str, data: DataParams) -> str:
+    return _hash(
+        content,
+        recording.source,
+        recording.id,
+        recording.format,
+        recording.instruction,
+        shown_path(recording.path, data.root),
+        repr((data.action_hz, data.vlm_reuse_count)),
+    )
+
+
+def _hash(*parts: str) -> str:
+    hasher = hashlib.blake2b(digest_size=16)
+    for part in parts:
+        hasher.update(f"{len(part)}:".encode() + part.encode())
+    return hasher.hexdigest()

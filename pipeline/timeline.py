@@ -1,0 +1,230 @@
+"""Clocks -> ticks: which frames, which readings, which action, which VL row.
+
+All times are float64 seconds on the recording's own clock. Ticks begin when every stream that the
+episode has has begun, and end when one ends. Everything that a tick sees is at or before it; only
+its action lies ahead.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from pipeline.errors import ConfigError, RecordingError
+from pipeline.recordings import Channels, RecordedAction, Recording, Stream
+
+ActionRotation = Literal["rotvec", "euler_delta"]
+
+RATE_TOLERANCE = 0.1
+"""Recorded rows are the ticks when `action_hz` differs from their rate by no more than this."""
+
+_TRANSLATION = ("dx", "dy", "dz")
+_ROTATION = {"rotvec": ("rx", "ry", "rz"), "euler_delta": ("da", "db", "dr")}
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """An episode's ticks; indices are into its own streams."""
+
+    time: NDArray[np.float64]
+    """(tick,) s."""
+    action: NDArray[np.float32]
+    """(tick, action_dim) in physical units."""
+    action_channels: Channels
+    action_kind: str
+    vl_row: NDArray[np.int64]
+    """(tick,) the VL row that serves it."""
+    vl_time: NDArray[np.float64]
+    """(vl_row,) s, the tick each VL row is computed for."""
+    frames: Mapping[str, NDArray[np.int64]]
+    """By view: (vl_row,) the last frame at or before `vl_time`."""
+    frame_time: Mapping[str, NDArray[np.float64]]
+    """By view: (vl_row,) s."""
+    sensor_end: NDArray[np.int64]
+    """(tick,) one past the last sensor reading at or before the tick; 0 without a sensor."""
+    state_end: NDArray[np.int64]
+    """(tick,) one past the last state at or before the tick; 0 without a state."""
+
+
+def build_timeline(
+    recording: Recording,
+    action_hz: float | None,
+    vlm_reuse_count: int,
+    action_rotation: ActionRotation,
+    state: Stream | None = None,
+    sensor: Stream | None = None,
+) -> Timeline:
+    """The ticks of one episode.
+
+    `state` and `sensor` are the recording's own streams, passed in because they are read once.
+    Raises `RecordingError` when there are no actions, when no instant is covered by every stream or
+    when a delta action would have to be resampled, and `ConfigError` when pose-derived actions are
+    asked for without a rate.
+    """
+    clocks = {f"view {view}": camera.time for view, camera in recording.cameras().items()}
+    clocks |= {
+        name: stream.time for name, stream in (("sensor", sensor), ("state", state)) if stream
+    }
+    recorded = recording.action()
+    poses = recording.poses()
+    if recorded is not None and not _redo_rotation(recorded, poses, action_rotation):
+        time, action = _recorded_ticks(recording, recorded, clocks, action_hz)
+        channels, kind = recorded.channels, recorded.kind
+    elif poses is not None:
+        time, action = _pose_ticks(recording, poses, clocks, action_hz, action_rotation)
+        channels, kind = _pose_channels(action_rotation), "delta"
+    else:
+        raise RecordingError(f"{recording.path}: neither actions nor poses to derive them from")
+    vl_time = time[::vlm_reuse_count]
+    frames = {view: last_at(camera.time, vl_time) for view, camera in recording.cameras().items()}
+    none = np.zeros(len(time), np.int64)
+    return Timeline(
+        time=time,
+        action=action,
+        action_channels=channels,
+        action_kind=kind,
+        vl_row=np.arange(len(time)) // vlm_reuse_count,
+        vl_time=vl_time,
+        frames=frames,
+        frame_time={
+            view: camera.time[frames[view]] for view, camera in recording.cameras().items()
+        },
+        sensor_end=none if sensor is None else last_at(sensor.time, time) + 1,
+        state_end=none if state is None else last_at(state.time, time) + 1,
+    )
+
+
+def choose_action_rotation(
+    asked: Literal["auto", "rotvec", "euler_delta"], recordings: Sequence[Recording]
+) -> ActionRotation:
+    """What `auto` means: rotation vectors where every recording has poses, else Euler deltas."""
+    if asked != "auto":
+        return asked
+    return "rotvec" if all(one.has_poses for one in recordings) else "euler_delta"
+
+
+def last_at(clock: NDArray[np.float64], times: NDArray[np.float64]) -> NDArray[np.int64]:
+    """For each time, the index of the last entry of a sorted clock at or before it (-1: none)."""
+    return np.searchsorted(clock, times, side="right") - 1
+
+
+def wrapped(degrees: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The same angles in [-180, 180)."""
+    return (degrees + 180.0) % 360.0 - 180.0
+
+
+def _redo_rotation(
+    recorded: RecordedAction, poses: Stream | None, action_rotation: ActionRotation
+) -> bool:
+    """Whether recorded Euler deltas have to be derived anew, as rotation vectors, from poses."""
+    return (
+        action_rotation == "rotvec"
+        and poses is not None
+        and recorded.channels == _pose_channels("euler_delta")
+    )
+
+
+def _pose_channels(action_rotation: ActionRotation) -> Channels:
+    names = (*_TRANSLATION, *_ROTATION[action_rotation], "gripper")
+    return Channels(names, ("mm",) * 3 + ("deg",) * 3 + ("",))
+
+
+def _recorded_ticks(
+    recording: Recording,
+    recorded: RecordedAction,
+    clocks: Mapping[str, NDArray[np.float64]],
+    action_hz: float | None,
+) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    start, stop = _covered(recording, {"action": recorded.time, **clocks})
+    rate = recorded.rate_hz or _rate(recorded.time)
+    if action_hz is None or abs(action_hz - rate) <= RATE_TOLERANCE * rate:
+        kept = (recorded.time >= start) & (recorded.time <= stop)
+        return _some(recording, recorded.time[kept]), recorded.values[kept]
+    if recorded.kind == "delta":
+        raise RecordingError(
+            f"{recording.path}: its actions are differences recorded at {rate:g} Hz and cannot be "
+            f"held at data.action_hz={action_hz:g}. Set data.action_hz to {rate:g} or null."
+        )
+    time = _some(recording, _grid(start, stop, action_hz))
+    return time, recorded.values[last_at(recorded.time, time)]
+
+
+def _pose_ticks(
+    recording: Recording,
+    poses: Stream,
+    clocks: Mapping[str, NDArray[np.float64]],
+    action_hz: float | None,
+    action_rotation: ActionRotation,
+) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    if action_hz is None:
+        raise ConfigError(
+            f"data.action_hz is null, but the actions of {recording.path} are derived from poses "
+            "and need a rate; set data.action_hz, for example to 10"
+        )
+    start, stop = _covered(recording, {"pose": poses.time, **clocks})
+    last = min(stop, float(poses.time[-1]) - 1 / action_hz)
+    time = _some(recording, _grid(start, last, action_hz))
+    edges = np.append(time, start + len(time) / action_hz)
+    edges = np.minimum(edges, poses.time[-1])
+    return time, _pose_actions(poses, edges, action_rotation)
+
+
+def _pose_actions(
+    poses: Stream, edges: NDArray[np.float64], action_rotation: ActionRotation
+) -> NDArray[np.float32]:
+    """Actions (edge - 1, 7) between poses interpolated at the edges."""
+    clock, first = np.unique(poses.time, return_index=True)
+    pose = poses.values[first].astype(np.float64)
+    place = np.stack([np.interp(edges, clock, pose[:, axis]) for axis in range(3)], axis=1)
+    if action_rotation == "rotvec":
+        turned = Slerp(clock, _rotations(pose[:, 3:]))(edges)
+        # In the base frame: R(k+1)·R(k)ᵀ.
+        rotation = (turned[1:] * turned[:-1].inv()).as_rotvec(degrees=True)
+    else:
+        # The recorder's own branch of the angles, made continuous; slerp might leave it.
+        angles = np.unwrap(pose[:, 3:], axis=0, period=360.0)
+        at = np.stack([np.interp(edges, clock, angles[:, axis]) for axis in range(3)], axis=1)
+        rotation = wrapped(np.diff(at, axis=0))
+    gripper = np.ones((len(edges) - 1, 1))
+    return np.concatenate([np.diff(place, axis=0), rotation, gripper], axis=1).astype(np.float32)
+
+
+def _rotations(angles: NDArray[np.float64]) -> Rotation:
+    """R = Rx(a)·Ry(b)·Rz(r), the arm's mobile XYZ convention; angles (n, 3) in degrees."""
+    return Rotation.from_euler("XYZ", angles, degrees=True)
+
+
+def _covered(
+    recording: Recording, clocks: Mapping[str, NDArray[np.float64]]
+) -> tuple[float, float]:
+    """The first and last instant at which every stream has begun and none has ended."""
+    late = max(clocks, key=lambda name: float(clocks[name][0]))
+    early = min(clocks, key=lambda name: float(clocks[name][-1]))
+    start, stop = float(clocks[late][0]), float(clocks[early][-1])
+    if start > stop:
+        raise RecordingError(
+            f"{recording.path}: no instant is covered by every stream: {late} begins at "
+            f"{start:.3f} s, after {early} has ended at {stop:.3f} s"
+        )
+    return start, stop
+
+
+def _grid(start: float, stop: float, rate_hz: float) -> NDArray[np.float64]:
+    """start, start + 1/rate, … up to `stop`; a microsecond of slack for rounding."""
+    count = int(np.floor((stop - start) * rate_hz + 1e-6 * rate_hz)) + 1
+    return start + np.arange(max(0, count)) / rate_hz
+
+
+def _some(recording: Recording, time: NDArray[np.float64]) -> NDArray[np.float64]:
+    if not len(time):
+        raise RecordingError(
+            f"{recording.path}: too short: no tick has every stream and a following action"
+        )
+    return time
+
+
+def _rate(time: NDArray[np.float64]) -> float:
+    return 1.0 / float(np.median(np.diff(time))) if len(time) > 1 else 1.0
