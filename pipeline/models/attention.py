@@ -1,0 +1,99 @@
+"""Pre-norm transformer layers (Xiong et al. 2020, "On Layer Normalization in the Transformer").
+
+`nn.TransformerEncoderLayer` switches to other kernels in evaluation and warns about masks; these
+run one path in training and evaluation, and under autocast norms and softmax stay in float32.
+"""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from pipeline.errors import ConfigError
+
+
+class Attention(nn.Module):
+    """Multi-head attention of `queries` to `source`."""
+
+    def __init__(self, dim: int, heads: int) -> None:
+        super().__init__()
+        if dim % heads:
+            raise ConfigError(
+                f"a transformer {dim} wide cannot have {heads} heads: heads must divide the width. "
+                "Change train_head.*.heads or the width beside it."
+            )
+        self.heads = heads
+        self.query = nn.Linear(dim, dim)
+        self.key_value = nn.Linear(dim, 2 * dim)
+        self.out = nn.Linear(dim, dim)
+
+    def forward(
+        self,
+        queries: Float[Tensor, "batch query dim"],
+        source: Float[Tensor, "batch token dim"],
+        valid: Bool[Tensor, "batch token"] | None = None,
+    ) -> Float[Tensor, "batch query dim"]:
+        """What each query takes from the valid tokens, of which each row must have one."""
+        query = self._split(self.query(queries))
+        key, value = (self._split(x) for x in self.key_value(source).chunk(2, dim=-1))
+        mask = None if valid is None else valid[:, None, None, :]
+        taken = F.scaled_dot_product_attention(query, key, value, attn_mask=mask)
+        return self.out(taken.transpose(1, 2).flatten(2))
+
+    def _split(self, x: Tensor) -> Tensor:
+        return x.unflatten(-1, (self.heads, -1)).transpose(1, 2)
+
+
+class TransformerLayer(nn.Module):
+    """Self-attention, attention to a context where `cross`, and a feed-forward network."""
+
+    def __init__(
+        self, dim: int, heads: int, expansion: int = 4, dropout: float = 0.0, cross: bool = False
+    ) -> None:
+        super().__init__()
+        self.self_norm = nn.LayerNorm(dim)
+        self.self_attention = Attention(dim, heads)
+        self.cross_norm = nn.LayerNorm(dim) if cross else None
+        self.cross_attention = Attention(dim, heads) if cross else None
+        self.feed_forward = nn.Sequential(
+            nn.LayerNorm(dim),
+            nn.Linear(dim, expansion * dim),
+            nn.GELU(approximate="tanh"),
+            nn.Linear(expansion * dim, dim),
+        )
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(
+        self,
+        tokens: Float[Tensor, "batch token dim"],
+        valid: Bool[Tensor, "batch token"] | None = None,
+        context: Float[Tensor, "batch source dim"] | None = None,
+    ) -> Float[Tensor, "batch token dim"]:
+        """The tokens after one layer; tokens that are not valid are never attended to."""
+        normed = self.self_norm(tokens)
+        tokens = tokens + self.dropout(self.self_attention(normed, normed, valid))
+        if self.cross_attention is not None and self.cross_norm is not None:
+            assert context is not None
+            taken = self.cross_attention(self.cross_norm(tokens), context)
+            tokens = tokens + self.dropout(taken)
+        return tokens + self.dropout(self.feed_forward(tokens))
+
+
+def learned(*shape: int) -> nn.Parameter:
+    """A learned embedding of this shape, drawn small (std 0.02) from the global generator."""
+    return nn.Parameter(torch.randn(*shape) * 0.02)
+
+
+def masked_mean(
+    tokens: Float[Tensor, "batch token dim"], valid: Bool[Tensor, "batch token"]
+) -> Float[Tensor, "batch dim"]:
+    """The float32 mean of each row's valid tokens, 0 where it has none."""
+    weight = valid.unsqueeze(-1)
+    total = tokens.float().masked_fill(~weight, 0.0).sum(dim=1)
+    return total / weight.sum(dim=1).clamp(min=1)
+
+
+def right_aligned(valid: Tensor, window: int) -> Bool[Tensor, "batch window"]:
+    """True at the last `valid[i]` steps of row i of a window; `valid` is (batch,) integer."""
+    steps = torch.arange(window, device=valid.device)
+    return steps >= window - valid.unsqueeze(-1)

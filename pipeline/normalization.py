@@ -1,0 +1,198 @@
+"""Per-channel mean and standard deviation: fitted in one streaming pass, kept exactly in JSON.
+
+Numpy only; `pipeline.models.normalizer` applies them to tensors.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import CheckpointMismatch, NumericsError
+
+Chunk = NDArray[Any] | tuple[NDArray[Any], NDArray[np.bool_]]
+
+_BLOCK_VALUES = 4_194_304
+"""Values converted to float64 at a time: 32 MB, whatever the size of the chunks."""
+
+_RELATIVE_FLOOR = 4 * float(np.finfo(np.float32).eps)
+"""A spread below a few float32 steps of the mean is rounding, not signal."""
+
+
+@dataclass(frozen=True, eq=False)
+class ChannelStatistics:
+    """Mean and population standard deviation of each channel over `count` rows.
+
+    `mean` and `std` are float64 of one shape: (channel,), or (slot, dim) for features.
+    """
+
+    mean: NDArray[np.float64]
+    std: NDArray[np.float64]
+    count: int
+
+    @property
+    def scale(self) -> NDArray[np.float64]:
+        """What to divide by: `std`, or 1 where the channel does not vary.
+
+        So a constant channel comes out as 0 and inverts exactly.
+        """
+        floor = np.maximum(_RELATIVE_FLOOR * np.abs(self.mean), float(np.finfo(np.float32).tiny))
+        return np.where(self.std > floor, self.std, 1.0)
+
+    def document(self) -> dict[str, Any]:
+        """The statistics as JSON values; Python writes the shortest digits that read back equal."""
+        return {"mean": self.mean.tolist(), "std": self.std.tolist(), "count": self.count}
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any]) -> "ChannelStatistics":
+        """The statistics of a `document`, bit for bit. Raises `CheckpointMismatch`."""
+        try:
+            mean = np.asarray(document["mean"], np.float64)
+            std = np.asarray(document["std"], np.float64)
+            count = int(document["count"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise CheckpointMismatch(
+                f"normalisation: expected numbers under mean, std and count, found {error!r}"
+            ) from None
+        if mean.shape != std.shape:
+            raise CheckpointMismatch(
+                f"normalisation: mean has shape {mean.shape}, std {std.shape}; they must agree"
+            )
+        return cls(mean, std, count)
+
+
+@dataclass(frozen=True, eq=False)
+class Normalization:
+    """The statistics of every stream a policy sees; None for a stream it does not have."""
+
+    action: ChannelStatistics
+    features: ChannelStatistics | None = None
+    sensor: ChannelStatistics | None = None
+    state: ChannelStatistics | None = None
+
+    def document(self) -> dict[str, Any]:
+        """All statistics as JSON values."""
+        streams = {
+            "action": self.action,
+            "features": self.features,
+            "sensor": self.sensor,
+            "state": self.state,
+        }
+        return {name: None if one is None else one.document() for name, one in streams.items()}
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any]) -> "Normalization":
+        """The normalisation of a `document`, bit for bit. Raises `CheckpointMismatch`."""
+        if document.get("action") is None:
+            raise CheckpointMismatch("normalisation: expected statistics of `action`, found none")
+        streams = {
+            name: ChannelStatistics.from_document(document[name])
+            for name in ("action", "features", "sensor", "state")
+            if document.get(name) is not None
+        }
+        return cls(**streams)
+
+
+def fit_channels(
+    chunks: Iterable[Chunk], what: str, names: Sequence[str] | None = None
+) -> ChannelStatistics:
+    """Statistics over all rows of `chunks`, each (row, channel…) of floating point, in one pass.
+
+    A chunk may be a pair (values, valid): `valid` is bool over the leading axes of `values`, such
+    as (row, slot) for features (row, slot, dim), and what is not valid is neither checked nor
+    counted. Moments are merged in float64 after Chan, Golub and LeVeque (1983), eq. 2.1.
+    Raises `NumericsError`, naming `what`, channel and row, on NaN, inf, or where there is no row.
+    """
+    moments: _Moments | None = None
+    rows = 0
+    for values, valid in _blocks(chunks):
+        if not np.issubdtype(values.dtype, np.floating):
+            raise TypeError(f"{what}: expected floating point, found {values.dtype}")
+        block = _moments(values, valid, what, names, rows)
+        moments = block if moments is None else _merge(moments, block)
+        rows += len(values)
+    if moments is None:
+        raise NumericsError(f"{what}: no rows to fit the normalisation on; check the split")
+    variance = moments.squares / np.maximum(moments.count, 1)
+    return ChannelStatistics(moments.mean, np.sqrt(variance), rows)
+
+
+@dataclass(frozen=True)
+class _Moments:
+    """`count` broadcasts to the channels; `squares` is the sum of squared distances to `mean`."""
+
+    count: NDArray[np.float64]
+    mean: NDArray[np.float64]
+    squares: NDArray[np.float64]
+
+
+def _blocks(chunks: Iterable[Chunk]) -> Iterator[tuple[NDArray[Any], NDArray[np.bool_] | None]]:
+    for chunk in chunks:
+        values, valid = chunk if isinstance(chunk, tuple) else (chunk, None)
+        channels = int(np.prod(values.shape[1:]))
+        rows = max(1, _BLOCK_VALUES // max(1, channels))
+        for start in range(0, len(values), rows):
+            part = slice(start, start + rows)
+            yield values[part], None if valid is None else valid[part]
+
+
+def _moments(
+    values: NDArray[Any],
+    valid: NDArray[np.bool_] | None,
+    what: str,
+    names: Sequence[str] | None,
+    first_row: int,
+) -> _Moments:
+    with np.errstate(invalid="ignore", over="ignore"):
+        block = values.astype(np.float64)
+        if valid is None:
+            count = np.float64(len(block))
+            mean = block.mean(axis=0)
+            block -= mean
+        else:
+            weight = valid.reshape(valid.shape + (1,) * (block.ndim - valid.ndim))
+            count = weight.sum(axis=0, dtype=np.float64)
+            block = np.where(weight, block, 0.0)
+            mean = block.sum(axis=0) / np.maximum(count, 1)
+            block = np.where(weight, block - mean, 0.0)
+        squares = np.einsum("r...,r...->...", block, block)
+    if not np.isfinite(squares).all():
+        _refuse(values, valid, what, names, first_row)
+    return _Moments(np.asarray(count), mean, squares)
+
+
+def _merge(left: _Moments, right: _Moments) -> _Moments:
+    count = left.count + right.count
+    delta = right.mean - left.mean
+    share = right.count / np.maximum(count, 1)
+    return _Moments(
+        count,
+        left.mean + delta * share,
+        left.squares + right.squares + delta * delta * left.count * share,
+    )
+
+
+def _refuse(
+    values: NDArray[Any],
+    valid: NDArray[np.bool_] | None,
+    what: str,
+    names: Sequence[str] | None,
+    first_row: int,
+) -> None:
+    bad = ~np.isfinite(values)
+    if valid is not None:
+        bad &= valid.reshape(valid.shape + (1,) * (values.ndim - valid.ndim))
+    if not bad.any():
+        raise NumericsError(
+            f"{what}: values near row {first_row} are so large that their variance overflows"
+        )
+    row, *channel = (int(i) for i in np.argwhere(bad)[0])
+    place = ", ".join(str(i) for i in channel)
+    if names is not None and len(channel) == 1:
+        place = repr(names[channel[0]])
+    raise NumericsError(
+        f"{what}: expected finite numbers, found {values[(row, *channel)]} in row "
+        f"{first_row + row}, channel {place}. Mend the recording and run stages.extract again."
+    )

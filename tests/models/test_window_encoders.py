@@ -1,0 +1,161 @@
+"""What both window encoders guarantee, and what each of them does on its own."""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from pipeline.models import RobotStateEncoder, SensorEncoder
+from pipeline.models.attention import right_aligned
+from pipeline.models.sensor_encoder import HalvingBlock, resampled
+
+CHANNELS, WINDOW, OUTPUT = 9, 13, 24
+ENCODERS: dict[str, Callable[[], nn.Module]] = {
+    "sensor": lambda: SensorEncoder(CHANNELS, WINDOW, (16, 32), 1, 2, OUTPUT),
+    "state": lambda: RobotStateEncoder(CHANNELS, WINDOW, 16, 1, 2, OUTPUT, patch=4),
+}
+
+
+@pytest.fixture(params=ENCODERS)
+def encoder(request: pytest.FixtureRequest) -> nn.Module:
+    return ENCODERS[request.param]()
+
+
+def windows(batch: int = 14) -> Tensor:
+    return torch.randn(batch, WINDOW, CHANNELS)
+
+
+class TestWindowEncoderContract:
+    def test_shape(self, encoder: nn.Module) -> None:
+        assert encoder(windows(3), torch.tensor([0, 5, 13])).shape == (3, OUTPUT)
+
+    @pytest.mark.parametrize("padding", [7.0, float("nan"), float("inf")])
+    def test_padding_never_reaches_the_output(self, encoder: nn.Module, padding: float) -> None:
+        values, valid = windows(), torch.arange(14)
+        changed = values.clone()
+        for row, real in enumerate(valid.tolist()):
+            changed[row, : WINDOW - real] = padding
+        assert torch.equal(encoder(values, valid), encoder(changed, valid))
+
+    def test_padding_never_reaches_a_gradient(self, encoder: nn.Module) -> None:
+        values = windows().requires_grad_()
+        encoder(values, torch.arange(14)).square().sum().backward()
+        assert values.grad is not None
+        reached = values.grad.abs().sum(dim=-1) > 0
+        expected = torch.arange(WINDOW) >= WINDOW - torch.arange(14).unsqueeze(-1)
+        assert torch.equal(reached, expected)
+
+    def test_tokens_of_padding_alone_are_never_attended_to(self, encoder: nn.Module) -> None:
+        values, valid = windows(3), torch.tensor([1, 2, 4])
+        before = encoder(values, valid)
+        with torch.no_grad():
+            encoder.position[:-1] += 3.0
+        assert torch.equal(encoder(values, valid), before)
+
+    def test_every_real_reading_counts_but_the_number_of_batch_mates_does_not(
+        self, encoder: nn.Module
+    ) -> None:
+        values, valid = windows(), torch.arange(14)
+        together = encoder(values, valid)
+        alone = torch.cat([encoder(values[i : i + 1], valid[i : i + 1]) for i in range(14)])
+        torch.testing.assert_close(together, alone, atol=1e-5, rtol=1e-4)
+
+    def test_a_missing_stream_is_a_learned_embedding(self, encoder: nn.Module) -> None:
+        encoded = encoder(windows(3), torch.tensor([0, 13, 0]))
+        assert torch.equal(encoded[0], encoder.missing)
+        assert torch.equal(encoded[0], encoded[2])
+        encoded.square().sum().backward()
+        assert encoder.missing.grad is not None
+        assert encoder.missing.grad.abs().min() > 0
+
+    def test_all_missing_gives_finite_gradients(self, encoder: nn.Module) -> None:
+        encoder(windows(2), torch.tensor([0, 0])).square().sum().backward()
+        gradients = [p.grad for p in encoder.parameters() if p.grad is not None]
+        assert gradients
+        assert all(torch.isfinite(gradient).all() for gradient in gradients)
+
+    def test_valid_defaults_to_all(self, encoder: nn.Module) -> None:
+        values = windows(2)
+        assert torch.equal(encoder(values), encoder(values, torch.tensor([13, 13])))
+
+    def test_bf16_autocast_is_finite_and_near_float32(self, encoder: nn.Module) -> None:
+        values, valid = windows(), torch.arange(14)
+        exact = encoder(values, valid)
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            rough = encoder(values, valid)
+            rough.float().sum().backward()
+        assert torch.isfinite(rough).all()
+        torch.testing.assert_close(rough.float(), exact, atol=0.05, rtol=0.05)
+        assert all(torch.isfinite(p.grad).all() for p in encoder.parameters() if p.grad is not None)
+
+    def test_time_order_matters(self, encoder: nn.Module) -> None:
+        values = windows(2)
+        assert (encoder(values) - encoder(values.flip(1))).abs().max() > 1e-3
+
+
+@pytest.mark.parametrize("real", [1, 2, 5, 8])
+def test_a_halving_block_sees_padding_as_the_end_of_the_signal(real: int) -> None:
+    block = HalvingBlock(CHANNELS, 16)
+    values = torch.randn(2, WINDOW, CHANNELS)
+    short, _ = block(values[:, -real:], torch.ones(2, real, dtype=torch.bool))
+    mask = right_aligned(torch.tensor([real, real]), WINDOW)
+    padded, valid = block(values.masked_fill(~mask.unsqueeze(-1), 0.0), mask)
+    torch.testing.assert_close(padded[:, -short.shape[1] :], short)
+    assert not padded[~valid].any()
+
+
+@pytest.mark.parametrize("window", [1, 2, 3, 16, 65])
+@pytest.mark.parametrize("channels", [1, 6])
+def test_sensor_encoder_takes_any_window_and_channel_count(window: int, channels: int) -> None:
+    encoder = SensorEncoder(channels, window, (8, 8), 1, 2, 5)
+    assert encoder(torch.randn(2, window, channels)).shape == (2, 5)
+
+
+@pytest.mark.parametrize("length", [5, 26, 130])
+def test_sensor_windows_of_another_length_are_resampled_without_leaks(length: int) -> None:
+    encoder = SensorEncoder(CHANNELS, WINDOW, (16, 32), 1, 2, OUTPUT)
+    values, valid = torch.randn(3, length, CHANNELS), torch.tensor([0, length // 2, length])
+    changed = values.clone()
+    changed[0] = float("nan")
+    changed[1, : length - length // 2] = float("nan")
+    assert torch.equal(encoder(values, valid), encoder(changed, valid))
+
+
+def test_resampling_keeps_a_constant_constant_beside_padding() -> None:
+    values = torch.full((1, 26, 2), 5.0)
+    values[0, :11] = 0.0
+    valid = torch.arange(26).unsqueeze(0) >= 11
+    for window in (13, 40):
+        resized, known = resampled(values, valid, window)
+        torch.testing.assert_close(resized[known], torch.full_like(resized[known], 5.0))
+        assert known[0, -1]
+        assert not known[0, 0]
+
+
+def test_a_ten_times_longer_window_encodes_what_its_averages_encode() -> None:
+    encoder = SensorEncoder(CHANNELS, WINDOW, (16, 32), 1, 2, OUTPUT)
+    values = torch.randn(2, 10 * WINDOW, CHANNELS)
+    averaged = values.unflatten(1, (WINDOW, 10)).mean(dim=2)
+    torch.testing.assert_close(encoder(values), encoder(averaged), atol=1e-5, rtol=1e-4)
+
+
+def test_state_patches_know_which_readings_are_real() -> None:
+    """A reading of zeros is the mean state, not padding."""
+    encoder = RobotStateEncoder(CHANNELS, WINDOW, 16, 1, 2, OUTPUT, patch=4)
+    zeros = torch.zeros(2, WINDOW, CHANNELS)
+    encoded = encoder(zeros, torch.tensor([1, 3]))
+    assert (encoded[0] - encoded[1]).abs().max() > 1e-3
+
+
+def test_default_sizes_are_the_seeds() -> None:
+    with torch.device("meta"):
+        sensor, state = SensorEncoder(), RobotStateEncoder()
+    assert [tuple(block.down.weight.shape) for block in sensor.blocks] == [
+        (512, 2 * 1026),
+        (1024, 2 * 512),
+        (1024, 2 * 1024),
+        (1024, 2 * 1024),
+    ]
+    assert sum(p.numel() for p in sensor.parameters()) == 34_388_992
+    assert sum(p.numel() for p in state.parameters()) == 1_748_224
