@@ -1,0 +1,36 @@
+"""Which device does the tensor maths, and in which precision."""
+
+from typing import Literal
+
+import torch
+
+from pipeline.errors import ConfigError
+
+
+def resolve_device(name: str) -> torch.device:
+    """The device of a `device:` param; `auto` is the first CUDA device where there is one.
+
+    Raises `ConfigError` for a device that this machine or this build of torch does not have.
+    """
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise ConfigError(
+            f"device: {name}: expected auto, cpu or a device of this machine "
+            f"(CUDA devices found: {torch.cuda.device_count()}): {str(error).splitlines()[0]}"
+        ) from None
+    return device
+
+
+def use_bfloat16(amp: Literal["auto", "off", "bfloat16"], device: torch.device) -> bool:
+    """Whether the forward pass runs under bfloat16 autocast.
+
+    `auto` is yes on a CUDA device with bfloat16 arithmetic and no elsewhere, where autocast
+    seldom pays and float32 keeps a run reproducible to the bit.
+    """
+    if amp == "auto":
+        return device.type == "cuda" and torch.cuda.is_bf16_supported(including_emulation=False)
+    return amp == "bfloat16"

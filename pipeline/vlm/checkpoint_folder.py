@@ -1,0 +1,166 @@
+"""Where a checkpoint or an adapter lies on disk, and which of its files decide what it says."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import VLMError
+
+_WANTED = ["*.json", "*.safetensors", "*.txt", "*.jinja"]
+"""What is fetched from the hub: never a pickle."""
+
+
+def resolve_checkpoint(
+    checkpoint: str, revision: str | None = None, setting: str = "vlm.checkpoint"
+) -> Path:
+    """The folder of a checkpoint or an adapter.
+
+    An existing folder is taken as it is and no network is touched. Anything else is a hub id: its
+    cached copy where complete, otherwise a download. Raises `VLMError` when neither is there.
+    """
+    folder = Path(checkpoint).expanduser()
+    if folder.is_dir():
+        return folder
+    if not _could_be_hub_id(checkpoint):
+        raise VLMError(
+            f"{setting} {checkpoint}: no such folder. Expected a folder in the hub's format (a "
+            "JSON config and *.safetensors) or a hub id such as Qwen/Qwen2.5-VL-3B-Instruct. The "
+            "demo's checkpoint is written by `python -m stages.demo`."
+        )
+    return _cached(checkpoint, revision) or _downloaded(checkpoint, revision, setting)
+
+
+def _could_be_hub_id(checkpoint: str) -> bool:
+    parts = checkpoint.split("/")
+    return len(parts) == 2 and all(parts) and parts[0][0] not in ".~"
+
+
+def _cached(checkpoint: str, revision: str | None) -> Path | None:
+    from huggingface_hub import snapshot_download
+    from huggingface_hub.errors import HFValidationError, LocalEntryNotFoundError
+
+    try:
+        found = snapshot_download(
+            checkpoint, revision=revision, local_files_only=True, allow_patterns=_WANTED
+        )
+    except (LocalEntryNotFoundError, HFValidationError):
+        return None
+    # A download that was cut short leaves a folder with holes: it is finished, not trusted.
+    return Path(found) if _is_complete(Path(found)) else None
+
+
+def _is_complete(folder: Path) -> bool:
+    try:
+        if (folder / "adapter_config.json").exists():
+            adapter_files(folder)
+        else:
+            weight_files(folder)
+            tokenizer_files(folder)
+            return (folder / "preprocessor_config.json").exists()
+    except VLMError:
+        return False
+    return True
+
+
+def _downloaded(checkpoint: str, revision: str | None, setting: str) -> Path:
+    from huggingface_hub import snapshot_download
+    from huggingface_hub.errors import HFValidationError
+
+    try:
+        return Path(snapshot_download(checkpoint, revision=revision, allow_patterns=_WANTED))
+    except (HFValidationError, OSError) as error:
+        raise VLMError(
+            f"{setting} {checkpoint}: no folder of this name, no complete copy in the hub's "
+            f"cache, and it cannot be downloaded ({type(error).__name__}: {_first_line(error)}). "
+            "If it is the demo's folder, run `python -m stages.demo`; if it is a hub id, run "
+            f"`hf download {checkpoint}` where there is network and set {setting} to the folder."
+        ) from error
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().partition("\n")[0]
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON object from a checkpoint's file; `VLMError` where it is missing or is not one."""
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise VLMError(
+            f"{path}: no such file, the checkpoint is incomplete. Copy or download it again."
+        ) from None
+    except (OSError, ValueError) as error:
+        raise VLMError(f"{path}: cannot be read as JSON: {error}") from None
+    if not isinstance(document, dict):
+        raise VLMError(f"{path}: expected a JSON object, found a {type(document).__name__}")
+    return document
+
+
+def read_config(folder: Path) -> dict[str, Any]:
+    """The checkpoint's config.json; `VLMError` unless it is a Qwen2.5-VL."""
+    config = read_json(folder / "config.json")
+    if config.get("model_type") != "qwen2_5_vl":
+        raise VLMError(
+            f"{folder / 'config.json'}: expected model_type 'qwen2_5_vl', found "
+            f"{config.get('model_type')!r}. Set vlm.checkpoint to a Qwen2.5-VL checkpoint."
+        )
+    return config
+
+
+def weight_files(folder: Path) -> list[Path]:
+    """Every file that decides the weights, sorted: config.json, safetensors and their index.
+
+    Raises `VLMError` where there is none, or where the index names a file that is missing.
+    """
+    shards = sorted(folder.glob("*.safetensors"))
+    index = folder / "model.safetensors.index.json"
+    if index.exists():
+        listed = {str(name) for name in read_json(index).get("weight_map", {}).values()}
+        missing = sorted(listed - {shard.name for shard in shards})
+        if missing:
+            raise VLMError(
+                f"{folder}: {index.name} names {len(listed)} weight files, missing: "
+                f"{', '.join(missing)}. Copy or download the checkpoint again."
+            )
+        shards = [*sorted(folder / name for name in listed), index]
+    if not shards:
+        raise VLMError(
+            f"{folder}: no *.safetensors file. Expected a checkpoint in the hub's format; pickled "
+            "weights (*.bin, *.pt) are not opened."
+        )
+    config = folder / "config.json"
+    read_config(folder)
+    return sorted([config, *shards])
+
+
+def tokenizer_files(folder: Path) -> list[Path]:
+    """Every file that decides the tokens, sorted; `VLMError` where there is no tokenizer."""
+    whole = folder / "tokenizer.json"
+    content = [whole] if whole.exists() else [folder / "vocab.json", folder / "merges.txt"]
+    missing = [path.name for path in content if not path.exists()]
+    if missing:
+        raise VLMError(
+            f"{folder}: no tokenizer: expected tokenizer.json (or vocab.json with merges.txt). "
+            "Copy or download the checkpoint again."
+        )
+    extra = [folder / name for name in ("tokenizer_config.json", "added_tokens.json")]
+    return sorted([*content, *(path for path in extra if path.exists())])
+
+
+def adapter_files(folder: Path) -> list[Path]:
+    """The files that decide what an adapter adds, sorted; `VLMError` where one is missing."""
+    files = [folder / "adapter_config.json", folder / "adapter_model.safetensors"]
+    for path in files:
+        if not path.exists():
+            raise VLMError(
+                f"{path}: no such file. Expected a peft adapter folder with adapter_config.json "
+                "and adapter_model.safetensors (save it with `save_pretrained`)."
+            )
+    read_json(files[0])
+    return files
+
+
+def content_digests(files: list[Path], digest_file: Callable[[Path], str]) -> dict[str, str]:
+    """The content digest of each file by name."""
+    return {path.name: digest_file(path) for path in files}

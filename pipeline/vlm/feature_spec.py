@@ -1,0 +1,257 @@
+"""What a feature is: its identity, computed without loading a weight.
+
+Two features may stand in one store only if their specs have the same digest. The attention
+backend and library versions are not part of it: they move a feature within the noise of its dtype.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.config import Pooling, VLMParams
+from pipeline.errors import VLMError
+from pipeline.vlm.checkpoint_folder import (
+    adapter_files,
+    content_digests,
+    read_config,
+    resolve_checkpoint,
+    tokenizer_files,
+    weight_files,
+)
+
+__all__ = [
+    "EXTRACTOR_VERSION",
+    "GRID_CELLS",
+    "FeatureSpec",
+    "Slot",
+    "differences",
+    "feature_spec",
+    "resolve_checkpoint",
+    "row_key",
+]
+
+EXTRACTOR_VERSION = 1
+"""Raised whenever this code changes what a feature is: the golden-feature test sees to it."""
+
+GRID_CELLS = 4
+"""Rows, and columns, of the cells of the `grid` pooling."""
+
+_PLACEHOLDER_INSTRUCTION = "…"
+
+
+@dataclass(frozen=True)
+class Slot:
+    """One pooled vector of a row: which layer, normed or not, over which tokens."""
+
+    layer: int
+    """Counted from the first, so never negative."""
+    norm: bool
+    pooling: str
+    view: str | None = None
+    cell: tuple[int, int] | None = None
+    """Row and column in the `grid` of a view."""
+
+    def document(self) -> dict[str, Any]:
+        """The slot as JSON-able values, without what does not apply."""
+        document: dict[str, Any] = {
+            "layer": self.layer,
+            "norm": self.norm,
+            "pooling": self.pooling,
+        }
+        if self.view is not None:
+            document["view"] = self.view
+        if self.cell is not None:
+            document["cell"] = list(self.cell)
+        return document
+
+
+@dataclass(frozen=True)
+class FeatureSpec:
+    """The identity of a feature, and the shape that follows from it."""
+
+    document: dict[str, Any]
+    """Everything that decides what a feature is, JSON-able."""
+    digest: str
+    """Hex digest of the document."""
+    slots: tuple[Slot, ...]
+    views: tuple[str, ...]
+    dim: int
+    image_size: tuple[int, int]
+    """Final height and width of every frame, in pixels."""
+
+    def attrs(self) -> dict[str, Any]:
+        """The document with its digest, as a store keeps it."""
+        return {"digest": self.digest, **self.document}
+
+
+def feature_spec(
+    vlm: VLMParams,
+    storage_dtype: str,
+    views: Sequence[str],
+    digest_file: Callable[[Path], str],
+) -> FeatureSpec:
+    """The spec of features that `vlm` gives for these views, stored as `storage_dtype`.
+
+    Reads the checkpoint's small files; `digest_file` gives the content digest of one file and may
+    remember it. Raises `VLMError` where the checkpoint is incomplete or `vlm.layers` goes past it.
+    """
+    from pipeline.vlm.pixels import PixelSettings
+    from pipeline.vlm.prompt import PromptRenderer
+
+    folder = resolve_checkpoint(vlm.checkpoint, vlm.revision)
+    layer_count, dim = _model_shape(folder)
+    ordered = tuple(sorted(set(views)))
+    slots = _slots(vlm, _resolved_layers(vlm.layers, layer_count), ordered)
+    pixels = PixelSettings.read(folder, (vlm.image_resize_height, vlm.image_resize_width))
+    renderer = PromptRenderer(folder, vlm.prompt)
+    document = {
+        "extractor_version": EXTRACTOR_VERSION,
+        "weights": _digest(content_digests(weight_files(folder), digest_file)),
+        "adapter": _adapter_digest(vlm.adapter, digest_file),
+        "tokenizer": _digest(content_digests(tokenizer_files(folder), digest_file)),
+        "chat_template": renderer.chat_template,
+        "prompt": vlm.prompt,
+        "example_prompt": renderer.render(_PLACEHOLDER_INSTRUCTION, len(ordered)),
+        "processor": pixels.document(),
+        "views": list(ordered),
+        "slots": [slot.document() for slot in slots],
+        "dim": dim,
+        "compute_dtype": vlm.dtype,
+        "storage_dtype": storage_dtype,
+    }
+    return FeatureSpec(document, _digest(document), slots, ordered, dim, pixels.image_size)
+
+
+def row_key(spec: FeatureSpec, prompt: str, frames: Mapping[str, NDArray[np.uint8]]) -> bytes:
+    """16 bytes that tell this row from any other: spec, rendered prompt, decoded frames by view.
+
+    `frames` are (height, width, 3) RGB as decoded, before any resize; a missing view is left out.
+    """
+    digest = hashlib.blake2b(digest_size=16)
+    for text in (spec.digest, prompt):
+        _add(digest, text.encode())
+    for view in spec.views:
+        if view in frames:
+            frame = np.ascontiguousarray(frames[view])
+            _add(digest, f"{view} {frame.shape} {frame.dtype}".encode())
+            digest.update(frame.data)
+    return digest.digest()
+
+
+def differences(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[str]:
+    """Readable lines such as `prompt: 'x' -> 'y'`, one for each entry that differs."""
+    lines: list[str] = []
+    for key in sorted(set(a) | set(b)):
+        if key != "digest":
+            lines += _differing(key, a.get(key), b.get(key))
+    return lines
+
+
+def _differing(place: str, a: Any, b: Any) -> list[str]:
+    if a == b:
+        return []
+    if isinstance(a, Mapping) and isinstance(b, Mapping):
+        return [
+            line
+            for key in sorted(set(a) | set(b))
+            for line in _differing(f"{place}.{key}", a.get(key), b.get(key))
+        ]
+    if isinstance(a, list) and isinstance(b, list) and any(isinstance(x, dict) for x in a + b):
+        if len(a) != len(b):
+            return [f"{place}: {len(a)} entries -> {len(b)} entries"]
+        return [
+            line
+            for index, pair in enumerate(zip(a, b, strict=True))
+            for line in _differing(f"{place}[{index}]", *pair)
+        ]
+    return [f"{place}: {_shown(a, b)} -> {_shown(b, a)}"]
+
+
+def _shown(value: Any, other: Any) -> str:
+    """The value, and of a long text only the part around where it departs from the other."""
+    if not isinstance(value, str) or len(value) <= 80:
+        return repr(value)
+    other = other if isinstance(other, str) else ""
+    pairs = zip(value, other, strict=False)
+    first = next((i for i, (x, y) in enumerate(pairs) if x != y), min(len(value), len(other)))
+    start = max(0, first - 20)
+    return f"{'…' * (start > 0)}{value[start : start + 60]!r}{'…' * (start + 60 < len(value))}"
+
+
+def _model_shape(folder: Path) -> tuple[int, int]:
+    """Number of decoder layers, and width of their output."""
+    config = read_config(folder)
+    # The hub's configs are flat, those that transformers 5 writes are nested.
+    text = config.get("text_config", config)
+    try:
+        return int(text["num_hidden_layers"]), int(text["hidden_size"])
+    except KeyError as error:
+        raise VLMError(f"{folder / 'config.json'}: {error} is missing") from None
+
+
+def _resolved_layers(layers: Sequence[int], count: int) -> tuple[int, ...]:
+    resolved: list[int] = []
+    for layer in layers:
+        index = layer + count if layer < 0 else layer
+        if not 0 <= index < count:
+            raise VLMError(
+                f"vlm.layers: expected {-count} to {count - 1} for a model of {count} decoder "
+                f"layers, found {layer}"
+            )
+        if index in resolved:
+            raise VLMError(
+                f"vlm.layers: {layer} is layer {index}, which is there already, in {list(layers)}"
+            )
+        resolved.append(index)
+    return tuple(resolved)
+
+
+def _slots(vlm: VLMParams, layers: Sequence[int], views: Sequence[str]) -> tuple[Slot, ...]:
+    for name, values in (("norms", vlm.norms), ("pooling", vlm.pooling)):
+        if len(set(values)) < len(values):
+            raise VLMError(f"vlm.{name}: each may stand once, found {list(values)}")
+    slots = tuple(
+        slot
+        for layer in layers
+        for norm in vlm.norms
+        for pooling in vlm.pooling
+        for slot in _slots_of(layer, norm, pooling, views)
+    )
+    if not slots:
+        raise VLMError(
+            f"vlm.pooling {list(vlm.pooling)} gives nothing without a view; add `mean` or `last`"
+        )
+    return slots
+
+
+def _slots_of(layer: int, norm: bool, pooling: Pooling, views: Sequence[str]) -> list[Slot]:
+    if pooling == "view_mean":
+        return [Slot(layer, norm, pooling, view) for view in views]
+    if pooling == "grid":
+        cells = [(row, column) for row in range(GRID_CELLS) for column in range(GRID_CELLS)]
+        return [Slot(layer, norm, pooling, view, cell) for view in views for cell in cells]
+    return [Slot(layer, norm, pooling)]
+
+
+def _adapter_digest(adapter: str | None, digest_file: Callable[[Path], str]) -> str | None:
+    if adapter is None:
+        return None
+    folder = resolve_checkpoint(adapter, setting="vlm.adapter")
+    return _digest(content_digests(adapter_files(folder), digest_file))
+
+
+def _digest(document: Any) -> str:
+    canonical = json.dumps(document, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
+    return hashlib.blake2b(canonical.encode(), digest_size=16).hexdigest()
+
+
+def _add(digest: "hashlib.blake2b", part: bytes) -> None:
+    # Lengths in between: moving a character from one part to the next is another key.
+    digest.update(len(part).to_bytes(8, "little"))
+    digest.update(part)

@@ -1,0 +1,146 @@
+"""A checkpoint folder and an optional adapter -> the inner model, every weight accounted for."""
+
+import sys
+import warnings
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+import transformers
+from safetensors import SafetensorError
+from transformers import Qwen2_5_VLForConditionalGeneration
+from transformers.utils import is_flash_attn_2_available
+from transformers.utils import logging as transformers_logging
+
+from pipeline.config import VLMParams
+from pipeline.errors import VLMError
+from pipeline.vlm.checkpoint_folder import adapter_files, resolve_checkpoint, weight_files
+
+_UNUSED = {"lm_head.weight"}
+"""Weights that a feature never meets: a checkpoint may lack them."""
+
+
+def load_model(vlm: VLMParams, layers: int, device: torch.device) -> Any:
+    """The inner `Qwen2_5_VLModel` with its first `layers` decoder layers, frozen, on `device`.
+
+    Raises `VLMError` where a weight is missing or left over, a file is damaged, or the adapter
+    does not fit: a model with a random weight is never returned.
+    """
+    folder = resolve_checkpoint(vlm.checkpoint, vlm.revision)
+    weight_files(folder)
+    whole = _load_checkpoint(folder, vlm, device)
+    if vlm.adapter is not None:
+        adapter = resolve_checkpoint(vlm.adapter, setting="vlm.adapter")
+        whole = _merge_adapter(whole, adapter, folder)
+    # The language-model head goes with the wrapper: it would cost as much as a small model.
+    model = whole.model
+    model.language_model.layers = model.language_model.layers[:layers]
+    return model.eval().requires_grad_(False).to(device)
+
+
+def environment(model: Any, device: torch.device) -> dict[str, str]:
+    """What may move a feature within its dtype's noise: backends, versions, device."""
+    cuda = device.type == "cuda"
+    return {
+        "attention": str(model.language_model.config._attn_implementation),
+        "vision_attention": str(model.visual.config._attn_implementation),
+        "torch": torch.__version__,
+        "transformers": transformers.__version__,
+        "device": torch.cuda.get_device_name(device) if cuda else device.type,
+    }
+
+
+@contextmanager
+def quiet_transformers() -> Generator[None]:
+    """Keep transformers' reports off stderr, and its progress bars unless that is a terminal.
+
+    What they warn of is checked and raised as `VLMError`.
+    """
+    verbosity = transformers_logging.get_verbosity()
+    bar = transformers_logging.is_progress_bar_enabled()
+    transformers_logging.set_verbosity_error()
+    if not sys.stderr.isatty():
+        transformers_logging.disable_progress_bar()
+    try:
+        yield
+    finally:
+        transformers_logging.set_verbosity(verbosity)
+        if bar:
+            transformers_logging.enable_progress_bar()
+
+
+def _attention(vlm: VLMParams, device: torch.device) -> str:
+    if vlm.attention != "auto":
+        return vlm.attention
+    half = vlm.dtype != "float32"
+    flash = device.type == "cuda" and half and is_flash_attn_2_available()
+    return "flash_attention_2" if flash else "sdpa"
+
+
+def _load_checkpoint(folder: Path, vlm: VLMParams, device: torch.device) -> Any:
+    attention = _attention(vlm, device)
+    if attention == "flash_attention_2" and (device.type != "cuda" or vlm.dtype == "float32"):
+        raise VLMError(
+            "vlm.attention flash_attention_2 needs CUDA and a half-precision vlm.dtype, found "
+            f"{device.type} and {vlm.dtype}. Set vlm.attention to auto."
+        )
+    try:
+        with quiet_transformers():
+            loaded: Any = Qwen2_5_VLForConditionalGeneration.from_pretrained(
+                folder,
+                dtype=getattr(torch, vlm.dtype),
+                attn_implementation=attention,
+                local_files_only=True,
+                output_loading_info=True,
+            )
+    except (OSError, ValueError, RuntimeError, ImportError, TypeError, SafetensorError) as error:
+        raise VLMError(
+            f"{folder}: cannot be loaded as Qwen2.5-VL: {error}. Copy or download it again, or "
+            "set vlm.checkpoint to a complete Qwen2.5-VL checkpoint."
+        ) from error
+    model, report = loaded
+    _refuse_strange(
+        folder, set(report["missing_keys"]) - _UNUSED, set(report["unexpected_keys"]), "checkpoint"
+    )
+    return model
+
+
+def _merge_adapter(model: Any, folder: Path, checkpoint: Path) -> Any:
+    """The model with a peft adapter added into its weights."""
+    from peft import PeftModel
+
+    adapter_files(folder)
+    try:
+        with warnings.catch_warnings():
+            # peft only warns of missing weights; the report of a second load is checked instead.
+            warnings.simplefilter("ignore")
+            adapted = PeftModel.from_pretrained(model, str(folder))
+            report = adapted.load_adapter(str(folder), adapter_name="default")
+    except (OSError, ValueError, RuntimeError, KeyError, TypeError, SafetensorError) as error:
+        raise VLMError(
+            f"{folder}: this adapter does not fit the checkpoint {checkpoint}: {error}. Set "
+            "vlm.adapter to one that was trained on this checkpoint, or to null."
+        ) from error
+    _refuse_strange(folder, set(report.missing_keys), set(report.unexpected_keys), "adapter")
+    if not hasattr(adapted, "merge_and_unload"):
+        kind = adapted.peft_config["default"].peft_type
+        raise VLMError(f"{folder}: a {kind} adapter cannot be merged into weights; use LoRA")
+    return adapted.merge_and_unload(safe_merge=True)
+
+
+def _refuse_strange(folder: Path, missing: set[str], unexpected: set[str], what: str) -> None:
+    if missing or unexpected:
+        raise VLMError(
+            f"{folder}: the {what}'s weights are not those of the model that it describes: "
+            f"missing {_some(missing)}, left over {_some(unexpected)}. Expected every weight, and "
+            f"no other. Copy or download the {what} again."
+        )
+
+
+def _some(keys: set[str]) -> str:
+    if not keys:
+        return "none"
+    shown = ", ".join(sorted(keys)[:4])
+    return shown if len(keys) <= 4 else f"{shown} and {len(keys) - 4} more"

@@ -1,0 +1,119 @@
+"""An instruction and frames -> a row ready for the model, on the CPU and without its weights."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.config import VLMParams
+from pipeline.errors import VLMError
+from pipeline.vlm.checkpoint_folder import resolve_checkpoint
+from pipeline.vlm.feature_spec import FeatureSpec
+from pipeline.vlm.pixels import PixelSettings, stretch
+from pipeline.vlm.prompt import PromptRenderer
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where what stands in a row's tokens; rows of equal layout need no padding between them."""
+
+    length: int
+    """Tokens in all."""
+    image_starts: tuple[tuple[str, int], ...]
+    """Each view that is present, in order, and its first image token."""
+    grid: tuple[int, int]
+    """Rows and columns of image tokens of each view, row-major in the sequence."""
+
+    def image_tokens(self) -> NDArray[np.int64]:
+        """Indices (image x token) of the image tokens, view after view."""
+        size = self.grid[0] * self.grid[1]
+        starts = np.array([start for _, start in self.image_starts], np.int64)
+        return (starts[:, None] + np.arange(size)).reshape(-1)
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedRow:
+    """One row ready to be encoded: small enough to wait in a queue."""
+
+    prompt: str
+    """The rendered prompt, one placeholder an image."""
+    token_ids: NDArray[np.int64]
+    """(token,), the placeholders expanded to one a merged patch."""
+    pixels: NDArray[np.uint8]
+    """(image, height, width, 3) RGB at the spec's image size, views in order."""
+    layout: Layout
+
+    @property
+    def shape_key(self) -> Layout:
+        """Equal for rows that batch without padding."""
+        return self.layout
+
+
+class Preparer:
+    """Makes `PreparedRow`s; may be used from several threads (the resize releases the GIL)."""
+
+    def __init__(self, vlm: VLMParams, spec: FeatureSpec) -> None:
+        """Read the checkpoint's tokenizer and processor settings."""
+        folder = resolve_checkpoint(vlm.checkpoint, vlm.revision)
+        self._views = spec.views
+        self._renderer = PromptRenderer(folder, vlm.prompt)
+        resize = (vlm.image_resize_height, vlm.image_resize_width)
+        self._settings = PixelSettings.read(folder, resize)
+        # An episode repeats its instruction in every row.
+        self._rendered = lru_cache(maxsize=4096)(self._renderer.render)
+        self._tokens = lru_cache(maxsize=4096)(self._expanded_tokens)
+
+    def render(self, instruction: str, views_present: Sequence[str]) -> str:
+        """The prompt of a row that has these views.
+
+        Raises `VLMError` where the instruction holds a control token, or a view is not the spec's.
+        """
+        return self._rendered(instruction, len(self._ordered(views_present)))
+
+    def prepare(self, instruction: str, frames: Mapping[str, NDArray[np.uint8]]) -> PreparedRow:
+        """The row of an instruction and its frames (height, width, 3) RGB by view.
+
+        A view of the spec that is not in `frames` is missing and left out of the prompt.
+        """
+        views = self._ordered(frames)
+        prompt = self.render(instruction, views)
+        token_ids, starts = self._tokens(prompt)
+        height, width = self._settings.image_size
+        pixels = np.empty((len(views), height, width, 3), np.uint8)
+        for place, view in zip(pixels, views, strict=True):
+            place[:] = stretch(_checked(frames[view], view), (height, width))
+        layout = Layout(
+            len(token_ids), tuple(zip(views, starts, strict=True)), self._settings.merged_grid
+        )
+        return PreparedRow(prompt, token_ids, pixels, layout)
+
+    def _ordered(self, views: Sequence[str] | Mapping[str, object]) -> tuple[str, ...]:
+        unknown = sorted(set(views) - set(self._views))
+        if unknown:
+            raise VLMError(
+                f"view {', '.join(unknown)} is not in the feature spec, which has "
+                f"{', '.join(self._views)}"
+            )
+        return tuple(view for view in self._views if view in views)
+
+    def _expanded_tokens(self, prompt: str) -> tuple[NDArray[np.int64], tuple[int, ...]]:
+        """Token ids with each image's placeholder repeated, and where each image begins."""
+        ids = np.array(self._renderer.tokenize(prompt), np.int64)
+        is_image = ids == self._renderer.image_token_id
+        rows, columns = self._settings.merged_grid
+        counts = np.where(is_image, rows * columns, 1)
+        starts = (np.cumsum(counts) - counts)[is_image]
+        token_ids = np.repeat(ids, counts)
+        token_ids.flags.writeable = False
+        return token_ids, tuple(starts.tolist())
+
+
+def _checked(frame: NDArray[np.uint8], view: str) -> NDArray[np.uint8]:
+    if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
+        raise VLMError(
+            f"{view}: expected a frame (height, width, 3) of uint8 RGB, found shape "
+            f"{frame.shape} of {frame.dtype}"
+        )
+    return frame

@@ -1,0 +1,268 @@
+"""A spec's digest moves with everything that decides a feature, and with nothing else."""
+
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from safetensors.torch import load_file, save_file
+
+from pipeline.config import VLMParams
+from pipeline.errors import VLMError
+from pipeline.vlm.checkpoint_folder import weight_files
+from pipeline.vlm.feature_spec import (
+    FeatureSpec,
+    Slot,
+    differences,
+    feature_spec,
+    resolve_checkpoint,
+    row_key,
+)
+
+VIEWS = ("View1", "View2", "View3")
+
+
+@pytest.fixture
+def spec_of(
+    vlm_params: Callable[..., VLMParams], digest_file: Callable[[Path], str]
+) -> Callable[..., FeatureSpec]:
+    def build(
+        views: tuple[str, ...] = VIEWS, storage_dtype: str = "float32", **changes: object
+    ) -> FeatureSpec:
+        return feature_spec(vlm_params(**changes), storage_dtype, views, digest_file)
+
+    return build
+
+
+def test_document_is_json_with_what_a_person_wants_to_see(
+    spec_of: Callable[..., FeatureSpec],
+) -> None:
+    spec = spec_of(views=("View2", "View1"), image_resize_height=360, image_resize_width=640)
+    assert json.loads(json.dumps(spec.attrs())) == spec.attrs()
+    assert spec.attrs()["digest"] == spec.digest
+    assert spec.views == ("View1", "View2")
+    assert spec.image_size == (364, 644)
+    assert spec.dim == 128
+    assert spec.document["processor"]["image_size"] == [364, 644]
+    assert spec.document["processor"]["resample"] == "bicubic"
+    assert spec.document["example_prompt"].count("<|image_pad|>") == 2
+    assert "attention" not in spec.document
+    assert spec == spec_of(
+        views=("View1", "View2"), image_resize_height=360, image_resize_width=640
+    )
+
+
+def test_slots_go_by_layer_norm_pooling(spec_of: Callable[..., FeatureSpec]) -> None:
+    spec = spec_of(
+        views=("View1", "View2"),
+        layers=[-1, 1],
+        norms=[True, False],
+        pooling=["mean", "view_mean", "grid"],
+    )
+    assert len(spec.slots) == 2 * 2 * (1 + 2 + 32)
+    assert spec.slots[0] == Slot(3, True, "mean")
+    assert spec.slots[1:3] == (
+        Slot(3, True, "view_mean", "View1"),
+        Slot(3, True, "view_mean", "View2"),
+    )
+    assert spec.slots[8] == Slot(3, True, "grid", "View1", (1, 1))
+    assert spec.slots[35] == Slot(3, False, "mean")
+    assert spec.slots[70] == Slot(1, True, "mean")
+    assert spec.slots[8].document() == {
+        "layer": 3,
+        "norm": True,
+        "pooling": "grid",
+        "view": "View1",
+        "cell": [1, 1],
+    }
+
+
+CHANGES: dict[str, dict[str, Any]] = {
+    "dtype": {"dtype": "bfloat16"},
+    "storage": {"storage_dtype": "float16"},
+    "views": {"views": ("View1", "View2")},
+    "height": {"image_resize_height": 140},
+    "width": {"image_resize_width": 168},
+    "same pixels, another request": {"image_resize_width": 141},
+    "prompt": {"prompt": "{images}{instruction}"},
+    "layers": {"layers": [1]},
+    "norms": {"norms": [False]},
+    "pooling": {"pooling": ["last"]},
+}
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES.keys())
+def test_digest_moves_with_each_param(
+    spec_of: Callable[..., FeatureSpec], change: dict[str, Any]
+) -> None:
+    base, changed = spec_of(), spec_of(**change)
+    assert changed.digest != base.digest
+    assert differences(base.attrs(), changed.attrs())
+
+
+def test_digest_stays_where_features_do(
+    spec_of: Callable[..., FeatureSpec], demo_checkpoint: Path, tmp_path: Path
+) -> None:
+    moved = shutil.copytree(demo_checkpoint, tmp_path / "moved")
+    (moved / "README.md").write_text("not read by the model")
+    base = spec_of()
+    assert spec_of(attention="eager") == base
+    assert spec_of(checkpoint=str(moved)) == base
+    assert spec_of(layers=[3]) == spec_of(layers=[-1]) == base
+    assert differences(base.attrs(), spec_of(attention="eager").attrs()) == []
+
+
+def _touch_weight(folder: Path) -> None:
+    path = folder / "model.safetensors"
+    weights = load_file(path)
+    weights["model.norm.weight"][0] += 1e-3
+    save_file(weights, path, metadata={"format": "pt"})
+
+
+def _edit(name: str, **changes: object) -> Callable[[Path], None]:
+    def edit(folder: Path) -> None:
+        path = folder / name
+        path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+    return edit
+
+
+def _rename_token(folder: Path) -> None:
+    path = folder / "tokenizer.json"
+    path.write_text(path.read_text().replace("<|box_end|>", "<|box_fin|>"))
+
+
+FILES: dict[str, tuple[Callable[[Path], None], str]] = {
+    "weights": (_touch_weight, "weights"),
+    "config": (_edit("config.json", tie_word_embeddings=False), "weights"),
+    "mean": (_edit("preprocessor_config.json", image_mean=[0.5, 0.5, 0.5]), "processor.image_mean"),
+    "limits": (_edit("preprocessor_config.json", max_pixels=12000), "processor.image_size"),
+    "tokenizer": (_rename_token, "tokenizer"),
+    "chat template": (
+        _edit("tokenizer_config.json", chat_template="{{ '<|image_pad|>' * 3 }}"),
+        "chat_template",
+    ),
+}
+
+
+@pytest.mark.parametrize(("change", "place"), FILES.values(), ids=FILES.keys())
+def test_digest_moves_with_each_file(
+    spec_of: Callable[..., FeatureSpec],
+    demo_checkpoint: Path,
+    tmp_path: Path,
+    change: Callable[[Path], None],
+    place: str,
+) -> None:
+    folder = shutil.copytree(demo_checkpoint, tmp_path / "changed")
+    change(folder)
+    base, changed = spec_of(), spec_of(checkpoint=str(folder))
+    assert changed.digest != base.digest
+    assert any(
+        line.startswith(f"{place}: ") for line in differences(base.document, changed.document)
+    )
+
+
+def test_extractor_version_is_part_of_it(
+    spec_of: Callable[..., FeatureSpec], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    base = spec_of()
+    monkeypatch.setattr("pipeline.vlm.feature_spec.EXTRACTOR_VERSION", 999)
+    assert spec_of().digest != base.digest
+
+
+def test_differences_are_readable(spec_of: Callable[..., FeatureSpec]) -> None:
+    base, changed = spec_of(), spec_of(prompt="{images}", pooling=["mean", "last"])
+    lines = differences(base.attrs(), changed.attrs())
+    assert "prompt: '{instruction}\\n{images}\\n{instruction}' -> '{images}'" in lines
+    assert "slots: 1 entries -> 2 entries" in lines
+    assert all(len(line) < 250 for line in lines)
+    assert differences({"a": {"b": [1, 2]}}, {"a": {"b": [1, 3]}}) == ["a.b: [1, 2] -> [1, 3]"]
+    assert differences({"s": [{"layer": 1}]}, {"s": [{"layer": 2}]}) == ["s[0].layer: 1 -> 2"]
+    assert differences({}, {"adapter": "x"}) == ["adapter: None -> 'x'"]
+
+
+def test_row_key_moves_with_spec_prompt_pixels_shape_and_view(
+    spec_of: Callable[..., FeatureSpec], make_frame: Callable[..., NDArray[np.uint8]]
+) -> None:
+    spec = spec_of()
+    frames = {view: make_frame(seed, 24, 32) for seed, view in enumerate(VIEWS)}
+    one_value = {view: frame.copy() for view, frame in frames.items()}
+    one_value["View3"][23, 31, 2] ^= 1
+    swapped = frames | {"View1": frames["View2"], "View2": frames["View1"]}
+    reshaped = frames | {"View1": frames["View1"].reshape(32, 24, 3)}
+    alone = frames["View1"]
+    keys = [
+        row_key(spec, "go", frames),
+        row_key(spec_of(dtype="float16"), "go", frames),
+        row_key(spec, "go ", frames),
+        row_key(spec, "go", one_value),
+        row_key(spec, "go", swapped),
+        row_key(spec, "go", reshaped),
+        row_key(spec, "go", {"View1": alone}),
+        row_key(spec, "go", {"View2": alone}),
+        row_key(spec, "go", {}),
+    ]
+    assert all(len(key) == 16 for key in keys)
+    assert len(set(keys)) == len(keys)
+    backwards = dict(reversed(frames.items()))
+    strided = {view: np.asfortranarray(frame) for view, frame in backwards.items()}
+    assert row_key(spec, "go", strided) == keys[0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"layers": [4]}, "expected -4 to 3 for a model of 4 decoder layers, found 4"),
+        ({"layers": [-5]}, "found -5"),
+        ({"layers": [-1, 3]}, "3 is layer 3, which is there already"),
+        ({"pooling": ["mean", "mean"]}, r"vlm\.pooling: each may stand once"),
+        ({"norms": [True, True]}, r"vlm\.norms: each may stand once"),
+        ({"checkpoint": "./nowhere"}, r"vlm\.checkpoint ./nowhere: no such folder"),
+        ({"adapter": "/nowhere"}, r"vlm\.adapter /nowhere: no such folder"),
+    ],
+)
+def test_bad_params_are_named(
+    spec_of: Callable[..., FeatureSpec], changes: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(VLMError, match=message):
+        spec_of(**changes)
+
+
+def test_a_hub_id_that_is_not_there_says_what_to_run(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
+    with pytest.raises(VLMError, match=r"stages\.demo.*hf download models/demo_vlm"):
+        resolve_checkpoint("models/demo_vlm")
+
+
+def test_a_cached_hub_copy_is_used_without_network(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, demo_checkpoint: Path
+) -> None:
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
+    repository = tmp_path / "models--someone--small-vl"
+    snapshot = repository / "snapshots" / ("a" * 40)
+    shutil.copytree(demo_checkpoint, snapshot)
+    (repository / "refs").mkdir()
+    (repository / "refs" / "main").write_text("a" * 40)
+    assert resolve_checkpoint("someone/small-vl") == snapshot
+    (snapshot / "model.safetensors").unlink()
+    with pytest.raises(VLMError, match=r"no \*\.safetensors"):
+        weight_files(resolve_checkpoint("someone/small-vl"))
+
+
+def test_importing_the_spec_imports_neither_torch_nor_transformers() -> None:
+    code = (
+        "import sys, pipeline.vlm.feature_spec;"
+        "print(sorted({'torch', 'transformers', 'peft'} & set(sys.modules)))"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]"

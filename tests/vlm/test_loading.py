@@ -1,0 +1,250 @@
+"""Every weight is accounted for, whatever the checkpoint's naming, with an adapter or without."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from peft import LoraConfig, PeftModel, get_peft_model
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+from transformers import Qwen2_5_VLForConditionalGeneration
+
+from pipeline.errors import VLMError
+
+# peft 0.21 reads an attribute that transformers 5.23 calls deprecated.
+pytestmark = pytest.mark.filterwarnings("ignore:`is_gradient_checkpointing`:FutureWarning")
+
+Encode = Callable[..., Tensor]
+
+
+@pytest.fixture(scope="module")
+def encode(extractor: Callable[..., Any], make_frame: Callable[..., NDArray[np.uint8]]) -> Encode:
+    """Features of one row under changed params."""
+    frames = {view: make_frame(seed) for seed, view in enumerate(("View1", "View2", "View3"))}
+
+    def features(**changes: object) -> Tensor:
+        ours = extractor(pooling=["mean", "view_mean"], **changes)
+        return ours.model.encode([ours.preparer.prepare("insert the needle", frames)])[0]
+
+    return features
+
+
+@pytest.fixture
+def copy(demo_checkpoint: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(demo_checkpoint, tmp_path / "copy")
+
+
+def _rewrite(folder: Path, change: Callable[[dict[str, Tensor]], dict[str, Tensor]]) -> None:
+    path = folder / "model.safetensors"
+    weights = {name: tensor.contiguous() for name, tensor in change(load_file(path)).items()}
+    save_file(weights, path, metadata={"format": "pt"})
+
+
+def _with_head(weights: dict[str, Tensor]) -> dict[str, Tensor]:
+    return weights | {"lm_head.weight": weights["model.embed_tokens.weight"].clone()}
+
+
+def _newer_names(weights: dict[str, Tensor]) -> dict[str, Tensor]:
+    def rename(name: str) -> str:
+        if name.startswith("visual."):
+            return f"model.{name}"
+        return name.replace("model.", "model.language_model.", 1)
+
+    return {rename(name): tensor for name, tensor in weights.items()}
+
+
+def test_original_and_newer_naming_load_the_same(
+    encode: Encode, demo_checkpoint: Path, copy: Path
+) -> None:
+    base = encode()
+    original = set(load_file(demo_checkpoint / "model.safetensors"))
+    assert "visual.blocks.0.attn.qkv.weight" in original
+    assert "model.layers.0.mlp.up_proj.weight" in original
+    for change in (_with_head, _newer_names):
+        shutil.copy(demo_checkpoint / "model.safetensors", copy / "model.safetensors")
+        _rewrite(copy, change)
+        assert torch.equal(encode(checkpoint=str(copy)), base)
+
+
+def test_an_untied_head_is_not_needed(encode: Encode, copy: Path) -> None:
+    base = encode()
+    config = json.loads((copy / "config.json").read_text())
+    config["tie_word_embeddings"] = False
+    config["text_config"]["tie_word_embeddings"] = False
+    (copy / "config.json").write_text(json.dumps(config))
+    assert torch.equal(encode(checkpoint=str(copy)), base)
+
+
+def test_the_hubs_flat_config_and_shards_load_the_same(encode: Encode, copy: Path) -> None:
+    base = encode()
+    config = json.loads((copy / "config.json").read_text())
+    text = config.pop("text_config")
+    rope = text.pop("rope_parameters")
+    flat = {key: text[key] for key in text if key not in ("model_type", "layer_types", "dtype")}
+    flat |= config | {"torch_dtype": flat.pop("dtype", "bfloat16")}
+    flat["rope_theta"] = rope["rope_theta"]
+    flat["rope_scaling"] = {"type": "mrope", "mrope_section": rope["mrope_section"]}
+    del flat["vision_config"]["model_type"]
+    (copy / "config.json").write_text(json.dumps(flat))
+
+    weights = load_file(copy / "model.safetensors")
+    (copy / "model.safetensors").unlink()
+    names = sorted(weights)
+    shards = {"model-00001-of-00002.safetensors": names[:50]}
+    shards["model-00002-of-00002.safetensors"] = names[50:]
+    for shard, members in shards.items():
+        save_file({n: weights[n] for n in members}, copy / shard, metadata={"format": "pt"})
+    where = {name: shard for shard, members in shards.items() for name in members}
+    index = {"metadata": {}, "weight_map": where}
+    (copy / "model.safetensors.index.json").write_text(json.dumps(index))
+    assert torch.equal(encode(checkpoint=str(copy)), base)
+
+    (copy / "model-00002-of-00002.safetensors").unlink()
+    with pytest.raises(VLMError, match=r"missing: model-00002-of-00002\.safetensors"):
+        encode(checkpoint=str(copy))
+
+
+def _without_a_layer(weights: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {name: tensor for name, tensor in weights.items() if ".layers.2.mlp." not in name}
+
+
+def _with_a_stranger(weights: dict[str, Tensor]) -> dict[str, Tensor]:
+    return weights | {"visual.blocks.9.norm1.weight": torch.ones(128)}
+
+
+def _narrower(weights: dict[str, Tensor]) -> dict[str, Tensor]:
+    return weights | {"model.norm.weight": torch.ones(64)}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (_without_a_layer, r"missing model\.language_model\.layers\.2\.mlp\.down_proj\.weight"),
+        (_with_a_stranger, r"left over .*visual\.blocks\.9\.norm1\.weight"),
+        (_narrower, "cannot be loaded as Qwen2.5-VL"),
+    ],
+)
+def test_no_weight_is_ever_random(
+    encode: Encode,
+    copy: Path,
+    change: Callable[[dict[str, Tensor]], dict[str, Tensor]],
+    message: str,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    _rewrite(copy, change)
+    with pytest.raises(VLMError, match=message):
+        encode(checkpoint=str(copy))
+    assert not capfd.readouterr().err
+
+
+def test_damaged_folders_are_named(encode: Encode, copy: Path) -> None:
+    weights = (copy / "model.safetensors").read_bytes()
+    (copy / "model.safetensors").write_bytes(weights[:-1000])
+    with pytest.raises(VLMError, match="cannot be loaded"):
+        encode(checkpoint=str(copy))
+    (copy / "model.safetensors").rename(copy / "pytorch_model.bin")
+    with pytest.raises(VLMError, match=r"no \*\.safetensors"):
+        encode(checkpoint=str(copy))
+    (copy / "preprocessor_config.json").unlink()
+    with pytest.raises(VLMError, match="preprocessor_config"):
+        encode(checkpoint=str(copy))
+    (copy / "config.json").write_text('{"model_type": "llama"}')
+    with pytest.raises(VLMError, match="expected model_type 'qwen2_5_vl', found 'llama'"):
+        encode(checkpoint=str(copy))
+    (copy / "config.json").write_text("{")
+    with pytest.raises(VLMError, match="cannot be read as JSON"):
+        encode(checkpoint=str(copy))
+
+
+def test_what_this_machine_cannot_do_is_said(extractor: Callable[..., Any], encode: Encode) -> None:
+    with pytest.raises(VLMError, match="flash_attention_2 needs CUDA"):
+        encode(attention="flash_attention_2")
+    ours = extractor()
+    with pytest.raises(VLMError, match="device 'tpu0'"):
+        type(ours.model).load(ours.vlm, ours.spec, "tpu0")
+    assert ours.model.environment["device"] == "cpu"
+    assert ours.model.environment["torch"] == torch.__version__
+
+
+@pytest.fixture(scope="module")
+def make_adapter(demo_checkpoint: Path) -> Callable[..., Path]:
+    def make(folder: Path, strength: float, targets: str | list[str] = "all-linear") -> Path:
+        base = Qwen2_5_VLForConditionalGeneration.from_pretrained(demo_checkpoint)
+        config = LoraConfig(r=4, lora_alpha=8, target_modules=targets)
+        adapted: Any = get_peft_model(base, config)
+        generator = torch.Generator().manual_seed(0)
+        for name, parameter in adapted.named_parameters():
+            if "lora_B" in name:
+                values = torch.randn(parameter.shape, generator=generator)
+                parameter.data.copy_(strength * values)
+        adapted.save_pretrained(folder)
+        return folder
+
+    return make
+
+
+def test_an_adapter_changes_features_and_identity(
+    encode: Encode,
+    extractor: Callable[..., Any],
+    make_adapter: Callable[..., Path],
+    tmp_path: Path,
+) -> None:
+    base = encode()
+    nothing = make_adapter(tmp_path / "zeros", 0.0)
+    torch.testing.assert_close(encode(adapter=str(nothing)), base)
+    strong = make_adapter(tmp_path / "strong", 0.1)
+    changed = encode(adapter=str(strong))
+    assert (changed - base).norm() > 0.05 * base.norm()
+    digests = {extractor(adapter=a).spec.digest for a in (None, str(nothing), str(strong))}
+    assert len(digests) == 3
+
+
+def test_an_adapter_is_what_peft_makes_of_it(
+    extractor: Callable[..., Any],
+    make_adapter: Callable[..., Path],
+    demo_checkpoint: Path,
+    tmp_path: Path,
+) -> None:
+    folder = make_adapter(tmp_path / "lora", 0.1, ["q_proj", "v_proj"])
+    ours = extractor(adapter=str(folder), pooling=["last"])
+    row = ours.preparer.prepare("insert the needle", {})
+    base = Qwen2_5_VLForConditionalGeneration.from_pretrained(demo_checkpoint)
+    adapted = PeftModel.from_pretrained(base, str(folder)).eval()
+    inner: Any = adapted.base_model.model.model
+    with torch.no_grad():
+        expected = inner(input_ids=torch.tensor(row.token_ids)[None]).last_hidden_state[0, -1]
+    torch.testing.assert_close(ours.model.encode([row])[0][0, 0], expected, atol=1e-4, rtol=1e-4)
+
+
+def test_an_adapter_that_does_not_fit_is_refused(
+    encode: Encode, make_adapter: Callable[..., Path], tmp_path: Path
+) -> None:
+    folder = make_adapter(tmp_path / "adapter", 0.1)
+    weights = folder / "adapter_model.safetensors"
+    config = json.loads((folder / "adapter_config.json").read_text())
+
+    whole = load_file(weights)
+    dropped = sorted(whole)[0]
+    save_file({name: t for name, t in whole.items() if name != dropped}, weights)
+    with pytest.raises(VLMError, match="missing base_model"):
+        encode(adapter=str(folder))
+    save_file(whole | {"base_model.model.model.nowhere.lora_A.weight": torch.ones(4, 4)}, weights)
+    with pytest.raises(VLMError, match="left over"):
+        encode(adapter=str(folder))
+    save_file(whole, weights)
+    (folder / "adapter_config.json").write_text(json.dumps(config | {"r": 8}))
+    with pytest.raises(VLMError, match="does not fit"):
+        encode(adapter=str(folder))
+    strange = config | {"target_modules": ["nowhere_proj"]}
+    (folder / "adapter_config.json").write_text(json.dumps(strange))
+    with pytest.raises(VLMError, match="does not fit"):
+        encode(adapter=str(folder))
+    weights.unlink()
+    with pytest.raises(VLMError, match=r"adapter_model\.safetensors: no such file"):
+        encode(adapter=str(folder))

@@ -1,0 +1,119 @@
+"""Prompts are one user turn of the checkpoint's chat template."""
+
+import json
+import shutil
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from transformers import AutoTokenizer
+
+from pipeline.errors import VLMError
+from pipeline.vlm.prompt import PromptRenderer
+
+SYSTEM = "<|im_start|>system\nYou are a helpful assistant.<|im_end|>\n"
+IMAGE = "<|vision_start|><|image_pad|><|vision_end|>"
+
+
+@pytest.mark.parametrize(
+    ("template", "images", "user"),
+    [
+        ("{instruction}\n{images}\n{instruction}", 2, f"go\n{IMAGE * 2}\ngo"),
+        ("{instruction}\n{images}\n{instruction}", 0, "go\n\ngo"),
+        ("Task: {instruction}.", 3, f"Task: go.{IMAGE * 3}"),
+        ("{images}{instruction}", 1, f"{IMAGE}go"),
+    ],
+)
+def test_rendering(demo_checkpoint: Path, template: str, images: int, user: str) -> None:
+    renderer = PromptRenderer(demo_checkpoint, template)
+    assert renderer.render("go", images) == f"{SYSTEM}<|im_start|>user\n{user}<|im_end|>\n"
+
+
+def test_an_instruction_is_never_a_template(demo_checkpoint: Path) -> None:
+    renderer = PromptRenderer(demo_checkpoint, "{instruction} {images}")
+    text = renderer.render("look at {images} and {instruction} {{ 1 }}", 1)
+    assert "look at {images} and {instruction} {{ 1 }}" in text
+    assert text.count(IMAGE) == 1
+
+
+@pytest.mark.parametrize("token", ["<|image_pad|>", "<|im_end|>", "<|endoftext|>", "<|box_start|>"])
+def test_control_tokens_are_refused(demo_checkpoint: Path, token: str) -> None:
+    renderer = PromptRenderer(demo_checkpoint, "{instruction}")
+    with pytest.raises(VLMError, match="control token"):
+        renderer.render(f"go {token} there", 1)
+    with pytest.raises(VLMError, match=r"vlm\.prompt holds"):
+        PromptRenderer(demo_checkpoint, f"{{instruction}}{token}")
+
+
+def test_tokens_are_the_tokenizers_with_one_placeholder_a_merged_patch(
+    demo_checkpoint: Path,
+    extractor: Callable[..., Any],
+    make_frame: Callable[..., NDArray[np.uint8]],
+) -> None:
+    preparer = extractor().preparer
+    row = preparer.prepare("insert the needle", {"View3": make_frame(1), "View1": make_frame(2)})
+    tokenizer: Any = AutoTokenizer.from_pretrained(demo_checkpoint)
+    text = row.prompt.replace("<|image_pad|>", "<|image_pad|>" * 20)
+    assert row.token_ids.tolist() == tokenizer(text)["input_ids"]
+    assert [view for view, _ in row.layout.image_starts] == ["View1", "View3"]
+    pad = tokenizer.convert_tokens_to_ids("<|image_pad|>")
+    assert (row.token_ids[row.layout.image_tokens()] == pad).all()
+    assert (row.token_ids == pad).sum() == 40
+    assert row.prompt == preparer.render("insert the needle", ["View3", "View1"])
+
+
+def test_rows_prepared_in_threads_are_the_same(
+    extractor: Callable[..., Any], make_frame: Callable[..., NDArray[np.uint8]]
+) -> None:
+    preparer = extractor().preparer
+    jobs = [(f"step {i % 5}", {"View1": make_frame(i % 3)}) for i in range(40)]
+    alone = [preparer.prepare(*job) for job in jobs]
+    with ThreadPoolExecutor(4) as threads:
+        together = list(threads.map(lambda job: preparer.prepare(*job), jobs))
+    for one, other in zip(alone, together, strict=True):
+        assert one.shape_key == other.shape_key
+        assert np.array_equal(one.token_ids, other.token_ids)
+        assert np.array_equal(one.pixels, other.pixels)
+
+
+@pytest.fixture
+def copy(demo_checkpoint: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(demo_checkpoint, tmp_path / "copy")
+
+
+def _edit(path: Path, **changes: object) -> None:
+    document = json.loads(path.read_text()) | changes
+    path.write_text(json.dumps({key: v for key, v in document.items() if v is not None}))
+
+
+def test_chat_template_in_a_file_of_its_own(demo_checkpoint: Path, copy: Path) -> None:
+    inside = PromptRenderer(demo_checkpoint, "{instruction}")
+    _edit(copy / "tokenizer_config.json", chat_template=None)
+    with pytest.raises(VLMError, match="no chat template"):
+        PromptRenderer(copy, "{instruction}")
+    for name, content in (
+        ("chat_template.json", json.dumps({"chat_template": inside.chat_template})),
+        ("chat_template.jinja", inside.chat_template),
+    ):
+        (copy / name).write_text(content)
+        assert PromptRenderer(copy, "{instruction}").render("go", 1) == inside.render("go", 1)
+        (copy / name).unlink()
+
+
+def test_a_template_that_drops_images_is_refused(copy: Path) -> None:
+    _edit(copy / "tokenizer_config.json", chat_template="{{ messages[0]['role'] }}")
+    with pytest.raises(VLMError, match="renders 0 of 2 images"):
+        PromptRenderer(copy, "{instruction}").render("go", 2)
+
+
+def test_another_checkpoints_tokenizer_is_refused(copy: Path) -> None:
+    _edit(copy / "config.json", image_token_id=5)
+    with pytest.raises(VLMError, match="image_token_id 5"):
+        PromptRenderer(copy, "{instruction}")
+    (copy / "tokenizer.json").unlink()
+    with pytest.raises(VLMError, match="no tokenizer"):
+        PromptRenderer(copy, "{instruction}")
