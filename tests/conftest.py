@@ -1,13 +1,15 @@
 """What tests of every room share: the real recordings, where present, and a small store."""
 
 import json
-from collections.abc import Callable
+import subprocess
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pipeline.store import SCHEMA, Sizes, StoreBuild, arrays
+from pipeline.vlm.demo_checkpoint import write_demo_checkpoint
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -168,3 +170,25 @@ def write_tiny_store(
 
 def _named(prefix: str, width: int) -> dict[str, list[str]]:
     return {"names": [f"{prefix}_{index}" for index in range(width)], "units": [""] * width}
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A tmpfs of 3 MiB; needs the right to mount one."""
+    place = tmp_path / "small_disk"
+    place.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=3m", "tmpfs", str(place)]
+    try:
+        subprocess.run(mount, check=True, capture_output=True)
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip("a small file system cannot be mounted here (needs root)")
+    yield place
+    subprocess.run(["umount", "-l", str(place)], check=True)
+
+
+@pytest.fixture(scope="session")
+def demo_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The small Qwen2.5-VL of the demo."""
+    folder = tmp_path_factory.mktemp("checkpoint") / "demo_vlm"
+    write_demo_checkpoint(folder)
+    return folder

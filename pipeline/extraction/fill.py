@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import NoReturn
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
 from pipeline.config import Params
+from pipeline.device import resolve_device
 from pipeline.digests import ContentDigests
 from pipeline.extraction.encoder import Encoder
 from pipeline.extraction.rows import KnownRow, ReadyRow, RowPreparation, in_background, spans_of
@@ -21,7 +21,7 @@ from pipeline.store import Donor, StoreBuild
 from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.qwen import FrozenVLM
 
-_AUTO_BATCH = {"cpu": 8, "cuda": 32}
+_AUTO_BATCH = defaultdict(lambda: 8, {"cuda": 32})
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,4 @@ def rate_name(surveyed: Survey, params: Params) -> str:
 def _batch_size(params: Params) -> int:
     if params.extract.batch_size != "auto":
         return params.extract.batch_size
-    cuda = params.extract.device.startswith("cuda") or (
-        params.extract.device == "auto" and torch.cuda.is_available()
-    )
-    return _AUTO_BATCH["cuda" if cuda else "cpu"]
+    return _AUTO_BATCH[resolve_device(params.extract.device).type]

@@ -1,0 +1,161 @@
+"""What a recording is, whatever its format on disk.
+
+A `Recording` is one episode. Making one touches metadata only; `state()`, `sensor()`, `poses()`
+and `action()` read a whole numeric stream; `cameras()` lists clocks and leaves the pixels on disk
+until `CameraStream.read` decodes them one frame at a time.
+
+Times are float64 seconds on the recording's own clock, never decreasing. Anything wrong raises
+`RecordingError` with the file and the place in it.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import RecordingError
+
+ActionKind = Literal["absolute", "velocity", "delta"]
+
+
+@dataclass(frozen=True)
+class Channels:
+    """Names and units of the columns of a stream; the unit of an unnamed quantity is ''."""
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Stream:
+    """A clocked stream: `time` (reading,) float64 s, `values` (reading, channel) float32."""
+
+    channels: Channels
+    time: NDArray[np.float64]
+    values: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class RecordedAction(Stream):
+    """Actions that the recorder wrote.
+
+    `kind` decides whether they may be resampled (`delta` may not); `rate_hz` is the nominal rate
+    where the recording names one.
+    """
+
+    kind: ActionKind
+    rate_hz: float | None
+
+
+class CameraStream(ABC):
+    """One view of one episode: `time` (frame,) float64 s is when each frame was captured."""
+
+    view: str
+    time: NDArray[np.float64]
+
+    @abstractmethod
+    def check(self, indices: Sequence[int]) -> None:
+        """Raise `RecordingError` naming the first of these frames that cannot be decoded.
+
+        Far cheaper than `read`; called before anything expensive runs.
+        """
+
+    @abstractmethod
+    def read(self, indices: Sequence[int]) -> Iterator[NDArray[np.uint8]]:
+        """Yield the frames (height, width, 3), RGB, for `indices` in never decreasing order.
+
+        Holds one decoded frame at a time and never seeks backwards.
+        """
+
+
+class Recording(ABC):
+    """One episode on disk."""
+
+    id: str
+    """Unique within its source: the episode folder relative to its source, or `episode_000003`."""
+    source: str
+    format: str
+    path: Path
+    instruction: str
+
+    @abstractmethod
+    def files(self) -> list[Path]:
+        """Every file whose bytes decide what this episode says, sorted."""
+
+    def identity(self) -> str:
+        """What, beside its files, tells this episode from others in the same files; often ''."""
+        return ""
+
+    @abstractmethod
+    def cameras(self) -> Mapping[str, CameraStream]:
+        """The views that have at least one frame, by name."""
+
+    def state(self) -> Stream | None:
+        """The robot state, or None where the episode has none."""
+        return None
+
+    def sensor(self) -> Stream | None:
+        """The high-rate sensor, or None where the episode has none."""
+        return None
+
+    @property
+    def has_poses(self) -> bool:
+        """Whether `poses()` gives something; known without reading it."""
+        return False
+
+    def poses(self) -> Stream | None:
+        """Tool poses x y z (mm) a b r (deg, mobile XYZ), or None; source of derived actions."""
+        return None
+
+    def action(self) -> RecordedAction | None:
+        """Recorded actions, or None where they have to be derived from `poses()`."""
+        return None
+
+
+def checked_stream(
+    channels: Channels, time: NDArray[np.float64], values: NDArray[np.float32], where: str
+) -> Stream:
+    """A `Stream` after checking what every stream must be.
+
+    Raises `RecordingError` (beginning with `where`) on differing lengths, a width other than the
+    channels', an empty stream, NaN or inf (row and channel named) and a clock that goes backwards.
+    """
+    time = np.asarray(time, np.float64)
+    values = np.asarray(values, np.float32)
+    if values.ndim != 2 or values.shape[1] != len(channels.names):
+        raise RecordingError(
+            f"{where}: expected rows of {len(channels.names)} values, found shape {values.shape}"
+        )
+    if time.shape != (len(values),):
+        raise RecordingError(
+            f"{where}: {len(values)} rows but {time.size} timestamps; they must agree"
+        )
+    if not len(values):
+        raise RecordingError(f"{where}: the stream is empty")
+    check_clock(time, where)
+    bad = ~np.isfinite(values)
+    if bad.any():
+        row, column = np.argwhere(bad)[0]
+        raise RecordingError(
+            f"{where}: {values[row, column]} in row {row}, channel {channels.names[column]!r} "
+            f"({int(bad.sum())} such values in all)"
+        )
+    return Stream(channels, time, values)
+
+
+def check_clock(time: NDArray[np.float64], where: str) -> None:
+    """Raise `RecordingError` where a clock is not finite or goes backwards."""
+    if not np.isfinite(time).all():
+        row = int(np.flatnonzero(~np.isfinite(time))[0])
+        raise RecordingError(f"{where}: timestamp {time[row]} in row {row}")
+    backwards = np.flatnonzero(np.diff(time) < 0)
+    if backwards.size:
+        row = int(backwards[0]) + 1
+        raise RecordingError(
+            f"{where}: the clock goes backwards at row {row}: "
+            f"{time[row]:.6f} s after {time[row - 1]:.6f} s"
+        )

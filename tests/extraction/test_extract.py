@@ -1,0 +1,306 @@
+"""One extraction: what it writes, what it takes over, what it refuses."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from pipeline.errors import DiskFull, NumericsError, RecordingError, StoreLocked, StoreMismatch
+from pipeline.extraction import extract
+from pipeline.recordings import open_recordings
+from pipeline.store import FeatureStore, build_lock
+from pipeline.timeline import build_timeline
+from pipeline.vlm.feature_spec import feature_spec
+from pipeline.vlm.preparation import Preparer
+from pipeline.vlm.qwen import FrozenVLM
+
+
+def run(params) -> tuple[object, list[str]]:
+    said: list[str] = []
+    return extract(params, said.append), said
+
+
+@pytest.fixture
+def counted(monkeypatch):
+    """How many rows the model is asked for."""
+    rows: list[int] = []
+    real = FrozenVLM.encode
+
+    def encode(self, batch):
+        rows.append(len(batch))
+        return real(self, batch)
+
+    monkeypatch.setattr(FrozenVLM, "encode", encode)
+    return rows
+
+
+@pytest.fixture
+def no_model_later(monkeypatch):
+    """A call makes loading the model, and with `images` opening a picture, an error."""
+
+    def refuse(*args, **kwargs):
+        raise AssertionError("nothing needs the model or a frame")
+
+    def begin(images: bool = True) -> None:
+        monkeypatch.setattr(FrozenVLM, "load", refuse)
+        if images:
+            monkeypatch.setattr(Image, "open", refuse)
+
+    return begin
+
+
+class TestWhatItWrites:
+    def test_streams_and_ticks_are_the_recordings(self, params):
+        run(params)
+        store = FeatureStore.open(params.extract.store)
+        opened = open_recordings(params.data.sources, params.data.root)
+        assert [one.id for one in store.episodes] == [one.id for one in opened.recordings]
+        for episode, recording in zip(store.episodes, opened.recordings, strict=True):
+            sensor, state = recording.sensor(), recording.state()
+            line = build_timeline(recording, 10.0, 3, "rotvec", state, sensor)
+            ticks = slice(episode.ticks.start, episode.ticks.stop)
+            assert np.array_equal(store.array("tick/time")[ticks], line.time)
+            assert np.array_equal(store.array("tick/action")[ticks], line.action)
+            vl_row = store.array("tick/vl_row")[ticks] - episode.vl_rows.start
+            assert np.array_equal(vl_row, line.vl_row)
+            assert episode.instruction == recording.instruction
+            for stream, rows, end, mine in (
+                ("sensor", episode.readings, line.sensor_end, sensor),
+                ("state", episode.states, line.state_end, state),
+            ):
+                inside = slice(rows.start, rows.stop)
+                stored = store.array(f"tick/{stream}_end")[ticks] - rows.start
+                assert np.array_equal(stored, end)
+                if mine is None:
+                    assert not len(rows)
+                else:
+                    assert np.array_equal(store.array(f"{stream}/values")[inside], mine.values)
+                    assert np.array_equal(store.array(f"{stream}/time")[inside], mine.time)
+
+    def test_features_are_what_the_model_says_of_each_row_alone(self, params):
+        run(params)
+        store = FeatureStore.open(params.extract.store)
+        spec = feature_spec(
+            params.vlm, "float32", store.streams["views"], lambda path: path.read_bytes().hex()
+        )
+        vlm, preparer = FrozenVLM.load(params.vlm, spec, "cpu"), Preparer(params.vlm, spec)
+        opened = open_recordings(params.data.sources, params.data.root)
+        for episode, recording in zip(store.episodes, opened.recordings, strict=True):
+            cameras = recording.cameras()
+            for row in (episode.vl_rows[0], episode.vl_rows[-1]):
+                now = store.array("vl/time")[row]
+                frames = {}
+                for view, camera in cameras.items():
+                    index = int(np.flatnonzero(camera.time <= now)[-1])
+                    (frames[view],) = camera.read([index])
+                alone, valid = vlm.encode([preparer.prepare(recording.instruction, frames)])
+                stored = store.array("vl/features")[row]
+                assert torch.allclose(torch.from_numpy(stored), alone[0], atol=2e-5)
+                assert np.array_equal(store.array("vl/slot_valid")[row], valid[0].numpy())
+
+    def test_a_missing_view_is_marked_and_zero(self, params):
+        run(params)
+        store = FeatureStore.open(params.extract.store)
+        press = next(one for one in store.episodes if one.id == "episode_3")
+        view1 = [slot.get("view") == "View1" for slot in store.attrs["slots"]]
+        rows = slice(press.vl_rows.start, press.vl_rows.stop)
+        assert np.isnan(store.array("vl/frame_time")[rows, 0]).all()
+        assert not store.array("vl/slot_valid")[rows][:, view1].any()
+        assert not store.array("vl/features")[rows][:, view1].any()
+        assert store.array("vl/slot_valid")[rows][:, np.logical_not(view1)].all()
+
+    @pytest.mark.parametrize("dtype", ["float16", "bfloat16"])
+    def test_stored_dtypes(self, changed, dtype):
+        params = changed(extract={"dtype": dtype, "sensor_dtype": "float16"})
+        run(params)
+        batch = FeatureStore.open(params.extract.store).gather([0])
+        assert batch.features.dtype == getattr(torch, dtype)
+        assert batch.sensor.dtype == torch.float16
+
+    def test_a_sensor_that_does_not_fit_float16_is_refused(self, changed, recordings):
+        path = recordings / "Touch_dot/episode_1/sensor_data.npz"
+        stored = dict(np.load(path))
+        stored["data"][3, 5, 7] = 1e6
+        np.savez(path, **stored)
+        with pytest.raises(NumericsError, match=r"aline_0006 = 1e\+06.*float16.*sensor_dtype"):
+            run(changed(extract={"sensor_dtype": "float16"}))
+
+
+class TestWhatItTakesOver:
+    def test_nothing_changed_needs_neither_model_nor_frame(self, params, no_model_later):
+        run(params)
+        no_model_later()
+        report, said = run(params)
+        assert report is None
+        assert not said
+
+    def test_an_added_episode_computes_only_its_rows(
+        self, params, recordings, counted, write_episode
+    ):
+        run(params)
+        before = FeatureStore.open(params.extract.store)
+        known = {bytes(key): row for row, key in enumerate(before.array("vl/key"))}
+        counted.clear()
+        write_episode(recordings / "Touch_dot" / "episode_0", 9)
+        report, said = run(params)
+        store = FeatureStore.open(params.extract.store)
+        (added,) = (one for one in store.episodes if one.id == "episode_0")
+        assert sum(counted) == len(added.vl_rows) == report.computed
+        assert report.taken == len(known)
+        assert any("1 episode(s) are new" in line for line in said)
+        for row, key in enumerate(store.array("vl/key")):
+            if bytes(key) in known:
+                old = before.array("vl/features")[known[bytes(key)]]
+                assert np.array_equal(store.array("vl/features")[row], old)
+
+    def test_another_reuse_count_takes_the_rows_whose_key_is_known(self, params, changed, counted):
+        run(params)
+        rows = len(FeatureStore.open(params.extract.store).array("vl/time"))
+        counted.clear()
+        report, said = run(changed(data={"vlm_reuse_count": 1}))
+        assert report.taken == rows
+        assert sum(counted) == report.rows - rows
+        assert any("vlm_reuse_count" in line for line in said)
+
+    def test_another_prompt_computes_everything_and_says_why(self, params, changed, counted):
+        run(params)
+        counted.clear()
+        report, said = run(changed(vlm={"prompt": "{images} do: {instruction}"}))
+        assert report.taken == 0
+        assert sum(counted) == report.rows
+        assert any("prompt: '{instruction}" in line for line in said)
+
+    def test_the_speed_knobs_change_nothing(self, params, changed, no_model_later):
+        run(params)
+        no_model_later()
+        knobs = {"batch_size": 1, "decode_threads": 1, "device": "cpu"}
+        assert run(changed(extract=knobs, vlm={"attention": "eager"}))[0] is None
+
+    def test_a_touched_file_is_read_again_and_found_equal(self, params, recordings):
+        run(params)
+        path = recordings / "Touch_dot/episode_1/robot_states.npz"
+        path.write_bytes(path.read_bytes())
+        assert run(params)[0] is None
+
+    def test_a_changed_file_is_noticed(self, params, recordings):
+        run(params)
+        path = recordings / "Touch_dot/episode_1/robot_states.npz"
+        stored = dict(np.load(path))
+        for name in stored:
+            stored[name] = stored[name] + 1
+        np.savez(path, **stored)
+        report, said = run(params)
+        assert report.computed == 0, "its frames did not change"
+        assert any("1 episode(s) are new or their files changed" in line for line in said)
+
+    def test_a_lost_ledger_costs_nothing_but_reading(self, params, no_model_later):
+        run(params)
+        ledger = params.extract.store.with_name("made.zarr.files.sqlite")
+        ledger.write_bytes(b"not a database" * 100)
+        no_model_later()
+        assert run(params)[0] is None
+
+
+class TestOutOfMemory:
+    def test_halves_the_batch_and_goes_on(self, params, monkeypatch):
+        run(params)
+        expected = FeatureStore.open(params.extract.store).array("vl/features").copy()
+        shutil.rmtree(params.extract.store)
+        real = FrozenVLM.encode
+
+        def encode(self, batch):
+            if len(batch) > 1:
+                raise torch.OutOfMemoryError("no memory for two")
+            return real(self, batch)
+
+        monkeypatch.setattr(FrozenVLM, "encode", encode)
+        run(params)
+        found = FeatureStore.open(params.extract.store).array("vl/features")
+        assert np.allclose(found, expected, atol=2e-5)
+
+
+class TestPlan:
+    def test_only_says_what_it_would_do(self, changed, no_model_later):
+        params = changed(extract={"plan": True})
+        no_model_later(images=False)
+        report, said = run(params)
+        text = "\n".join(said)
+        assert report is None
+        assert "there is no store yet" in text
+        assert "rows: 24, 0 known, 24 to compute" in text
+        assert "free" in text
+        assert not params.extract.store.exists()
+        assert [path.name for path in params.extract.store.parent.iterdir()] == [
+            "made.zarr.files.sqlite"
+        ]
+
+    def test_names_a_time_once_a_speed_is_known(self, params, changed):
+        run(params)
+        _, said = run(changed(extract={"plan": True}, data={"vlm_reuse_count": 2}))
+        assert any("rows/s, as last measured" in line for line in said)
+
+
+class TestRefusals:
+    def test_too_little_disk_is_refused_before_the_model(self, params, monkeypatch, no_model_later):
+        monkeypatch.setattr("pipeline.extraction.layout.free_bytes", lambda path: 1000)
+        no_model_later(images=False)
+        with pytest.raises(DiskFull, match=r"needs .* GiB.*free"):
+            run(params)
+        assert not params.extract.store.exists()
+
+    def test_lists_everything_that_is_wrong_at_once(self, params, recordings, no_model_later):
+        no_model_later(images=False)
+        npz = recordings / "Touch_dot/episode_1/sensor_data.npz"
+        npz.write_bytes(npz.read_bytes()[:5000])
+        image = sorted((recordings / "Press/episode_3/images/View2").iterdir())[3]
+        image.write_bytes(image.read_bytes()[:300])
+        with pytest.raises(RecordingError) as caught:
+            run(params)
+        text = str(caught.value)
+        assert "2 of 3 episodes cannot be used" in text
+        assert str(npz) in text
+        assert str(image) in text
+        assert "on_bad_episode=skip" in text
+
+    def test_skip_leaves_bad_episodes_out_and_lists_them(
+        self, changed, recordings, capsys, no_model_later
+    ):
+        npz = recordings / "Touch_dot/episode_1/sensor_data.npz"
+        npz.write_bytes(npz.read_bytes()[:5000])
+        params = changed(data={"on_bad_episode": "skip"})
+        run(params)
+        assert str(npz) in capsys.readouterr().err
+        store = FeatureStore.open(params.extract.store)
+        assert [one.id for one in store.episodes] == ["episode_3", "episode_2"]
+        no_model_later()
+        assert run(params)[0] is None
+
+    def test_two_embodiments_are_refused_naming_both(
+        self, changed, recordings, tmp_path, write_episode
+    ):
+        other = tmp_path / "other"
+        write_episode(other / "Task" / "episode_9", 9)
+        path = other / "Task/episode_9/sensor_data.npz"
+        stored = dict(np.load(path))
+        np.savez(path, timestamps=stored["timestamps"], data=stored["data"][:, :, :7])
+        sources = [{"name": "made", "path": "."}, {"name": "other", "path": str(other)}]
+        with pytest.raises((StoreMismatch, RecordingError), match=r"other|sensor"):
+            run(changed(data={"sources": sources}))
+
+    def test_a_second_extraction_is_refused(self, params):
+        with build_lock(params.extract.store), pytest.raises(StoreLocked, match="being built by"):
+            run(params)
+
+
+def test_finished_files_never_change(params, recordings, tmp_path, write_episode):
+    """Hard links to a finished store, as a cache makes them, keep their bytes."""
+    run(params)
+    cache = tmp_path / "cache"
+    shutil.copytree(params.extract.store, cache, copy_function=lambda a, b: Path(b).hardlink_to(a))
+    before = {path: path.read_bytes() for path in cache.rglob("*") if path.is_file()}
+    write_episode(recordings / "Touch_dot" / "episode_7", 7)
+    run(params)
+    assert {path: path.read_bytes() for path in before} == before

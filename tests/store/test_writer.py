@@ -1,0 +1,295 @@
+"""A build loses at most what was in flight, whatever kills it."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from pipeline.errors import DiskFull, StoreIncomplete, StoreLocked
+from pipeline.store import Donor, FeatureStore, Sizes, StoreBuild, arrays, build_lock, recover
+from pipeline.store.chunks import row_checksums
+from pipeline.store.schema import FEATURES, ArraySpec
+
+ROWS = 12
+SIZES = Sizes(1, 24, ROWS, 0, 0, 2, 3, 8, 1, 2, 0, 0)
+
+
+def begun(folder: Path, plan: str = "plan") -> StoreBuild:
+    build = StoreBuild(folder / "s.zarr", arrays(SIZES, "float32", "float32"), plan)
+    build.create()
+    build.allocate()
+    build.write("episode/text_start", 0, np.array([0, 2]))
+    build.write("episode/text", 0, np.frombuffer(b"{}", np.uint8))
+    build.write("episode/vl_start", 0, np.array([0, ROWS]))
+    build.finish_layout({"schema": 1, "environment": []}, {})
+    return build
+
+
+def resumed(build: StoreBuild) -> StoreBuild:
+    build.close()
+    return StoreBuild(build.target, build.specs, build.plan)
+
+
+def rows_of(seed: int, count: int) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=(count, 3, 8)).astype(np.float32)
+
+
+class Killed(BaseException):
+    """Stands for SIGKILL: nothing may catch it."""
+
+
+class TestCommit:
+    @settings(
+        max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    )
+    @given(
+        batches=st.lists(
+            st.lists(st.integers(0, ROWS - 1), min_size=1, max_size=5, unique=True), max_size=5
+        ),
+        kill_at=st.integers(0, 25),
+        kept=st.floats(0, 1),
+    )
+    def test_a_kill_at_any_write_leaves_only_whole_rows(
+        self, tmp_path_factory, batches, kill_at, kept
+    ):
+        """Against a dict: what is not missing after the kill is what was handed over last."""
+        build = begun(tmp_path_factory.mktemp("kill"))
+        number = build.environment_index({"torch": "1"})
+        expected: dict[int, tuple[np.ndarray, bytes]] = {}
+        offered: dict[int, list[tuple[np.ndarray, bytes]]] = {}
+        writes = iter(range(10**6))
+        real = os.pwrite
+
+        def pwrite(descriptor, block, offset):
+            if next(writes) == kill_at:
+                real(descriptor, bytes(block)[: int(len(block) * kept)], offset)
+                raise Killed
+            return real(descriptor, block, offset)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(os, "pwrite", pwrite)
+            try:
+                for index, rows in enumerate(batches):
+                    features = rows_of(index, len(rows))
+                    keys = [bytes([index, row] * 8) for row in rows]
+                    pairs = dict(zip(rows, zip(features, keys, strict=True), strict=True))
+                    for row, pair in pairs.items():
+                        offered.setdefault(row, []).append(pair)
+                    build.commit(rows, features, keys, number)
+                    expected |= pairs
+            except Killed:
+                pass
+        again = resumed(build)
+        missing = set(again.missing().tolist())
+        rewritten = {row for row in offered if len(offered[row]) > 1}
+        assert not missing & (set(expected) - rewritten), "a committed row was lost"
+        for row in set(range(ROWS)) - missing:
+            stored = again.files(FEATURES).read(row, 1)[0]
+            assert any(np.array_equal(stored, features) for features, _ in offered[row])
+        again.close()
+
+    def test_a_damaged_row_counts_as_missing(self, tmp_path):
+        build = begun(tmp_path)
+        build.commit(range(ROWS), rows_of(0, ROWS), [bytes(16)] * ROWS, 0)
+        path = build.files(FEATURES).paths[0]
+        with path.open("r+b") as file:
+            file.seek(5 * 3 * 8 * 4 + 17)
+            file.write(b"\xff")
+        assert resumed(build).missing().tolist() == [5]
+
+    def test_zero_checksums_are_kept_as_one(self, monkeypatch):
+        monkeypatch.setattr("google_crc32c.value", lambda row: 0)
+        assert row_checksums(np.ones((2, 3), np.float32)).tolist() == [1, 1]
+
+
+class TestSeal:
+    def full(self, folder: Path, plan: str = "plan", seed: int = 0) -> StoreBuild:
+        build = begun(folder, plan)
+        number = build.environment_index({"torch": plan})
+        build.commit(
+            range(ROWS), rows_of(seed, ROWS), [bytes([i] * 16) for i in range(ROWS)], number
+        )
+        return build
+
+    def test_zarr_refuses_features_until_sealed(self, tmp_path):
+        build = self.full(tmp_path)
+        with pytest.raises(ValueError, match="checksum"):
+            zarr.open_array(build.part, path=FEATURES, mode="r")[:]
+        build.seal()
+        assert np.array_equal(
+            zarr.open_array(build.target, path=FEATURES, mode="r")[:], rows_of(0, ROWS)
+        )
+        assert not build.part.exists()
+
+    def test_refuses_an_incomplete_build(self, tmp_path):
+        build = begun(tmp_path)
+        build.commit([0], rows_of(0, 1), [bytes(16)], 0)
+        with pytest.raises(StoreIncomplete, match="11 feature rows are missing, the first is 1"):
+            build.seal()
+
+    @pytest.mark.parametrize(
+        ("replaces", "steps", "stride"),
+        [
+            (False, ((os, "pwrite"), (os, "fsync")), 13),
+            (True, ((Path, "rename"), (Path, "unlink"), (shutil, "rmtree")), 1),
+        ],
+    )
+    def test_a_kill_at_any_step_is_mended_by_sealing_again(self, tmp_path, replaces, steps, stride):
+        """Kill before the n-th of these steps, for every n (or every 13th), until none is left."""
+        for kill_at in range(0, 200, stride):
+            folder = tmp_path / str(kill_at)
+            folder.mkdir()
+            if replaces:
+                self.full(folder, "before", seed=1).seal()
+            build = self.full(folder, "after")
+            finished = self._sealed_before_kill(build, steps, kill_at)
+            if not finished:
+                recover(build.target)
+                if build.part.exists():
+                    resumed(build).seal()
+            store = FeatureStore.open(build.target)
+            assert np.array_equal(store.array(FEATURES), rows_of(0, ROWS))
+            assert store.attrs["environment"] == [{"rows": [0, ROWS], "torch": "after"}]
+            assert [path.name for path in folder.iterdir()] == ["s.zarr"]
+            if finished:
+                assert kill_at >= 4
+                return
+        raise AssertionError("sealing takes more steps than expected")
+
+    def _sealed_before_kill(self, build: StoreBuild, steps, kill_at: int) -> bool:
+        count = iter(range(10**6))
+
+        def counted(real):
+            def call(*args, **kwargs):
+                if next(count) == kill_at:
+                    raise Killed
+                return real(*args, **kwargs)
+
+            return call
+
+        with pytest.MonkeyPatch.context() as patch:
+            for owner, name in steps:
+                patch.setattr(owner, name, counted(getattr(owner, name)))
+            try:
+                build.seal()
+            except Killed:
+                return False
+        return True
+
+    def test_a_finished_store_replaced_is_never_written(self, tmp_path):
+        self.full(tmp_path, "before", seed=1).seal()
+        kept = tmp_path / "kept"
+        subprocess.run(["cp", "-al", tmp_path / "s.zarr", kept], check=True)
+        before = {path: path.read_bytes() for path in kept.rglob("*") if path.is_file()}
+        self.full(tmp_path, "after").seal()
+        assert {path: path.read_bytes() for path in before} == before
+
+
+class TestLinks:
+    def test_unchanged_chunks_are_linked_and_others_are_not(self, tmp_path, monkeypatch):
+        monkeypatch.setattr("pipeline.store.schema.CHUNK_BYTES", 4096)
+        build, values = self._with_sensor(tmp_path, 9000, "one")
+        build.seal()
+        longer, grown = self._specs(tmp_path, 14000, "two")
+        longer.create()
+        donor = Donor(build.target)
+        taken = longer.link_unchanged(
+            "sensor/values", build.target, donor.specs["sensor/values"], 9000
+        )
+        assert taken == 2, "the last chunk holds the end of the stream"
+        longer.allocate()
+        grown[:9000] = values
+        longer.write("sensor/values", 0, grown)
+        inode = [path.stat().st_ino for path in longer.files("sensor/values").paths]
+        old = [
+            path.stat().st_ino for path in sorted((build.target / "sensor/values/c").glob("*/0"))
+        ]
+        assert inode[:2] == old[:2]
+        assert inode[2] != old[2]
+        self._finish(longer)
+        longer.seal()
+        assert np.array_equal(FeatureStore.open(longer.target).array("sensor/values"), grown)
+
+    def _specs(self, folder: Path, readings: int, plan: str):
+        sizes = Sizes(1, 2, 1, readings, 0, 2, 1, 2, 1, 2, 3, 0)
+        build = StoreBuild(folder / "s.zarr", arrays(sizes, "float32", "float32"), plan)
+        values = np.random.default_rng(readings).normal(size=(readings, 3)).astype(np.float32)
+        return build, values
+
+    def _with_sensor(self, folder: Path, readings: int, plan: str):
+        build, values = self._specs(folder, readings, plan)
+        build.create()
+        build.allocate()
+        build.write("sensor/values", 0, values)
+        self._finish(build)
+        return build, values
+
+    def _finish(self, build: StoreBuild) -> None:
+        build.finish_layout({"schema": 1, "environment": []}, {})
+        build.commit([0], np.zeros((1, 1, 2), np.float32), [bytes(16)], 0)
+
+
+class TestDiskFull:
+    def test_a_full_disk_is_named_and_the_build_resumes(self, small_disk):
+        build = begun(small_disk)
+        features = rows_of(0, ROWS)
+        keys = [bytes([i] * 16) for i in range(ROWS)]
+        build.commit(range(4), features[:4], keys[:4], build.environment_index({"torch": "1"}))
+        ballast_path = small_disk / "ballast"
+        with pytest.raises(OSError, match="No space"), ballast_path.open("wb") as ballast:
+            while True:
+                ballast.write(bytes(4096))
+                ballast.flush()
+        with pytest.raises(DiskFull, match=r"no space left.*make room"):
+            other = StoreBuild(small_disk / "other.zarr", build.specs, "plan")
+            other.create()
+            other.allocate()
+        ballast_path.unlink()
+        again = resumed(build)
+        assert again.missing().tolist() == list(range(4, ROWS))
+        again.commit(range(4, ROWS), features[4:], keys[4:], 0)
+        again.seal()
+        assert np.array_equal(FeatureStore.open(again.target).array(FEATURES), features)
+
+
+class TestLock:
+    def test_the_second_builder_is_refused_and_told_of_the_first(self, tmp_path):
+        target = tmp_path / "s.zarr"
+        code = (
+            "import sys; from pathlib import Path; from pipeline.store import build_lock\n"
+            "with build_lock(Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
+        )
+        holder = subprocess.Popen(
+            [sys.executable, "-c", code, target], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        )
+        assert holder.stdout is not None
+        with holder:
+            assert holder.stdout.readline() == b"held\n"
+            with pytest.raises(StoreLocked, match=f"process {holder.pid}"), build_lock(target):
+                pass
+            holder.kill()
+        with build_lock(target):
+            pass
+
+
+class TestChunkRule:
+    @given(
+        rows=st.integers(0, 10**8),
+        width=st.integers(1, 200_000),
+        dtype=st.sampled_from(["u1", "f2", "f4", "f8"]),
+    )
+    def test_chunks_are_multiples_of_4096_rows_of_about_64_mb(self, rows, width, dtype):
+        spec = ArraySpec("x", (rows, width), np.dtype(dtype), ("row", "column"))
+        assert spec.chunk_rows % 4096 == 0
+        assert spec.chunk_bytes % 4096 == 0
+        assert spec.chunk_rows == 4096 or spec.chunk_bytes <= 64 * 2**20
+        assert spec.chunk_count * spec.chunk_rows >= rows
+        if spec.data_bytes and spec.chunk_count > 1:
+            assert spec.chunk_rows == 4096 or spec.chunk_bytes > 32 * 2**20

@@ -1,0 +1,132 @@
+"""The picture of the house is true: who imports whom, and what each stage declares to DVC."""
+
+import ast
+import sys
+from functools import cache
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parents[1]
+
+TIERS = (
+    {"errors"},
+    {"config", "digests", "device", "durable"},
+    {"recordings", "vlm", "store", "normalization", "models"},
+    {"timeline", "simulation", "sampling", "checkpoint"},
+    {"batches", "extraction"},
+    {"evaluation"},
+    {"training"},
+    {"plots"},
+)
+"""Rooms import from tiers above theirs in this list, and from themselves."""
+
+ONLY_IN = {
+    "transformers": {"vlm"},
+    "peft": {"vlm"},
+    "zarr": {"store"},
+    "numcodecs": {"store"},
+    "yaml": {"config"},
+    "matplotlib": {"plots", "report"},
+    "jinja2": {"plots", "report"},
+}
+WITHOUT_TORCH = {"recordings", "timeline"}
+
+
+def modules() -> dict[str, Path]:
+    """Every module of `pipeline` and `stages` by dotted name."""
+    found = {}
+    for path in sorted([*ROOT.glob("pipeline/**/*.py"), *ROOT.glob("stages/**/*.py")]):
+        parts = path.relative_to(ROOT).with_suffix("").parts
+        found[".".join(part for part in parts if part != "__init__")] = path
+    return found
+
+
+MODULES = modules()
+
+
+@cache
+def imports(module: str) -> frozenset[str]:
+    """What a module imports anywhere in its text, as modules of the project or top-level names."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(MODULES[module].read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{module}: relative import"
+            base = node.module or ""
+            names |= {
+                full if (full := f"{base}.{alias.name}") in MODULES else base
+                for alias in node.names
+            }
+    return frozenset(names)
+
+
+def room(module: str) -> str:
+    parts = module.split(".")
+    return parts[1] if len(parts) > 1 else ""
+
+
+@pytest.mark.parametrize("module", [name for name in MODULES if name.startswith("pipeline.")])
+def test_a_room_imports_only_from_rooms_below(module):
+    tier = {name: level for level, names in enumerate(TIERS) for name in names}
+    assert room(module) in tier, f"{room(module)} has no place in the picture"
+    for imported in imports(module):
+        if imported.startswith("stages"):
+            pytest.fail(f"{module} imports {imported}")
+        if imported.startswith("pipeline.") and room(imported) != room(module):
+            assert tier[room(imported)] < tier[room(module)], f"{module} imports {imported}"
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_heavy_libraries_stay_in_their_rooms(module):
+    for imported in imports(module):
+        top = imported.split(".")[0]
+        assert room(module) in ONLY_IN.get(top, {room(module)}), f"{module} imports {top}"
+        if room(module) in WITHOUT_TORCH:
+            assert top != "torch", f"{module} imports torch"
+
+
+def reached(module: str) -> set[str]:
+    """The project's modules that importing this one runs, packages on the way included."""
+    found: set[str] = set()
+    waiting = [module]
+    while waiting:
+        name = waiting.pop()
+        if name in MODULES and name not in found:
+            found.add(name)
+            waiting += [*imports(name), name.rpartition(".")[0]]
+    return found
+
+
+@pytest.mark.parametrize("stage", ["demo", "extract", "train_head", "evaluate"])
+def test_every_module_a_stage_runs_is_among_its_deps(stage):
+    document = yaml.safe_load((ROOT / "dvc.yaml").read_text())
+    deps = [ROOT / dep for dep in document["stages"][stage]["deps"] if "$" not in dep]
+    for name in reached(f"stages.{stage}"):
+        path = MODULES[name]
+        if path.stat().st_size:
+            covered = any(dep == path or dep in path.parents for dep in deps)
+            assert covered, f"{path.relative_to(ROOT)} is not among the deps of {stage}"
+
+
+def test_stage_two_knows_nothing_of_stage_one():
+    for stage in ("train_head", "evaluate"):
+        rooms = {room(name) for name in reached(f"stages.{stage}") if name.startswith("pipeline.")}
+        assert not rooms & {"vlm", "recordings", "extraction", "timeline", "simulation"}
+
+
+def test_source_files_stay_readable():
+    long = {
+        str(path.relative_to(ROOT)): count
+        for path in MODULES.values()
+        if (count := len(path.read_text(encoding="utf-8").splitlines())) > 300
+    }
+    assert not long
+
+
+def test_the_pictures_rooms_exist():
+    names = {room(name) for name in MODULES if name.startswith("pipeline.")}
+    assert names == set().union(*TIERS), names ^ set().union(*TIERS)
+    assert sys.version_info >= (3, 11)
