@@ -1,0 +1,132 @@
+"""What the three formats of the needle-insertion recorder share.
+
+Channels, the task folder's name as instruction, JPEG views, robot states and sensor rows.
+"""
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import RecordingError
+from pipeline.recordings.arrays import Numbers, csv_header, member, read_csv, read_npz
+from pipeline.recordings.jpeg import JpegCamera
+from pipeline.recordings.reader import FileRecording, absolute
+from pipeline.recordings.recording import CameraStream, Channels, Stream, checked_stream
+
+_JOINTS = tuple(f"joint_{joint}" for joint in range(1, 7))
+_POSE = tuple(f"pose_{axis}" for axis in "xyzabr")
+_POSE_UNITS = ("mm",) * 3 + ("deg",) * 3
+STATE = Channels(_JOINTS + _POSE, ("deg",) * 6 + _POSE_UNITS)
+POSES = Channels(_POSE, _POSE_UNITS)
+ALINE_BINS = 1025
+SENSOR = Channels(
+    ("force", *(f"aline_{depth:04d}" for depth in range(ALINE_BINS))),
+    ("N", *[""] * ALINE_BINS),
+)
+CLOCK = "origin_timestamp"
+
+
+class InsertionRecording(FileRecording):
+    """An episode folder of the needle-insertion recorder."""
+
+    def poses(self) -> Stream | None:
+        state = self.state()
+        if state is None:
+            return None
+        return Stream(POSES, state.time, np.ascontiguousarray(state.values[:, len(_JOINTS) :]))
+
+    def files(self) -> list[Path]:
+        frames = [
+            path
+            for view, paths in self._view_files().items()
+            if self._wants(view)
+            for path in paths
+        ]
+        return sorted({*self._data_files(), *frames})
+
+    def all_views(self) -> Sequence[str]:
+        return list(self._view_files())
+
+    def _recorded_instruction(self) -> str:
+        return absolute(self.path).parent.name.replace("_", " ")
+
+    def _cameras(self) -> Mapping[str, CameraStream]:
+        wanted = {v: paths for v, paths in self._view_files().items() if self._wants(v)}
+        return {view: JpegCamera(view, paths) for view, paths in wanted.items()}
+
+    @abstractmethod
+    def _view_files(self) -> Mapping[str, list[Path]]:
+        """JPEGs by view, views without any left out."""
+
+    @abstractmethod
+    def _data_files(self) -> Sequence[Path]:
+        """The files that are not frames."""
+
+
+def robot_state_file(folder: Path) -> Path | None:
+    """`robot_states.npz`, else `robot_states.csv`, else None."""
+    for name in ("robot_states.npz", "robot_states.csv"):
+        if (folder / name).is_file():
+            return folder / name
+    return None
+
+
+def read_robot_states(path: Path, start: float | None, rate_hz: float | None) -> Stream:
+    """Joints and poses; without a clock of its own, row i is at `start + i / rate_hz`."""
+    if path.suffix == ".npz":
+        return _clocked(_states_of_npz(path), start, rate_hz, path)
+    if CLOCK in csv_header(path):
+        return read_state_csv(path)
+    return _clocked(read_csv(path, STATE.names), start, rate_hz, path)
+
+
+def read_state_csv(path: Path) -> Stream:
+    """The robot-state stream of a CSV that has `origin_timestamp`."""
+    table = read_csv(path, (CLOCK, *STATE.names))
+    return checked_stream(STATE, table[:, 0], table[:, 1:].astype(np.float32), str(path))
+
+
+def sensor_rows(force: Numbers, aline: Numbers, where: str) -> NDArray[np.float32]:
+    """Force (reading,) or (reading, 1) and A-lines (reading, 1025) -> (reading, 1026)."""
+    if aline.ndim != 2 or aline.shape[1] != ALINE_BINS:
+        raise RecordingError(
+            f"{where}: expected A-lines (N, {ALINE_BINS}), found shape {aline.shape}"
+        )
+    if force.shape not in ((len(aline),), (len(aline), 1)):
+        raise RecordingError(
+            f"{where}: {len(aline)} A-lines but forces of shape {force.shape}; they must agree"
+        )
+    rows = np.empty((len(aline), 1 + ALINE_BINS), np.float32)
+    rows[:, 0] = force.reshape(-1)
+    rows[:, 1:] = aline
+    return rows
+
+
+def _states_of_npz(path: Path) -> Numbers:
+    members = read_npz(path, ("robot_states", "joints", "poses"))
+    counts = {name: len(array) for name, array in members.items() if array.ndim == 2}
+    if len(set(counts.values())) > 1:
+        raise RecordingError(
+            f"{path}: {', '.join(f'{n} {name}' for name, n in counts.items())}; they must agree"
+        )
+    if "robot_states" in members:
+        return members["robot_states"]
+    halves = [member(members, (name,), path) for name in ("joints", "poses")]
+    if any(half.ndim != 2 for half in halves):
+        raise RecordingError(
+            f"{path}: expected joints and poses (M, 6), found {[half.shape for half in halves]}"
+        )
+    return np.concatenate(halves, axis=1)
+
+
+def _clocked(values: Numbers, start: float | None, rate_hz: float | None, path: Path) -> Stream:
+    if start is None or rate_hz is None:
+        raise RecordingError(
+            f"{path}: has no clock, and the episode's metadata gives no start_time and robot_hz "
+            f"to make one; add them, or a column {CLOCK}"
+        )
+    time = start + np.arange(len(values), dtype=np.float64) / rate_hz
+    return checked_stream(STATE, time, values.astype(np.float32), str(path))

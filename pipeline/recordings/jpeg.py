@@ -1,0 +1,144 @@
+"""Folders of JPEGs as camera streams: the time of a frame stands in its file's name."""
+
+import math
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from io import BytesIO
+from pathlib import Path, PurePath
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from pipeline.errors import RecordingError
+from pipeline.recordings.reader import natural_key
+from pipeline.recordings.recording import CameraStream
+
+Frame = TypeVar("Frame")
+_EYES = ("left", "right")
+_SUFFIXES = (".jpg", ".jpeg")
+_UNREADABLE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
+
+
+class JpegCamera(CameraStream):
+    """A view whose frames are files."""
+
+    def __init__(self, view: str, paths: Sequence[Path]) -> None:
+        """Sorts the files by the time in their names; raises `RecordingError` on a name without."""
+        timed = sorted((frame_time(path), str(path)) for path in paths)
+        self.view = view
+        self.paths = [Path(path) for _, path in timed]
+        self.time = np.array([time for time, _ in timed], np.float64)
+
+    def check(self, indices: Sequence[int]) -> None:
+        for index in indices:
+            check_image(self.paths[index], str(self.paths[index]))
+
+    def read(self, indices: Sequence[int]) -> Iterator[NDArray[np.uint8]]:
+        last, frame = -1, None
+        for index in indices:
+            if frame is None or index != last:
+                last, frame = index, read_image(self.paths[index], str(self.paths[index]))
+            yield frame
+
+
+def frame_time(path: PurePath) -> float:
+    """Seconds in the last `_`-separated part of the stem, as in `zed_left_1761551500.174.jpg`."""
+    text = path.stem.rsplit("_", 1)[-1]
+    try:
+        time = float(text)
+    except ValueError:
+        time = math.nan
+    if not math.isfinite(time):
+        raise RecordingError(
+            f"{path}: expected a name that ends in the time in seconds, such as "
+            f"zed_left_1761551500.174.jpg, found {text!r}"
+        )
+    return time
+
+
+def list_views(folder: Path, prefix: str = "") -> dict[str, list[Path]]:
+    """JPEG files by view name, from the folders `<prefix>…` in `folder`; views without are absent.
+
+    `left` is dropped unless both eyes exist; an eye is a subfolder, the end of the folder's name,
+    or the part before the time in a file's name.
+    """
+    found: dict[tuple[str, str], list[Path]] = {}
+    for view in sorted(_entries(folder), key=lambda entry: natural_key(entry.name)):
+        if not view.name.startswith(prefix) or not view.is_dir():
+            continue
+        base, eye = split_eye(view.name)
+        for entry in _entries(Path(view.path)):
+            if entry.name in _EYES and entry.is_dir():
+                inside = [Path(e.path) for e in _entries(Path(entry.path)) if _is_jpeg(e.name)]
+                found.setdefault((base, entry.name), []).extend(inside)
+            elif _is_jpeg(entry.name):
+                side = eye or _eye_of_file(entry.name)
+                found.setdefault((base, side), []).append(Path(entry.path))
+    return name_views({key: paths for key, paths in found.items() if paths})
+
+
+def name_views(found: Mapping[tuple[str, str], list[Frame]]) -> dict[str, list[Frame]]:
+    """View names for (base, eye) pairs: the eye is part of the name only where both exist."""
+    eyes: dict[str, set[str]] = {}
+    for base, eye in found:
+        eyes.setdefault(base, set()).add(eye)
+    return {
+        base if len(eyes[base]) == 1 or not eye else f"{base}_{eye}": found[base, eye]
+        for base, eye in sorted(found, key=lambda key: natural_key("_".join(key)))
+    }
+
+
+def split_eye(name: str) -> tuple[str, str]:
+    """`View1_left` -> (`View1`, `left`); no eye is ''."""
+    base, _, eye = name.rpartition("_")
+    return (base, eye) if base and eye in _EYES else (name, "")
+
+
+def read_image(file: Path | bytes, where: str) -> NDArray[np.uint8]:
+    """The image (height, width, 3), RGB as stored (EXIF orientation is ignored)."""
+    try:
+        with Image.open(_readable(file)) as image:
+            return np.asarray(image.convert("RGB"))
+    except _UNREADABLE as error:
+        raise RecordingError(f"{where}: cannot be decoded as an image: {error}") from None
+
+
+def check_image(file: Path | bytes, where: str) -> None:
+    """Raise `RecordingError` on an unreadable image.
+
+    A JPEG is decoded at an eighth of its size, a PNG by its checksums.
+    """
+    try:
+        with Image.open(_readable(file)) as image:
+            if image.format == "PNG":
+                image.verify()
+            else:
+                image.draft("RGB", (max(1, image.width // 8), max(1, image.height // 8)))
+                image.load()
+    except _UNREADABLE as error:
+        raise RecordingError(f"{where}: cannot be decoded as an image: {error}") from None
+
+
+def _readable(file: Path | bytes) -> Path | BytesIO:
+    return BytesIO(file) if isinstance(file, bytes) else file
+
+
+def _entries(folder: Path) -> Iterable[os.DirEntry[str]]:
+    if not folder.is_dir():
+        return []
+    try:
+        with os.scandir(folder) as entries:
+            return [entry for entry in entries if not entry.name.startswith(".")]
+    except OSError as error:
+        raise RecordingError(f"{folder}: cannot be listed: {error}") from None
+
+
+def _is_jpeg(name: str) -> bool:
+    return name.lower().endswith(_SUFFIXES)
+
+
+def _eye_of_file(name: str) -> str:
+    parts = name.split("_")
+    return parts[-2] if len(parts) > 2 and parts[-2] in _EYES else ""

@@ -1,0 +1,234 @@
+"""LeRobot data sets v2.0, v2.1 and v3.0: state and action from parquet, frames from video.
+
+Rows and frames pair by number; the `timestamp` column is the clock and is kept as it is. A
+high-rate sensor has no home in LeRobot: this project's sidecar is `sensor/episode_000003.npz`.
+"""
+
+import re
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from pipeline.config import Source
+from pipeline.errors import RecordingError
+from pipeline.recordings.arrays import member, read_npz
+from pipeline.recordings.insertion import SENSOR
+from pipeline.recordings.lerobot_layout import Entry, Layout, read_layout
+from pipeline.recordings.lerobot_rows import ParquetCamera, find_rows, matrix
+from pipeline.recordings.reader import FileRecording
+from pipeline.recordings.recording import (
+    ActionKind,
+    CameraStream,
+    Channels,
+    RecordedAction,
+    Stream,
+    check_clock,
+    checked_stream,
+)
+from pipeline.recordings.video import VideoClip
+
+MARKER = "meta/info.json"
+STATE = "observation.state"
+ACTION = "action"
+CLOCK = "timestamp"
+_DELTA = re.compile(r"delta.*|d(x|y|z|a|b|r|rx|ry|rz|alpha|beta|gamma|roll|pitch|yaw)")
+
+
+def is_root(folder: Path, names: Collection[str]) -> bool:
+    """Whether a folder with these entries is a LeRobot data set."""
+    return "meta" in names and (folder / MARKER).is_file()
+
+
+def open_data_set(
+    root: Path, source: Source, views: Sequence[str] | None
+) -> tuple[list["LeRobotRecording"], list[str]]:
+    """The episodes whose files are there, and a line for each that `meta/` lists and has none.
+
+    Raises `RecordingError` where `meta/` is broken.
+    """
+    layout, entries = read_layout(root)
+    there: dict[Path, bool] = {}
+    recordings: list[LeRobotRecording] = []
+    missing: list[str] = []
+    for entry in entries:
+        recording = LeRobotRecording(layout, entry, source, views)
+        absent = next(
+            (p for p in recording.listed_files() if not there.setdefault(p, p.is_file())), None
+        )
+        if absent is None:
+            recordings.append(recording)
+        else:
+            missing.append(f"{source.name}: {root} lists {entry.id}, but {absent} is not there")
+    return recordings, missing
+
+
+class LeRobotRecording(FileRecording):
+    """One episode of a LeRobot data set; `path` is the data set's root."""
+
+    format = "lerobot"
+
+    def __init__(
+        self, layout: Layout, entry: Entry, source: Source, views: Sequence[str] | None
+    ) -> None:
+        super().__init__(layout.root, source, views)
+        self.id = entry.id
+        self._layout = layout
+        self._entry = entry
+
+    def listed_files(self) -> list[Path]:
+        """The data file and the wanted views' videos, as `meta/` names them."""
+        keys = [key for view, key in self._layout.views.items() if self._wants(view)]
+        videos = [self._entry.videos[key].path for key in keys if key in self._entry.videos]
+        return [self._entry.data, *videos]
+
+    def files(self) -> list[Path]:
+        _, *videos = self.listed_files()
+        sidecar = [self._sidecar] if self._sidecar.is_file() else []
+        return sorted({find_rows(self._layout, self._entry).path, *videos, *sidecar})
+
+    def identity(self) -> str:
+        """Where the shared files of v3.0 hold this episode; '' where its files are its own."""
+        if not self._entry.shared:
+            return ""
+        spans = {view: self._entry.videos.get(key) for view, key in self._layout.views.items()}
+        frames = [f"{v}@{span.first}" for v, span in sorted(spans.items()) if span]
+        return " ".join([f"{self.id}+{self._entry.length}", *frames])
+
+    def state(self) -> Stream | None:
+        return self._stream(STATE) if STATE in self._layout.features else None
+
+    def action(self) -> RecordedAction:
+        if ACTION not in self._layout.features:
+            raise RecordingError(
+                f"{self.path / MARKER}: no feature {ACTION!r}; "
+                f"it has {', '.join(self._layout.features)}"
+            )
+        stream = self._stream(ACTION)
+        told = self._overrides.action_kind
+        kind = action_kind(stream.channels.names) if told == "auto" else told
+        return RecordedAction(stream.channels, stream.time, stream.values, kind, self._layout.fps)
+
+    def sensor(self) -> Stream | None:
+        path = self._sidecar
+        if not path.is_file():
+            return None
+        members = read_npz(path, ("timestamps", "values"), text=("names", "units"))
+        values = member(members, ("values",), path)
+        if values.ndim != 2:
+            raise RecordingError(f"{path}: expected values (N, channel), found {values.shape}")
+        channels = _sidecar_channels(members, values.shape[1], path)
+        return checked_stream(channels, member(members, ("timestamps",), path), values, str(path))
+
+    def all_views(self) -> Sequence[str]:
+        return list(self._layout.views)
+
+    def _recorded_instruction(self) -> str:
+        if len(self._entry.tasks) == 1:
+            return self._entry.tasks[0]
+        where, table = self._rows(("task_index",))
+        if "task_index" not in table.column_names:
+            raise RecordingError(f"{where}: no column task_index, and meta/ names no one task")
+        asked = [int(index) for index in np.unique(table["task_index"].to_numpy())]
+        texts = [self._layout.task_text.get(index) for index in asked]
+        if len(texts) != 1 or texts[0] is None:
+            raise RecordingError(
+                f"{where}: expected one task that meta/ knows, found task_index {asked}: {texts}; "
+                f"give source {self.source!r} an `instruction`"
+            )
+        return texts[0]
+
+    def _cameras(self) -> Mapping[str, CameraStream]:
+        wanted = {v: key for v, key in self._layout.views.items() if self._wants(v)}
+        if not wanted:
+            return {}
+        time = self._clock(*self._rows((CLOCK, STATE, ACTION)))
+        rows = find_rows(self._layout, self._entry)
+        videos, fps = self._entry.videos, self._layout.fps
+        return {
+            view: VideoClip(view, time, videos[key], fps)
+            if key in videos
+            else ParquetCamera(view, time, rows, key)
+            for view, key in sorted(wanted.items())
+        }
+
+    def _stream(self, name: str) -> Stream:
+        where, table = self._rows((CLOCK, STATE, ACTION))
+        channels = _channels(name, self._layout.features[name], f"{self.path / MARKER}, {name!r}")
+        values = matrix(_column(table, name, where), len(channels.names), f"{where}, {name!r}")
+        return checked_stream(
+            channels, self._clock(where, table), values.astype(np.float32), f"{where}, {name!r}"
+        )
+
+    def _clock(self, where: str, table: pa.Table) -> NDArray[np.float64]:
+        time = matrix(_column(table, CLOCK, where), 1, f"{where}, {CLOCK!r}")[:, 0]
+        check_clock(time, f"{where}, {CLOCK!r}")
+        return time
+
+    def _rows(self, columns: Sequence[str]) -> tuple[str, pa.Table]:
+        rows = find_rows(self._layout, self._entry)
+        return f"{rows.path}, {self._entry.id}", rows.columns(columns)
+
+    @property
+    def _sidecar(self) -> Path:
+        return self.path / "sensor" / f"{self.id}.npz"
+
+
+def action_kind(names: Sequence[str]) -> ActionKind:
+    """What the names of the action's channels say; absolute where they say nothing."""
+    lower = [name.lower() for name in names]
+    if any("vel" in name for name in lower):
+        return "velocity"
+    return "delta" if any(_DELTA.fullmatch(name) for name in lower) else "absolute"
+
+
+def _column(table: pa.Table, name: str, where: str) -> pa.ChunkedArray:
+    if name not in table.column_names:
+        raise RecordingError(f"{where}: missing column {name!r}")
+    return table[name]
+
+
+def _channels(name: str, feature: Mapping[str, Any], where: str) -> Channels:
+    """The channels of a feature; `units` beside `names` is this project's extension."""
+    shape = feature.get("shape")
+    if not isinstance(shape, list) or len(shape) != 1 or not isinstance(shape[0], int):
+        raise RecordingError(f"{where}: expected a shape of one number, found {shape}")
+    names = _flat_names(feature.get("names"))
+    units = feature.get("units")
+    if names is None:
+        names = [f"{name.rpartition('.')[2]}_{place}" for place in range(shape[0])]
+    for key, found in (("names", names), ("units", units)):
+        if found is not None and len(found) != shape[0]:
+            raise RecordingError(f"{where}: {len(found)} {key} for {shape[0]} values: {found}")
+    return Channels(tuple(names), ("",) * shape[0] if units is None else tuple(map(str, units)))
+
+
+def _flat_names(names: Any) -> list[str] | None:
+    """Channel names from a list, a list in a list, a dict of lists, or null."""
+    if names is None:
+        return None
+    if isinstance(names, dict):
+        named_lists = all(isinstance(value, list) for value in names.values())
+        names = list(names.values()) if named_lists else list(names)
+    flat: list[str] = []
+    for name in names:
+        flat.extend(map(str, name) if isinstance(name, list) else [str(name)])
+    return flat
+
+
+def _sidecar_channels(members: Mapping[str, NDArray[Any]], width: int, path: Path) -> Channels:
+    if "names" in members:
+        names, default = tuple(map(str, members["names"])), ("",) * width
+    elif width == len(SENSOR.names):
+        names, default = SENSOR.names, SENSOR.units
+    else:
+        names, default = tuple(f"sensor_{channel}" for channel in range(width)), ("",) * width
+    units = tuple(map(str, members["units"])) if "units" in members else default
+    if len(names) != width or len(units) != width:
+        raise RecordingError(
+            f"{path}: {width} values a reading, but {len(names)} names and {len(units)} units"
+        )
+    return Channels(names, units)

@@ -1,0 +1,208 @@
+"""What a LeRobot data set's `meta/` says: where each episode's rows and frames are.
+
+v2.0 and v2.1 keep a file an episode, v3.0 many episodes a file. Only `meta/` is read here.
+"""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from pipeline.errors import RecordingError
+from pipeline.recordings.arrays import number, read_json
+from pipeline.recordings.reader import natural_key
+from pipeline.recordings.video import VideoSpan
+
+VERSIONS = ("v2.0", "v2.1", "v3.0")
+_VIEW_PREFIXES = ("observation.images.", "observation.")
+_V3_TEXT = ("task", "__index_level_0__")
+"""Column of a task's text from lerobot 0.5.0 on, and before."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One episode as `meta/` lists it."""
+
+    index: int
+    length: int
+    tasks: tuple[str, ...]
+    data: Path
+    shared: bool
+    """Whether other episodes' rows may stand in the same file."""
+    videos: Mapping[str, VideoSpan]
+    """By feature key."""
+
+    @property
+    def id(self) -> str:
+        """As in `episode_000003`."""
+        return f"episode_{self.index:06d}"
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What all episodes of a data set share."""
+
+    root: Path
+    version: str
+    fps: float
+    features: Mapping[str, Mapping[str, Any]]
+    task_text: Mapping[int, str]
+
+    @property
+    def views(self) -> Mapping[str, str]:
+        """Feature keys of the cameras, by view name."""
+        cameras = (k for k, f in self.features.items() if f.get("dtype") in ("video", "image"))
+        return {_view_name(key): key for key in cameras}
+
+
+def read_layout(root: Path) -> tuple[Layout, tuple[Entry, ...]]:
+    """The data set's layout, and its episodes by index.
+
+    Raises `RecordingError` naming the file of `meta/` that is wrong, and the place in it.
+    """
+    path = root / "meta" / "info.json"
+    info = read_json(path)
+    version = info.get("codebase_version")
+    if version not in VERSIONS:
+        raise RecordingError(
+            f"{path}: codebase_version is {version!r}; this reader knows {', '.join(VERSIONS)}. "
+            "Convert the data set with the lerobot release that it names"
+        )
+    fps = number(info, "fps", str(path), positive=True)
+    features = info.get("features")
+    if fps is None or not isinstance(features, dict):
+        raise RecordingError(f"{path}: expected fps and features, found {', '.join(info)}")
+    read = _entries_v3 if version == "v3.0" else _entries_v2
+    try:
+        entries = tuple(sorted(read(root, info, fps), key=lambda entry: entry.index))
+        tasks = _tasks_v3(root) if version == "v3.0" else _tasks_v2(root)
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
+        if isinstance(error, RecordingError):
+            raise
+        raise RecordingError(f"{root / 'meta'}: cannot be understood: {error!r}") from None
+    return Layout(root, version, fps, features, tasks), entries
+
+
+def _view_name(key: str) -> str:
+    for prefix in _VIEW_PREFIXES:
+        if key.startswith(prefix):
+            return key.removeprefix(prefix)
+    return key
+
+
+def _video_keys(info: Mapping[str, Any]) -> list[str]:
+    return [key for key, f in info["features"].items() if f.get("dtype") == "video"]
+
+
+def _entries_v2(root: Path, info: Mapping[str, Any], fps: float) -> Iterator[Entry]:
+    for row in _jsonl(root / "meta" / "episodes.jsonl", ("episode_index", "length")):
+        index = int(row["episode_index"])
+        place = {"episode_index": index, "episode_chunk": index // int(info["chunks_size"])}
+        yield Entry(
+            index=index,
+            length=int(row["length"]),
+            tasks=tuple(row.get("tasks") or ()),
+            data=root / info["data_path"].format(**place),
+            shared=False,
+            videos={
+                key: VideoSpan(root / info["video_path"].format(video_key=key, **place))
+                for key in _video_keys(info)
+            },
+        )
+
+
+def _entries_v3(root: Path, info: Mapping[str, Any], fps: float) -> Iterator[Entry]:
+    folder = root / "meta" / "episodes"
+    files = sorted(folder.glob("chunk-*/file-*.parquet"), key=natural_key)
+    if not files:
+        raise RecordingError(f"{folder}: expected chunk-000/file-000.parquet, found none")
+    keys = _video_keys(info)
+    needed = ["episode_index", "length", "data/chunk_index", "data/file_index"]
+    for key in keys:
+        needed += [f"videos/{key}/{field}" for field in _SPAN_FIELDS]
+    for row in _rows(files, needed):
+        yield Entry(
+            index=row["episode_index"],
+            length=row["length"],
+            tasks=tuple(row.get("tasks") or ()),
+            data=root
+            / info["data_path"].format(
+                chunk_index=row["data/chunk_index"], file_index=row["data/file_index"]
+            ),
+            shared=True,
+            videos={key: _span_v3(root, info, row, key, fps) for key in keys},
+        )
+
+
+_SPAN_FIELDS = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
+
+
+def _span_v3(
+    root: Path, info: Mapping[str, Any], row: Mapping[str, Any], key: str, fps: float
+) -> VideoSpan:
+    chunk, file, begin, end = (row[f"videos/{key}/{field}"] for field in _SPAN_FIELDS)
+    path = info["video_path"].format(video_key=key, chunk_index=chunk, file_index=file)
+    # Rounded to frame numbers: the timestamps are inexact sums such as 36.900000000000006.
+    return VideoSpan(root / path, round(begin * fps), round((end - begin) * fps))
+
+
+def _tasks_v2(root: Path) -> dict[int, str]:
+    path = root / "meta" / "tasks.jsonl"
+    if not path.is_file():
+        return {}
+    rows = _jsonl(path, ("task_index", "task"))
+    return {int(row["task_index"]): str(row["task"]) for row in rows}
+
+
+def _tasks_v3(root: Path) -> dict[int, str]:
+    path = root / "meta" / "tasks.parquet"
+    if not path.is_file():
+        return {}
+    rows = list(_rows([path], ["task_index"]))
+    text = next((name for name in _V3_TEXT if rows and name in rows[0]), None)
+    return {row["task_index"]: row[text] for row in rows} if text else {}
+
+
+def _rows(files: Sequence[Path], needed: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """Rows of parquet files of `meta/`, statistics left out."""
+    for path in files:
+        try:
+            with pq.ParquetFile(path) as file:
+                columns = [n for n in file.schema_arrow.names if not n.startswith("stats/")]
+                missing = [name for name in needed if name not in columns]
+                if missing:
+                    raise RecordingError(
+                        f"{path}: missing column(s) {', '.join(missing)}; "
+                        f"it has {', '.join(columns)}"
+                    )
+                rows = file.read(columns=columns).to_pylist()
+        except (pa.ArrowException, OSError) as error:
+            raise RecordingError(f"{path}: cannot be read as parquet: {error}") from None
+        for place, row in enumerate(rows):
+            empty = [name for name in needed if row[name] is None]
+            if empty:
+                raise RecordingError(f"{path}, row {place}: {', '.join(empty)} is null")
+            yield row
+
+
+def _jsonl(path: Path, needed: Sequence[str]) -> Iterator[dict[str, Any]]:
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise RecordingError(f"{path}: cannot be read: {error}") from None
+    for place, line in enumerate(lines, start=1):
+        if not line.strip():
+            continue
+        try:
+            row = json.loads(line)
+        except ValueError as error:
+            raise RecordingError(f"{path}, line {place}: not JSON: {error}") from None
+        if not isinstance(row, dict) or any(key not in row for key in needed):
+            raise RecordingError(
+                f"{path}, line {place}: expected an object with {', '.join(needed)}"
+            )
+        yield row

@@ -1,0 +1,190 @@
+"""Frames of a video file, by number, decoded one at a time.
+
+LeRobot pairs rows with frames by number. A frame's number is its rank by presentation time in its
+clip: the whole file, or the part of a shared file that holds one episode.
+"""
+
+import sys
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+from av.container import InputContainer
+from av.video.frame import VideoFrame
+from av.video.stream import VideoStream
+from numpy.typing import NDArray
+
+from pipeline.errors import RecordingError
+from pipeline.recordings.recording import CameraStream
+
+_AV1_DECODERS = frozenset({"libdav1d", "libaom-av1", "libgav1"})
+
+
+@dataclass(frozen=True)
+class VideoSpan:
+    """Which frames of a file are an episode's: all of them where `first` is None."""
+
+    path: Path
+    first: int | None = None
+    count: int | None = None
+    """How many the metadata says there are; None where it does not say."""
+
+
+@dataclass(frozen=True)
+class _FrameTable:
+    """Per frame of the clip, in order of presentation."""
+
+    pts: NDArray[np.int64]
+    key_pts: NDArray[np.int64]
+    """Of the key frame from which decoding has to start."""
+    key_dts: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class _Packet:
+    """What the container says of a frame."""
+
+    pts: int
+    key_pts: int
+    key_dts: int
+
+
+class VideoClip(CameraStream):
+    """A view whose frames are those of a video; `time` has one entry per row of the episode."""
+
+    def __init__(self, view: str, time: NDArray[np.float64], span: VideoSpan, fps: float) -> None:
+        self.view = view
+        self.time = time
+        self._span = span
+        self._fps = fps
+
+    def check(self, indices: Sequence[int]) -> None:
+        """Reads every packet of the clip and decodes only the first frame asked for.
+
+        So it finds a missing, truncated or undecodable file and a frame count other than the
+        rows'; damage inside a packet shows in `read`.
+        """
+        for _ in self.read(indices[:1]):
+            pass
+
+    def read(self, indices: Sequence[int]) -> Iterator[NDArray[np.uint8]]:
+        table = self._table
+        with self._open() as (container, stream):
+            decoded: Iterator[VideoFrame] = iter(())
+            at, image = -1, None
+            for index in indices:
+                assert index >= at, "frames are read in never decreasing order"
+                if image is None or index != at:
+                    # Whole groups of pictures between two frames are skipped, not decoded.
+                    if image is None or table.key_pts[index] > table.pts[at + 1]:
+                        container.seek(int(table.key_dts[index]), stream=stream)
+                        decoded = iter(container.decode(stream))
+                    image = self._decode_until(decoded, int(table.pts[index]), index)
+                    at = index
+                yield image
+
+    def _decode_until(
+        self, decoded: Iterator[VideoFrame], pts: int, index: int
+    ) -> NDArray[np.uint8]:
+        said = ""
+        try:
+            for frame in decoded:
+                if frame.pts == pts and not frame.is_corrupt:
+                    return np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
+                if frame.pts is None or frame.pts >= pts:
+                    break
+        except av.FFmpegError as error:
+            said = f" ({error})"
+        raise RecordingError(
+            f"{self._span.path}: frame {index} of view {self.view!r} cannot be decoded{said}; "
+            "the video is damaged there: copy the file again"
+        )
+
+    @cached_property
+    def _table(self) -> _FrameTable:
+        rows, span = len(self.time), self._span
+        with self._open() as (container, stream):
+            packets = list(_packets(container, stream, span, self._fps, rows))
+        for found in (len(packets), span.count):
+            if found is not None and found != rows:
+                raise RecordingError(
+                    f"{span.path}: {found} frames of view {self.view!r} but {rows} rows; they "
+                    "pair by number, so the counts must agree. Copy the video again, or leave "
+                    "the episode out"
+                )
+        packets.sort(key=lambda packet: packet.pts)
+        columns = np.array([(p.pts, p.key_pts, p.key_dts) for p in packets], np.int64)
+        return _FrameTable(*columns.reshape(-1, 3).T)
+
+    @contextmanager
+    def _open(self) -> Generator[tuple[InputContainer, VideoStream], None, None]:
+        path = self._span.path
+        try:
+            with av.open(str(path)) as container:
+                if not container.streams.video:
+                    raise RecordingError(f"{path}: holds no video")
+                stream = container.streams.video[0]
+                _check_decoder(stream, path)
+                stream.codec_context.thread_count = 1
+                yield container, stream
+        except av.FFmpegError as error:
+            raise RecordingError(
+                f"{path}: cannot be read as video: {error}; copy the file again"
+            ) from None
+
+
+def _packets(
+    container: InputContainer, stream: VideoStream, span: VideoSpan, fps: float, rows: int
+) -> Iterator[_Packet]:
+    """The packets of the clip's frames, in decoding order, without decoding any."""
+    if stream.time_base is None:
+        raise RecordingError(f"{span.path}: the video has no time base")
+    start, step = stream.start_time or 0, 1 / (fps * float(stream.time_base))
+    wanted = range(sys.maxsize) if span.first is None else range(span.first, span.first + rows)
+    if wanted.start:
+        _seek_before(container, stream, start + round((wanted.start - 0.5) * step))
+    keys: list[tuple[int, int]] = []
+    for packet in container.demux(stream):
+        if packet.size == 0:
+            continue  # the flush at the end
+        if packet.pts is None or packet.is_corrupt:
+            raise RecordingError(f"{span.path}: a packet is cut off or has no time")
+        dts = packet.pts if packet.dts is None else packet.dts
+        if dts - start > wanted.stop * step:
+            return
+        if packet.is_keyframe:
+            keys = [*keys[-1:], (packet.pts, dts)]
+        if keys and round((packet.pts - start) / step) in wanted:
+            # A frame shown before the newest key frame depends on the key frame before that.
+            yield _Packet(packet.pts, *(keys[-1] if packet.pts >= keys[-1][0] else keys[0]))
+
+
+def _seek_before(container: InputContainer, stream: VideoStream, pts: int) -> None:
+    """Go to a key frame that is shown at or before `pts`.
+
+    A seek goes by decoding times, so the key frame it finds may be shown later.
+    """
+    target = pts
+    while True:
+        container.seek(target, stream=stream)
+        packet = next(packet for packet in container.demux(stream))
+        if packet.pts is None or packet.pts <= pts or packet.dts is None or packet.dts >= target:
+            break
+        target = packet.dts - 1
+    container.seek(target, stream=stream)
+
+
+def _check_decoder(stream: VideoStream, path: Path) -> None:
+    context: Any = stream.codec_context
+    if context is None:
+        raise RecordingError(f"{path}: this PyAV build has no decoder for the video's codec")
+    if context.codec.canonical_name == "av1" and not _AV1_DECODERS & av.codecs_available:
+        raise RecordingError(
+            f"{path}: the video is AV1 and this PyAV build decodes none; "
+            "install a wheel that has libdav1d: pip install --upgrade av"
+        )

@@ -1,0 +1,382 @@
+"""Small synthetic recordings in every format, written as the recorders write them."""
+
+import json
+import pickle
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import av
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from PIL import Image
+
+from pipeline.config import Source
+from pipeline.recordings import Recording, open_recordings
+
+START = 1762581333.25
+STATE_NAMES = [f"joint_{i}" for i in range(1, 7)] + [f"pose_{axis}" for axis in "xyzabr"]
+DATA_PATHS = {
+    "v2.0": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
+    "v3.0": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+}
+VIDEO_PATHS = {
+    "v2.0": "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4",
+    "v3.0": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
+}
+
+
+@dataclass
+class Truth:
+    """What a synthetic insertion episode holds: half a second of every stream."""
+
+    rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
+
+    def __post_init__(self) -> None:
+        self.state_time = START + 0.001 + np.arange(50) / 100
+        self.state = self.rng.normal(size=(50, 12)).astype(np.float32)
+        self.sensor_time = START + np.arange(325) / 650
+        self.sensor = self.rng.normal(size=(325, 1026)).astype(np.float32)
+        self.frame_time = START + np.round(np.arange(4) * 0.2, 3)
+        self.action = self.rng.normal(size=(5, 7)).astype(np.float32)
+
+
+def write_jpeg(path: Path, shade: int = 100) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(shaded(shade)).save(path, quality=90)
+    return path
+
+
+def shaded(shade: int, height: int = 48, width: int = 64) -> np.ndarray:
+    """An image whose mean tells which it is."""
+    image = np.full((height, width, 3), shade, np.uint8)
+    image[: height // 2, : width // 2] = 255 - shade
+    return image
+
+
+def write_csv(path: Path, header: Sequence[str], rows: Sequence[Sequence[object]]) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lines = [",".join(header), *(",".join(map(str, row)) for row in rows)]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+def write_raw(
+    folder: Path, truth: Truth, views: Sequence[str] = ("View1", "View5"), sensor: bool = True
+) -> Path:
+    table = zip(truth.state_time, truth.state, strict=True)
+    write_csv(
+        folder / "robot_state_x.csv",
+        ["recv_timestamp", "origin_timestamp", "force_placeholder", *STATE_NAMES],
+        [[repr(float(t) + 9), repr(float(t)), 0.0, *map(float, row)] for t, row in table],
+    )
+    if sensor:
+        np.savez(
+            folder / "sensor_data_x.npz",
+            timestamps=truth.sensor_time,
+            forces=truth.sensor[:, 0],
+            alines=truth.sensor[:, 1:],
+        )
+    for view in views:
+        for frame, time in enumerate(truth.frame_time):
+            write_jpeg(folder / view / f"zed_1_left_{time:.3f}.jpg", 40 * frame)
+    return folder
+
+
+def write_new(
+    folder: Path,
+    truth: Truth,
+    width: int = 65,
+    stride: int = 65,
+    metadata: Mapping[str, Any] | None = None,
+) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    stops = np.arange(width, len(truth.sensor) + 1, stride)
+    np.savez(
+        folder / "sensor_data.npz",
+        timestamps=truth.sensor_time[stops - 1],
+        data=np.stack([truth.sensor[stop - width : stop] for stop in stops]),
+    )
+    np.savez(
+        folder / "robot_states.npz",
+        robot_states=truth.state,
+        joints=truth.state[:, :6],
+        poses=truth.state[:, 6:],
+    )
+    document = {
+        "start_time": START,
+        "sensor_hz": 650,
+        "robot_hz": 100,
+        "camera_views": ["View1", "View2"],
+        "sensor_windows_count": len(stops),
+        "robot_states_count": len(truth.state),
+        **(metadata or {}),
+    }
+    (folder / "metadata.json").write_text(
+        json.dumps({k: v for k, v in document.items() if v is not None})
+    )
+    for view in ("View1", "View2"):
+        for frame, time in enumerate(truth.frame_time):
+            write_jpeg(folder / "images" / view / f"{time:.3f}.jpg", 40 * frame)
+    return folder
+
+
+def write_old(
+    folder: Path,
+    truth: Truth,
+    eyes: Sequence[str] = ("left",),
+    protocol: int = 4,
+    **changes: Any,
+) -> Path:
+    images: dict[str, list[str]] = {"View3": []}
+    for eye in eyes:
+        paths = []
+        for frame, time in enumerate(truth.frame_time):
+            name = f"View1/{eye}/zed_1_{eye}_{time:.3f}.jpg"
+            write_jpeg(folder / name, 40 * frame)
+            paths.append(f"/mnt/robot/dataset/{folder.parent.name}/{folder.name}/{name}")
+        images[f"View1_{eye}"] = paths
+    document = {
+        "action": truth.action,
+        "image": images,
+        "sensor_data": {"force": truth.sensor[:5, :1], "fpi": truth.sensor[:5, 1:]},
+        "instruction": "insert the needle",
+        "metadata": {"robot_hz": 100.0, "action_hz": 10.0},
+        **changes,
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / "data.pkl").open("wb") as file:
+        pickle.dump(document, file, protocol=protocol)
+    return folder
+
+
+def write_video(
+    path: Path,
+    shades: Sequence[int],
+    fps: int = 10,
+    codec: str = "libx264",
+    group: int = 4,
+    b_frames: int = 0,
+) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(path), "w") as container:
+        options = {"g": str(group), "bf": str(b_frames), "preset": "12" if "av1" in codec else ""}
+        if "264" in codec:
+            options |= {"preset": "ultrafast", "sc_threshold": "0"}
+        stream = container.add_stream(
+            codec, rate=fps, options={k: v for k, v in options.items() if v}
+        )
+        if codec == "mpeg4":
+            stream.bit_rate = 4_000_000
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for shade in shades:
+            frame = av.VideoFrame.from_ndarray(shaded(shade), format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return path
+
+
+def shade_of(index: int) -> int:
+    """The shade of frame `index` of a LeRobot data set: tells neighbours apart."""
+    return 20 + 11 * index % 200
+
+
+def png(shade: int) -> bytes:
+    from io import BytesIO
+
+    buffer = BytesIO()
+    Image.fromarray(shaded(shade)).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+def write_lerobot(
+    root: Path,
+    version: str = "v2.1",
+    lengths: Sequence[int] = (7, 5, 9),
+    image: bool = False,
+    group: int = 4,
+    features: Mapping[str, Any] | None = None,
+    file_of: Sequence[int] | None = None,
+    tasks: Sequence[str] = ("pick", "place", "pick"),
+    **columns: Any,
+) -> Path:
+    """A data set at 10 fps with a jittered clock; in v3.0 `file_of` says which file an episode is
+    in (both data and video)."""
+    rng = np.random.default_rng(1)
+    v3 = version == "v3.0"
+    key = "observation.images.top"
+    described = {
+        "observation.state": {"dtype": "float32", "shape": [2], "names": ["a", "b"]},
+        "action": {"dtype": "float32", "shape": [3], "names": [["x", "y", "gripper"]]},
+        key: {"dtype": "image" if image else "video", "shape": [48, 64, 3], "names": None},
+        "timestamp": {"dtype": "float32", "shape": [1], "names": None},
+        **(features or {}),
+    }
+    described = {name: feature for name, feature in described.items() if feature}
+    info = {
+        "codebase_version": version,
+        "fps": 10,
+        "chunks_size": 1000,
+        "features": described,
+        "data_path": DATA_PATHS["v3.0" if v3 else "v2.0"],
+        "video_path": VIDEO_PATHS["v3.0" if v3 else "v2.0"],
+    }
+    (root / "meta").mkdir(parents=True)
+    (root / "meta/info.json").write_text(json.dumps(info))
+    texts = {"place": 7, "pick": 3}
+    tables, first = [], 0
+    for index, length in enumerate(lengths):
+        frames = np.arange(first, first + length)
+        rows = {
+            "observation.state": list(rng.normal(size=(length, 2)).astype(np.float32)),
+            "action": list(rng.normal(size=(length, 3)).astype(np.float32)),
+            "timestamp": (np.arange(length) / 10 + rng.uniform(0, 0.05, length)).astype(np.float32),
+            "frame_index": np.arange(length),
+            "episode_index": np.full(length, index),
+            "index": frames,
+            "task_index": np.full(length, texts[tasks[index]]),
+        }
+        if image:
+            rows[key] = [{"bytes": png(shade_of(f)), "path": None} for f in frames]
+        rows |= columns
+        tables.append(pa.table({k: v for k, v in rows.items() if v is not None}))
+        first += length
+    starts = np.cumsum([0, *lengths])
+    if v3:
+        _write_v3(root, tables, starts, image, group, file_of, tasks, texts, key)
+    else:
+        _write_v2(root, tables, starts, image, group, tasks, texts, key)
+    return root
+
+
+def _write_v2(
+    root: Path,
+    tables: Sequence[pa.Table],
+    starts: np.ndarray,
+    image: bool,
+    group: int,
+    tasks: Sequence[str],
+    texts: Mapping[str, int],
+    key: str,
+) -> None:
+    episodes = []
+    for index, table in enumerate(tables):
+        place = {"episode_chunk": 0, "episode_index": index}
+        path = root / DATA_PATHS["v2.0"].format(**place)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        pq.write_table(table, path)
+        if not image:
+            shades = [shade_of(f) for f in range(starts[index], starts[index + 1])]
+            write_video(
+                root / VIDEO_PATHS["v2.0"].format(video_key=key, **place), shades, 10, group=group
+            )
+        episodes.append({"episode_index": index, "tasks": [tasks[index]], "length": table.num_rows})
+    write_jsonl(root / "meta/episodes.jsonl", episodes)
+    write_jsonl(
+        root / "meta/tasks.jsonl", [{"task_index": i, "task": text} for text, i in texts.items()]
+    )
+
+
+def _write_v3(
+    root: Path,
+    tables: Sequence[pa.Table],
+    starts: np.ndarray,
+    image: bool,
+    group: int,
+    file_of: Sequence[int] | None,
+    tasks: Sequence[str],
+    texts: Mapping[str, int],
+    key: str,
+) -> None:
+    files = file_of or [0] * len(tables)
+    rows: list[dict[str, Any]] = []
+    for file in sorted(set(files)):
+        members = [i for i, f in enumerate(files) if f == file]
+        path = root / DATA_PATHS["v3.0"].format(chunk_index=0, file_index=file)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        pq.write_table(pa.concat_tables([tables[i] for i in members]), path, row_group_size=6)
+        shades = [shade_of(f) for i in members for f in range(starts[i], starts[i + 1])]
+        if not image:
+            place = {"video_key": key, "chunk_index": 0, "file_index": file}
+            write_video(root / VIDEO_PATHS["v3.0"].format(**place), shades, 10, group=group)
+        origin = starts[members[0]]
+        for i in members:
+            row: dict[str, Any] = {
+                "episode_index": i,
+                "length": tables[i].num_rows,
+                "tasks": [tasks[i]],
+                "data/chunk_index": 0,
+                "data/file_index": file,
+                "dataset_from_index": int(starts[i]),
+                "dataset_to_index": int(starts[i + 1]),
+                "stats/action/min": [0.0],
+            }
+            if not image:
+                row |= {
+                    f"videos/{key}/chunk_index": 0,
+                    f"videos/{key}/file_index": file,
+                    # An inexact sum, as LeRobot's own.
+                    f"videos/{key}/from_timestamp": float(starts[i] - origin) * 0.1,
+                    f"videos/{key}/to_timestamp": float(starts[i + 1] - origin) * 0.1,
+                }
+            rows.append(row)
+    path = root / "meta/episodes/chunk-000/file-000.parquet"
+    path.parent.mkdir(parents=True)
+    pq.write_table(pa.Table.from_pylist(rows), path)
+    pq.write_table(
+        pa.table({"task_index": list(texts.values()), "__index_level_0__": list(texts)}),
+        root / "meta/tasks.parquet",
+    )
+
+
+def write_jsonl(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+
+
+def edit_json(path: Path, **changes: Any) -> None:
+    """Lay entries over a JSON object; None removes one."""
+    document = {**json.loads(path.read_text()), **changes}
+    path.write_text(json.dumps({k: v for k, v in document.items() if v is not None}))
+
+
+@pytest.fixture
+def truth() -> Truth:
+    return Truth()
+
+
+@pytest.fixture(scope="session")
+def write() -> SimpleNamespace:
+    """The writers: `write.raw(folder, truth)`, `write.lerobot(root, version)` …"""
+    return SimpleNamespace(
+        raw=write_raw,
+        new=write_new,
+        old=write_old,
+        lerobot=write_lerobot,
+        video=write_video,
+        jpeg=write_jpeg,
+        csv=write_csv,
+        png=png,
+        jsonl=write_jsonl,
+        edit_json=edit_json,
+        shaded=shaded,
+        shade_of=shade_of,
+        START=START,
+        STATE_NAMES=STATE_NAMES,
+    )
+
+
+@pytest.fixture
+def only() -> Callable[..., Recording]:
+    """`only(folder, instruction=…)` opens the one episode below a folder."""
+
+    def open_one(folder: Path, views: Sequence[str] | None = None, **entries: Any) -> Recording:
+        opened = open_recordings([Source(name="s", path=str(folder), **entries)], folder, views)
+        assert not opened.bad, opened.bad
+        (recording,) = opened.recordings
+        return recording
+
+    return open_one

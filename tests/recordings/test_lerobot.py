@@ -1,0 +1,431 @@
+"""LeRobot data sets of the three layouts."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from pipeline.config import Source
+from pipeline.errors import RecordingError
+from pipeline.recordings import open_recordings
+from pipeline.recordings.lerobot import action_kind
+
+VERSIONS = ["v2.0", "v2.1", "v3.0"]
+LENGTHS = (7, 5, 9)
+KEY = "observation.images.top"
+
+
+def opened(root: Path, **entries):
+    return open_recordings([Source(name="s", path=str(root), **entries)], root)
+
+
+def shades(frames) -> list[int]:
+    return [int(frame[-4, -4].mean()) for frame in frames]
+
+
+@pytest.fixture(params=VERSIONS)
+def root(request, tmp_path, write) -> Path:
+    return write.lerobot(tmp_path / "set", request.param)
+
+
+def test_all_layouts_say_the_same(tmp_path, write):
+    sets = [
+        opened(write.lerobot(tmp_path / version, version)).recordings
+        for version in ("v2.0", "v2.1", "v3.0")
+    ]
+    split = write.lerobot(tmp_path / "split", "v3.0", file_of=[0, 1, 1])
+    for one, *others in zip(*sets, opened(split).recordings, strict=True):
+        for other in others:
+            assert other.id == one.id and other.instruction == one.instruction
+            for name in ("state", "action"):
+                a, b = getattr(one, name)(), getattr(other, name)()
+                np.testing.assert_array_equal(a.values, b.values)
+                np.testing.assert_array_equal(a.time, b.time)
+                assert a.channels == b.channels
+            cameras = one.cameras()["top"], other.cameras()["top"]
+            np.testing.assert_array_equal(cameras[0].time, cameras[1].time)
+            np.testing.assert_allclose(
+                *[shades(c.read(range(len(c.time)))) for c in cameras], atol=3
+            )
+
+
+def test_frames_pair_with_rows_by_number(root, write):
+    first = 0
+    for recording, length in zip(opened(root).recordings, LENGTHS, strict=True):
+        camera = recording.cameras()["top"]
+        np.testing.assert_array_equal(camera.time, recording.state().time)
+        expected = [write.shade_of(first + row) for row in range(length)]
+        np.testing.assert_allclose(shades(camera.read(range(length))), expected, atol=3)
+        first += length
+
+
+def test_the_clock_keeps_its_jitter(root):
+    time = opened(root).recordings[2].action().time
+    assert np.ptp(np.diff(time)) > 0.01 and time.dtype == np.float64
+    assert np.array_equal(time, time.astype(np.float32))
+
+
+def test_streams_are_described(root):
+    recording = opened(root).recordings[0]
+    action, state = recording.action(), recording.state()
+    assert action.channels.names == ("x", "y", "gripper") and action.channels.units == ("",) * 3
+    assert (action.kind, action.rate_hz) == ("absolute", 10.0)
+    assert state.channels.names == ("a", "b") and recording.poses() is None
+    assert opened(root, action_kind="delta").recordings[0].action().kind == "delta"
+
+
+@pytest.mark.parametrize(
+    ("names", "kind"),
+    [
+        (["joint_0_vel", "gripper"], "velocity"),
+        (["linear_velocity_x"], "velocity"),
+        (["delta_x", "delta_y", "gripper"], "delta"),
+        (["dx", "dy", "dz", "gripper"], "delta"),
+        (["DX", "droll"], "delta"),
+        (["x", "y", "dxl_3", "drawer"], "absolute"),
+        (["action_0"], "absolute"),
+    ],
+)
+def test_names_tell_the_kind_of_action(names, kind):
+    assert action_kind(names) == kind
+
+
+@pytest.mark.parametrize(
+    ("names", "found"),
+    [
+        (["p", "q"], ("p", "q")),
+        ([["p", "q"]], ("p", "q")),
+        ({"motors": ["p", "q"]}, ("p", "q")),
+        ({"arm": ["p"], "hand": ["q"]}, ("p", "q")),
+        ({"p": 0, "q": 1}, ("p", "q")),
+        (None, ("state_0", "state_1")),
+    ],
+)
+def test_names_come_in_many_shapes(tmp_path, write, names, found):
+    feature = {"dtype": "float32", "shape": [2], "names": names, "units": ["rad", "mm"]}
+    root = write.lerobot(tmp_path / "set", features={"observation.state": feature})
+    channels = opened(root).recordings[0].state().channels
+    assert channels.names == found and channels.units == ("rad", "mm")
+
+
+@pytest.mark.parametrize(
+    ("feature", "message"),
+    [
+        ({"shape": [2], "names": ["p"]}, "1 names for 2 values"),
+        ({"shape": [2], "names": None, "units": ["mm"]}, "1 units for 2 values"),
+        ({"shape": [2, 3], "names": None}, r"shape of one number, found \[2, 3\]"),
+        ({"shape": [3], "names": None}, "2 values in row 0, but its feature has 3"),
+    ],
+)
+def test_a_feature_that_contradicts_itself_is_named(tmp_path, write, feature, message):
+    features = {"observation.state": {"dtype": "float32", **feature}}
+    root = write.lerobot(tmp_path / "set", features=features)
+    with pytest.raises(RecordingError, match=f"observation.state.*{message}"):
+        opened(root).recordings[0].state()
+
+
+def test_a_set_without_state_or_views_or_action(tmp_path, write):
+    root = write.lerobot(tmp_path / "a", features={"observation.state": None, KEY: None})
+    recording = opened(root).recordings[0]
+    assert recording.state() is None and recording.cameras() == {}
+    root = write.lerobot(tmp_path / "b", features={"action": None})
+    with pytest.raises(RecordingError, match=r"no feature 'action'.*observation\.state"):
+        opened(root).recordings[0].action()
+
+
+@pytest.mark.parametrize("column", ["action", "timestamp"])
+@pytest.mark.parametrize("version", VERSIONS)
+def test_a_missing_column_is_named(tmp_path, write, column, version):
+    root = write.lerobot(tmp_path / "set", version, **{column: None})
+    with pytest.raises(RecordingError, match=rf"\.parquet.*missing column '{column}'"):
+        opened(root).recordings[0].action()
+
+
+def test_numbers_in_a_plain_column_are_a_stream_of_one(tmp_path, write):
+    feature = {"dtype": "float32", "shape": [1], "names": None}
+    root = write.lerobot(
+        tmp_path / "set",
+        lengths=(7,),
+        features={"observation.state": feature},
+        **{"observation.state": np.arange(7, dtype=np.float32)},
+    )
+    assert opened(root).recordings[0].state().values[:, 0].tolist() == list(range(7))
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ([[0.0, 1.0]] * 6 + [[0.0]], "1 values in row 6"),
+        ([[0.0, 1.0]] * 6 + [None], "no value in row 6"),
+        ([[0.0, 1.0]] * 6 + [[0.0, None]], "nan in row 6.*'b'"),
+        ([["0", "1"]] * 7, "expected numbers, found string"),
+    ],
+)
+def test_spoilt_rows_are_named(tmp_path, write, values, message):
+    root = write.lerobot(tmp_path / "set", lengths=(7,), **{"observation.state": values})
+    with pytest.raises(RecordingError, match=f"episode_000000.*observation.state.*{message}"):
+        opened(root).recordings[0].state()
+
+
+def test_a_clock_that_goes_backwards_is_named(tmp_path, write):
+    times = np.array([0, 1, 2, 3, 2.5, 5, 6], np.float32)
+    root = write.lerobot(tmp_path / "set", lengths=(7,), timestamp=times)
+    for read in (lambda r: r.state(), lambda r: r.cameras()):
+        with pytest.raises(RecordingError, match=r"timestamp.*goes backwards at row 4"):
+            read(opened(root).recordings[0])
+
+
+def test_instructions_go_by_value_of_the_task_index(root, write):
+    assert [r.instruction for r in opened(root).recordings] == ["pick", "place", "pick"]
+    assert {r.instruction for r in opened(root, instruction="mine").recordings} == {"mine"}
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+@pytest.mark.parametrize("tasks", [[], ["pick", "place"]])
+def test_tasks_that_meta_leaves_open_are_asked_of_the_rows(tmp_path, write, version, tasks):
+    root = write.lerobot(tmp_path / "set", version)
+    if version == "v3.0":
+        path = root / "meta/episodes/chunk-000/file-000.parquet"
+        rows = [{**row, "tasks": tasks} for row in pq.ParquetFile(path).read().to_pylist()]
+        pq.write_table(pa.Table.from_pylist(rows), path)
+    else:
+        path = root / "meta/episodes.jsonl"
+        rows = [json.loads(line) for line in path.read_text().splitlines()]
+        write.jsonl(path, [{**row, "tasks": tasks} for row in rows])
+    assert [r.instruction for r in opened(root).recordings] == ["pick", "place", "pick"]
+
+
+@pytest.mark.parametrize("indices", [[3, 3, 3, 7, 7, 7, 7], [99] * 7])
+def test_a_task_that_is_not_one_asks_for_an_instruction(tmp_path, write, indices):
+    root = write.lerobot(tmp_path / "set", lengths=(7,), task_index=indices)
+    path = root / "meta/episodes.jsonl"
+    write.jsonl(path, [{"episode_index": 0, "tasks": [], "length": 7}])
+    with pytest.raises(RecordingError, match=r"expected one task.*give source 's'"):
+        _ = opened(root).recordings[0].instruction
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_images_in_rows_are_read_lazily(tmp_path, write, version):
+    root = write.lerobot(tmp_path / "set", version, image=True, lengths=(7, 5, 40))
+    camera = opened(root).recordings[2].cameras()["top"]
+    indices = [0, 3, 3, 17, 39, 39]
+    camera.check(indices)
+    assert shades(camera.read(indices)) == [write.shade_of(12 + index) for index in indices]
+
+
+def test_a_spoilt_image_in_a_row_is_named(tmp_path, write):
+    whole = write.png(50)
+    cells = [{"bytes": whole, "path": None}] * 4 + [{"bytes": whole[:90], "path": None}]
+    cells += [{"bytes": None, "path": "a.png"}, {"bytes": whole, "path": None}]
+    root = write.lerobot(tmp_path / "set", image=True, lengths=(7,), **{KEY: cells})
+    camera = opened(root).recordings[0].cameras()["top"]
+    for attempt in (camera.check, lambda indices: list(camera.read(indices))):
+        attempt([0, 3, 6])
+        with pytest.raises(RecordingError, match=rf"parquet, column '{KEY}', row 4: cannot be"):
+            attempt([3, 4])
+        with pytest.raises(RecordingError, match=r"row 5.*no image bytes"):
+            attempt([3, 5])
+
+
+def test_the_sidecar_is_the_sensor(root, truth):
+    (root / "sensor").mkdir()
+    time = np.arange(30) / 50
+    save = lambda index, **members: np.savez(root / f"sensor/episode_{index:06d}.npz", **members)  # noqa: E731
+    save(0, timestamps=time, values=truth.sensor[:30])
+    save(1, timestamps=time, values=truth.sensor[:30, :2])
+    save(2, timestamps=time, values=truth.sensor[:30, :2], names=["fx", "fy"], units=["N", "N"])
+    recordings = opened(root).recordings
+    full, numbered, named = (recording.sensor() for recording in recordings)
+    assert full.channels.names[:2] == ("force", "aline_0000") and full.channels.units[0] == "N"
+    assert numbered.channels.names == ("sensor_0", "sensor_1")
+    assert named.channels.names == ("fx", "fy") and named.channels.units == ("N", "N")
+    np.testing.assert_array_equal(named.values, truth.sensor[:30, :2])
+    assert all(r.path / "sensor" / f"{r.id}.npz" in r.files() for r in recordings)
+    save(0, timestamps=time, values=truth.sensor[:30, :2], names=["fx"])
+    with pytest.raises(RecordingError, match="2 values a reading, but 1 names"):
+        opened(root).recordings[0].sensor()
+    save(0, timestamps=time[:-1], values=truth.sensor[:30])
+    with pytest.raises(RecordingError, match="30 rows but 29 timestamps"):
+        opened(root).recordings[0].sensor()
+
+
+def test_episodes_whose_files_are_absent_are_listed(tmp_path, write):
+    root = write.lerobot(tmp_path / "set")
+    (root / "data/chunk-000/episode_000001.parquet").unlink()
+    (root / f"videos/chunk-000/{KEY}/episode_000002.mp4").unlink()
+    found = opened(root)
+    assert [r.id for r in found.recordings] == ["episode_000000"]
+    assert [line.split()[3].rstrip(",") for line in found.missing] == [
+        "episode_000001",
+        "episode_000002",
+    ]
+    assert "episode_000001.parquet" in found.missing[0] and ".mp4" in found.missing[1]
+    (root / "data/chunk-000/episode_000000.parquet").unlink()
+    with pytest.raises(RecordingError, match="none of the 3 episode"):
+        opened(root)
+
+
+def test_a_video_of_a_view_that_is_not_wanted_may_be_absent(tmp_path, write):
+    feature = {"dtype": "video", "shape": [48, 64, 3], "names": None}
+    root = write.lerobot(tmp_path / "set", features={"observation.images.side": feature})
+    assert len(open_recordings([Source(name="s", path=".")], root, ["top"]).recordings) == 3
+    with pytest.raises(RecordingError, match="none of the 3"):
+        opened(root)
+
+
+def test_shared_files_that_are_absent_take_their_episodes_with_them(tmp_path, write):
+    root = write.lerobot(tmp_path / "set", "v3.0", file_of=[0, 0, 1])
+    (root / f"videos/{KEY}/chunk-000/file-000.mp4").unlink()
+    found = opened(root)
+    assert [r.id for r in found.recordings] == ["episode_000002"] and len(found.missing) == 2
+
+
+def edit_v3(root: Path, **columns) -> None:
+    path = root / "meta/episodes/chunk-000/file-000.parquet"
+    table = pq.ParquetFile(path).read()
+    for name, values in columns.items():
+        place = table.column_names.index(name)
+        table = table.set_column(place, name, pa.array(values))
+    pq.write_table(table, path)
+
+
+def test_a_stale_file_index_is_seen_through(tmp_path, write):
+    root = write.lerobot(tmp_path / "set", "v3.0", file_of=[0, 0, 1])
+    good = [r.state().values for r in opened(root).recordings]
+    edit_v3(root, **{"data/file_index": [0, 0, 0]})
+    recordings = opened(root).recordings
+    for recording, values in zip(recordings, good, strict=True):
+        np.testing.assert_array_equal(recording.state().values, values)
+    assert root / "data/chunk-000/file-001.parquet" in recordings[2].files()
+    (root / "data/chunk-000/file-001.parquet").unlink()
+    with pytest.raises(RecordingError, match=r"file-000.*no row of episode 2"):
+        opened(root).recordings[2].state()
+
+
+def test_stale_global_indices_do_not_matter(tmp_path, write):
+    root = write.lerobot(tmp_path / "set", "v3.0", file_of=[0, 0, 1])
+    good = opened(root).recordings[2].state().values
+    edit_v3(root, dataset_from_index=[0, 7, 0], dataset_to_index=[7, 12, 9])
+    np.testing.assert_array_equal(opened(root).recordings[2].state().values, good)
+
+
+def test_row_counts_that_disagree_with_meta_are_named(root, write):
+    if (root / "meta/episodes.jsonl").exists():
+        rows = [{"episode_index": i, "tasks": ["pick"], "length": 8} for i in range(3)]
+        write.jsonl(root / "meta/episodes.jsonl", rows)
+    else:
+        edit_v3(root, length=[8, 8, 8])
+    with pytest.raises(RecordingError, match=r"\.parquet: 7 rows of episode 0.*says 8"):
+        opened(root).recordings[0].state()
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_frame_counts_that_disagree_are_found_by_check(tmp_path, write, version):
+    root = write.lerobot(tmp_path / "set", version, lengths=(7,))
+    (path,) = root.rglob("*.mp4")
+    write.video(path, [50] * 6)
+    with pytest.raises(RecordingError, match=r"\.mp4: 6 frames of view 'top' but 7 rows"):
+        opened(root).recordings[0].cameras()["top"].check([0])
+
+
+def test_timestamps_of_meta_that_disagree_with_the_rows_are_found_by_check(tmp_path, write):
+    root = write.lerobot(tmp_path / "set", "v3.0")
+    edit_v3(root, **{f"videos/{KEY}/to_timestamp": [0.6, 1.2, 2.1]})
+    with pytest.raises(RecordingError, match="6 frames of view 'top' but 7 rows"):
+        opened(root).recordings[0].cameras()["top"].check([0])
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_a_truncated_parquet_is_named(tmp_path, write, version):
+    root = write.lerobot(tmp_path / "set", version)
+    path = min((root / "data").rglob("*.parquet"))
+    path.write_bytes(path.read_bytes()[:-100])
+    recording = opened(root).recordings[0]
+    for read in (recording.state, recording.action, recording.cameras, recording.files):
+        if version == "v2.1" and read == recording.files:
+            continue
+        with pytest.raises(RecordingError, match=path.name):
+            read()
+
+
+@pytest.mark.parametrize("version", ["v1.6", "v2.2", "v3.1", None, 3])
+def test_an_unknown_version_is_refused(tmp_path, write, version):
+    root = write.lerobot(tmp_path / "set")
+    write.edit_json(root / "meta/info.json", codebase_version=version)
+    with pytest.raises(RecordingError, match=f"'s'.*codebase_version is {version!r}.*v3.0"):
+        opened(root)
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "message"),
+    [
+        ("info.json", "{", "info.json: cannot be read as JSON"),
+        ("info.json", "[]", "expected a JSON object"),
+        ("episodes.jsonl", '{"episode_index": 0, "length": 7}\n{', "episodes.jsonl, line 2"),
+        ("episodes.jsonl", '{"length": 7}', "line 1.*episode_index"),
+        ("episodes.jsonl", '{"episode_index": "a", "length": 7}', "cannot be understood"),
+        ("tasks.jsonl", '{"task": "pick"}', "tasks.jsonl, line 1.*task_index"),
+    ],
+)
+def test_broken_meta_of_v2_is_named(tmp_path, write, file, text, message):
+    root = write.lerobot(tmp_path / "set")
+    (root / "meta" / file).write_text(text)
+    with pytest.raises(RecordingError, match=f"source 's'.*{message}"):
+        opened(root)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"fps": None}, "expected fps and features"),
+        ({"fps": 0}, "fps must be a positive number"),
+        ({"features": []}, "expected fps and features"),
+        ({"data_path": "data/{nonsense}.parquet"}, "nonsense"),
+        ({"data_path": None}, "data_path"),
+    ],
+)
+def test_broken_info_is_named(tmp_path, write, changes, message):
+    root = write.lerobot(tmp_path / "set")
+    write.edit_json(root / "meta/info.json", **changes)
+    with pytest.raises(RecordingError, match=f"source 's'.*{message}"):
+        opened(root)
+
+
+def test_broken_meta_of_v3_is_named(tmp_path, write):
+    root = write.lerobot(tmp_path / "set", "v3.0")
+    path = root / "meta/episodes/chunk-000/file-000.parquet"
+    table = pq.ParquetFile(path).read()
+    pq.write_table(table.drop_columns(["data/file_index"]), path)
+    with pytest.raises(RecordingError, match=r"file-000\.parquet: missing column.*data/file_index"):
+        opened(root)
+    edit = table.set_column(1, "length", pa.array([7, None, 9]))
+    pq.write_table(edit, path)
+    with pytest.raises(RecordingError, match="row 1: length is null"):
+        opened(root)
+    path.write_bytes(path.read_bytes()[:50])
+    with pytest.raises(RecordingError, match="cannot be read as parquet"):
+        opened(root)
+    path.unlink()
+    with pytest.raises(RecordingError, match="expected chunk-000/file-000"):
+        opened(root)
+
+
+def test_episodes_files_of_resumed_recordings_are_all_read(tmp_path, write):
+    root = write.lerobot(tmp_path / "set", "v3.0")
+    path = root / "meta/episodes/chunk-000/file-000.parquet"
+    table = pq.ParquetFile(path).read()
+    pq.write_table(table.slice(0, 1), path)
+    pq.write_table(table.slice(1), path.with_name("file-001.parquet"))
+    assert len(opened(root).recordings) == 3
+
+
+def test_adding_an_episode_leaves_the_files_of_the_others_alone(tmp_path, write):
+    small = opened(write.lerobot(tmp_path / "a", lengths=(7, 5))).recordings
+    large = opened(write.lerobot(tmp_path / "b", lengths=(7, 5, 9))).recordings
+    for one, other in zip(small, large, strict=False):
+        assert [p.name for p in one.files()] == [p.name for p in other.files()]
+        assert one.identity() == other.identity() == ""
+        assert not any("meta" in path.parts for path in one.files())

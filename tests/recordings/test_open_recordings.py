@@ -1,0 +1,155 @@
+"""Finding the episodes of the params' sources."""
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.config import Source
+from pipeline.errors import RecordingError
+from pipeline.recordings import BadEpisode, open_recordings
+
+
+@pytest.fixture
+def root(tmp_path: Path, write, truth) -> Path:
+    """Two tasks and every format; `e10` and `e9` to see natural order."""
+    write.raw(tmp_path / "raw" / "Blue_point" / "e10", truth)
+    write.raw(tmp_path / "raw" / "Blue_point" / "e9", truth, views=("View1",))
+    write.raw(tmp_path / "raw" / "Red_point" / "e9", truth)
+    write.new(tmp_path / "new" / "Blue_point" / "episode_1", truth)
+    write.old(tmp_path / "old" / "White" / "recv_all_1", truth, eyes=("left", "right"))
+    write.lerobot(tmp_path / "sets" / "banana", "v3.0")
+    return tmp_path
+
+
+def names(root: Path, *paths: str, **entries) -> list[str]:
+    path = paths[0] if len(paths) == 1 else paths
+    opened = open_recordings([Source(name="s", path=path, **entries)], root)
+    assert not opened.bad and not opened.missing
+    return [recording.id for recording in opened.recordings]
+
+
+RAW = ["Blue_point/e9", "e10", "Red_point/e9"]
+SET = ["episode_000000", "episode_000001", "episode_000002"]
+
+
+@pytest.mark.parametrize(
+    ("paths", "found"),
+    [
+        (["raw/Blue_point/e9"], ["e9"]),
+        (["raw/Blue_point"], ["e9", "e10"]),
+        (["raw/*/e9"], ["Blue_point/e9", "Red_point/e9"]),
+        (["raw/**/e10"], ["e10"]),
+        (["raw/**"], ["Blue_point/e9", "e10", "Red_point/e9"]),
+        (["raw/*/*", "raw", "raw/Blue_point/**"], ["Blue_point/e9", "e10", "Red_point/e9"]),
+        (["sets/banana"], SET),
+        (["sets/*", "new"], ["episode_1", *SET]),
+        (["old/White/recv_all_?"], ["recv_all_1"]),
+    ],
+)
+def test_paths_globs_and_lists_find_episodes_once_in_natural_order(root, paths, found):
+    ids = names(root, *paths)
+    assert sorted(ids) == sorted(found)
+    if "e10" in ids and "Blue_point/e9" in ids:
+        assert ids.index("Blue_point/e9") < ids.index("e10")
+
+
+def test_a_whole_tree_holds_all_formats(root):
+    opened = open_recordings([Source(name="s", path=".")], root)
+    assert [r.format for r in opened.recordings] == ["new", "old", *["raw"] * 3, *["lerobot"] * 3]
+    assert len({r.id for r in opened.recordings}) == 8
+
+
+def test_an_absolute_path_stands_as_it_is(root, tmp_path_factory):
+    assert names(tmp_path_factory.mktemp("elsewhere"), str(root / "raw" / "Red_point")) == ["e9"]
+
+
+def test_a_symbolic_link_is_the_folder_it_points_to(root):
+    (root / "linked").symlink_to(root / "raw")
+    (root / "raw" / "loop").symlink_to(root / "raw")
+    assert names(root, "linked/**", "raw/*/e9", "raw/Blue_point/e10") == RAW
+
+
+def test_sources_keep_their_order_and_their_names(root):
+    sources = [Source(name=name, path=path) for name, path in (("z", "new"), ("a", "raw"))]
+    opened = open_recordings(sources, root)
+    assert [r.source for r in opened.recordings] == ["z", "a", "a", "a"]
+
+
+def test_ids_of_twins_take_their_parents_names(root, write):
+    write.lerobot(root / "sets" / "apple", "v2.1", lengths=(3,))
+    assert set(names(root, "sets")) == {
+        "apple/episode_000000",
+        "banana/episode_000000",
+        "episode_000001",
+        "episode_000002",
+    }
+
+
+@pytest.mark.parametrize("format", ["raw", "new", "old", "lerobot"])
+def test_an_explicit_format_is_taken_or_refused(root, format):
+    folder = {"lerobot": "sets"}.get(format, format)
+    assert names(root, folder, format=format)
+    other = "new" if format != "new" else "raw"
+    with pytest.raises(RecordingError, match=rf"'s'.*format '{format}'.*looks like '{other}'"):
+        names(root, other, format=format)
+
+
+def test_raw_beside_a_metadata_file_can_be_asked_for(root):
+    (root / "raw/Red_point/e9/metadata.json").write_text("{}")
+    opened = open_recordings([Source(name="s", path="raw/Red_point", format="raw")], root)
+    assert [r.format for r in opened.recordings] == ["raw"]
+
+
+@pytest.mark.parametrize(
+    ("path", "message"),
+    [
+        ("nothing/*", "'nothing/\\*' matches nothing"),
+        ("raw/Blue_point/e9/robot_state_x.csv", "matches nothing"),
+        ("raw/Blue_point/e9/View1", "none with an episode.*metadata.json.*data.pkl.*meta/info"),
+        (("raw", "nowhere"), "'nowhere' matches nothing"),
+    ],
+)
+def test_nothing_found_says_what_was_looked_for(root, path, message):
+    with pytest.raises(RecordingError, match=f"source 's'.*{message}"):
+        open_recordings([Source(name="s", path=path)], root)
+
+
+def test_every_bad_episode_is_listed_and_the_rest_opened(root, truth, write):
+    write.new(root / "new" / "Blue_point" / "episode_2", truth)
+    (root / "new/Blue_point/episode_2/metadata.json").write_text("{")
+    (root / "raw/Red_point/e9/robot_state_x.csv").unlink()
+    opened = open_recordings([Source(name="a", path="new"), Source(name="b", path="raw")], root)
+    assert len(opened.recordings) == 3
+    assert [(bad.source, bad.where.name) for bad in opened.bad] == [("a", "episode_2"), ("b", "e9")]
+    assert all(isinstance(bad, BadEpisode) and str(bad.where) in bad.reason for bad in opened.bad)
+
+
+def test_the_view_filter_keeps_what_is_asked_for(root):
+    sources = [Source(name="s", path=path) for path in ("raw", "new")]
+    opened = open_recordings(sources, root, ["View1", "View5"])
+    assert [list(r.cameras()) for r in opened.recordings] == [
+        ["View1"],
+        ["View1", "View5"],
+        ["View1", "View5"],
+        ["View1"],
+    ]
+    kept = opened.recordings[3].files()
+    assert any("View1" in file.parts for file in kept)
+    assert not any("View2" in file.parts for file in kept)
+
+
+@pytest.mark.parametrize("view", ["View1_right", "top", "View5"])
+def test_a_view_that_only_one_format_has_is_known(root, view):
+    opened = open_recordings([Source(name="s", path=".")], root, [view])
+    assert {view} == {name for r in opened.recordings for name in r.cameras()}
+
+
+def test_a_view_that_nothing_has_is_refused(root):
+    with pytest.raises(RecordingError, match=r"View7.*no recording has.*View1, View1_left.*top"):
+        open_recordings([Source(name="s", path=".")], root, ["View1", "View7"])
+
+
+def test_an_unknown_view_beside_an_unreadable_episode_is_still_refused(root):
+    (root / "old/White/recv_all_1/data.pkl").write_bytes(b"\x80")
+    with pytest.raises(RecordingError, match="View7"):
+        open_recordings([Source(name="s", path=".")], root, ["View7"])

@@ -1,0 +1,90 @@
+"""params.yaml: what is wrong is said at once, with its place."""
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.config import load_params
+from pipeline.errors import ConfigError
+
+ROOT = Path(__file__).resolve().parents[1]
+
+MINIMAL = """
+data: {sources: [{name: demo, path: raw}]}
+vlm: {checkpoint: models/demo_vlm}
+"""
+
+
+@pytest.fixture
+def minimal(tmp_path: Path) -> Path:
+    path = tmp_path / "params.yaml"
+    path.write_text(MINIMAL)
+    return path
+
+
+def test_the_projects_own_params_are_valid():
+    params = load_params(ROOT / "params.yaml")
+    assert params.data.vlm_reuse_count == 3
+    assert [source.name for source in params.data.sources] == ["raw", "new", "old", "lerobot"]
+
+
+def test_overrides_are_yaml_and_reach_any_depth(minimal):
+    params = load_params(
+        minimal,
+        [
+            "data.vlm_reuse_count=5",
+            "data.action_hz=null",
+            'data.sources=[{"name": "a", "path": ["x", "y/*"]}]',
+            "train_head.mixture={a: 3}",
+            "train_head.expert.dim=64",
+            "vlm.prompt={images} {instruction}",
+        ],
+    )
+    assert params.data.vlm_reuse_count == 5
+    assert params.data.action_hz is None
+    assert params.data.sources[0].paths == ("x", "y/*")
+    assert params.train_head.mixture == {"a": 3.0}
+    assert params.train_head.expert.dim == 64
+    assert params.vlm.prompt == "{images} {instruction}"
+
+
+def test_every_problem_is_said_with_its_place(minimal):
+    with pytest.raises(ConfigError) as caught:
+        load_params(minimal, ["train_head.lr=-1", "train_head.lrr=1", "data.vlm_reuse_count=0"])
+    text = str(caught.value)
+    assert "3 problem(s)" in text
+    assert "train_head.lr: Input should be greater than 0 (found -1)" in text
+    assert "train_head.lrr: Extra inputs are not permitted" in text
+    assert "data.vlm_reuse_count" in text
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("lr=1", "expected section.key=value"),
+        ("train_head.lr", "expected section.key=value"),
+        ("data.sources=[", "not YAML"),
+        ("data.sources.path=x", "data.sources is a list"),
+        ("vlm.prompt='{picture}'", "only {instruction} and {images}"),
+        ("vlm.prompt='{images}{images}'", "may stand once"),
+        ("extract.store=cache_store/demo", "ends in .zarr"),
+        ("data.sources=[{name: a, path: x}, {name: a, path: y}]", "stands more than once"),
+        ("train_head.mixture={other: 1}", "mixture names other"),
+        ("extract.workers=2", "extract.workers"),
+    ],
+)
+def test_what_is_refused(minimal, override, message):
+    with pytest.raises(ConfigError) as caught:
+        load_params(minimal, [override])
+    assert message in str(caught.value)
+
+
+def test_a_missing_and_a_broken_file(tmp_path):
+    with pytest.raises(ConfigError, match=r"nowhere\.yaml: no such file.*--params"):
+        load_params(tmp_path / "nowhere.yaml")
+    (tmp_path / "broken.yaml").write_text("data: [")
+    with pytest.raises(ConfigError, match="cannot be read as YAML"):
+        load_params(tmp_path / "broken.yaml")
+    (tmp_path / "list.yaml").write_text("- 1")
+    with pytest.raises(ConfigError, match="expected sections"):
+        load_params(tmp_path / "list.yaml")
