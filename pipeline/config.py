@@ -256,7 +256,10 @@ def _lay_over(document: dict[str, Any], override: str) -> None:
     try:
         value = yaml.safe_load(text)
     except yaml.YAMLError as error:
-        raise ConfigError(f"--set {override}: the value is not YAML: {error}") from None
+        raise ConfigError(
+            f"--set {override}: the value is not YAML (put a text that begins with a brace or a "
+            f"bracket in quotes of its own): {error}"
+        ) from None
     node = document
     for depth, key in enumerate(keys[:-1], start=1):
         child = node.get(key)

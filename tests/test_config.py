@@ -37,7 +37,7 @@ def test_overrides_are_yaml_and_reach_any_depth(minimal):
             'data.sources=[{"name": "a", "path": ["x", "y/*"]}]',
             "train_head.mixture={a: 3}",
             "train_head.expert.dim=64",
-            "vlm.prompt={images} {instruction}",
+            "vlm.prompt='{images} {instruction}'",
         ],
     )
     assert params.data.vlm_reuse_count == 5

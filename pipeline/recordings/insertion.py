@@ -32,6 +32,10 @@ CLOCK = "origin_timestamp"
 class InsertionRecording(FileRecording):
     """An episode folder of the needle-insertion recorder."""
 
+    @property
+    def has_poses(self) -> bool:
+        return robot_state_file(self.path) is not None
+
     def poses(self) -> Stream | None:
         state = self.state()
         if state is None:

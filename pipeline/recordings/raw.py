@@ -46,6 +46,10 @@ class RawRecording(InsertionRecording):
         self._state_file = state_file
         self._sensor_file = self._only(_SENSOR_FILES)
 
+    @property
+    def has_poses(self) -> bool:
+        return True
+
     def state(self) -> Stream:
         return read_state_csv(self._state_file)
 
