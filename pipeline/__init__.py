@@ -1,0 +1,27 @@
+"""Two stages around one store.
+
+    recordings -> timeline -> extraction (vlm) -> store -> sampling -> models -> evaluation
+
+`errors`       what can go wrong, named
+`config`       params.yaml -> Params
+`digests`      content digests of files, remembered
+`durable`      files that survive a kill
+`device`       which device does the tensor maths
+`recordings`   files on disk -> Recording
+`vlm`          the frozen Qwen2.5-VL, and what a feature is
+`store`        the seam: a zarr store that is also a set of flat files
+`normalization` statistics of training ticks
+`models`       encoders, fusion, action experts, policy
+`timeline`     clocks -> ticks
+`simulation`   a simulated needle insertion, and the demo recordings
+`sampling`     split by episode, mixture weights, resumable order
+`checkpoint`   a trained policy on disk
+`batches`      gathered ahead, in a background thread
+`extraction`   recordings x vlm -> store
+`evaluation`   predictions -> figures of merit
+`training`     one loop for every expert
+`plots`        arrays -> pictures
+
+Imports go only upwards in this list, and never within {recordings, vlm, store, normalization,
+models}; `tests/test_architecture.py` keeps that true.
+"""

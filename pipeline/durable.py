@@ -1,0 +1,121 @@
+"""Files and folders that survive a kill: written beside their place, synced, renamed into it."""
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from pipeline.errors import CheckpointIncomplete
+
+
+def replace_folder(folder: Path, write: Callable[[Path], None]) -> None:
+    """Put what `write` writes into a temporary folder at `folder`, in place of what is there.
+
+    A kill leaves the old content or the new, for one instant under the name `<folder>.old`, from
+    where `recover_folder` brings it back. Raises `OSError` of a full disk with the old in place.
+    """
+    recover_folder(folder)
+    temporary, old = _beside(folder, "new"), _beside(folder, "old")
+    temporary.mkdir(parents=True)
+    try:
+        write(temporary)
+        for file in temporary.iterdir():
+            sync(file)
+        sync(temporary)
+    except BaseException:
+        shutil.rmtree(temporary)
+        raise
+    if folder.exists():
+        folder.rename(old)
+    temporary.rename(folder)
+    sync(folder.parent)
+    if old.exists():
+        shutil.rmtree(old)
+
+
+def recover_folder(folder: Path) -> None:
+    """Undo or complete a `replace_folder` that a kill stopped."""
+    temporary, old = _beside(folder, "new"), _beside(folder, "old")
+    if old.exists():
+        if folder.exists():
+            shutil.rmtree(old)
+        else:
+            old.rename(folder)
+    if temporary.exists():
+        shutil.rmtree(temporary)
+
+
+def sync(path: Path) -> None:
+    """Wait until a file's content, or a folder's list of names, is on the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def write_document(path: Path, document: Mapping[str, Any]) -> None:
+    """Write a JSON document, atomically; its floats come back to the bit."""
+    temporary = _beside(path, "new")
+    text = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False)
+    temporary.write_text(text + "\n", encoding="utf-8")
+    sync(temporary)
+    temporary.rename(path)
+
+
+def read_document(path: Path) -> dict[str, Any]:
+    """The JSON document at `path`; `CheckpointIncomplete` when it is missing or not one."""
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise CheckpointIncomplete(
+            f"{path}: no such file. Run stages.train_head, or name another checkpoint."
+        ) from None
+    except ValueError as error:
+        raise CheckpointIncomplete(_damaged(path, error)) from None
+    if not isinstance(document, dict):
+        raise CheckpointIncomplete(_damaged(path, "not a JSON object"))
+    return document
+
+
+def write_tensors(path: Path, tensors: Mapping[str, Tensor]) -> str:
+    """Write tensors as safetensors and return the sha256 of the file."""
+    save_file({name: value.detach().cpu().contiguous() for name, value in tensors.items()}, path)
+    # safetensors writes for the owner alone; other files have what the umask leaves.
+    path.chmod(path.parent.stat().st_mode & 0o666)
+    return _sha256(path)
+
+
+def read_tensors(path: Path, sha256: str) -> dict[str, Tensor]:
+    """The tensors at `path`; `CheckpointIncomplete` when they are not those that were written."""
+    try:
+        if _sha256(path) != sha256:
+            raise CheckpointIncomplete(_damaged(path, "its sha256 is not the one written with it"))
+        return load_file(path)
+    except FileNotFoundError:
+        raise CheckpointIncomplete(_damaged(path, "no such file")) from None
+    except SafetensorError as error:
+        raise CheckpointIncomplete(_damaged(path, error)) from None
+
+
+def _damaged(path: Path, why: object) -> str:
+    return (
+        f"{path}: the checkpoint is damaged: {why}. Remove {path.parent} and run "
+        "stages.train_head again."
+    )
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _beside(path: Path, suffix: str) -> Path:
+    return path.with_name(f"{path.name}.{suffix}")

@@ -1,0 +1,25 @@
+"""A policy judged on recordings it has not seen, beside baselines that see nothing."""
+
+from pipeline.evaluation.held_out import check_store, held_out_ranges, held_out_ticks, judge
+from pipeline.evaluation.predictions import BASELINES, METHODS, Predictions, baselines, predict
+from pipeline.evaluation.scores import Comparison, Group, Scores, compare
+from pipeline.evaluation.tables import metrics, table, write_tables
+
+__all__ = [
+    "BASELINES",
+    "METHODS",
+    "Comparison",
+    "Group",
+    "Predictions",
+    "Scores",
+    "baselines",
+    "check_store",
+    "compare",
+    "held_out_ranges",
+    "held_out_ticks",
+    "judge",
+    "metrics",
+    "predict",
+    "table",
+    "write_tables",
+]

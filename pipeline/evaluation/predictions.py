@@ -1,0 +1,77 @@
+"""What a policy does at recorded ticks, and what simple rules would have done there."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from pipeline.batches import Prefetch, Ticks, Windows
+from pipeline.models import Policy
+from pipeline.store import FeatureStore
+
+Actions = NDArray[np.float32]
+METHODS = ("policy", "zero_action", "mean_action", "repeat_last")
+BASELINES = METHODS[1:]
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """Action chunks at `ticks`, in physical units: (tick, horizon, action_dim).
+
+    `valid` (tick, horizon) is False beyond the end of an episode, where nothing was recorded.
+    """
+
+    ticks: Ticks
+    episodes: NDArray[np.int64]
+    """(tick,) index of each tick's episode in the store."""
+    predicted: Actions
+    recorded: Actions
+    valid: NDArray[np.bool_]
+
+
+def predict(
+    policy: Policy, store: FeatureStore, ticks: Ticks, windows: Windows, batch_size: int
+) -> Predictions:
+    """What the policy, in evaluation mode, does at these ticks, beside what was recorded.
+
+    Runs on the policy's device. Sampling experts draw from a generator of fixed seed, so that the
+    same weights give the same figures.
+    """
+    device = next(policy.parameters()).device
+    generator = torch.Generator(device).manual_seed(0)
+    plan = np.split(ticks, range(batch_size, len(ticks), batch_size))
+    predicted, recorded, valid = [], [], []
+    with torch.inference_mode(), Prefetch(store, plan, windows, device) as batches:
+        for _, batch in batches:
+            action = policy.act(batch, generator=generator)
+            predicted.append(action.float().cpu().numpy())
+            recorded.append(batch.action.cpu().numpy().copy())
+            valid.append(batch.action_valid.cpu().numpy().copy())
+    return Predictions(
+        ticks=ticks,
+        episodes=np.searchsorted(store.array("episode/tick_start"), ticks, side="right") - 1,
+        predicted=np.concatenate(predicted),
+        recorded=np.concatenate(recorded),
+        valid=np.concatenate(valid),
+    )
+
+
+def baselines(
+    store: FeatureStore, predictions: Predictions, mean_action: NDArray[np.floating]
+) -> dict[str, Actions]:
+    """What three rules that see nothing would have done: name -> (tick, 1, action_dim).
+
+    `zero_action`: no motion. `mean_action`: the mean over the training ticks. `repeat_last`: the
+    action of the tick before, the whole chunk long; at an episode's first tick, zero.
+    """
+    ticks = predictions.ticks
+    action = store.array("tick/action")
+    first = ticks == store.array("episode/tick_start")[predictions.episodes]
+    last = np.where(first[:, None], np.float32(0), action[np.maximum(ticks - 1, 0)])
+    zero = np.zeros((len(ticks), 1, action.shape[1]), np.float32)
+    return {
+        "zero_action": zero,
+        "mean_action": zero + np.asarray(mean_action, np.float32),
+        "repeat_last": last[:, None],
+    }

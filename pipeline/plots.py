@@ -1,0 +1,252 @@
+"""Scores and predictions -> pictures; the same numbers give the same bytes.
+
+Every way of acting keeps its colour, marker and line in all pictures (Okabe and Ito's palette,
+which colour-blind readers can tell apart).
+"""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from pipeline.evaluation import METHODS, Comparison, Group, Predictions
+from pipeline.store import Episode, FeatureStore
+
+LABELS = {
+    "policy": "policy",
+    "zero_action": "baseline: zero action",
+    "mean_action": "baseline: mean training action",
+    "repeat_last": "baseline: repeat the last action",
+}
+STYLES: dict[str, dict[str, Any]] = {
+    "policy": {"color": "#0072B2", "marker": "o", "linestyle": "-", "zorder": 5},
+    "zero_action": {"color": "#E69F00", "marker": "s", "linestyle": "--", "fillstyle": "none"},
+    "mean_action": {"color": "#009E73", "marker": "^", "linestyle": "-."},
+    "repeat_last": {"color": "#CC79A7", "marker": "D", "linestyle": ":"},
+}
+RECORDED = "#333333"
+RC: dict[Any, Any] = {
+    "figure.constrained_layout.use": True,
+    "font.size": 10,
+    "axes.titlesize": 11,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#dddddd",
+    "axes.axisbelow": True,
+    "legend.frameon": False,
+}
+TIMELINES = 2
+"""Episodes whose course is drawn: the one the policy follows best, and the one it follows worst."""
+SCATTER_POINTS = 4000
+EPISODE_LINES = 40
+
+
+def write_plots(
+    folder: Path, comparison: Comparison, predictions: Predictions, store: FeatureStore
+) -> list[Path]:
+    """Write the pictures of an evaluation into `folder` and return their paths."""
+    with mpl.rc_context(RC):
+        figures = {
+            "timeline.png": timeline(comparison, predictions, store),
+            "scatter.png": scatter(comparison, predictions),
+            "horizon.png": horizon(comparison, store.action_hz),
+            "episodes.png": episodes(comparison, store),
+        }
+        for name, figure in figures.items():
+            # Without its `Software` entry the file does not change with matplotlib's version.
+            figure.savefig(folder / name, dpi=120, metadata={"Software": None})
+    return [folder / name for name in figures]
+
+
+def timeline(comparison: Comparison, predictions: Predictions, store: FeatureStore) -> Figure:
+    """Recorded and predicted action over time, a row a dimension, a column an episode."""
+    shown = _best_and_worst(comparison)
+    rows = len(comparison.names)
+    figure = _figure(max(5.8 * len(shown) + 0.4, 8.0), 1.15 * rows + 1.4)
+    axes = figure.subplots(rows, len(shown), squeeze=False, sharex="col", sharey="row")
+    for column, (title, index) in enumerate(shown):
+        episode = store.episodes[index]
+        here = predictions.episodes == index
+        time_s = store.array("tick/time")[predictions.ticks[here]]
+        time_s = time_s - store.array("tick/time")[episode.ticks.start]
+        for row, axis in enumerate(axes[:, column]):
+            axis.plot(
+                time_s, predictions.recorded[here, 0, row], color=RECORDED, lw=2.2, label="recorded"
+            )
+            axis.plot(
+                time_s,
+                predictions.predicted[here, 0, row],
+                color=STYLES["policy"]["color"],
+                lw=1.6,
+                label="policy, next action",
+            )
+        axes[0, column].set_title(f"{title}: {_short(episode)}")
+        axes[-1, column].set_xlabel("time since the episode began [s]")
+    for row, axis in enumerate(axes[:, 0]):
+        axis.set_ylabel(_with_unit(comparison.names[row], comparison.units[row]))
+        _readable_range(axis, comparison.scale[row])
+    figure.align_ylabels(axes[:, 0])
+    _legend(figure, axes[0, 0], 2)
+    figure.suptitle("Held-out episodes: the recorded action, and what the policy would do next")
+    return figure
+
+
+def scatter(comparison: Comparison, predictions: Predictions) -> Figure:
+    """Predicted against recorded next action, a panel a dimension; on the diagonal it is right."""
+    dimensions = _varying(comparison)
+    count = len(dimensions)
+    columns = min(4, count)
+    lines = math.ceil(count / columns)
+    figure = _figure(3.1 * columns, 3.1 * lines + 0.5)
+    axes = figure.subplots(lines, columns, squeeze=False).ravel()
+    step = math.ceil(len(predictions.ticks) / SCATTER_POINTS)
+    for axis in axes[count:]:
+        axis.set_axis_off()
+    for index, axis in zip(dimensions, axes, strict=False):
+        recorded = predictions.recorded[::step, 0, index]
+        predicted = predictions.predicted[::step, 0, index]
+        low, high = _padded(np.concatenate([recorded, predicted]))
+        axis.plot([low, high], [low, high], color=RECORDED, lw=1, zorder=1)
+        axis.scatter(
+            recorded, predicted, s=9, alpha=0.35, linewidths=0, color=STYLES["policy"]["color"]
+        )
+        axis.set(xlim=(low, high), ylim=(low, high), aspect="equal")
+        unit = comparison.units[index]
+        axis.set_title(_with_unit(comparison.names[index], unit))
+        axis.set_xlabel(_with_unit("recorded", unit))
+        axis.set_ylabel(_with_unit("policy", unit))
+    figure.suptitle("Next action at held-out ticks: on the line, the policy does what was recorded")
+    return figure
+
+
+def horizon(comparison: Comparison, action_hz: float | None) -> Figure:
+    """Mean absolute error by how far ahead an action lies, a panel an action group."""
+    groups = _varying_groups(comparison)
+    figure = _figure(max(4.6 * len(groups), 8.5), 4.4)
+    axes = figure.subplots(1, len(groups), squeeze=False)[0]
+    for axis, group in zip(axes, groups, strict=True):
+        for method in METHODS:
+            errors = group.mean(comparison.scores[method].mae_horizon)
+            axis.plot(np.arange(len(errors)), errors, label=LABELS[method], **_marked(method))
+        axis.set_title(_title(comparison, group))
+        axis.set_xlabel(
+            "steps ahead" if action_hz is None else f"steps ahead [{1000 / action_hz:.0f} ms each]"
+        )
+        axis.set_ylabel(_with_unit("mean absolute error", group.unit))
+        axis.set_ylim(bottom=0)
+        axis.xaxis.get_major_locator().set_params(integer=True)
+    _legend(figure, axes[0], len(METHODS))
+    figure.suptitle("Error over the action chunk on held-out ticks (lower is better)")
+    return figure
+
+
+def episodes(comparison: Comparison, store: FeatureStore) -> Figure:
+    """Mean absolute error of each held-out episode, a panel an action group, worst on top."""
+    order = np.argsort(_overall_by_episode(comparison), kind="stable")
+    if len(order) > EPISODE_LINES:
+        order = order[np.linspace(0, len(order) - 1, EPISODE_LINES).round().astype(int)]
+    groups = _varying_groups(comparison)
+    figure = _figure(max(3.6 * len(groups) + 3, 9.0), 0.3 * len(order) + 2)
+    axes = figure.subplots(1, len(groups), squeeze=False, sharey=True)[0]
+    lines = np.arange(len(order))
+    for axis, group in zip(axes, groups, strict=True):
+        for method in METHODS:
+            errors = group.mean(comparison.scores[method].mae_episode)[order]
+            axis.plot(errors, lines, label=LABELS[method], **_marked(method) | {"linestyle": ""})
+        axis.set_title(_title(comparison, group))
+        axis.set_xlabel(_with_unit("mean absolute error", group.unit))
+        axis.set_xlim(left=0)
+    axes[0].set_yticks(lines, [_short(store.episodes[comparison.episodes[i]]) for i in order])
+    axes[0].set_ylim(-0.6, len(order) - 0.4)
+    _legend(figure, axes[0], len(METHODS))
+    some = (
+        f" ({len(order)} of {len(comparison.episodes)})"
+        if len(order) < len(comparison.episodes)
+        else ""
+    )
+    figure.suptitle(f"Error of each held-out episode{some}, worst on top (left is better)")
+    return figure
+
+
+def _figure(width: float, height: float) -> Figure:
+    figure = Figure(figsize=(width, height))
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _marked(method: str) -> dict[str, Any]:
+    wide = method == "policy"
+    # An open, larger square stays visible where the mean action is next to no motion.
+    size = {"policy": 6.5, "zero_action": 8.5}.get(method, 5)
+    return STYLES[method] | {"linewidth": 2.4 if wide else 1.5, "markersize": size}
+
+
+def _legend(figure: Figure, axis: Axes, columns: int) -> None:
+    handles, labels = axis.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns)
+
+
+def _title(comparison: Comparison, group: Group) -> str:
+    names = ", ".join(comparison.names[index] for index in group.dimensions[:6])
+    more = " …" if len(group.dimensions) > 6 else ""
+    return f"{group.name} ({names}{more})"
+
+
+def _varying(comparison: Comparison) -> list[int]:
+    """The dimensions that vary in training; all, where none does."""
+    varying = np.flatnonzero(comparison.scale > 0).tolist()
+    return varying or list(range(len(comparison.names)))
+
+
+def _varying_groups(comparison: Comparison) -> list[Group]:
+    """The groups with something to predict: one that never varies would fill a panel with 0."""
+    varying = set(_varying(comparison))
+    return [group for group in comparison.groups if varying & set(group.dimensions)]
+
+
+def _best_and_worst(comparison: Comparison) -> list[tuple[str, int]]:
+    order = np.argsort(_overall_by_episode(comparison), kind="stable")
+    if len(order) == 1:
+        return [("the held-out episode", comparison.episodes[0])]
+    return [
+        ("lowest error", comparison.episodes[order[0]]),
+        ("highest error", comparison.episodes[order[-1]]),
+    ][:TIMELINES]
+
+
+def _overall_by_episode(comparison: Comparison) -> NDArray[np.float64]:
+    errors = comparison.scores["policy"].mae_episode
+    varying = _varying(comparison)
+    scale = comparison.scale[varying]
+    return (errors[:, varying] / np.where(scale > 0, scale, 1)).mean(axis=1)
+
+
+def _readable_range(axis: Axes, scale: float) -> None:
+    """Keep a channel that never varies from filling its panel with rounding noise."""
+    if scale == 0:
+        low, high = axis.get_ylim()
+        middle = (low + high) / 2
+        half = max((high - low) / 2, 0.1 * max(1.0, abs(middle)))
+        axis.set_ylim(middle - half, middle + half)
+
+
+def _padded(values: NDArray[np.floating]) -> tuple[float, float]:
+    low, high = float(values.min()), float(values.max())
+    margin = max(0.05 * (high - low), 0.02 * max(abs(low), abs(high)), 1e-6)
+    return low - margin, high + margin
+
+
+def _short(episode: Episode) -> str:
+    name = f"{episode.source}/{episode.id}"
+    return name if len(name) <= 44 else f"{name[:14]}…{name[-28:]}"
+
+
+def _with_unit(name: str, unit: str) -> str:
+    return f"{name} [{unit}]" if unit else name

@@ -1,0 +1,91 @@
+"""What a run writes down while it goes: curves for DVC, speed beside them."""
+
+import csv
+import time
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from dvclive import Live
+
+from pipeline.batches import Prefetch
+
+Row = tuple[int, Mapping[str, float]]
+"""A step, counted from 1, and metrics by name."""
+
+SPEED = "speed.tsv"
+
+
+class _Curves(Live):
+    """dvclive's files without its repository.
+
+    On start dvclive looks for git and DVC around the working directory: it fails in a repository
+    without a commit and runs `dvc init` in one that does not use DVC. All of that serves
+    experiments (`save_dvc_exp`), which DVC itself makes here, from the outputs in dvc.yaml.
+    """
+
+    def _init_dvc(self) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        self._dvc_file = "dvc.yaml"
+
+
+class TrainingLog:
+    """Curves in `<folder>/plots/metrics/*.tsv`, their newest values in `<folder>/metrics.json`.
+
+    What came before a stop is given back as `earlier` and written again: DVC may have deleted the
+    folder since, and a run that was killed has logged steps beyond its last checkpoint. Speed goes
+    to `speed.tsv`, so that the files DVC tracks hold nothing of the clock.
+    """
+
+    def __init__(self, folder: Path, earlier: Iterable[Row] = ()) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self.rows: list[Row] = []
+        self._live = _Curves(str(folder), resume=False, dvcyaml=None, save_dvc_exp=False)
+        self._speed = (folder / SPEED).open("w", encoding="utf-8", newline="")
+        self._writer = csv.writer(self._speed, delimiter="\t")
+        self._writer.writerow(["step", "steps_per_s", "data_wait_share"])
+        for step, metrics in earlier:
+            self.write(step, metrics)
+
+    def write(self, step: int, metrics: Mapping[str, float]) -> None:
+        """Add a point to each of these curves."""
+        self.rows.append((step, dict(metrics)))
+        self._live.step = step
+        for name, value in metrics.items():
+            self._live.log_metric(name, value)
+        self._live.make_summary()
+
+    def write_speed(self, step: int, steps_per_s: float, data_wait_share: float) -> None:
+        """Add a line to `speed.tsv`; the share is the time spent waiting for batches."""
+        self._writer.writerow([step, f"{steps_per_s:.3f}", f"{data_wait_share:.4f}"])
+        self._speed.flush()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._speed.close()
+        self._live.end()
+
+
+class Speed:
+    """Steps a second and the share of time spent waiting for batches, since the last reading."""
+
+    def __init__(self, batches: Prefetch, step: int) -> None:
+        self._batches = batches
+        self._step = step
+        self._time, self._waited = time.perf_counter(), batches.waited_s
+
+    def read(self, step: int) -> tuple[float, float]:
+        """Both figures at this step."""
+        now, waited = time.perf_counter(), self._batches.waited_s
+        elapsed = max(now - self._time, 1e-9)
+        steps = step - self._step
+        figures = steps / elapsed, (waited - self._waited) / elapsed
+        self._step, self._time, self._waited = step, now, waited
+        return figures

@@ -1,0 +1,60 @@
+"""Predictions over a small store, without a policy."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.evaluation import Comparison, Group, Predictions, baselines, compare
+from pipeline.store import FeatureStore
+
+GROUPS = (
+    Group("translation", "mm", (0, 1, 2)),
+    Group("rotation", "deg", (3,)),
+    Group("gripper", "", (4,)),
+)
+
+
+@pytest.fixture(scope="session")
+def store(
+    tiny_store: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory
+) -> FeatureStore:
+    return FeatureStore.open(tiny_store(tmp_path_factory.mktemp("evaluation")))
+
+
+@pytest.fixture
+def recorded(store: FeatureStore) -> Callable[..., Predictions]:
+    """`recorded(ticks, error=0)`: a policy that does what was recorded, plus `error`."""
+
+    def make(ticks: np.ndarray, error: float | np.ndarray = 0.0, horizon: int = 4) -> Predictions:
+        batch = store.gather(ticks, horizon=horizon)
+        action = batch.action.numpy()
+        return Predictions(
+            ticks=ticks,
+            episodes=ticks // 30,
+            predicted=(action + error).astype(np.float32),
+            recorded=action,
+            valid=batch.action_valid.numpy(),
+        )
+
+    return make
+
+
+@pytest.fixture
+def compared(store: FeatureStore) -> Callable[[Predictions], Comparison]:
+    """The comparison of predictions with the baselines, statistics over the whole store."""
+
+    def make(predictions: Predictions) -> Comparison:
+        action = store.array("tick/action").astype(np.float64)
+        spread = np.where(action.std(0) > 1e-9, action.std(0), 0)
+        return compare(
+            predictions,
+            baselines(store, predictions, action.mean(0)),
+            store.streams["action"]["names"],
+            store.streams["action"]["units"],
+            GROUPS,
+            spread,
+        )
+
+    return make

@@ -1,0 +1,47 @@
+"""The ticks a checkpoint says it has not seen are found again, or refused by name."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.errors import CheckpointMismatch
+from pipeline.evaluation import held_out_ranges, held_out_ticks
+from pipeline.evaluation.held_out import groups_of
+from pipeline.sampling import split_by_episode
+from pipeline.store import FeatureStore
+
+
+@pytest.mark.parametrize("episodes", [1, 2, 6])
+def test_the_split_is_found_again(
+    tiny_store: Callable[..., Path], tmp_path: Path, episodes: int
+) -> None:
+    store = FeatureStore.open(tiny_store(tmp_path, episodes=episodes))
+    split = split_by_episode(store, 0.3)
+    ranges = held_out_ranges(store, split.held_out)
+    assert tuple(sorted(ranges)) == split.held_out_episodes
+    assert np.array_equal(held_out_ticks(store, ranges), split.held_out)
+    if episodes == 1:
+        assert ranges == {"left/episode_000": (24, 30)}
+
+
+def test_episodes_that_are_gone_or_shorter_are_named(store: FeatureStore) -> None:
+    assert held_out_ticks(store, {"right/episode_001": (10, 30)}).tolist() == list(range(40, 60))
+    with pytest.raises(CheckpointMismatch, match=r"lacks 2 of the 3 episodes.*left/gone, left/epi"):
+        held_out_ticks(
+            store,
+            {"left/gone": (0, 3), "left/episode_000": (0, 31), "right/episode_001": (0, 30)},
+        )
+    with pytest.raises(CheckpointMismatch, match="val_fraction 0"):
+        held_out_ticks(store, {})
+
+
+def test_groups_share_a_unit() -> None:
+    groups = groups_of(["x", "roll", "y", "gripper", "j1"], ["mm", "deg", "mm", "", "rad"])
+    assert [(group.key, group.dimensions) for group in groups] == [
+        ("translation_mm", (0, 2)),
+        ("rotation_deg", (1,)),
+        ("gripper", (3,)),
+        ("rotation_rad", (4,)),
+    ]

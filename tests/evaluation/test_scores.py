@@ -1,0 +1,136 @@
+"""Errors and baselines against values worked out by hand."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.batches import Windows
+from pipeline.evaluation import Comparison, Group, Predictions, baselines, compare, predict
+from pipeline.store import FeatureStore
+
+Recorded = Callable[..., Predictions]
+Compared = Callable[[Predictions], Comparison]
+
+
+def test_the_baselines_are_the_rules_they_are_named_after(
+    store: FeatureStore, recorded: Recorded
+) -> None:
+    action = store.array("tick/action")
+    mean = np.array([1.0, 2.0, 3.0, 4.0, 5.0])
+    found = baselines(store, recorded(np.array([0, 1, 29, 30, 31])), mean)
+    assert np.array_equal(found["zero_action"], np.zeros((5, 1, 5)))
+    assert np.array_equal(found["mean_action"], np.tile(mean, (5, 1, 1)))
+    nothing = np.zeros(5)
+    # Ticks 0 and 30 begin episodes: what the other episode did last is not theirs to repeat.
+    expected = [nothing, action[0], action[28], nothing, action[30]]
+    assert np.array_equal(found["repeat_last"][:, 0], expected)
+
+
+def test_a_perfect_policy_has_no_error(recorded: Recorded, compared: Compared) -> None:
+    comparison = compared(recorded(np.arange(60)))
+    score = comparison.scores["policy"]
+    for errors in (score.mae, score.rmse, score.mae_horizon, score.rmse_horizon, score.mae_episode):
+        assert np.array_equal(errors, np.zeros_like(errors))
+    assert comparison.overall("policy") == 0
+    assert comparison.relative() == 0
+    assert comparison.overall("zero_action") > 0
+
+
+def test_errors_worked_out_by_hand() -> None:
+    recorded = np.zeros((2, 2, 2), np.float32)
+    predicted = np.array([[[1, 10], [3, 20]], [[5, 30], [99, 99]]], np.float32)
+    predictions = Predictions(
+        ticks=np.array([4, 9]),
+        episodes=np.array([2, 7]),
+        predicted=predicted,
+        recorded=recorded,
+        valid=np.array([[True, True], [True, False]]),  # the second chunk leaves its episode
+    )
+    groups = (Group("both", "mm", (0, 1)),)
+    rules = {name: np.full((2, 1, 2), 30, np.float32) for name in ("zero_action", "mean_action")}
+    rules["repeat_last"] = np.full((2, 1, 2), -13, np.float32)
+    found = compare(predictions, rules, ["x", "y"], ["mm", "mm"], groups, np.array([2.0, 10.0]))
+    score = found.scores["policy"]
+    assert found.episodes == (2, 7)
+    assert score.mae == pytest.approx([3, 20])
+    assert score.rmse == pytest.approx(np.sqrt([35 / 3, 1400 / 3]))
+    assert score.mae_horizon == pytest.approx(np.array([[3, 20], [3, 20]]))
+    assert score.rmse_horizon == pytest.approx(np.sqrt([[13, 500], [9, 400]]))
+    assert score.mae_episode == pytest.approx(np.array([[2, 15], [5, 30]]))
+    assert found.group_mae("policy", groups[0]) == pytest.approx(11.5)
+    assert found.group_rmse("policy", groups[0]) == pytest.approx(np.sqrt(1435 / 6))
+    assert found.overall("policy") == pytest.approx((3 / 2 + 20 / 10) / 2)
+    assert found.relative(groups[0]) == pytest.approx(11.5 / 13)
+    assert found.relative() == pytest.approx(1.75 / ((13 / 2 + 13 / 10) / 2))
+
+
+def test_a_horizon_no_episode_reaches_has_no_error_and_counts_nowhere(
+    recorded: Recorded, compared: Compared
+) -> None:
+    last = recorded(np.array([29, 59]), error=1.0)
+    score = compared(last).scores["policy"]
+    assert score.mae == pytest.approx(np.ones(5))
+    assert np.isnan(score.mae_horizon[1:]).all()
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), ticks=st.integers(1, 12), horizon=st.integers(1, 4))
+def test_what_lies_beyond_an_episode_changes_no_score(seed: int, ticks: int, horizon: int) -> None:
+    rng = np.random.default_rng(seed)
+    shape = (ticks, horizon, 3)
+    valid = np.arange(horizon) < rng.integers(1, horizon + 1, (ticks, 1))
+    clean = rng.normal(size=shape).astype(np.float32)
+    dirty = np.where(valid[..., None], clean, np.float32(1e9))
+    groups = (Group("all", "", (0, 1, 2)),)
+    scores = []
+    for predicted in (clean, dirty):
+        predictions = Predictions(
+            np.arange(ticks), np.arange(ticks) // 3, predicted, np.zeros(shape, np.float32), valid
+        )
+        nothing = {
+            name: np.zeros((ticks, 1, 3), np.float32)
+            for name in ("zero_action", "mean_action", "repeat_last")
+        }
+        found = compare(predictions, nothing, "abc", ["", "", ""], groups, np.ones(3))
+        scores.append(found.scores["policy"])
+    for name in vars(scores[0]):
+        assert np.array_equal(getattr(scores[0], name), getattr(scores[1], name), equal_nan=True)
+
+
+def test_a_group_that_never_varies_is_not_compared_and_weighs_nothing(
+    recorded: Recorded, compared: Compared
+) -> None:
+    error = np.array([0, 0, 0, 0, 5.0])
+    comparison = compared(recorded(np.arange(60), error))
+    gripper = comparison.groups[2]
+    assert comparison.relative(gripper) is None
+    assert comparison.group_mae("policy", gripper) == pytest.approx(5.0)
+    assert comparison.overall("policy") == pytest.approx(0.0, abs=1e-6)
+
+
+class FirstFeature(torch.nn.Module):
+    """Acts by the batch alone, so that what `predict` hands to it shows in what comes out."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.ones(1))
+
+    def act(self, batch, generator=None):
+        return batch.features[:, :1, :1].expand(-1, 4, 5) * self.weight
+
+
+@pytest.mark.parametrize("batch_size", [1, 7, 64])
+def test_predictions_belong_to_their_ticks(store: FeatureStore, batch_size: int) -> None:
+    ticks = np.arange(25, 65)
+    windows = Windows(horizon=4, sensor_window=2, state_window=2)
+    found = predict(FirstFeature(), store, ticks, windows, batch_size)  # type: ignore[arg-type]
+    rows = store.array("tick/vl_row")[ticks]
+    assert np.array_equal(found.predicted[:, 0, 0], store.array("vl/features")[rows, 0, 0])
+    expected = store.gather(ticks, horizon=4)
+    assert np.array_equal(found.recorded, expected.action.numpy())
+    assert np.array_equal(found.valid, expected.action_valid.numpy())
+    assert found.episodes.tolist() == [0] * 5 + [1] * 30 + [2] * 5

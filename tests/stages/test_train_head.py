@@ -1,0 +1,229 @@
+"""The command: what it prints, how it stops, what it needs."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from stages import evaluate, train_head
+
+ROOT = Path(train_head.__file__).parents[1]
+WITHOUT_VLM = """
+import sys
+
+class Blocker:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in ("transformers", "peft"):
+            raise ImportError(f"{name} is not there")
+
+sys.meta_path.insert(0, Blocker())
+from stages import evaluate, train_head
+sys.exit(train_head.main(["--params", sys.argv[1]]) or evaluate.main(["--params", sys.argv[1]]))
+"""
+SLOWED = """
+import sys, time
+from pipeline.training import Trainer
+from stages import train_head
+
+step = Trainer._train_step
+def slow(self, batch):
+    step(self, batch)
+    print("step", self.step, flush=True)
+    time.sleep(0.02)
+Trainer._train_step = slow
+sys.exit(train_head.main(["--params", sys.argv[1]]))
+"""
+
+
+@pytest.fixture
+def write_params(tiny_store: Callable[..., Path], tmp_path: Path) -> Callable[..., Path]:
+    """`write_params(train_head={...}, store={...})`: a params.yaml on a small store."""
+
+    def write(name: str = "params", store: dict[str, Any] | None = None, **head: Any) -> Path:
+        place = tmp_path / f"{name}.zarr"
+        if not place.exists():
+            tiny_store(tmp_path, name=name, **(store or {}))
+        small = {
+            "sensor_encoder": {"channels": [8], "layers": 0, "heads": 1, "output_dim": 8},
+            "state_encoder": {"dim": 8, "layers": 0, "heads": 1, "output_dim": 8},
+            "expert": {"dim": 8, "layers": 1, "heads": 1},
+            "horizon": 3,
+            "sensor_window": 6,
+            "state_window": 5,
+            "batch_size": 8,
+            "max_steps": 30,
+            "warmup_steps": 3,
+            "eval_every": 10,
+            "checkpoint_every": 4,
+            "device": "cpu",
+            "output": str(tmp_path / name / "head"),
+            "logs": str(tmp_path / name / "logs"),
+        }
+        document = {
+            "data": {"sources": [{"name": "left", "path": "a"}, {"name": "right", "path": "b"}]},
+            "vlm": {"checkpoint": "unused"},
+            "extract": {"store": str(place)},
+            "train_head": small | head,
+            "evaluate": {
+                "checkpoint": str(tmp_path / name / "head"),
+                "output": str(tmp_path / name / "report"),
+                "device": "cpu",
+            },
+        }
+        path = tmp_path / f"{name}.yaml"
+        path.write_text(yaml.safe_dump(document))
+        return path
+
+    return write
+
+
+def python(code: str, params: Path) -> "subprocess.Popen[str]":
+    return subprocess.Popen(
+        [sys.executable, "-c", code, str(params)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+    )
+
+
+def wait_for(process: "subprocess.Popen[str]", line: str) -> None:
+    assert process.stdout is not None
+    for said in process.stdout:
+        if said.strip() == line:
+            return
+    raise AssertionError(f"ended before {line!r}")
+
+
+def test_it_trains_evaluates_and_then_has_nothing_to_do(
+    write_params: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    params = write_params(store={"sensor_channels": 0}, robot_state_enabled=False)
+    assert train_head.main(["--params", str(params)]) == 0
+    said = capsys.readouterr().out
+    assert "6 episodes, 180 ticks" in said
+    assert "sensor: absent from the store, its encoder is disabled" in said
+    assert "state: disabled by train_head.robot_state_enabled" in said
+    assert "held out of 1 episode(s)" in said
+    assert "parameters: features" in said
+    assert "device cpu, float32; steps 0 to 30" in said
+    assert "step 30: train loss" in said
+
+    assert train_head.main(["--params", str(params)]) == 0
+    assert "nothing to do" in capsys.readouterr().out
+
+    assert evaluate.main(["--params", str(params)]) == 0
+    said = capsys.readouterr().out
+    assert "overall [training std]" in said
+    assert "30 held-out ticks of 1 episode(s)" in said
+    report = tmp_path / "params/report"
+    found = json.loads((report / "metrics.json").read_text())
+    best = json.loads((tmp_path / "params/head/best/policy.json").read_text())
+    # Fewer held-out ticks than the cap: training has judged the very same ones.
+    assert found["overall"]["policy"] == pytest.approx(best["metrics"]["val/error"])
+    assert {"timeline.png", "scatter.png", "horizon.png", "episodes.png"} <= set(os.listdir(report))
+
+
+def test_evaluating_twice_gives_the_same_bytes(
+    write_params: Callable[..., Path], tmp_path: Path
+) -> None:
+    params = write_params()
+    assert train_head.main(["--params", str(params)]) == 0
+    written = []
+    for _ in range(2):
+        assert evaluate.main(["--params", str(params)]) == 0
+        report = tmp_path / "params/report"
+        written.append({path.name: path.read_bytes() for path in report.iterdir()})
+    assert written[0] == written[1]
+
+
+def test_stage_two_needs_neither_transformers_nor_peft(write_params: Callable[..., Path]) -> None:
+    process = python(WITHOUT_VLM, write_params(max_steps=4))
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 0, err
+    assert "overall [training std]" in out
+
+
+def test_killed_in_mid_run_it_ends_where_an_undisturbed_run_ends(
+    write_params: Callable[..., Path], tmp_path: Path
+) -> None:
+    undisturbed, killed = write_params("undisturbed"), write_params("killed")
+    process = python(SLOWED, killed)
+    wait_for(process, "step 18")
+    process.kill()
+    process.communicate(timeout=60)
+    part = tmp_path / "killed/head.part"
+    assert (part / "last/policy.json").exists()
+    assert not (tmp_path / "killed/head").exists()
+    for params in (undisturbed, killed):
+        done = python(SLOWED, params)
+        out, err = done.communicate(timeout=120)
+        assert done.returncode == 0, err
+    assert "resuming the run in" in out
+    assert "steps 16 to 30" in out
+    for name in ("best", "last"):
+        files = [
+            tmp_path / run / "head" / name / "policy.safetensors"
+            for run in ("undisturbed", "killed")
+        ]
+        assert files[0].read_bytes() == files[1].read_bytes()
+
+
+def test_a_sigterm_leaves_the_step_it_came_in(
+    write_params: Callable[..., Path], tmp_path: Path
+) -> None:
+    process = python(SLOWED, write_params(checkpoint_every=1000))
+    wait_for(process, "step 6")
+    process.send_signal(signal.SIGTERM)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert "the same command continues" in err
+    assert "Traceback" not in err
+    last = json.loads((tmp_path / "params/head.part/last/trainer.json").read_text())
+    assert 6 <= last["step"] <= 8
+
+
+def test_a_second_training_of_the_same_output_is_refused(
+    write_params: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    params = write_params()
+    process = python(SLOWED, params)
+    wait_for(process, "step 1")
+    try:
+        assert train_head.main(["--params", str(params)]) == 2
+        assert "being built by process" in capsys.readouterr().err
+    finally:
+        process.kill()
+        process.communicate(timeout=60)
+
+
+def test_mistakes_end_in_one_message(
+    write_params: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    params = write_params()
+    for override, said in (
+        ("train_head.store=nowhere.zarr", "no finished store"),
+        ("train_head.device=cuda:77", "device: cuda:77"),
+        ("train_head.lr=-1", "train_head.lr"),
+        ("train_head.sensor_encoder.heads=3", "heads must divide"),
+    ):
+        layers = ["--set", "train_head.sensor_encoder.layers=1"]
+        assert train_head.main(["--params", str(params), *layers, "--set", override]) == 2
+        assert said in capsys.readouterr().err
+
+
+def test_progress_is_silent_where_there_is_no_terminal(
+    write_params: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    started = time.monotonic()
+    assert train_head.main(["--params", str(write_params(max_steps=2))]) == 0
+    assert capsys.readouterr().err == ""
+    assert time.monotonic() - started < 60

@@ -1,0 +1,136 @@
+"""Pictures are written for any shape of data, whole, and the same for the same numbers."""
+
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from pipeline import plots
+from pipeline.evaluation import Comparison, Group, Predictions, baselines, compare
+
+Drawn = tuple[Comparison, Predictions, SimpleNamespace]
+
+
+def evaluated(episodes: int, dimensions: int = 5, ticks: int = 12, constant: int = 1) -> Drawn:
+    """`constant` dimensions at the end never vary."""
+    rng = np.random.default_rng(0)
+    horizon = 3
+    action = rng.normal(size=(episodes * ticks, dimensions)).astype(np.float32)
+    action[:, dimensions - constant :] = 1
+    tick = np.arange(episodes * ticks)
+    episode = tick // ticks
+    ahead = tick[:, None] + np.arange(horizon)
+    end = (episode[:, None] + 1) * ticks
+    recorded = action[np.minimum(ahead, end - 1)]
+    predictions = Predictions(
+        tick,
+        episode,
+        (recorded + rng.normal(0, 0.2, recorded.shape)).astype(np.float32),
+        recorded,
+        ahead < end,
+    )
+    arrays = {
+        "tick/action": action,
+        "tick/time": (tick % ticks) * 0.1,
+        "episode/tick_start": np.arange(episodes + 1) * ticks,
+    }
+    store = SimpleNamespace(
+        array=arrays.__getitem__,
+        action_hz=10.0,
+        episodes=[
+            SimpleNamespace(
+                source="demo", id=f"episode_{i}" * (1 + i), ticks=range(i * ticks, (i + 1) * ticks)
+            )
+            for i in range(episodes)
+        ],
+    )
+    names = [f"d{index}" for index in range(dimensions)]
+    units = ["mm"] * (dimensions - 1) + [""]
+    groups = (
+        Group("translation", "mm", tuple(range(dimensions - 1))),
+        Group("gripper", "", (dimensions - 1,)),
+    )
+    spread = np.where(np.arange(dimensions) < dimensions - constant, 1.0, 0.0)
+    comparison = compare(
+        predictions,
+        baselines(store, predictions, action.mean(0)),  # type: ignore[arg-type]
+        names,
+        units,
+        groups,
+        spread,
+    )
+    return comparison, predictions, store
+
+
+@pytest.mark.parametrize(
+    ("episodes", "dimensions", "constant"), [(1, 5, 1), (2, 2, 0), (3, 14, 1), (2, 3, 3)]
+)
+def test_every_picture_is_written(
+    tmp_path: Path, episodes: int, dimensions: int, constant: int
+) -> None:
+    files = plots.write_plots(tmp_path, *evaluated(episodes, dimensions, constant=constant))  # type: ignore[arg-type]
+    assert {file.name for file in files} == {
+        "timeline.png",
+        "scatter.png",
+        "horizon.png",
+        "episodes.png",
+    }
+    for file in files:
+        assert file.read_bytes().startswith(b"\x89PNG")
+        assert file.stat().st_size > 5000
+
+
+def test_the_same_numbers_are_the_same_bytes(tmp_path: Path) -> None:
+    written = []
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        files = plots.write_plots(tmp_path / name, *evaluated(2))  # type: ignore[arg-type]
+        written.append([file.read_bytes() for file in files])
+    assert written[0] == written[1]
+
+
+def texts(figure: Figure) -> str:
+    said = [figure.get_suptitle()]
+    for axis in figure.axes:
+        said += [axis.get_title(), axis.get_xlabel(), axis.get_ylabel()]
+    return "\n".join(said)
+
+
+@pytest.mark.parametrize(
+    ("draw", "said"),
+    [
+        (lambda c, p, s: plots.timeline(c, p, s), ["d0 [mm]", "time since the episode began [s]"]),
+        (lambda c, p, s: plots.scatter(c, p), ["recorded [mm]", "policy [mm]"]),
+        (lambda c, p, s: plots.horizon(c, 10.0), ["[100 ms each]", "mean absolute error [mm]"]),
+        (lambda c, p, s: plots.episodes(c, s), ["mean absolute error [mm]", "worst on top"]),
+    ],
+)
+def test_axes_carry_units_and_titles_say_what_one_sees(
+    draw: Callable[..., Figure], said: list[str]
+) -> None:
+    figure = draw(*evaluated(2))
+    assert figure.get_suptitle()
+    for part in said:
+        assert part in texts(figure)
+
+
+def test_what_never_varies_takes_no_panel() -> None:
+    comparison, _, store = evaluated(2)
+    assert len(plots.horizon(comparison, None).axes) == 1
+    assert len(plots.episodes(comparison, store).axes) == 1  # type: ignore[arg-type]
+
+
+def test_many_episodes_are_thinned_but_not_the_extremes() -> None:
+    comparison, _, store = evaluated(60, ticks=4)
+    figure = plots.episodes(comparison, store)  # type: ignore[arg-type]
+    assert len(figure.axes[0].get_yticks()) == plots.EPISODE_LINES
+    assert "40 of 60" in figure.get_suptitle()
+    policy = plots.LABELS["policy"]
+    lines = figure.axes[0].lines
+    shown = next(line.get_xdata() for line in lines if line.get_label() == policy)
+    errors = comparison.groups[0].mean(comparison.scores["policy"].mae_episode)
+    assert shown[-1] == pytest.approx(errors.max())
+    assert shown[0] == pytest.approx(errors.min())

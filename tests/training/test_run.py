@@ -1,0 +1,177 @@
+"""What a start finds at its output decides what it does, and nothing of another's is lost."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.durable import read_document
+from pipeline.errors import CheckpointIncomplete, CheckpointMismatch, ConfigError
+from pipeline.store import FeatureStore
+from pipeline.training import Trainer, open_run
+from pipeline.training.log import TrainingLog
+
+Make = Callable[..., Any]
+
+
+class Stop(Exception):
+    """Stands for the end of the process."""
+
+
+@pytest.fixture
+def unfinished(
+    store: FeatureStore, params: Make, trainer: Make, monkeypatch: pytest.MonkeyPatch
+) -> Path:
+    """A run stopped at step 11, its last checkpoint at step 10."""
+    real = Trainer._train_step
+
+    def killed(self: Trainer, batch: object) -> None:
+        if self.step == 11:
+            raise Stop
+        real(self, batch)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Trainer, "_train_step", killed)
+        with pytest.raises(Stop):
+            trainer(store, params()).fit()
+    return params().output.with_name("head.part")
+
+
+def test_a_finished_run_is_left_alone(store: FeatureStore, params: Make, trainer: Make) -> None:
+    trainer(store, params()).fit()
+    leftover = params().output / "last" / "trainer.json"
+    leftover.touch()  # killed between renaming and tidying
+    run = open_run(params(device="cpu", logs="elsewhere", checkpoint_every=1), store)
+    assert run.status == "finished"
+    assert not leftover.exists()
+
+
+def test_another_run_replaces_a_finished_one_when_it_is_finished(
+    store: FeatureStore, params: Make, trainer: Make
+) -> None:
+    trainer(store, params()).fit()
+    other = trainer(store, params(seed=5))
+    assert other.run.status == "new"
+    assert "holds another run" in other.run.notes[0]
+    assert read_document(params().output / "run.json")["decides"]["train_head"]["seed"] == 0
+    other.fit()
+    assert read_document(params().output / "run.json")["decides"]["train_head"]["seed"] == 5
+    assert sorted(p.name for p in params().output.parent.glob("head*")) == ["head"]
+
+
+def test_other_params_move_an_unfinished_run_aside(
+    store: FeatureStore, params: Make, unfinished: Path
+) -> None:
+    aside = unfinished.with_name("head.part-old")
+    run = open_run(params(lr=0.5, expert={"dim": 16, "heads": 4}), store)
+    assert run.status == "new"
+    assert "train_head.lr: 0.003 (that run), 0.5 (now)" in run.notes[0]
+    assert "train_head.expert.heads: 2 (that run), 4 (now)" in run.notes[0]
+    assert (aside / "last" / "policy.json").exists()
+    assert os.listdir(unfinished) == ["run.json"]
+    # One that has only begun does not replace what was put aside before.
+    run = open_run(params(lr=0.25), store)
+    assert run.notes == ()
+    assert read_document(aside / "run.json")["decides"]["train_head"]["lr"] == 0.003
+
+
+def test_a_run_put_aside_is_taken_back(
+    store: FeatureStore, params: Make, trainer: Make, unfinished: Path
+) -> None:
+    mistyped = trainer(store, params(lr=0.5))
+    with TrainingLog(mistyped.params.logs) as log:
+        mistyped._train_step(store.gather(mistyped.sampler.batch(0), 3, 6, 5))
+        mistyped._save_last(log)
+    back = trainer(store, params())
+    assert (back.run.status, back.step) == ("resumed", 10)
+    assert "put aside earlier: taken back" in back.run.notes[0]
+    assert "train_head.lr: 0.5 (that run), 0.003 (now)" in back.run.notes[1]
+    again = trainer(store, params(lr=0.5))
+    assert (again.run.status, again.step) == ("resumed", 1)
+
+
+def test_other_features_or_streams_are_refused(
+    store: FeatureStore,
+    params: Make,
+    unfinished: Path,
+    tiny_store: Callable[..., Path],
+    tmp_path: Path,
+) -> None:
+    other = FeatureStore.open(
+        tiny_store(tmp_path, name="other", spec_digest="another", state_dim=0, reuse=5)
+    )
+    with pytest.raises(CheckpointMismatch) as caught:
+        open_run(params(), other)
+    said = str(caught.value)
+    assert 'feature_spec.digest: "tiny-spec" (the run), "another" (the store now)' in said
+    assert "streams.state.names" in said
+    assert "vlm_reuse_count: 3 (the run), 5 (the store now)" in said
+    assert f"Remove {unfinished}" in said
+    assert (unfinished / "last").exists()
+
+
+def test_other_recordings_of_the_same_kind_begin_anew(
+    store: FeatureStore,
+    params: Make,
+    unfinished: Path,
+    tiny_store: Callable[..., Path],
+    tmp_path: Path,
+) -> None:
+    more = FeatureStore.open(tiny_store(tmp_path, name="more", episodes=7))
+    run = open_run(params(), more)
+    assert run.status == "new"
+    assert "recordings.episodes: 6 (that run), 7 (now)" in run.notes[0]
+
+
+@pytest.mark.parametrize("half", ["new", "old"])
+def test_a_checkpoint_swap_that_was_killed_is_recovered(
+    store: FeatureStore, params: Make, trainer: Make, unfinished: Path, half: str
+) -> None:
+    last = unfinished / "last"
+    if half == "new":  # killed while writing: the old one still stands
+        (unfinished / "last.new").mkdir()
+    else:  # killed between the two renames
+        last.rename(unfinished / "last.old")
+    assert trainer(store, params()).step == 10
+
+
+@pytest.mark.parametrize("file", ["trainer.safetensors", "policy.safetensors", "trainer.json"])
+def test_a_truncated_checkpoint_is_named(
+    store: FeatureStore, params: Make, trainer: Make, unfinished: Path, file: str
+) -> None:
+    path = unfinished / "last" / file
+    path.write_bytes(path.read_bytes()[:-20])
+    with pytest.raises(CheckpointIncomplete, match=f"{file}: the checkpoint is damaged"):
+        trainer(store, params())
+
+
+def test_a_finish_that_was_killed_is_recovered(
+    store: FeatureStore, params: Make, trainer: Make
+) -> None:
+    trainer(store, params()).fit()
+    output = params().output
+    output.rename(output.with_name("head.part-replaced"))
+    assert open_run(params(), store).status == "finished"
+    output.with_name("head.part-replaced").mkdir()
+    assert open_run(params(), store).status == "finished"
+    assert not output.with_name("head.part-replaced").exists()
+
+
+def test_what_no_training_wrote_is_never_replaced(store: FeatureStore, params: Make) -> None:
+    output = params().output
+    output.mkdir()
+    assert open_run(params(), store).status == "new"
+    (output / "thesis.tex").write_text("years of work")
+    with pytest.raises(ConfigError, match="no training run"):
+        open_run(params(), store)
+    assert (output / "thesis.tex").exists()
+
+
+def test_checkpoints_without_their_run_are_not_guessed_at(
+    store: FeatureStore, params: Make, unfinished: Path
+) -> None:
+    (unfinished / "run.json").unlink()
+    with pytest.raises(ConfigError, match=r"no run\.json"):
+        open_run(params(), store)

@@ -1,0 +1,51 @@
+"""The normalisation sees what training may see, once, and nothing else."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.store import FeatureStore
+from pipeline.training import fit_normalization
+
+
+@pytest.mark.parametrize("chunk_bytes", [1, 500, 2**26])
+def test_statistics_are_those_of_the_training_ticks(
+    store: FeatureStore, monkeypatch: pytest.MonkeyPatch, chunk_bytes: int
+) -> None:
+    monkeypatch.setattr("pipeline.training.statistics.CHUNK_BYTES", chunk_bytes)
+    # All of episode 1, and of episode 4 the first 7 ticks: a tail is held out.
+    ticks = np.concatenate([np.arange(30, 60), np.arange(120, 127)])
+    found = fit_normalization(store, ticks)
+
+    action = store.array("tick/action")[ticks]
+    rows = [*range(10, 20), 40, 41, 42]
+    features = store.array("vl/features")[rows]
+    sensor = store.array("sensor/values")[[*range(240, 480), *range(960, 960 + 7 * 8)]]
+    state = store.array("state/values")[[*range(120, 240), *range(480, 480 + 7 * 4)]]
+    for name, values in (
+        ("action", action),
+        ("features", features),
+        ("sensor", sensor),
+        ("state", state),
+    ):
+        statistics = getattr(found, name)
+        assert statistics.count == len(values), name
+        assert statistics.mean == pytest.approx(values.mean(0, np.float64), abs=1e-6), name
+        assert statistics.std == pytest.approx(values.std(0, np.float64), abs=1e-6), name
+
+
+def test_absent_streams_have_none_and_bfloat16_is_read(
+    tiny_store: Callable[..., Path], tmp_path: Path
+) -> None:
+    store = FeatureStore.open(
+        tiny_store(tmp_path, sensor_channels=0, state_dim=0, dtype="bfloat16")
+    )
+    found = fit_normalization(store, np.arange(store.ticks))
+    assert found.sensor is None
+    assert found.state is None
+    assert found.features is not None
+    batch = store.gather(np.arange(0, store.ticks, store.vlm_reuse_count))
+    expected = batch.features.double().numpy()
+    assert found.features.mean == pytest.approx(expected.mean(0), abs=1e-6)
