@@ -7,7 +7,6 @@ The ledger only saves reading: losing it costs time, never correctness.
 import hashlib
 import sqlite3
 from pathlib import Path
-from types import TracebackType
 
 from pipeline.errors import RecordingError
 
@@ -37,15 +36,8 @@ class ContentDigests:
             "CREATE TABLE IF NOT EXISTS rate (what TEXT PRIMARY KEY, rows_per_s REAL)"
         )
 
-    def __enter__(self) -> "ContentDigests":
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
+        """Close the ledger."""
         self._database.close()
 
     def of(self, path: Path) -> str:

@@ -1,6 +1,7 @@
 """Content digests are remembered until a file's size or time changes."""
 
 import os
+from contextlib import closing
 
 import pytest
 
@@ -11,10 +12,10 @@ from pipeline.errors import RecordingError
 def test_reads_a_file_once_and_notices_a_change(tmp_path, monkeypatch):
     ledger, file = tmp_path / "ledger.sqlite", tmp_path / "file"
     file.write_bytes(b"one")
-    with ContentDigests(ledger) as digests:
+    with closing(ContentDigests(ledger)) as digests:
         first = digests.of(file)
     monkeypatch.setattr("pipeline.digests._digest", lambda path: "read again")
-    with ContentDigests(ledger) as digests:
+    with closing(ContentDigests(ledger)) as digests:
         assert digests.of(file) == first
         os.utime(file, ns=(1, 1))
         assert digests.of(file) == "read again"
@@ -23,28 +24,28 @@ def test_reads_a_file_once_and_notices_a_change(tmp_path, monkeypatch):
 def test_equal_content_has_an_equal_digest_wherever_it_lies(tmp_path):
     for name in "ab":
         (tmp_path / name).write_bytes(b"same")
-    with ContentDigests(tmp_path / "ledger.sqlite") as digests:
+    with closing(ContentDigests(tmp_path / "ledger.sqlite")) as digests:
         assert digests.of(tmp_path / "a") == digests.of(tmp_path / "b")
 
 
 def test_a_damaged_ledger_is_begun_anew(tmp_path):
     (tmp_path / "ledger.sqlite").write_bytes(b"no database" * 50)
     (tmp_path / "file").write_bytes(b"one")
-    with ContentDigests(tmp_path / "ledger.sqlite") as digests:
+    with closing(ContentDigests(tmp_path / "ledger.sqlite")) as digests:
         assert len(digests.of(tmp_path / "file")) == 32
 
 
 def test_names_a_file_that_cannot_be_read(tmp_path):
     with (
-        ContentDigests(tmp_path / "ledger.sqlite") as digests,
+        closing(ContentDigests(tmp_path / "ledger.sqlite")) as digests,
         pytest.raises(RecordingError, match=r"gone: cannot be read: No such file"),
     ):
         digests.of(tmp_path / "gone")
 
 
 def test_remembers_speeds(tmp_path):
-    with ContentDigests(tmp_path / "ledger.sqlite") as digests:
+    with closing(ContentDigests(tmp_path / "ledger.sqlite")) as digests:
         assert digests.rate("model") is None
         digests.note_rate("model", 12.5)
-    with ContentDigests(tmp_path / "ledger.sqlite") as digests:
+    with closing(ContentDigests(tmp_path / "ledger.sqlite")) as digests:
         assert digests.rate("model") == 12.5

@@ -1,8 +1,8 @@
 """Recordings x frozen model -> store, on one machine."""
 
 import shutil
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Generator, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 from pipeline.config import Params
@@ -24,7 +24,7 @@ def extract(params: Params, say: Callable[[str], None]) -> ExtractionReport | No
     """
     target = params.extract.store
     with ExitStack() as stack:
-        digests = stack.enter_context(ContentDigests(_beside(target, ".files.sqlite")))
+        digests = stack.enter_context(closing(ContentDigests(_beside(target, ".files.sqlite"))))
         if not params.extract.plan:
             stack.enter_context(build_lock(target))
             recover(target)
@@ -55,7 +55,7 @@ def extract(params: Params, say: Callable[[str], None]) -> ExtractionReport | No
 
 
 @contextmanager
-def _donors(target: Path, surveyed: Survey, plan_only: bool) -> Iterator[list[Donor]]:
+def _donors(target: Path, surveyed: Survey, plan_only: bool) -> Generator[list[Donor]]:
     """Stores and abandoned builds of the same feature spec.
 
     An abandoned build of another plan is set aside; of another spec, it is of no use and removed.

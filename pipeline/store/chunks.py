@@ -5,7 +5,7 @@ Never through a map: a full disk must be an error of `pwrite`, not a SIGBUS.
 
 import errno
 import os
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ def row_checksums(rows: NDArray[Any]) -> NDArray[np.uint32]:
 
 
 @contextmanager
-def disk_full_named(path: Path) -> Iterator[None]:
+def disk_full_named(path: Path) -> Generator[None]:
     """Turn "no space left" and "quota exceeded" into `DiskFull` naming the place."""
     try:
         yield
@@ -95,7 +95,7 @@ class ChunkFiles:
                 continue
             lines = raw[first - start : first - start + count]
             with disk_full_named(self.paths[chunk]):
-                _write_all(self._descriptor(chunk), memoryview(lines.ravel()), self._offset(first))
+                _write_all(self._descriptor(chunk), lines.ravel().data, self._offset(first))
             self._unsynced.add(chunk)
 
     def read(self, start: int, count: int) -> NDArray[Any]:

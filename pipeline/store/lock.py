@@ -3,7 +3,7 @@
 import fcntl
 import os
 import socket
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from pipeline.errors import StoreLocked
 
 
 @contextmanager
-def build_lock(target: Path) -> Iterator[None]:
+def build_lock(target: Path) -> Generator[None]:
     """Hold `<name>.zarr.lock` beside the store.
 
     The kernel releases it when the process ends, however it ends, so a left-over lock file means

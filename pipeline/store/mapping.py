@@ -11,7 +11,7 @@ import os
 import weakref
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,7 +60,7 @@ def map_flat(
             )
         finally:
             os.close(descriptor)
-    return np.frombuffer(buffer, dtype, count).reshape(shape)
+    return np.frombuffer(cast(Any, buffer), dtype, count).reshape(shape)
 
 
 def _mmap(address: int | None, length: int, protection: int, flags: int, descriptor: int) -> int:
