@@ -144,13 +144,16 @@ def source_of(store: FeatureStore) -> dict[str, Any]:
     return {key: getattr(store, "spec" if key == "feature_spec" else key) for key in SOURCE_KEYS}
 
 
-def policy_shape(store: FeatureStore) -> PolicyShape:
-    """The widths that this store gives to a policy."""
+def policy_shape(store: FeatureStore, normalization: Normalization) -> PolicyShape:
+    """The widths that this store gives to a policy.
+
+    A stream without statistics is absent from what the policy is trained on, so it has width 0.
+    """
     action = store.streams["action"]
     return PolicyShape(
         *store.feature_shape,
-        sensor_channels=store.sensor_channels,
-        state_dim=store.state_dim,
+        sensor_channels=store.sensor_channels if normalization.sensor else 0,
+        state_dim=store.state_dim if normalization.state else 0,
         action_dim=store.action_dim,
         action_groups=action_groups(action["names"], action["units"]),
     )

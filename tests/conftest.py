@@ -7,9 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from jaxtyping import install_import_hook
 
 from pipeline.store import SCHEMA, Sizes, StoreBuild, arrays
 from pipeline.vlm.demo_checkpoint import write_demo_checkpoint
+
+# Before anything imports them: every shape annotation of the models is checked in tests.
+install_import_hook("pipeline.models", "beartype.beartype")
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -49,7 +49,7 @@ def store(
 @pytest.fixture
 def checkpoint(store: FeatureStore) -> PolicyCheckpoint:
     normalization = fit_normalization(store, torch.arange(60).numpy())
-    shape = policy_shape(store)
+    shape = policy_shape(store, normalization)
     torch.manual_seed(3)
     return PolicyCheckpoint(
         params=PARAMS,

@@ -61,7 +61,6 @@ class Trainer:
         self.device = resolve_device(params.device)
         self.bfloat16 = use_bfloat16(params.amp, self.device)
         self.windows = Windows.of(params)
-        self.shape = policy_shape(store)
         self.sampler = TickSampler(
             ticks_by_source(store, split.train), params.mixture, params.batch_size, params.seed
         )
@@ -103,7 +102,7 @@ class Trainer:
         """What is trained, from what and on what, as lines for the user."""
         precision = "bfloat16 autocast" if self.bfloat16 else "float32"
         return [
-            *describe_data(self.store, self.params, self.split),
+            *describe_data(self.store, self.shape, self.params, self.split),
             "parameters: "
             + ", ".join(f"{part} {count:,}" for part, count in self.policy.parameter_table()),
             f"device {self.device}, {precision}; steps {self.step} to {self.params.max_steps}",
@@ -226,10 +225,11 @@ class Trainer:
     def _begin(self) -> None:
         torch.manual_seed(self.params.seed)
         self.normalization = fit_normalization(self.store, self.split.train)
+        self.shape = policy_shape(self.store, self.normalization)
         self._build(Policy(self.params, self.shape, self.normalization))
 
     def _restore(self, checkpoint: PolicyCheckpoint, state: TrainerState) -> None:
-        self.normalization = checkpoint.normalization
+        self.normalization, self.shape = checkpoint.normalization, checkpoint.shape
         policy = Policy(self.params, self.shape, self.normalization)
         policy.load_state_dict(dict(state.weights))
         self._build(policy)

@@ -1,11 +1,14 @@
 """What a run trains from, in words."""
 
 from pipeline.config import TrainHeadParams
+from pipeline.models import PolicyShape
 from pipeline.sampling import Split
 from pipeline.store import FeatureStore
 
 
-def describe_data(store: FeatureStore, params: TrainHeadParams, split: Split) -> list[str]:
+def describe_data(
+    store: FeatureStore, shape: PolicyShape, params: TrainHeadParams, split: Split
+) -> list[str]:
     """Lines on the store, its streams that are there, absent or disabled, and the split."""
     slots, dim = store.feature_shape
     lines = [
@@ -17,13 +20,24 @@ def describe_data(store: FeatureStore, params: TrainHeadParams, split: Split) ->
     if split.note:
         lines.append(f"split: {split.note}")
     streams = {
-        "sensor": (store.sensor_channels, params.sensor_enabled, "sensor_enabled"),
-        "state": (store.state_dim, params.robot_state_enabled, "robot_state_enabled"),
-        "features": (slots * dim, params.features_enabled, "features_enabled"),
+        "sensor": (
+            store.sensor_channels,
+            shape.sensor_channels,
+            params.sensor_enabled,
+            "sensor_enabled",
+        ),
+        "state": (
+            store.state_dim,
+            shape.state_dim,
+            params.robot_state_enabled,
+            "robot_state_enabled",
+        ),
+        "features": (slots * dim, slots * dim, params.features_enabled, "features_enabled"),
     }
-    for stream, (width, enabled, param) in streams.items():
-        if not width:
-            lines.append(f"{stream}: absent from the store, its encoder is disabled")
+    for stream, (stored, trained, enabled, param) in streams.items():
+        if not trained:
+            lacking = "the training episodes" if stored else "the store"
+            lines.append(f"{stream}: absent from {lacking}, its encoder is disabled")
         elif not enabled:
             lines.append(f"{stream}: disabled by train_head.{param}")
     return lines

@@ -1,4 +1,4 @@
-"""Small policies and observations; every shape annotation of the models is checked in tests."""
+"""Small policies and observations."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -7,13 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from jaxtyping import install_import_hook
 from torch import Tensor
 
-with install_import_hook("pipeline.models", "beartype.beartype"):
-    from pipeline.models import Policy, PolicyShape
-
 from pipeline.config import TrainHeadParams
+from pipeline.models import Policy, PolicyShape
 from pipeline.normalization import ChannelStatistics, Normalization
 
 

@@ -1,0 +1,141 @@
+"""What re-runs when what changes: the pipeline in a copy of the project, with tiny params."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from pipeline.store import FeatureStore
+
+ROOT = Path(__file__).resolve().parents[1]
+
+TINY = {
+    "demo": {"episodes": 2},
+    "vlm": {"image_resize_height": 56, "image_resize_width": 56, "pooling": ["mean"]},
+    "train_head": {"max_steps": 6, "eval_every": 3, "checkpoint_every": 3, "warmup_steps": 1},
+}
+
+
+class Project:
+    """A copy of the project with its own repository."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        tracked = self._git(ROOT, "ls-files", "-co", "--exclude-standard", "-z").split("\0")
+        for name in filter(None, tracked):
+            if (ROOT / name).is_file():
+                (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy2(ROOT / name, folder / name)
+        self._git(folder, "init", "-q")
+        self._git(folder, "add", "-A")
+        identity = ("-c", "user.name=test", "-c", "user.email=test@localhost")
+        self._git(folder, *identity, "commit", "-qm", "copy")
+
+    def set(self, **sections: dict) -> None:
+        path = self.folder / "params.yaml"
+        document = yaml.safe_load(path.read_text())
+        for section, values in sections.items():
+            document[section] |= values
+        path.write_text(yaml.safe_dump(document, sort_keys=False))
+
+    def dvc(self, *arguments: str) -> str:
+        paths = [str(Path(sys.executable).parent), os.environ["PATH"]]
+        done = subprocess.run(
+            [sys.executable, "-m", "dvc", *arguments],
+            cwd=self.folder,
+            capture_output=True,
+            text=True,
+            check=False,
+            env={
+                **os.environ,
+                "PATH": os.pathsep.join(paths),
+                "PYTHONPATH": str(self.folder),
+                "DVC_NO_ANALYTICS": "1",
+            },
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    def stale(self) -> dict[str, list]:
+        """The stages whose own params, code or data changed."""
+        return json.loads(self.dvc("status", "--json"))
+
+    def _git(self, folder: Path, *arguments: str) -> str:
+        return subprocess.run(
+            ["git", *arguments], cwd=folder, check=True, capture_output=True, text=True
+        ).stdout
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
+    """The project after one `dvc repro`."""
+    if shutil.which("git") is None or not (ROOT / ".git").exists():
+        pytest.skip("needs git and the project's own repository")
+    made = Project(tmp_path_factory.mktemp("project"))
+    made.set(**TINY)
+    made.dvc("repro")
+    return made
+
+
+def test_a_second_run_does_nothing(project):
+    assert "Data and pipelines are up to date." in project.dvc("repro")
+
+
+def test_metrics_and_plots_are_declared(project):
+    shown = json.loads(project.dvc("metrics", "show", "--json"))
+    (found,) = shown[""]["data"].values()
+    assert "policy" in found["data"]["overall"]
+    assert (project.folder / "reports/evaluate/timeline.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("section", "values", "stage"),
+    [
+        ("train_head", {"lr": 0.123}, "train_head"),
+        ("vlm", {"prompt": "{images}{instruction}"}, "extract"),
+        ("extract", {"dtype": "float16"}, "extract"),
+        ("evaluate", {"batch_size": 3}, "evaluate"),
+        ("extract", {"batch_size": 3, "decode_threads": 1}, None),
+    ],
+)
+def test_a_param_makes_its_own_stage_stale_and_none_before(project, section, values, stage):
+    before = (project.folder / "params.yaml").read_text()
+    try:
+        project.set(**{section: values})
+        assert set(project.stale()) == ({stage} if stage else set())
+    finally:
+        (project.folder / "params.yaml").write_text(before)
+
+
+def test_own_data_leave_the_demo_alone_and_an_added_episode_computes_its_rows(project, tmp_path):
+    own = tmp_path / "own"
+    shutil.copytree(project.folder / "data/demo/raw", own / "task" / "raw")
+    sources = [{"name": "mine", "path": "task/raw"}]
+    before = (project.folder / "params.yaml").read_text()
+    project.set(
+        data={"root": str(own), "sources": sources}, extract={"store": "cache_store/own.zarr"}
+    )
+    said = project.dvc("repro", "extract")
+    assert "Running stage 'extract'" in said
+    assert "Running stage 'demo'" not in said
+    rows = len(FeatureStore.open(project.folder / "cache_store/own.zarr").array("vl/time"))
+
+    episode = next((own / "task/raw").glob("*/*"))
+    added = episode.with_name("data_collection_20300101_000000")
+    shutil.copytree(episode, added)
+    image = next(added.glob("View1/**/*.jpg"))
+    shutil.copy(sorted(added.glob("View2/**/*.jpg"))[0], image)
+    said = project.dvc("repro", "extract")
+    assert f"{rows} taken over" in said or "computed" in said
+    store = FeatureStore.open(project.folder / "cache_store/own.zarr")
+    assert len(store.episodes) == 3
+    line = next(text for text in said.splitlines() if "taken over" in text)
+    computed = int(line.split("rows, ")[1].split(" computed")[0])
+    assert computed <= len(store.episodes[-1].vl_rows)
+    assert int(line.rsplit(", ", 1)[1].split()[0]) >= rows
+    (project.folder / "params.yaml").write_text(before)

@@ -1,0 +1,123 @@
+"""Real recordings through the whole pipeline, by the commands a user would type."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from pipeline.store import FeatureStore
+
+ROOT = Path(__file__).resolve().parents[1]
+Run = Callable[..., str]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("real")
+
+
+@pytest.fixture(scope="module")
+def run(folder: Path, demo_checkpoint: Path) -> Run:
+    """`run("extract", name, data)`: the stage with params of its own, its output returned."""
+
+    def stage(stage: str, name: str, data: dict[str, Any]) -> str:
+        document = yaml.safe_load((ROOT / "params.yaml").read_text())
+        document["data"] |= data
+        document["vlm"] |= {
+            "checkpoint": str(demo_checkpoint),
+            "image_resize_height": 84,
+            "image_resize_width": 84,
+        }
+        document["extract"]["store"] = str(folder / f"{name}.zarr")
+        document["train_head"] |= {
+            "max_steps": 40,
+            "eval_every": 20,
+            "output": str(folder / name / "head"),
+            "logs": str(folder / name / "logs"),
+        }
+        document["evaluate"] = {
+            "checkpoint": str(folder / name / "head"),
+            "output": str(folder / name / "evaluate"),
+        }
+        params = folder / f"{name}.yaml"
+        params.write_text(yaml.safe_dump(document))
+        command = [sys.executable, "-m", f"stages.{stage}", "--params", str(params)]
+        done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    return stage
+
+
+@pytest.fixture(scope="module")
+def cr5(run: Run, shared_data: Path, folder: Path) -> dict[str, FeatureStore]:
+    """The same five episodes as LeRobot v2.1 and as v3.0, each in a store."""
+    stores = {}
+    for name, path in (("v21", "cr5_banana_v21"), ("v30", "cr5_banana_v30_split")):
+        sources = [{"name": "cr5", "path": path}]
+        run("extract", name, {"root": str(shared_data / "lerobot"), "sources": sources})
+        stores[name] = FeatureStore.open(folder / f"{name}.zarr")
+    return stores
+
+
+@pytest.mark.parametrize(
+    "array",
+    ["vl/key", "vl/time", "tick/time", "tick/action", "tick/vl_row", "state/values", "state/time"],
+)
+def test_two_versions_of_a_data_set_give_the_same_rows(cr5, array):
+    assert np.array_equal(cr5["v21"].array(array), cr5["v30"].array(array))
+
+
+def test_the_ticks_are_the_recorded_rows(cr5):
+    store = cr5["v21"]
+    assert store.ticks == 935
+    assert [len(episode.ticks) for episode in store.episodes] == [176, 193, 204, 181, 181]
+    assert len(store.array("vl/time")) == sum(-(-count // 3) for count in (176, 193, 204, 181, 181))
+    assert store.streams["action"]["kind"] == "velocity"
+    assert {episode.instruction for episode in store.episodes} == {"put the banana on the plate"}
+    assert np.diff(store.array("tick/time")[:176]).std() > 1e-3, "a real clock jitters"
+
+
+def test_a_head_is_trained_and_judged(cr5, run, shared_data, folder):
+    data = {
+        "root": str(shared_data / "lerobot"),
+        "sources": [{"name": "cr5", "path": "cr5_banana_v21"}],
+    }
+    said = run("train_head", "v21", data)
+    assert "sensor: absent from the store" in said
+    run("evaluate", "v21", data)
+    metrics = json.loads((folder / "v21/evaluate/metrics.json").read_text())
+    assert metrics["held_out"]["episodes"] >= 1
+    for name in ("policy", "zero_action", "mean_action", "repeat_last"):
+        assert np.isfinite(metrics["overall"][name])
+
+
+def test_three_insertion_formats_share_a_store(run, shared_data, folder):
+    data = {
+        "root": str(shared_data / "insertion"),
+        "sources": [{"name": name, "path": name} for name in ("raw", "new", "old")],
+    }
+    run("extract", "insertion", data)
+    store = FeatureStore.open(folder / "insertion.zarr")
+    raw, new, old = store.episodes
+    assert (raw.format, new.format, old.format) == ("raw", "new", "old")
+    assert store.streams["views"] == ["View1", "View2", "View3", "View5"]
+    assert store.sensor_channels == 1026
+    assert (len(raw.readings), len(new.readings), len(old.readings)) == (1950, 1950, 32)
+    assert not len(old.states), "the old recording has no robot state"
+    keys = store.array("vl/key")
+    assert np.array_equal(keys[raw.vl_rows[0]], keys[new.vl_rows[0]]), "the same frames"
+    frames = store.array("vl/frame_time")[slice(old.vl_rows.start, old.vl_rows.stop)]
+    assert np.isnan(frames[:, 2:]).all(), "two of its views never came up"
+    a, b = (store.array("tick/action")[one.ticks.start + 5] for one in (raw, new))
+    assert np.allclose(a, b, atol=0.01), "derived from the same motion"
+    said = run("train_head", "insertion", data)
+    assert "held out" in said
+    run("evaluate", "insertion", data)
+    assert (folder / "insertion/evaluate/timeline.png").stat().st_size > 10_000
