@@ -86,12 +86,12 @@ READERS = {
 
 
 def open_recordings(
-    sources: Sequence[Source], root: Path, views: Sequence[str] | None = None
+    sources: Sequence[Source], root: Path = Path(), views: Sequence[str] | None = None
 ) -> Opened:
     """Every episode of the sources, without reading a stream or a frame.
 
-    A relative path of a source resolves under `root`. Only the views in `views` are kept. Raises
-    `RecordingError` where a path matches nothing, holds no episode or not those of the source's
+    A relative path of a source resolves under `root`, by default the working directory. Only the
+    views in `views` are kept. Raises `RecordingError` where a path matches nothing, holds no episode or not those of the source's
     `format`, where a LeRobot `meta/` is broken, and where no recording has a wanted view.
     """
     recordings: list[FileRecording] = []

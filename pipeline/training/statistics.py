@@ -19,7 +19,7 @@ def fit_normalization(store: FeatureStore, ticks: Ticks) -> Normalization:
     """Statistics per channel over the training `ticks` and what was known at them.
 
     Features over the VL rows that these ticks use, each once; sensor and state over the readings
-    from each episode's start to the last of its ticks; a stream that none of them has has no statistics.
+    from each episode's start to the last of its ticks; a stream that none of them has, has none.
     Reads the store once, a chunk of about 64 MB at a time. Raises `NumericsError` on NaN or inf.
     """
     actions = _rows(store.array("tick/action"), ticks)

@@ -1,0 +1,147 @@
+"""The demo's recordings: simulated episodes in every format that is read, in one folder.
+
+    raw/<task>/data_collection_…   new/<task>/episode_…   old/<task>/recv_all_…   lerobot/
+
+`demo.json` says which seed and version wrote which sets, so that finished sets are kept, sets of
+other params are replaced, and nothing that the demo did not write is ever touched.
+"""
+
+import errno
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from tqdm import tqdm
+
+from pipeline.errors import ConfigError, DiskFull
+from pipeline.simulation.insertion_formats import (
+    ABUTTING,
+    OVERLAPPING,
+    write_new,
+    write_old,
+    write_raw,
+)
+from pipeline.simulation.lerobot_format import write_lerobot
+from pipeline.simulation.recorder import SimulatedEpisode, simulate_episode
+
+DEMO_VERSION: Final = 1
+"""Goes up whenever the same seed gives other recordings."""
+MARKER: Final = "demo.json"
+TASK: Final = "Red_point"
+
+_FIRST_EPOCH_S = datetime(2026, 1, 5, 9, tzinfo=UTC).timestamp()
+_BETWEEN_EPISODES_S, _BETWEEN_SETS_S = 45.0, 86_400.0
+_OVERLAPPING_EVERY, _ROBOT_CLOCK_EVERY, _CROSSING_EVERY = 6, 3, 6
+
+Episodes = Iterator[SimulatedEpisode]
+Write = Callable[[Path, Episodes], None]
+
+
+def write_demo_recordings(root: Path, episodes: int, seed: int) -> None:
+    """Make `root` hold `episodes` simulated episodes in each of the four formats.
+
+    Each set appears whole or not at all, and is left alone where it is there already; the same
+    arguments give the same bytes. Raises `ConfigError` where `root` holds something the demo did
+    not write, `DiskFull` where the disk is.
+    """
+    wanted = {"version": DEMO_VERSION, "episodes": episodes, "seed": seed}
+    finished = _finished_sets(root, wanted)
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        _mark(root, wanted, finished)
+        with tqdm(total=4 * episodes, unit="episode", desc="simulating", disable=None) as progress:
+            for number, (name, write) in enumerate(_SETS.items()):
+                if name in finished:
+                    progress.update(episodes)
+                    continue
+                part = root / f".{name}.part"
+                shutil.rmtree(part, ignore_errors=True)
+                write(part, _simulated(number, episodes, seed, progress))
+                part.rename(root / name)
+                finished.append(name)
+                _mark(root, wanted, finished)
+    except OSError as error:
+        if error.errno != errno.ENOSPC:
+            raise
+        raise DiskFull(
+            f"{root}: the disk is full after {len(finished)} of {len(_SETS)} sets; "
+            "make room (the demo takes about 60 MB) and run stages.demo again"
+        ) from error
+
+
+def _simulated(number: int, episodes: int, seed: int, progress: "tqdm[Any]") -> Episodes:
+    for index in range(episodes):
+        own_seed = int(np.random.SeedSequence([seed, number, index]).generate_state(1)[0])
+        fraction = np.random.default_rng(own_seed).uniform(0, 1)
+        epoch_s = _FIRST_EPOCH_S + number * _BETWEEN_SETS_S + index * _BETWEEN_EPISODES_S + fraction
+        yield simulate_episode(own_seed, epoch_s, index % _CROSSING_EVERY == 2)
+        progress.update()
+
+
+def _write_raw_set(folder: Path, episodes: Episodes) -> None:
+    for episode in episodes:
+        write_raw(folder / TASK, episode)
+
+
+def _write_new_set(folder: Path, episodes: Episodes) -> None:
+    for index, episode in enumerate(episodes):
+        windows = OVERLAPPING if index % _OVERLAPPING_EVERY == 1 else ABUTTING
+        write_new(folder / TASK, episode, windows, index % _ROBOT_CLOCK_EVERY == 2)
+
+
+def _write_old_set(folder: Path, episodes: Episodes) -> None:
+    for episode in episodes:
+        write_old(folder / TASK, episode)
+
+
+_SETS: Final[dict[str, Write]] = {
+    "raw": _write_raw_set,
+    "new": _write_new_set,
+    "old": _write_old_set,
+    "lerobot": write_lerobot,
+}
+
+
+def _finished_sets(root: Path, wanted: dict[str, int]) -> list[str]:
+    """The sets already there as wanted, after removing the demo's own that are not."""
+    if not root.exists() or (root.is_dir() and not any(root.iterdir())):
+        return []
+    marked = _marked(root)
+    written = [name for name in marked["sets"] if (root / name).is_dir()]
+    strange = [name for name in _SETS if (root / name).exists() and name not in written]
+    if strange:
+        raise ConfigError(
+            f"{root}: {MARKER} does not list {', '.join(strange)} as the demo's, so it is not "
+            "replaced; move it away, or set demo.recordings to another folder"
+        )
+    if {key: marked.get(key) for key in wanted} == wanted:
+        return written
+    for name in written:
+        shutil.rmtree(root / name)
+    return []
+
+
+def _marked(root: Path) -> dict[str, Any]:
+    path = root / MARKER
+    try:
+        marked = json.loads(path.read_text(encoding="utf-8"))
+    except (FileNotFoundError, NotADirectoryError):
+        raise ConfigError(
+            f"{root} is there and has no {MARKER}: the demo did not write it and leaves it alone; "
+            "move it away, or set demo.recordings to another folder"
+        ) from None
+    except ValueError as error:
+        raise ConfigError(f"{path}: not JSON ({error}); remove {root} and run again") from None
+    if not isinstance(marked, dict) or not isinstance(marked.get("sets"), list):
+        raise ConfigError(f"{path}: expected an object with 'sets'; remove {root} and run again")
+    return marked
+
+
+def _mark(root: Path, wanted: dict[str, int], finished: list[str]) -> None:
+    part = root / f".{MARKER}.part"
+    part.write_text(json.dumps({**wanted, "sets": finished}, indent=2) + "\n", encoding="utf-8")
+    part.rename(root / MARKER)

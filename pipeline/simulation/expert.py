@@ -1,0 +1,70 @@
+"""The demonstrator: a hand that sees the target and the A-scan, and needs time to react.
+
+Align over the target at limited speed while descending to a standoff; once aligned, go down
+slowly, puncture, and stop at the target layer. It acts on where target and surface were
+`REACTION_TICKS` ago, as a person does: whoever looks at the images and the A-scan now knows
+what the hand will do next, whoever looks only at the hand does not.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+REACTION_TICKS: Final = 5
+ALIGNED_MM: Final = 0.6
+STANDOFF_MM: Final = 1.4
+
+_LATERAL_GAIN_HZ, _VERTICAL_GAIN_HZ, _TURN_GAIN_HZ = 4.0, 3.0, 2.0
+_DESCENT_MM_S, _INSERTION_MM_S, _TURN_DEG_S = 3.5, 1.5, 9.0
+_TREMOR_MM, _TREMOR_DEG = 0.012, 0.012
+_SMOOTHING = 0.5
+"""Share of the velocity that carries over from the last tick."""
+
+
+@dataclass(frozen=True)
+class Percept:
+    """What the demonstrator acts on.
+
+    `offset_mm` (2,) from needle to target; `distance_mm` from tip to surface and `layer_mm` from
+    tip to target layer; `inside` the tissue; `turn_deg` (3,) rotation vector to the upright;
+    `velocity` (6,) its own last action, a tick.
+    """
+
+    offset_mm: NDArray[np.float64]
+    distance_mm: float
+    layer_mm: float
+    inside: bool
+    turn_deg: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+
+
+def expert_motion(
+    seen: Percept, speed_mm_s: float, tick_s: float, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """The motion (6,) of one tick: translation in mm, rotation vector in degrees, base frame."""
+    lateral = (
+        np.zeros(2) if seen.inside else _limited(_LATERAL_GAIN_HZ * seen.offset_mm, speed_mm_s)
+    )
+    turn = _limited(_TURN_GAIN_HZ * seen.turn_deg, _TURN_DEG_S)
+    wanted = np.concatenate([lateral, [_vertical_mm_s(seen)], turn]) * tick_s
+    motion = _SMOOTHING * seen.velocity + (1 - _SMOOTHING) * wanted
+    tremor = rng.standard_normal(6) * np.repeat([_TREMOR_MM, _TREMOR_DEG], 3)
+    # Tissue holds a needle that is inside it.
+    tremor[:2] *= not seen.inside
+    return motion + tremor
+
+
+def _vertical_mm_s(seen: Percept) -> float:
+    if seen.inside:
+        return -float(np.clip(_VERTICAL_GAIN_HZ * seen.layer_mm, -_INSERTION_MM_S, _INSERTION_MM_S))
+    fall = _VERTICAL_GAIN_HZ * (seen.distance_mm - STANDOFF_MM)
+    if np.hypot(*seen.offset_mm) < ALIGNED_MM:
+        return -float(np.clip(fall, _INSERTION_MM_S, _DESCENT_MM_S))
+    return -float(np.clip(fall, -_DESCENT_MM_S, _DESCENT_MM_S))
+
+
+def _limited(velocity: NDArray[np.float64], limit: float) -> NDArray[np.float64]:
+    length = float(np.linalg.norm(velocity))
+    return velocity if length <= limit else velocity * (limit / length)

@@ -1,0 +1,128 @@
+"""One episode's hidden truth, and how it is drawn.
+
+Each concern draws from its own generator, so that changing one leaves the others as they were.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.simulation.arm import NOMINAL_POSE, angles_deg, orientation, wrapped_deg
+
+WORKSPACE_MM: Final = np.array([6.5, 4.0])
+"""Needle and target begin within plus or minus this of the bench's middle, x and y."""
+
+_PUSHES = 3
+_PUSH_MM: Final = (3.0, 8.0)
+_PUSH_EVERY_S: Final = (0.7, 1.4)
+
+
+@dataclass(frozen=True)
+class Tissue:
+    """Soft tissue: a stiffening spring, then a needle that cuts and rubs."""
+
+    stiffness_n_mm: float
+    stiffening_n_mm2: float
+    puncture_n: float
+    cutting_n: float
+    friction_n_mm: float
+    layer_depth_mm: float
+
+    def spring_n(self, indentation_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Force of the unbroken surface for an indentation of 0 or more."""
+        return self.stiffness_n_mm * indentation_mm + self.stiffening_n_mm2 * indentation_mm**2
+
+    def drag_n(self, depth_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Force on a needle whose tip is this deep under a punctured surface."""
+        return self.cutting_n + self.friction_n_mm * np.maximum(depth_mm, 0)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What an episode is made of and no observation states outright.
+
+    `bench_mm` (2,), `start_pose` (6,) and `surfaces_mm` (place,) are in the base frame,
+    `targets_mm` (place, 2) in the bench frame. The phantom begins at place 0 and goes to the next
+    at each push that happens. `upright_deg` (3,) are a b r of a needle that points straight down.
+    """
+
+    seed: int
+    bench_mm: NDArray[np.float64]
+    start_pose: NDArray[np.float64]
+    upright_deg: NDArray[np.float64]
+    targets_mm: NDArray[np.float64]
+    surfaces_mm: NDArray[np.float64]
+    push_times_s: NDArray[np.float64]
+    tissue: Tissue
+    speed_mm_s: float
+    brightness: float
+    oct_gain: float
+
+
+def draw_layout(seed: int, crosses_180: bool = False) -> Layout:
+    """The episode of a seed; with `crosses_180` its angle r passes ±180° on the way upright."""
+    bench, lateral, depth, hand, look = (np.random.default_rng([seed, i]) for i in range(5))
+    bench_mm = NOMINAL_POSE[:2] + bench.uniform(-15, 15, 2)
+    surface = NOMINAL_POSE[2] + bench.uniform(-10, 10)
+    rises = depth.uniform(0.5, 1.2, _PUSHES) * depth.choice([-1, 1], _PUSHES)
+    start_xy = bench_mm + hand.uniform(-WORKSPACE_MM, WORKSPACE_MM)
+    start_z = surface + depth.uniform(3.8, 5.0)
+    upright, leaning = _orientations(hand.uniform(-8, 8, 2), crosses_180)
+    return Layout(
+        seed=seed,
+        bench_mm=bench_mm,
+        start_pose=np.concatenate([start_xy, [start_z], leaning]),
+        upright_deg=upright,
+        targets_mm=_targets(lateral),
+        surfaces_mm=surface + np.concatenate([[0.0], _bounded_walk(rises)]),
+        push_times_s=np.cumsum(lateral.uniform(*_PUSH_EVERY_S, _PUSHES)),
+        tissue=_tissue(depth),
+        speed_mm_s=float(hand.uniform(6, 9)),
+        brightness=float(look.uniform(0.94, 1.06)),
+        oct_gain=float(look.uniform(0.92, 1.08)),
+    )
+
+
+def _targets(rng: np.random.Generator) -> NDArray[np.float64]:
+    targets = [rng.uniform(-WORKSPACE_MM, WORKSPACE_MM)]
+    while len(targets) <= _PUSHES:
+        target = rng.uniform(-WORKSPACE_MM, WORKSPACE_MM)
+        if _PUSH_MM[0] <= np.hypot(*(target - targets[-1])) <= _PUSH_MM[1]:
+            targets.append(target)
+    return np.stack(targets)
+
+
+def _bounded_walk(rises: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Heights after each rise, each turned around where it would lead farther than 1.5 mm."""
+    heights: list[float] = []
+    height = 0.0
+    for rise in rises:
+        height = height + rise if abs(height + rise) <= 1.5 else height - rise
+        heights.append(float(height))
+    return np.array(heights)
+
+
+def _orientations(
+    lean_deg: NDArray[np.float64], crosses_180: bool
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The upright and the starting a b r; angles of both are continuous, not wrapped."""
+    upright = NOMINAL_POSE[3:].copy()
+    lean = orientation(np.zeros(3)).from_rotvec([*lean_deg, 0.0], degrees=True)
+    turn = wrapped_deg(angles_deg(lean * orientation(upright)) - upright)
+    if crosses_180:
+        # Spin about the needle adds to r alone: start half the turn before 180°, end half after.
+        upright[2] = 180.0 - turn[2] / 2
+    return upright, upright + turn
+
+
+def _tissue(rng: np.random.Generator) -> Tissue:
+    return Tissue(
+        stiffness_n_mm=float(rng.uniform(0.9, 1.3)),
+        stiffening_n_mm2=float(rng.uniform(0.5, 0.9)),
+        puncture_n=float(rng.uniform(0.9, 1.3)),
+        cutting_n=float(rng.uniform(0.2, 0.3)),
+        friction_n_mm=float(rng.uniform(0.1, 0.18)),
+        layer_depth_mm=float(rng.uniform(2.0, 3.2)),
+    )

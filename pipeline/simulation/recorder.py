@@ -1,0 +1,104 @@
+"""A simulated episode as recorders see it: each stream through a clock of its own.
+
+Clocks start a little after each other and jitter; the arm's readings carry the noise of its
+encoders. Times are seconds since the epoch.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.simulation.arm import robot_state
+from pipeline.simulation.insertion import STATE_HZ, NeedleInsertion
+from pipeline.simulation.layout import draw_layout
+from pipeline.simulation.needle_sensor import READING_HZ
+from pipeline.simulation.rendering import render
+
+CAMERA_HZ: Final = 10
+
+_LATE_S: Final = 0.08
+_ROBOT_JITTER_S, _SENSOR_JITTER_S, _CAMERA_JITTER_S = 4e-4, 8e-5, 3e-3
+_LOST_FRAMES = 0.01
+_ENCODER_NOISE = 0.002
+"""Of every joint and pose reading, mm and degrees."""
+
+
+@dataclass(frozen=True)
+class SimulatedEpisode:
+    """One finished episode that began at `epoch_s`, and a generator for what its clocks do.
+
+    `sensor` (reading, 1026) at 650 Hz, the first a reading's time after the beginning.
+    """
+
+    insertion: NeedleInsertion
+    sensor: NDArray[np.float32]
+    epoch_s: float
+    rng: np.random.Generator
+
+    @property
+    def duration_s(self) -> float:
+        """Length of the episode."""
+        return self.insertion.time_s
+
+    @property
+    def stamp(self) -> str:
+        """The beginning as recorders write it into names, UTC."""
+        return datetime.fromtimestamp(self.epoch_s, UTC).strftime("%Y%m%d_%H%M%S")
+
+    @cached_property
+    def sensor_time(self) -> NDArray[np.float64]:
+        """The sensor's jittered clock, one time a row of `sensor`."""
+        nominal = self.epoch_s + np.arange(1, len(self.sensor) + 1) / READING_HZ
+        return _jittered(nominal, _SENSOR_JITTER_S, self.rng)
+
+    def robot_clock(self, jitter_s: float = _ROBOT_JITTER_S) -> NDArray[np.float64]:
+        """A 100 Hz clock that begins late."""
+        late = self.rng.uniform(0, _LATE_S)
+        nominal = self.epoch_s + late + np.arange((self.duration_s - late) * STATE_HZ) / STATE_HZ
+        return _jittered(nominal, jitter_s, self.rng)
+
+    def camera_clock(self, late_s: float | None = None) -> NDArray[np.float64]:
+        """A 10 Hz clock in whole milliseconds that begins late and loses a frame now and then."""
+        late = self.rng.uniform(0, _LATE_S) if late_s is None else late_s
+        frames = np.arange((self.duration_s - late) * CAMERA_HZ)
+        times = _jittered(self.epoch_s + late + frames / CAMERA_HZ, _CAMERA_JITTER_S, self.rng)
+        kept = self.rng.random(len(times)) >= _LOST_FRAMES
+        times[0], kept[0] = self.epoch_s + late, True
+        return np.round(times[kept], 3)
+
+    def states(self, time: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Joints and pose (time, 12), with the encoders' noise."""
+        exact = robot_state(self.poses(time))
+        noise = self.rng.standard_normal(exact.shape) * _ENCODER_NOISE
+        return (exact + noise).astype(np.float32)
+
+    def poses(self, time: NDArray[np.float64]) -> NDArray[np.float64]:
+        """True poses (time, 6), angles not wrapped."""
+        return self.insertion.poses(time - self.epoch_s)
+
+    def frames(self, view: str, time: NDArray[np.float64]) -> Iterator[NDArray[np.uint8]]:
+        """What a camera sees at each time, rendered one by one."""
+        for instant in time:
+            yield render(view, self.insertion.scene(float(instant) - self.epoch_s))
+
+
+def simulate_episode(seed: int, epoch_s: float, crosses_180: bool = False) -> SimulatedEpisode:
+    """The demonstrator's whole episode of a seed; same arguments, same episode."""
+    insertion = NeedleInsertion()
+    readings = [insertion.start(draw_layout(seed, crosses_180)).sensor]
+    while not insertion.finished:
+        readings.append(insertion.step(insertion.expert_action()).sensor)
+    rng = np.random.default_rng([seed, 201])
+    return SimulatedEpisode(insertion, np.concatenate(readings), epoch_s, rng)
+
+
+def _jittered(
+    nominal: NDArray[np.float64], jitter_s: float, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """The clock with normal jitter, never going backwards."""
+    return np.maximum.accumulate(nominal + jitter_s * rng.standard_normal(len(nominal)))

@@ -1,0 +1,126 @@
+"""Three camera views of the bench, drawn without perspective: heights leave no trace in them.
+
+    View1  from the side, across the diagonal: the camera rides up and down with the arm, and a
+           splash guard fixed to it hides what lies below the needle's tip. A laser plane
+           through the target draws a red stripe on the wall behind.
+    View2  from above, fixed to the bench: the phantom, its sticker, and the needle held by its arm.
+    View5  from the hand: the needle's tip stays in the middle of the image, the sticker moves.
+
+The views look through telecentric lenses: distance changes neither size nor place.
+"""
+
+from functools import cache
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+
+from pipeline.simulation.insertion import HUB_MM, Scene
+
+VIEWS: Final = ("View1", "View2", "View5")
+WIDTH: Final = 224
+HEIGHT: Final = 126
+
+_OVERSAMPLING = 2
+_SIZE = np.array([WIDTH, HEIGHT]) * _OVERSAMPLING
+_MIDDLE = _SIZE / 2
+_SIDE_PX_MM = 10.0 * _OVERSAMPLING
+_BENCH_PX_MM = 8.0 * _OVERSAMPLING
+_HAND_PX_MM = 7.0 * _OVERSAMPLING
+
+_PHANTOM_MM: Final = np.array([13.4, 7.6])
+"""Half extents of the phantom."""
+_STICKER_MM, _MARK_MM = 3.6, 2.8
+_HUB_RADIUS_MM, _SHAFT_MM, _ARM_MM = 1.25, 0.55, 0.6
+_GUARD_TOP = 0.85
+_ACROSS: Final = np.array([1.0, 1.0]) / np.sqrt(2.0)
+"""What the side camera shows to the right, in x and y of the bench."""
+
+_BENCH, _WALL, _GUARD = (96, 104, 112), (206, 212, 216), (58, 62, 68)
+_SKIN, _SKIN_EDGE = (232, 190, 168), (196, 146, 124)
+_STICKER, _MARK, _LASER = (250, 250, 246), (214, 24, 30), (226, 40, 40)
+_STEEL, _HUB, _ARM = (70, 74, 84), (20, 44, 140), (120, 124, 132)
+
+_Point = NDArray[np.float64]
+
+
+def render(view: str, scene: Scene) -> NDArray[np.uint8]:
+    """The image (126, 224, 3), RGB, of one of `VIEWS`."""
+    image = Image.new("RGB", (int(_SIZE[0]), int(_SIZE[1])), _WALL if view == "View1" else _BENCH)
+    _VIEWS[view](ImageDraw.Draw(image), scene)
+    return _exposure(scene.brightness)[np.asarray(image.reduce(_OVERSAMPLING))]
+
+
+@cache
+def _exposure(brightness: float) -> NDArray[np.uint8]:
+    """What each of the 256 levels becomes."""
+    return np.minimum(np.rint(np.arange(256) * brightness), 255).astype(np.uint8)
+
+
+def _draw_side(draw: ImageDraw.ImageDraw, scene: Scene) -> None:
+    stripe = _MIDDLE[0] + _SIDE_PX_MM * float(scene.target_mm @ _ACROSS)
+    half = _SIDE_PX_MM * _MARK_MM / 2
+    draw.rectangle((stripe - half, 0, stripe + half, _SIZE[1]), fill=_LASER)
+    tip = np.array(
+        [_MIDDLE[0] + _SIDE_PX_MM * float(scene.needle_mm @ _ACROSS), _GUARD_TOP * _SIZE[1]]
+    )
+    hub = tip + _SIDE_PX_MM * np.array([float(scene.lean_mm @ _ACROSS), -HUB_MM])
+    # The tip goes a little behind the guard, so that its end never shows.
+    _line(draw, hub, tip + 0.1 * (tip - hub), _SIDE_PX_MM * _SHAFT_MM, _STEEL)
+    size = _SIDE_PX_MM * _HUB_RADIUS_MM
+    draw.rectangle((hub[0] - size, 0, hub[0] + size, hub[1]), fill=_HUB)
+    draw.rectangle((0, _GUARD_TOP * _SIZE[1], *_SIZE), fill=_GUARD)
+
+
+def _draw_above(draw: ImageDraw.ImageDraw, scene: Scene) -> None:
+    _phantom(draw, _on_bench(np.zeros(2)), _on_bench(scene.target_mm), _BENCH_PX_MM)
+    tip, hub = _on_bench(scene.needle_mm), _on_bench(scene.needle_mm + scene.lean_mm)
+    _line(draw, hub, np.array([hub[0], -1.0]), _BENCH_PX_MM * _ARM_MM, _ARM)
+    _line(draw, tip, hub, _BENCH_PX_MM * _SHAFT_MM, _STEEL)
+    _disc(draw, hub, _BENCH_PX_MM * _HUB_RADIUS_MM, _HUB)
+
+
+def _draw_from_hand(draw: ImageDraw.ImageDraw, scene: Scene) -> None:
+    bench = _from_tip(-scene.needle_mm)
+    _phantom(draw, bench, _from_tip(scene.target_mm - scene.needle_mm), _HAND_PX_MM)
+    _line(draw, _MIDDLE, _SIZE.astype(np.float64), 2 * _HAND_PX_MM * _SHAFT_MM, _STEEL)
+    _disc(draw, _MIDDLE, _HAND_PX_MM * _SHAFT_MM * 1.4, _HUB)
+
+
+def _phantom(draw: ImageDraw.ImageDraw, middle: _Point, target: _Point, px_mm: float) -> None:
+    low, high = middle - px_mm * _PHANTOM_MM, middle + px_mm * _PHANTOM_MM
+    draw.rounded_rectangle(
+        (*low, *high), radius=px_mm * 1.5, fill=_SKIN, outline=_SKIN_EDGE, width=int(px_mm / 2)
+    )
+    _disc(draw, target, px_mm * _STICKER_MM, _STICKER)
+    _disc(draw, target, px_mm * _MARK_MM, _MARK)
+
+
+def _on_bench(place_mm: _Point) -> _Point:
+    """Pixels of View2: x to the right, y upwards, the bench's middle in the middle."""
+    return _MIDDLE + _BENCH_PX_MM * place_mm * [1.0, -1.0]
+
+
+def _from_tip(offset_mm: _Point) -> _Point:
+    """Pixels of View5: x to the right, y upwards, the needle's tip in the middle."""
+    return _MIDDLE + _HAND_PX_MM * offset_mm * [1.0, -1.0]
+
+
+def _disc(
+    draw: ImageDraw.ImageDraw, middle: _Point, radius: float, colour: tuple[int, int, int]
+) -> None:
+    draw.ellipse((*(middle - radius), *(middle + radius)), fill=colour)
+
+
+def _line(
+    draw: ImageDraw.ImageDraw,
+    start: _Point,
+    end: _Point,
+    width_px: float,
+    colour: tuple[int, int, int],
+) -> None:
+    draw.line((*start, *end), fill=colour, width=round(width_px))
+
+
+_VIEWS: Final = {"View1": _draw_side, "View2": _draw_above, "View5": _draw_from_hand}

@@ -1,0 +1,240 @@
+"""Every format the demo writes reads back, and nothing that is not the demo's is touched."""
+
+import errno
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.config import Source
+from pipeline.errors import ConfigError, DiskFull
+from pipeline.recordings import Recording, open_recordings
+from pipeline.simulation import demo_recordings
+from pipeline.simulation.demo_recordings import MARKER, write_demo_recordings
+from pipeline.simulation.recorder import SimulatedEpisode
+from pipeline.simulation.rendering import VIEWS, render
+
+SETS = ("raw", "new", "old", "lerobot")
+EPISODES, SEED = 3, 7
+
+
+def recordings(root: Path, name: str) -> list[Recording]:
+    """The episodes of a set; each must be there and whole."""
+    opened = open_recordings([Source(name=name, path=name)], root)
+    assert not opened.bad and not opened.missing
+    return list(opened.recordings)
+
+
+def simulated(name: str) -> list[SimulatedEpisode]:
+    """The episodes that a set was written from."""
+    seeds = np.random.SeedSequence
+    found = []
+    for index in range(EPISODES):
+        own = int(seeds([SEED, SETS.index(name), index]).generate_state(1)[0])
+        epoch = demo_recordings._FIRST_EPOCH_S + SETS.index(name) * 86_400.0 + index * 45.0
+        epoch += np.random.default_rng(own).uniform(0, 1)
+        found.append(demo_recordings.simulate_episode(own, epoch, index % 6 == 2))
+    return found
+
+
+def contents(root: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(root)): path.read_bytes()
+        for path in sorted(root.rglob("*"))
+        if path.is_file()
+    }
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_a_set_reads_back_as_what_was_simulated(demo_root: Path, name: str) -> None:
+    found = recordings(demo_root, name)
+    assert len(found) == EPISODES
+    for recording, truth in zip(found, simulated(name), strict=True):
+        assert recording.format == name
+        state, sensor = recording.state(), recording.sensor()
+        assert state is not None and sensor is not None
+        # LeRobot counts from its first row, which is a tick after the beginning.
+        origin = truth.epoch_s + 0.1 if name == "lerobot" else 0.0
+        poses = truth.poses(state.time + origin)
+        turned = (state.values[:, 9:] - poses[:, 3:] + 180) % 360 - 180
+        assert np.abs(state.values[:, 6:9] - poses[:, :3]).max() < 0.02
+        assert np.abs(turned).max() < 0.02
+        before = np.searchsorted(truth.sensor_time, sensor.time + origin, side="right") - 1
+        rows = np.maximum(before, 0)
+        near = np.abs(truth.sensor[rows, 1:] - sensor.values[:, 1:]).max(axis=1)
+        # A clock that is rebuilt may be a reading off where a scan gives way to the next.
+        assert np.mean(near == 0) > 0.7
+        assert len(sensor.values) > 0.97 * truth.duration_s * (10 if name == "old" else 650) - 1
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_frames_show_the_scene_at_their_time(demo_root: Path, name: str) -> None:
+    recording, truth = recordings(demo_root, name)[0], simulated(name)[0]
+    cameras = recording.cameras()
+    assert tuple(cameras) == VIEWS
+    origin = truth.epoch_s + 0.1 if name == "lerobot" else 0.0
+    for view, camera in cameras.items():
+        picked = [0, len(camera.time) // 3, len(camera.time) - 1]
+        assert len(camera.time) >= 0.9 * 10 * truth.duration_s - 2
+        for index, frame in zip(picked, camera.read(picked), strict=True):
+            scene = truth.insertion.scene(camera.time[index] + origin - truth.epoch_s)
+            # JPEG and H.264 keep it to a few levels on average; a wrong frame is far off.
+            assert np.abs(frame.astype(int) - render(view, scene).astype(int)).mean() < 4
+
+
+def test_all_formats_are_one_embodiment(demo_root: Path) -> None:
+    channels = set()
+    for name in SETS:
+        for recording in recordings(demo_root, name):
+            state, sensor, action = recording.state(), recording.sensor(), recording.action()
+            assert state is not None and sensor is not None
+            channels.add((state.channels, sensor.channels))
+            if name in ("raw", "new"):
+                assert action is None and recording.poses() is not None
+            else:
+                assert action is not None and action.kind == "delta"
+                assert np.abs(action.values[:, :6]).max() < 3
+                assert (action.values[:, 6] == 1).all()
+    assert len(channels) == 1
+
+
+def test_recorded_actions_lead_from_pose_to_pose(demo_root: Path) -> None:
+    for name in ("old", "lerobot"):
+        for recording, truth in zip(recordings(demo_root, name), simulated(name), strict=True):
+            action = recording.action()
+            assert action is not None
+            origin = truth.epoch_s + 0.1 if name == "lerobot" else 0.0
+            poses = truth.poses(action.time + origin)
+            steps = (np.diff(poses, axis=0) + 180) % 360 - 180
+            np.testing.assert_allclose(action.values[:-1, :6], steps, atol=2e-3)
+
+
+def test_windows_come_in_both_kinds_and_robot_clocks_too(demo_root: Path) -> None:
+    shapes, clocks = [], []
+    for folder in sorted((demo_root / "new").glob("*/*")):
+        with np.load(folder / "sensor_data.npz") as members:
+            shapes.append(members["data"].shape[1:])
+        metadata = json.loads((folder / "metadata.json").read_text(encoding="utf-8"))
+        assert metadata["sensor_window_size"] == shapes[-1][0]
+        clocks.append((folder / "robot_states.csv").is_file())
+    assert shapes == [(65, 1026), (650, 1026), (65, 1026)]
+    assert clocks == [False, False, True]
+
+
+def test_clocks_start_apart_and_jitter(demo_root: Path) -> None:
+    recording = recordings(demo_root, "raw")[0]
+    state, sensor = recording.state(), recording.sensor()
+    assert state is not None and sensor is not None
+    clocks = [state.time, sensor.time, *(c.time for c in recording.cameras().values())]
+    assert len({clock[0] for clock in clocks}) == len(clocks)
+    for clock in clocks:
+        assert np.diff(clock).std() > 1e-5
+    assert np.diff(state.time).max() > 0.04
+
+
+def test_one_episode_crosses_180(demo_root: Path) -> None:
+    for name in SETS:
+        jumps = []
+        for recording in recordings(demo_root, name):
+            state = recording.state()
+            assert state is not None
+            jumps.append(bool(np.abs(np.diff(state.values[:, 11])).max() > 300))
+        assert jumps == [False, False, True]
+
+
+def test_same_seed_same_bytes(demo_root: Path, tmp_path: Path) -> None:
+    write_demo_recordings(tmp_path / "again", EPISODES, SEED)
+    assert contents(tmp_path / "again") == contents(demo_root)
+
+
+@pytest.fixture
+def quick_sets(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Replaces the writers by ones that write a file; returns the names of the sets written."""
+    written: list[str] = []
+
+    def writer(name: str) -> demo_recordings.Write:
+        def write(folder: Path, episodes: demo_recordings.Episodes) -> None:
+            folder.mkdir()
+            (folder / "content").write_text(name, encoding="utf-8")
+            written.append(name)
+
+        return write
+
+    monkeypatch.setattr(demo_recordings, "_SETS", {name: writer(name) for name in SETS})
+    return written
+
+
+def test_finished_sets_are_kept(quick_sets: list[str], tmp_path: Path) -> None:
+    write_demo_recordings(tmp_path, 2, 0)
+    write_demo_recordings(tmp_path, 2, 0)
+    assert quick_sets == list(SETS)
+
+
+def test_other_params_replace_the_demos_own_sets(quick_sets: list[str], tmp_path: Path) -> None:
+    write_demo_recordings(tmp_path, 2, 0)
+    (tmp_path / "mine").mkdir()
+    write_demo_recordings(tmp_path, 2, 1)
+    assert quick_sets == [*SETS, *SETS]
+    assert (tmp_path / "mine").is_dir()
+
+
+def test_a_stopped_run_goes_on_with_the_unfinished_sets(
+    quick_sets: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = dict(demo_recordings._SETS)
+
+    def stopped(folder: Path, episodes: demo_recordings.Episodes) -> None:
+        folder.mkdir()
+        (folder / "half").touch()
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(demo_recordings._SETS, "old", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        write_demo_recordings(tmp_path, 2, 0)
+    assert not (tmp_path / "old").exists()
+    monkeypatch.setattr(demo_recordings, "_SETS", whole)
+    write_demo_recordings(tmp_path, 2, 0)
+    assert quick_sets == list(SETS)
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*SETS, MARKER])
+    assert not (tmp_path / "old" / "half").exists()
+
+
+def test_a_folder_that_the_demo_did_not_write_is_left_alone(
+    quick_sets: list[str], tmp_path: Path
+) -> None:
+    (tmp_path / "raw").mkdir()
+    with pytest.raises(ConfigError, match=r"did not write it.*demo\.recordings"):
+        write_demo_recordings(tmp_path, 2, 0)
+    (tmp_path / "raw").rmdir()
+    write_demo_recordings(tmp_path, 2, 0)
+    marker = json.loads((tmp_path / MARKER).read_text(encoding="utf-8"))
+    marker["sets"].remove("new")
+    (tmp_path / MARKER).write_text(json.dumps(marker), encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"does not list new"):
+        write_demo_recordings(tmp_path, 2, 5)
+    assert (tmp_path / "raw" / "content").is_file()
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"sets": 3}'])
+def test_a_broken_marker_is_named(quick_sets: list[str], tmp_path: Path, text: str) -> None:
+    (tmp_path / MARKER).write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError, match=MARKER):
+        write_demo_recordings(tmp_path, 2, 0)
+
+
+def test_a_file_in_place_of_the_folder_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match="did not write it"):
+        write_demo_recordings(tmp_path / "file", 2, 0)
+
+
+def test_a_full_disk_says_so(
+    quick_sets: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(folder: Path, episodes: demo_recordings.Episodes) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setitem(demo_recordings._SETS, "lerobot", full)
+    with pytest.raises(DiskFull, match="3 of 4"):
+        write_demo_recordings(tmp_path, 2, 0)

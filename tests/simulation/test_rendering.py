@@ -1,0 +1,84 @@
+"""The three views show where needle and target stand, and nothing else."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipeline.simulation.insertion import Scene
+from pipeline.simulation.layout import WORKSPACE_MM
+from pipeline.simulation.rendering import HEIGHT, VIEWS, WIDTH, render
+
+SCENE = Scene(np.array([-5.0, -3.0]), np.array([0.4, 0.3]), np.array([5.0, 2.0]), 1.0)
+
+
+def middle(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Mean x and y of the pixels that are set."""
+    rows, columns = np.nonzero(mask)
+    return np.array([columns.mean(), rows.mean()]) + 0.5
+
+
+def red(image: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    return (image[..., 0] > 180) & (image[..., 1] < 80)
+
+
+def blue(image: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    return (image[..., 2] > 110) & (image[..., 0] < 60)
+
+
+def test_the_scene_knows_no_height() -> None:
+    shown = {field.name: np.size(getattr(SCENE, field.name)) for field in fields(Scene)}
+    assert shown == {"needle_mm": 2, "lean_mm": 2, "target_mm": 2, "brightness": 1}
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_images_are_small_rgb_and_repeatable(view: str) -> None:
+    image = render(view, SCENE)
+    assert image.shape == (HEIGHT, WIDTH, 3) and image.dtype == np.uint8
+    np.testing.assert_array_equal(image, render(view, SCENE))
+
+
+@pytest.mark.parametrize("x", [-6.0, -2.0, 6.0])
+@pytest.mark.parametrize("y", [-4.0, 0.0, 4.0])
+def test_the_mark_and_the_hub_stand_where_they_are(x: float, y: float) -> None:
+    needle = np.array([9.0 if x < 0 else -9.0, 0.0])
+    scene = replace(SCENE, target_mm=np.array([x, y]), needle_mm=needle)
+    centre = np.array([WIDTH, HEIGHT]) / 2
+    above, side = render("View2", scene), render("View1", scene)
+    np.testing.assert_allclose(middle(red(above)), centre + 8 * np.array([x, -y]), atol=1)
+    hub = scene.needle_mm + scene.lean_mm
+    np.testing.assert_allclose(middle(blue(above)), centre + 8 * hub * [1, -1], atol=1)
+    for mask, place in ((red(side), scene.target_mm), (blue(side), hub)):
+        assert abs(middle(mask)[0] - (centre[0] + 10 * place.sum() / np.sqrt(2))) < 1
+
+
+def test_the_hand_eye_view_shows_the_offset_alone() -> None:
+    # Below the needle's tip the shaft would hide a part of the mark.
+    offset = np.array([-6.0, 3.0])
+    centre = np.array([WIDTH, HEIGHT]) / 2
+    for needle in (np.array([-1.0, -1.0]), np.array([2.0, 1.0])):
+        image = render("View5", replace(SCENE, needle_mm=needle, target_mm=needle + offset))
+        np.testing.assert_allclose(middle(red(image)), centre + 7 * offset * [1, -1], atol=1)
+
+
+def test_every_place_of_the_workspace_is_in_view() -> None:
+    for x in (-1, 1):
+        for y in (-1, 1):
+            target = WORKSPACE_MM * [x, y]
+            scene = replace(SCENE, target_mm=target, needle_mm=-target)
+            for view in VIEWS:
+                # In one corner of the hand-eye view the needle hides a part of the mark.
+                assert red(render(view, scene)).sum() > 100
+
+
+def test_the_side_view_does_not_show_depth_into_the_image() -> None:
+    aside = np.array([1.5, -1.5])
+    needle, target = SCENE.needle_mm + aside, SCENE.target_mm - aside
+    nearer = replace(SCENE, needle_mm=needle, target_mm=target)
+    np.testing.assert_array_equal(render("View1", SCENE), render("View1", nearer))
+
+
+def test_brightness_scales_all_colours() -> None:
+    dark, light = (render("View5", replace(SCENE, brightness=b)).astype(int) for b in (0.8, 1.0))
+    assert np.abs(dark - 0.8 * light).max() <= 1
