@@ -8,7 +8,7 @@ import hashlib
 import sqlite3
 from pathlib import Path
 
-from pipeline.errors import RecordingError
+from pipeline.errors import DiskFull, RecordingError
 
 _BLOCK = 4 * 2**20
 
@@ -17,6 +17,7 @@ class ContentDigests:
     """Digests of files, kept in one SQLite file."""
 
     def __init__(self, ledger: Path) -> None:
+        self._ledger = ledger
         ledger.parent.mkdir(parents=True, exist_ok=True)
         try:
             self._open(ledger)
@@ -56,15 +57,13 @@ class ContentDigests:
             digest = _digest(path)
         except OSError as error:
             raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
-        self._database.execute(
-            "INSERT OR REPLACE INTO file VALUES (?, ?, ?, ?)",
-            (place, status.st_size, status.st_mtime_ns, digest),
-        )
+        row = (place, status.st_size, status.st_mtime_ns, digest)
+        self._write("INSERT OR REPLACE INTO file VALUES (?, ?, ?, ?)", row)
         return digest
 
     def note_rate(self, what: str, rows_per_s: float) -> None:
         """Remember how fast rows were computed, for the estimate of a later plan."""
-        self._database.execute("INSERT OR REPLACE INTO rate VALUES (?, ?)", (what, rows_per_s))
+        self._write("INSERT OR REPLACE INTO rate VALUES (?, ?)", (what, rows_per_s))
 
     def rate(self, what: str) -> float | None:
         """Rows a second of the last session under that name."""
@@ -72,6 +71,15 @@ class ContentDigests:
             "SELECT rows_per_s FROM rate WHERE what = ?", (what,)
         ).fetchone()
         return float(row[0]) if row else None
+
+    def _write(self, statement: str, values: tuple[object, ...]) -> None:
+        try:
+            self._database.execute(statement, values)
+        except sqlite3.OperationalError as error:
+            raise DiskFull(
+                f"{self._ledger}: cannot be written: {error}. Make room on that disk, or set "
+                "extract.store to another, and run the same command again."
+            ) from None
 
 
 def _digest(path: Path) -> str:

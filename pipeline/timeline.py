@@ -48,6 +48,12 @@ class Timeline:
     state_end: NDArray[np.int64]
     """(tick,) one past the last state at or before the tick; 0 without a state."""
 
+    def frame_times(self, views: Sequence[str]) -> NDArray[np.float64]:
+        """(vl_row, view) s, NaN where the episode lacks the view."""
+        missing = np.full(len(self.vl_time), np.nan)
+        columns = [self.frame_time.get(view, missing) for view in views]
+        return np.stack(columns, axis=1) if columns else np.zeros((len(self.vl_time), 0))
+
 
 def build_timeline(
     recording: Recording,

@@ -44,12 +44,13 @@ def fill(
     params: Params,
     digests: ContentDigests,
 ) -> ExtractionReport:
-    """Fill in every missing row: from donors where an episode is unchanged, else by the model."""
+    """Fill in every missing row: from donors where its frames are known, else by the model."""
     begun = time.monotonic()
     layout = Donor(build.part)
     by_digest = {one.digest: one for one in surveyed.episodes}
     recordings = [by_digest[digest].recording for digest in layout.episode_digests]
     vl_start = layout.episode_edges("vl")
+    frame_time = build.files("vl/frame_time").read(0, int(vl_start[-1]))
     missing = build.missing()
     with tqdm(
         total=int(vl_start[-1]),
@@ -59,11 +60,10 @@ def fill(
         disable=None,
         smoothing=0.05,
     ) as progress:
-        taken = _take_unchanged(build, layout, donors, vl_start, missing, progress)
+        taken = _take_over(build, layout, donors, frame_time, missing, progress)
         missing = np.setdiff1d(missing, taken)
         computed = by_key = 0
         if len(missing):
-            frame_time = build.files("vl/frame_time").read(0, int(vl_start[-1]))
             spans = spans_of(recordings, vl_start, frame_time, surveyed.spec.views, missing)
             preparation = RowPreparation(Preparer(params.vlm, surveyed.spec), surveyed.spec, donors)
             rows = in_background(spans, preparation.prepare, params.extract.decode_threads)
@@ -73,24 +73,28 @@ def fill(
     return ExtractionReport(build.target, int(vl_start[-1]), len(taken) + by_key, computed, seconds)
 
 
-def _take_unchanged(
+def _take_over(
     build: StoreBuild,
     layout: Donor,
     donors: Sequence[Donor],
-    vl_start: NDArray[np.int64],
+    frame_time: NDArray[np.float64],
     missing: NDArray[np.int64],
     progress: "tqdm[NoReturn]",
 ) -> list[int]:
-    """Copy the known rows of unchanged episodes, an episode at a time, without decoding a frame."""
+    """Copy rows of frames that a donor has seen, an episode at a time, without decoding one."""
+    vl_start = layout.episode_edges("vl")
     taken: list[int] = []
     wanted = set(missing.tolist())
-    for episode, digest in enumerate(layout.episode_digests):
+    for episode, (content, instruction) in enumerate(layout.episode_said):
+        rows = range(*vl_start[episode : episode + 2])
         for donor in donors:
-            keys = donor.keys_of(digest) or ()
+            keys = donor.keys_of(content, instruction)
             found = [
                 KnownRow(row, key, values, donor.environment_of(key))
-                for row, key in enumerate(keys, int(vl_start[episode]))
-                if row in wanted and key is not None and (values := donor.take(key)) is not None
+                for row in rows
+                if row in wanted
+                and (key := keys.get(frame_time[row].tobytes())) is not None
+                and (values := donor.take(key)) is not None
             ]
             _commit_known(build, found)
             progress.update(len(found))

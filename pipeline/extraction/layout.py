@@ -128,7 +128,7 @@ def _whole_arrays(
     yield "tick/sensor_end", shifted("sensor", [line.sensor_end for line in lines])
     yield "tick/state_end", shifted("state", [line.state_end for line in lines])
     yield "vl/time", np.concatenate([line.vl_time for line in lines])
-    yield "vl/frame_time", np.concatenate([_frame_times(line, views) for line in lines])
+    yield "vl/frame_time", np.concatenate([line.frame_times(views) for line in lines])
     yield "vl/slot_valid", np.concatenate([_slot_valid(line, survey.spec) for line in lines])
     for kind, edge in edges.items():
         yield f"episode/{kind}_start", edge
@@ -136,12 +136,6 @@ def _whole_arrays(
     yield "episode/text", np.frombuffer(b"".join(texts), np.uint8)
     source = [names.index(one.surveyed.recording.source) for one in checked]
     yield "episode/source", np.array(source, np.int32)
-
-
-def _frame_times(line: Timeline, views: Sequence[str]) -> NDArray[np.float64]:
-    missing = np.full(len(line.vl_time), np.nan)
-    columns = [line.frame_time.get(view, missing) for view in views]
-    return np.stack(columns, axis=1) if columns else np.zeros((len(line.vl_time), 0))
 
 
 def _slot_valid(line: Timeline, spec: FeatureSpec) -> NDArray[np.uint8]:

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from pipeline.extraction.check import CheckedEpisode
 from pipeline.extraction.survey import Survey
 from pipeline.store import FEATURES, Donor
 from pipeline.store.schema import ArraySpec
@@ -15,9 +16,10 @@ class ExtractionPlan:
 
     episodes: int
     unchanged: int
+    """Episodes that an earlier store holds just so."""
     rows: int
     known: int
-    """Rows that are there already: of the interrupted build, or of unchanged episodes."""
+    """Rows of the interrupted build, or of the same frames in an earlier store."""
     bytes: int
     free: int
     rows_per_s: float | None
@@ -76,15 +78,17 @@ def reasons(survey: Survey, store: Donor | None, specs: dict[str, ArraySpec]) ->
     return tuple(why) or ("the order of episodes, or how actions are derived, changed",)
 
 
-def unchanged_rows(survey: Survey, donors: Sequence[Donor]) -> tuple[int, int]:
-    """(episodes, rows) that a donor of the same spec has whole."""
-    episodes = rows = 0
-    for one in survey.episodes:
-        found = [keys for donor in donors if (keys := donor.keys_of(one.digest)) is not None]
-        if found:
-            episodes += 1
-            rows += max(sum(key is not None for key in keys) for keys in found)
-    return episodes, rows
+def known_rows(
+    checked: Sequence[CheckedEpisode], views: Sequence[str], donors: Sequence[Donor]
+) -> int:
+    """How many rows donors are known to have before a frame is decoded."""
+    count = 0
+    for one in checked:
+        said = one.surveyed.content, one.surveyed.recording.instruction
+        known = set().union(*(donor.keys_of(*said) for donor in donors))
+        rows = one.timeline.frame_times(views)
+        count += sum(row.tobytes() in known for row in rows)
+    return count
 
 
 def _duration(seconds: float) -> str:

@@ -10,7 +10,7 @@ from pipeline.digests import ContentDigests
 from pipeline.extraction.check import CheckedEpisode, check_episodes
 from pipeline.extraction.fill import ExtractionReport, fill, rate_name
 from pipeline.extraction.layout import build_arrays, lay_out
-from pipeline.extraction.plan import ExtractionPlan, reasons, store_bytes, unchanged_rows
+from pipeline.extraction.plan import ExtractionPlan, known_rows, reasons, store_bytes
 from pipeline.extraction.survey import Survey, survey
 from pipeline.store import Donor, StoreBuild, build_lock, free_bytes, part_path, read_plan, recover
 from pipeline.store.schema import read_specs
@@ -110,13 +110,13 @@ def _new_plan(
     params: Params,
     digests: ContentDigests,
 ) -> ExtractionPlan:
-    unchanged, known = unchanged_rows(surveyed, donors)
+    before = {digest for donor in donors for digest in donor.episode_digests}
     store = Donor(build.target) if build.target.exists() else None
     return ExtractionPlan(
         episodes=len(checked),
-        unchanged=unchanged,
+        unchanged=sum(one.surveyed.digest in before for one in checked),
         rows=build.specs["vl/time"].shape[0],
-        known=known,
+        known=known_rows(checked, surveyed.spec.views, donors),
         bytes=store_bytes(build.specs),
         free=free_bytes(build.part),
         rows_per_s=digests.rate(rate_name(surveyed, params)),

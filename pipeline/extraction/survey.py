@@ -29,7 +29,7 @@ class SurveyedEpisode:
     content: str
     """Digest of its files: equal content means equal streams."""
     digest: str
-    """Digest of content and of everything else that decides its rows."""
+    """Digest of content and of everything else that decides what the store says of it."""
 
 
 @dataclass(frozen=True)
@@ -61,18 +61,18 @@ def survey(params: Params, digests: ContentDigests) -> Survey:
     for recording in tqdm(opened.recordings, "survey", unit="episode", disable=None, leave=False):
         try:
             content = _content(recording, digests)
+            digest = _digest(recording, content, data, rotation)
             views |= set(recording.cameras())
         except RecordingError as error:
             bad.append(BadEpisode(recording.source, recording.path, str(error)))
             continue
-        episodes.append(SurveyedEpisode(recording, content, _digest(recording, content, data)))
+        episodes.append(SurveyedEpisode(recording, content, digest))
     if not episodes:
         refuse_bad(bad, of=len(bad))
     spec = feature_spec(params.vlm, params.extract.dtype, sorted(views), digests.of)
     plan = _hash(
         spec.digest,
         params.extract.sensor_dtype,
-        rotation,
         data.on_bad_episode,
         repr([(source.name, source.action_kind) for source in data.sources]),
         *(episode.digest for episode in episodes),
@@ -109,7 +109,7 @@ def _content(recording: Recording, digests: ContentDigests) -> str:
     return _hash(recording.identity(), json.dumps(sorted(named)))
 
 
-def _digest(recording: Recording, content: str, data: DataParams) -> str:
+def _digest(recording: Recording, content: str, data: DataParams, rotation: ActionRotation) -> str:
     return _hash(
         content,
         recording.source,
@@ -117,7 +117,7 @@ def _digest(recording: Recording, content: str, data: DataParams) -> str:
         recording.format,
         recording.instruction,
         shown_path(recording.path, data.root),
-        repr((data.action_hz, data.vlm_reuse_count)),
+        repr((data.action_hz, data.vlm_reuse_count, rotation)),
     )
 
 

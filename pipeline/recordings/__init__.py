@@ -91,8 +91,9 @@ def open_recordings(
     """Every episode of the sources, without reading a stream or a frame.
 
     A relative path of a source resolves under `root`, by default the working directory. Only the
-    views in `views` are kept. Raises `RecordingError` where a path matches nothing, holds no episode or not those of the source's
-    `format`, where a LeRobot `meta/` is broken, and where no recording has a wanted view.
+    views in `views` are kept. Raises `RecordingError` where a path matches nothing, holds no
+    episode or not those of the source's `format`, where a LeRobot `meta/` is broken, and where no
+    recording has a wanted view.
     """
     recordings: list[FileRecording] = []
     missing: list[str] = []

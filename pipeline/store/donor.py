@@ -26,6 +26,7 @@ class Donor:
         self.specs: dict[str, ArraySpec] = read_specs(path)
         self.attrs: dict[str, Any] = zarr.open_group(path, mode="r").attrs.asdict()
         self._features = ChunkFiles(path, self.specs[FEATURES])
+        self._edges: dict[str, NDArray[np.int64]] = {}
 
     @property
     def spec_digest(self) -> str:
@@ -37,6 +38,11 @@ class Donor:
         """The digest of each episode, in order: equal digest, equal rows."""
         return [said["digest"] for said in self._said]
 
+    @property
+    def episode_said(self) -> list[tuple[str, str]]:
+        """Content digest and instruction of each episode, in order."""
+        return [(said["content"], said["instruction"]) for said in self._said]
+
     @cached_property
     def episode_contents(self) -> list[str]:
         """The content digest of each episode, in order: equal content, equal streams."""
@@ -44,7 +50,9 @@ class Donor:
 
     def episode_edges(self, kind: str) -> NDArray[np.int64]:
         """(episode + 1,) offsets of `tick`, `vl`, `sensor` or `state` rows."""
-        return self._read(f"episode/{kind}_start")
+        if kind not in self._edges:
+            self._edges[kind] = self._read(f"episode/{kind}_start")
+        return self._edges[kind]
 
     @cached_property
     def rows(self) -> dict[bytes, int]:
@@ -53,16 +61,18 @@ class Donor:
         keys = self._keys
         return {keys[row].tobytes(): int(row) for row in done}
 
-    def keys_of(self, digest: str) -> list[bytes | None] | None:
-        """The keys of an unchanged episode's rows (None for a row not done), or None if unknown."""
-        if digest not in self.episode_digests:
-            return None
-        episode = self.episode_digests.index(digest)
-        start, stop = self.episode_edges("vl")[episode : episode + 2]
-        return [
-            self._keys[row].tobytes() if self._checksums[row] else None
-            for row in range(start, stop)
-        ]
+    def keys_of(self, content: str, instruction: str) -> dict[bytes, bytes]:
+        """Keys of the rows of episodes of this content and instruction, by their frame times.
+
+        Under one feature spec, the same files and the same capture time of every view (the bytes
+        of a row of `vl/frame_time`) are the same frames: no pixel needs to be decoded to tell.
+        """
+        return {
+            self._frame_time[row].tobytes(): self._keys[row].tobytes()
+            for episode in self._episodes_by_said.get((content, instruction), ())
+            for row in range(*self.episode_edges("vl")[episode : episode + 2])
+            if self._checksums[row]
+        }
 
     def take(self, key: bytes) -> NDArray[Any] | None:
         """The feature row (slot, dim) of a key; None where it is unknown or fails its checksum."""
@@ -83,6 +93,17 @@ class Donor:
     def close(self) -> None:
         """Close its files."""
         self._features.close()
+
+    @cached_property
+    def _episodes_by_said(self) -> dict[tuple[str, str], list[int]]:
+        found: dict[tuple[str, str], list[int]] = {}
+        for index, said in enumerate(self._said):
+            found.setdefault((said["content"], said["instruction"]), []).append(index)
+        return found
+
+    @cached_property
+    def _frame_time(self) -> NDArray[np.float64]:
+        return self._read("vl/frame_time")
 
     @cached_property
     def _environments(self) -> list[dict[str, Any]]:

@@ -20,6 +20,7 @@ class EnvironmentLog:
     def __init__(self, part: Path) -> None:
         self._listed = part / ".environments.json"
         self._of_row = part / ".environment_of_row"
+        self._temporary = part / ".environments.json.tmp"
 
     @property
     def noted(self) -> bool:
@@ -31,9 +32,8 @@ class EnvironmentLog:
         known = self._known()
         if environment not in known:
             known.append(dict(environment))
-            temporary = self._listed.with_suffix(".tmp")
-            temporary.write_text(json.dumps(known))
-            temporary.replace(self._listed)
+            self._temporary.write_text(json.dumps(known))
+            self._temporary.replace(self._listed)
         return known.index(dict(environment))
 
     def note(self, start: int, count: int, number: int) -> None:
@@ -58,6 +58,7 @@ class EnvironmentLog:
         """Forget it; a kill between the two leaves nothing that would be folded again."""
         self._listed.unlink(missing_ok=True)
         self._of_row.unlink(missing_ok=True)
+        self._temporary.unlink(missing_ok=True)
 
     def _known(self) -> list[dict[str, Any]]:
         return json.loads(self._listed.read_text()) if self._listed.exists() else []

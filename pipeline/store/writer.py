@@ -154,6 +154,8 @@ class StoreBuild:
             self.files(name).seal()
         with disk_full_named(self.part):
             self._note_environments()
+        for partial in self.part.glob("*.partial"):  # of a zarr write that was killed
+            partial.unlink()
         self.close()
         _sync_folders(self.part)
         self._put_in_place()

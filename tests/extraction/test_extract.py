@@ -163,6 +163,7 @@ class TestWhatItTakesOver:
         report, said = run(changed(data={"vlm_reuse_count": 1}))
         assert report.taken == rows
         assert sum(counted) == report.rows - rows
+        assert any(f"{rows} known" in line for line in said), "without decoding a frame"
         assert any("vlm_reuse_count" in line for line in said)
 
     def test_another_prompt_computes_everything_and_says_why(self, params, changed, counted):
@@ -250,6 +251,23 @@ class TestRefusals:
         with pytest.raises(DiskFull, match=r"needs .* GiB.*free"):
             run(params)
         assert not params.extract.store.exists()
+
+    def test_a_disk_that_fills_up_ends_in_an_error_and_a_build_that_resumes(
+        self, changed, small_disk, monkeypatch
+    ):
+        ballast = small_disk / "ballast"
+        ballast.write_bytes(bytes(3 * 2**19))
+        store = {"store": str(small_disk / "made.zarr"), "sensor_dtype": "float16"}
+        params = changed(extract=store)
+        with monkeypatch.context() as patch:
+            patch.setattr("pipeline.extraction.layout.free_bytes", lambda path: 2**40)
+            with pytest.raises(DiskFull, match=r"no space left.*make room and run the same"):
+                run(params)
+        assert not params.extract.store.exists()
+        ballast.unlink()
+        report, _ = run(params)
+        assert FeatureStore.open(params.extract.store).ticks == 59
+        assert report.computed == report.rows
 
     def test_lists_everything_that_is_wrong_at_once(self, params, recordings, no_model_later):
         no_model_later(images=False)
