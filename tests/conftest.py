@@ -178,10 +178,10 @@ def _named(prefix: str, width: int) -> dict[str, list[str]]:
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A tmpfs of 3 MiB; needs the right to mount one."""
+    """A tmpfs of 8 MiB; needs the right to mount one."""
     place = tmp_path / "small_disk"
     place.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=3m", "tmpfs", str(place)]
+    mount = ["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", str(place)]
     try:
         subprocess.run(mount, check=True, capture_output=True)
     except (OSError, subprocess.CalledProcessError):

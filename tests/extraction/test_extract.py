@@ -256,7 +256,7 @@ class TestRefusals:
         self, changed, small_disk, monkeypatch
     ):
         ballast = small_disk / "ballast"
-        ballast.write_bytes(bytes(3 * 2**19))
+        ballast.write_bytes(bytes(6 * 2**20))
         store = {"store": str(small_disk / "made.zarr"), "sensor_dtype": "float16"}
         params = changed(extract=store)
         with monkeypatch.context() as patch:
@@ -266,7 +266,7 @@ class TestRefusals:
         assert not params.extract.store.exists()
         ballast.unlink()
         report, _ = run(params)
-        assert FeatureStore.open(params.extract.store).ticks == 59
+        assert FeatureStore.open(params.extract.store).ticks == 68
         assert report.computed == report.rows
 
     def test_lists_everything_that_is_wrong_at_once(self, params, recordings, no_model_later):
