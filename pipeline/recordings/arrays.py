@@ -85,10 +85,12 @@ def member(members: Mapping[str, Numbers], names: Sequence[str], path: Path) -> 
 
 
 def numeric(array: Any, where: str) -> Numbers:
-    """The array, if it holds real numbers."""
+    """The array, if it holds rows of real numbers."""
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
         found = getattr(array, "dtype", type(array).__name__)
         raise RecordingError(f"{where}: expected an array of numbers, found {found}")
+    if array.ndim == 0:
+        raise RecordingError(f"{where}: expected rows of numbers, found the single {array}")
     return array
 
 

@@ -4,6 +4,7 @@ Rows and frames pair by number; the `timestamp` column is the clock and is kept 
 high-rate sensor has no home in LeRobot: this project's sidecar is `sensor/episode_000003.npz`.
 """
 
+import json
 import re
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
@@ -26,7 +27,7 @@ from pipeline.recordings.recording import (
     Channels,
     RecordedAction,
     Stream,
-    check_clock,
+    check_rising_clock,
     checked_stream,
 )
 from pipeline.recordings.video import VideoClip
@@ -35,6 +36,7 @@ MARKER = "meta/info.json"
 STATE = "observation.state"
 ACTION = "action"
 CLOCK = "timestamp"
+_DESCRIBING = ("dtype", "names", "units")
 _DELTA = re.compile(r"delta.*|d(x|y|z|a|b|r|rx|ry|rz|alpha|beta|gamma|roll|pitch|yaw)")
 
 
@@ -91,12 +93,26 @@ class LeRobotRecording(FileRecording):
         return sorted({find_rows(self._layout, self._entry).path, *videos, *sidecar})
 
     def identity(self) -> str:
-        """Where the shared files of v3.0 hold this episode; '' where its files are its own."""
+        """What `meta/info.json` decides, and where the shared files of v3.0 hold the episode.
+
+        Not the whole of `meta/`, which changes whenever an episode is added.
+        """
+        features = {
+            name: {key: self._layout.features[name].get(key) for key in _DESCRIBING}
+            for name in self._read_features()
+        }
+        described = json.dumps(
+            {"fps": self._layout.fps, "features": features}, sort_keys=True, separators=(",", ":")
+        )
         if not self._entry.shared:
-            return ""
+            return described
         spans = {view: self._entry.videos.get(key) for view, key in self._layout.views.items()}
         frames = [f"{v}@{span.first}" for v, span in sorted(spans.items()) if span]
-        return " ".join([f"{self.id}+{self._entry.length}", *frames])
+        return " ".join([described, f"{self.id}+{self._entry.length}", *frames])
+
+    def _read_features(self) -> list[str]:
+        kept = [key for view, key in self._layout.views.items() if self._wants(view)]
+        return [*(name for name in (STATE, ACTION) if name in self._layout.features), *kept]
 
     def state(self) -> Stream | None:
         return self._stream(STATE) if STATE in self._layout.features else None
@@ -124,7 +140,7 @@ class LeRobotRecording(FileRecording):
         return checked_stream(channels, member(members, ("timestamps",), path), values, str(path))
 
     def all_views(self) -> Sequence[str]:
-        return list(self._layout.views)
+        return sorted(self._layout.views)
 
     def _recorded_instruction(self) -> str:
         if len(self._entry.tasks) == 1:
@@ -165,7 +181,8 @@ class LeRobotRecording(FileRecording):
 
     def _clock(self, where: str, table: pa.Table) -> NDArray[np.float64]:
         time = matrix(_column(table, CLOCK, where), 1, f"{where}, {CLOCK!r}")[:, 0]
-        check_clock(time, f"{where}, {CLOCK!r}")
+        # Rows are chosen by time: of two at one time, the earlier would show the later's frame.
+        check_rising_clock(time, f"{where}, {CLOCK!r}")
         return time
 
     def _rows(self, columns: Sequence[str]) -> tuple[str, pa.Table]:
@@ -196,8 +213,12 @@ def _channels(name: str, feature: Mapping[str, Any], where: str) -> Channels:
     shape = feature.get("shape")
     if not isinstance(shape, list) or len(shape) != 1 or not isinstance(shape[0], int):
         raise RecordingError(f"{where}: expected a shape of one number, found {shape}")
-    names = _flat_names(feature.get("names"))
-    units = feature.get("units")
+    names, units = feature.get("names"), feature.get("units")
+    if not isinstance(names, list | dict | None) or not isinstance(units, list | None):
+        raise RecordingError(
+            f"{where}: expected names and units in lists, found names {names!r}, units {units!r}"
+        )
+    names = _flat_names(names)
     if names is None:
         names = [f"{name.rpartition('.')[2]}_{place}" for place in range(shape[0])]
     for key, found in (("names", names), ("units", units)):
@@ -206,7 +227,7 @@ def _channels(name: str, feature: Mapping[str, Any], where: str) -> Channels:
     return Channels(tuple(names), ("",) * shape[0] if units is None else tuple(map(str, units)))
 
 
-def _flat_names(names: Any) -> list[str] | None:
+def _flat_names(names: list[Any] | dict[str, Any] | None) -> list[str] | None:
     """Channel names from a list, a list in a list, a dict of lists, or null."""
     if names is None:
         return None

@@ -4,6 +4,7 @@ v2.0 and v2.1 keep a file an episode, v3.0 many episodes a file. Only `meta/` is
 """
 
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -76,11 +77,11 @@ def read_layout(root: Path) -> tuple[Layout, tuple[Entry, ...]]:
     features = info.get("features")
     if fps is None or not isinstance(features, dict):
         raise RecordingError(f"{path}: expected fps and features, found {', '.join(info)}")
-    read = _entries_v3 if version == "v3.0" else _entries_v2
     try:
-        entries = tuple(sorted(read(root, info, fps), key=lambda entry: entry.index))
+        read = _entries_v3(root, info, fps) if version == "v3.0" else _entries_v2(root, info)
+        entries = tuple(sorted(read, key=lambda entry: entry.index))
         tasks = _tasks_v3(root) if version == "v3.0" else _tasks_v2(root)
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         if isinstance(error, RecordingError):
             raise
         raise RecordingError(f"{root / 'meta'}: cannot be understood: {error!r}") from None
@@ -98,14 +99,20 @@ def _video_keys(info: Mapping[str, Any]) -> list[str]:
     return [key for key, f in info["features"].items() if f.get("dtype") == "video"]
 
 
-def _entries_v2(root: Path, info: Mapping[str, Any], fps: float) -> Iterator[Entry]:
-    for row in _jsonl(root / "meta" / "episodes.jsonl", ("episode_index", "length")):
+def _entries_v2(root: Path, info: Mapping[str, Any]) -> Iterator[Entry]:
+    path = root / "meta" / "episodes.jsonl"
+    chunk = number(info, "chunks_size", str(root / "meta" / "info.json"), positive=True)
+    if chunk is None or chunk % 1:
+        raise RecordingError(
+            f"{root / 'meta' / 'info.json'}: chunks_size must be a whole number, found {chunk}"
+        )
+    for row in _jsonl(path, ("episode_index", "length")):
         index = int(row["episode_index"])
-        place = {"episode_index": index, "episode_chunk": index // int(info["chunks_size"])}
+        place = {"episode_index": index, "episode_chunk": index // int(chunk)}
         yield Entry(
             index=index,
             length=int(row["length"]),
-            tasks=tuple(row.get("tasks") or ()),
+            tasks=_texts(row, path),
             data=root / info["data_path"].format(**place),
             shared=False,
             videos={
@@ -128,7 +135,7 @@ def _entries_v3(root: Path, info: Mapping[str, Any], fps: float) -> Iterator[Ent
         yield Entry(
             index=row["episode_index"],
             length=row["length"],
-            tasks=tuple(row.get("tasks") or ()),
+            tasks=_texts(row, folder),
             data=root
             / info["data_path"].format(
                 chunk_index=row["data/chunk_index"], file_index=row["data/file_index"]
@@ -136,6 +143,15 @@ def _entries_v3(root: Path, info: Mapping[str, Any], fps: float) -> Iterator[Ent
             shared=True,
             videos={key: _span_v3(root, info, row, key, fps) for key in keys},
         )
+
+
+def _texts(row: Mapping[str, Any], where: Path) -> tuple[str, ...]:
+    tasks = row.get("tasks") or []
+    if not isinstance(tasks, list) or not all(isinstance(task, str) for task in tasks):
+        raise RecordingError(
+            f"{where}, episode {row['episode_index']}: expected tasks as texts, found {tasks!r}"
+        )
+    return tuple(tasks)
 
 
 _SPAN_FIELDS = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
@@ -186,6 +202,9 @@ def _rows(files: Sequence[Path], needed: Sequence[str]) -> Iterator[dict[str, An
             empty = [name for name in needed if row[name] is None]
             if empty:
                 raise RecordingError(f"{path}, row {place}: {', '.join(empty)} is null")
+            for name in needed:
+                if isinstance(row[name], float) and not math.isfinite(row[name]):
+                    raise RecordingError(f"{path}, row {place}: {name} is {row[name]}")
             yield row
 
 

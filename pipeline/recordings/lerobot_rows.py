@@ -100,6 +100,8 @@ def find_rows(layout: Layout, entry: Entry) -> EpisodeRows:
         with opened(entry.data) as file:
             rows = EpisodeRows(entry.data, 0, file.metadata.num_rows)
         _check_length(rows.stop, entry, entry.data)
+        if not rows.stop:
+            raise RecordingError(f"{entry.data}: has no row of episode {entry.index}")
         return rows
     others = sorted((layout.root / "data").glob("*/*.parquet"), key=natural_key)
     for path in [entry.data, *(other for other in others if other != entry.data)]:

@@ -32,6 +32,9 @@ class FileRecording(Recording):
     def cameras(self) -> Mapping[str, CameraStream]:
         return {view: camera for view, camera in self._cameras().items() if self._wants(view)}
 
+    def view_names(self) -> Sequence[str]:
+        return [view for view in self.all_views() if self._wants(view)]
+
     @abstractmethod
     def all_views(self) -> Sequence[str]:
         """Names of the views before the filter, without reading any numeric stream."""

@@ -61,7 +61,7 @@ class CameraStream(ABC):
     def check(self, indices: Sequence[int]) -> None:
         """Raise `RecordingError` naming the first of these frames that cannot be decoded.
 
-        Far cheaper than `read`; called before anything expensive runs.
+        Cheaper than `read`; called before anything expensive runs.
         """
 
     @abstractmethod
@@ -93,6 +93,10 @@ class Recording(ABC):
     @abstractmethod
     def cameras(self) -> Mapping[str, CameraStream]:
         """The views that have at least one frame, by name."""
+
+    def view_names(self) -> Sequence[str]:
+        """Names of `cameras()`, where the format allows it without reading a numeric stream."""
+        return list(self.cameras())
 
     def state(self) -> Stream | None:
         """The robot state, or None where the episode has none."""
@@ -158,4 +162,16 @@ def check_clock(time: NDArray[np.float64], where: str) -> None:
         raise RecordingError(
             f"{where}: the clock goes backwards at row {row}: "
             f"{time[row]:.6f} s after {time[row - 1]:.6f} s"
+        )
+
+
+def check_rising_clock(time: NDArray[np.float64], where: str) -> None:
+    """Raise `RecordingError` where a clock is not finite, goes backwards or stands still."""
+    check_clock(time, where)
+    still = np.flatnonzero(np.diff(time) == 0)
+    if still.size:
+        row = int(still[0]) + 1
+        raise RecordingError(
+            f"{where}: the clock stands still at row {row}: "
+            f"{time[row]:.6f} s after {time[row - 1]:.6f} s; it must rise from row to row"
         )

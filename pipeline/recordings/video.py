@@ -64,39 +64,47 @@ class VideoClip(CameraStream):
         self._fps = fps
 
     def check(self, indices: Sequence[int]) -> None:
-        """Reads every packet of the clip and decodes only the first frame asked for.
+        """Reads every packet of the clip and decodes the frames asked for, one held at a time.
 
-        So it finds a missing, truncated or undecodable file and a frame count other than the
-        rows'; damage inside a packet shows in `read`.
+        So it finds a missing, truncated or undecodable file, a frame count other than the rows',
+        and damage inside a packet wherever the decoder notices it.
         """
-        for _ in self.read(indices[:1]):
+        for _ in self._frames(sorted(set(indices))):
             pass
 
     def read(self, indices: Sequence[int]) -> Iterator[NDArray[np.uint8]]:
+        last, image = None, None
+        for frame in self._frames(indices):
+            if image is None or frame is not last:
+                last, image = frame, np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
+            yield image
+
+    def _frames(self, indices: Sequence[int]) -> Iterator[VideoFrame]:
+        """The frames before their conversion to RGB; the same object where an index repeats."""
         table = self._table
         with self._open() as (container, stream):
             decoded: Iterator[VideoFrame] = iter(())
-            at, image = -1, None
+            at, frame = -1, None
             for index in indices:
                 assert index >= at, "frames are read in never decreasing order"
-                if image is None or index != at:
+                if frame is None or index != at:
                     # Whole groups of pictures between two frames are skipped, not decoded.
-                    if image is None or table.key_pts[index] > table.pts[at + 1]:
+                    if frame is None or table.key_pts[index] > table.pts[at + 1]:
                         container.seek(int(table.key_dts[index]), stream=stream)
                         decoded = iter(container.decode(stream))
-                    image = self._decode_until(decoded, int(table.pts[index]), index)
+                    frame = self._decode_until(decoded, index)
                     at = index
-                yield image
+                yield frame
 
-    def _decode_until(
-        self, decoded: Iterator[VideoFrame], pts: int, index: int
-    ) -> NDArray[np.uint8]:
-        said = ""
+    def _decode_until(self, decoded: Iterator[VideoFrame], index: int) -> VideoFrame:
+        pts, key_pts, said = int(self._table.pts[index]), int(self._table.key_pts[index]), ""
         try:
             for frame in decoded:
                 if frame.pts == pts and not frame.is_corrupt:
-                    return np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
-                if frame.pts is None or frame.pts >= pts:
+                    return frame
+                # A damaged frame since the key frame spoils those that are predicted from it.
+                spoilt = frame.is_corrupt and frame.pts is not None and frame.pts >= key_pts
+                if frame.pts is None or frame.pts >= pts or spoilt:
                     break
         except av.FFmpegError as error:
             said = f" ({error})"

@@ -55,7 +55,7 @@ def _is_complete(folder: Path) -> bool:
         if (folder / "adapter_config.json").exists():
             adapter_files(folder)
         else:
-            weight_files(folder)
+            _present_weights(folder)
             tokenizer_files(folder)
             return (folder / "preprocessor_config.json").exists()
     except VLMError:
@@ -111,8 +111,29 @@ def read_config(folder: Path) -> dict[str, Any]:
 def weight_files(folder: Path) -> list[Path]:
     """Every file that decides the weights, sorted: config.json, safetensors and their index.
 
-    Raises `VLMError` where there is none, or where the index names a file that is missing.
+    Raises `VLMError` where there is none, where the index names a file that is missing, and where
+    transformers would load other files than these.
     """
+    if (folder / "adapter_config.json").exists():
+        raise VLMError(
+            f"{folder}: holds an adapter_config.json, so transformers could load an adapter "
+            "unasked. Expected a checkpoint alone: move the adapter to a folder of its own and "
+            "name that as vlm.adapter."
+        )
+    files, whole = _present_weights(folder), folder / "model.safetensors"
+    index = folder / "model.safetensors.index.json"
+    shards = [path for path in files if path.suffix == ".safetensors"]
+    # transformers loads model.safetensors and passes the index over.
+    if index.exists() and whole.exists() and shards != [whole]:
+        raise VLMError(
+            f"{folder}: ambiguous: it has both {whole.name} and {index.name}, which names "
+            f"{len(shards)} weight file(s). Remove {whole.name} if the shards are the checkpoint, "
+            f"else {index.name} and the shards."
+        )
+    return files
+
+
+def _present_weights(folder: Path) -> list[Path]:
     shards = sorted(folder.glob("*.safetensors"))
     index = folder / "model.safetensors.index.json"
     if index.exists():

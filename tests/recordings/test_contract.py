@@ -84,6 +84,16 @@ class TestRecordingContract:
         for recording in recordings:
             assert recording.instruction and recording.source == "s" and recording.path.is_dir()
 
+    def test_names_its_views_without_reading_a_stream(self, folder, recordings, monkeypatch):
+        expected = [list(recording.cameras()) for recording in recordings]
+        (first, *_) = expected[0]
+        kept = open_recordings([Source(name="s", path=str(folder))], folder, [first]).recordings
+        monkeypatch.setattr(np, "load", None)
+        monkeypatch.setattr(pq, "ParquetFile", None)
+        monkeypatch.setattr("pipeline.recordings.insertion.read_csv", None)
+        assert [list(recording.view_names()) for recording in recordings] == expected
+        assert all(recording.view_names() == [first] for recording in kept)
+
     def test_can_be_sent_to_another_process(self, recordings: tuple[Recording, ...]):
         for recording in recordings:
             again = pickle.loads(pickle.dumps(recording))

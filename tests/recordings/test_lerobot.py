@@ -116,6 +116,10 @@ def test_names_come_in_many_shapes(tmp_path, write, names, found):
     [
         ({"shape": [2], "names": ["p"]}, "1 names for 2 values"),
         ({"shape": [2], "names": None, "units": ["mm"]}, "1 units for 2 values"),
+        ({"shape": [2], "names": 5}, "expected names and units in lists, found names 5"),
+        ({"shape": [2], "names": "ab"}, "expected names and units in lists, found names 'ab'"),
+        ({"shape": [2], "names": None, "units": 5}, "found names None, units 5"),
+        ({"shape": [2], "names": None, "units": "mm"}, "found names None, units 'mm'"),
         ({"shape": [2, 3], "names": None}, r"shape of one number, found \[2, 3\]"),
         ({"shape": [3], "names": None}, "2 values in row 0, but its feature has 3"),
     ],
@@ -176,6 +180,29 @@ def test_a_clock_that_goes_backwards_is_named(tmp_path, write):
     for read in (lambda r: r.state(), lambda r: r.cameras()):
         with pytest.raises(RecordingError, match=r"timestamp.*goes backwards at row 4"):
             read(opened(root).recordings[0])
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_a_clock_that_stands_still_is_named(tmp_path, write, version):
+    times = np.array([0, 1, 2, 3, 3, 5, 6], np.float32)
+    root = write.lerobot(tmp_path / "set", version, lengths=(7,), timestamp=times)
+    message = (
+        r"\.parquet, episode_000000, 'timestamp'.*still at row 4: 3\.000000 s after 3\.000000 s"
+    )
+    for read in (lambda r: r.state(), lambda r: r.action(), lambda r: r.cameras()):
+        with pytest.raises(RecordingError, match=message):
+            read(opened(root).recordings[0])
+
+
+def test_an_episode_without_rows_is_named(tmp_path, write):
+    root = write.lerobot(tmp_path / "set", lengths=(7,))
+    path = root / "data/chunk-000/episode_000000.parquet"
+    pq.write_table(pq.ParquetFile(path).read().slice(0, 0), path)
+    write.jsonl(root / "meta/episodes.jsonl", [{"episode_index": 0, "tasks": [], "length": 0}])
+    recording = opened(root).recordings[0]
+    for read in (recording.state, recording.action, recording.cameras):
+        with pytest.raises(RecordingError, match=r"episode_000000\.parquet: has no row"):
+            read()
 
 
 def test_instructions_go_by_value_of_the_task_index(root, write):
@@ -367,6 +394,16 @@ def test_an_unknown_version_is_refused(tmp_path, write, version):
         ("episodes.jsonl", '{"episode_index": 0, "length": 7}\n{', "episodes.jsonl, line 2"),
         ("episodes.jsonl", '{"length": 7}', "line 1.*episode_index"),
         ("episodes.jsonl", '{"episode_index": "a", "length": 7}', "cannot be understood"),
+        (
+            "episodes.jsonl",
+            '{"episode_index": 4, "length": 7, "tasks": [5]}',
+            r"episodes\.jsonl, episode 4: expected tasks as texts, found \[5\]",
+        ),
+        (
+            "episodes.jsonl",
+            '{"episode_index": 4, "length": 7, "tasks": "pick"}',
+            "episode 4: expected tasks as texts, found 'pick'",
+        ),
         ("tasks.jsonl", '{"task": "pick"}', "tasks.jsonl, line 1.*task_index"),
     ],
 )
@@ -382,6 +419,9 @@ def test_broken_meta_of_v2_is_named(tmp_path, write, file, text, message):
     [
         ({"fps": None}, "expected fps and features"),
         ({"fps": 0}, "fps must be a positive number"),
+        ({"chunks_size": 0}, r"info\.json: chunks_size must be a positive number, found 0"),
+        ({"chunks_size": 0.5}, r"info\.json: chunks_size must be a whole number, found 0\.5"),
+        ({"chunks_size": None}, r"info\.json: chunks_size must be a whole number, found None"),
         ({"features": []}, "expected fps and features"),
         ({"data_path": "data/{nonsense}.parquet"}, "nonsense"),
         ({"data_path": None}, "data_path"),
@@ -391,6 +431,16 @@ def test_broken_info_is_named(tmp_path, write, changes, message):
     root = write.lerobot(tmp_path / "set")
     write.edit_json(root / "meta/info.json", **changes)
     with pytest.raises(RecordingError, match=f"source 's'.*{message}"):
+        opened(root)
+
+
+@pytest.mark.parametrize("field", ["from_timestamp", "to_timestamp"])
+@pytest.mark.parametrize("value", [np.inf, np.nan, 1e308])
+def test_a_video_span_that_is_no_time_is_named(tmp_path, write, field, value):
+    root = write.lerobot(tmp_path / "set", "v3.0")
+    edit_v3(root, **{f"videos/{KEY}/{field}": [0.7, value, 2.1]})
+    place = "cannot be understood" if value == 1e308 else rf"file-000\.parquet, row 1: .*{field}"
+    with pytest.raises(RecordingError, match=place):
         opened(root)
 
 
@@ -422,10 +472,43 @@ def test_episodes_files_of_resumed_recordings_are_all_read(tmp_path, write):
     assert len(opened(root).recordings) == 3
 
 
+def feature(dtype: str = "float32", names=("a", "b"), **entries) -> dict:
+    return {"dtype": dtype, "shape": [2], "names": list(names), **entries}
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_what_info_says_of_an_episode_is_in_its_identity(tmp_path, write, version):
+    root = write.lerobot(tmp_path / "set", version)
+    path = root / "meta/info.json"
+    info = json.loads(path.read_text())
+    features = info["features"]
+    side = {**features[KEY], "dtype": "image"}
+
+    def identity(views=("top",), **changes) -> str:
+        path.write_text(json.dumps({**info, **changes}))
+        source = Source(name="s", path=str(root))
+        return open_recordings([source], root, views).recordings[1].identity()
+
+    renamed = {**features, "action": {**features["action"], "names": ["x", "y", "z"]}}
+    identities = [
+        identity(),
+        identity(fps=20),
+        identity(features=renamed),
+        identity(features={**features, "observation.state": feature(units=["rad", "rad"])}),
+        identity(features={**features, "observation.state": feature("float64")}),
+        identity(views=("top", "side"), features={**features, "observation.images.side": side}),
+    ]
+    assert len(set(identities)) == len(identities)
+    assert identities[0] == identity(
+        total_episodes=99,
+        features={**dict(reversed(features.items())), "observation.images.side": side},
+    )
+
+
 def test_adding_an_episode_leaves_the_files_of_the_others_alone(tmp_path, write):
     small = opened(write.lerobot(tmp_path / "a", lengths=(7, 5))).recordings
     large = opened(write.lerobot(tmp_path / "b", lengths=(7, 5, 9))).recordings
     for one, other in zip(small, large, strict=False):
         assert [p.name for p in one.files()] == [p.name for p in other.files()]
-        assert one.identity() == other.identity() == ""
+        assert one.identity() == other.identity()
         assert not any("meta" in path.parts for path in one.files())

@@ -171,3 +171,10 @@ def test_a_truncated_npy_is_named(tmp_path: Path, write, truth, only):
     path.write_bytes(path.read_bytes()[:-10])
     with pytest.raises(RecordingError, match=r"sensor_data\.npy.*cannot be read"):
         only(folder).sensor()
+
+
+def test_a_single_number_is_no_sensor_stream(tmp_path, write, truth, only):
+    folder = write.old(tmp_path / "T" / "e", truth, sensor_data=None)
+    np.save(folder / "sensor_data.npy", np.float32(1))
+    with pytest.raises(RecordingError, match=r"sensor_data\.npy: expected rows of numbers"):
+        only(folder).sensor()

@@ -118,20 +118,38 @@ def test_a_file_cut_off_behind_its_index_is_found_by_check(tmp_path, write):
         clip(path, 36).check([0])
 
 
+def damage(path, packet: int, kept: float = 0.0) -> None:
+    """Zeros over a packet, behind the part of it that is kept."""
+    with av.open(str(path)) as container:
+        packets = [(p.pos, p.size) for p in container.demux(video=0) if p.size]
+    content, (begin, size) = bytearray(path.read_bytes()), packets[packet]
+    begin, stop = begin + round(kept * size), begin + size
+    content[begin:stop] = bytes(stop - begin)
+    path.write_bytes(bytes(content))
+
+
 @pytest.mark.parametrize("codec", ["libx264", "libsvtav1"])
-def test_damage_inside_a_packet_is_found_by_read_and_named(tmp_path, write, codec):
+def test_damage_inside_a_packet_is_found_and_named(tmp_path, write, codec):
     if codec not in av.codecs_available:
         pytest.skip(f"this PyAV build has no {codec}")
     path = write.video(tmp_path / "a.mp4", list(range(0, 216, 6)), codec=codec, group=1)
-    with av.open(str(path)) as container:
-        packets = [(p.pos, p.size) for p in container.demux(video=0) if p.size]
-    content, (begin, size) = bytearray(path.read_bytes()), packets[20]
-    content[begin : begin + size] = bytes(size)
-    path.write_bytes(bytes(content))
+    damage(path, 20)
     assert len(list(clip(path, 36).read(range(18)))) == 18
     assert len(list(clip(path, 36).read([19, 21]))) == 2
-    with pytest.raises(RecordingError, match=r"a\.mp4: frame 20 of view 'top' cannot be decoded"):
-        list(clip(path, 36).read([20]))
+    clip(path, 36).check([19, 21])
+    for attempt in (lambda c: list(c.read([20])), lambda c: c.check([0, 20, 35])):
+        with pytest.raises(RecordingError, match=r"a\.mp4: frame 20 of view 'top' cannot be dec"):
+            attempt(clip(path, 36))
+
+
+@pytest.mark.parametrize("packet", [13, 14])
+def test_damage_that_the_decoder_conceals_spoils_the_frames_after_it(tmp_path, write, packet):
+    path = write.video(tmp_path / "a.mp4", list(range(0, 216, 6)))
+    damage(path, packet, kept=0.5)
+    clip(path, 36).check([0, 12, 16, 35])
+    for attempt in (lambda c: list(c.read([12, 15])), lambda c: c.check([12, 15])):
+        with pytest.raises(RecordingError, match=r"a\.mp4: frame 15 of view 'top' cannot be dec"):
+            attempt(clip(path, 36))
 
 
 def test_a_file_without_video_is_named(tmp_path):

@@ -88,6 +88,8 @@ def rewrite_states(**changes):
         (rewrite_states(robot_states=None, poses=None), "no member 'poses'"),
         (rewrite_states(robot_states=np.zeros((50, 11))), r"12 values.*\(50, 11\)"),
         (rewrite_states(robot_states=None, joints=None, poses=None), "expected robot_states"),
+        (rewrite_states(robot_states=np.float32(1)), "'robot_states': expected rows of numbers"),
+        (rewrite_states(joints=np.float32(1)), "'joints': expected rows of numbers, found .* 1"),
         (rewrite_states(robot_states=np.full((50, 12), np.inf)), "inf in row 0.*joint_1"),
     ],
 )

@@ -259,6 +259,29 @@ def test_a_cached_hub_copy_is_used_without_network(
         weight_files(resolve_checkpoint("someone/small-vl"))
 
 
+def test_only_what_transformers_loads_is_digested(tmp_path: Path, demo_checkpoint: Path) -> None:
+    folder = tmp_path / "vlm"
+    shutil.copytree(demo_checkpoint, folder)
+    whole, shard = folder / "model.safetensors", folder / "model-00001-of-00001.safetensors"
+    index = folder / "model.safetensors.index.json"
+    index.write_text(json.dumps({"weight_map": {"a": whole.name}}))
+    assert weight_files(folder) == sorted([folder / "config.json", whole, index])
+    shutil.copy(whole, shard)
+    index.write_text(json.dumps({"weight_map": {"a": shard.name}}))
+    with pytest.raises(VLMError, match=r"ambiguous.*Remove model\.safetensors if.*else.*index"):
+        weight_files(folder)
+    whole.unlink()
+    assert weight_files(folder) == sorted([folder / "config.json", shard, index])
+
+
+def test_an_adapter_inside_a_checkpoint_is_refused(tmp_path: Path, demo_checkpoint: Path) -> None:
+    folder = tmp_path / "vlm"
+    shutil.copytree(demo_checkpoint, folder)
+    (folder / "adapter_config.json").write_text("{}")
+    with pytest.raises(VLMError, match=r"adapter_config\.json.*name that as vlm\.adapter"):
+        weight_files(folder)
+
+
 def test_importing_the_spec_imports_neither_torch_nor_transformers() -> None:
     code = (
         "import sys, pipeline.vlm.feature_spec;"

@@ -1,0 +1,73 @@
+"""Read params.yaml: the only place that reads YAML."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import ValidationError
+
+from pipeline.config.sections import Params
+from pipeline.errors import ConfigError
+
+
+def load_params(path: Path, overrides: Sequence[str] = ()) -> Params:
+    """The params of a YAML file with `section.key=value` overrides laid over it.
+
+    A value is YAML, so `[1, 2]`, `null` and JSON work. Raises `ConfigError` with every problem.
+    """
+    try:
+        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigError(
+            f"{path}: no such file. Run from the project's root or pass --params FILE."
+        ) from None
+    except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
+        raise ConfigError(f"{path}: cannot be read as YAML: {error}") from None
+    if not isinstance(document, dict):
+        raise ConfigError(f"{path}: expected sections such as `data:`, found {document!r}")
+    for override in overrides:
+        _lay_over(document, override)
+    try:
+        return Params.model_validate(document)
+    except ValidationError as error:
+        raise ConfigError(_all_problems(error, path)) from None
+
+
+def _lay_over(document: dict[str, Any], override: str) -> None:
+    dotted, equals, text = override.partition("=")
+    keys = dotted.split(".")
+    if not equals or len(keys) < 2 or not all(keys):
+        raise ConfigError(f"--set {override}: expected section.key=value")
+    try:
+        value = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ConfigError(
+            f"--set {override}: the value is not YAML (put a text that begins with a brace or a "
+            f"bracket in quotes of its own): {error}"
+        ) from None
+    node = document
+    for depth, key in enumerate(keys[:-1], start=1):
+        child = node.get(key)
+        if child is None:
+            child = node[key] = {}
+        if not isinstance(child, dict):
+            raise ConfigError(
+                f"--set {override}: {'.'.join(keys[:depth])} is a {type(child).__name__}, "
+                "not a section; set it whole"
+            )
+        node = child
+    node[keys[-1]] = value
+
+
+def _all_problems(error: ValidationError, path: Path) -> str:
+    lines = [f"{path}: {error.error_count()} problem(s)"]
+    for problem in error.errors():
+        place = ".".join(str(part) for part in problem["loc"]) or "params"
+        found = (
+            ""
+            if problem["type"] in ("missing", "extra_forbidden")
+            else (f" (found {problem['input']!r:.200})")
+        )
+        lines.append(f"  {place}: {problem['msg']}{found}")
+    return "\n".join(lines)

@@ -1,0 +1,29 @@
+"""All sections together."""
+
+from pydantic import model_validator
+
+from pipeline.config.section import Section
+from pipeline.config.stage_one import DataParams, DemoParams, ExtractParams, VLMParams
+from pipeline.config.stage_two import EvaluateParams, TrainHeadParams
+
+
+class Params(Section):
+    """All of params.yaml."""
+
+    demo: DemoParams = DemoParams()
+    data: DataParams
+    vlm: VLMParams
+    extract: ExtractParams = ExtractParams()
+    train_head: TrainHeadParams = TrainHeadParams()
+    evaluate: EvaluateParams = EvaluateParams()
+
+    @model_validator(mode="after")
+    def _mixture_names_sources(self) -> "Params":
+        names = [source.name for source in self.data.sources]
+        unknown = sorted(set(self.train_head.mixture) - set(names))
+        if unknown and self.train_head.store is None:
+            raise ValueError(
+                f"train_head.mixture names {', '.join(unknown)}, "
+                f"but data.sources has {', '.join(names)}"
+            )
+        return self

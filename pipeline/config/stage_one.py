@@ -1,0 +1,139 @@
+"""Sections of the demo, the recordings, the frozen model and the extraction."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, field_validator
+
+from pipeline.config.section import Section, Seed
+
+RecordingFormat = Literal["auto", "raw", "new", "old", "lerobot"]
+Pooling = Literal["mean", "image_mean", "text_mean", "view_mean", "grid", "last"]
+Dtype = Literal["float32", "float16", "bfloat16"]
+
+
+class DemoParams(Section):
+    """The simulated recordings and the small checkpoint that `stages.demo` writes."""
+
+    recordings: Path = Path("data/demo")
+    """Folder of the four sets of recordings."""
+    checkpoint: Path = Path("models/demo_vlm")
+    """Folder of a small Qwen2.5-VL with random weights."""
+    episodes: int = Field(default=12, ge=2)
+    """Episodes a format."""
+    seed: Seed = 0
+    """Of the simulation and of the checkpoint's weights."""
+
+
+class Source(Section):
+    """One named set of recordings."""
+
+    name: str = Field(min_length=1)
+    """What `train_head.mixture` and reports call it."""
+    path: str | tuple[str, ...]
+    """Globs or paths: episode folders, folders of such, or LeRobot roots; relative to data.root."""
+    format: RecordingFormat = "auto"
+    """`auto` goes by the files that are there."""
+    instruction: str | None = None
+    """Replaces what the recording says."""
+    action_kind: Literal["auto", "absolute", "velocity", "delta"] = "auto"
+    """How a recorded action may be resampled; `auto` goes by format and channel names."""
+
+    @property
+    def paths(self) -> tuple[str, ...]:
+        """The globs as a tuple."""
+        return (self.path,) if isinstance(self.path, str) else self.path
+
+
+class DataParams(Section):
+    """Which recordings, and how they become ticks."""
+
+    root: Path = Path("data/demo")
+    """What DVC watches; an absolute source path stands outside it."""
+    sources: tuple[Source, ...] = Field(min_length=1)
+    """Sets of recordings of one embodiment: the same action, state and sensor channels."""
+    action_hz: float | None = Field(default=10.0, gt=0)
+    """Ticks a second; null takes the recorded rows as they are."""
+    vlm_reuse_count: int = Field(default=3, ge=1)
+    """Ticks that share one answer of the model."""
+    views: tuple[str, ...] | None = None
+    """Cameras to keep; null keeps all."""
+    action_rotation: Literal["auto", "rotvec", "euler_delta"] = "auto"
+    """Of actions derived from poses: rotation vectors, or wrapped differences of Euler angles as
+    the old format recorded them; `auto` is rotvec where every recording has poses."""
+    on_bad_episode: Literal["stop", "skip"] = "stop"
+    """Refuse to begin, or list bad episodes and leave them out."""
+
+    @field_validator("sources")
+    @classmethod
+    def _names_differ(cls, sources: tuple[Source, ...]) -> tuple[Source, ...]:
+        names = [source.name for source in sources]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ValueError(f"source names must differ; {', '.join(twice)} stands more than once")
+        return sources
+
+
+class VLMParams(Section):
+    """Which frozen model says what about an image; all but `attention` is a feature's identity."""
+
+    checkpoint: str
+    """A Qwen2.5-VL checkpoint folder or hub id."""
+    revision: str | None = None
+    """Of a hub id."""
+    adapter: str | None = None
+    """Folder of a peft adapter, merged into the weights."""
+    dtype: Dtype = "bfloat16"
+    """What the model computes in."""
+    attention: Literal["auto", "eager", "sdpa", "flash_attention_2"] = "auto"
+    """Backend; recorded in the store, not part of a feature's identity."""
+    image_resize_height: int = Field(default=360, ge=28)
+    """Pixels; rounded to what the processor takes (360 -> 364)."""
+    image_resize_width: int = Field(default=640, ge=28)
+    """Pixels; rounded to what the processor takes (640 -> 644)."""
+    prompt: str = "{instruction}\n{images}\n{instruction}"
+    """One user turn. Attention is causal: images see only what stands before them."""
+    layers: tuple[int, ...] = Field(default=(-1,), min_length=1)
+    """Decoder layers whose output is taken; 0 is the first, -1 the last."""
+    norms: tuple[bool, ...] = Field(default=(True,), min_length=1)
+    """Whether the model's final norm is applied to what a layer gives; both may be asked for."""
+    pooling: tuple[Pooling, ...] = Field(default=("mean",), min_length=1)
+    """Over which tokens: all, of images, of text, of each view, of 4 x 4 cells a view, the last."""
+
+    @field_validator("prompt")
+    @classmethod
+    def _known_placeholders(cls, prompt: str) -> str:
+        if prompt.count("{images}") > 1:
+            raise ValueError("{images} may stand once: each view is shown once")
+        rest = prompt.replace("{instruction}", "").replace("{images}", "")
+        if "{" in rest or "}" in rest:
+            raise ValueError("only {instruction} and {images} may stand in braces")
+        return prompt
+
+
+class ExtractParams(Section):
+    """Where the store goes and how it is computed; only store and dtypes decide what it holds."""
+
+    store: Path = Path("cache_store/demo.zarr")
+    """Written once, then never modified."""
+    dtype: Dtype = "float32"
+    """Of stored features."""
+    sensor_dtype: Literal["float32", "float16"] = "float32"
+    """Of the stored sensor stream."""
+    batch_size: Literal["auto"] | Annotated[int, Field(ge=1)] = "auto"
+    """Rows a forward pass; halved when memory runs out."""
+    workers: Literal[0] = 0
+    """Local processes or a scheduler address; so far only 0, this process."""
+    device: str = "auto"
+    """auto, cpu, cuda or cuda:N."""
+    decode_threads: int = Field(default=2, ge=1)
+    """Threads that decode and resize while the model works."""
+    plan: bool = False
+    """Only say what would be done."""
+
+    @field_validator("store")
+    @classmethod
+    def _named_zarr(cls, store: Path) -> Path:
+        if store.suffix != ".zarr":
+            raise ValueError(f"a store's name ends in .zarr, found {store}")
+        return store
