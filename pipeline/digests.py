@@ -8,7 +8,13 @@ import hashlib
 import sqlite3
 from pathlib import Path
 
-from pipeline.errors import DiskFull, RecordingError
+from pipeline.errors import (
+    ConfigError,
+    DiskFull,
+    PipelineError,
+    RecordingError,
+    StoreLocked,
+)
 
 _BLOCK = 4 * 2**20
 
@@ -18,15 +24,18 @@ class ContentDigests:
 
     def __init__(self, ledger: Path) -> None:
         self._ledger = ledger
-        ledger.parent.mkdir(parents=True, exist_ok=True)
         try:
-            self._open(ledger)
-        except sqlite3.DatabaseError:
-            ledger.unlink()
-            self._open(ledger)
+            ledger.parent.mkdir(parents=True, exist_ok=True)
+            self._open()
+        except sqlite3.DatabaseError as error:
+            if error.sqlite_errorcode not in (sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_CORRUPT):
+                raise self._unwritable(error) from None
+            for suffix in ("", "-wal", "-shm"):
+                ledger.with_name(ledger.name + suffix).unlink(missing_ok=True)
+            self._open()
 
-    def _open(self, ledger: Path) -> None:
-        self._database = sqlite3.connect(ledger, isolation_level=None)
+    def _open(self) -> None:
+        self._database = sqlite3.connect(self._ledger, isolation_level=None)
         self._database.execute("PRAGMA journal_mode = WAL")
         self._database.execute("PRAGMA synchronous = OFF")
         self._database.execute(
@@ -35,6 +44,9 @@ class ContentDigests:
         )
         self._database.execute(
             "CREATE TABLE IF NOT EXISTS rate (what TEXT PRIMARY KEY, rows_per_s REAL)"
+        )
+        self._database.execute(
+            "CREATE TABLE IF NOT EXISTS bad (episode TEXT PRIMARY KEY, reason TEXT)"
         )
 
     def close(self) -> None:
@@ -72,14 +84,32 @@ class ContentDigests:
         ).fetchone()
         return float(row[0]) if row else None
 
+    def note_bad(self, episode: str, reason: str) -> None:
+        """Remember that the episode of this digest cannot be used."""
+        self._write("INSERT OR REPLACE INTO bad VALUES (?, ?)", (episode, reason))
+
+    def bad(self, episode: str) -> str | None:
+        """Why the episode of this digest cannot be used; None where nothing is known."""
+        row = self._database.execute(
+            "SELECT reason FROM bad WHERE episode = ?", (episode,)
+        ).fetchone()
+        return str(row[0]) if row else None
+
     def _write(self, statement: str, values: tuple[object, ...]) -> None:
         try:
             self._database.execute(statement, values)
         except sqlite3.OperationalError as error:
-            raise DiskFull(
-                f"{self._ledger}: cannot be written: {error}. Make room on that disk, or set "
-                "extract.store to another, and run the same command again."
-            ) from None
+            raise self._unwritable(error) from None
+
+    def _unwritable(self, error: sqlite3.DatabaseError) -> PipelineError:
+        if error.sqlite_errorcode == sqlite3.SQLITE_BUSY:
+            return StoreLocked(f"{self._ledger}: in use by another process; try again when it ends")
+        if error.sqlite_errorcode == sqlite3.SQLITE_FULL:
+            return DiskFull(f"{self._ledger}: {error}. Make room and run the same command again.")
+        return ConfigError(
+            f"{self._ledger}: cannot be written: {error}. Set extract.store to a folder that "
+            "can be written to."
+        )
 
 
 def _digest(path: Path) -> str:

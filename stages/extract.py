@@ -24,8 +24,6 @@ def main(params: Params) -> None:
             f"{store}: {report.rows} rows, {report.computed} computed ({rate:.1f} rows/s), "
             f"{report.taken} taken over"
         )
-    elif not params.extract.plan:
-        print(f"{store}: up to date, nothing to do")
 
 
 if __name__ == "__main__":

@@ -116,7 +116,6 @@ def test_own_data_leave_the_demo_alone_and_an_added_episode_computes_its_rows(pr
     own = tmp_path / "own"
     shutil.copytree(project.folder / "data/demo/raw", own / "task" / "raw")
     sources = [{"name": "mine", "path": "task/raw"}]
-    before = (project.folder / "params.yaml").read_text()
     project.set(
         data={"root": str(own), "sources": sources}, extract={"store": "cache_store/own.zarr"}
     )
@@ -131,11 +130,9 @@ def test_own_data_leave_the_demo_alone_and_an_added_episode_computes_its_rows(pr
     image = next(added.glob("View1/**/*.jpg"))
     shutil.copy(sorted(added.glob("View2/**/*.jpg"))[0], image)
     said = project.dvc("repro", "extract")
-    assert f"{rows} taken over" in said or "computed" in said
     store = FeatureStore.open(project.folder / "cache_store/own.zarr")
     assert len(store.episodes) == 3
     line = next(text for text in said.splitlines() if "taken over" in text)
     computed = int(line.split("rows, ")[1].split(" computed")[0])
     assert computed <= len(store.episodes[-1].vl_rows)
     assert int(line.rsplit(", ", 1)[1].split()[0]) >= rows
-    (project.folder / "params.yaml").write_text(before)

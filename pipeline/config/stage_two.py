@@ -95,11 +95,13 @@ class TrainHeadParams(Section):
     """Of the average of weights that is evaluated and kept."""
     amp: Literal["auto", "off", "bfloat16"] = "auto"
     """bfloat16 autocast; `auto` where a CUDA device has it."""
-    group_weights: dict[Literal["translation", "rotation", "gripper", "other"], Weight] = {}
+    group_weights: dict[Literal["translation", "rotation", "gripper", "other"], Weight] = Field(
+        default_factory=dict
+    )
     """Weight of each action group in the loss, 1 where not named."""
     val_fraction: Fraction = 0.1
     """Share of episodes held out."""
-    mixture: dict[str, Weight] = {}
+    mixture: dict[str, Weight] = Field(default_factory=dict)
     """Sampling weight of each source; 1 where not named."""
     eval_every: int = Field(default=200, ge=1)
     """Steps between evaluations on held-out ticks."""

@@ -3,7 +3,6 @@
 So all that is wrong is said at once, and before anything expensive runs.
 """
 
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -11,10 +10,11 @@ import numpy as np
 from tqdm import tqdm
 
 from pipeline.config import Params
-from pipeline.errors import RecordingError, StoreMismatch
+from pipeline.errors import RecordingError, StoreMismatch, VLMError
 from pipeline.extraction.survey import Survey, SurveyedEpisode, refuse_bad
 from pipeline.recordings import BadEpisode, Channels
 from pipeline.timeline import Timeline, build_timeline
+from pipeline.vlm.preparation import Preparer
 
 NO_CHANNELS = Channels((), ())
 
@@ -31,30 +31,34 @@ class CheckedEpisode:
     states: int
 
 
-def check_episodes(survey: Survey, params: Params) -> list[CheckedEpisode]:
-    """Read and check every episode.
+def check_episodes(
+    survey: Survey, params: Params
+) -> tuple[list[CheckedEpisode], list[tuple[SurveyedEpisode, str]]]:
+    """Read and check every episode; returns the sound ones, and the others with the reason.
 
-    Raises one `RecordingError` that lists all that cannot be used (or, with
-    `data.on_bad_episode: skip`, prints them and goes on), and `StoreMismatch` when two sources are
+    Raises one `RecordingError` that lists all that cannot be used, unless
+    `data.on_bad_episode: skip` allows to leave them out, and `StoreMismatch` when two sources are
     not of one embodiment.
     """
+    preparer = Preparer(params.vlm, survey.spec)
     good: list[CheckedEpisode] = []
-    bad: list[BadEpisode] = list(survey.bad)
+    found: list[tuple[SurveyedEpisode, str]] = []
     for surveyed in tqdm(survey.episodes, "check", unit="episode", disable=None, leave=False):
         try:
-            good.append(_checked(surveyed, survey, params))
+            good.append(_checked(surveyed, survey, params, preparer))
         except RecordingError as error:
-            recording = surveyed.recording
-            bad.append(BadEpisode(recording.source, recording.path, str(error)))
+            found.append((surveyed, str(error)))
+    recordings = [(surveyed.recording, reason) for surveyed, reason in found]
+    bad = [*survey.bad, *(BadEpisode(one.source, one.path, reason) for one, reason in recordings)]
     if bad and (params.data.on_bad_episode == "stop" or not good):
         refuse_bad(bad, of=len(good) + len(bad))
-    for one in bad:
-        print(f"skipped {one.source}: {one.reason}", file=sys.stderr)
     _check_one_embodiment(good)
-    return good
+    return good, found
 
 
-def _checked(surveyed: SurveyedEpisode, survey: Survey, params: Params) -> CheckedEpisode:
+def _checked(
+    surveyed: SurveyedEpisode, survey: Survey, params: Params, preparer: Preparer
+) -> CheckedEpisode:
     recording = surveyed.recording
     state, sensor = recording.state(), recording.sensor()
     timeline = build_timeline(
@@ -65,7 +69,12 @@ def _checked(surveyed: SurveyedEpisode, survey: Survey, params: Params) -> Check
         state,
         sensor,
     )
-    for view, camera in recording.cameras().items():
+    cameras = recording.cameras()
+    try:
+        preparer.render(recording.instruction, list(cameras))
+    except VLMError as error:
+        raise RecordingError(f"{recording.path}: {error}") from None
+    for view, camera in cameras.items():
         camera.check(np.unique(timeline.frames[view]).tolist())
     return CheckedEpisode(
         surveyed,

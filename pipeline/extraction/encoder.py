@@ -45,16 +45,21 @@ class Encoder:
             batch = rows[: self.batch_size]
             try:
                 features, _ = self._vlm.encode([one.prepared for one in batch])
-            except torch.OutOfMemoryError as error:
+            except RuntimeError as error:
+                if not _out_of_memory(error):
+                    raise
                 self._halve(len(batch), error)
                 continue
             except NumericsError as error:
-                places = "; ".join(one.where for one in batch)
-                raise NumericsError(f"{error} The batch was: {places}") from None
-            yield batch, stored_bits(features)
-            rows = rows[self.batch_size :]
+                if len(batch) == 1:
+                    raise NumericsError(f"{batch[0].where}: {error}") from None
+                for one in batch:  # alone, the row that is not finite names itself
+                    yield from self.encode([one])
+            else:
+                yield batch, stored_bits(features)
+            rows = rows[len(batch) :]
 
-    def _halve(self, failed: int, error: torch.OutOfMemoryError) -> None:
+    def _halve(self, failed: int, error: RuntimeError) -> None:
         if failed == 1:
             raise VLMError(
                 f"out of memory with a single row ({error}). Use a GPU with more memory, a smaller "
@@ -63,6 +68,11 @@ class Encoder:
         self.batch_size = failed // 2
         torch.cuda.empty_cache()
         print(f"out of memory: going on with batches of {self.batch_size}", file=sys.stderr)
+
+
+def _out_of_memory(error: RuntimeError) -> bool:
+    """CUDA has an exception of its own; the CPU allocator says it in words."""
+    return isinstance(error, torch.OutOfMemoryError) or "can't allocate memory" in str(error)
 
 
 def stored_bits(features: torch.Tensor) -> NDArray[Any]:

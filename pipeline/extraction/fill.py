@@ -43,15 +43,15 @@ def fill(
     donors: Sequence[Donor],
     params: Params,
     digests: ContentDigests,
+    missing: NDArray[np.int64],
 ) -> ExtractionReport:
-    """Fill in every missing row: from donors where its frames are known, else by the model."""
+    """Fill in the missing rows: from donors where its frames are known, else by the model."""
     begun = time.monotonic()
     layout = Donor(build.part)
     by_digest = {one.digest: one for one in surveyed.episodes}
     recordings = [by_digest[digest].recording for digest in layout.episode_digests]
     vl_start = layout.episode_edges("vl")
     frame_time = build.files("vl/frame_time").read(0, int(vl_start[-1]))
-    missing = build.missing()
     with tqdm(
         total=int(vl_start[-1]),
         initial=int(vl_start[-1]) - len(missing),

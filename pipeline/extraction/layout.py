@@ -19,6 +19,24 @@ from pipeline.timeline import Timeline
 from pipeline.vlm.feature_spec import FeatureSpec
 
 
+def check_space(
+    build: StoreBuild, checked: Sequence[CheckedEpisode], donors: Sequence[Donor]
+) -> None:
+    """Raise `DiskFull` where the store will not fit, chunks that can be linked left out."""
+    linked = sum(
+        build.linkable(name, donor.specs[name], rows) * build.specs[name].chunk_bytes
+        for donor, name, rows in _linkable(build, checked, donors)
+    )
+    needed = sum(spec.data_bytes for spec in build.specs.values()) - linked
+    free = free_bytes(build.part)
+    if needed > free:
+        raise DiskFull(
+            f"{build.target}: the store needs {needed / 2**30:.2f} GiB, {build.part.parent} has "
+            f"{free / 2**30:.2f} GiB free. Make room, or set extract.store to another disk, "
+            "extract.dtype or extract.sensor_dtype to float16, or fewer vlm.pooling slots."
+        )
+
+
 def lay_out(
     build: StoreBuild,
     checked: Sequence[CheckedEpisode],
@@ -28,14 +46,12 @@ def lay_out(
 ) -> None:
     """Write all but the feature rows; chunks of unchanged streams are linked from a finished store.
 
-    Raises `DiskFull` before anything is written when the store will not fit.
+    Raises `DiskFull` where the disk fills up.
     """
-    _check_space(build)
     build.create()
     edges = _edges(checked)
-    for donor in donors:
-        if donor.path == build.target:
-            _link_streams(build, donor, checked, edges)
+    for donor, name, rows in _linkable(build, checked, donors):
+        build.link_unchanged(name, donor.path, donor.specs[name], rows)
     build.allocate()
     for name, values in _whole_arrays(checked, survey, params, edges):
         build.write(name, 0, values)
@@ -68,17 +84,6 @@ def build_arrays(
     return arrays(sizes, params.extract.dtype, params.extract.sensor_dtype)
 
 
-def _check_space(build: StoreBuild) -> None:
-    needed = sum(spec.data_bytes for spec in build.specs.values())
-    free = free_bytes(build.part)
-    if needed > free:
-        raise DiskFull(
-            f"{build.target}: the store needs {needed / 2**30:.2f} GiB, {build.part.parent} has "
-            f"{free / 2**30:.2f} GiB free. Make room, or set extract.store to another disk, "
-            "extract.dtype or extract.sensor_dtype to float16, or fewer vlm.pooling slots."
-        )
-
-
 def _edges(checked: Sequence[CheckedEpisode]) -> dict[str, NDArray[np.int64]]:
     counts = {
         "tick": [len(one.timeline.time) for one in checked],
@@ -89,22 +94,25 @@ def _edges(checked: Sequence[CheckedEpisode]) -> dict[str, NDArray[np.int64]]:
     return {kind: np.cumsum([0, *each], dtype=np.int64) for kind, each in counts.items()}
 
 
-def _link_streams(
-    build: StoreBuild,
-    donor: Donor,
-    checked: Sequence[CheckedEpisode],
-    edges: Mapping[str, NDArray[np.int64]],
-) -> None:
-    """Link the stream chunks that hold nothing but leading episodes of unchanged content."""
-    same = 0
-    for known, one in zip(donor.episode_contents, checked, strict=False):
-        if known != one.surveyed.content:
-            break
-        same += 1
-    for stream in ("sensor", "state"):
-        for part in ("values", "time"):
-            name = f"{stream}/{part}"
-            build.link_unchanged(name, donor.path, donor.specs[name], int(edges[stream][same]))
+def _linkable(
+    build: StoreBuild, checked: Sequence[CheckedEpisode], donors: Sequence[Donor]
+) -> Iterator[tuple[Donor, str, int]]:
+    """Stream arrays of a finished store, and how many of their first rows are the same here.
+
+    Those of the leading episodes of unchanged content; only whole chunks of them can be linked.
+    """
+    edges = _edges(checked)
+    for donor in donors:
+        if donor.path != build.target:
+            continue
+        same = 0
+        for known, one in zip(donor.episode_contents, checked, strict=False):
+            if known != one.surveyed.content:
+                break
+            same += 1
+        for stream in ("sensor", "state"):
+            for part in ("values", "time"):
+                yield donor, f"{stream}/{part}", int(edges[stream][same])
 
 
 def _whole_arrays(

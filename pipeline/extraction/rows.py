@@ -10,8 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import VLMError
-from pipeline.recordings import Recording
+from pipeline.recordings import CameraStream, Recording
 from pipeline.store import Donor
 from pipeline.timeline import last_at
 from pipeline.vlm.feature_spec import FeatureSpec, row_key
@@ -29,6 +28,8 @@ class Span:
     """Consecutive missing rows of one episode and the frame of each view for each."""
 
     recording: Recording
+    cameras: Mapping[str, CameraStream]
+    """Opened once an episode: listing its frames costs time."""
     rows: NDArray[np.int64]
     """Store-global VL rows."""
     frames: Mapping[str, NDArray[np.int64]]
@@ -79,7 +80,7 @@ def spans_of(
                 for column, view in enumerate(views)
                 if np.isfinite(frame_time[rows[0], column])
             }
-            yield Span(recording, rows, frames)
+            yield Span(recording, cameras, rows, frames)
 
 
 class RowPreparation:
@@ -94,12 +95,10 @@ class RowPreparation:
     def prepare(self, span: Span) -> list[KnownRow | ReadyRow]:
         """The rows of a span, each decoded frame held only while its row is made."""
         recording = span.recording
-        cameras = recording.cameras()
-        readers = {view: cameras[view].read(each.tolist()) for view, each in span.frames.items()}
-        try:
-            prompt = self._preparer.render(recording.instruction, list(span.frames))
-        except VLMError as error:
-            raise VLMError(f"{recording.path}: {error}") from None
+        readers = {
+            view: span.cameras[view].read(frames.tolist()) for view, frames in span.frames.items()
+        }
+        prompt = self._preparer.render(recording.instruction, list(span.frames))
         made: list[KnownRow | ReadyRow] = []
         for row in span.rows.tolist():
             frames = {view: next(reader) for view, reader in readers.items()}

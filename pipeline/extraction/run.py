@@ -5,101 +5,130 @@ from collections.abc import Callable, Generator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
+import numpy as np
+
 from pipeline.config import Params
+from pipeline.device import resolve_device
 from pipeline.digests import ContentDigests
 from pipeline.extraction.check import CheckedEpisode, check_episodes
 from pipeline.extraction.fill import ExtractionReport, fill, rate_name
-from pipeline.extraction.layout import build_arrays, lay_out
+from pipeline.extraction.layout import build_arrays, check_space, lay_out
 from pipeline.extraction.plan import ExtractionPlan, known_rows, reasons, store_bytes
 from pipeline.extraction.survey import Survey, survey
 from pipeline.store import Donor, StoreBuild, build_lock, free_bytes, part_path, read_plan, recover
 from pipeline.store.schema import read_specs
+from pipeline.vlm.feature_spec import differences
+
+Say = Callable[[str], None]
 
 
-def extract(params: Params, say: Callable[[str], None]) -> ExtractionReport | None:
+def extract(params: Params, say: Say) -> ExtractionReport | None:
     """Make `extract.store` hold exactly what `params` describe; None where it does already.
 
     Resumes an interrupted build of the same plan, takes known rows over from an older store of the
     same feature spec, and computes the rest. With `extract.plan` it only says what it would do.
     """
     target = params.extract.store
+    resolve_device(params.extract.device)
     with ExitStack() as stack:
-        digests = stack.enter_context(closing(ContentDigests(_beside(target, ".files.sqlite"))))
         if not params.extract.plan:
             stack.enter_context(build_lock(target))
             recover(target)
+        digests = stack.enter_context(closing(ContentDigests(_beside(target, ".files.sqlite"))))
         surveyed = survey(params, digests)
-        for line in surveyed.missing:
-            say(f"not there: {line}")
+        if surveyed.bad and params.data.on_bad_episode == "stop":
+            check_episodes(surveyed, params)  # lists them with whatever else is wrong
         if read_plan(target) == surveyed.plan:
+            _say_survey(surveyed, params, say)
+            say(f"{target}: up to date, nothing to do")
             return None
-        donors = stack.enter_context(_donors(target, surveyed, params.extract.plan))
         if read_plan(part_path(target)) == surveyed.plan:
-            build = StoreBuild(target, read_specs(part_path(target)), surveyed.plan)
-            stack.callback(build.close)
-            _say_plan(_resume_plan(build, surveyed, params, digests), say)
-        else:
-            checked = check_episodes(surveyed, params)
-            build = StoreBuild(target, build_arrays(checked, surveyed, params), surveyed.plan)
-            stack.callback(build.close)
-            _say_plan(_new_plan(build, checked, surveyed, donors, params, digests), say)
-            if not params.extract.plan:
-                lay_out(build, checked, surveyed, params, donors)
+            _say_survey(surveyed, params, say)
+            return _resume(surveyed, params, digests, say)
+        surveyed, checked = _checked(surveyed, params, digests)
+        _say_survey(surveyed, params, say)
+        if read_plan(target) == surveyed.plan:
+            say(f"{target}: up to date, nothing to do")
+            return None
+        return _begin(surveyed, checked, params, digests, say)
+
+
+def _checked(
+    surveyed: Survey, params: Params, digests: ContentDigests
+) -> tuple[Survey, list[CheckedEpisode]]:
+    """Every sound episode; the survey again without those that have to be skipped.
+
+    A bad episode must decide neither the views nor how actions are derived.
+    """
+    checked, bad = check_episodes(surveyed, params)
+    if not bad:
+        return surveyed, checked
+    for one, reason in bad:
+        digests.note_bad(one.digest, reason)
+    again = survey(params, digests)
+    if again.action_rotation == surveyed.action_rotation:
+        kept = {one.digest for one in again.episodes}
+        return again, [one for one in checked if one.surveyed.digest in kept]
+    return _checked(again, params, digests)
+
+
+def _resume(
+    surveyed: Survey, params: Params, digests: ContentDigests, say: Say
+) -> ExtractionReport | None:
+    """Go on with the build of this very plan."""
+    target = params.extract.store
+    build = StoreBuild(target, read_specs(part_path(target)), surveyed.plan)
+    with closing(build), _donors([*_set_aside(target), target], surveyed) as donors:
+        missing = build.missing()
+        rows, episodes = (build.specs[name].shape[0] for name in ("vl/time", "episode/source"))
+        plan = ExtractionPlan(
+            episodes=episodes,
+            unchanged=episodes,
+            rows=rows,
+            known=rows - len(missing),
+            bytes=store_bytes(build.specs),
+            free=free_bytes(build.part),
+            rows_per_s=digests.rate(rate_name(surveyed, params)),
+            reasons=(f"continuing the interrupted build {build.part}",),
+        )
+        for line in plan.lines():
+            say(line)
         if params.extract.plan:
             return None
-        report = fill(build, surveyed, donors, params, digests)
+        report = fill(build, surveyed, donors, params, digests, missing)
         build.seal()
-    for leftover in _set_aside(target):
-        shutil.rmtree(leftover)
+    _remove(_set_aside(target))
     return report
 
 
-@contextmanager
-def _donors(target: Path, surveyed: Survey, plan_only: bool) -> Generator[list[Donor]]:
-    """Stores and abandoned builds of the same feature spec.
-
-    An abandoned build of another plan is set aside; of another spec, it is of no use and removed.
-    """
-    part = part_path(target)
-    abandoned = part.exists() and read_plan(part) != surveyed.plan
-    if abandoned and not plan_only:
-        plan = read_plan(part)
-        if plan is not None and Donor(part).spec_digest == surveyed.spec.digest:
-            part.rename(_beside(target, f".known-{plan[:8]}"))
-        else:
-            shutil.rmtree(part)
-    places = [*_set_aside(target)]
-    if abandoned and plan_only and read_plan(part) is not None:
-        places.append(part)
-    if target.exists():
-        places.append(target)
-    donors = [Donor(place) for place in places]
-    try:
-        yield [donor for donor in donors if donor.spec_digest == surveyed.spec.digest]
-    finally:
-        for donor in donors:
-            donor.close()
-
-
-def _set_aside(target: Path) -> list[Path]:
-    return sorted(target.parent.glob(f"{target.name}.known-*"))
-
-
-def _resume_plan(
-    build: StoreBuild, surveyed: Survey, params: Params, digests: ContentDigests
-) -> ExtractionPlan:
-    rows = build.specs["vl/time"].shape[0]
-    episodes = build.specs["episode/source"].shape[0]
-    return ExtractionPlan(
-        episodes=episodes,
-        unchanged=episodes,
-        rows=rows,
-        known=rows - len(build.missing()),
-        bytes=store_bytes(build.specs),
-        free=free_bytes(build.part),
-        rows_per_s=digests.rate(rate_name(surveyed, params)),
-        reasons=(f"continuing the interrupted build {build.part}",),
-    )
+def _begin(
+    surveyed: Survey,
+    checked: Sequence[CheckedEpisode],
+    params: Params,
+    digests: ContentDigests,
+    say: Say,
+) -> ExtractionReport | None:
+    """Begin a new build; what stood in its place is set aside only when nothing can refuse it."""
+    target, part = params.extract.store, part_path(params.extract.store)
+    build = StoreBuild(target, build_arrays(checked, surveyed, params), surveyed.plan)
+    if any(one.recording.has_poses for one in surveyed.episodes):
+        say(f"actions: rotations as {surveyed.action_rotation}")
+    with closing(build):
+        with _donors([*_set_aside(target), part, target], surveyed) as donors:
+            plan = _new_plan(build, checked, surveyed, donors, params, digests)
+            for line in plan.lines():
+                say(line)
+            if params.extract.plan:
+                return None
+            check_space(build, checked, donors)
+        _make_room(target, surveyed, say)
+        with _donors([*_set_aside(target), target], surveyed) as donors:
+            lay_out(build, checked, surveyed, params, donors)
+            everything = np.arange(plan.rows)
+            report = fill(build, surveyed, donors, params, digests, everything)
+            build.seal()
+    _remove(_set_aside(target))
+    return report
 
 
 def _new_plan(
@@ -124,9 +153,52 @@ def _new_plan(
     )
 
 
-def _say_plan(plan: ExtractionPlan, say: Callable[[str], None]) -> None:
-    for line in plan.lines():
-        say(line)
+def _say_survey(surveyed: Survey, params: Params, say: Say) -> None:
+    for source in params.data.sources:
+        for path in source.paths:
+            if Path(path).is_absolute():
+                say(f"source {source.name!r}: {path} is absolute, so DVC does not watch it")
+    for line in surveyed.missing:
+        say(f"not there: {line}")
+    for bad in surveyed.bad:
+        say(f"skipped {bad.source}: {bad.reason}")
+
+
+@contextmanager
+def _donors(places: Sequence[Path], surveyed: Survey) -> Generator[list[Donor]]:
+    """Stores and laid-out builds of the same feature spec among these places."""
+    donors = [Donor(place) for place in places if read_plan(place) is not None]
+    try:
+        yield [donor for donor in donors if donor.spec_digest == surveyed.spec.digest]
+    finally:
+        for donor in donors:
+            donor.close()
+
+
+def _make_room(target: Path, surveyed: Survey, say: Say) -> None:
+    """Set an unfinished build of another plan aside; of another feature spec, it is of no use."""
+    part = part_path(target)
+    if read_plan(part) is None:
+        return
+    abandoned = Donor(part)
+    abandoned.close()
+    if abandoned.spec_digest == surveyed.spec.digest:
+        taken = len(_set_aside(target))
+        while (aside := _beside(target, f".known-{taken}")).exists():
+            taken += 1
+        part.rename(aside)
+        return
+    for line in differences(abandoned.attrs["feature_spec"], surveyed.spec.attrs()):
+        say(f"the unfinished build {part} is given up: {line}")
+
+
+def _set_aside(target: Path) -> list[Path]:
+    return sorted(target.parent.glob(f"{target.name}.known-*"))
+
+
+def _remove(folders: Sequence[Path]) -> None:
+    for folder in folders:
+        shutil.rmtree(folder)
 
 
 def _beside(target: Path, suffix: str) -> Path:

@@ -1,4 +1,4 @@
-"""Which episodes there are and what they are, without reading a stream or decoding a frame.
+"""Which episodes there are and what they are, without reading a sensor or decoding a frame.
 
 The survey's plan digest names everything that decides what a store holds. Where a finished store
 carries the same, there is nothing to do.
@@ -49,8 +49,8 @@ class Survey:
 def survey(params: Params, digests: ContentDigests) -> Survey:
     """Open every source, take the content digest of its files and name the feature spec.
 
-    Raises `RecordingError` when no episode is usable, and whatever a source as a whole is refused
-    for.
+    With `data.on_bad_episode: skip`, episodes that an earlier check found bad are left out. Raises
+    `RecordingError` when no episode is usable, and whatever a source as a whole is refused for.
     """
     data = params.data
     opened = open_recordings(data.sources, data.root, data.views)
@@ -62,7 +62,9 @@ def survey(params: Params, digests: ContentDigests) -> Survey:
         try:
             content = _content(recording, digests)
             digest = _digest(recording, content, data, rotation)
-            views |= set(recording.cameras())
+            if data.on_bad_episode == "skip" and (reason := digests.bad(digest)) is not None:
+                raise RecordingError(reason)
+            views |= set(recording.view_names())
         except RecordingError as error:
             bad.append(BadEpisode(recording.source, recording.path, str(error)))
             continue
@@ -73,7 +75,6 @@ def survey(params: Params, digests: ContentDigests) -> Survey:
     plan = _hash(
         spec.digest,
         params.extract.sensor_dtype,
-        data.on_bad_episode,
         repr([(source.name, source.action_kind) for source in data.sources]),
         *(episode.digest for episode in episodes),
     )

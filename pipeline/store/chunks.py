@@ -77,10 +77,17 @@ class ChunkFiles:
         path = self.paths[chunk]
         return path.exists() and path.stat().st_nlink > 1
 
-    def link(self, chunk: int, donor: Path) -> None:
-        """Take a chunk over from another store as it is."""
+    def link(self, chunk: int, donor: Path) -> bool:
+        """Take a chunk over from another store as it is; False where files cannot be linked."""
         self.paths[chunk].parent.mkdir(parents=True, exist_ok=True)
-        os.link(donor, self.paths[chunk])
+        try:
+            # A cache may hand its files out as symbolic links: the file itself has to be shared.
+            os.link(donor.resolve(), self.paths[chunk])
+        except OSError as error:
+            if error.errno not in (errno.EXDEV, errno.EPERM, errno.EMLINK, errno.EOPNOTSUPP):
+                raise
+            return False
+        return True
 
     def write(self, start: int, values: NDArray[Any]) -> None:
         """Write consecutive rows from `start`; rows in linked chunks are there already."""
@@ -101,6 +108,8 @@ class ChunkFiles:
     def read(self, start: int, count: int) -> NDArray[Any]:
         """Consecutive rows as they are on disk."""
         raw = bytearray()
+        if not self.spec.row_bytes:
+            return np.zeros((count, *self.spec.shape[1:]), self.spec.dtype)
         for chunk, first, rows in self._spans(start, count):
             wanted = rows * self.spec.row_bytes
             part = os.pread(self._descriptor(chunk), wanted, self._offset(first))

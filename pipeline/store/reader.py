@@ -61,7 +61,13 @@ class FeatureStore:
             part = root.with_name(root.name + ".part")
             found = f"only the unfinished build {part}" if part.exists() else "nothing there"
             raise StoreIncomplete(f"{root}: no finished store ({found}). Run stages.extract.")
-        attrs = zarr.open_group(root, mode="r").attrs.asdict()
+        try:
+            attrs = zarr.open_group(root, mode="r").attrs.asdict()
+        except (ValueError, KeyError) as error:
+            raise StoreIncomplete(
+                f"{root / 'zarr.json'}: not a zarr group's metadata ({error}). Remove {root} and "
+                "run stages.extract again."
+            ) from None
         if attrs.get("schema") != SCHEMA:
             raise StoreMismatch(
                 f"{root}: expected store schema {SCHEMA}, found {attrs.get('schema')!r}. "
@@ -172,8 +178,13 @@ class FeatureStore:
         repeats the episode's last action, marked invalid, beyond its end.
 
         Raises `IndexError` for a tick the store does not have and `ValueError` for an `out` of
-        other sizes.
+        other sizes or a negative lag, which would show the future.
         """
+        if min(feature_lag, sensor_lag_s, state_lag_s) < 0:
+            raise ValueError(
+                f"a lag goes back in time and cannot be negative: feature_lag={feature_lag}, "
+                f"sensor_lag_s={sensor_lag_s}, state_lag_s={state_lag_s}"
+            )
         tick = np.asarray(ticks, np.int64)
         if tick.size and (tick.min() < 0 or tick.max() >= self.ticks):
             raise IndexError(f"{self.path}: ticks lie in 0..{self.ticks - 1}, asked for {tick}")

@@ -38,6 +38,8 @@ class ArraySpec:
     dtype: np.dtype[Any]
     dimensions: tuple[str, ...]
     attributes: Mapping[str, Any] = field(default_factory=dict)
+    stored_chunk_rows: int | None = None
+    """As an array on disk is cut; None for one that follows the rule."""
 
     @property
     def row_bytes(self) -> int:
@@ -52,6 +54,8 @@ class ArraySpec:
     @property
     def chunk_rows(self) -> int:
         """Rows a chunk: about 64 MB for wide rows, all of a small array in one."""
+        if self.stored_chunk_rows is not None:
+            return self.stored_chunk_rows
         wide = max(1, CHUNK_BYTES // (max(1, self.row_bytes) * ROW_MULTIPLE)) * ROW_MULTIPLE
         return min(wide, max(1, math.ceil(self.shape[0] / ROW_MULTIPLE)) * ROW_MULTIPLE)
 
@@ -178,5 +182,12 @@ def read_specs(root: Path) -> dict[str, ArraySpec]:
             ) from None
         names = getattr(array.metadata, "dimension_names", None) or ()
         dimensions = tuple(str(axis) for axis in names)
-        specs[name] = ArraySpec(name, array.shape, array.dtype, dimensions, array.attrs.asdict())
+        specs[name] = ArraySpec(
+            name,
+            array.shape,
+            array.dtype,
+            dimensions,
+            array.attrs.asdict(),
+            stored_chunk_rows=array.chunks[0],
+        )
     return specs

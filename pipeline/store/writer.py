@@ -9,7 +9,7 @@ accept the chunks, and one rename puts the build in its place.
 import json
 import os
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -42,11 +42,6 @@ class StoreBuild:
         self._files: dict[str, ChunkFiles] = {}
         self._environments = EnvironmentLog(self.part)
 
-    @property
-    def laid_out(self) -> bool:
-        """Whether everything but the feature rows is written; the plan is noted last."""
-        return read_plan(self.part) == self.plan
-
     def create(self) -> None:
         """Begin from nothing: metadata of every array, then the space for its rows."""
         if self.part.exists():
@@ -61,24 +56,24 @@ class StoreBuild:
         for name in self.specs:
             self.files(name).allocate()
 
-    def link_unchanged(self, name: str, donor: Path, donor_spec: ArraySpec, rows: int) -> int:
-        """Take the chunks that lie wholly in the first `rows` rows from a finished store.
-
-        Returns how many were taken; none where the chunks of the two are cut differently.
-        """
+    def linkable(self, name: str, donor_spec: ArraySpec, rows: int) -> int:
+        """How many chunks lie wholly in the first `rows` rows and are cut as the donor's are."""
         spec = self.specs[name]
         alike = (spec.chunk_rows, spec.row_bytes, spec.dtype) == (
             donor_spec.chunk_rows,
             donor_spec.row_bytes,
             donor_spec.dtype,
         )
-        taken = min(rows // spec.chunk_rows, spec.chunk_count, donor_spec.chunk_count)
         if not alike or name in INCREMENTAL:
             return 0
+        return min(rows // spec.chunk_rows, spec.chunk_count, donor_spec.chunk_count)
+
+    def link_unchanged(self, name: str, donor: Path, donor_spec: ArraySpec, rows: int) -> None:
+        """Take the linkable chunks of the first `rows` rows from a finished store."""
         source = ChunkFiles(donor, donor_spec)
-        for chunk in range(taken):
-            self.files(name).link(chunk, source.paths[chunk])
-        return taken
+        for chunk in range(self.linkable(name, donor_spec, rows)):
+            if not self.files(name).link(chunk, source.paths[chunk]):
+                return
 
     def write(self, name: str, start: int, values: NDArray[Any]) -> None:
         """Write consecutive rows of a stream, tick or episode array."""
@@ -136,7 +131,9 @@ class StoreBuild:
             with disk_full_named(self.part):
                 self._environments.note(start, len(run), environment)
             self.files(KEYS).write(start, names[run])
-            self.files(CHECKSUMS).write(start, checksums[run])
+        self.files(KEYS).sync()
+        for run in runs:
+            self.files(CHECKSUMS).write(int(rows[run[0]]), checksums[run])
 
     def seal(self) -> None:
         """Check every row, write the trailers and put the store in its place.
@@ -221,13 +218,15 @@ def read_plan(store: Path) -> str | None:
 
 
 def _sync_folders(root: Path) -> None:
-    folders: Iterable[str] = (folder for folder, _, _ in os.walk(root))
-    for folder in folders:
+    """Wait for every folder and zarr's metadata; chunk files are synced as they are sealed."""
+    for folder, _, files in os.walk(root):
         _sync(Path(folder))
+        if "zarr.json" in files:
+            _sync(Path(folder) / "zarr.json")
 
 
-def _sync(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
     finally:

@@ -10,8 +10,9 @@ from PIL import Image
 
 from pipeline.errors import DiskFull, NumericsError, RecordingError, StoreLocked, StoreMismatch
 from pipeline.extraction import extract
-from pipeline.recordings import open_recordings
-from pipeline.store import FeatureStore, build_lock
+from pipeline.recordings import Channels, Stream, open_recordings
+from pipeline.recordings.windowed import WindowedRecording
+from pipeline.store import FeatureStore, StoreBuild, build_lock
 from pipeline.timeline import build_timeline
 from pipeline.vlm.feature_spec import feature_spec
 from pipeline.vlm.preparation import Preparer
@@ -135,7 +136,7 @@ class TestWhatItTakesOver:
         no_model_later()
         report, said = run(params)
         assert report is None
-        assert not said
+        assert said == [f"{params.extract.store}: up to date, nothing to do"]
 
     def test_an_added_episode_computes_only_its_rows(
         self, params, recordings, counted, write_episode
@@ -205,6 +206,85 @@ class TestWhatItTakesOver:
         assert run(params)[0] is None
 
 
+class TestAbandonedBuilds:
+    def interrupted(self, params, monkeypatch, rows: int) -> None:
+        """Stop as Ctrl-C does once this many rows are committed."""
+        done = []
+        real = StoreBuild.commit
+
+        def commit(self, numbers, *rest):
+            real(self, numbers, *rest)
+            done.extend(numbers)
+            if len(done) >= rows:
+                raise KeyboardInterrupt
+
+        with monkeypatch.context() as patch:
+            patch.setattr(StoreBuild, "commit", commit)
+            with pytest.raises(KeyboardInterrupt):
+                run(params)
+
+    def test_their_rows_are_taken_over_however_many_there_are(
+        self, params, changed, recordings, monkeypatch, counted, write_episode
+    ):
+        self.interrupted(params, monkeypatch, 8)
+        for index, reuse in enumerate((2, 1, 2)):
+            self.interrupted(changed(data={"vlm_reuse_count": reuse}), monkeypatch, 12 + index)
+        counted.clear()
+        report, _ = run(params)
+        assert report.taken >= 8
+        assert sum(counted) == report.rows - report.taken
+        assert not list(params.extract.store.parent.glob("*.known-*"))
+
+    def test_a_refused_run_leaves_them_alone(self, params, changed, recordings, monkeypatch):
+        self.interrupted(params, monkeypatch, 8)
+        (recordings / "Press/episode_3/images/View2/x.jpg").write_bytes(b"no time in its name")
+        with pytest.raises(RecordingError):
+            run(changed(vlm={"prompt": "{images}"}))
+        (recordings / "Press/episode_3/images/View2/x.jpg").unlink()
+        _, said = run(params)
+        assert any("continuing the interrupted build" in line for line in said)
+
+    def test_of_another_spec_are_given_up_and_the_difference_said(
+        self, params, changed, monkeypatch
+    ):
+        self.interrupted(params, monkeypatch, 8)
+        _, said = run(changed(vlm={"prompt": "{images}"}))
+        assert any("is given up: prompt:" in line for line in said)
+
+
+def test_recordings_without_a_camera(changed):
+    params = changed(data={"views": []}, vlm={"pooling": ["mean", "text_mean"]})
+    report, _ = run(params)
+    store = FeatureStore.open(params.extract.store)
+    assert store.array("vl/frame_time").shape == (report.rows, 0)
+    assert np.isfinite(store.gather([0, 5]).feature_age.numpy()).all()
+    assert run(params)[0] is None
+
+
+def test_a_store_that_a_cache_handed_out_as_symbolic_links_is_not_written_through(
+    params, recordings, tmp_path, monkeypatch, write_episode
+):
+    monkeypatch.setattr("pipeline.store.schema.CHUNK_BYTES", 4096)
+    (recordings / "Zlast").mkdir()
+    for index in range(7):
+        write_episode(recordings / "Zlast" / f"episode_{index}", 20 + index, seconds=6.0)
+    run(params)
+    cache = tmp_path / "cache"
+    params.extract.store.rename(cache)
+    for path in sorted(cache.rglob("*")):
+        place = params.extract.store / path.relative_to(cache)
+        if path.is_dir():
+            place.mkdir(parents=True, exist_ok=True)
+        else:
+            place.symlink_to(path)
+    before = {path: path.read_bytes() for path in cache.rglob("*") if path.is_file()}
+    write_episode(recordings / "Zlast" / "episode_8", 40)
+    run(params)
+    linked = params.extract.store / "sensor/values/c/0/0"
+    assert linked.stat().st_ino == (cache / "sensor/values/c/0/0").stat().st_ino
+    assert {path: path.read_bytes() for path in before} == before
+
+
 class TestOutOfMemory:
     def test_halves_the_batch_and_goes_on(self, params, monkeypatch):
         run(params)
@@ -231,6 +311,7 @@ class TestPlan:
         text = "\n".join(said)
         assert report is None
         assert "there is no store yet" in text
+        assert "actions: rotations as rotvec" in text
         assert "rows: 24, 0 known, 24 to compute" in text
         assert "free" in text
         assert not params.extract.store.exists()
@@ -283,29 +364,57 @@ class TestRefusals:
         assert str(image) in text
         assert "on_bad_episode=skip" in text
 
-    def test_skip_leaves_bad_episodes_out_and_lists_them(
-        self, changed, recordings, capsys, no_model_later
+    def test_skip_leaves_bad_episodes_out_and_lists_them_every_time(
+        self, changed, recordings, no_model_later
     ):
         npz = recordings / "Touch_dot/episode_1/sensor_data.npz"
         npz.write_bytes(npz.read_bytes()[:5000])
         params = changed(data={"on_bad_episode": "skip"})
-        run(params)
-        assert str(npz) in capsys.readouterr().err
+        _, said = run(params)
+        assert any(line.startswith("skipped made") and str(npz) in line for line in said)
         store = FeatureStore.open(params.extract.store)
         assert [one.id for one in store.episodes] == ["episode_3", "episode_2"]
         no_model_later()
-        assert run(params)[0] is None
+        report, said = run(params)
+        assert report is None
+        assert any(str(npz) in line for line in said)
+
+    def test_a_skipped_episode_decides_nothing(self, changed, recordings, counted, write_episode):
+        bad = write_episode(recordings / "Press" / "episode_9", 9, views=("View9",))
+        npz = bad / "sensor_data.npz"
+        npz.write_bytes(npz.read_bytes()[:5000])
+        params = changed(data={"on_bad_episode": "skip"})
+        run(params)
+        assert FeatureStore.open(params.extract.store).streams["views"] == ["View1", "View2"]
+        counted.clear()
+        shutil.rmtree(bad)
+        run(params)
+        assert not counted, "removing it changes no feature"
+
+    def test_stop_stops_beside_a_finished_store_too(self, params, recordings):
+        run(params)
+        (recordings / "Press/episode_3/metadata.json").write_text("{")
+        with pytest.raises(RecordingError, match=r"1 of 3 episodes.*\n.*metadata\.json"):
+            run(params)
 
     def test_two_embodiments_are_refused_naming_both(
-        self, changed, recordings, tmp_path, write_episode
+        self, changed, recordings, tmp_path, monkeypatch, write_episode
     ):
-        other = tmp_path / "other"
-        write_episode(other / "Task" / "episode_9", 9)
-        path = other / "Task/episode_9/sensor_data.npz"
-        stored = dict(np.load(path))
-        np.savez(path, timestamps=stored["timestamps"], data=stored["data"][:, :, :7])
-        sources = [{"name": "made", "path": "."}, {"name": "other", "path": str(other)}]
-        with pytest.raises((StoreMismatch, RecordingError), match=r"other|sensor"):
+        other = write_episode(tmp_path / "other" / "Task" / "episode_9", 9).parent.parent
+        sources = [{"name": "made", "path": "."}, {"name": "second", "path": str(other)}]
+        real = WindowedRecording.sensor
+
+        def narrower(self):
+            stream = real(self)
+            if self.source != "second" or stream is None:
+                return stream
+            channels = Channels(stream.channels.names[:7], stream.channels.units[:7])
+            return Stream(channels, stream.time, stream.values[:, :7])
+
+        monkeypatch.setattr(WindowedRecording, "sensor", narrower)
+        with pytest.raises(
+            StoreMismatch, match=r"the sensor of source 'made'.*'second'.*7 channels.*two stores"
+        ):
             run(changed(data={"sources": sources}))
 
     def test_a_second_extraction_is_refused(self, params):

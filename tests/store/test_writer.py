@@ -200,10 +200,9 @@ class TestLinks:
         longer, grown = self._specs(tmp_path, 14000, "two")
         longer.create()
         donor = Donor(build.target)
-        taken = longer.link_unchanged(
-            "sensor/values", build.target, donor.specs["sensor/values"], 9000
-        )
-        assert taken == 2, "the last chunk holds the end of the stream"
+        spec = donor.specs["sensor/values"]
+        assert longer.linkable("sensor/values", spec, 9000) == 2, "the last holds the stream's end"
+        longer.link_unchanged("sensor/values", build.target, spec, 9000)
         longer.allocate()
         grown[:9000] = values
         longer.write("sensor/values", 0, grown)
