@@ -28,7 +28,7 @@ from pipeline.models import Policy, PolicyShape, action_groups
 from pipeline.normalization import Normalization
 from pipeline.store import FeatureStore
 
-FORMAT = 1
+FORMAT = 2
 WEIGHTS, DOCUMENT = "policy.safetensors", "policy.json"
 SOURCE_KEYS = ("feature_spec", "streams", "action_hz", "vlm_reuse_count")
 
@@ -44,6 +44,8 @@ class PolicyCheckpoint:
     """What the store was: `feature_spec`, `streams`, `action_hz`, `vlm_reuse_count`."""
     held_out_ticks: Mapping[str, tuple[int, int]]
     """`source/id` of each episode with held-out ticks -> [first, stop), counted in the episode."""
+    held_out_content: Mapping[str, str]
+    """`source/id` of each of these episodes -> digest of its files."""
     step: int
     weights: Mapping[str, Tensor]
     metrics: Mapping[str, float] = field(default_factory=dict)
@@ -71,6 +73,7 @@ class PolicyCheckpoint:
             **self.source,
             "held_out_episodes": list(self.held_out_ticks),
             "held_out_ticks": {name: list(ticks) for name, ticks in self.held_out_ticks.items()},
+            "held_out_content": dict(self.held_out_content),
             "weights_sha256": weights_sha256,
             "normalization": self.normalization.document(),
         }
@@ -126,6 +129,7 @@ def load_policy(folder: Path) -> PolicyCheckpoint:
                 name: (int(first), int(stop))
                 for name, (first, stop) in document["held_out_ticks"].items()
             },
+            held_out_content=dict(document["held_out_content"]),
             step=document["step"],
             metrics=document["metrics"],
             weights=read_tensors(folder / WEIGHTS, document["weights_sha256"]),

@@ -1,10 +1,12 @@
 """Files and folders that survive a kill: written beside their place, synced, renamed into it."""
 
+import errno
 import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,26 +14,57 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from pipeline.errors import CheckpointIncomplete
+from pipeline.errors import CheckpointIncomplete, DiskFull
+
+FULL = (errno.ENOSPC, errno.EDQUOT)
+
+
+@contextmanager
+def disk_full_named(place: Path) -> Generator[None]:
+    """Turn "no space left" and "quota exceeded" into `DiskFull` naming the place."""
+    try:
+        yield
+    except DiskFull:
+        raise
+    except (OSError, SafetensorError) as error:
+        # safetensors says the number in words only.
+        said = any(f"(os error {number})" in str(error) for number in FULL)
+        if not said and getattr(error, "errno", None) not in FULL:
+            raise
+        raise DiskFull(
+            f"{place}: no space left on the device. What was complete before is kept: make room "
+            "and run the same command again."
+        ) from error
+
+
+def fresh(path: Path) -> Path:
+    """The path, with nothing at it.
+
+    DVC restores files as hard links into its cache, so that writing into one would alter the
+    cache; a new file of the same name leaves it alone.
+    """
+    path.unlink(missing_ok=True)
+    return path
 
 
 def replace_folder(folder: Path, write: Callable[[Path], None]) -> None:
     """Put what `write` writes into a temporary folder at `folder`, in place of what is there.
 
     A kill leaves the old content or the new, for one instant under the name `<folder>.old`, from
-    where `recover_folder` brings it back. Raises `OSError` of a full disk with the old in place.
+    where `recover_folder` brings it back. Raises `DiskFull` with the old in place.
     """
     recover_folder(folder)
     temporary, old = _beside(folder, "new"), _beside(folder, "old")
-    temporary.mkdir(parents=True)
-    try:
-        write(temporary)
-        for file in temporary.iterdir():
-            sync(file)
-        sync(temporary)
-    except BaseException:
-        shutil.rmtree(temporary)
-        raise
+    with disk_full_named(folder):
+        temporary.mkdir(parents=True)
+        try:
+            write(temporary)
+            for file in temporary.iterdir():
+                sync(file)
+            sync(temporary)
+        except BaseException:
+            shutil.rmtree(temporary)
+            raise
     if folder.exists():
         folder.rename(old)
     temporary.rename(folder)
@@ -62,11 +95,12 @@ def sync(path: Path) -> None:
 
 
 def write_document(path: Path, document: Mapping[str, Any]) -> None:
-    """Write a JSON document, atomically; its floats come back to the bit."""
+    """Write a JSON document, atomically; its floats come back to the bit. Raises `DiskFull`."""
     temporary = _beside(path, "new")
     text = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False)
-    temporary.write_text(text + "\n", encoding="utf-8")
-    sync(temporary)
+    with disk_full_named(path):
+        temporary.write_text(text + "\n", encoding="utf-8")
+        sync(temporary)
     temporary.rename(path)
 
 
@@ -79,9 +113,9 @@ def read_document(path: Path) -> dict[str, Any]:
             f"{path}: no such file. Run stages.train_head, or name another checkpoint."
         ) from None
     except ValueError as error:
-        raise CheckpointIncomplete(_damaged(path, error)) from None
+        raise CheckpointIncomplete(damaged(path, error)) from None
     if not isinstance(document, dict):
-        raise CheckpointIncomplete(_damaged(path, "not a JSON object"))
+        raise CheckpointIncomplete(damaged(path, "not a JSON object"))
     return document
 
 
@@ -97,15 +131,16 @@ def read_tensors(path: Path, sha256: str) -> dict[str, Tensor]:
     """The tensors at `path`; `CheckpointIncomplete` when they are not those that were written."""
     try:
         if _sha256(path) != sha256:
-            raise CheckpointIncomplete(_damaged(path, "its sha256 is not the one written with it"))
+            raise CheckpointIncomplete(damaged(path, "its sha256 is not the one written with it"))
         return load_file(path)
     except FileNotFoundError:
-        raise CheckpointIncomplete(_damaged(path, "no such file")) from None
+        raise CheckpointIncomplete(damaged(path, "no such file")) from None
     except SafetensorError as error:
-        raise CheckpointIncomplete(_damaged(path, error)) from None
+        raise CheckpointIncomplete(damaged(path, error)) from None
 
 
-def _damaged(path: Path, why: object) -> str:
+def damaged(path: Path, why: object) -> str:
+    """What is said of a file of a run that is not as it was written."""
     return (
         f"{path}: the checkpoint is damaged: {why}. Remove {path.parent} and run "
         "stages.train_head again."

@@ -15,7 +15,15 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from pipeline.evaluation import METHODS, Comparison, Group, Predictions
+from pipeline.durable import disk_full_named, fresh
+from pipeline.evaluation import (
+    METHODS,
+    Comparison,
+    Group,
+    Predictions,
+    episode_name,
+    with_unit,
+)
 from pipeline.store import Episode, FeatureStore
 
 LABELS = {
@@ -61,7 +69,8 @@ def write_plots(
         }
         for name, figure in figures.items():
             # Without its `Software` entry the file does not change with matplotlib's version.
-            figure.savefig(folder / name, dpi=120, metadata={"Software": None})
+            with disk_full_named(folder):
+                figure.savefig(fresh(folder / name), dpi=120, metadata={"Software": None})
     return [folder / name for name in figures]
 
 
@@ -90,7 +99,7 @@ def timeline(comparison: Comparison, predictions: Predictions, store: FeatureSto
         axes[0, column].set_title(f"{title}: {_short(episode)}")
         axes[-1, column].set_xlabel("time since the episode began [s]")
     for row, axis in enumerate(axes[:, 0]):
-        axis.set_ylabel(_with_unit(comparison.names[row], comparison.units[row]))
+        axis.set_ylabel(with_unit(comparison.names[row], comparison.units[row]))
         _readable_range(axis, comparison.scale[row])
     figure.align_ylabels(axes[:, 0])
     _legend(figure, axes[0, 0], 2)
@@ -119,9 +128,9 @@ def scatter(comparison: Comparison, predictions: Predictions) -> Figure:
         )
         axis.set(xlim=(low, high), ylim=(low, high), aspect="equal")
         unit = comparison.units[index]
-        axis.set_title(_with_unit(comparison.names[index], unit))
-        axis.set_xlabel(_with_unit("recorded", unit))
-        axis.set_ylabel(_with_unit("policy", unit))
+        axis.set_title(with_unit(comparison.names[index], unit))
+        axis.set_xlabel(with_unit("recorded", unit))
+        axis.set_ylabel(with_unit("policy", unit))
     figure.suptitle("Next action at held-out ticks: on the line, the policy does what was recorded")
     return figure
 
@@ -139,7 +148,7 @@ def horizon(comparison: Comparison, action_hz: float | None) -> Figure:
         axis.set_xlabel(
             "steps ahead" if action_hz is None else f"steps ahead [{1000 / action_hz:.0f} ms each]"
         )
-        axis.set_ylabel(_with_unit("mean absolute error", group.unit))
+        axis.set_ylabel(with_unit("mean absolute error", group.unit))
         axis.set_ylim(bottom=0)
         axis.xaxis.get_major_locator().set_params(integer=True)
     _legend(figure, axes[0], len(METHODS))
@@ -149,7 +158,7 @@ def horizon(comparison: Comparison, action_hz: float | None) -> Figure:
 
 def episodes(comparison: Comparison, store: FeatureStore) -> Figure:
     """Mean absolute error of each held-out episode, a panel an action group, worst on top."""
-    order = np.argsort(_overall_by_episode(comparison), kind="stable")
+    order = np.argsort(comparison.overall_by_episode("policy"), kind="stable")
     if len(order) > EPISODE_LINES:
         order = order[np.linspace(0, len(order) - 1, EPISODE_LINES).round().astype(int)]
     groups = _varying_groups(comparison)
@@ -161,7 +170,7 @@ def episodes(comparison: Comparison, store: FeatureStore) -> Figure:
             errors = group.mean(comparison.scores[method].mae_episode)[order]
             axis.plot(errors, lines, label=LABELS[method], **_marked(method) | {"linestyle": ""})
         axis.set_title(_title(comparison, group))
-        axis.set_xlabel(_with_unit("mean absolute error", group.unit))
+        axis.set_xlabel(with_unit("mean absolute error", group.unit))
         axis.set_xlim(left=0)
     axes[0].set_yticks(lines, [_short(store.episodes[comparison.episodes[i]]) for i in order])
     axes[0].set_ylim(-0.6, len(order) - 0.4)
@@ -171,7 +180,9 @@ def episodes(comparison: Comparison, store: FeatureStore) -> Figure:
         if len(order) < len(comparison.episodes)
         else ""
     )
-    figure.suptitle(f"Error of each held-out episode{some}, worst on top (left is better)")
+    figure.suptitle(
+        f"Error of each held-out episode{some}, worst by overall error on top (left is better)"
+    )
     return figure
 
 
@@ -212,20 +223,13 @@ def _varying_groups(comparison: Comparison) -> list[Group]:
 
 
 def _best_and_worst(comparison: Comparison) -> list[tuple[str, int]]:
-    order = np.argsort(_overall_by_episode(comparison), kind="stable")
+    order = np.argsort(comparison.overall_by_episode("policy"), kind="stable")
     if len(order) == 1:
         return [("the held-out episode", comparison.episodes[0])]
     return [
         ("lowest error", comparison.episodes[order[0]]),
         ("highest error", comparison.episodes[order[-1]]),
     ][:TIMELINES]
-
-
-def _overall_by_episode(comparison: Comparison) -> NDArray[np.float64]:
-    errors = comparison.scores["policy"].mae_episode
-    varying = _varying(comparison)
-    scale = comparison.scale[varying]
-    return (errors[:, varying] / np.where(scale > 0, scale, 1)).mean(axis=1)
 
 
 def _readable_range(axis: Axes, scale: float) -> None:
@@ -244,9 +248,5 @@ def _padded(values: NDArray[np.floating]) -> tuple[float, float]:
 
 
 def _short(episode: Episode) -> str:
-    name = f"{episode.source}/{episode.id}"
+    name = episode_name(episode)
     return name if len(name) <= 44 else f"{name[:14]}…{name[-28:]}"
-
-
-def _with_unit(name: str, unit: str) -> str:
-    return f"{name} [{unit}]" if unit else name

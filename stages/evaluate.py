@@ -3,9 +3,6 @@
 Writes metrics.json, tables (CSV) and pictures (PNG) into `evaluate.output`.
 """
 
-import sys
-from collections.abc import Sequence
-
 from pipeline.batches import Windows
 from pipeline.checkpoint import find_policy, load_policy
 from pipeline.config import Params
@@ -13,15 +10,10 @@ from pipeline.device import resolve_device
 from pipeline.evaluation import check_store, held_out_ticks, judge, table, write_tables
 from pipeline.plots import write_plots
 from pipeline.store import FeatureStore
-from stages import command
+from stages.command import run
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the stage; returns its exit code."""
-    return command.run(__doc__ or "", evaluate, arguments)
-
-
-def evaluate(params: Params) -> None:
+def main(params: Params) -> None:
     """Judge the checkpoint that `evaluate` names."""
     wanted = params.evaluate
     device = resolve_device(wanted.device)
@@ -29,7 +21,7 @@ def evaluate(params: Params) -> None:
     checkpoint = load_policy(folder)
     store = FeatureStore.open(wanted.store or params.train_head.store or params.extract.store)
     check_store(checkpoint, store)
-    ticks = held_out_ticks(store, checkpoint.held_out_ticks)
+    ticks = held_out_ticks(store, checkpoint.held_out_ticks, checkpoint.held_out_content)
     print(
         f"{folder} (step {checkpoint.step}) on {len(ticks)} held-out ticks of "
         f"{len(checkpoint.held_out_ticks)} episode(s) in {store.path}, device {device}"
@@ -41,6 +33,7 @@ def evaluate(params: Params) -> None:
         Windows.of(checkpoint.params),
         wanted.batch_size,
         checkpoint.normalization,
+        progress=True,
     )
     wanted.output.mkdir(parents=True, exist_ok=True)
     files = write_tables(wanted.output, comparison, predictions, store)
@@ -50,4 +43,4 @@ def evaluate(params: Params) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(run(__doc__ or "", main))

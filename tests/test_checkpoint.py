@@ -57,6 +57,7 @@ def checkpoint(store: FeatureStore) -> PolicyCheckpoint:
         normalization=normalization,
         source=source_of(store),
         held_out_ticks={"left/episode_004": (0, 30), "right/episode_005": (24, 30)},
+        held_out_content={"left/episode_004": "0-4", "right/episode_005": "0-5"},
         step=7,
         weights=Policy(PARAMS, shape, normalization).state_dict(),
         metrics={"val/error": 1 / 3},
@@ -72,6 +73,7 @@ def test_a_checkpoint_comes_back_to_the_bit(
     assert found.shape == checkpoint.shape
     assert found.source == checkpoint.source
     assert found.held_out_ticks == checkpoint.held_out_ticks
+    assert found.held_out_content == checkpoint.held_out_content
     assert (found.step, found.metrics) == (7, {"val/error": 1 / 3})
     for name, value in checkpoint.weights.items():
         assert torch.equal(found.weights[name], value), name
@@ -114,7 +116,7 @@ def test_a_folder_or_a_run_is_found(checkpoint: PolicyCheckpoint, tmp_path: Path
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"format": 99}, "expected format 1, found 99"),
+        ({"format": 99}, "expected format 2, found 99"),
         ({"shape": None}, "not what a checkpoint's description must be"),
         ({"held_out_ticks": {"left/a": 3}}, "not what a checkpoint's description must be"),
         ({"params": {"train_head": {"model_type": "oracle"}}}, "model_type"),

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from pipeline.durable import (
+    fresh,
     read_document,
     read_tensors,
     recover_folder,
@@ -14,7 +15,7 @@ from pipeline.durable import (
     write_document,
     write_tensors,
 )
-from pipeline.errors import CheckpointIncomplete
+from pipeline.errors import CheckpointIncomplete, DiskFull
 
 
 def put(folder: Path, text: str) -> None:
@@ -64,7 +65,7 @@ def test_a_failed_write_keeps_the_old(tmp_path: Path) -> None:
     def full(temporary: Path) -> None:
         raise OSError(28, "No space left on device")
 
-    with pytest.raises(OSError, match="No space"):
+    with pytest.raises(DiskFull, match=f"{folder}: no space left"):
         replace_folder(folder, full)
     assert (folder / "a").read_text() == "old"
     assert os.listdir(tmp_path) == ["last"]
@@ -100,3 +101,30 @@ def test_tensors_come_back_and_damage_is_found(tmp_path: Path) -> None:
     path.unlink()
     with pytest.raises(CheckpointIncomplete, match="no such file"):
         read_tensors(path, digest)
+
+
+def test_tensors_on_a_full_disk_are_named_and_the_old_stand(small_disk: Path) -> None:
+    """On a real one: safetensors has an error of its own."""
+    folder = small_disk / "last"
+
+    def write(megabytes: int) -> None:
+        tensors = {"a": torch.zeros(megabytes * 2**18)}
+        replace_folder(folder, lambda temporary: write_tensors(temporary / "a", tensors) and None)
+
+    write(1)
+    with pytest.raises(DiskFull, match="last: no space left"):
+        write(16)
+    assert (folder / "a").stat().st_size == pytest.approx(2**20, abs=200)
+    assert os.listdir(small_disk) == ["last"]
+
+
+def test_what_is_no_full_disk_keeps_its_error(tmp_path: Path) -> None:
+    with pytest.raises(IsADirectoryError):
+        replace_folder(tmp_path / "a", lambda temporary: temporary.write_text("") and None)
+
+
+def test_fresh_leaves_a_link_s_other_end_alone(tmp_path: Path) -> None:
+    (tmp_path / "cached").write_text("old")
+    (tmp_path / "file").hardlink_to(tmp_path / "cached")
+    fresh(tmp_path / "file").write_text("new")
+    assert (tmp_path / "cached").read_text() == "old"

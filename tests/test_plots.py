@@ -40,6 +40,7 @@ def evaluated(episodes: int, dimensions: int = 5, ticks: int = 12, constant: int
     store = SimpleNamespace(
         array=arrays.__getitem__,
         action_hz=10.0,
+        streams={"action": {"kind": "delta"}},
         episodes=[
             SimpleNamespace(
                 source="demo", id=f"episode_{i}" * (1 + i), ticks=range(i * ticks, (i + 1) * ticks)
@@ -105,7 +106,10 @@ def texts(figure: Figure) -> str:
         (lambda c, p, s: plots.timeline(c, p, s), ["d0 [mm]", "time since the episode began [s]"]),
         (lambda c, p, s: plots.scatter(c, p), ["recorded [mm]", "policy [mm]"]),
         (lambda c, p, s: plots.horizon(c, 10.0), ["[100 ms each]", "mean absolute error [mm]"]),
-        (lambda c, p, s: plots.episodes(c, s), ["mean absolute error [mm]", "worst on top"]),
+        (
+            lambda c, p, s: plots.episodes(c, s),
+            ["error [mm]", "worst by overall error on top"],
+        ),
     ],
 )
 def test_axes_carry_units_and_titles_say_what_one_sees(
@@ -134,3 +138,12 @@ def test_many_episodes_are_thinned_but_not_the_extremes() -> None:
     errors = comparison.groups[0].mean(comparison.scores["policy"].mae_episode)
     assert shown[-1] == pytest.approx(errors.max())
     assert shown[0] == pytest.approx(errors.min())
+
+
+def test_a_picture_never_writes_through_a_link(tmp_path: Path) -> None:
+    cache, report = tmp_path / "cache.png", tmp_path / "report"
+    report.mkdir()
+    cache.write_bytes(b"cached")
+    (report / "timeline.png").hardlink_to(cache)
+    plots.write_plots(report, *evaluated(1))  # type: ignore[arg-type]
+    assert cache.read_bytes() == b"cached"

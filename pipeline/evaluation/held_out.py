@@ -1,12 +1,13 @@
 """Which ticks a policy is judged on, and the judgement."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 
 from pipeline.batches import Ticks, Windows
 from pipeline.checkpoint import PolicyCheckpoint, describe, source_differences, source_of
 from pipeline.errors import CheckpointMismatch
+from pipeline.evaluation.names import episode_name
 from pipeline.evaluation.predictions import Predictions, baselines, predict
 from pipeline.evaluation.scores import Comparison, Group, compare
 from pipeline.models import Policy, action_groups
@@ -19,41 +20,59 @@ def held_out_ranges(store: FeatureStore, ticks: Ticks) -> dict[str, tuple[int, i
 
     So a checkpoint says what it has not seen in a way that outlives episodes added before these.
     """
+    ticks = np.sort(ticks)
+    edges = np.searchsorted(ticks, store.array("episode/tick_start"))
     ranges = {}
-    for episode in store.episodes:
-        inside = ticks[(ticks >= episode.ticks.start) & (ticks < episode.ticks.stop)]
-        if len(inside):
-            first, stop = int(inside[0]), int(inside[-1]) + 1
-            assert len(inside) == stop - first, "held-out ticks of an episode lie side by side"
-            start = episode.ticks.start
-            ranges[f"{episode.source}/{episode.id}"] = (first - start, stop - start)
+    for index in np.flatnonzero(np.diff(edges)):
+        first, stop = int(ticks[edges[index]]), int(ticks[edges[index + 1] - 1]) + 1
+        count = edges[index + 1] - edges[index]
+        assert count == stop - first, "held-out ticks of an episode lie side by side"
+        episode = store.episodes[index]
+        start = episode.ticks.start
+        ranges[episode_name(episode)] = (first - start, stop - start)
     return ranges
 
 
-def held_out_ticks(store: FeatureStore, ranges: Mapping[str, tuple[int, int]]) -> Ticks:
+def held_out_contents(store: FeatureStore, names: Collection[str]) -> dict[str, str]:
+    """The digest of the files of each of these episodes, by name."""
+    known = {episode_name(episode): episode.content for episode in store.episodes}
+    return {name: known[name] for name in names}
+
+
+def held_out_ticks(
+    store: FeatureStore, ranges: Mapping[str, tuple[int, int]], contents: Mapping[str, str]
+) -> Ticks:
     """The store's ticks of `held_out_ranges`, ascending.
 
-    Raises `CheckpointMismatch` where there are none, or where the store lacks an episode or has a
-    shorter one of that name.
+    Raises `CheckpointMismatch` where there are none, or where the store lacks an episode, has a
+    shorter one of that name, or one made from other files than `contents` says.
     """
     if not ranges:
         raise CheckpointMismatch(
             "the checkpoint lists no held-out episode, so nothing is left to judge it on: it was "
             "trained with train_head.val_fraction 0. Train with a fraction above 0."
         )
-    episodes = {f"{episode.source}/{episode.id}": episode for episode in store.episodes}
+    episodes = {episode_name(episode): episode for episode in store.episodes}
     missing = [
         name
         for name, (_, stop) in ranges.items()
         if name not in episodes or len(episodes[name].ticks) < stop
     ]
-    if missing:
-        raise CheckpointMismatch(
-            f"{store.path} lacks {len(missing)} of the {len(ranges)} episodes that the checkpoint "
-            f"holds out, or has shorter ones: {', '.join(missing[:5])}"
-            f"{' …' if len(missing) > 5 else ''}. Name the store it was trained from in "
-            "evaluate.store, or train again."
-        )
+    altered = [
+        name
+        for name in ranges
+        if name not in missing and episodes[name].content != contents.get(name)
+    ]
+    for what, names in (
+        ("lacks {} of the {} episodes that the checkpoint holds out, or has shorter ones", missing),
+        ("has other recordings under the names of {} of the {} held-out episodes", altered),
+    ):
+        if names:
+            raise CheckpointMismatch(
+                f"{store.path} {what.format(len(names), len(ranges))}: {', '.join(names[:5])}"
+                f"{' …' if len(names) > 5 else ''}. Name the store it was trained from in "
+                "evaluate.store, or train again."
+            )
     parts = [
         np.arange(first, stop, dtype=np.int64) + episodes[name].ticks.start
         for name, (first, stop) in ranges.items()
@@ -80,9 +99,13 @@ def judge(
     windows: Windows,
     batch_size: int,
     normalization: Normalization,
+    progress: bool = False,
 ) -> tuple[Comparison, Predictions]:
-    """The policy beside the baselines on these ticks, and its predictions there."""
-    predictions = predict(policy, store, ticks, windows, batch_size)
+    """The policy beside the baselines on these ticks, and its predictions there.
+
+    Raises `NumericsError` as `predict` does.
+    """
+    predictions = predict(policy, store, ticks, windows, batch_size, progress)
     action, statistics = store.streams["action"], normalization.action
     # A channel that does not vary has a scale of 1 that is not its spread.
     spread = np.where(statistics.scale == statistics.std, statistics.std, 0.0)

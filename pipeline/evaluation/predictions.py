@@ -5,8 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from pipeline.batches import Prefetch, Ticks, Windows
+from pipeline.errors import NumericsError
+from pipeline.evaluation.names import place
 from pipeline.models import Policy
 from pipeline.store import FeatureStore
 
@@ -31,23 +34,40 @@ class Predictions:
 
 
 def predict(
-    policy: Policy, store: FeatureStore, ticks: Ticks, windows: Windows, batch_size: int
+    policy: Policy,
+    store: FeatureStore,
+    ticks: Ticks,
+    windows: Windows,
+    batch_size: int,
+    progress: bool = False,
 ) -> Predictions:
     """What the policy, in evaluation mode, does at these ticks, beside what was recorded.
 
     Runs on the policy's device. Sampling experts draw from a generator of fixed seed, so that the
-    same weights give the same figures.
+    same weights give the same figures. `progress` shows a bar on a terminal. Raises
+    `NumericsError`, naming episode, tick and time, where a prediction or a recorded action is NaN
+    or infinite.
     """
     device = next(policy.parameters()).device
     generator = torch.Generator(device).manual_seed(0)
     plan = np.split(ticks, range(batch_size, len(ticks), batch_size))
     predicted, recorded, valid = [], [], []
-    with torch.inference_mode(), Prefetch(store, plan, windows, device) as batches:
-        for _, batch in batches:
+    with (
+        torch.inference_mode(),
+        Prefetch(store, plan, windows, device) as batches,
+        tqdm(
+            total=len(ticks), desc="predicting", unit="tick", disable=None if progress else True
+        ) as bar,
+    ):
+        for here, batch in batches:
             action = policy.act(batch, generator=generator)
             predicted.append(action.float().cpu().numpy())
             recorded.append(batch.action.cpu().numpy().copy())
-            valid.append(batch.action_valid.cpu().numpy().copy())
+            valid.append(batch.action_valid.cpu().numpy().astype(bool))
+            everywhere = np.ones_like(valid[-1])
+            _refuse_not_finite(store, here, recorded[-1], valid[-1], "recorded action")
+            _refuse_not_finite(store, here, predicted[-1], everywhere, "action of the policy")
+            bar.update(len(here))
     return Predictions(
         ticks=ticks,
         episodes=np.searchsorted(store.array("episode/tick_start"), ticks, side="right") - 1,
@@ -63,15 +83,35 @@ def baselines(
     """What three rules that see nothing would have done: name -> (tick, 1, action_dim).
 
     `zero_action`: no motion. `mean_action`: the mean over the training ticks. `repeat_last`: the
-    action of the tick before, the whole chunk long; at an episode's first tick, zero.
+    action of the tick before, the whole chunk long; at an episode's first tick, which has none
+    before it, zero where actions are deltas or velocities, and the mean training action where they
+    are absolute: zero would be a pose far from all others.
     """
     ticks = predictions.ticks
     action = store.array("tick/action")
     first = ticks == store.array("episode/tick_start")[predictions.episodes]
-    last = np.where(first[:, None], np.float32(0), action[np.maximum(ticks - 1, 0)])
+    mean = np.asarray(mean_action, np.float32)
+    start = mean if store.streams["action"]["kind"] == "absolute" else np.zeros_like(mean)
+    last = np.where(first[:, None], start, action[np.maximum(ticks - 1, 0)])
     zero = np.zeros((len(ticks), 1, action.shape[1]), np.float32)
     return {
         "zero_action": zero,
-        "mean_action": zero + np.asarray(mean_action, np.float32),
+        "mean_action": zero + mean,
         "repeat_last": last[:, None],
     }
+
+
+def _refuse_not_finite(
+    store: FeatureStore, ticks: Ticks, actions: Actions, counted: NDArray[np.bool_], what: str
+) -> None:
+    bad = np.argwhere(~np.isfinite(actions) & counted[..., None])
+    if len(bad):
+        row, ahead, dimension = (int(index) for index in bad[0])
+        # What was recorded lies at a tick of its own; what is predicted, at the tick it is of.
+        tick = int(ticks[row]) + (ahead if what.startswith("recorded") else 0)
+        name = store.streams["action"]["names"][dimension]
+        raise NumericsError(
+            f"{place(store, 'tick', tick)} of {store.path}: expected finite numbers, found "
+            f"{actions[row, ahead, dimension]} as the {what} ({name}). Look at what was recorded "
+            "there, mend or leave out the recording and run stages.extract again."
+        )

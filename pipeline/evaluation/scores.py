@@ -67,9 +67,11 @@ class Comparison:
         normally distributed actions, always acting the mean then costs 0.8. Where none varies, all
         count, undivided.
         """
-        varies = self.scale > 0
-        mae = self.scores[method].mae
-        return float((mae[varies] / self.scale[varies]).mean() if varies.any() else mae.mean())
+        return float(self._in_training_std(self.scores[method].mae))
+
+    def overall_by_episode(self, method: str) -> Errors:
+        """`overall` of each episode, (episode,), in the order of `episodes`."""
+        return self._in_training_std(self.scores[method].mae_episode)
 
     def group_mae(self, method: str, group: Group) -> float:
         """Mean absolute error of a group, in its unit."""
@@ -92,6 +94,12 @@ class Comparison:
         }
         best = min(errors[method] for method in BASELINES)
         return errors["policy"] / best if best > 0 else None
+
+    def _in_training_std(self, errors: Errors) -> Errors:
+        varies = self.scale > 0
+        if not varies.any():
+            return errors.mean(axis=-1)
+        return (errors[..., varies] / self.scale[varies]).mean(axis=-1)
 
 
 def compare(

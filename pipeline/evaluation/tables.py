@@ -6,11 +6,16 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.durable import write_document
+from pipeline.durable import disk_full_named, fresh, write_document
+from pipeline.evaluation.names import with_unit
 from pipeline.evaluation.predictions import METHODS, Predictions
 from pipeline.evaluation.scores import Comparison
 from pipeline.store import FeatureStore
 
+FOOTNOTE = (
+    "repeat last: at an episode's first tick, which has none before it, it does nothing; where "
+    "actions are absolute, it takes the mean training action"
+)
 HEADINGS = {
     "policy": "policy",
     "zero_action": "zero",
@@ -23,51 +28,59 @@ def metrics(comparison: Comparison) -> dict[str, Any]:
     """The essential numbers, nested, for `metrics.json`.
 
     `overall` is in units of the training standard deviation (`Comparison.overall`), a group in
-    its own; `relative` is the policy's error divided by the best baseline's.
+    its own; `relative` is the policy's error divided by the best baseline's. `horizon` is by step
+    of the chunk, of which step_1 is the action at the tick itself; a step that no held-out chunk
+    reaches is left out. Numbers have 6 significant digits: less would hide, more would be noise.
     """
     document: dict[str, Any] = {
         "held_out": {"episodes": len(comparison.episodes), "ticks": comparison.ticks},
-        "overall": _finite(
+        "overall": _numbers(
             {method: comparison.overall(method) for method in METHODS}
             | {"relative": comparison.relative()}
         ),
     }
     for group in comparison.groups:
-        document[group.key] = _finite(
+        document[group.key] = _numbers(
             {method: comparison.group_mae(method, group) for method in METHODS}
             | {
                 "relative": comparison.relative(group),
                 "policy_rmse": comparison.group_rmse("policy", group),
             }
         )
-    document["dimension"] = _finite(
-        {
-            f"{name}_{unit}" if unit else name: float(mae)
-            for name, unit, mae in zip(
-                comparison.names, comparison.units, comparison.scores["policy"].mae, strict=True
-            )
+    document["dimension"] = {
+        f"{name}_{unit}" if unit else name: _numbers(
+            {method: float(comparison.scores[method].mae[index]) for method in METHODS}
+        )
+        for index, (name, unit) in enumerate(zip(comparison.names, comparison.units, strict=True))
+    }
+    document["horizon"] = {
+        group.key: {
+            method: _steps(group.mean(comparison.scores[method].mae_horizon).tolist())
+            for method in METHODS
         }
-    )
+        for group in comparison.groups
+    }
     return document
 
 
 def table(comparison: Comparison) -> str:
-    """Mean absolute errors of policy and baselines, a line a group, for a terminal."""
+    """Mean absolute errors of policy and baselines, a line a group and a footnote."""
     head = ["mean absolute error", *(HEADINGS[method] for method in METHODS), "policy / best"]
     lines = [head]
     for group in comparison.groups:
         errors = [comparison.group_mae(method, group) for method in METHODS]
-        lines.append(_line(_with_unit(group.name, group.unit), errors, comparison.relative(group)))
+        lines.append(_line(with_unit(group.name, group.unit), errors, comparison.relative(group)))
     errors = [comparison.overall(method) for method in METHODS]
     lines.append(_line("overall [training std]", errors, comparison.relative()))
     widths = [max(len(line[column]) for line in lines) for column in range(len(head))]
-    return "\n".join(
+    rows = [
         "  ".join(
             cell.ljust(width) if column == 0 else cell.rjust(width)
             for column, (cell, width) in enumerate(zip(line, widths, strict=True))
         )
         for line in lines
-    )
+    ]
+    return "\n".join([*rows, FOOTNOTE])
 
 
 def write_tables(
@@ -81,9 +94,10 @@ def write_tables(
         "predictions.csv": _prediction_rows(comparison, predictions, store),
     }
     write_document(folder / "metrics.json", metrics(comparison))
-    for name, rows in files.items():
-        with (folder / name).open("w", encoding="utf-8", newline="") as file:
-            csv.writer(file, lineterminator="\n").writerows(rows)
+    with disk_full_named(folder):
+        for name, rows in files.items():
+            with fresh(folder / name).open("w", encoding="utf-8", newline="") as file:
+                csv.writer(file, lineterminator="\n").writerows(rows)
     return [folder / "metrics.json", *(folder / name for name in files)]
 
 
@@ -143,14 +157,15 @@ def _line(name: str, errors: Sequence[float], relative: float | None) -> list[st
     return [name, *(f"{error:.4g}" for error in errors), ratio]
 
 
-def _with_unit(name: str, unit: str) -> str:
-    return f"{name} [{unit}]" if unit else name
+def _numbers(values: dict[str, float | None] | dict[str, float]) -> dict[str, float]:
+    """Without what has no value; a NaN stays, and a JSON document refuses it."""
+    return {key: float(f"{value:.6g}") for key, value in values.items() if value is not None}
 
 
-def _finite(values: dict[str, float | None]) -> dict[str, float]:
-    return {
-        key: value for key, value in values.items() if value is not None and math.isfinite(value)
-    }
+def _steps(errors: Sequence[float]) -> dict[str, float]:
+    """Scores are NaN where no entry is valid."""
+    steps = {f"step_{step}": error for step, error in enumerate(errors, start=1)}
+    return _numbers({name: error for name, error in steps.items() if not math.isnan(error)})
 
 
 def _cell(value: float) -> str:

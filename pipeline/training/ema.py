@@ -16,6 +16,7 @@ class WeightAverage(Generic[Module]):
     After update t (from 1): average += (1 - d) (weights - average), d = min(decay, t / (t + 9)):
     the warm-up of Tarvainen and Valpola's mean teacher (2017) in the form of TensorFlow's
     ExponentialMovingAverage, without which a short run would still average in its random start.
+    Buffers stay those of the first: a policy's (normalisation, group weights) never change.
     """
 
     def __init__(self, policy: Module, decay: float) -> None:
@@ -29,5 +30,3 @@ class WeightAverage(Generic[Module]):
         decay = min(self._decay, updates / (updates + 9))
         average = tuple(self.policy.parameters())
         get_ema_multi_avg_fn(decay)(average, tuple(policy.parameters()), 0)
-        for held, current in zip(self.policy.buffers(), policy.buffers(), strict=True):
-            held.copy_(current)

@@ -10,11 +10,15 @@ from typing import Self
 from dvclive import Live
 
 from pipeline.batches import Prefetch
+from pipeline.durable import disk_full_named, fresh
 
 Row = tuple[int, Mapping[str, float]]
 """A step, counted from 1, and metrics by name."""
 
-SPEED = "speed.tsv"
+
+def speed_file(logs: Path) -> Path:
+    """Where the speed of a run is written: beside its logs, for DVC tracks all that is in them."""
+    return logs.with_name(f"{logs.name}.speed.tsv")
 
 
 class _Curves(Live):
@@ -33,15 +37,17 @@ class TrainingLog:
     """Curves in `<folder>/plots/metrics/*.tsv`, their newest values in `<folder>/metrics.json`.
 
     What came before a stop is given back as `earlier` and written again: DVC may have deleted the
-    folder since, and a run that was killed has logged steps beyond its last checkpoint. Speed goes
-    to `speed.tsv`, so that the files DVC tracks hold nothing of the clock.
+    folder since, and a run that was killed has logged steps beyond its last checkpoint. Speed since
+    the last start goes to `speed_file`, so that the folder, which DVC tracks, holds nothing of the
+    clock. Raises `DiskFull`.
     """
 
     def __init__(self, folder: Path, earlier: Iterable[Row] = ()) -> None:
         folder.mkdir(parents=True, exist_ok=True)
+        self._folder = folder
         self.rows: list[Row] = []
         self._live = _Curves(str(folder), resume=False, dvcyaml=None, save_dvc_exp=False)
-        self._speed = (folder / SPEED).open("w", encoding="utf-8", newline="")
+        self._speed = fresh(speed_file(folder)).open("w", encoding="utf-8", newline="")
         self._writer = csv.writer(self._speed, delimiter="\t")
         self._writer.writerow(["step", "steps_per_s", "data_wait_share"])
         for step, metrics in earlier:
@@ -50,15 +56,17 @@ class TrainingLog:
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
         """Add a point to each of these curves."""
         self.rows.append((step, dict(metrics)))
-        self._live.step = step
-        for name, value in metrics.items():
-            self._live.log_metric(name, value)
-        self._live.make_summary()
+        with disk_full_named(self._folder):
+            self._live.step = step
+            for name, value in metrics.items():
+                self._live.log_metric(name, value)
+            self._live.make_summary()
 
     def write_speed(self, step: int, steps_per_s: float, data_wait_share: float) -> None:
-        """Add a line to `speed.tsv`; the share is the time spent waiting for batches."""
-        self._writer.writerow([step, f"{steps_per_s:.3f}", f"{data_wait_share:.4f}"])
-        self._speed.flush()
+        """Add a line to `speed_file`; the share is the time spent waiting for batches."""
+        with disk_full_named(self._folder):
+            self._writer.writerow([step, f"{steps_per_s:.3f}", f"{data_wait_share:.4f}"])
+            self._speed.flush()
 
     def __enter__(self) -> Self:
         return self

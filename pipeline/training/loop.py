@@ -21,7 +21,7 @@ from pipeline.config import TrainHeadParams
 from pipeline.device import resolve_device, use_bfloat16
 from pipeline.durable import replace_folder
 from pipeline.errors import NumericsError
-from pipeline.evaluation.held_out import held_out_ranges, judge
+from pipeline.evaluation import held_out_contents, held_out_ranges, judge
 from pipeline.models import Policy
 from pipeline.sampling import Split, TickSampler, ticks_by_source
 from pipeline.store import Batch, FeatureStore
@@ -80,6 +80,7 @@ class Trainer:
         ticks. On Ctrl-C or SIGTERM the step ends, the last checkpoint is written and
         `KeyboardInterrupt` raised.
         """
+        self.run.begin()
         with (
             deferred_interrupt() as interrupted,
             TrainingLog(self.params.logs, self._earlier) as log,
@@ -211,12 +212,14 @@ class Trainer:
         replace_folder(self.run.last, write)
 
     def _checkpoint(self, metrics: Mapping[str, float]) -> PolicyCheckpoint:
+        ranges = held_out_ranges(self.store, self.split.held_out)
         return PolicyCheckpoint(
             params=self.params,
             shape=self.shape,
             normalization=self.normalization,
             source=source_of(self.store),
-            held_out_ticks=held_out_ranges(self.store, self.split.held_out),
+            held_out_ticks=ranges,
+            held_out_content=held_out_contents(self.store, ranges),
             step=self.step,
             weights=self.average.policy.state_dict(),
             metrics=metrics,

@@ -13,12 +13,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pipeline.checkpoint import DOCUMENT, describe, differences, source_differences, source_of
+from pipeline.checkpoint import (
+    DOCUMENT,
+    SOURCE_KEYS,
+    describe,
+    differences,
+    load_policy,
+    source_differences,
+    source_of,
+)
 from pipeline.config import TrainHeadParams
-from pipeline.durable import read_document, recover_folder, write_document
-from pipeline.errors import CheckpointMismatch, ConfigError
+from pipeline.durable import damaged, read_document, recover_folder, write_document
+from pipeline.errors import CheckpointIncomplete, CheckpointMismatch, ConfigError
 from pipeline.store import FeatureStore
 
+TRAINER_VERSION = 1
+"""Raised with every change of code that changes the numbers of a run: part of its identity, so
+that no run goes on under code other than it began with."""
 RUN, BEST, LAST = "run.json", "best", "last"
 TRAINER_WEIGHTS, TRAINER_DOCUMENT = "trainer.safetensors", "trainer.json"
 FREE_PARAMS = {"device", "output", "logs", "checkpoint_every", "store"}
@@ -34,7 +45,8 @@ class Run:
     output: Path
     status: Status
     notes: tuple[str, ...]
-    """What was found and done, for the user."""
+    """What was found and will be done, for the user."""
+    identity: Mapping[str, Any]
 
     @property
     def part(self) -> Path:
@@ -51,6 +63,23 @@ class Run:
         """The newest checkpoint, with everything that going on from it takes."""
         return self.part / LAST
 
+    def begin(self) -> None:
+        """Make room for a new run and leave its `run.json`; nothing for one that goes on.
+
+        Another unfinished run is put aside to `<output>.part-old`, in place of an older one there,
+        unless it has no checkpoint. Called when nothing can be wrong with the params any more.
+        """
+        if self.status != "new":
+            return
+        if (self.part / RUN).exists():
+            if _has_checkpoint(self.part) and read_document(self.part / RUN) != self.identity:
+                shutil.rmtree(_aside(self.part), ignore_errors=True)
+                self.part.rename(_aside(self.part))
+            else:
+                shutil.rmtree(self.part)
+        self.part.mkdir(parents=True, exist_ok=True)
+        write_document(self.part / RUN, self.identity)
+
     def finish(self) -> None:
         """Rename the part to the output, in place of an older run, and drop what only resuming
         takes: the optimizer's state and the weights before averaging, three times the policy."""
@@ -66,9 +95,10 @@ class Run:
 def open_run(params: TrainHeadParams, store: FeatureStore) -> Run:
     """The run of these params on this store: new, resumed or finished.
 
-    An unfinished run of other params or recordings is moved aside to `<output>.part-old`. Raises
-    `CheckpointMismatch` when the unfinished run saw other features or other streams, and
-    `ConfigError` when the output is something that no training wrote.
+    Begins nothing. A finished run with a damaged checkpoint is new: trained again, then replaced.
+    Raises `CheckpointMismatch` when an unfinished run with a checkpoint saw other features or other
+    streams, `CheckpointIncomplete` when its `run.json` is damaged, and `ConfigError` when the
+    output is something that no training wrote.
     """
     output, identity = params.output, run_identity(params, store)
     part = _part(output)
@@ -76,24 +106,31 @@ def open_run(params: TrainHeadParams, store: FeatureStore) -> Run:
     _recover(output)
     if output.exists():
         finished = _finished_identity(output)
-        if finished == identity:
+        if finished != identity:
+            notes.append(f"{output} holds another run; it is replaced when this one is finished")
+        elif (why := _damage(output)) is None:
             _drop_trainer_state(output)
-            return Run(output, "finished", (f"{output} is this very run, finished",))
-        notes.append(f"{output} holds another run; it is replaced when this one is finished")
-    if any(part.glob(f"*/{DOCUMENT}")) and not (part / RUN).exists():
+            return Run(output, "finished", _finished_notes(params), identity)
+        else:
+            notes.append(f"{output} is this very run, but damaged; it is trained again: {why}")
+    if _has_checkpoint(part) and not (part / RUN).exists():
         raise ConfigError(
             f"{part} has checkpoints but no {RUN}, so it cannot be told what run they are of. "
             "Move it away or choose another train_head.output."
         )
-    notes += _make_room(part, identity)
     if (part / RUN).exists():
         recover_folder(part / BEST)
         recover_folder(part / LAST)
-        if (part / LAST).exists():
-            return Run(output, "resumed", (*notes, f"resuming the run in {part}"))
-    part.mkdir(parents=True, exist_ok=True)
-    write_document(part / RUN, identity)
-    return Run(output, "new", tuple(notes))
+    if (part / RUN).exists() and _has_checkpoint(part):
+        differing = _compare(part, identity)
+        if differing:
+            notes.append(
+                f"{part} is an unfinished run of something else; it is put aside as "
+                f"{_aside(part)}:\n{describe(differing, 'that run', 'now')}"
+            )
+        elif (part / LAST).exists():
+            return Run(output, "resumed", (*notes, f"resuming the run in {part}"), identity)
+    return Run(output, "new", tuple(notes), identity)
 
 
 def run_identity(params: TrainHeadParams, store: FeatureStore) -> dict[str, Any]:
@@ -102,6 +139,7 @@ def run_identity(params: TrainHeadParams, store: FeatureStore) -> dict[str, Any]
     digest = hashlib.blake2b(json.dumps(episodes).encode(), digest_size=16)
     digest.update(store.array("vl/key").tobytes())
     decides = {
+        "trainer_version": TRAINER_VERSION,
         "train_head": params.model_dump(mode="json", exclude=FREE_PARAMS),
         "recordings": {
             "episodes": len(store.episodes),
@@ -123,8 +161,31 @@ def _finished_identity(output: Path) -> Mapping[str, Any] | None:
     )
 
 
-def _refuse_other_source(prior: Mapping[str, Any], identity: Mapping[str, Any], part: Path) -> None:
-    differing = source_differences(prior["source"], identity["source"])
+def _damage(output: Path) -> str | None:
+    """What is wrong with a finished run's checkpoints; None where both are whole."""
+    try:
+        for name in (BEST, LAST):
+            load_policy(output / name)
+    except (CheckpointIncomplete, CheckpointMismatch) as error:
+        return str(error)
+    return None
+
+
+def _finished_notes(params: TrainHeadParams) -> tuple[str, ...]:
+    said = f"{params.output} is this very run, finished"
+    logs = load_policy(params.output / LAST).params.logs
+    if logs == params.logs:
+        return (said,)
+    return said, f"its curves are left where they were written, in {logs}, not in {params.logs}"
+
+
+def _compare(part: Path, identity: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """What else the unfinished run in `part` was to be; refused where its store was another."""
+    prior = read_document(part / RUN)
+    source = prior.get("source")
+    if not isinstance(source, dict) or {*SOURCE_KEYS} - {*source} or "decides" not in prior:
+        raise CheckpointIncomplete(damaged(part / RUN, "not what it must hold"))
+    differing = source_differences(source, identity["source"])
     if differing:
         raise CheckpointMismatch(
             f"{part}: this unfinished run cannot go on, its store was another one:\n"
@@ -132,40 +193,11 @@ def _refuse_other_source(prior: Mapping[str, Any], identity: Mapping[str, Any], 
             f"Remove {part} to begin anew, choose another train_head.output, or name the store "
             "it began with in train_head.store."
         )
+    return differences(prior["decides"], identity["decides"])
 
 
-def _make_room(part: Path, identity: Mapping[str, Any]) -> list[str]:
-    """Leave in `part` this run or nothing, and say what was done.
-
-    Another unfinished run is put aside. If it is this run that was put aside before, the two
-    change places: a mistyped param costs no training.
-    """
-    aside, between = part.with_name(f"{part.name}-old"), part.with_name(f"{part.name}-between")
-    if between.exists() and not aside.exists():  # killed while two runs changed places
-        between.rename(aside)
-    differing = {}
-    if (part / RUN).exists():
-        prior = read_document(part / RUN)
-        _refuse_other_source(prior, identity, part)
-        differing = differences(prior["decides"], identity["decides"])
-        if not differing:
-            return []
-        part.rename(between)
-    notes = []
-    if (aside / RUN).exists() and read_document(aside / RUN) == identity:
-        aside.rename(part)
-        notes.append(f"{aside} is this run, put aside earlier: taken back")
-    if between.exists() and not any(between.glob(f"*/{DOCUMENT}")):
-        shutil.rmtree(between)  # it had only begun
-    if between.exists():
-        if aside.exists():
-            shutil.rmtree(aside)
-        between.rename(aside)
-        notes.append(
-            f"{part} was an unfinished run of something else; it is kept as {aside}:\n"
-            f"{describe(differing, 'that run', 'now')}"
-        )
-    return notes
+def _has_checkpoint(part: Path) -> bool:
+    return any(part.glob(f"*/{DOCUMENT}"))
 
 
 def _drop_trainer_state(output: Path) -> None:
@@ -188,3 +220,7 @@ def _replaced(output: Path) -> Path:
 
 def _part(output: Path) -> Path:
     return output.with_name(f"{output.name}.part")
+
+
+def _aside(part: Path) -> Path:
+    return part.with_name(f"{part.name}-old")

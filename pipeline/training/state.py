@@ -3,10 +3,18 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor
 
-from pipeline.durable import read_document, read_tensors, write_document, write_tensors
+from pipeline.durable import (
+    damaged,
+    read_document,
+    read_tensors,
+    write_document,
+    write_tensors,
+)
+from pipeline.errors import CheckpointIncomplete, PipelineError
 from pipeline.training.log import Row
 from pipeline.training.run import TRAINER_DOCUMENT, TRAINER_WEIGHTS
 
@@ -49,7 +57,17 @@ def write_trainer(folder: Path, state: TrainerState) -> None:
 
 def read_trainer(folder: Path) -> TrainerState:
     """The state at `folder`; `CheckpointIncomplete` where a file is missing or damaged."""
-    document = read_document(folder / TRAINER_DOCUMENT)
+    path = folder / TRAINER_DOCUMENT
+    try:
+        return _state(folder, read_document(path))
+    except PipelineError:
+        raise
+    except (KeyError, TypeError, ValueError) as error:
+        why = f"not what it must hold ({type(error).__name__}: {error})"
+        raise CheckpointIncomplete(damaged(path, why)) from None
+
+
+def _state(folder: Path, document: Mapping[str, Any]) -> TrainerState:
     tensors = read_tensors(folder / TRAINER_WEIGHTS, document["weights_sha256"])
     kinds: dict[str, dict[str, Tensor]] = {"policy": {}, "optimizer": {}, "history": {}}
     for key, value in tensors.items():

@@ -1,18 +1,30 @@
 """The normalisation, fitted on what training may see and nothing else."""
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from pipeline.batches import Ticks
+from pipeline.errors import NumericsError
+from pipeline.evaluation import place
 from pipeline.normalization import ChannelStatistics, Normalization, fit_channels
 from pipeline.store import FeatureStore
 
 CHUNK_BYTES = 64 * 2**20
-Values = NDArray[np.floating]
+Rows = range | NDArray[np.int64]
+"""Rows of one of the store's arrays."""
+
+
+class _Chunk(NamedTuple):
+    rows: Rows
+    """Where in the store the values lie."""
+    values: NDArray[np.floating]
+    valid: NDArray[np.bool_] | None
+    """(row, slot) of features: False for what is neither checked nor counted."""
 
 
 def fit_normalization(store: FeatureStore, ticks: Ticks) -> Normalization:
@@ -20,45 +32,88 @@ def fit_normalization(store: FeatureStore, ticks: Ticks) -> Normalization:
 
     Features over the VL rows that these ticks use, each once; sensor and state over the readings
     from each episode's start to the last of its ticks; a stream that none of them has, has none.
-    Reads the store once, a chunk of about 64 MB at a time. Raises `NumericsError` on NaN or inf.
+    Reads the store once, a chunk of about 64 MB at a time, with a bar on a terminal. Raises
+    `NumericsError` on NaN or inf, naming episode, tick or reading, time and channel.
     """
-    actions = _rows(store.array("tick/action"), ticks)
-    return Normalization(
-        action=fit_channels(actions, "training actions", store.streams["action"]["names"]),
-        features=fit_channels(_features(store, ticks), "training features"),
-        **{stream: _fit_stream(store, ticks, stream) for stream in ("sensor", "state")},
+    parts: dict[str, list[Rows]] = {
+        "tick": _split(store.array("tick/action"), ticks),
+        "vl": _split(store.array("vl/features"), np.unique(store.array("tick/vl_row")[ticks])),
+        "sensor": _readings(store, ticks, "sensor"),
+        "state": _readings(store, ticks, "state"),
+    }
+    total = sum(len(rows) for several in parts.values() for rows in several)
+    with tqdm(total=total, desc="normalisation", unit="row", leave=False, disable=None) as bar:
+        fitted = {
+            stream: _fit(store, stream, several, bar)
+            for stream, several in parts.items()
+            if several or stream == "tick"
+        }
+    return Normalization(fitted.pop("tick"), fitted.pop("vl", None), **fitted)
+
+
+def _fit(
+    store: FeatureStore, stream: str, parts: list[Rows], bar: "tqdm[NoReturn]"
+) -> ChannelStatistics:
+    what = {"tick": "training actions", "vl": "training features"}.get(
+        stream, f"training readings of {stream}"
     )
 
+    def chunks() -> Iterator[Any]:
+        for chunk in _chunks(store, stream, parts):
+            yield chunk.values if chunk.valid is None else (chunk.values, chunk.valid)
+            bar.update(len(chunk.rows))
 
-def _fit_stream(store: FeatureStore, ticks: Ticks, stream: str) -> ChannelStatistics | None:
-    names = store.streams[stream]["names"]
-    if not any(len(readings) for readings in _readings(store, ticks, stream)):
-        return None
-    return fit_channels(_readings(store, ticks, stream), f"training readings of {stream}", names)
-
-
-def _features(store: FeatureStore, ticks: Ticks) -> Iterator[tuple[Values, NDArray[np.bool_]]]:
-    rows = np.unique(store.array("tick/vl_row")[ticks])
-    valid = store.array("vl/slot_valid")
-    done = 0
-    for values in _rows(store.array("vl/features"), rows):
-        if values.dtype == np.uint16:
-            values = torch.from_numpy(values).view(torch.bfloat16).float().numpy()
-        yield values, valid[rows[done : done + len(values)]].astype(bool)
-        done += len(values)
+    names = None if stream == "vl" else store.streams[_streams_entry(stream)]["names"]
+    try:
+        return fit_channels(chunks(), what, names)
+    except NumericsError:
+        # It knows the row of what it was given, which says nothing to who made the recordings.
+        for chunk in _chunks(store, stream, parts):
+            _refuse_not_finite(store, stream, chunk, what)
+        raise
 
 
-def _readings(store: FeatureStore, ticks: Ticks, stream: str) -> Iterator[Values]:
-    values = store.array(f"{stream}/values")
-    starts = store.array(f"episode/{stream}_start")
-    episode = np.searchsorted(store.array("episode/tick_start"), ticks, side="right") - 1
-    for index in np.unique(episode):
-        end = int(store.array(f"tick/{stream}_end")[ticks[episode == index].max()])
-        yield values[int(starts[index]) : end]
+def _refuse_not_finite(store: FeatureStore, stream: str, chunk: _Chunk, what: str) -> None:
+    counted = True if chunk.valid is None else chunk.valid[..., None]
+    bad = np.argwhere(~np.isfinite(chunk.values) & counted)
+    if len(bad):
+        row, *channel = (int(index) for index in bad[0])
+        name = ", ".join(map(str, channel))
+        if stream != "vl":
+            name = repr(store.streams[_streams_entry(stream)]["names"][channel[0]])
+        raise NumericsError(
+            f"{what}: expected finite numbers, found {chunk.values[(row, *channel)]} at "
+            f"{place(store, stream, int(chunk.rows[row]))}, channel {name}, in {store.path}. Mend "
+            "or leave out the recording and run stages.extract again."
+        ) from None
 
 
-def _rows(array: NDArray[Any], rows: NDArray[np.int64]) -> Iterator[NDArray[Any]]:
+def _streams_entry(stream: str) -> str:
+    return "action" if stream == "tick" else stream
+
+
+def _split(array: NDArray[Any], rows: NDArray[np.int64]) -> list[Rows]:
     row_bytes = max(1, array.dtype.itemsize * int(np.prod(array.shape[1:])))
     step = max(1, CHUNK_BYTES // row_bytes)
-    for start in range(0, len(rows), step):
-        yield array[rows[start : start + step]]
+    return [rows[start : start + step] for start in range(0, len(rows), step)]
+
+
+def _readings(store: FeatureStore, ticks: Ticks, stream: str) -> list[Rows]:
+    """The readings from each episode's start to the last of its ticks, where it has any."""
+    starts = store.array(f"episode/{stream}_start")
+    episode = np.searchsorted(store.array("episode/tick_start"), ticks, side="right") - 1
+    ends = np.array(starts, np.int64)
+    np.maximum.at(ends, episode, store.array(f"tick/{stream}_end")[ticks].astype(np.int64))
+    return [range(starts[index], ends[index]) for index in np.flatnonzero(ends > starts)]
+
+
+def _chunks(store: FeatureStore, stream: str, parts: list[Rows]) -> Iterator[_Chunk]:
+    array = store.array(
+        {"tick": "tick/action", "vl": "vl/features"}.get(stream, f"{stream}/values")
+    )
+    for rows in parts:
+        values = array[rows.start : rows.stop] if isinstance(rows, range) else array[rows]
+        if values.dtype == np.uint16:
+            values = torch.from_numpy(values).view(torch.bfloat16).float().numpy()
+        valid = store.array("vl/slot_valid")[rows].astype(bool) if stream == "vl" else None
+        yield _Chunk(rows, values, valid)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import CheckpointMismatch
-from pipeline.evaluation import held_out_ranges, held_out_ticks
+from pipeline.evaluation import held_out_contents, held_out_ranges, held_out_ticks
 from pipeline.evaluation.held_out import groups_of
 from pipeline.sampling import split_by_episode
 from pipeline.store import FeatureStore
@@ -21,20 +21,32 @@ def test_the_split_is_found_again(
     split = split_by_episode(store, 0.3)
     ranges = held_out_ranges(store, split.held_out)
     assert tuple(sorted(ranges)) == split.held_out_episodes
-    assert np.array_equal(held_out_ticks(store, ranges), split.held_out)
+    contents = held_out_contents(store, ranges)
+    assert np.array_equal(held_out_ticks(store, ranges, contents), split.held_out)
     if episodes == 1:
         assert ranges == {"left/episode_000": (24, 30)}
 
 
 def test_episodes_that_are_gone_or_shorter_are_named(store: FeatureStore) -> None:
-    assert held_out_ticks(store, {"right/episode_001": (10, 30)}).tolist() == list(range(40, 60))
+    contents = {"right/episode_001": "0-1", "left/episode_000": "0-0", "left/gone": "x"}
+    found = held_out_ticks(store, {"right/episode_001": (10, 30)}, contents)
+    assert found.tolist() == list(range(40, 60))
     with pytest.raises(CheckpointMismatch, match=r"lacks 2 of the 3 episodes.*left/gone, left/epi"):
         held_out_ticks(
             store,
             {"left/gone": (0, 3), "left/episode_000": (0, 31), "right/episode_001": (0, 30)},
+            contents,
         )
     with pytest.raises(CheckpointMismatch, match="val_fraction 0"):
-        held_out_ticks(store, {})
+        held_out_ticks(store, {}, {})
+
+
+def test_other_recordings_of_the_same_names_and_lengths_are_refused(store: FeatureStore) -> None:
+    ranges = {"left/episode_000": (0, 30), "right/episode_001": (0, 30)}
+    contents = {"left/episode_000": "0-0", "right/episode_001": "another recording"}
+    said = r"other recordings under the names of 1 of the 2 held-out episodes: right/episode_001"
+    with pytest.raises(CheckpointMismatch, match=said):
+        held_out_ticks(store, ranges, contents)
 
 
 def test_groups_share_a_unit() -> None:

@@ -1,6 +1,7 @@
 """Errors and baselines against values worked out by hand."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.batches import Windows
+from pipeline.errors import NumericsError
 from pipeline.evaluation import Comparison, Group, Predictions, baselines, compare, predict
 from pipeline.store import FeatureStore
 
@@ -134,3 +136,46 @@ def test_predictions_belong_to_their_ticks(store: FeatureStore, batch_size: int)
     assert np.array_equal(found.recorded, expected.action.numpy())
     assert np.array_equal(found.valid, expected.action_valid.numpy())
     assert found.episodes.tolist() == [0] * 5 + [1] * 30 + [2] * 5
+
+
+WINDOWS = Windows(horizon=4, sensor_window=2, state_window=2)
+
+
+@pytest.mark.parametrize("what", ["recorded action", "action of the policy"])
+def test_a_number_that_is_none_is_named_by_episode_tick_and_time(
+    tiny_store: Callable[..., Path], tmp_path: Path, what: str
+) -> None:
+    store = FeatureStore.open(tiny_store(tmp_path))
+    if what == "recorded action":
+        store.array("tick/action")[37, 3] = np.nan
+    else:
+        store.array("vl/features")[store.array("tick/vl_row")[37], 0, 0] = np.inf
+    with pytest.raises(NumericsError) as caught:
+        predict(FirstFeature(), store, np.arange(30, 60), WINDOWS, 8)  # type: ignore[arg-type]
+    said = str(caught.value)
+    # The VL row of tick 37 serves ticks 36 to 38.
+    place = "tick 7 (at 0.700 s)" if what == "recorded action" else "tick 6 (at 0.600 s)"
+    assert f"right/episode_001, {place}" in said
+    assert what in said
+    # Beyond the end of an episode nothing was recorded, so nothing can be wrong there.
+    assert len(predict(FirstFeature(), store, np.arange(26, 30), WINDOWS, 8).ticks)  # type: ignore[arg-type]
+
+
+def test_absolute_actions_are_not_repeated_from_nothing(
+    store: FeatureStore, recorded: Recorded, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mean = np.array([1.0, 2.0, 3.0, 4.0, 5.0])
+    absolute = store.streams | {"action": store.streams["action"] | {"kind": "absolute"}}
+    monkeypatch.setattr(FeatureStore, "streams", absolute)
+    found = baselines(store, recorded(np.array([0, 1, 30])), mean)["repeat_last"][:, 0]
+    assert np.array_equal(found, [mean, store.array("tick/action")[0], mean])
+
+
+def test_the_overall_error_of_episodes_of_one_length_is_their_mean(
+    recorded: Recorded, compared: Compared
+) -> None:
+    rng = np.random.default_rng(0)
+    comparison = compared(recorded(np.arange(60), rng.normal(size=(60, 1, 5)), horizon=1))
+    by_episode = comparison.overall_by_episode("policy")
+    assert by_episode.shape == (2,)
+    assert by_episode.mean() == pytest.approx(comparison.overall("policy"))

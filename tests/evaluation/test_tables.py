@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pipeline.errors import DiskFull
 from pipeline.evaluation import Comparison, Predictions, metrics, table, write_tables
+from pipeline.evaluation.tables import FOOTNOTE
 from pipeline.store import FeatureStore
 
 TICKS = np.arange(30, 90)
@@ -40,10 +42,17 @@ def test_the_metrics_are_few_and_numbers_only(comparison: Comparison) -> None:
     assert document["held_out"] == {"episodes": 2, "ticks": 60}
     assert document["translation_mm"]["policy"] == pytest.approx(0.2)
     assert document["rotation_deg"]["policy_rmse"] == pytest.approx(0.5)
-    assert document["dimension"]["dz_mm"] == pytest.approx(0.3)
+    assert document["dimension"]["dz_mm"]["policy"] == pytest.approx(0.3)
+    assert document["dimension"]["dz_mm"]["zero_action"] > 0.3
+    steps = document["horizon"]["translation_mm"]
+    assert list(steps) == ["policy", "zero_action", "mean_action", "repeat_last"]
+    assert list(steps["policy"]) == ["step_1", "step_2", "step_3", "step_4"]
+    assert steps["policy"]["step_4"] == pytest.approx(0.2)
     assert "relative" not in document["gripper"]
     assert document["overall"]["relative"] < 1
-    assert len(numbers(document)) <= 40
+    # A number for each method: overall, by group, by dimension, by group and step; and a few more.
+    assert len(numbers(document)) == 2 + 5 + (6 + 6 + 5) + 5 * 4 + 3 * 4 * 4
+    assert all(number == float(f"{number:.6g}") for number in numbers(document))
     assert all(np.isfinite(numbers(document)))
 
 
@@ -55,8 +64,9 @@ def test_the_table_lines_up(comparison: Comparison) -> None:
         "rotation [deg]",
         "gripper",
         "overall [training std]",
+        FOOTNOTE,
     ]
-    assert len({len(line) for line in lines}) == 1
+    assert len({len(line) for line in lines[:-1]}) == 1
     assert lines[3].endswith("-")
 
 
@@ -86,3 +96,41 @@ def test_files_hold_every_dimension_step_episode_and_tick(
     assert tick["episode"] == "episode_002"
     assert float(tick["time_s"]) == pytest.approx(0.1)
     assert float(tick["dx_predicted"]) - float(tick["dx_recorded"]) == pytest.approx(0.1, abs=1e-5)
+
+
+def test_a_number_that_is_none_is_not_left_out(comparison: Comparison) -> None:
+    comparison.scores["policy"].mae[0] = np.nan
+    assert np.isnan(metrics(comparison)["translation_mm"]["policy"])
+
+
+def test_a_step_no_chunk_reaches_is_left_out(
+    recorded: Callable[..., Predictions], compared: Callable[[Predictions], Comparison]
+) -> None:
+    document = metrics(compared(recorded(np.array([28, 58]))))
+    assert list(document["horizon"]["gripper"]["policy"]) == ["step_1", "step_2"]
+
+
+def test_what_a_report_is_linked_to_is_not_written(
+    comparison: Comparison, predictions: Predictions, store: FeatureStore, tmp_path: Path
+) -> None:
+    """As DVC restores an output: every file a link into its cache."""
+    report, cache = tmp_path / "report", tmp_path / "cache"
+    report.mkdir()
+    cache.mkdir()
+    for name in ("metrics.json", "dimensions.csv", "horizon.csv", "episodes.csv"):
+        (cache / name).write_text("as it was")
+        (report / name).hardlink_to(cache / name)
+    write_tables(report, comparison, predictions, store)
+    assert {file.read_text() for file in cache.iterdir()} == {"as it was"}
+    assert json.loads((report / "metrics.json").read_text()) == metrics(comparison)
+
+
+def test_a_full_disk_is_named(
+    comparison: Comparison, predictions: Predictions, store: FeatureStore, monkeypatch, tmp_path
+) -> None:
+    def full(path: Path, *rest: object, **named: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "open", full)
+    with pytest.raises(DiskFull, match=str(tmp_path)):
+        write_tables(tmp_path, comparison, predictions, store)

@@ -7,6 +7,7 @@ import pytest
 import yaml
 
 from stages import evaluate, train_head
+from stages.command import run
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +34,7 @@ def trained(tiny_store: Callable[..., Path], tmp_path_factory: pytest.TempPathFa
     }
     path = folder / "params.yaml"
     path.write_text(yaml.safe_dump(document))
-    assert train_head.main(["--params", str(path)]) == 0
+    assert run("", train_head.main, ["--params", str(path)]) == 0
     return path
 
 
@@ -45,7 +46,10 @@ def test_a_store_that_grew_is_judged_on_the_same_episodes(
 ) -> None:
     grown = tiny_store(tmp_path, episodes=9)
     for store in (trained.parent / "tiny.zarr", grown):
-        assert evaluate.main(["--params", str(trained), "--set", f"evaluate.store={store}"]) == 0
+        assert (
+            run("", evaluate.main, ["--params", str(trained), "--set", f"evaluate.store={store}"])
+            == 0
+        )
         assert "30 held-out ticks of 1 episode(s)" in capsys.readouterr().out
 
 
@@ -57,6 +61,7 @@ def test_a_store_that_grew_is_judged_on_the_same_episodes(
         ({"state_dim": 0}, "streams.state.names"),
         ({"reuse": 2}, "vlm_reuse_count: 3 (the checkpoint), 2 (the store)"),
         ({"episodes": 1}, "lacks 1 of the 1 episodes"),
+        ({"seed": 1}, "other recordings under the names of 1 of the 1 held-out episodes"),
     ],
 )
 def test_another_store_is_refused_by_name(
@@ -68,7 +73,9 @@ def test_another_store_is_refused_by_name(
     said: str,
 ) -> None:
     other = tiny_store(tmp_path, name="other", **store)
-    assert evaluate.main(["--params", str(trained), "--set", f"evaluate.store={other}"]) == 2
+    assert (
+        run("", evaluate.main, ["--params", str(trained), "--set", f"evaluate.store={other}"]) == 2
+    )
     error = capsys.readouterr().err
     assert said in error
     assert "Traceback" not in error
@@ -78,10 +85,10 @@ def test_a_missing_checkpoint_says_what_to_run(
     trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     wanted = f"evaluate.checkpoint={tmp_path / 'nowhere'}"
-    assert evaluate.main(["--params", str(trained), "--set", wanted]) == 2
+    assert run("", evaluate.main, ["--params", str(trained), "--set", wanted]) == 2
     assert "Run stages.train_head" in capsys.readouterr().err
 
 
 def test_last_can_be_judged_too(trained: Path) -> None:
     last = f"evaluate.checkpoint={trained.parent / 'head/last'}"
-    assert evaluate.main(["--params", str(trained), "--set", last]) == 0
+    assert run("", evaluate.main, ["--params", str(trained), "--set", last]) == 0

@@ -1,6 +1,7 @@
 """What a start finds at its output decides what it does, and nothing of another's is lost."""
 
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,6 @@ from pipeline.durable import read_document
 from pipeline.errors import CheckpointIncomplete, CheckpointMismatch, ConfigError
 from pipeline.store import FeatureStore
 from pipeline.training import Trainer, open_run
-from pipeline.training.log import TrainingLog
 
 Make = Callable[..., Any]
 
@@ -43,8 +43,10 @@ def test_a_finished_run_is_left_alone(store: FeatureStore, params: Make, trainer
     trainer(store, params()).fit()
     leftover = params().output / "last" / "trainer.json"
     leftover.touch()  # killed between renaming and tidying
+    assert len(open_run(params(), store).notes) == 1
     run = open_run(params(device="cpu", logs="elsewhere", checkpoint_every=1), store)
     assert run.status == "finished"
+    assert f"left where they were written, in {params().logs}, not in elsewhere" in run.notes[1]
     assert not leftover.exists()
 
 
@@ -67,6 +69,8 @@ def test_other_params_move_an_unfinished_run_aside(
     aside = unfinished.with_name("head.part-old")
     run = open_run(params(lr=0.5, expert={"dim": 16, "heads": 4}), store)
     assert run.status == "new"
+    assert not aside.exists()
+    run.begin()
     assert "train_head.lr: 0.003 (that run), 0.5 (now)" in run.notes[0]
     assert "train_head.expert.heads: 2 (that run), 4 (now)" in run.notes[0]
     assert (aside / "last" / "policy.json").exists()
@@ -74,22 +78,29 @@ def test_other_params_move_an_unfinished_run_aside(
     # One that has only begun does not replace what was put aside before.
     run = open_run(params(lr=0.25), store)
     assert run.notes == ()
+    run.begin()
+    assert read_document(unfinished / "run.json")["decides"]["train_head"]["lr"] == 0.25
     assert read_document(aside / "run.json")["decides"]["train_head"]["lr"] == 0.003
 
 
-def test_a_run_put_aside_is_taken_back(
+def test_a_run_put_aside_gives_way_to_the_next(
     store: FeatureStore, params: Make, trainer: Make, unfinished: Path
 ) -> None:
-    mistyped = trainer(store, params(lr=0.5))
-    with TrainingLog(mistyped.params.logs) as log:
-        mistyped._train_step(store.gather(mistyped.sampler.batch(0), 3, 6, 5))
-        mistyped._save_last(log)
-    back = trainer(store, params())
-    assert (back.run.status, back.step) == ("resumed", 10)
-    assert "put aside earlier: taken back" in back.run.notes[0]
-    assert "train_head.lr: 0.5 (that run), 0.003 (now)" in back.run.notes[1]
-    again = trainer(store, params(lr=0.5))
-    assert (again.run.status, again.step) == ("resumed", 1)
+    aside = unfinished.with_name("head.part-old")
+    aside.mkdir()
+    (aside / "run.json").write_text("older")
+    trainer(store, params(lr=0.5, max_steps=1)).fit()
+    assert read_document(aside / "run.json")["decides"]["train_head"]["lr"] == 0.003
+
+
+def test_nothing_is_written_before_the_params_are_known_to_be_good(
+    store: FeatureStore, params: Make, trainer: Make, unfinished: Path
+) -> None:
+    before = sorted(unfinished.rglob("*"))
+    with pytest.raises(ConfigError):
+        trainer(store, params(mixture={"middle": 1.0}))
+    assert sorted(unfinished.rglob("*")) == before
+    assert not unfinished.with_name("head.part-old").exists()
 
 
 def test_other_features_or_streams_are_refused(
@@ -175,3 +186,58 @@ def test_checkpoints_without_their_run_are_not_guessed_at(
     (unfinished / "run.json").unlink()
     with pytest.raises(ConfigError, match=r"no run\.json"):
         open_run(params(), store)
+
+
+@pytest.mark.parametrize("harm", ["remove", "truncate"])
+@pytest.mark.parametrize(
+    "file", ["best/policy.json", "best/policy.safetensors", "last/policy.json", "best"]
+)
+def test_a_damaged_finished_run_is_trained_again(
+    store: FeatureStore, params: Make, trainer: Make, harm: str, file: str
+) -> None:
+    trainer(store, params()).fit()
+    path = params().output / file
+    if path.is_dir():
+        shutil.rmtree(path)
+    elif harm == "remove":
+        path.unlink()
+    else:
+        path.write_bytes(path.read_bytes()[:-20])
+    again = trainer(store, params())
+    assert again.run.status == "new"
+    assert "this very run, but damaged; it is trained again" in again.run.notes[0]
+    again.fit()
+    assert open_run(params(), store).status == "finished"
+
+
+@pytest.mark.parametrize("file", ["last/trainer.json", "last/policy.json", "run.json"])
+def test_the_advice_of_a_damaged_unfinished_run_leads_out(
+    store: FeatureStore, params: Make, trainer: Make, unfinished: Path, file: str
+) -> None:
+    (unfinished / file).write_text("{}")
+    with pytest.raises((CheckpointIncomplete, CheckpointMismatch)) as caught:
+        trainer(store, params())
+    if file != "last/policy.json":  # an empty one says another format
+        assert f"{unfinished / file}: the checkpoint is damaged" in str(caught.value)
+        assert f"Remove {(unfinished / file).parent} and run" in str(caught.value)
+    shutil.rmtree((unfinished / file).parent)
+    trainer(store, params()).fit()
+    assert open_run(params(), store).status == "finished"
+
+
+def test_a_run_without_a_checkpoint_refuses_no_other_store(
+    store: FeatureStore, params: Make, tiny_store: Callable[..., Path], tmp_path: Path
+) -> None:
+    open_run(params(), store).begin()
+    other = FeatureStore.open(tiny_store(tmp_path, name="other", spec_digest="another"))
+    run = open_run(params(), other)
+    assert (run.status, run.notes) == ("new", ())
+
+
+def test_code_of_other_numbers_goes_on_with_no_run(
+    store: FeatureStore, params: Make, unfinished: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipeline.training.run.TRAINER_VERSION", 99)
+    run = open_run(params(), store)
+    assert run.status == "new"
+    assert "trainer_version: 1 (that run), 99 (now)" in run.notes[0]

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.errors import NumericsError
 from pipeline.store import FeatureStore
 from pipeline.training import fit_normalization
 
@@ -49,3 +50,28 @@ def test_absent_streams_have_none_and_bfloat16_is_read(
     batch = store.gather(np.arange(0, store.ticks, store.vlm_reuse_count))
     expected = batch.features.double().numpy()
     assert found.features.mean == pytest.approx(expected.mean(0), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("array", "row", "said"),
+    [
+        ("tick/action", (37, 3), "right/episode_001, tick 7 (at 0.700 s), channel 'da'"),
+        ("vl/features", (12, 1, 4), "right/episode_001, VL row 2 (at 0.600 s), channel 1, 4"),
+        ("sensor/values", (245, 2), "right/episode_001, sensor reading 5 (at 0.062 s)"),
+        ("state/values", (121, 0), "right/episode_001, state reading 1 (at 0.025 s)"),
+    ],
+)
+def test_a_number_that_is_none_is_named_by_episode_and_time(
+    tiny_store: Callable[..., Path], tmp_path: Path, array: str, row: tuple[int, ...], said: str
+) -> None:
+    store = FeatureStore.open(tiny_store(tmp_path))
+    store.array(array)[row] = np.nan
+    with pytest.raises(NumericsError) as caught:
+        fit_normalization(store, np.arange(30, 60))
+    assert said in str(caught.value)
+    assert "found nan" in str(caught.value)
+
+
+def test_no_ticks_are_no_statistics(tiny_store: Callable[..., Path], tmp_path: Path) -> None:
+    with pytest.raises(NumericsError, match="no rows"):
+        fit_normalization(FeatureStore.open(tiny_store(tmp_path)), np.arange(0))

@@ -1,0 +1,26 @@
+"""The precision that `amp` asks for, on each kind of device."""
+
+import pytest
+import torch
+
+from pipeline.device import use_bfloat16
+
+CPU, CUDA = torch.device("cpu"), torch.device("cuda")
+
+
+@pytest.mark.parametrize(
+    ("amp", "device", "supported", "expected"),
+    [
+        ("auto", CPU, True, False),
+        ("auto", CUDA, True, True),
+        ("auto", CUDA, False, False),
+        ("off", CUDA, True, False),
+        ("bfloat16", CPU, False, True),
+        ("bfloat16", CUDA, True, True),
+    ],
+)
+def test_when_the_forward_pass_runs_in_bfloat16(
+    monkeypatch: pytest.MonkeyPatch, amp, device: torch.device, supported: bool, expected: bool
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: supported)
+    assert use_bfloat16(amp, device) is expected
