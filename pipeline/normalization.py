@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from pipeline.errors import CheckpointMismatch, NumericsError
 
-Chunk = NDArray[Any] | tuple[NDArray[Any], NDArray[np.bool_]]
+Block = NDArray[Any] | tuple[NDArray[Any], NDArray[np.bool_]]
+"""Rows of values, or such rows and which of their values are valid."""
 
-_BLOCK_VALUES = 4_194_304
-"""Values converted to float64 at a time: 32 MB, whatever the size of the chunks."""
+_PIECE_VALUES = 4_194_304
+"""Values converted to float64 at a time: 32 MB, whatever the size of the blocks."""
 
 _RELATIVE_FLOOR = 4 * float(np.finfo(np.float32).eps)
 """A spread below a few float32 steps of the mean is rounding, not signal."""
@@ -96,22 +97,22 @@ class Normalization:
 
 
 def fit_channels(
-    chunks: Iterable[Chunk], what: str, names: Sequence[str] | None = None
+    blocks: Iterable[Block], what: str, names: Sequence[str] | None = None
 ) -> ChannelStatistics:
-    """Statistics over all rows of `chunks`, each (row, channel…) of floating point, in one pass.
+    """Statistics over all rows of `blocks`, each (row, channel…) of floating point, in one pass.
 
-    A chunk may be a pair (values, valid): `valid` is bool over the leading axes of `values`, such
+    A block may be a pair (values, valid): `valid` is bool over the leading axes of `values`, such
     as (row, slot) for features (row, slot, dim), and what is not valid is neither checked nor
     counted. Moments are merged in float64 after Chan, Golub and LeVeque (1983), eq. 2.1.
     Raises `NumericsError`, naming `what`, channel and row, on NaN, inf, or where there is no row.
     """
     moments: _Moments | None = None
     rows = 0
-    for values, valid in _blocks(chunks):
+    for values, valid in _pieces(blocks):
         if not np.issubdtype(values.dtype, np.floating):
             raise TypeError(f"{what}: expected floating point, found {values.dtype}")
-        block = _moments(values, valid, what, names, rows)
-        moments = block if moments is None else _merge(moments, block)
+        piece = _moments(values, valid, what, names, rows)
+        moments = piece if moments is None else _merge(moments, piece)
         rows += len(values)
     if moments is None:
         raise NumericsError(f"{what}: no rows to fit the normalisation on; check the split")
@@ -128,11 +129,11 @@ class _Moments:
     squares: NDArray[np.float64]
 
 
-def _blocks(chunks: Iterable[Chunk]) -> Iterator[tuple[NDArray[Any], NDArray[np.bool_] | None]]:
-    for chunk in chunks:
-        values, valid = chunk if isinstance(chunk, tuple) else (chunk, None)
+def _pieces(blocks: Iterable[Block]) -> Iterator[tuple[NDArray[Any], NDArray[np.bool_] | None]]:
+    for block in blocks:
+        values, valid = block if isinstance(block, tuple) else (block, None)
         channels = int(np.prod(values.shape[1:]))
-        rows = max(1, _BLOCK_VALUES // max(1, channels))
+        rows = max(1, _PIECE_VALUES // max(1, channels))
         for start in range(0, len(values), rows):
             part = slice(start, start + rows)
             yield values[part], None if valid is None else valid[part]
@@ -146,18 +147,18 @@ def _moments(
     first_row: int,
 ) -> _Moments:
     with np.errstate(invalid="ignore", over="ignore"):
-        block = values.astype(np.float64)
+        piece = values.astype(np.float64)
         if valid is None:
-            count = np.float64(len(block))
-            mean = block.mean(axis=0)
-            block -= mean
+            count = np.float64(len(piece))
+            mean = piece.mean(axis=0)
+            piece -= mean
         else:
-            weight = valid.reshape(valid.shape + (1,) * (block.ndim - valid.ndim))
+            weight = valid.reshape(valid.shape + (1,) * (piece.ndim - valid.ndim))
             count = weight.sum(axis=0, dtype=np.float64)
-            block = np.where(weight, block, 0.0)
-            mean = block.sum(axis=0) / np.maximum(count, 1)
-            block = np.where(weight, block - mean, 0.0)
-        squares = np.einsum("r...,r...->...", block, block)
+            piece = np.where(weight, piece, 0.0)
+            mean = piece.sum(axis=0) / np.maximum(count, 1)
+            piece = np.where(weight, piece - mean, 0.0)
+        squares = np.einsum("r...,r...->...", piece, piece)
     if not np.isfinite(squares).all():
         _refuse(values, valid, what, names, first_row)
     return _Moments(np.asarray(count), mean, squares)

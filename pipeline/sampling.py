@@ -7,7 +7,7 @@ saved to resume, and resuming at any step gives the same stream.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import TYPE_CHECKING
@@ -21,7 +21,10 @@ if TYPE_CHECKING:
     from pipeline.store import Episode, FeatureStore
 
 _TAIL = 0.2
-"""What a single episode holds out of its ticks."""
+"""What a single recording holds out of its ticks."""
+
+_SLACK_S = 1e-6
+"""Two times that differ by less are one: seconds since 1970 in float64 are this coarse."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,13 +39,16 @@ class Split:
 
 
 def split_by_episode(store: FeatureStore, val_fraction: float, horizon: int = 8) -> Split:
-    """Whole episodes on either side, by a hash of "source/id" that other episodes never change.
+    """Whole episodes on either side, by a hash of "source/id".
 
-    Episodes whose first VL keys are equal are one recording in two formats and share a side, by
-    the hash of the first of their names. Of two recordings at least one is held out and at least
-    one trained on. A single one holds out the last 20 % of its ticks, and the `horizon - 1` ticks
-    before those belong to neither side, so that no trained chunk holds a held-out action.
-    Raises `StoreMismatch` where the store has no tick.
+    Episodes whose first VL keys are equal are one recording in several formats and share a side,
+    by the hash of the first of their names. So an added episode moves none but other formats of
+    itself, save where a side would be empty: of two recordings one is held out, one trained on.
+
+    A single recording is cut at one instant for all of its formats: the earliest at which the last
+    20 % of a format's ticks begin. Ticks from there on are held out; ticks before it whose chunk
+    of `horizon` actions is not over by then belong to neither side. Raises `ConfigError` where that
+    leaves nothing to train on, `StoreMismatch` where the store has no tick.
     """
     recordings = _recordings(store)
     if not recordings:
@@ -51,11 +57,10 @@ def split_by_episode(store: FeatureStore, val_fraction: float, horizon: int = 8)
             "stages.extract again."
         )
     if val_fraction <= 0:
-        everything = [episode for episodes in recordings.values() for episode in episodes]
-        return Split(_ticks(everything), _ticks([]), (), None)
+        return Split(_ticks(store.episodes), _ticks([]), (), None)
     if len(recordings) == 1:
-        return _split_tail(next(iter(recordings.values())), horizon)
-    ranks = {name: _unit_hash(name) for name in recordings}
+        return _split_tail(store, next(iter(recordings.values())), horizon)
+    ranks = {name: _hash(name) / 2**64 for name in recordings}
     chosen = {name for name, rank in ranks.items() if rank < val_fraction}
     note = None
     if not chosen:
@@ -122,8 +127,7 @@ class TickSampler:
         """The ticks (batch_size,) of this step, source by source: a function of (seed, step)."""
         first = self.drawn(step * self.batch_size)
         last = self.drawn((step + 1) * self.batch_size)
-        parts = [self._range(name, first[name], last[name]) for name in self._ticks]
-        return np.concatenate(parts)
+        return np.concatenate([self._range(name, first[name], last[name]) for name in self._ticks])
 
     def drawn(self, draws: int) -> dict[str, int]:
         """How many of the first `draws` ticks each source gave."""
@@ -151,89 +155,106 @@ class TickSampler:
 
 
 @dataclass(frozen=True)
-class _Leaf:
-    name: str
+class _Node:
+    """A source, or a fork that divides draws between two nodes; mass is weight times ticks."""
+
     mass: Fraction
+    source: str = ""
+    fork: tuple[_Node, _Node] | None = None
 
     def drawn(self, draws: int) -> dict[str, int]:
-        return {self.name: draws}
+        """How many of the first `draws` that come here each source from here on gets.
+
+        The left gets round(draws · share), exactly, the right the rest: of one more draw either
+        gets 0 or 1 more, and so does every source. Rounding source by source and handing out the
+        remainder would take draws back (the Alabama paradox).
+        """
+        if self.fork is None:
+            return {self.source: draws}
+        left, right = self.fork
+        to_left = (2 * draws * left.mass + self.mass) // (2 * self.mass)
+        return left.drawn(to_left) | right.drawn(draws - to_left)
 
 
-@dataclass(frozen=True)
-class _Fork:
-    """Sends round(draws · share) to the left and the rest to the right, in exact arithmetic.
+def _mixture(masses: Mapping[str, Fraction]) -> _Node:
+    """Forks to all sources, the two lightest nodes joined until one is left: a Huffman tree.
 
-    Both counts grow by 0 or 1 a draw, so sources never take a draw back, which the method of
-    largest remainders would (the Alabama paradox).
+    Each fork rounds by half a draw. Split off one after the other, eight sources would add that up
+    to more than 1.5 draws; here heavy sources are a fork or two away.
     """
-
-    left: _Leaf | _Fork
-    right: _Leaf | _Fork
-
-    @property
-    def mass(self) -> Fraction:
-        return self.left.mass + self.right.mass
-
-    def drawn(self, draws: int) -> dict[str, int]:
-        left = (2 * draws * self.left.mass + self.mass) // (2 * self.mass)
-        return self.left.drawn(left) | self.right.drawn(draws - left)
-
-
-def _mixture(masses: Mapping[str, Fraction]) -> _Leaf | _Fork:
-    """A Huffman tree over the sources: shallow, so that rounding adds up to little."""
-    nodes: list[_Leaf | _Fork] = [_Leaf(name, masses[name]) for name in sorted(masses)]
+    nodes = [_Node(masses[name], name) for name in sorted(masses)]
     while len(nodes) > 1:
-        nodes.sort(key=lambda node: node.mass)
-        nodes = [_Fork(nodes[0], nodes[1]), *nodes[2:]]
+        left, right, *others = sorted(nodes, key=lambda node: node.mass)
+        nodes = [_Node(left.mass + right.mass, fork=(left, right)), *others]
     return nodes[0]
 
 
 def _recordings(store: FeatureStore) -> dict[str, list[Episode]]:
     """Episodes that have ticks, by the first name among those with the same first VL key."""
     keys = store.array("vl/key")
-    by_key: dict[bytes | str, list[Episode]] = {}
+    by_key: dict[bytes, list[Episode]] = {}
     for episode in store.episodes:
         if len(episode.ticks):
-            rows = episode.vl_rows
-            key = keys[rows.start].tobytes() if len(rows) else _name(episode)
-            by_key.setdefault(key, []).append(episode)
+            by_key.setdefault(keys[episode.vl_rows.start].tobytes(), []).append(episode)
     return {min(_names(episodes)): episodes for episodes in by_key.values()}
 
 
-def _split_tail(episodes: list[Episode], horizon: int) -> Split:
+def _split_tail(store: FeatureStore, episodes: list[Episode], horizon: int) -> Split:
+    named = f"a single recording ({', '.join(_names(episodes))})"
+    clocks = [_elapsed(store, episode) for episode in episodes]
+    begins = [clock[-n] for clock in clocks if (n := round(_TAIL * len(clock)))]
+    if not begins:
+        return Split(_ticks(episodes), _ticks([]), (), f"{named}, too short to hold ticks out")
     train, held_out = [], []
-    for episode in episodes:
-        ticks = _ticks([episode])
-        boundary = len(ticks) - round(_TAIL * len(ticks))
-        # At least one tick is trained on, however short the episode.
-        train.append(ticks[: max(1, boundary - (horizon - 1))])
-        held_out.append(ticks[boundary:])
-    if not any(map(len, held_out)):
-        note = f"a single recording ({', '.join(_names(episodes))}), too short to hold ticks out"
-        return Split(np.concatenate(train), _ticks([]), (), note)
+    for episode, clock in zip(episodes, clocks, strict=True):
+        trained, first = _sides(clock, min(begins), horizon)
+        train.append(_ticks([episode])[:trained])
+        held_out.append(_ticks([episode])[first:])
+    if not any(map(len, train)):
+        raise ConfigError(
+            f"{named} of {', '.join(str(len(clock)) for clock in clocks)} ticks, its last "
+            f"{_TAIL:.0%} held out: expected an action chunk of train_head.horizon {horizon} ticks "
+            "before those, found none. Set a shorter train_head.horizon or "
+            "train_head.val_fraction=0, or add recordings to data.sources."
+        )
     note = (
-        f"a single recording ({', '.join(_names(episodes))}): its last {_TAIL:.0%} of ticks are "
-        "held out, which says less than a recording never seen"
+        f"{named}: its last {_TAIL:.0%} of ticks are held out, "
+        "which says less than a recording never seen"
     )
-    return Split(np.concatenate(train), np.concatenate(held_out), _names(episodes), note)
+    names = _names([e for e, ticks in zip(episodes, held_out, strict=True) if len(ticks)])
+    return Split(np.sort(np.concatenate(train)), np.sort(np.concatenate(held_out)), names, note)
 
 
-def _ticks(episodes: list[Episode]) -> NDArray[np.int64]:
+def _elapsed(store: FeatureStore, episode: Episode) -> NDArray[np.float64]:
+    """The times (tick,) in s since the newest frame of the first VL row: one for all formats.
+
+    Their clocks may differ and their ticks begin apart. Without a view, since the first tick.
+    """
+    time = store.array("tick/time")[episode.ticks.start : episode.ticks.stop]
+    frames = store.array("vl/frame_time")[episode.vl_rows.start]
+    taken = frames[np.isfinite(frames)]
+    return time - (taken.max() if len(taken) else time[0])
+
+
+def _sides(clock: NDArray[np.float64], cut: float, horizon: int) -> tuple[int, int]:
+    """How many leading ticks have chunks that end before the cut, and the first tick at it."""
+    first = int(np.searchsorted(clock, cut - _SLACK_S))
+    last_step = np.median(np.diff(clock)) if len(clock) > 1 else 0.0
+    ends = np.append(clock[1:], clock[-1] + last_step)
+    # Where ticks of two formats alternate, the action of the tick before the cut lasts beyond it.
+    done = first - 1 if first and ends[first - 1] > cut + _SLACK_S else first
+    # Chunks do not reach beyond the episode's end.
+    return (done if done == len(clock) else max(0, done - (horizon - 1))), first
+
+
+def _ticks(episodes: Sequence[Episode]) -> NDArray[np.int64]:
     ranges = [np.arange(e.ticks.start, e.ticks.stop, dtype=np.int64) for e in episodes]
     return np.sort(np.concatenate(ranges)) if ranges else np.empty(0, np.int64)
 
 
-def _name(episode: Episode) -> str:
-    return f"{episode.source}/{episode.id}"
-
-
-def _names(episodes: list[Episode]) -> tuple[str, ...]:
-    return tuple(sorted(_name(episode) for episode in episodes))
+def _names(episodes: Sequence[Episode]) -> tuple[str, ...]:
+    return tuple(sorted(f"{episode.source}/{episode.id}" for episode in episodes))
 
 
 def _hash(text: str) -> int:
     return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "big")
-
-
-def _unit_hash(text: str) -> float:
-    return _hash(text) / 2**64

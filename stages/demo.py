@@ -4,8 +4,11 @@ The same seed gives the same bytes. Finished sets are kept, an interrupted run g
 others, and a folder that the demo did not write is refused.
 """
 
+from pathlib import Path
+
 from pipeline.config import Params
-from pipeline.simulation.demo_recordings import write_demo_recordings
+from pipeline.durable import replace_folder, write_document
+from pipeline.simulation.demo_recordings import MARKER, refuse_foreign, write_demo_recordings
 from pipeline.vlm.demo_checkpoint import write_demo_checkpoint
 from stages.command import run
 
@@ -13,8 +16,14 @@ from stages.command import run
 def main(params: Params) -> None:
     """The recordings under `demo.recordings`, the checkpoint at `demo.checkpoint`."""
     demo = params.demo
+    refuse_foreign(demo.checkpoint, "demo.checkpoint")
     write_demo_recordings(demo.recordings, demo.episodes, demo.seed)
-    write_demo_checkpoint(demo.checkpoint, demo.seed)
+
+    def write_marked(folder: Path) -> None:
+        write_demo_checkpoint(folder, demo.seed)
+        write_document(folder / MARKER, {"seed": demo.seed})
+
+    replace_folder(demo.checkpoint, write_marked)
     print(f"{demo.episodes} episodes a format in {demo.recordings}, checkpoint {demo.checkpoint}")
 
 

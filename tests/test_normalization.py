@@ -12,7 +12,7 @@ from pipeline.normalization import ChannelStatistics, Normalization, fit_channel
 
 @given(st.lists(st.integers(0, 40), max_size=5), st.integers(0, 2**32 - 1))
 @settings(max_examples=50, deadline=None)
-def test_chunks_say_what_the_whole_says(cuts: list[int], seed: int) -> None:
+def test_blocks_say_what_the_whole_says(cuts: list[int], seed: int) -> None:
     values = np.random.default_rng(seed).normal(1e4, 3, (40, 3)).astype(np.float32)
     edges = [0, *sorted(cuts), 40]
     fitted = fit_channels((values[a:b] for a, b in pairwise(edges)), "x")
@@ -22,8 +22,8 @@ def test_chunks_say_what_the_whole_says(cuts: list[int], seed: int) -> None:
     assert fitted.count == 40
 
 
-def test_large_chunks_are_taken_in_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.normalization._BLOCK_VALUES", 64)
+def test_large_blocks_are_taken_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.normalization._PIECE_VALUES", 64)
     values = np.random.default_rng(0).normal(size=(100, 3, 5)).astype(np.float32)
     fitted = fit_channels([values], "features")
     np.testing.assert_allclose(fitted.std, values.astype(np.float64).std(axis=0), rtol=1e-9)
@@ -72,10 +72,10 @@ def test_overflow_is_named() -> None:
         fit_channels([np.array([[1e300], [-1e300]])], "sensor")
 
 
-@pytest.mark.parametrize("chunks", [[], [np.zeros((0, 3), np.float32)]])
-def test_no_rows_are_an_error(chunks: list[np.ndarray]) -> None:
+@pytest.mark.parametrize("blocks", [[], [np.zeros((0, 3), np.float32)]])
+def test_no_rows_are_an_error(blocks: list[np.ndarray]) -> None:
     with pytest.raises(NumericsError, match="actions: no rows"):
-        fit_channels(chunks, "actions")
+        fit_channels(blocks, "actions")
 
 
 def test_bfloat16_bits_are_not_mistaken_for_numbers() -> None:

@@ -21,11 +21,20 @@ class FakeEpisode:
 
 
 class FakeStore:
-    """Episodes of these lengths and first VL keys, as the split sees them."""
+    """Episodes of these lengths and first VL keys, as the split sees them.
+
+    Their ticks are 0.1 s apart, the first `late` s after the frame it sees; clocks differ.
+    """
 
     path = Path("fake.zarr")
 
-    def __init__(self, lengths: list[int], keys: list[int] | None = None, sources: str = "s"):
+    def __init__(
+        self,
+        lengths: list[int],
+        keys: list[int] | None = None,
+        sources: str = "s",
+        late: list[float] | None = None,
+    ):
         tick = np.cumsum([0, *lengths])
         row = np.cumsum([0, *(-(-n // 3) for n in lengths)])
         self.episodes = tuple(
@@ -41,10 +50,21 @@ class FakeStore:
         self._keys = np.arange(row[-1] * 16).reshape(-1, 16).astype(np.int64)
         for episode, key in zip(self.episodes, keys or [], strict=False):
             self._keys[episode.vl_rows] = -key
+        self._time = np.empty(tick[-1])
+        self._frames = np.full((row[-1], 2), np.nan)
+        for i, episode in enumerate(self.episodes):
+            start = 1.7e9 * (i % 2) + 0.05
+            self._time[episode.ticks] = start + np.arange(len(episode.ticks)) * 0.1
+            if late is not None and len(episode.vl_rows):
+                taken = start - late[i]
+                self._frames[episode.vl_rows.start] = taken - 0.03, taken
 
     def array(self, name: str) -> np.ndarray:
-        assert name == "vl/key"
-        return self._keys
+        return {
+            "vl/key": self._keys,
+            "tick/time": self._time,
+            "vl/frame_time": self._frames,
+        }[name]
 
     def names(self, ticks: np.ndarray) -> set[str]:
         return {
@@ -62,7 +82,7 @@ class TestSplit:
     ) -> None:
         keys = [i // 2 for i in range(len(lengths))] if paired else None
         store = FakeStore(lengths, keys)
-        split = split_by_episode(store, fraction)
+        split = split_by_episode(store, fraction, horizon=1)
         if paired and len(lengths) == 2:
             assert split.note is not None
             return
@@ -85,6 +105,17 @@ class TestSplit:
         before = split_by_episode(FakeStore([6] * 40), 0.3).held_out_episodes
         after = split_by_episode(FakeStore([6] * 41), 0.3).held_out_episodes
         assert set(after) - {"s/episode_40"} == set(before)
+
+    def test_another_format_of_an_episode_moves_no_other(self) -> None:
+        before = split_by_episode(FakeStore([6] * 40), 0.3).held_out_episodes
+        for twin in range(40):
+            store = FakeStore([6] * 41, [*range(40), twin], sources="s")
+            # Its name comes first, so that the pair's side is by its hash.
+            store.episodes[40].id = "another_format"
+            after = split_by_episode(store, 0.3).held_out_episodes
+            pair = {f"s/episode_{twin}", "s/another_format"}
+            assert set(after) - pair == set(before) - pair
+            assert len(pair & set(after)) in (0, 2)
 
     def test_the_fraction_is_about_kept(self) -> None:
         held_out = split_by_episode(FakeStore([3] * 2000), 0.1).held_out_episodes
@@ -115,13 +146,67 @@ class TestSplit:
         split = split_by_episode(FakeStore([50, 50], keys=[7, 7]), 0.1, horizon=1)
         assert split.held_out.tolist() == [*range(40, 50), *range(90, 100)]
 
-    @pytest.mark.parametrize("length", [1, 2, 3, 8])
-    def test_however_short_something_is_trained_on(self, length: int) -> None:
+    def test_formats_of_one_recording_are_cut_at_one_instant(self) -> None:
+        """The second begins 1 s later and ends 3 s earlier: its tail would begin at 5.8 s."""
+        store = FakeStore([100, 60], keys=[7, 7], late=[0.0, 1.0])
+        split = split_by_episode(store, 0.1, horizon=4)
+        assert split.held_out.tolist() == [*range(58, 100), *range(148, 160)]
+        assert split.train.tolist() == [*range(55), *range(100, 145)]
+        assert split.held_out_episodes == ("s/episode_0", "s/episode_1")
+
+    def test_an_action_that_lasts_beyond_the_cut_is_not_trained_on(self) -> None:
+        """Ticks of the second lie between those of the first; the cut is at 8 s."""
+        split = split_by_episode(FakeStore([100, 100], keys=[7, 7], late=[0.0, 0.05]), 0.1, 1)
+        assert split.held_out.tolist() == [*range(80, 100), *range(180, 200)]
+        # Of the second, the action of tick 79 lasts from 7.95 s to 8.05 s.
+        assert split.train.tolist() == [*range(80), *range(100, 179)]
+
+    def test_a_format_that_ends_before_the_cut_is_trained_on_whole(self) -> None:
+        split = split_by_episode(FakeStore([100, 2], keys=[7, 7], late=[0.0, 0.0]), 0.1, 8)
+        assert split.train.tolist() == [*range(73), 100, 101]
+        assert split.held_out_episodes == ("s/episode_0",)
+
+    @given(
+        st.lists(st.tuples(st.integers(1, 90), st.floats(0, 3)), min_size=1, max_size=4),
+        st.integers(1, 12),
+    )
+    @settings(deadline=None)
+    def test_no_trained_chunk_reaches_into_what_is_held_out(
+        self, formats: list[tuple[int, float]], horizon: int
+    ) -> None:
+        lengths, late = [list(column) for column in zip(*formats, strict=True)]
+        store = FakeStore(lengths, [7] * len(formats), late=late)
+        try:
+            split = split_by_episode(store, 0.1, horizon)
+        except ConfigError:
+            return
+        begins, ends = [], []
+        for episode, waited in zip(store.episodes, late, strict=True):
+            for tick in episode.ticks:
+                if tick in split.held_out:
+                    begins.append(waited + 0.1 * (tick - episode.ticks.start))
+                if tick in split.train:
+                    last = min(tick + horizon, episode.ticks.stop)
+                    ends.append(waited + 0.1 * (last - episode.ticks.start))
+        assert ends
+        assert not begins or max(ends) <= min(begins) + 1e-5
+
+    @pytest.mark.parametrize("length", [1, 2])
+    def test_too_short_to_hold_ticks_out_trains_on_all(self, length: int) -> None:
         split = split_by_episode(FakeStore([length]), 0.1, horizon=8)
-        assert split.train.tolist() == [0]
-        assert len(split.held_out) == round(0.2 * length)
-        assert bool(split.held_out_episodes) == (length >= 3)
-        assert ("too short" in str(split.note)) == (length < 3)
+        assert len(split.train) == length
+        assert not len(split.held_out)
+        assert split.held_out_episodes == ()
+        assert "too short" in str(split.note)
+
+    def test_the_longest_horizon_that_leaves_a_tick(self) -> None:
+        assert split_by_episode(FakeStore([10]), 0.1, horizon=8).train.tolist() == [0]
+
+    @pytest.mark.parametrize(("length", "horizon"), [(3, 8), (8, 8), (10, 9), (100, 81)])
+    def test_a_horizon_that_leaves_nothing_is_refused(self, length: int, horizon: int) -> None:
+        said = rf"of {length} ticks.*horizon {horizon} .*shorter.*val_fraction=0.*data\.sources"
+        with pytest.raises(ConfigError, match=said):
+            split_by_episode(FakeStore([length]), 0.1, horizon)
 
     def test_episodes_without_ticks_are_no_recordings(self) -> None:
         split = split_by_episode(FakeStore([0, 100, 0]), 0.1)

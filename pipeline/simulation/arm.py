@@ -13,9 +13,6 @@ from scipy.spatial.transform import Rotation
 ActionRotation = Literal["rotvec", "euler_delta"]
 """How an action's three rotation channels are meant, in degrees; DESIGN's names."""
 
-ACTION_NAMES = ("dx", "dy", "dz", "da", "db", "dr", "gripper")
-ACTION_UNITS = ("mm",) * 3 + ("deg",) * 3 + ("",)
-
 NOMINAL_POSE = np.array([82.0, 111.0, 253.0, -136.0, 38.0, -158.0])
 """About where a Meca500 with this tool stands when it inserts."""
 

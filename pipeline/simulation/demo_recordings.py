@@ -17,6 +17,7 @@ from typing import Any, Final
 import numpy as np
 from tqdm import tqdm
 
+from pipeline.durable import write_document
 from pipeline.errors import ConfigError, DiskFull
 from pipeline.simulation.insertion_formats import (
     ABUTTING,
@@ -108,7 +109,8 @@ _SETS: Final[dict[str, Write]] = {
 
 def _finished_sets(root: Path, wanted: dict[str, int]) -> list[str]:
     """The sets already there as wanted, after removing the demo's own that are not."""
-    if not root.exists() or (root.is_dir() and not any(root.iterdir())):
+    refuse_foreign(root, "demo.recordings")
+    if not (root / MARKER).exists():
         return []
     marked = _marked(root)
     written = [name for name in marked["sets"] if (root / name).is_dir()]
@@ -125,15 +127,20 @@ def _finished_sets(root: Path, wanted: dict[str, int]) -> list[str]:
     return []
 
 
+def refuse_foreign(folder: Path, setting: str) -> None:
+    """Raise `ConfigError` naming `setting` where `folder` has content that is not the demo's."""
+    empty = not folder.exists() or (folder.is_dir() and not any(folder.iterdir()))
+    if not empty and not (folder / MARKER).is_file():
+        raise ConfigError(
+            f"{folder} is there and has no {MARKER}: the demo did not write it and leaves it "
+            f"alone; move it away, or set {setting} to another folder"
+        )
+
+
 def _marked(root: Path) -> dict[str, Any]:
     path = root / MARKER
     try:
         marked = json.loads(path.read_text(encoding="utf-8"))
-    except (FileNotFoundError, NotADirectoryError):
-        raise ConfigError(
-            f"{root} is there and has no {MARKER}: the demo did not write it and leaves it alone; "
-            "move it away, or set demo.recordings to another folder"
-        ) from None
     except ValueError as error:
         raise ConfigError(f"{path}: not JSON ({error}); remove {root} and run again") from None
     if not isinstance(marked, dict) or not isinstance(marked.get("sets"), list):
@@ -142,6 +149,4 @@ def _marked(root: Path) -> dict[str, Any]:
 
 
 def _mark(root: Path, wanted: dict[str, int], finished: list[str]) -> None:
-    part = root / f".{MARKER}.part"
-    part.write_text(json.dumps({**wanted, "sets": finished}, indent=2) + "\n", encoding="utf-8")
-    part.rename(root / MARKER)
+    write_document(root / MARKER, {**wanted, "sets": finished})

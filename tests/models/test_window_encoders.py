@@ -58,6 +58,12 @@ class TestWindowEncoderContract:
     ) -> None:
         values, valid = windows(), torch.arange(14)
         together = encoder(values, valid)
+        # The reading of this age is real in the rows that have so many.
+        for age in range(1, WINDOW + 1):
+            changed = values.clone()
+            changed[:, WINDOW - age] += 1.0
+            differs = (encoder(changed, valid) != together).any(dim=-1)
+            assert torch.equal(differs, valid >= age)
         alone = torch.cat([encoder(values[i : i + 1], valid[i : i + 1]) for i in range(14)])
         torch.testing.assert_close(together, alone, atol=1e-5, rtol=1e-4)
 

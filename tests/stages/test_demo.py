@@ -25,6 +25,10 @@ def params(tmp_path: Path) -> Path:
     return path
 
 
+def write_weights(folder: Path, seed: int) -> None:
+    (folder / "weights").write_text(str(seed), encoding="utf-8")
+
+
 def test_writes_recordings_and_checkpoint(
     params: Path,
     tmp_path: Path,
@@ -33,10 +37,30 @@ def test_writes_recordings_and_checkpoint(
 ) -> None:
     calls: list[tuple[object, ...]] = []
     monkeypatch.setattr(demo, "write_demo_recordings", lambda *given: calls.append(given))
-    monkeypatch.setattr(demo, "write_demo_checkpoint", lambda *given: calls.append(given))
-    assert command.run("", demo.main, ["--params", str(params)]) == 0
-    assert calls == [(tmp_path / "recordings", 2, 5), (tmp_path / "vlm", 5)]
+    monkeypatch.setattr(demo, "write_demo_checkpoint", write_weights)
+    # The second time replaces the demo's own.
+    for _ in range(2):
+        assert command.run("", demo.main, ["--params", str(params)]) == 0
+    assert calls == [(tmp_path / "recordings", 2, 5)] * 2
+    assert (tmp_path / "vlm" / "weights").read_text(encoding="utf-8") == "5"
+    assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["vlm"]
     assert "2 episodes" in capsys.readouterr().out
+
+
+def test_a_checkpoint_that_the_demo_did_not_write_is_left_alone(
+    params: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(demo, "write_demo_checkpoint", write_weights)
+    (tmp_path / "vlm").mkdir()
+    (tmp_path / "vlm" / "weights").write_text("real", encoding="utf-8")
+    assert command.run("", demo.main, ["--params", str(params)]) == 2
+    said = capsys.readouterr().err
+    assert "demo.checkpoint" in said and str(tmp_path / "vlm") in said
+    assert (tmp_path / "vlm" / "weights").read_text(encoding="utf-8") == "real"
+    assert not (tmp_path / "recordings").exists()
 
 
 def test_foreign_recordings_end_with_2_and_no_checkpoint(
