@@ -34,6 +34,7 @@ class FakeStore:
         keys: list[int] | None = None,
         sources: str = "s",
         late: list[float] | None = None,
+        cameras: bool = True,
     ):
         tick = np.cumsum([0, *lengths])
         row = np.cumsum([0, *(-(-n // 3) for n in lengths)])
@@ -55,8 +56,8 @@ class FakeStore:
         for i, episode in enumerate(self.episodes):
             start = 1.7e9 * (i % 2) + 0.05
             self._time[episode.ticks] = start + np.arange(len(episode.ticks)) * 0.1
-            if late is not None and len(episode.vl_rows):
-                taken = start - late[i]
+            if cameras and len(episode.vl_rows):
+                taken = start - (late[i] if late else 0.0)
                 self._frames[episode.vl_rows.start] = taken - 0.03, taken
 
     def array(self, name: str) -> np.ndarray:
@@ -73,6 +74,13 @@ class FakeStore:
 
 
 class TestSplit:
+    def test_equal_keys_without_a_frame_are_not_one_recording(self):
+        store = FakeStore([30] * 8, keys=[7] * 8, cameras=False)
+        split = split_by_episode(store, 0.3)
+        assert split.note is None or "single recording" not in split.note
+        assert len(split.held_out_episodes) in range(1, 8)
+        assert set(split.held_out_episodes) == store.names(split.held_out)
+
     @given(
         st.lists(st.integers(1, 20), min_size=2, max_size=30), st.floats(0.01, 1.0), st.booleans()
     )
