@@ -110,12 +110,15 @@ def has_code(path: Path) -> bool:
 @pytest.mark.parametrize("stage", ["demo", "extract", "train_head", "evaluate"])
 def test_every_module_a_stage_runs_is_among_its_deps(stage):
     document = yaml.safe_load((ROOT / "dvc.yaml").read_text())
-    deps = [ROOT / dep for dep in document["stages"][stage]["deps"] if "$" not in dep]
+    deps = {ROOT / dep for dep in document["stages"][stage]["deps"] if "$" not in dep}
+    needed = set()
     for name in reached(f"stages.{stage}"):
         path = MODULES[name]
         if has_code(path):
-            covered = any(dep == path or dep in path.parents for dep in deps)
-            assert covered, f"{path.relative_to(ROOT)} is not among the deps of {stage}"
+            covering = {dep for dep in deps if dep == path or dep in path.parents}
+            assert covering, f"{path.relative_to(ROOT)} is not among the deps of {stage}"
+            needed |= covering
+    assert deps == needed, f"{stage} does not need {[str(dep) for dep in deps - needed]}"
 
 
 def test_stage_two_knows_nothing_of_stage_one():
