@@ -29,6 +29,16 @@ def test_two_and_one_message_for_what_the_user_can_mend(capsys):
     assert capsys.readouterr().err == "error: folder/x.npz: truncated\n"
 
 
+def test_two_for_a_place_that_cannot_be_used(capsys, tmp_path):
+    (tmp_path / "file").touch()
+
+    def work(params):
+        (tmp_path / "file" / "below").mkdir()
+
+    assert run("Summary.", work, ["--params", PARAMS]) == 2
+    assert f"error: {tmp_path}/file/below: Not a directory" in capsys.readouterr().err
+
+
 def test_two_for_bad_params(capsys):
     assert run("Summary.", print, ["--params", PARAMS, "--set", "nothing.like=it"]) == 2
     assert "nothing: Extra inputs are not permitted" in capsys.readouterr().err
