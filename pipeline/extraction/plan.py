@@ -40,7 +40,7 @@ class ExtractionPlan:
             *(f"why: {reason}" for reason in self.reasons),
             f"episodes: {self.episodes}, {self.unchanged} of them unchanged",
             f"rows: {self.rows}, {self.known} known, {left} to compute"
-            + (" (fewer where a key is known)" if left and self.unchanged < self.episodes else ""),
+            + (" (fewer where a key turns out to be known)" if left and self.known else ""),
             f"disk: {_size(self.bytes)} for the whole store, {_size(self.free)} free",
             f"time: {time}",
         ]
