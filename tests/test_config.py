@@ -71,6 +71,12 @@ def test_every_problem_is_said_with_its_place(minimal):
         ("data.sources=[{name: a, path: x}, {name: a, path: y}]", "stands more than once"),
         ("train_head.mixture={other: 1}", "mixture names other"),
         ("extract.workers=2", "extract.workers"),
+        ("train_head.diffusion={timesteps: 20, sampling_steps: 50}", "above timesteps 20"),
+        ("train_head.grad_accumulation=80", "parts without a tick"),
+        ("train_head.model_type=transformer", "flow_matching"),
+        ("train_head.fusion_strategy=film", "cross_attention"),
+        ("finetune.tuning.towers=[]", "finetune.tuning.towers"),
+        ("vlm.variants=0", "vlm.variants"),
     ],
 )
 def test_what_is_refused(minimal, override, message):

@@ -2,12 +2,23 @@
 
 Every section is a frozen model that forbids unknown keys, so that a misspelt key is an error and
 not a default; all errors are reported at once. `stage_one` has the sections of the demo,
-the data and extraction, `stage_two` those of training and evaluation, `load` reads the file.
+the data and extraction, `stage_two` those of training and evaluation, `policy` those of the
+policy's parts, `finetune` that of tuning the model itself; `load` reads the file.
 """
 
+from pipeline.config.finetune import FinetuneParams, TuningParams
 from pipeline.config.load import load_params
+from pipeline.config.policy import (
+    DiffusionParams,
+    ExpertParams,
+    FlowMatchingParams,
+    RegressionParams,
+    SensorEncoderParams,
+    StateEncoderParams,
+)
 from pipeline.config.sections import Params
 from pipeline.config.stage_one import (
+    AugmentationParams,
     DataParams,
     DemoParams,
     Dtype,
@@ -18,27 +29,36 @@ from pipeline.config.stage_one import (
     VLMParams,
 )
 from pipeline.config.stage_two import (
+    CompareParams,
     EvaluateParams,
-    ExpertParams,
-    SensorEncoderParams,
-    StateEncoderParams,
+    FusionStrategy,
+    ModelType,
     TrainHeadParams,
 )
 
 __all__ = [
+    "AugmentationParams",
+    "CompareParams",
     "DataParams",
     "DemoParams",
+    "DiffusionParams",
     "Dtype",
     "EvaluateParams",
     "ExpertParams",
     "ExtractParams",
+    "FinetuneParams",
+    "FlowMatchingParams",
+    "FusionStrategy",
+    "ModelType",
     "Params",
     "Pooling",
     "RecordingFormat",
+    "RegressionParams",
     "SensorEncoderParams",
     "Source",
     "StateEncoderParams",
     "TrainHeadParams",
+    "TuningParams",
     "VLMParams",
     "load_params",
 ]

@@ -2,9 +2,10 @@
 
 from pydantic import model_validator
 
+from pipeline.config.finetune import FinetuneParams
 from pipeline.config.section import Section
 from pipeline.config.stage_one import DataParams, DemoParams, ExtractParams, VLMParams
-from pipeline.config.stage_two import EvaluateParams, TrainHeadParams
+from pipeline.config.stage_two import CompareParams, EvaluateParams, TrainHeadParams
 
 
 class Params(Section):
@@ -16,6 +17,8 @@ class Params(Section):
     extract: ExtractParams = ExtractParams()
     train_head: TrainHeadParams = TrainHeadParams()
     evaluate: EvaluateParams = EvaluateParams()
+    finetune: FinetuneParams = FinetuneParams()
+    compare: CompareParams = CompareParams()
 
     @model_validator(mode="after")
     def _mixture_names_sources(self) -> "Params":

@@ -74,6 +74,22 @@ class DataParams(Section):
         return sources
 
 
+class AugmentationParams(Section):
+    """How far the augmented variants of a frame go; each is drawn from its row's key and `seed`."""
+
+    rotation_deg: float = Field(default=5.0, ge=0, le=45)
+    """Largest rotation about the centre, either way."""
+    crop: float = Field(default=0.9, gt=0, le=1)
+    """Smallest side of the crop, as a share of the frame's."""
+    brightness: float = Field(default=0.2, ge=0, le=1)
+    """Largest relative change, either way."""
+    contrast: float = Field(default=0.2, ge=0, le=1)
+    """Largest relative change, either way."""
+    saturation: float = Field(default=0.2, ge=0, le=1)
+    """Largest relative change, either way."""
+    seed: Seed = 0
+
+
 class VLMParams(Section):
     """Which frozen model says what about an image; all but `attention` is a feature's identity."""
 
@@ -99,6 +115,10 @@ class VLMParams(Section):
     """Whether the model's final norm is applied to what a layer gives; both may be asked for."""
     pooling: tuple[Pooling, ...] = Field(default=("mean",), min_length=1)
     """Over which tokens: all, of images, of text, of each view, of 4 x 4 cells a view, the last."""
+    variants: int = Field(default=1, ge=1)
+    """Views of each row that are encoded and stored: the frames as they are, and variants - 1
+    augmented ones, among which training samples. Costs as many times the time and space."""
+    augmentation: AugmentationParams = AugmentationParams()
 
     @field_validator("prompt")
     @classmethod

@@ -3,64 +3,29 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
+from pipeline.config.policy import (
+    DiffusionParams,
+    ExpertParams,
+    FlowMatchingParams,
+    RegressionParams,
+    SensorEncoderParams,
+    StateEncoderParams,
+)
 from pipeline.config.section import Fraction, Section, Seed
 
+ModelType = Literal["regression", "diffusion", "flow_matching"]
+FusionStrategy = Literal["concat", "cross_attention", "gated", "none"]
 Weight = Annotated[float, Field(ge=0)]
-
-
-class SensorEncoderParams(Section):
-    """Widths of the sensor encoder; the defaults, the seeds', cost 34 M parameters."""
-
-    channels: tuple[Annotated[int, Field(ge=1)], ...] = Field(
-        default=(512, 1024, 1024, 1024), min_length=1
-    )
-    """Of each residual convolution block; every block halves the length."""
-    layers: int = Field(default=2, ge=0)
-    """Transformer layers after the convolutions."""
-    heads: int = Field(default=8, ge=1)
-    """Must divide the last of `channels`."""
-    output_dim: int = Field(default=1024, ge=1)
-    """Width of the encoded window."""
-
-
-class StateEncoderParams(Section):
-    """Widths of the robot-state encoder."""
-
-    dim: int = Field(default=256, ge=1)
-    """Width of its transformer."""
-    layers: int = Field(default=2, ge=0)
-    """Transformer layers."""
-    heads: int = Field(default=8, ge=1)
-    """Must divide `dim`."""
-    output_dim: int = Field(default=512, ge=1)
-    """Width of the encoded window."""
-    patch: int = Field(default=10, ge=1)
-    """Readings a token."""
-
-
-class ExpertParams(Section):
-    """Widths of the action expert."""
-
-    dim: int = Field(default=512, ge=1)
-    """Width of its transformer, and of the context it attends to."""
-    layers: int = Field(default=4, ge=1)
-    """Transformer layers."""
-    heads: int = Field(default=8, ge=1)
-    """Must divide `dim`."""
-    dropout: Annotated[float, Field(ge=0, lt=1)] = 0.1
-    """While training."""
-    refinements: int = Field(default=1, ge=1)
-    """Rounds of prediction; the first proposal is zeros, each later one the round before."""
 
 
 class TrainHeadParams(Section):
     """What is trained from the store, and how."""
 
-    model_type: Literal["regression"] = "regression"
+    model_type: ModelType = "regression"
     """The action expert."""
-    fusion_strategy: Literal["concat"] = "concat"
+    fusion_strategy: FusionStrategy = "concat"
     """How the encoded streams become the expert's context."""
     features_enabled: bool = True
     """Whether the policy sees the model's features."""
@@ -71,22 +36,42 @@ class TrainHeadParams(Section):
     sensor_encoder: SensorEncoderParams = SensorEncoderParams()
     state_encoder: StateEncoderParams = StateEncoderParams()
     expert: ExpertParams = ExpertParams()
+    regression: RegressionParams = RegressionParams()
+    diffusion: DiffusionParams = DiffusionParams()
+    flow_matching: FlowMatchingParams = FlowMatchingParams()
+    drop_features: Fraction = 0.0
+    """Share of training samples that see no features, so that a policy leans on the rest too."""
+    drop_sensor: Fraction = 0.0
+    """Share of training samples without the sensor."""
+    drop_state: Fraction = 0.0
+    """Share of training samples without the robot's state."""
     horizon: int = Field(default=8, ge=1)
     """Ticks an action chunk."""
     sensor_window: int = Field(default=65, ge=1)
     """Readings before the tick."""
     state_window: int = Field(default=100, ge=1)
     """Readings before the tick."""
+    terminal_stop: bool = False
+    """Beyond an episode's end, train to stand still (zero deltas and velocities, the last absolute
+    action) instead of leaving those steps of the chunk out of the loss."""
     batch_size: int = Field(default=64, ge=1)
-    """Ticks a step."""
+    """Ticks a step, over all accumulated parts and all processes."""
+    grad_accumulation: int = Field(default=1, ge=1)
+    """Parts that a step's ticks are computed in on each process, one after the other."""
     max_steps: int = Field(default=2000, ge=1)
     """Steps of the run; the learning rate's decay ends there."""
+    lr_schedule: Literal["cosine", "trapezoid", "constant"] = "cosine"
+    """After the warm-up: half a cosine to the floor, flat and then linear to it, or flat."""
+    decay_fraction: Fraction = 0.2
+    """Of `trapezoid`: the share of all steps that its final decay takes."""
     warmup_steps: int = Field(default=100, ge=0)
     """Steps of linear warm-up."""
     lr: float = Field(default=3e-4, gt=0)
     """Peak learning rate of AdamW."""
+    sensor_lr: float | None = Field(default=None, gt=0)
+    """Peak learning rate of the sensor encoder; `lr` where null."""
     min_lr_fraction: Fraction = 0.05
-    """Of the peak, at the end of the cosine decay."""
+    """Of the peak, at the end of the decay."""
     weight_decay: float = Field(default=0.01, ge=0)
     """On matrices; norms, biases and embeddings are not decayed."""
     grad_clip: float = Field(default=1.0, gt=0)
@@ -95,6 +80,8 @@ class TrainHeadParams(Section):
     """Of the average of weights that is evaluated and kept."""
     amp: Literal["auto", "off", "bfloat16"] = "auto"
     """bfloat16 autocast; `auto` where a CUDA device has it."""
+    compile: bool = False
+    """Compile the policy with torch.compile: slow to begin, faster steps."""
     group_weights: dict[Literal["translation", "rotation", "gripper", "other"], Weight] = Field(
         default_factory=dict
     )
@@ -105,6 +92,10 @@ class TrainHeadParams(Section):
     """Sampling weight of each source; 1 where not named."""
     eval_every: int = Field(default=200, ge=1)
     """Steps between evaluations on held-out ticks."""
+    eval_samples: int = Field(default=4, ge=1)
+    """Chunks sampled a tick, whose mean is judged; experts that do not sample give one."""
+    early_stopping: int | None = Field(default=None, ge=1)
+    """Stop after this many evaluations in a row without a better one; null never stops early."""
     checkpoint_every: int = Field(default=200, ge=1)
     """Steps between checkpoints."""
     seed: Seed = 0
@@ -125,6 +116,15 @@ class TrainHeadParams(Section):
             raise ValueError(f"must be a folder of its own, found {str(folder)!r}")
         return folder
 
+    @model_validator(mode="after")
+    def _every_part_has_ticks(self) -> "TrainHeadParams":
+        if self.grad_accumulation > self.batch_size:
+            raise ValueError(
+                f"grad_accumulation {self.grad_accumulation} cuts a batch_size of "
+                f"{self.batch_size} into parts without a tick"
+            )
+        return self
+
 
 class EvaluateParams(Section):
     """Which policy is judged, and where the report goes."""
@@ -135,7 +135,20 @@ class EvaluateParams(Section):
     """Folder of metrics, tables and pictures."""
     batch_size: int = Field(default=64, ge=1)
     """Ticks a forward pass."""
+    samples: int = Field(default=16, ge=1)
+    """Chunks sampled a tick, whose mean is judged; experts that do not sample give one."""
+    modalities: bool = True
+    """Also judge with each stream zeroed, shuffled across episodes and delayed."""
     device: str = "auto"
     """auto, cpu, cuda or cuda:N."""
     store: Path | None = None
     """The store to judge on; `train_head.store`, else `extract.store`, where null."""
+
+
+class CompareParams(Section):
+    """Which evaluations stand side by side in one table."""
+
+    reports: Path = Path("reports/experiments")
+    """Folder of evaluation folders, each named after its experiment."""
+    output: Path = Path("reports/comparison")
+    """Folder of the table and the picture."""

@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.batches import Prefetch, Ticks, Windows
+from pipeline.batches import Prefetch, Ticks, Windows, draws
 from pipeline.errors import NumericsError
 from pipeline.evaluation.names import place
 from pipeline.models import Policy
@@ -50,7 +50,7 @@ def predict(
     """
     device = next(policy.parameters()).device
     generator = torch.Generator(device).manual_seed(0)
-    plan = np.split(ticks, range(batch_size, len(ticks), batch_size))
+    plan = draws(ticks, batch_size)
     predicted, recorded, valid = [], [], []
     with (
         torch.inference_mode(),
@@ -59,15 +59,15 @@ def predict(
             total=len(ticks), desc="predicting", unit="tick", disable=None if progress else True
         ) as bar,
     ):
-        for here, batch in batches:
+        for draw, batch in batches:
             action = policy.act(batch, generator=generator)
             predicted.append(action.float().cpu().numpy())
             recorded.append(batch.action.cpu().numpy().copy())
             valid.append(batch.action_valid.cpu().numpy().astype(bool))
             everywhere = np.ones_like(valid[-1])
-            _refuse_not_finite(store, here, recorded[-1], valid[-1], "recorded action")
-            _refuse_not_finite(store, here, predicted[-1], everywhere, "action of the policy")
-            bar.update(len(here))
+            _refuse_not_finite(store, draw.ticks, recorded[-1], valid[-1], "recorded action")
+            _refuse_not_finite(store, draw.ticks, predicted[-1], everywhere, "action of the policy")
+            bar.update(len(draw.ticks))
     return Predictions(
         ticks=ticks,
         episodes=np.searchsorted(store.array("episode/tick_start"), ticks, side="right") - 1,

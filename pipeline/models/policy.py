@@ -167,7 +167,7 @@ def _build_encoders(
         sensor = params.sensor_encoder
         widths["sensor"] = sensor.output_dim
         encoders["sensor"] = SensorEncoder(
-            shape.sensor_channels, params.sensor_window, **sensor.model_dump()
+            shape.sensor_channels, params.sensor_window, **sensor.model_dump(exclude={"kind"})
         )
     if params.robot_state_enabled and shape.state_dim:
         state = params.state_encoder
@@ -193,6 +193,7 @@ def _build_expert(params: TrainHeadParams, shape: PolicyShape) -> ActionExpert:
         groups=shape.action_groups,
         group_weights={str(name): weight for name, weight in params.group_weights.items()},
         **params.expert.model_dump(),
+        **getattr(params, params.model_type).model_dump(),
     )
 
 

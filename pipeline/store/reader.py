@@ -170,6 +170,7 @@ class FeatureStore:
         sensor_lag_s: float = 0.0,
         state_lag_s: float = 0.0,
         out: Batch | None = None,
+        variants: NDArray[np.int64] | None = None,
     ) -> Batch:
         """The batch of these ticks (store-global), into the buffers of `out` where given.
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from pipeline.batches import Prefetch, Ticks, Windows
+from pipeline.batches import Draw, Prefetch, Windows
 from pipeline.checkpoint import (
     PolicyCheckpoint,
     load_policy,
@@ -109,8 +109,9 @@ class Trainer:
             f"device {self.device}, {precision}; steps {self.step} to {self.params.max_steps}",
         ]
 
-    def _plan(self) -> Iterator[Ticks]:
-        return (self.sampler.batch(step) for step in range(self.step, self.params.max_steps))
+    def _plan(self) -> Iterator[Draw]:
+        steps = range(self.step, self.params.max_steps)
+        return (Draw(self.sampler.batch(step)) for step in steps)
 
     def _train_step(self, batch: Batch) -> None:
         rate = learning_rate(self.step, self.params)
