@@ -14,6 +14,10 @@ class ConfigError(PipelineError, ValueError):
     """A value of params.yaml or of `--set` is not what it must be."""
 
 
+class ObservationError(PipelineError, ValueError):
+    """What a policy is given to look at is not what it takes."""
+
+
 class RecordingError(PipelineError, ValueError):
     """A recording on disk is missing something or contradicts itself."""
 

@@ -11,6 +11,11 @@ from torch.nn import functional as F
 
 from pipeline.errors import ConfigError
 
+Projected = tuple[
+    Float[Tensor, "batch head source head_dim"], Float[Tensor, "batch head source head_dim"]
+]
+"""Keys and values of a source, for one layer."""
+
 
 class Attention(nn.Module):
     """Multi-head attention of `queries` to `source`."""
@@ -34,10 +39,23 @@ class Attention(nn.Module):
         valid: Bool[Tensor, "batch token"] | None = None,
     ) -> Float[Tensor, "batch query dim"]:
         """What each query takes from the valid tokens, of which each row must have one."""
-        query = self._split(self.query(queries))
-        key, value = (self._split(x) for x in self.key_value(source).chunk(2, dim=-1))
+        return self.attend(queries, self.project(source), valid)
+
+    def project(self, source: Float[Tensor, "batch token dim"]) -> Projected:
+        """Keys and values, for a source that is attended to more than once."""
+        key, value = self.key_value(source).chunk(2, dim=-1)
+        return self._split(key), self._split(value)
+
+    def attend(
+        self,
+        queries: Float[Tensor, "batch query dim"],
+        projected: Projected,
+        valid: Bool[Tensor, "batch token"] | None = None,
+    ) -> Float[Tensor, "batch query dim"]:
+        """The same from keys and values of `project`."""
         mask = None if valid is None else valid[:, None, None, :]
-        taken = F.scaled_dot_product_attention(query, key, value, attn_mask=mask)
+        query = self._split(self.query(queries))
+        taken = F.scaled_dot_product_attention(query, *projected, attn_mask=mask)
         return self.out(taken.transpose(1, 2).flatten(2))
 
     def _split(self, x: Tensor) -> Tensor:
@@ -67,16 +85,45 @@ class TransformerLayer(nn.Module):
         self,
         tokens: Float[Tensor, "batch token dim"],
         valid: Bool[Tensor, "batch token"] | None = None,
-        context: Float[Tensor, "batch source dim"] | None = None,
+        context: Float[Tensor, "batch source dim"] | Projected | None = None,
+        modulation: Float[Tensor, "batch 6 dim"] | None = None,
     ) -> Float[Tensor, "batch token dim"]:
-        """The tokens after one layer; tokens that are not valid are never attended to."""
-        normed = self.self_norm(tokens)
-        tokens = tokens + self.dropout(self.self_attention(normed, normed, valid))
+        """The tokens after one layer; tokens that are not valid are never attended to.
+
+        `context` may come as this layer's `project` of it, where many forward passes share it.
+        `modulation` is a shift, a scale and a gate for self-attention, then for the feed-forward
+        network (adaLN, Peebles & Xie 2023, figure 3); zeros change nothing.
+        """
+        first, second = (None, None) if modulation is None else modulation.chunk(2, dim=1)
+        normed = _shifted(self.self_norm(tokens), first)
+        taken = self.self_attention(normed, normed, valid)
+        tokens = tokens + _gated(self.dropout(taken), first)
         if self.cross_attention is not None and self.cross_norm is not None:
             assert context is not None
-            taken = self.cross_attention(self.cross_norm(tokens), context)
+            projected = self.project(context) if isinstance(context, Tensor) else context
+            taken = self.cross_attention.attend(self.cross_norm(tokens), projected)
             tokens = tokens + self.dropout(taken)
-        return tokens + self.dropout(self.feed_forward(tokens))
+        norm, *network = self.feed_forward
+        normed = _shifted(norm(tokens), second)
+        for module in network:
+            normed = module(normed)
+        return tokens + _gated(self.dropout(normed), second)
+
+    def project(self, context: Float[Tensor, "batch source dim"]) -> Projected:
+        """What `forward` may take in place of this context."""
+        assert self.cross_attention is not None
+        return self.cross_attention.project(context)
+
+
+def _shifted(normed: Tensor, modulation: Tensor | None) -> Tensor:
+    if modulation is None:
+        return normed
+    shift, scale, _ = modulation.unsqueeze(2).unbind(1)
+    return normed * (1 + scale) + shift
+
+
+def _gated(taken: Tensor, modulation: Tensor | None) -> Tensor:
+    return taken if modulation is None else taken * (1 + modulation[:, 2:])
 
 
 def learned(*shape: int) -> nn.Parameter:

@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from typing import ClassVar, Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -15,9 +16,12 @@ class ActionExpert(nn.Module, ABC):
     """Context in, action chunk out; all actions are normalised units.
 
     `loss` sees the recorded chunk, `act` never does: an expert that predicts directly must form
-    its prediction in a function that takes the context alone, and use it in both.
+    its prediction in a function that takes the context alone, and use it in both. A `stochastic`
+    expert draws its chunks, and everything random in its loss but dropout, from the generator it
+    is given, on whichever device that is, or else from the global one of the context's device.
     """
 
+    stochastic: ClassVar[bool]
     horizon: int
     action_dim: int
 
@@ -39,7 +43,9 @@ class ActionExpert(nn.Module, ABC):
 
 
 class GroupedLoss(nn.Module):
-    """Smooth-L1 (Girshick 2015, eq. 3), averaged over the valid entries of each action group.
+    """An error averaged over the valid entries of each action group.
+
+    The error of an entry is smooth-L1 (Girshick 2015, eq. 3) or its square (`mse`).
 
     The total is the mean of the groups under `weights` (1 where not named): three rotation
     channels count as much as three hundred, and the total does not grow with the groups. Raises
@@ -49,8 +55,14 @@ class GroupedLoss(nn.Module):
     membership: Tensor
     weights: Tensor
 
-    def __init__(self, groups: Sequence[str], weights: Mapping[str, float]) -> None:
+    def __init__(
+        self,
+        groups: Sequence[str],
+        weights: Mapping[str, float],
+        kind: Literal["smooth_l1", "mse"] = "smooth_l1",
+    ) -> None:
         super().__init__()
+        self.error = F.smooth_l1_loss if kind == "smooth_l1" else F.mse_loss
         self.names = tuple(sorted(set(groups)))
         chosen = [float(weights.get(name, 1.0)) for name in self.names]
         if min(chosen) < 0 or sum(chosen) <= 0:
@@ -72,9 +84,25 @@ class GroupedLoss(nn.Module):
         """The weighted mean over the groups, and each group's own mean, detached."""
         mask = valid.unsqueeze(-1)
         target = target.masked_fill(~mask, 0.0)
-        error = F.smooth_l1_loss(prediction.float(), target.float(), reduction="none")
+        error = self.error(prediction.float(), target.float(), reduction="none")
         per_channel = error.masked_fill(~mask, 0.0).sum(dim=(0, 1))
         entries = valid.sum() * self.membership.sum(dim=1)
         means = (self.membership * per_channel).sum(dim=1) / entries.clamp(min=1)
         parts = dict(zip(self.names, means.detach().unbind(), strict=True))
         return (means * self.weights).sum(), parts
+
+
+def standard_normal(
+    shape: Sequence[int], device: torch.device, generator: torch.Generator | None
+) -> Float[Tensor, "..."]:
+    """Float32 noise on `device`, drawn where the generator is."""
+    drawn_on = device if generator is None else generator.device
+    return torch.randn(*shape, generator=generator, device=drawn_on).to(device)
+
+
+def uniform(
+    count: int, device: torch.device, generator: torch.Generator | None
+) -> Float[Tensor, " {count}"]:
+    """Float32 numbers in [0, 1) on `device`, drawn where the generator is."""
+    drawn_on = device if generator is None else generator.device
+    return torch.rand(count, generator=generator, device=drawn_on).to(device)

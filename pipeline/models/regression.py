@@ -18,6 +18,8 @@ class RegressionActionExpert(ActionExpert):
     `loss` and `act` go through it, so a target cannot become an input.
     """
 
+    stochastic = False
+
     def __init__(
         self,
         *,

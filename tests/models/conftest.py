@@ -105,3 +105,58 @@ def build_policy(
         return Policy(small_params(**over), shape, normalization)
 
     return make
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """Round Gaussians of one spread: `means` (mode, dim), `weights` (mode,); sums to 1."""
+
+    means: Tensor
+    weights: Tensor
+    spread: float
+
+    def draw(self, count: int, generator: torch.Generator | None = None) -> Tensor:
+        """(count, 1, dim): chunks of a single step."""
+        mode = torch.multinomial(self.weights, count, replacement=True, generator=generator)
+        noise = torch.randn(count, self.means.shape[1], generator=generator)
+        return (self.means[mode] + self.spread * noise).unsqueeze(1)
+
+    def expectations(self, noisy: Tensor, signal: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """What is left of sample and noise on average, given signal * sample + noise * epsilon."""
+        signal, noise = (x.view(-1, 1, 1).to(noisy) for x in (signal, noise))
+        variance = (signal * self.spread) ** 2 + noise**2
+        off = noisy - signal * self.means.to(noisy)
+        likelihood = self.weights.to(noisy).log() - (off**2).sum(-1) / (2 * variance.squeeze(-1))
+        share = likelihood.softmax(-1).unsqueeze(-1)
+        sample = self.means.to(noisy) + signal * self.spread**2 / variance * off
+        epsilon = noise / variance * off
+        return tuple((share * x).sum(1, keepdim=True) for x in (sample, epsilon))  # type: ignore
+
+    def judge(self, samples: Tensor) -> tuple[Tensor, Tensor, Tensor, float]:
+        """Weight, mean and spread of the samples nearest to each mode; the share within 4 spreads.
+
+        The spread is that of the samples within 4 spreads of the mode.
+        """
+        samples = samples[:, 0]
+        distance, mode = (samples[:, None] - self.means).norm(dim=-1).min(dim=1)
+        near = distance < 4 * self.spread
+        of = [mode == index for index in range(len(self.means))]
+        return (
+            torch.stack([x.float().mean() for x in of]),
+            torch.stack([samples[x].mean(0) for x in of]),
+            torch.stack([samples[x & near].std(0).mean() for x in of]),
+            near.float().mean().item(),
+        )
+
+
+@pytest.fixture(scope="session")
+def two_modes() -> Mixture:
+    """In 2-D, of unequal weight, far apart for their spread."""
+    means = torch.tensor([[-1.0, 0.5], [1.0, -0.5]])
+    return Mixture(means, torch.tensor([0.3, 0.7]), 0.1)
+
+
+@pytest.fixture(scope="session")
+def mixture() -> type[Mixture]:
+    """To make others."""
+    return Mixture

@@ -1,0 +1,164 @@
+"""The noise schedule of a diffusion model and the algebra on it; no network, no randomness.
+
+Steps count as in the papers: 0 is clean and `timesteps` is almost pure noise. At step t a sample
+x0 and a standard normal epsilon make `x_t = signal[t] x0 + noise[t] epsilon`.
+"""
+
+import math
+from typing import Literal
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from pipeline.errors import ConfigError
+
+ScheduleKind = Literal["cosine", "linear"]
+Prediction = Literal["epsilon", "sample", "v"]
+
+
+class NoiseSchedule(nn.Module):
+    """How much of a sample and how much noise is left at every step.
+
+    `alpha_bar`, its roots `signal` = sqrt(alpha_bar) and `noise` = sqrt(1 - alpha_bar), each
+    (timesteps + 1,), are buffers: they move with the module, and weights come back with the
+    schedule that they were trained on.
+    """
+
+    alpha_bar: Tensor
+    signal: Tensor
+    noise: Tensor
+
+    def __init__(self, timesteps: int = 100, kind: ScheduleKind = "cosine") -> None:
+        super().__init__()
+        self.timesteps = timesteps
+        betas = _cosine_betas(timesteps) if kind == "cosine" else _linear_betas(timesteps)
+        one = torch.ones(1, dtype=torch.float64, device="cpu")
+        alpha_bar = torch.cat([one, (1 - betas).cumprod(0)])
+        # Rounded at the end: of 1 - alpha_bar, float32 has few digits left at small steps.
+        self.register_buffer("alpha_bar", alpha_bar.float())
+        self.register_buffer("signal", alpha_bar.sqrt().float())
+        self.register_buffer("noise", (1 - alpha_bar).sqrt().float())
+
+    def steps(self, count: int) -> list[int]:
+        """`count` falling steps and then 0, evenly spaced: what a sampler visits.
+
+        A sampler begins with pure noise, so it must begin near the top, or its mean is pulled
+        towards the noise's; but at the very top nothing is left of the sample, so a predicted
+        epsilon says nothing of it: the first is at 98 % where there is a choice. The last stands at
+        half a share of the schedule, so that the final jump keeps the spread. Raises `ConfigError`
+        where the schedule has fewer steps.
+        """
+        if not 1 <= count <= self.timesteps:
+            raise ConfigError(
+                f"train_head.diffusion.sampling_steps: expected 1 to {self.timesteps} (timesteps), "
+                f"found {count}"
+            )
+        first = max(count, round(0.98 * self.timesteps))
+        last = max(1, round(self.timesteps / count / 2)) if count > 1 else first
+        shares = [index / max(1, count - 1) for index in range(count)]
+        return [round(first + (last - first) * share) for share in shares] + [0]
+
+    def add_noise(
+        self,
+        sample: Float[Tensor, "batch horizon action"],
+        epsilon: Float[Tensor, "batch horizon action"],
+        step: Int[Tensor, " batch"],
+    ) -> Float[Tensor, "batch horizon action"]:
+        """The noisy chunk at each row's step (Ho et al. 2020, eq. 4)."""
+        return self._at(self.signal, step) * sample + self._at(self.noise, step) * epsilon
+
+    def target(
+        self,
+        kind: Prediction,
+        sample: Float[Tensor, "batch horizon action"],
+        epsilon: Float[Tensor, "batch horizon action"],
+        step: Int[Tensor, " batch"],
+    ) -> Float[Tensor, "batch horizon action"]:
+        """What a network of this prediction must say (v: Salimans & Ho 2022, section 4)."""
+        if kind == "epsilon":
+            return epsilon
+        if kind == "sample":
+            return sample
+        return self._at(self.signal, step) * epsilon - self._at(self.noise, step) * sample
+
+    def sample_of(
+        self,
+        kind: Prediction,
+        predicted: Float[Tensor, "batch horizon action"],
+        noisy: Float[Tensor, "batch horizon action"],
+        step: Int[Tensor, " batch"] | int,
+    ) -> Float[Tensor, "batch horizon action"]:
+        """The clean chunk that a prediction stands for; steps are above 0."""
+        signal, noise = self._at(self.signal, step), self._at(self.noise, step)
+        if kind == "epsilon":
+            return (noisy - noise * predicted) / signal
+        if kind == "sample":
+            return predicted
+        return signal * noisy - noise * predicted
+
+    def epsilon_of(
+        self,
+        sample: Float[Tensor, "batch horizon action"],
+        noisy: Float[Tensor, "batch horizon action"],
+        step: Int[Tensor, " batch"] | int,
+    ) -> Float[Tensor, "batch horizon action"]:
+        """The noise between a clean chunk and a noisy one; steps are above 0."""
+        return (noisy - self._at(self.signal, step) * sample) / self._at(self.noise, step)
+
+    def posterior(
+        self,
+        sample: Float[Tensor, "batch horizon action"],
+        noisy: Float[Tensor, "batch horizon action"],
+        step: int,
+    ) -> tuple[Float[Tensor, "batch horizon action"], Float[Tensor, ""]]:
+        """Mean and variance of step - 1 given this step and the clean chunk (Ho 2020, eq. 7).
+
+        The caller clips `sample` before: the mean follows from what it is given and nothing else.
+        """
+        before, now = self.alpha_bar[step - 1], self.alpha_bar[step]
+        beta = 1 - now / before
+        cleaned = self.noise[step - 1] ** 2 / self.noise[step] ** 2
+        mean = before.sqrt() * beta / self.noise[step] ** 2 * sample
+        return mean + (1 - beta).sqrt() * cleaned * noisy, cleaned * beta
+
+    def ddim(
+        self,
+        sample: Float[Tensor, "batch horizon action"],
+        noisy: Float[Tensor, "batch horizon action"],
+        step: int,
+        to: int,
+        eta: float,
+    ) -> tuple[Float[Tensor, "batch horizon action"], Float[Tensor, ""]]:
+        """Mean and variance of step `to` < `step` (Song et al. 2021, eq. 12 and 16).
+
+        The noise of eq. 12 is the one that belongs to `sample`, also where the caller clipped it,
+        so that `eta` = 1 from each step to the next is `posterior`.
+        """
+        ratio = self.alpha_bar[step] / self.alpha_bar[to]
+        cleaned = self.noise[to] ** 2 / self.noise[step] ** 2
+        variance = eta**2 * cleaned * (1 - ratio)
+        epsilon = self.epsilon_of(sample, noisy, step)
+        left = (self.noise[to] ** 2 - variance).clamp(min=0).sqrt()
+        return self.signal[to] * sample + left * epsilon, variance
+
+    def _at(self, values: Tensor, step: Tensor | int) -> Tensor:
+        return values[step].view(-1, 1, 1)
+
+
+def _cosine_betas(timesteps: int) -> Tensor:
+    """Nichol & Dhariwal 2021, eq. 17, betas held at 0.999 as there."""
+    share = torch.linspace(0, 1, timesteps + 1, dtype=torch.float64, device="cpu")
+    alpha_bar = torch.cos((share + 0.008) / 1.008 * math.pi / 2) ** 2
+    return (1 - alpha_bar[1:] / alpha_bar[:-1]).clamp(max=0.999)
+
+
+def _linear_betas(timesteps: int) -> Tensor:
+    """Ho et al. 2020, section 4: 1e-4 to 0.02 over 1000 steps.
+
+    With another number of steps they grow by 1000 / timesteps, so that as little is left at the
+    end, and are held at 0.999.
+    """
+    scale = 1000 / timesteps
+    betas = torch.linspace(1e-4, 0.02, timesteps, dtype=torch.float64, device="cpu")
+    return (scale * betas).clamp(max=0.999)
