@@ -1,4 +1,4 @@
-"""Encoder of the frozen model's pooled features: one vector that still knows where things were."""
+"""Encoder of the frozen model's pooled features: a token a slot, which knows its place and age."""
 
 import math
 
@@ -13,27 +13,25 @@ _SHORTEST_PERIOD_S, _LONGEST_PERIOD_S = 0.5, 64.0
 
 
 class FeatureEncoder(nn.Module):
-    """One vector (batch, output_dim) for normalised features (batch, slot, dim) and their age.
+    """Tokens (batch, slot, width) for normalised features (batch, slot, dim) and their age.
 
-    A projection that all slots share, to `slot_width`, keeps the cost at
-    dim·slot_width + slots·slot_width·output_dim; then the slots are laid side by side, so that a
-    grid cell keeps its place. A slot that is not valid is a learned embedding of its own. The age,
-    in s since the newest frame, tells how stale the vision is.
+    All slots share one projection to `width`, which keeps the cost at dim·width a slot; an
+    embedding of its own tells a grid cell from the next. The age, in s since the newest frame,
+    is added to every token and tells how stale the vision is. A slot that is not valid is a
+    learned embedding of its own, which has no age.
     """
 
-    def __init__(
-        self, slots: int, feature_dim: int, output_dim: int = 512, slot_width: int | None = None
-    ) -> None:
+    def __init__(self, slots: int, feature_dim: int, width: int | None = None) -> None:
         super().__init__()
+        self.slots = slots
         # Few slots carry much each: 512 wide for a single mean, 64 for a grid cell.
-        width = slot_width or min(feature_dim, max(64, 512 // slots))
-        self.squeeze = nn.Linear(feature_dim, width)
-        self.slot = learned(slots, width)
-        self.missing = learned(slots, width)
-        self.norm = nn.LayerNorm(width)
-        self.project = nn.Linear(slots * width, output_dim)
+        self.width = width or min(feature_dim, max(64, 512 // slots))
+        self.squeeze = nn.Linear(feature_dim, self.width)
+        self.slot = learned(slots, self.width)
+        self.missing = learned(slots, self.width)
+        self.norm = nn.LayerNorm(self.width)
         self.age = nn.Sequential(
-            nn.Linear(2 * _AGE_PERIODS, output_dim), nn.GELU(), nn.Linear(output_dim, output_dim)
+            nn.Linear(2 * _AGE_PERIODS, self.width), nn.GELU(), nn.Linear(self.width, self.width)
         )
 
     def forward(
@@ -41,13 +39,18 @@ class FeatureEncoder(nn.Module):
         features: Float[Tensor, "batch slot dim"],
         slot_valid: Bool[Tensor, "batch slot"],
         age_s: Float[Tensor, " batch"],
-    ) -> Float[Tensor, "batch output"]:
-        """Encode; what stands in a slot that is not valid never reaches the output."""
+    ) -> Float[Tensor, "batch slot width"]:
+        """Encode; what stands in a slot that is not valid never reaches output or gradients.
+
+        Nor does the age of a sample without any valid slot.
+        """
         absent = ~slot_valid.unsqueeze(-1)
         slots = self.squeeze(features.masked_fill(absent, 0.0)) + self.slot
         slots = torch.where(absent, self.missing.to(slots.dtype), slots)
         slots = nn.functional.gelu(self.norm(slots), approximate="tanh")
-        return self.project(slots.flatten(1)) + self.age(fourier(age_s))
+        # Masked before it is encoded: zero times the gradient of a NaN is NaN.
+        known_s = age_s.masked_fill(~slot_valid.any(dim=1), 0.0)
+        return slots + self.age(fourier(known_s)).unsqueeze(1).masked_fill(absent, 0.0)
 
 
 def fourier(seconds: Float[Tensor, " batch"]) -> Float[Tensor, "batch wave"]:

@@ -20,6 +20,23 @@ class Statistics(Protocol):
     def scale(self) -> NDArray[np.float64]: ...
 
 
+@runtime_checkable
+class StreamStatistics(Protocol):
+    """Statistics by stream, None where a stream is absent; see `pipeline.normalization`."""
+
+    @property
+    def action(self) -> Statistics: ...
+
+    @property
+    def features(self) -> Statistics | None: ...
+
+    @property
+    def sensor(self) -> Statistics | None: ...
+
+    @property
+    def state(self) -> Statistics | None: ...
+
+
 class Normalizer(nn.Module):
     """Physical units to zero mean and unit variance per channel, and back, in float32.
 

@@ -45,10 +45,10 @@ class RobotStateEncoder(nn.Module):
         batch, window, _ = values.shape
         if valid is None:
             valid = torch.full((batch,), window, device=values.device)
-        mask = right_aligned(valid, window).unsqueeze(-1)
-        values = torch.cat([values.masked_fill(~mask, 0.0), mask.to(values.dtype)], dim=-1)
         short = -window % self.patch
-        values, mask = F.pad(values, (0, 0, short, 0)), F.pad(mask, (0, 0, short, 0))
+        mask = right_aligned(valid, window + short).unsqueeze(-1)
+        values = F.pad(values, (0, 0, short, 0)).masked_fill(~mask, 0.0)
+        values = torch.cat([values, mask.to(values.dtype)], dim=-1)
         present = mask.squeeze(-1).unflatten(1, (-1, self.patch)).any(dim=-1)
         missing = (valid == 0).unsqueeze(-1)
         # A row without any reading attends to zeros: softmax over nothing is NaN on some devices.
