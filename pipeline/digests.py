@@ -54,7 +54,7 @@ class ContentDigests:
         self._database.close()
 
     def of(self, path: Path) -> str:
-        """The digest of a file's content, 32 hex digits of BLAKE2b.
+        """The `file_digest` of a file, read where it is not known.
 
         Raises `RecordingError` when the file cannot be read.
         """
@@ -66,7 +66,7 @@ class ContentDigests:
             ).fetchone()
             if known:
                 return str(known[0])
-            digest = _digest(path)
+            digest = file_digest(path)
         except OSError as error:
             raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
         row = (place, status.st_size, status.st_mtime_ns, digest)
@@ -112,7 +112,8 @@ class ContentDigests:
         )
 
 
-def _digest(path: Path) -> str:
+def file_digest(path: Path) -> str:
+    """The digest of a file's content, read anew: 32 hex digits of BLAKE2b."""
     hasher = hashlib.blake2b(digest_size=16)
     with path.open("rb") as file:
         while block := file.read(_BLOCK):

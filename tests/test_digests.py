@@ -14,7 +14,7 @@ def test_reads_a_file_once_and_notices_a_change(tmp_path, monkeypatch):
     file.write_bytes(b"one")
     with closing(ContentDigests(ledger)) as digests:
         first = digests.of(file)
-    monkeypatch.setattr("pipeline.digests._digest", lambda path: "read again")
+    monkeypatch.setattr("pipeline.digests.file_digest", lambda path: "read again")
     with closing(ContentDigests(ledger)) as digests:
         assert digests.of(file) == first
         os.utime(file, ns=(1, 1))

@@ -3,20 +3,19 @@
 So all that is wrong is said at once, and before anything expensive runs.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from tqdm import tqdm
 
 from pipeline.config import Params
-from pipeline.errors import RecordingError, StoreMismatch, VLMError
+from pipeline.errors import RecordingError, VLMError
 from pipeline.extraction.survey import Survey, SurveyedEpisode, refuse_bad
-from pipeline.recordings import BadEpisode, Channels
+from pipeline.recordings import BadEpisode
+from pipeline.recordings.embodiment import Embodiment, common_embodiment
 from pipeline.timeline import Timeline, build_timeline
 from pipeline.vlm.preparation import Preparer
-
-NO_CHANNELS = Channels((), ())
 
 
 @dataclass(frozen=True)
@@ -25,9 +24,8 @@ class CheckedEpisode:
 
     surveyed: SurveyedEpisode
     timeline: Timeline
-    sensor: Channels
+    embodiment: Embodiment
     readings: int
-    state: Channels
     states: int
 
 
@@ -52,7 +50,7 @@ def check_episodes(
     bad = [*survey.bad, *(BadEpisode(one.source, one.path, reason) for one, reason in recordings)]
     if bad and (params.data.on_bad_episode == "stop" or not good):
         refuse_bad(bad, of=len(good) + len(bad))
-    _check_one_embodiment(good)
+    embodiment_of(good)
     return good, found
 
 
@@ -79,34 +77,17 @@ def _checked(
     return CheckedEpisode(
         surveyed,
         timeline,
-        sensor.channels if sensor else NO_CHANNELS,
+        Embodiment.of(timeline.action_channels, timeline.action_kind, sensor, state),
         len(sensor.time) if sensor else 0,
-        state.channels if state else NO_CHANNELS,
         len(state.time) if state else 0,
     )
 
 
-def _check_one_embodiment(checked: Sequence[CheckedEpisode]) -> None:
-    streams: dict[str, Callable[[CheckedEpisode], tuple[Channels, str]]] = {
-        "action": lambda one: (one.timeline.action_channels, one.timeline.action_kind),
-        "state": lambda one: (one.state, ""),
-        "sensor": lambda one: (one.sensor, ""),
-    }
-    for stream, channels_of in streams.items():
-        having = [one for one in checked if channels_of(one)[0].names]
-        for one in having[1:]:
-            if channels_of(one) != channels_of(having[0]):
-                a, b = having[0].surveyed.recording, one.surveyed.recording
-                raise StoreMismatch(
-                    f"one store holds one embodiment, but the {stream} of source {a.source!r} "
-                    f"({a.path}) is {_shown(*channels_of(having[0]))} and that of source "
-                    f"{b.source!r} ({b.path}) is {_shown(*channels_of(one))}. Extract them into "
-                    "two stores: one params file each, with its own data.sources and extract.store."
-                )
-
-
-def _shown(channels: Channels, kind: str) -> str:
-    pairs = zip(channels.names, channels.units, strict=True)
-    named = [f"{name} ({unit})" if unit else name for name, unit in pairs]
-    listed = ", ".join(named if len(named) <= 12 else [*named[:4], "…", named[-1]])
-    return f"{len(named)} {kind} channels [{listed}]".replace("  ", " ")
+def embodiment_of(checked: Sequence[CheckedEpisode]) -> Embodiment:
+    """What all these episodes have in common; `StoreMismatch` where two sources differ."""
+    return common_embodiment(
+        [(one.surveyed.recording, one.embodiment) for one in checked],
+        "store",
+        "Extract them into two stores: one params file each, with its own data.sources and "
+        "extract.store.",
+    )

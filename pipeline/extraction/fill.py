@@ -64,8 +64,9 @@ def fill(
         missing = np.setdiff1d(missing, taken)
         computed = by_key = 0
         if len(missing):
-            spans = spans_of(recordings, vl_start, frame_time, surveyed.spec.views, missing)
-            preparation = RowPreparation(Preparer(params.vlm, surveyed.spec), surveyed.spec, donors)
+            spec = surveyed.spec
+            spans = spans_of(recordings, vl_start, frame_time, spec.views, missing, spec.variants)
+            preparation = RowPreparation(Preparer(params.vlm, spec), spec, donors)
             rows = in_background(spans, preparation.prepare, params.extract.decode_threads)
             computed, by_key = _encode_all(build, rows, surveyed, params, digests, progress)
     layout.close()
@@ -142,7 +143,7 @@ def _encode_all(
             continue
         if encoder is None:
             vlm = FrozenVLM.load(params.vlm, surveyed.spec, params.extract.device)
-            encoder = Encoder(vlm, _batch_size(params))
+            encoder = Encoder(vlm, _batch_size(params), surveyed.spec.variants)
             number = build.environment_index(vlm.environment)
             begun = time.monotonic()
         if batch := encoder.add(row):

@@ -20,6 +20,8 @@ class ExtractionPlan:
     rows: int
     known: int
     """Rows of the interrupted build, or of the same frames in an earlier store."""
+    variants: int
+    """Of each row, each of which the model has to see."""
     bytes: int
     free: int
     rows_per_s: float | None
@@ -40,6 +42,7 @@ class ExtractionPlan:
             *(f"why: {reason}" for reason in self.reasons),
             f"episodes: {self.episodes}, {self.unchanged} of them unchanged",
             f"rows: {self.rows}, {self.known} known, {left} to compute"
+            + (f" in {self.variants} variants each" if left and self.variants > 1 else "")
             + (" (fewer where a key turns out to be known)" if left and self.known else ""),
             f"disk: {_size(self.bytes)} for the whole store, {_size(self.free)} free",
             f"time: {time}",

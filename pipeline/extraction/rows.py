@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +20,15 @@ Work = TypeVar("Work")
 Made = TypeVar("Made")
 
 SPAN_ROWS = 16
-"""Rows that one thread decodes in one go: long enough for video, short enough for memory."""
+"""Rows that one thread decodes in one go: long enough for video, short enough for memory.
+
+Variants count as rows of their own here: they wait in memory alike.
+"""
 
 
 @dataclass(frozen=True)
 class Span:
-    """Consecutive missing rows of one episode and the frame of each view for each."""
+    """Rows of one episode, ascending, and the frame of each view for each."""
 
     recording: Recording
     cameras: Mapping[str, CameraStream]
@@ -33,6 +36,31 @@ class Span:
     rows: NDArray[np.int64]
     """Store-global VL rows."""
     frames: Mapping[str, NDArray[np.int64]]
+
+    @classmethod
+    def of(
+        cls,
+        recording: Recording,
+        cameras: Mapping[str, CameraStream],
+        rows: NDArray[np.int64],
+        frame_time: NDArray[np.float64],
+        views: Sequence[str],
+    ) -> Self:
+        """Which frames rows show follows from the capture times (row, view) that a store has."""
+        frames = {
+            view: last_at(cameras[view].time, frame_time[:, column])
+            for column, view in enumerate(views)
+            if np.isfinite(frame_time[0, column])
+        }
+        return cls(recording, cameras, rows, frames)
+
+    def read(self) -> Iterator[tuple[int, dict[str, NDArray[np.uint8]]]]:
+        """Each row and its frames by view, decoded one row at a time."""
+        readers = {
+            view: self.cameras[view].read(frames.tolist()) for view, frames in self.frames.items()
+        }
+        for row in self.rows.tolist():
+            yield row, {view: next(reader) for view, reader in readers.items()}
 
 
 @dataclass(frozen=True)
@@ -51,7 +79,8 @@ class ReadyRow:
 
     row: int
     key: bytes
-    prepared: PreparedRow
+    variants: tuple[PreparedRow, ...]
+    """The frames as they are, then augmented; all of one shape."""
     where: str
     """Recording and row, for messages."""
 
@@ -62,25 +91,21 @@ def spans_of(
     frame_time: NDArray[np.float64],
     views: Sequence[str],
     missing: NDArray[np.int64],
+    variants: int,
 ) -> Iterator[Span]:
-    """Cut the missing rows into spans.
+    """Cut the missing rows into spans of `SPAN_ROWS` prepared rows, `variants` of each.
 
-    Which frame a row shows follows from the frame times that the layout wrote, so that a resumed
-    build needs no stream.
+    By the frame times that the layout wrote, so that a resumed build needs no stream.
     """
+    together = max(1, SPAN_ROWS // variants)
     for episode, recording in enumerate(recordings):
         first, last = np.searchsorted(missing, vl_start[episode : episode + 2])
         if first == last:
             continue
         cameras = recording.cameras()
-        for start in range(first, last, SPAN_ROWS):
-            rows = missing[start : min(start + SPAN_ROWS, last)]
-            frames = {
-                view: last_at(cameras[view].time, frame_time[rows, column])
-                for column, view in enumerate(views)
-                if np.isfinite(frame_time[rows[0], column])
-            }
-            yield Span(recording, cameras, rows, frames)
+        for start in range(first, last, together):
+            rows = missing[start : min(start + together, last)]
+            yield Span.of(recording, cameras, rows, frame_time[rows], views)
 
 
 class RowPreparation:
@@ -95,13 +120,9 @@ class RowPreparation:
     def prepare(self, span: Span) -> list[KnownRow | ReadyRow]:
         """The rows of a span, each decoded frame held only while its row is made."""
         recording = span.recording
-        readers = {
-            view: span.cameras[view].read(frames.tolist()) for view, frames in span.frames.items()
-        }
         prompt = self._preparer.render(recording.instruction, list(span.frames))
         made: list[KnownRow | ReadyRow] = []
-        for row in span.rows.tolist():
-            frames = {view: next(reader) for view, reader in readers.items()}
+        for row, frames in span.read():
             key = row_key(self._spec, prompt, frames)
             known = self._known(row, key)
             made.append(
@@ -109,7 +130,7 @@ class RowPreparation:
                 or ReadyRow(
                     row,
                     key,
-                    self._preparer.prepare(recording.instruction, frames),
+                    self._preparer.prepare_variants(recording.instruction, frames, key),
                     f"{recording.path}, VL row {row}",
                 )
             )

@@ -60,7 +60,7 @@ def survey(params: Params, digests: ContentDigests) -> Survey:
     views: set[str] = set()
     for recording in tqdm(opened.recordings, "survey", unit="episode", disable=None, leave=False):
         try:
-            content = _content(recording, digests)
+            content = content_digest(recording, digests)
             digest = _digest(recording, content, data, rotation)
             if data.on_bad_episode == "skip" and (reason := digests.bad(digest)) is not None:
                 raise RecordingError(reason)
@@ -102,7 +102,8 @@ def shown_path(path: Path, root: Path) -> str:
         return os.path.abspath(path)
 
 
-def _content(recording: Recording, digests: ContentDigests) -> str:
+def content_digest(recording: Recording, digests: ContentDigests) -> str:
+    """Digest of a recording's files, wherever they lie; `RecordingError` where one is not read."""
     # Frame times stand in file names, so a name is content too; where the folder lies is not.
     named = (
         (os.path.relpath(file, recording.path), digests.of(file)) for file in recording.files()

@@ -1,6 +1,8 @@
 """What `gather` hands out."""
 
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import Self
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -35,17 +37,15 @@ class Batch:
         """(batch, horizon, sensor_window, state_window)."""
         return len(self), self.action.shape[1], self.sensor.shape[1], self.state.shape[1]
 
-    def to(self, device: torch.device | str, non_blocking: bool = False) -> "Batch":
-        """The same on another device."""
-        return Batch(
-            **{
-                field.name: getattr(self, field.name).to(device, non_blocking=non_blocking)
-                for field in fields(self)
-            }
-        )
+    def to(self, device: torch.device | str, non_blocking: bool = False) -> Self:
+        """The same on another device; what a subclass has beside tensors stays as it is."""
+        return self._each(lambda tensor: tensor.to(device, non_blocking=non_blocking))
 
-    def pin(self) -> "Batch":
+    def pin(self) -> Self:
         """The same in page-locked memory, from where copies to a GPU are asynchronous."""
-        return Batch(
-            **{field.name: getattr(self, field.name).pin_memory() for field in fields(self)}
-        )
+        return self._each(lambda tensor: tensor.pin_memory())
+
+    def _each(self, change: Callable[[Tensor], Tensor]) -> Self:
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        tensors = {name: value for name, value in values.items() if isinstance(value, Tensor)}
+        return replace(self, **{name: change(value) for name, value in tensors.items()})

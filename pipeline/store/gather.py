@@ -17,10 +17,14 @@ from pipeline.store.batch import Batch
 
 
 class Gatherer:
-    """Fills batches from the arrays of one store, given by name."""
+    """Fills batches from the arrays of one store, given by name.
 
-    def __init__(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+    Each VL row holds its slots once a variant, variant after variant.
+    """
+
+    def __init__(self, arrays: Mapping[str, NDArray[Any]], variants: int) -> None:
         self._arrays = arrays
+        self._variants = variants
         self._tensors: dict[str, Tensor] = {}
 
     def gather(
@@ -30,10 +34,11 @@ class Gatherer:
         feature_lag: int,
         sensor_lag_s: float,
         state_lag_s: float,
+        variant: NDArray[np.int64] | None,
     ) -> None:
         """Fill `batch` with what belongs to these ticks; see `FeatureStore.gather`."""
         episode = np.searchsorted(self._arrays["episode/tick_start"], tick, side="right") - 1
-        self._features(batch, tick, episode, feature_lag)
+        self._features(batch, tick, episode, feature_lag, variant)
         for stream, window, counts, lag_s in (
             ("sensor", batch.sensor, batch.sensor_valid, sensor_lag_s),
             ("state", batch.state, batch.state_valid, state_lag_s),
@@ -45,7 +50,7 @@ class Gatherer:
 
     def empty_batch(self, batch: int, horizon: int, sensor_window: int, state_window: int) -> Batch:
         """Buffers for `gather(..., out=)`."""
-        _, slots, dim = self._arrays["vl/features"].shape
+        _, slots, dim = self._tensor("vl/features").shape
         action = (batch, horizon, self._arrays["tick/action"].shape[1])
         return Batch(
             features=torch.empty((batch, slots, dim), dtype=self._tensor("vl/features").dtype),
@@ -63,12 +68,18 @@ class Gatherer:
         )
 
     def _features(
-        self, batch: Batch, tick: NDArray[np.int64], episode: NDArray[np.int64], lag: int
+        self,
+        batch: Batch,
+        tick: NDArray[np.int64],
+        episode: NDArray[np.int64],
+        lag: int,
+        variant: NDArray[np.int64] | None,
     ) -> None:
         row = self._arrays["tick/vl_row"][tick]
         if lag:
             row = np.maximum(row - lag, self._arrays["episode/vl_start"][episode])
-        index = torch.from_numpy(row)
+        view = row * self._variants + (0 if variant is None else variant)
+        index = torch.from_numpy(view)
         torch.index_select(self._tensor("vl/features"), 0, index, out=batch.features)
         batch.slot_valid.copy_(self._tensor("vl/slot_valid").index_select(0, index))
         age = self._arrays["tick/time"][tick] - self._newest_frame[row]
@@ -130,9 +141,13 @@ class Gatherer:
         torch.index_select(self._tensor("tick/action"), 0, kept, out=flat)
 
     def _tensor(self, name: str) -> Tensor:
+        """An array as it is gathered from: those of the slots as (vl_row x variant, slot, …)."""
         if name not in self._tensors:
             tensor = torch.from_numpy(self._arrays[name])
             if name == "vl/features" and self._arrays[name].dtype == np.uint16:
                 tensor = tensor.view(torch.bfloat16)
+            if name in ("vl/features", "vl/slot_valid"):
+                rows, slots, *rest = tensor.shape
+                tensor = tensor.view(rows * self._variants, slots // self._variants, *rest)
             self._tensors[name] = tensor
         return self._tensors[name]

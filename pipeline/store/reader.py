@@ -114,10 +114,15 @@ class FeatureStore:
         return len(self._arrays["tick/time"])
 
     @property
+    def variants(self) -> int:
+        """Stored views of each VL row: 0 is the frames as they are, the others are augmented."""
+        return int(self.attrs["feature_spec"].get("variants", 1))
+
+    @property
     def feature_shape(self) -> tuple[int, int]:
-        """(slot, dim) of a VL row."""
+        """(slot, dim) of one variant of a VL row."""
         _, slots, dim = self._arrays["vl/features"].shape
-        return slots, dim
+        return slots // self.variants, dim
 
     @property
     def action_dim(self) -> int:
@@ -176,10 +181,11 @@ class FeatureStore:
 
         Windows end at the last reading at or before the tick less the lag; `feature_lag` goes back
         whole VL rows, not beyond the episode's first. The action chunk begins at its own tick and
-        repeats the episode's last action, marked invalid, beyond its end.
+        repeats the episode's last action, marked invalid, beyond its end. `variants` (batch,) says
+        which variant of its VL row each tick sees; without it all see 0, the plain frames.
 
-        Raises `IndexError` for a tick the store does not have and `ValueError` for an `out` of
-        other sizes or a negative lag, which would show the future.
+        Raises `IndexError` for a tick the store does not have and `ValueError` for a variant it
+        does not have, an `out` of other sizes, or a negative lag, which would show the future.
         """
         if min(feature_lag, sensor_lag_s, state_lag_s) < 0:
             raise ValueError(
@@ -189,6 +195,8 @@ class FeatureStore:
         tick = np.asarray(ticks, np.int64)
         if tick.size and (tick.min() < 0 or tick.max() >= self.ticks):
             raise IndexError(f"{self.path}: ticks lie in 0..{self.ticks - 1}, asked for {tick}")
+        if variants is not None:
+            self._check_variants(variants, len(tick))
         sizes = (len(tick), horizon, sensor_window, state_window)
         batch = self.empty_batch(*sizes) if out is None else out
         if batch.sizes != sizes:
@@ -196,7 +204,7 @@ class FeatureStore:
                 "`out` has (batch, horizon, sensor_window, state_window) "
                 f"{batch.sizes}, asked for {sizes}"
             )
-        self._gatherer.gather(batch, tick, feature_lag, sensor_lag_s, state_lag_s)
+        self._gatherer.gather(batch, tick, feature_lag, sensor_lag_s, state_lag_s, variants)
         return batch
 
     def empty_batch(self, batch: int, horizon: int, sensor_window: int, state_window: int) -> Batch:
@@ -205,7 +213,18 @@ class FeatureStore:
 
     @cached_property
     def _gatherer(self) -> Gatherer:
-        return Gatherer(self._arrays)
+        return Gatherer(self._arrays, self.variants)
+
+    def _check_variants(self, variants: NDArray[np.int64], batch: int) -> None:
+        if variants.shape != (batch,):
+            raise ValueError(
+                f"`variants` names one a tick: expected shape ({batch},), found {variants.shape}"
+            )
+        if variants.size and (variants.min() < 0 or variants.max() >= self.variants):
+            raise ValueError(
+                f"{self.path}: variants lie in 0..{self.variants - 1}, asked for "
+                f"{variants.min()}..{variants.max()}. A store holds `vlm.variants` of them."
+            )
 
 
 def _mapped(root: Path, spec: ArraySpec) -> NDArray[Any]:

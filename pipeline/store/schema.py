@@ -112,6 +112,7 @@ class Sizes:
     states: int
     text_bytes: int
     slots: int
+    """Of a VL row: those of all its variants, one variant after the other."""
     dim: int
     views: int
     action_dim: int

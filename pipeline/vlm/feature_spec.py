@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.config import Pooling, VLMParams
+from pipeline.config import VLMParams
 from pipeline.errors import VLMError
 from pipeline.vlm.checkpoint_folder import (
     adapter_files,
@@ -24,10 +24,11 @@ from pipeline.vlm.checkpoint_folder import (
     tokenizer_files,
     weight_files,
 )
+from pipeline.vlm.slots import Slot, slot_documents, slots_of
 
 __all__ = [
+    "AUGMENTATION_VERSION",
     "EXTRACTOR_VERSION",
-    "GRID_CELLS",
     "FeatureSpec",
     "Slot",
     "differences",
@@ -39,36 +40,10 @@ __all__ = [
 EXTRACTOR_VERSION = 1
 """Raised whenever this code changes what a feature is: the golden-feature test sees to it."""
 
-GRID_CELLS = 4
-"""Rows, and columns, of the cells of the `grid` pooling."""
+AUGMENTATION_VERSION = 1
+"""Raised whenever this code changes what an augmented variant of a frame is."""
 
 _PLACEHOLDER_INSTRUCTION = "…"
-
-
-@dataclass(frozen=True)
-class Slot:
-    """One pooled vector of a row: which layer, normed or not, over which tokens."""
-
-    layer: int
-    """Counted from the first, so never negative."""
-    norm: bool
-    pooling: str
-    view: str | None = None
-    cell: tuple[int, int] | None = None
-    """Row and column in the `grid` of a view."""
-
-    def document(self) -> dict[str, Any]:
-        """The slot as JSON-able values, without what does not apply."""
-        document: dict[str, Any] = {
-            "layer": self.layer,
-            "norm": self.norm,
-            "pooling": self.pooling,
-        }
-        if self.view is not None:
-            document["view"] = self.view
-        if self.cell is not None:
-            document["cell"] = list(self.cell)
-        return document
 
 
 @dataclass(frozen=True)
@@ -80,10 +55,17 @@ class FeatureSpec:
     digest: str
     """Hex digest of the document."""
     slots: tuple[Slot, ...]
+    """Of one variant."""
     views: tuple[str, ...]
     dim: int
     image_size: tuple[int, int]
     """Final height and width of every frame, in pixels."""
+    variants: int
+    """How many times a row holds the slots: the frames as they are, then augmented."""
+
+    def stored_slots(self) -> list[dict[str, Any]]:
+        """The slots of a whole row, in order: of each variant where there are several."""
+        return slot_documents(self.slots, self.variants)
 
     def attrs(self) -> dict[str, Any]:
         """The document with its digest, as a store keeps it."""
@@ -107,7 +89,7 @@ def feature_spec(
     folder = resolve_checkpoint(vlm.checkpoint, vlm.revision)
     layer_count, dim = _model_shape(folder)
     ordered = tuple(sorted(set(views)))
-    slots = _slots(vlm, _resolved_layers(vlm.layers, layer_count), ordered)
+    slots = slots_of(vlm, layer_count, ordered)
     pixels = PixelSettings.read(folder, (vlm.image_resize_height, vlm.image_resize_width))
     renderer = PromptRenderer(folder, vlm.prompt)
     document = {
@@ -120,12 +102,14 @@ def feature_spec(
         "example_prompt": renderer.render(_PLACEHOLDER_INSTRUCTION, len(ordered)),
         "processor": pixels.document(),
         "views": list(ordered),
-        "slots": [slot.document() for slot in slots],
+        "slots": slot_documents(slots, vlm.variants),
         "dim": dim,
         "compute_dtype": vlm.dtype,
         "storage_dtype": storage_dtype,
+        **_augmentation(vlm),
     }
-    return FeatureSpec(document, _digest(document), slots, ordered, dim, pixels.image_size)
+    digest = _digest(document)
+    return FeatureSpec(document, digest, slots, ordered, dim, pixels.image_size, vlm.variants)
 
 
 def row_key(spec: FeatureSpec, prompt: str, frames: Mapping[str, NDArray[np.uint8]]) -> bytes:
@@ -195,48 +179,12 @@ def _model_shape(folder: Path) -> tuple[int, int]:
         raise VLMError(f"{folder / 'config.json'}: {error} is missing") from None
 
 
-def _resolved_layers(layers: Sequence[int], count: int) -> tuple[int, ...]:
-    resolved: list[int] = []
-    for layer in layers:
-        index = layer + count if layer < 0 else layer
-        if not 0 <= index < count:
-            raise VLMError(
-                f"vlm.layers: expected {-count} to {count - 1} for a model of {count} decoder "
-                f"layers, found {layer}"
-            )
-        if index in resolved:
-            raise VLMError(
-                f"vlm.layers: {layer} is layer {index}, which is there already, in {list(layers)}"
-            )
-        resolved.append(index)
-    return tuple(resolved)
-
-
-def _slots(vlm: VLMParams, layers: Sequence[int], views: Sequence[str]) -> tuple[Slot, ...]:
-    for name, values in (("norms", vlm.norms), ("pooling", vlm.pooling)):
-        if len(set(values)) < len(values):
-            raise VLMError(f"vlm.{name}: each may stand once, found {list(values)}")
-    slots = tuple(
-        slot
-        for layer in layers
-        for norm in vlm.norms
-        for pooling in vlm.pooling
-        for slot in _slots_of(layer, norm, pooling, views)
-    )
-    if not slots:
-        raise VLMError(
-            f"vlm.pooling {list(vlm.pooling)} gives nothing without a view; add `mean` or `last`"
-        )
-    return slots
-
-
-def _slots_of(layer: int, norm: bool, pooling: Pooling, views: Sequence[str]) -> list[Slot]:
-    if pooling == "view_mean":
-        return [Slot(layer, norm, pooling, view) for view in views]
-    if pooling == "grid":
-        cells = [(row, column) for row in range(GRID_CELLS) for column in range(GRID_CELLS)]
-        return [Slot(layer, norm, pooling, view, cell) for view in views for cell in cells]
-    return [Slot(layer, norm, pooling)]
+def _augmentation(vlm: VLMParams) -> dict[str, Any]:
+    """What augmented variants are; nothing where there is none, so that no feature is renamed."""
+    if vlm.variants == 1:
+        return {}
+    how = {"version": AUGMENTATION_VERSION, **vlm.augmentation.model_dump()}
+    return {"variants": vlm.variants, "augmentation": how}
 
 
 def _adapter_digest(adapter: str | None, digest_file: Callable[[Path], str]) -> str | None:

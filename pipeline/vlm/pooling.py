@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.vlm.feature_spec import GRID_CELLS, Slot
 from pipeline.vlm.preparation import Layout
+from pipeline.vlm.slots import GRID_CELLS, Slot
 
 
 @lru_cache(maxsize=64)

@@ -1,7 +1,7 @@
 """An instruction and frames -> a row ready for the model, on the CPU and without its weights."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pipeline.config import VLMParams
 from pipeline.errors import VLMError
+from pipeline.vlm.augmentation import Augmentation
 from pipeline.vlm.checkpoint_folder import resolve_checkpoint
 from pipeline.vlm.feature_spec import FeatureSpec
 from pipeline.vlm.pixels import PixelSettings, stretch
@@ -58,6 +59,8 @@ class Preparer:
         """Read the checkpoint's tokenizer and processor settings."""
         folder = resolve_checkpoint(vlm.checkpoint, vlm.revision)
         self._views = spec.views
+        self._variants = spec.variants
+        self._augmentation = vlm.augmentation
         self._renderer = PromptRenderer(folder, vlm.prompt)
         resize = (vlm.image_resize_height, vlm.image_resize_width)
         self._settings = PixelSettings.read(folder, resize)
@@ -80,14 +83,44 @@ class Preparer:
         views = self._ordered(frames)
         prompt = self.render(instruction, views)
         token_ids, starts = self._tokens(prompt)
-        height, width = self._settings.image_size
-        pixels = np.empty((len(views), height, width, 3), np.uint8)
+        size = self._settings.image_size
+        pixels = np.empty((len(views), *size, 3), np.uint8)
         for place, view in zip(pixels, views, strict=True):
-            place[:] = stretch(_checked(frames[view], view), (height, width))
+            place[:] = stretch(_checked(frames[view], view), size)
         layout = Layout(
             len(token_ids), tuple(zip(views, starts, strict=True)), self._settings.merged_grid
         )
         return PreparedRow(prompt, token_ids, pixels, layout)
+
+    def prepare_variants(
+        self, instruction: str, frames: Mapping[str, NDArray[np.uint8]], key: bytes
+    ) -> tuple[PreparedRow, ...]:
+        """The row once a variant of the spec: 0 as `prepare` makes it, then augmented.
+
+        `key` is the row's (`row_key`): what is drawn depends on nothing else. All have one layout.
+        """
+        plain = self.prepare(instruction, frames)
+        others = range(1, self._variants)
+        return (plain, *(self._augmented(plain, frames, key, variant) for variant in others))
+
+    def _augmented(
+        self,
+        plain: PreparedRow,
+        frames: Mapping[str, NDArray[np.uint8]],
+        key: bytes,
+        variant: int,
+    ) -> PreparedRow:
+        """A row whose images are changed at the model's size, where they are smallest."""
+        pixels = np.empty_like(plain.pixels)
+        height, width = self._settings.image_size
+        for place, image, (view, _) in zip(
+            pixels, plain.pixels, plain.layout.image_starts, strict=True
+        ):
+            seen_height, seen_width, _ = frames[view].shape
+            widened = (width / seen_width) / (height / seen_height)
+            drawn = Augmentation.drawn(self._augmentation, key, view, variant)
+            place[:] = drawn.apply(image, widened)
+        return replace(plain, pixels=pixels)
 
     def _ordered(self, views: Sequence[str] | Mapping[str, object]) -> tuple[str, ...]:
         unknown = sorted(set(views) - set(self._views))

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -65,30 +66,43 @@ def _write_episode(
     return folder
 
 
-@pytest.fixture
-def recordings(tmp_path: Path) -> Path:
-    """Three episodes of one task; the last has one view only and no sensor."""
-    root = tmp_path / "recordings"
-    _write_episode(root / "Touch_dot" / "episode_1", 1)
-    _write_episode(root / "Touch_dot" / "episode_2", 2, seconds=3.0)
-    _write_episode(root / "Press" / "episode_3", 3, views=("View2",), sensor=False)
-    return root
+@pytest.fixture(scope="session")
+def make_document(demo_checkpoint: Path) -> Callable[[Path], dict[str, Any]]:
+    """`make_document(folder)` writes recordings there, and says what params.yaml would.
+
+    Three episodes of one task; the last has one view only and no sensor.
+    """
+
+    def make(folder: Path) -> dict[str, Any]:
+        root = folder / "recordings"
+        _write_episode(root / "Touch_dot" / "episode_1", 1)
+        _write_episode(root / "Touch_dot" / "episode_2", 2, seconds=3.0)
+        _write_episode(root / "Press" / "episode_3", 3, views=("View2",), sensor=False)
+        return {
+            "data": {"root": str(root), "sources": [{"name": "made", "path": "."}]},
+            "vlm": {
+                "checkpoint": str(demo_checkpoint),
+                "dtype": "float32",
+                "image_resize_height": 56,
+                "image_resize_width": 56,
+                "pooling": ["mean", "image_mean", "view_mean"],
+            },
+            "extract": {"store": str(folder / "stores" / "made.zarr"), "batch_size": 4},
+        }
+
+    return make
 
 
 @pytest.fixture
-def document(recordings: Path, demo_checkpoint: Path, tmp_path: Path) -> dict[str, Any]:
+def document(make_document: Callable[[Path], dict[str, Any]], tmp_path: Path) -> dict[str, Any]:
     """params.yaml as it would be read, to be changed by a test."""
-    return {
-        "data": {"root": str(recordings), "sources": [{"name": "made", "path": "."}]},
-        "vlm": {
-            "checkpoint": str(demo_checkpoint),
-            "dtype": "float32",
-            "image_resize_height": 56,
-            "image_resize_width": 56,
-            "pooling": ["mean", "image_mean", "view_mean"],
-        },
-        "extract": {"store": str(tmp_path / "stores" / "made.zarr"), "batch_size": 4},
-    }
+    return make_document(tmp_path)
+
+
+@pytest.fixture
+def recordings(document: dict[str, Any]) -> Path:
+    """The folder of the recordings."""
+    return Path(document["data"]["root"])
 
 
 @pytest.fixture
@@ -107,8 +121,10 @@ def params_file(document: dict[str, Any], tmp_path: Path) -> Path:
 def changed(document: dict[str, Any]) -> Callable[..., Params]:
     """`changed(vlm={"prompt": ...})`: the params with some values laid over."""
 
-    def lay_over(**sections: dict[str, Any]) -> Params:
-        merged = {name: {**document.get(name, {}), **sections.get(name, {})} for name in document}
-        return Params.model_validate(merged)
+    return partial(laid_over, document)
 
-    return lay_over
+
+def laid_over(document: dict[str, Any], **sections: dict[str, Any]) -> Params:
+    """The params of a document with some values of its sections replaced."""
+    merged = {name: {**document.get(name, {}), **sections.get(name, {})} for name in document}
+    return Params.model_validate(merged)

@@ -126,6 +126,78 @@ class TestGather:
         assert batch.sensor_valid.tolist() == [0, 0]
 
 
+@pytest.fixture(scope="module", params=["float32", "bfloat16"])
+def varied(tiny_store, tmp_path_factory, request) -> FeatureStore:
+    """A row of six slots is three variants of two, some of them not valid."""
+    path = tiny_store(tmp_path_factory.mktemp("varied"), slots=6, dtype=request.param)
+    zarr.open_group(path, mode="r+").attrs["feature_spec"] = {"digest": "x", "variants": 3}
+    store = FeatureStore.open(path)
+    valid = store.array("vl/slot_valid")
+    valid[:] = np.random.default_rng(1).integers(0, 2, valid.shape)
+    return store
+
+
+class TestVariants:
+    def test_a_batch_has_the_slots_of_one(self, varied):
+        assert varied.variants == 3
+        assert varied.feature_shape == (2, 8)
+        assert varied.array("vl/features").shape[1:] == (6, 8)
+        assert varied.empty_batch(4, 8, 65, 100).features.shape == (4, 2, 8)
+
+    @settings(max_examples=60, deadline=None)
+    @given(data=st.data())
+    def test_each_tick_sees_the_variant_it_asks_for(self, varied, data):
+        ticks = data.draw(st.lists(st.integers(0, varied.ticks - 1), max_size=9))
+        lag = data.draw(st.integers(0, 12))
+        asked = data.draw(
+            st.none()
+            | st.lists(st.integers(0, 2), min_size=len(ticks), max_size=len(ticks)).map(np.array)
+        )
+        if asked is not None:
+            asked = asked.astype(np.int64)
+        batch = varied.gather(ticks, feature_lag=lag, variants=asked)
+        stored = varied.array("vl/features")
+        if stored.dtype == np.uint16:
+            stored = (stored.astype(np.uint32) << 16).view(np.float32)
+        for index, tick in enumerate(ticks):
+            episode = next(one for one in varied.episodes if tick in one.ticks)
+            row = max(int(varied.array("tick/vl_row")[tick]) - lag, episode.vl_rows.start)
+            first = 0 if asked is None else 2 * asked[index]
+            slots = slice(first, first + 2)
+            assert np.array_equal(batch.features[index].float().numpy(), stored[row, slots])
+            valid = varied.array("vl/slot_valid")[row, slots]
+            assert np.array_equal(batch.slot_valid[index].numpy(), valid)
+
+    def test_nothing_but_features_depends_on_the_variant(self, varied):
+        ticks = np.arange(0, varied.ticks, 7)
+        plain = varied.gather(ticks)
+        first = varied.gather(ticks, variants=np.zeros(len(ticks), np.int64))
+        last = varied.gather(ticks, variants=np.full(len(ticks), 2))
+        for name, value in vars(plain).items():
+            assert torch.equal(getattr(first, name), value)
+            if name not in ("features", "slot_valid"):
+                assert torch.equal(getattr(last, name), value)
+        assert not torch.equal(last.features, plain.features)
+
+    def test_buffers_are_reused(self, varied):
+        out = varied.gather([0, 1], variants=np.array([2, 2]))
+        again = varied.gather([0, 1], variants=np.array([1, 0]), out=out)
+        assert again.features.data_ptr() == out.features.data_ptr()
+        assert torch.equal(
+            again.features, varied.gather([0, 1], variants=np.array([1, 0])).features
+        )
+
+    def test_refuses_a_variant_that_is_not_there(self, varied, store):
+        with pytest.raises(ValueError, match=r"variants lie in 0\.\.2, asked for 0\.\.3.*vlm\.var"):
+            varied.gather([0, 1], variants=np.array([0, 3]))
+        with pytest.raises(ValueError, match=r"asked for -1\.\.0"):
+            varied.gather([0, 1], variants=np.array([0, -1]))
+        with pytest.raises(ValueError, match=r"expected shape \(2,\), found \(1,\)"):
+            varied.gather([0, 1], variants=np.array([0]))
+        with pytest.raises(ValueError, match=r"variants lie in 0\.\.0"):
+            store.gather([0], variants=np.array([1]))
+
+
 class TestOpen:
     def test_writing_into_the_map_changes_nothing_on_disk(self, path):
         first = FeatureStore.open(path)

@@ -83,6 +83,64 @@ def test_slots_go_by_layer_norm_pooling(spec_of: Callable[..., FeatureSpec]) -> 
     }
 
 
+def test_variants_are_named_only_where_there_are_several(
+    spec_of: Callable[..., FeatureSpec],
+) -> None:
+    """So that stores of one variant keep their digest, and what was extracted stays known."""
+    one = spec_of()
+    assert spec_of(variants=1, augmentation={"rotation_deg": 30, "seed": 7}) == one
+    assert set(one.document) == {
+        "extractor_version",
+        "weights",
+        "adapter",
+        "tokenizer",
+        "chat_template",
+        "prompt",
+        "example_prompt",
+        "processor",
+        "views",
+        "slots",
+        "dim",
+        "compute_dtype",
+        "storage_dtype",
+    }
+    assert one.stored_slots() == [{"layer": 3, "norm": True, "pooling": "mean"}]
+    three = spec_of(variants=3, pooling=["mean", "last"], augmentation={"crop": 0.8})
+    assert three.slots == spec_of(pooling=["mean", "last"]).slots, "those of one variant"
+    assert [(slot["variant"], slot["pooling"]) for slot in three.stored_slots()] == [
+        (variant, pooling) for variant in range(3) for pooling in ("mean", "last")
+    ]
+    assert three.document["slots"] == three.stored_slots()
+    assert three.document["variants"] == 3
+    assert three.document["augmentation"] == {
+        "version": 1,
+        "rotation_deg": 5.0,
+        "crop": 0.8,
+        "brightness": 0.2,
+        "contrast": 0.2,
+        "saturation": 0.2,
+        "seed": 0,
+    }
+    assert json.loads(json.dumps(three.attrs())) == three.attrs()
+
+
+def test_digest_and_keys_move_with_variants_and_augmentation(
+    spec_of: Callable[..., FeatureSpec],
+) -> None:
+    specs = [
+        spec_of(),
+        spec_of(variants=2),
+        spec_of(variants=3),
+        spec_of(variants=3, augmentation={"seed": 1}),
+        spec_of(variants=3, augmentation={"rotation_deg": 4}),
+    ]
+    assert len({spec.digest for spec in specs}) == len(specs)
+    assert len({row_key(spec, "go", {}) for spec in specs}) == len(specs)
+    lines = differences(specs[0].attrs(), specs[2].attrs())
+    assert "variants: None -> 3" in lines
+    assert differences(specs[2].attrs(), specs[3].attrs()) == ["augmentation.seed: 0 -> 1"]
+
+
 CHANGES: dict[str, dict[str, Any]] = {
     "dtype": {"dtype": "bfloat16"},
     "storage": {"storage_dtype": "float16"},
@@ -239,6 +297,7 @@ def test_a_hub_id_that_is_not_there_says_what_to_run(
 ) -> None:
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
     with pytest.raises(VLMError, match=r"stages\.demo.*hf download models/demo_vlm"):
         resolve_checkpoint("models/demo_vlm")
 

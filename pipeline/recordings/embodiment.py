@@ -1,0 +1,73 @@
+"""What the channels of recordings are, and whether they can stand side by side."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pipeline.errors import StoreMismatch
+from pipeline.recordings.recording import Channels, Recording, Stream
+
+_NO_CHANNELS = Channels((), ())
+
+
+@dataclass(frozen=True)
+class Embodiment:
+    """Channels of action, sensor and state; none where a stream is absent."""
+
+    action: Channels
+    action_kind: str
+    sensor: Channels = _NO_CHANNELS
+    state: Channels = _NO_CHANNELS
+
+    @classmethod
+    def of(
+        cls, action: Channels, action_kind: str, sensor: Stream | None, state: Stream | None
+    ) -> "Embodiment":
+        """That of a recording with these streams."""
+        there = {"sensor": sensor, "state": state}
+        channels = {name: one.channels for name, one in there.items() if one is not None}
+        return cls(action, action_kind, **channels)
+
+    def document(self) -> dict[str, dict[str, Any]]:
+        """Names and units by stream, and the kind of action, as a store keeps them."""
+        document: dict[str, dict[str, Any]] = {}
+        for stream in ("action", "sensor", "state"):
+            channels: Channels = getattr(self, stream)
+            document[stream] = {"names": list(channels.names), "units": list(channels.units)}
+        document["action"]["kind"] = self.action_kind
+        return document
+
+
+def common_embodiment(
+    found: Sequence[tuple[Recording, Embodiment]], of: str, remedy: str
+) -> Embodiment:
+    """The embodiment of all these recordings; streams that some lack are those of the others.
+
+    Raises `StoreMismatch` that names two that differ in channels, units or kind of action, says
+    that they are to be one `of` something, and ends with the `remedy`.
+    """
+    common: dict[str, Channels] = {}
+    for stream in ("action", "state", "sensor"):
+        having = [(one, _seen(all_of, stream)) for one, all_of in found]
+        having = [(one, seen) for one, seen in having if seen[0].names]
+        for one, seen in having[1:]:
+            first, expected = having[0]
+            if seen != expected:
+                raise StoreMismatch(
+                    f"one {of} holds one embodiment, but the {stream} of source {first.source!r} "
+                    f"({first.path}) is {_shown(*expected)} and that of source {one.source!r} "
+                    f"({one.path}) is {_shown(*seen)}. {remedy}"
+                )
+        common[stream] = having[0][1][0] if having else _NO_CHANNELS
+    return Embodiment(action_kind=found[0][1].action_kind, **common)
+
+
+def _seen(embodiment: Embodiment, stream: str) -> tuple[Channels, str]:
+    return getattr(embodiment, stream), embodiment.action_kind if stream == "action" else ""
+
+
+def _shown(channels: Channels, kind: str) -> str:
+    pairs = zip(channels.names, channels.units, strict=True)
+    named = [f"{name} ({unit})" if unit else name for name, unit in pairs]
+    listed = ", ".join(named if len(named) <= 12 else [*named[:4], "…", named[-1]])
+    return f"{len(named)} {kind} channels [{listed}]".replace("  ", " ")

@@ -1,0 +1,82 @@
+"""Episodes one behind the other: the arrays of a store that need no model and no stream."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Ticks(Protocol):
+    """An episode's ticks, with indices into its own streams; see `pipeline.timeline.Timeline`."""
+
+    @property
+    def time(self) -> NDArray[np.float64]: ...
+    @property
+    def action(self) -> NDArray[np.float32]: ...
+    @property
+    def vl_row(self) -> NDArray[np.int64]: ...
+    @property
+    def vl_time(self) -> NDArray[np.float64]: ...
+    @property
+    def sensor_end(self) -> NDArray[np.int64]: ...
+    @property
+    def state_end(self) -> NDArray[np.int64]: ...
+
+    def frame_times(self, views: Sequence[str]) -> NDArray[np.float64]: ...
+
+
+@dataclass(frozen=True)
+class EpisodeRows:
+    """How many rows of each kind an episode has, and what is said of it."""
+
+    ticks: Ticks
+    readings: int
+    states: int
+    source: str
+    said: Mapping[str, str]
+    """The fields of `Episode` that are text, but its source."""
+
+    @property
+    def text(self) -> bytes:
+        """What is said, as JSON."""
+        return json.dumps(self.said, ensure_ascii=False).encode()
+
+
+def episode_edges(episodes: Sequence[EpisodeRows]) -> dict[str, NDArray[np.int64]]:
+    """(episode + 1,) where the ticks, VL rows, readings, states and text of each begin."""
+    counts = {
+        "tick": [len(one.ticks.time) for one in episodes],
+        "vl": [len(one.ticks.vl_time) for one in episodes],
+        "sensor": [one.readings for one in episodes],
+        "state": [one.states for one in episodes],
+        "text": [len(one.text) for one in episodes],
+    }
+    return {kind: np.cumsum([0, *each], dtype=np.int64) for kind, each in counts.items()}
+
+
+def episode_arrays(
+    episodes: Sequence[EpisodeRows], sources: Sequence[str], views: Sequence[str]
+) -> dict[str, NDArray[Any]]:
+    """Everything under `tick/` and `episode/`, and the times under `vl/`; indices store-global."""
+    edges = episode_edges(episodes)
+    ticks = [one.ticks for one in episodes]
+
+    def shifted(kind: str, values: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
+        starts = edges[kind][:-1]
+        return np.concatenate([one + start for one, start in zip(values, starts, strict=True)])
+
+    arrays = {
+        "tick/time": np.concatenate([one.time for one in ticks]),
+        "tick/action": np.concatenate([one.action for one in ticks]),
+        "tick/vl_row": shifted("vl", [one.vl_row for one in ticks]),
+        "tick/sensor_end": shifted("sensor", [one.sensor_end for one in ticks]),
+        "tick/state_end": shifted("state", [one.state_end for one in ticks]),
+        "vl/time": np.concatenate([one.vl_time for one in ticks]),
+        "vl/frame_time": np.concatenate([one.frame_times(views) for one in ticks]),
+        "episode/source": np.array([sources.index(one.source) for one in episodes], np.int32),
+        "episode/text": np.frombuffer(b"".join(one.text for one in episodes), np.uint8),
+    }
+    return arrays | {f"episode/{kind}_start": edge for kind, edge in edges.items()}

@@ -1,0 +1,92 @@
+"""The slots of a row: which pooled vectors it holds, and in which order."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pipeline.config import Pooling, VLMParams
+from pipeline.errors import VLMError
+
+GRID_CELLS = 4
+"""Rows, and columns, of the cells of the `grid` pooling."""
+
+
+@dataclass(frozen=True)
+class Slot:
+    """One pooled vector of a row: which layer, normed or not, over which tokens."""
+
+    layer: int
+    """Counted from the first, so never negative."""
+    norm: bool
+    pooling: str
+    view: str | None = None
+    cell: tuple[int, int] | None = None
+    """Row and column in the `grid` of a view."""
+
+    def document(self) -> dict[str, Any]:
+        """The slot as JSON-able values, without what does not apply."""
+        document: dict[str, Any] = {
+            "layer": self.layer,
+            "norm": self.norm,
+            "pooling": self.pooling,
+        }
+        if self.view is not None:
+            document["view"] = self.view
+        if self.cell is not None:
+            document["cell"] = list(self.cell)
+        return document
+
+
+def slots_of(vlm: VLMParams, layers: int, views: Sequence[str]) -> tuple[Slot, ...]:
+    """The slots that `vlm` asks of a model of this many decoder layers for these views, in order.
+
+    Raises `VLMError` for a layer past the model, for what is asked twice, and where none is left.
+    """
+    for name, values in (("norms", vlm.norms), ("pooling", vlm.pooling)):
+        if len(set(values)) < len(values):
+            raise VLMError(f"vlm.{name}: each may stand once, found {list(values)}")
+    slots = tuple(
+        slot
+        for layer in _resolved_layers(vlm.layers, layers)
+        for norm in vlm.norms
+        for pooling in vlm.pooling
+        for slot in _slots_of(layer, norm, pooling, views)
+    )
+    if not slots:
+        raise VLMError(
+            f"vlm.pooling {list(vlm.pooling)} gives nothing without a view; add `mean` or `last`"
+        )
+    return slots
+
+
+def _slots_of(layer: int, norm: bool, pooling: Pooling, views: Sequence[str]) -> list[Slot]:
+    if pooling == "view_mean":
+        return [Slot(layer, norm, pooling, view) for view in views]
+    if pooling == "grid":
+        cells = [(row, column) for row in range(GRID_CELLS) for column in range(GRID_CELLS)]
+        return [Slot(layer, norm, pooling, view, cell) for view in views for cell in cells]
+    return [Slot(layer, norm, pooling)]
+
+
+def slot_documents(slots: Sequence[Slot], variants: int) -> list[dict[str, Any]]:
+    """The slots of a whole row as JSON-able values: variant after variant, where there are any."""
+    if variants == 1:
+        return [slot.document() for slot in slots]
+    return [slot.document() | {"variant": v} for v in range(variants) for slot in slots]
+
+
+def _resolved_layers(layers: Sequence[int], count: int) -> tuple[int, ...]:
+    resolved: list[int] = []
+    for layer in layers:
+        index = layer + count if layer < 0 else layer
+        if not 0 <= index < count:
+            raise VLMError(
+                f"vlm.layers: expected {-count} to {count - 1} for a model of {count} decoder "
+                f"layers, found {layer}"
+            )
+        if index in resolved:
+            raise VLMError(
+                f"vlm.layers: {layer} is layer {index}, which is there already, in {list(layers)}"
+            )
+        resolved.append(index)
+    return tuple(resolved)

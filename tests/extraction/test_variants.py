@@ -1,0 +1,254 @@
+"""`vlm.variants`: one extraction stores each row as its frames are, and augmented."""
+
+import dataclasses
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.config import Params
+from pipeline.errors import DiskFull, NumericsError, VLMError
+from pipeline.extraction import extract
+from pipeline.extraction.encoder import Encoder
+from pipeline.extraction.rows import ReadyRow
+from pipeline.store import FeatureStore, StoreBuild
+from pipeline.store.schema import ARRAY_NAMES
+from pipeline.vlm.preparation import Layout, PreparedRow
+
+K = 3
+
+
+def run(params) -> tuple[object, list[str]]:
+    said: list[str] = []
+    return extract(params, said.append), said
+
+
+def features_by_key(store: FeatureStore) -> dict[bytes, np.ndarray]:
+    return dict(zip(map(bytes, store.array("vl/key")), store.array("vl/features"), strict=True))
+
+
+def by_variant(store: FeatureStore) -> np.ndarray:
+    """(variant, vl_row, slot, dim)"""
+    stored = store.array("vl/features")
+    slots, dim = store.feature_shape
+    return stored.reshape(len(stored), store.variants, slots, dim).swapaxes(0, 1)
+
+
+@pytest.fixture(scope="module")
+def extracted(make_document, tmp_path_factory) -> dict[int, FeatureStore]:
+    """The same recordings as a store of one variant and of three, a pass of the model a variant."""
+    document = make_document(tmp_path_factory.mktemp("extracted"))
+    stores = {}
+    for variants in (1, K):
+        place = Path(document["extract"]["store"]).with_name(f"{variants}.zarr")
+        params = Params.model_validate(
+            document
+            | {"vlm": document["vlm"] | {"variants": variants}}
+            | {"extract": {"store": str(place), "batch_size": 1}}
+        )
+        run(params)
+        stores[variants] = FeatureStore.open(place)
+    return stores
+
+
+@pytest.fixture
+def varied(changed):
+    """Params of three variants, with some sections laid over."""
+
+    def lay_over(**sections):
+        return changed(**sections | {"vlm": {"variants": K, **sections.get("vlm", {})}})
+
+    return lay_over
+
+
+class TestWhatItWrites:
+    def test_variant_0_is_the_store_of_one_bit_for_bit_and_the_others_differ(self, extracted):
+        plain, store = extracted[1], extracted[K]
+        assert (store.variants, plain.variants) == (K, 1)
+        assert store.feature_shape == plain.feature_shape
+        variants = by_variant(store)
+        assert np.array_equal(variants[0], plain.array("vl/features"))
+        for name in ("tick/action", "tick/vl_row", "vl/time", "vl/frame_time", "sensor/values"):
+            assert np.array_equal(store.array(name), plain.array(name), equal_nan=True)
+        seen = store.array("vl/slot_valid")[:, : store.feature_shape[0]].astype(bool)
+        for a, b in ((0, 1), (0, 2), (1, 2)):
+            assert (np.abs(variants[a] - variants[b]).max(axis=-1)[seen] > 1e-3).all()
+
+    def test_slots_are_named_variant_after_variant(self, extracted):
+        plain, store = extracted[1].attrs["slots"], extracted[K].attrs["slots"]
+        assert store == [slot | {"variant": v} for v in range(K) for slot in plain]
+        assert store == extracted[K].spec["slots"]
+
+    def test_a_missing_view_is_missing_in_every_variant(self, extracted):
+        store = extracted[K]
+        press = next(one for one in store.episodes if one.id == "episode_3")
+        batch = store.gather(np.array([press.ticks[0]] * K), variants=np.arange(K))
+        slots = extracted[1].attrs["slots"]
+        view1 = [slot.get("view") == "View1" for slot in slots]
+        assert not batch.slot_valid[:, view1].any()
+        assert not batch.features[:, view1].any()
+        assert batch.slot_valid[:, np.logical_not(view1)].all()
+        assert len({row.numpy().tobytes() for row in batch.features}) == K
+
+    def test_the_keys_are_not_those_of_one_variant(self, extracted):
+        one, several = (set(map(bytes, store.array("vl/key"))) for store in extracted.values())
+        assert not one & several
+
+    def test_without_a_camera_there_is_nothing_to_augment(self, varied):
+        params = varied(data={"views": []}, vlm={"pooling": ["mean"]})
+        run(params)
+        variants = by_variant(FeatureStore.open(params.extract.store))
+        assert np.allclose(variants[0], variants[1], atol=2e-5)
+
+
+def test_neither_batch_nor_threads_nor_order_nor_episode_decide_a_variant(
+    extracted, varied, recordings, write_episode
+):
+    write_episode(recordings / "Press" / "episode_0", 9)  # in front: every row moves
+    params = varied(extract={"batch_size": 7, "decode_threads": 3})
+    report, _ = run(params)
+    assert report.taken == 0
+    found, known = features_by_key(FeatureStore.open(params.extract.store)), extracted[K]
+    for key, features in features_by_key(known).items():
+        assert np.allclose(found[key], features, atol=2e-5)
+
+
+class TestWhatItTakesOver:
+    def test_more_variants_compute_everything_and_say_why(self, extracted, changed):
+        store = changed().extract.store
+        shutil.copytree(extracted[1].path, store)
+        _, said = run(changed(vlm={"variants": 2}, extract={"plan": True}))
+        assert any("feature spec, variants: None -> 2" in line for line in said)
+        assert any("rows: 24, 0 known, 24 to compute in 2 variants" in line for line in said)
+
+    def test_an_added_episode_computes_only_its_rows(
+        self, extracted, varied, recordings, write_episode
+    ):
+        params = varied()
+        shutil.copytree(extracted[K].path, params.extract.store)
+        write_episode(recordings / "Touch_dot" / "episode_0", 9)
+        report, _ = run(params)
+        store = FeatureStore.open(params.extract.store)
+        (added,) = (one for one in store.episodes if one.id == "episode_0")
+        assert report.computed == len(added.vl_rows)
+        assert report.taken == 24
+        found = features_by_key(store)
+        for key, features in features_by_key(extracted[K]).items():
+            assert np.array_equal(found[key], features)
+
+    def test_an_interrupted_build_goes_on(self, extracted, varied, monkeypatch):
+        params = varied(extract={"batch_size": 2 * K})
+        real = StoreBuild.commit
+        commits = []
+
+        def commit(self, numbers, *rest):
+            real(self, numbers, *rest)
+            commits.append(len(numbers))
+            if len(commits) == 3:
+                raise KeyboardInterrupt
+
+        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+            patch.setattr(StoreBuild, "commit", commit)
+            run(params)
+        assert commits == [2, 2, 2], "the batch size counts variants"
+        report, said = run(params)
+        assert report.computed == 24 - 6
+        assert any("rows: 24, 6 known, 18 to compute in 3 variants each" in line for line in said)
+        found, undisturbed = FeatureStore.open(params.extract.store), extracted[K]
+        assert np.array_equal(found.array("vl/key"), undisturbed.array("vl/key"))
+        assert np.allclose(found.array("vl/features"), undisturbed.array("vl/features"), atol=2e-5)
+
+
+def test_the_plan_and_the_disk_check_count_every_variant(extracted, varied, monkeypatch):
+    needed = {
+        variants: sum(store.array(name).nbytes for name in ARRAY_NAMES)
+        for variants, store in extracted.items()
+    }
+    features, valid = (
+        extracted[1].array(f"vl/{name}").nbytes for name in ("features", "slot_valid")
+    )
+    assert needed[K] - needed[1] == (K - 1) * (features + valid)
+    _, said = run(varied(extract={"plan": True}))
+    assert f"disk: {needed[K] / 2**20:.1f} MiB for the whole store" in "\n".join(said)
+    monkeypatch.setattr("pipeline.extraction.layout.free_bytes", lambda path: needed[K] - 1)
+    with pytest.raises(DiskFull, match=r"fewer vlm\.pooling slots or vlm\.variants"):
+        run(varied())
+
+
+class FakeVLM:
+    """Says of each row its pixel value in both slots; refuses more rows than it has memory for."""
+
+    def __init__(self, room: int = 10**6, dtype: torch.dtype = torch.float32) -> None:
+        self.room = room
+        self.dtype = dtype
+        self.batches: list[int] = []
+
+    def encode(self, rows):
+        self.batches.append(len(rows))
+        if len(rows) > self.room:
+            raise torch.OutOfMemoryError("too many")
+        values = torch.tensor([float(row.pixels.flat[0]) for row in rows])
+        if (bad := (values == 255).nonzero()).numel():
+            raise NumericsError(f"row {int(bad[0])} of the batch: expected finite features")
+        return (values[:, None, None] + torch.tensor([0.0, 0.5])[:, None]).to(self.dtype), None
+
+
+def ready(row: int, values: list[int]) -> ReadyRow:
+    layout = Layout(1, (), (1, 1))
+    plain = PreparedRow("p", np.zeros(1, np.int64), np.zeros((1, 1, 1, 3), np.uint8), layout)
+    variants = tuple(
+        dataclasses.replace(plain, pixels=np.full((1, 1, 1, 3), value, np.uint8))
+        for value in values
+    )
+    return ReadyRow(row, bytes(16), variants, f"recording, VL row {row}")
+
+
+class TestEncoder:
+    @pytest.mark.parametrize(
+        ("batch_size", "room", "passes"),
+        [
+            (6, 99, [6, 6, 3]),
+            (7, 99, [6, 6, 3]),
+            (2, 99, [2, 1] * 5),  # less than a row's variants: a row takes two passes
+            (1, 99, [1] * 15),
+            (12, 4, [12, 6, 3, 3, 3, 3, 3]),  # out of memory: 12 -> 6 -> 3
+            (12, 2, [12, 6, 3, 1, 1, 1, *[1] * 12]),
+        ],
+    )
+    def test_any_batch_size_gives_the_rows_variant_after_variant(self, batch_size, room, passes):
+        vlm = FakeVLM(room)
+        rows = [ready(row, [10 * row, 10 * row + 1, 10 * row + 2]) for row in range(5)]
+        found = {}
+        for batch, features in Encoder(vlm, batch_size, K).encode(rows):
+            assert features.shape == (len(batch), K * 2, 1)
+            found |= {one.row: features[i, :, 0].tolist() for i, one in enumerate(batch)}
+        assert found == {
+            row: [10 * row + variant + half for variant in range(K) for half in (0, 0.5)]
+            for row in range(5)
+        }
+        assert vlm.batches == passes
+
+    def test_bfloat16_is_stored_as_its_bits(self):
+        encoder = Encoder(FakeVLM(dtype=torch.bfloat16), 2, K)
+        ((_, bits),) = encoder.encode([ready(0, [1, 2, 3])])
+        assert bits.dtype == np.uint16
+        values = torch.from_numpy(bits).view(torch.bfloat16)[0, :, 0]
+        assert values.tolist() == [1.0, 1.5, 2.0, 2.5, 3.0, 3.5]
+
+    def test_no_room_for_a_single_variant_is_an_error(self):
+        with pytest.raises(VLMError, match="out of memory with a single row"):
+            list(Encoder(FakeVLM(0), 8, K).encode([ready(0, [1, 2, 3])]))
+
+    def test_a_feature_that_is_not_finite_names_row_and_variant(self):
+        encoder = Encoder(FakeVLM(), 8, K)
+        rows = [ready(0, [1, 2, 3]), ready(1, [4, 5, 255])]
+        with pytest.raises(NumericsError, match="recording, VL row 1, variant 2: row 2 of the"):
+            list(encoder.encode(rows))
+
+    def test_a_batch_is_full_when_its_variants_are(self):
+        encoder = Encoder(FakeVLM(), 6, K)
+        assert not encoder.add(ready(0, [0, 1, 2]))
+        full = encoder.add(ready(1, [0, 1, 2]))
+        assert [one.row for one in full] == [0, 1]

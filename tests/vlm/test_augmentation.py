@@ -1,0 +1,243 @@
+"""Augmented variants are small, lawful changes that depend on what is shown and on nothing else."""
+
+import subprocess
+import sys
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from PIL import Image, ImageEnhance
+
+from pipeline.config import AugmentationParams
+from pipeline.vlm.augmentation import Augmentation
+from pipeline.vlm.feature_spec import AUGMENTATION_VERSION, row_key
+
+KEY = bytes(range(16))
+PLAIN = Augmentation(0.0, 1.0, (0.0, 0.0), 1.0, 1.0, 1.0)
+Frame = NDArray[np.uint8]
+
+GOLDEN_DRAW = [
+    4.383235060258086,
+    0.939893097954117,
+    -0.0066152925915543125,
+    0.02828732060499131,
+    0.8279398402138759,
+    0.9828019572951286,
+    0.8920166787939391,
+]
+GOLDEN_PIXELS = [
+    [[9, 5, 186], [52, 12, 165], [94, 17, 144]],
+    [[10, 49, 176], [53, 55, 155], [95, 61, 135]],
+    [[11, 92, 166], [53, 99, 145], [95, 105, 125]],
+]
+
+
+def drawn(variant: int = 1, view: str = "View1", key: bytes = KEY, **params: Any) -> Augmentation:
+    return Augmentation.drawn(AugmentationParams(**params), key, view, variant)
+
+
+def flat(one: Augmentation) -> list[float]:
+    return [one.rotation_deg, one.side, *one.offset, one.brightness, one.contrast, one.saturation]
+
+
+@given(
+    key=st.binary(min_size=16, max_size=16),
+    variant=st.integers(1, 50),
+    rotation_deg=st.floats(0, 45),
+    crop=st.floats(0.1, 1),
+    light=st.floats(0, 1),
+)
+def test_a_draw_stays_within_the_params(
+    key: bytes, variant: int, rotation_deg: float, crop: float, light: float
+) -> None:
+    found = drawn(
+        variant,
+        key=key,
+        rotation_deg=rotation_deg,
+        crop=crop,
+        brightness=light,
+        contrast=light,
+        saturation=light,
+    )
+    assert abs(found.rotation_deg) <= rotation_deg
+    assert crop <= found.side <= 1
+    assert all(abs(offset) <= (1 - found.side) / 2 for offset in found.offset)
+    for factor in (found.brightness, found.contrast, found.saturation):
+        assert 1 - light <= factor <= 1 + light
+
+
+def test_draws_are_spread_evenly_and_independent() -> None:
+    params = AugmentationParams(rotation_deg=10, crop=0.5)
+    keys = [np.random.default_rng(seed).bytes(16) for seed in range(2000)]
+    draws = np.array([flat(Augmentation.drawn(params, key, "View1", 1)) for key in keys])
+    shares = (draws[:, [0, 1, 4, 5, 6]] - [-10, 0.5, 0.8, 0.8, 0.8]) / [20, 0.5, 0.4, 0.4, 0.4]
+    # Of 2,000 uniform draws: the mean lies within 5 standard errors, as do the correlations.
+    assert np.abs(shares.mean(axis=0) - 0.5).max() < 5 * np.sqrt(1 / 12 / 2000)
+    assert np.abs(shares.std(axis=0) - np.sqrt(1 / 12)).max() < 0.01
+    correlation = np.corrcoef(draws.T) - np.eye(7)
+    assert np.abs(correlation).max() < 5 / np.sqrt(2000)
+
+
+def test_row_view_variant_and_seed_each_draw_anew() -> None:
+    every = {
+        drawn(),
+        drawn(variant=2),
+        drawn(view="View2"),
+        drawn(key=KEY[::-1]),
+        drawn(seed=1),
+    }
+    assert len(every) == 5
+    assert drawn() == drawn()
+
+
+def test_what_a_draw_is_belongs_to_its_version() -> None:
+    """Changed numbers: raise AUGMENTATION_VERSION, or stores would mix two meanings."""
+    assert AUGMENTATION_VERSION == 1
+    one = drawn()
+    assert flat(one) == pytest.approx(GOLDEN_DRAW, abs=1e-12)
+    y, x = np.mgrid[0:60, 0:80]
+    frame = np.stack([2 * x, 3 * y, 255 - x - y], axis=-1).astype(np.uint8)
+    changed = one.apply(frame)
+    # Rounding may differ by a level with Pillow's version.
+    assert np.abs(changed[::20, ::30].astype(int) - GOLDEN_PIXELS).max() <= 1
+
+
+def test_another_process_draws_the_same() -> None:
+    code = (
+        "from pipeline.config import AugmentationParams as P\n"
+        "from pipeline.vlm.augmentation import Augmentation as A\n"
+        "print(A.drawn(P(), bytes(range(16)), 'View1', 1))"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert said.stdout.strip() == str(drawn())
+
+
+def test_nothing_asked_is_nothing_changed(make_frame: Callable[..., Frame]) -> None:
+    frame = make_frame(0)
+    none = drawn(rotation_deg=0, crop=1, brightness=0, contrast=0, saturation=0)
+    assert none == PLAIN
+    assert np.array_equal(none.apply(frame), frame)
+
+
+@pytest.mark.parametrize("angle", [-30.0, 4.0])
+def test_a_turn_is_pillows_rotation_where_that_has_pixels(
+    make_frame: Callable[..., Frame], angle: float
+) -> None:
+    frame = make_frame(1)
+    found = replace(PLAIN, rotation_deg=angle).apply(frame)
+    image = Image.fromarray(frame).rotate(angle, Image.Resampling.BICUBIC)
+    inside = Image.new("L", image.size, 255).rotate(angle, Image.Resampling.BICUBIC)
+    shown = np.asarray(inside) == 255
+    assert shown.mean() > 0.6
+    difference = np.abs(found.astype(int) - np.asarray(image))[shown]
+    # At the border of what it has, Pillow mixes repeated pixels where the mirror has others.
+    assert np.percentile(difference, 99) <= 1
+
+
+def test_a_stretched_frame_turns_as_the_camera_saw_it(make_frame: Callable[..., Frame]) -> None:
+    def wide(image: NDArray[np.uint8]) -> Frame:
+        return np.asarray(Image.fromarray(image).resize((400, 160), Image.Resampling.BICUBIC))
+
+    frame = make_frame(4, 200, 200)
+    turned = replace(PLAIN, rotation_deg=12.0)
+    found, expected = turned.apply(wide(frame), widened=2.5), wide(turned.apply(frame))
+    assert np.abs(found.astype(int) - expected).mean() < 2
+    assert np.abs(turned.apply(wide(frame)).astype(int) - expected).mean() > 10
+
+
+def test_a_crop_is_pillows_box_resized_back(make_frame: Callable[..., Frame]) -> None:
+    frame = make_frame(2, 120, 160)
+    found = replace(PLAIN, side=0.75, offset=(0.125, -0.125)).apply(frame)
+    expected = Image.fromarray(frame).resize(
+        (160, 120), Image.Resampling.BICUBIC, box=(40, 0, 160, 90)
+    )
+    assert np.abs(found.astype(int) - np.asarray(expected)).max() <= 6
+    # An affine resampling rounds down, a resize to the nearest.
+    assert np.abs(found.astype(int) - np.asarray(expected)).mean() < 1
+
+
+@pytest.mark.parametrize("name", ["brightness", "contrast", "saturation"])
+@pytest.mark.parametrize("factor", [0.7, 1.3])
+def test_light_is_pillows_enhancement(
+    make_frame: Callable[..., Frame], name: str, factor: float
+) -> None:
+    frame = (make_frame(3) * 0.6 + 40).astype(np.uint8)  # clear of both ends of the range
+    enhancer = {"saturation": "Color"}.get(name, name.capitalize())
+    expected = getattr(ImageEnhance, enhancer)(Image.fromarray(frame)).enhance(factor)
+    found = replace(PLAIN, **{name: factor}).apply(frame)
+    assert np.abs(found.astype(int) - np.asarray(expected)).max() <= 2
+
+
+@given(
+    height=st.integers(1, 40),
+    width=st.integers(1, 40),
+    angle=st.floats(-45, 45),
+    side=st.floats(0.05, 1),
+    where=st.tuples(st.floats(-1, 1), st.floats(-1, 1)),
+)
+def test_no_size_or_draw_shows_what_the_frame_has_not(
+    height: int, width: int, angle: float, side: float, where: tuple[float, float]
+) -> None:
+    frame = np.full((height, width, 3), (200, 90, 30), np.uint8)
+    offset = (where[0] * (1 - side) / 2, where[1] * (1 - side) / 2)
+    found = replace(PLAIN, rotation_deg=angle, side=side, offset=offset).apply(frame)
+    assert found.shape == frame.shape
+    assert np.array_equal(found, frame), "beyond its edge the frame is mirrored, not black"
+
+
+class TestPreparer:
+    @pytest.fixture
+    def frames(self, make_frame: Callable[..., Frame]) -> dict[str, Frame]:
+        return {view: make_frame(seed) for seed, view in enumerate(("View1", "View2"))}
+
+    def test_variant_0_is_the_plain_row_and_all_have_its_layout(
+        self, extractor: Callable[..., Any], frames: dict[str, Frame]
+    ) -> None:
+        ours = extractor(variants=3)
+        key = row_key(ours.spec, "prompt", frames)
+        rows = ours.preparer.prepare_variants("go", frames, key)
+        plain = extractor().preparer.prepare("go", frames)
+        assert len(rows) == 3
+        assert np.array_equal(rows[0].pixels, plain.pixels)
+        assert {row.layout for row in rows} == {plain.layout}
+        for a, b in ((0, 1), (0, 2), (1, 2)):
+            for view in range(2):
+                assert (rows[a].pixels[view] != rows[b].pixels[view]).mean() > 0.5
+
+    def test_cameras_are_drawn_apart_and_a_missing_one_is_missing_in_all(
+        self, extractor: Callable[..., Any], make_frame: Callable[..., Frame]
+    ) -> None:
+        ours = extractor(variants=2)
+        twins = {"View1": make_frame(0), "View2": make_frame(0)}
+        _, changed = ours.preparer.prepare_variants("go", twins, KEY)
+        assert not np.array_equal(changed.pixels[0], changed.pixels[1])
+        _, alone = ours.preparer.prepare_variants("go", {"View2": make_frame(0)}, KEY)
+        assert [view for view, _ in alone.layout.image_starts] == ["View2"]
+        assert np.array_equal(alone.pixels[0], changed.pixels[1])
+
+    def test_threads_prepare_the_same(
+        self, extractor: Callable[..., Any], frames: dict[str, Frame]
+    ) -> None:
+        ours = extractor(variants=4)
+        keys = [bytes([index] * 16) for index in range(12)]
+
+        def pixels(key: bytes) -> bytes:
+            rows = ours.preparer.prepare_variants("go", frames, key)
+            return b"".join(row.pixels.tobytes() for row in rows)
+
+        with ThreadPoolExecutor(4) as pool:
+            threaded = list(pool.map(pixels, keys))
+        assert threaded == [pixels(key) for key in keys]
+        assert len(set(threaded)) == len(keys)
+
+    def test_one_variant_is_the_plain_row(
+        self, extractor: Callable[..., Any], frames: dict[str, Frame]
+    ) -> None:
+        (only,) = extractor().preparer.prepare_variants("go", frames, KEY)
+        assert np.array_equal(only.pixels, extractor().preparer.prepare("go", frames).pixels)
