@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import PIL
 import torch
 import transformers
 from safetensors import SafetensorError
@@ -17,6 +18,7 @@ from transformers.utils import logging as transformers_logging
 from pipeline.config import VLMParams
 from pipeline.errors import VLMError
 from pipeline.vlm.checkpoint_folder import adapter_files, resolve_checkpoint, weight_files
+from pipeline.vlm.pixels import PixelSettings
 
 _UNUSED = {"lm_head.weight"}
 """Weights that a feature never meets: a checkpoint may lack them."""
@@ -28,26 +30,46 @@ def load_model(vlm: VLMParams, layers: int, device: torch.device) -> Any:
     Raises `VLMError` where a weight is missing or left over, a file is damaged, or the adapter
     does not fit: a model with a random weight is never returned.
     """
-    folder = resolve_checkpoint(vlm.checkpoint, vlm.revision)
-    weight_files(folder)
-    whole = _load_checkpoint(folder, vlm, device)
-    if vlm.adapter is not None:
-        adapter = resolve_checkpoint(vlm.adapter, setting="vlm.adapter")
-        whole = _merge_adapter(whole, adapter, folder)
     # The language-model head goes with the wrapper: it would cost as much as a small model.
-    model = whole.model
-    model.language_model.layers = model.language_model.layers[:layers]
+    model = cut(load_whole(vlm, device), layers).model
     return model.eval().requires_grad_(False).to(device)
 
 
+def load_whole(vlm: VLMParams, device: torch.device, dtype: str | None = None) -> Any:
+    """The whole `Qwen2_5_VLForConditionalGeneration`, its adapter merged, on the CPU.
+
+    `dtype` replaces that of `vlm`: "auto" is what the files hold. `device` is where the model is
+    meant to run. Raises as `load_model`.
+    """
+    whole = load_checkpoint(vlm, device, dtype)
+    return whole if vlm.adapter is None else adapted(whole, vlm).merge_and_unload(safe_merge=True)
+
+
+def cut(whole: Any, layers: int) -> Any:
+    """The same model with its first `layers` decoder layers only."""
+    text = whole.model.language_model
+    text.layers = text.layers[:layers]
+    return whole
+
+
+def pixel_settings(vlm: VLMParams) -> PixelSettings:
+    """What the checkpoint's image processor does to a frame."""
+    folder = resolve_checkpoint(vlm.checkpoint, vlm.revision)
+    return PixelSettings.read(folder, (vlm.image_resize_height, vlm.image_resize_width))
+
+
 def environment(model: Any, device: torch.device) -> dict[str, str]:
-    """What may move a feature within its dtype's noise: backends, versions, device."""
+    """What may move a feature within its dtype's noise: backends, versions, device.
+
+    Pillow is what stretches and augments frames.
+    """
     cuda = device.type == "cuda"
     return {
         "attention": str(model.language_model.config._attn_implementation),
         "vision_attention": str(model.visual.config._attn_implementation),
         "torch": torch.__version__,
         "transformers": transformers.__version__,
+        "pillow": PIL.__version__,
         "device": torch.cuda.get_device_name(device) if cuda else device.type,
     }
 
@@ -79,7 +101,10 @@ def _attention(vlm: VLMParams, device: torch.device) -> str:
     return "flash_attention_2" if flash else "sdpa"
 
 
-def _load_checkpoint(folder: Path, vlm: VLMParams, device: torch.device) -> Any:
+def load_checkpoint(vlm: VLMParams, device: torch.device, dtype: str | None = None) -> Any:
+    """As `load_whole`, without the adapter."""
+    folder = resolve_checkpoint(vlm.checkpoint, vlm.revision)
+    weight_files(folder)
     attention = _attention(vlm, device)
     if attention == "flash_attention_2" and (device.type != "cuda" or vlm.dtype == "float32"):
         raise VLMError(
@@ -90,7 +115,7 @@ def _load_checkpoint(folder: Path, vlm: VLMParams, device: torch.device) -> Any:
         with quiet_transformers():
             loaded: Any = Qwen2_5_VLForConditionalGeneration.from_pretrained(
                 folder,
-                dtype=getattr(torch, vlm.dtype),
+                dtype=dtype or vlm.dtype,
                 attn_implementation=attention,
                 local_files_only=True,
                 output_loading_info=True,
@@ -107,27 +132,38 @@ def _load_checkpoint(folder: Path, vlm: VLMParams, device: torch.device) -> Any:
     return model
 
 
-def _merge_adapter(model: Any, folder: Path, checkpoint: Path) -> Any:
-    """The model with a peft adapter added into its weights."""
-    from peft import PeftModel
+def adapted(whole: Any, vlm: VLMParams, dropout: float | None = None) -> Any:
+    """The model with `vlm.adapter` on it, not merged: a `PeftModel`.
 
+    With a `dropout` the adapter learns on, under that dropout. Raises `VLMError` where it does not
+    fit the checkpoint, or cannot be merged.
+    """
+    from peft import PeftConfig, PeftModel
+
+    assert vlm.adapter is not None, "no adapter to load"
+    folder = resolve_checkpoint(vlm.adapter, setting="vlm.adapter")
     adapter_files(folder)
     try:
         with warnings.catch_warnings():
             # peft only warns of missing weights; the report of a second load is checked instead.
             warnings.simplefilter("ignore")
-            adapted = PeftModel.from_pretrained(model, str(folder))
-            report = adapted.load_adapter(str(folder), adapter_name="default")
+            config: Any = PeftConfig.from_pretrained(str(folder))
+            if dropout is not None:
+                config.lora_dropout = dropout
+            learns = dropout is not None
+            found: Any = PeftModel.from_pretrained(
+                whole, str(folder), config=config, is_trainable=learns
+            )
+            report = found.load_adapter(str(folder), adapter_name="default", is_trainable=learns)
     except (OSError, ValueError, RuntimeError, KeyError, TypeError, SafetensorError) as error:
         raise VLMError(
-            f"{folder}: this adapter does not fit the checkpoint {checkpoint}: {error}. Set "
+            f"{folder}: this adapter does not fit the checkpoint {vlm.checkpoint}: {error}. Set "
             "vlm.adapter to one that was trained on this checkpoint, or to null."
         ) from error
     _refuse_strange(folder, set(report.missing_keys), set(report.unexpected_keys), "adapter")
-    if not hasattr(adapted, "merge_and_unload"):
-        kind = adapted.peft_config["default"].peft_type
-        raise VLMError(f"{folder}: a {kind} adapter cannot be merged into weights; use LoRA")
-    return adapted.merge_and_unload(safe_merge=True)
+    if not hasattr(found, "merge_and_unload"):
+        raise VLMError(f"{folder}: a {config.peft_type} adapter cannot be merged; use LoRA")
+    return found
 
 
 def _refuse_strange(folder: Path, missing: set[str], unexpected: set[str], what: str) -> None:

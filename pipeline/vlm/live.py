@@ -1,0 +1,126 @@
+"""The Qwen2.5-VL that learns: features with gradients, and what it has learned on disk."""
+
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from pipeline.config import TuningParams, VLMParams
+from pipeline.device import resolve_device
+from pipeline.digests import file_digest
+from pipeline.errors import VLMError
+from pipeline.vlm.extractor import Extractor, layers_needed
+from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
+from pipeline.vlm.loading import load_model, pixel_settings
+from pipeline.vlm.preparation import PreparedRow
+from pipeline.vlm.tuning import load_adapting, load_learning, save_adapter, save_checkpoint
+
+
+def live_spec(vlm: VLMParams, views: Sequence[str]) -> FeatureSpec:
+    """The spec of the features that a live model of `vlm` gives, every file digested anew."""
+    return feature_spec(vlm, "float32", views, file_digest)
+
+
+class LiveVLM(nn.Module):
+    """A Qwen2.5-VL that computes the features of `spec` from prepared rows, and may learn.
+
+    What learns has `requires_grad`: nothing, low-rank adapters on the linear layers of the chosen
+    towers, or every weight of those towers, and is held in float32. The rest computes as in
+    `FrozenVLM`, so both give the same features within the noise of `vlm.dtype`. In `train()` mode
+    adapters drop out and activations are checkpointed.
+
+    `copy.deepcopy` with a memo of the frozen parameters shares them.
+    """
+
+    spec: FeatureSpec
+    vlm: VLMParams
+    tuning: TuningParams
+
+    def __init__(
+        self,
+        model: nn.Module,
+        extractor: Extractor,
+        spec: FeatureSpec,
+        vlm: VLMParams,
+        tuning: TuningParams,
+    ) -> None:
+        """Wrap `model`, which is or holds the extractor's inner model."""
+        super().__init__()
+        self.model = model
+        self.spec, self.vlm, self.tuning = spec, vlm, tuning
+        self._extractor = extractor
+        self._beyond: dict[str, Tensor] = {}
+
+    @classmethod
+    def load(
+        cls, vlm: VLMParams, spec: FeatureSpec, tuning: TuningParams, device: str = "auto"
+    ) -> "LiveVLM":
+        """The checkpoint of `vlm`, cut after the last layer needed, as `tuning` lets it learn.
+
+        With `vlm.adapter`, `lora` goes on learning that adapter; `none` and `full` merge it first.
+        Raises `VLMError` as `FrozenVLM.load` does, where the adapter is not what `tuning` says,
+        and for float16, whose gradients underflow.
+        """
+        target = resolve_device(device)
+        layers = layers_needed(spec.slots)
+        if tuning.method != "none" and vlm.dtype == "float16":
+            raise VLMError(
+                "vlm.dtype float16 is too narrow for gradients. Set it to bfloat16 or float32 to "
+                "tune the model."
+            )
+        model: Any
+        beyond: dict[str, Tensor] = {}
+        if tuning.method == "none":
+            model = inner = load_model(vlm, layers, target)
+        elif tuning.method == "full":
+            model = inner = load_learning(vlm, tuning, spec.slots, layers, target)
+        else:
+            model, beyond = load_adapting(vlm, tuning, layers, target)
+            inner = model.base_model.model.model
+        if tuning.method != "none" and tuning.gradient_checkpointing:
+            inner.activation_checkpointing_enable({"use_reentrant": False})
+            # Image tokens are written into the embeddings in place, which a leaf would refuse;
+            # without re-entrance checkpoints need no input that requires gradients.
+            inner.disable_input_require_grads()
+        extractor = Extractor(inner, pixel_settings(vlm), spec.slots)
+        live = cls(model.to(target), extractor, spec, vlm, tuning)
+        live._beyond = beyond
+        return live
+
+    def forward(
+        self, rows: Sequence[PreparedRow]
+    ) -> tuple[Float[Tensor, "row slot dim"], Bool[Tensor, "row slot"]]:
+        """Features of each row in float32 and which slots are valid, on the model's device.
+
+        A slot whose view is missing is zero and invalid; a row is the same, within the compute
+        dtype's noise, whatever rows stand beside it. Computed in `vlm.dtype` whatever autocast
+        the caller is in.
+        """
+        with self._precision():
+            features, valid = self._extractor.extract(rows)
+        return features, valid.to(features.device)
+
+    def save(self, folder: Path) -> None:
+        """Write what has been learned into `folder`, made if need be.
+
+        `lora`: a peft adapter for `vlm.adapter`; `full`: a whole checkpoint for `vlm.checkpoint`
+        (then with `vlm.adapter` null), weights in the dtype of the base's files; `none`: nothing.
+        Raises `DiskFull`.
+        """
+        if self.tuning.method == "none":
+            return
+        folder.mkdir(parents=True, exist_ok=True)
+        if self.tuning.method == "lora":
+            save_adapter(folder, self.model, self._beyond)
+        else:
+            save_checkpoint(folder, self.vlm, self.model.state_dict())
+
+    def _precision(self) -> AbstractContextManager[Any]:
+        """Weights of the compute dtype need no autocast, float32 ones that learn do."""
+        device = self._extractor.model.device.type
+        half = self.tuning.method == "full" and self.vlm.dtype != "float32"
+        return torch.autocast(device, getattr(torch, self.vlm.dtype) if half else None, half)

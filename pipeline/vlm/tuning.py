@@ -1,0 +1,191 @@
+"""What of the model learns, and what is written of what it has learned."""
+
+import re
+import shutil
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import load_file
+from torch import Tensor, nn
+
+from pipeline.config import TuningParams, VLMParams
+from pipeline.durable import disk_full_named, sync, write_tensors
+from pipeline.errors import VLMError
+from pipeline.vlm.checkpoint_folder import resolve_checkpoint
+from pipeline.vlm.loading import adapted, cut, load_checkpoint, load_whole, quiet_transformers
+from pipeline.vlm.slots import Slot
+
+TOWERS = {"language": "model.language_model.", "vision": "model.visual."}
+"""Where each tower stands in a `Qwen2_5_VLForConditionalGeneration`."""
+
+_COMPANIONS = (
+    "config.json",
+    "generation_config.json",
+    "preprocessor_config.json",
+    "processor_config.json",
+    "video_preprocessor_config.json",
+    "chat_template.json",
+    "chat_template.jinja",
+    "tokenizer.json",
+    "tokenizer_config.json",
+    "vocab.json",
+    "merges.txt",
+    "added_tokens.json",
+    "special_tokens_map.json",
+)
+"""What a checkpoint folder holds beside its weights."""
+
+
+def load_adapting(
+    vlm: VLMParams, tuning: TuningParams, layers: int, device: torch.device
+) -> tuple[Any, dict[str, Tensor]]:
+    """A `PeftModel` of the first `layers` layers whose low-rank adapters learn, on the CPU.
+
+    They stand on every linear layer of the chosen towers; with `vlm.adapter` they are those of
+    that adapter, gone on from. Also the adapter's weights on layers beyond, which it keeps.
+    Raises `VLMError` where the adapter is of another rank, scale or towers than `tuning` says.
+    """
+    whole = load_checkpoint(vlm, device)
+    # A feature never meets the head.
+    whole.lm_head = nn.Identity()
+    if vlm.adapter is None:
+        model, beyond = _fresh_adapter(whole, vlm, tuning, layers), {}
+    else:
+        model = adapted(whole, vlm, tuning.lora_dropout)
+        _check_goes_on(model, vlm, tuning)
+        beyond = _beyond(model, layers)
+    cut(whole, layers)
+    model.requires_grad_(False)
+    for name, parameter in model.named_parameters():
+        parameter.requires_grad = "lora_" in name and any(
+            name.startswith(f"base_model.model.{TOWERS[tower]}") for tower in tuning.towers
+        )
+    model.peft_config["default"].base_model_name_or_path = vlm.checkpoint
+    model.peft_config["default"].revision = vlm.revision
+    return model, beyond
+
+
+def load_learning(
+    vlm: VLMParams, tuning: TuningParams, slots: tuple[Slot, ...], layers: int, device: torch.device
+) -> Any:
+    """The inner model of the first `layers` layers with every weight of the towers learning.
+
+    Those weights are float32 whatever `vlm.dtype`, which small steps would be lost in.
+    """
+    whole = cut(load_whole(vlm, device), layers)
+    whole.requires_grad_(False)
+    for tower in tuning.towers:
+        whole.get_submodule(TOWERS[tower].rstrip(".")).float().requires_grad_(True)
+    if not any(slot.norm for slot in slots):
+        # Nothing reads what the final norm gives.
+        whole.model.language_model.norm.requires_grad_(False)
+    return whole.model
+
+
+def save_adapter(folder: Path, model: Any, beyond: Mapping[str, Tensor]) -> None:
+    """Write the adapter of a `PeftModel` in peft's format, and what it keeps beyond the model.
+
+    Raises `DiskFull`.
+    """
+    weights = folder / "adapter_model.safetensors"
+    with disk_full_named(folder):
+        # Whether embeddings were resized would be asked of the hub: they never are.
+        model.save_pretrained(str(folder), save_embedding_layers=False)
+        # A template of a model card with nothing filled in.
+        (folder / "README.md").unlink(missing_ok=True)
+        if beyond:
+            write_tensors(weights, load_file(weights) | dict(beyond))
+        _finish(folder)
+
+
+def save_checkpoint(folder: Path, vlm: VLMParams, tuned: Mapping[str, Tensor]) -> None:
+    """Write the checkpoint of `vlm` with these weights of its inner model in place of its own.
+
+    Every other weight, in the files' own dtype, and every other file is the base's (with
+    `vlm.adapter` merged). Raises `DiskFull`.
+    """
+    plain = vlm.model_copy(update={"attention": "sdpa"})
+    whole = load_whole(plain, torch.device("cpu"), dtype="auto")
+    report = whole.model.load_state_dict(dict(tuned), strict=False)
+    assert not report.unexpected_keys, report.unexpected_keys
+    base = resolve_checkpoint(vlm.checkpoint, vlm.revision)
+    with disk_full_named(folder), quiet_transformers():
+        whole.save_pretrained(folder)
+        for name in _COMPANIONS:
+            if (base / name).exists():
+                shutil.copyfile(base / name, folder / name)
+        _finish(folder)
+
+
+def _fresh_adapter(whole: Any, vlm: VLMParams, tuning: TuningParams, layers: int) -> Any:
+    from peft import LoraConfig, get_peft_model
+
+    config = LoraConfig(
+        r=tuning.lora_r,
+        lora_alpha=tuning.lora_alpha,
+        lora_dropout=tuning.lora_dropout,
+        target_modules=_targets(whole, tuning, layers),
+    )
+    with warnings.catch_warnings():
+        # peft 0.21 reads an attribute that transformers 5.23 calls deprecated.
+        warnings.filterwarnings("ignore", "`is_gradient_checkpointing`", FutureWarning)
+        return get_peft_model(whole, config)
+
+
+def _targets(whole: Any, tuning: TuningParams, layers: int) -> str:
+    """A regular expression that matches the linear layers that run, and no other module.
+
+    It goes into the adapter's config, where a set of names would stand in random order.
+    """
+    kept = "|".join(map(str, range(layers)))
+    patterns: dict[str, None] = {}
+    for name, module in whole.named_modules():
+        if isinstance(module, nn.Linear) and name.startswith(_prefixes(tuning)):
+            pattern = re.sub(r"(blocks\\\.)\d+", r"\1\\d+", re.escape(name))
+            patterns[re.sub(r"(layers\\\.)\d+", rf"\1({kept})", pattern)] = None
+    return "|".join(patterns)
+
+
+def _prefixes(tuning: TuningParams) -> tuple[str, ...]:
+    return tuple(TOWERS[tower] for tower in tuning.towers)
+
+
+def _check_goes_on(model: Any, vlm: VLMParams, tuning: TuningParams) -> None:
+    config = model.peft_config["default"]
+    found = f"lora_r {config.r}, lora_alpha {config.lora_alpha}"
+    asked = f"lora_r {tuning.lora_r}, lora_alpha {tuning.lora_alpha}"
+    if found != asked:
+        raise VLMError(
+            f"{vlm.adapter}: tuning goes on from this adapter of {found}, but {asked} is asked "
+            "for. Set finetune.tuning to the adapter's values, or vlm.adapter to null."
+        )
+    names = [name for name, _ in model.named_parameters() if "lora_" in name]
+    for tower in tuning.towers:
+        if not any(name.startswith(f"base_model.model.{TOWERS[tower]}") for name in names):
+            raise VLMError(
+                f"{vlm.adapter}: tuning goes on from this adapter, which has nothing in the "
+                f"{tower} tower. Leave it out of finetune.tuning.towers, or set vlm.adapter to "
+                "null."
+            )
+
+
+def _beyond(model: Any, layers: int) -> dict[str, Tensor]:
+    """The adapter's weights on decoder layers that do not run, by their names in its file."""
+    place = re.compile(r"\.language_model\.layers\.(\d+)\..*\.lora_")
+    found = ((name, place.search(name), tensor) for name, tensor in model.state_dict().items())
+    return {
+        name.replace(".default.", "."): tensor
+        for name, match, tensor in found
+        if match and int(match[1]) >= layers
+    }
+
+
+def _finish(folder: Path) -> None:
+    """Give the files what the umask leaves (safetensors writes for the owner alone); sync them."""
+    for file in folder.iterdir():
+        file.chmod(folder.stat().st_mode & 0o666)
+        sync(file)
+    sync(folder)

@@ -1,0 +1,305 @@
+"""The live model gives the frozen one's features, learns what it should, and saves it."""
+
+import copy
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from safetensors.torch import load_file
+from torch import Tensor
+from transformers import Qwen2_5_VLForConditionalGeneration
+
+from pipeline.config import TuningParams
+from pipeline.errors import VLMError
+from pipeline.vlm.live import LiveVLM
+from pipeline.vlm.preparation import PreparedRow
+
+POOLING = {"pooling": ["mean", "view_mean", "last"]}
+BF16_TOLERANCE = 0.06
+"""Largest relative error of a slot that bfloat16 makes: as between two batches of frozen rows."""
+
+
+@pytest.fixture(scope="module")
+def jobs(make_frame: Callable[..., NDArray[np.uint8]]) -> list[tuple[str, dict[str, Any]]]:
+    """Rows of different length and views, one without any."""
+    frames = {view: make_frame(seed) for seed, view in enumerate(("View1", "View2", "View3"))}
+    return [
+        ("insert the needle", frames),
+        ("move slowly to the left", {"View2": frames["View2"]}),
+        ("hold", {}),
+    ]
+
+
+@pytest.fixture(scope="module")
+def prepare(extractor: Callable[..., Any], jobs: list[Any]) -> Callable[..., Any]:
+    """The frozen extractor of some params, its rows and their features."""
+
+    def make(*args: Any, **changes: Any) -> tuple[Any, list[PreparedRow], Tensor]:
+        frozen = extractor(*args, **(POOLING | changes))
+        rows = [frozen.preparer.prepare(*job) for job in jobs]
+        return frozen, rows, frozen.model.encode(rows)[0]
+
+    return make
+
+
+def _live(frozen: Any, **tuning: Any) -> LiveVLM:
+    torch.manual_seed(0)
+    return LiveVLM.load(frozen.vlm, frozen.spec, TuningParams(**tuning), "cpu")
+
+
+def _stir(live: LiveVLM, strength: float = 0.05) -> None:
+    """Move what learns, as a training would: adapters begin as zero."""
+    generator = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        for parameter in _learning(live).values():
+            scale = strength * parameter.std() if parameter.std() > 0 else strength
+            parameter += scale * torch.randn(parameter.shape, generator=generator)
+
+
+def _learning(live: LiveVLM) -> dict[str, torch.nn.Parameter]:
+    return {name: p for name, p in live.named_parameters() if p.requires_grad}
+
+
+def _gradients(live: LiveVLM, rows: list[PreparedRow]) -> dict[str, Tensor]:
+    torch.manual_seed(3)
+    features, _ = live(rows)
+    weights = torch.randn(features.shape, generator=torch.Generator().manual_seed(2))
+    (features * weights).sum().backward()
+    found = {}
+    for name, parameter in _learning(live).items():
+        assert parameter.grad is not None, f"no gradient at {name}"
+        found[name] = parameter.grad.clone()
+    live.zero_grad()
+    return found
+
+
+def _relative(a: Tensor, b: Tensor) -> Tensor:
+    return (a - b).norm(dim=-1) / b.norm(dim=-1).clamp(min=1e-6)
+
+
+@pytest.mark.parametrize("method", ["none", "lora", "full"])
+def test_an_untrained_live_model_is_the_frozen_one(
+    prepare: Callable[..., Any], method: str
+) -> None:
+    frozen, rows, expected = prepare(layers=[-1, 1], norms=[True, False])
+    live = _live(frozen, method=method).eval()
+    features, valid = live(rows)
+    torch.testing.assert_close(features, expected, atol=2e-5, rtol=1e-4)
+    assert torch.equal(valid, frozen.model.encode(rows)[1])
+    assert features.requires_grad == (method != "none")
+    assert bool(_learning(live)) == (method != "none")
+
+
+@pytest.mark.parametrize("method", ["none", "lora", "full"])
+def test_bfloat16_agrees_within_its_noise(prepare: Callable[..., Any], method: str) -> None:
+    frozen, rows, expected = prepare("bfloat16", dtype="bfloat16")
+    live = _live(frozen, method=method).eval()
+    features, valid = live(rows)
+    assert features.dtype == torch.float32
+    assert _relative(features, expected.float())[valid].max() < BF16_TOLERANCE
+    assert {p.dtype for p in _learning(live).values()} <= {torch.float32}
+    with torch.autocast("cpu", torch.bfloat16):
+        torch.testing.assert_close(live(rows)[0], features)
+
+
+@pytest.mark.parametrize(
+    ("tuning", "towers"),
+    [
+        ({"method": "lora"}, {"language_model", "visual"}),
+        ({"method": "lora", "towers": ["vision"]}, {"visual"}),
+        ({"method": "full"}, {"language_model", "visual"}),
+        ({"method": "full", "towers": ["language"]}, {"language_model"}),
+    ],
+)
+def test_gradients_reach_all_that_learns_with_checkpointing_or_without(
+    prepare: Callable[..., Any], tuning: dict[str, Any], towers: set[str]
+) -> None:
+    frozen, rows, _ = prepare(layers=[2])
+    found = []
+    for checkpointing in (True, False):
+        live = _live(frozen, **tuning, gradient_checkpointing=checkpointing)
+        _stir(live)
+        found.append(_gradients(live.train(), rows))
+    assert {tower for name in found[0] for tower in towers if tower in name} == towers
+    assert not any(name for name in found[0] if not any(tower in name for tower in towers))
+    assert found[0].keys() == found[1].keys()
+    for name, gradient in found[0].items():
+        assert gradient.any(), f"{name} has a gradient of zeros"
+        torch.testing.assert_close(gradient, found[1][name], atol=1e-5, rtol=1e-4)
+
+
+def test_checkpointing_recomputes_blocks_in_the_backward_pass(prepare: Callable[..., Any]) -> None:
+    frozen, rows, _ = prepare()
+    runs = {}
+    for checkpointing in (True, False):
+        live = _live(frozen, gradient_checkpointing=checkpointing).train()
+        model: Any = live.model
+        calls: list[int] = []
+        model.base_model.model.model.visual.blocks[0].attn.register_forward_hook(
+            lambda *_, calls=calls: calls.append(1)
+        )
+        _gradients(live, rows)
+        runs[checkpointing] = len(calls)
+    assert runs == {True: 2, False: 1}
+
+
+def test_lora_stands_on_every_linear_layer_that_runs(prepare: Callable[..., Any]) -> None:
+    frozen, _, _ = prepare(layers=[1])
+    live = _live(frozen, lora_r=3)
+    names = {name.partition(".lora_")[0] for name in _learning(live)}
+    linear = {
+        f"model.base_model.model.{name}"
+        for name, module in Qwen2_5_VLForConditionalGeneration.from_pretrained(
+            frozen.vlm.checkpoint
+        ).named_modules()
+        if isinstance(module, torch.nn.Linear) and name != "lm_head"
+    }
+    beyond = {name for name in linear if ".layers.2." in name or ".layers.3." in name}
+    assert names == linear - beyond
+    assert all(3 in parameter.shape for parameter in _learning(live).values())
+
+
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+def test_a_saved_adapter_makes_the_frozen_model_the_live_one(
+    prepare: Callable[..., Any], tmp_path: Path, dtype: str
+) -> None:
+    frozen, rows, before = prepare(dtype, dtype=dtype, layers=[2])
+    live = _live(frozen, lora_r=4, lora_alpha=8)
+    _stir(live)
+    live.save(tmp_path / "adapter")
+    assert {path.name for path in (tmp_path / "adapter").iterdir()} == {
+        "adapter_config.json",
+        "adapter_model.safetensors",
+    }
+    config = json.loads((tmp_path / "adapter" / "adapter_config.json").read_text())
+    assert config["base_model_name_or_path"] == frozen.vlm.checkpoint
+    assert (config["peft_type"], config["r"], config["lora_alpha"]) == ("LORA", 4, 8)
+
+    tuned, _, after = prepare(dtype, dtype=dtype, layers=[2], adapter=str(tmp_path / "adapter"))
+    assert tuned.spec.digest != frozen.spec.digest
+    with torch.no_grad():
+        features, valid = live.eval()(rows)
+    moved = _relative(after.float(), before.float())[valid].mean()
+    if dtype == "float32":
+        torch.testing.assert_close(features, after, atol=5e-5, rtol=1e-4)
+        assert moved > 0.05
+    else:
+        assert _relative(features, after.float())[valid].max() < BF16_TOLERANCE
+        assert moved > 2 * _relative(features, after.float())[valid].mean()
+
+
+def test_the_same_adapter_is_the_same_file(prepare: Callable[..., Any], tmp_path: Path) -> None:
+    frozen, _, _ = prepare()
+    for name in ("one", "two"):
+        _live(frozen).save(tmp_path / name)
+    for file in ("adapter_config.json", "adapter_model.safetensors"):
+        first, second = ((tmp_path / name / file).read_bytes() for name in ("one", "two"))
+        assert first == second
+
+
+def test_tuning_goes_on_from_an_adapter(prepare: Callable[..., Any], tmp_path: Path) -> None:
+    whole, _, _ = prepare()
+    first = _live(whole, lora_r=4, lora_alpha=8)
+    _stir(first)
+    first.save(tmp_path / "first")
+
+    # A lower layer is read now: what the adapter has above it must not be lost.
+    frozen, rows, expected = prepare(layers=[1], adapter=str(tmp_path / "first"))
+    second = _live(frozen, lora_r=4, lora_alpha=8, lora_dropout=0.5, towers=["vision"])
+    torch.testing.assert_close(second.eval()(rows)[0], expected, atol=5e-5, rtol=1e-4)
+    assert all(".visual." in name for name in _learning(second))
+    assert (second.train()(rows)[0] - second(rows)[0]).abs().max() > 1e-3, "dropout is of tuning"
+    second.save(tmp_path / "second")
+    again = prepare(layers=[1], adapter=str(tmp_path / "second"))[2]
+    torch.testing.assert_close(again, expected)
+    saved = [load_file(tmp_path / n / "adapter_model.safetensors") for n in ("first", "second")]
+    assert saved[0].keys() == saved[1].keys()
+    assert all(torch.equal(saved[0][name], saved[1][name]) for name in saved[0])
+
+    with pytest.raises(VLMError, match=r"of lora_r 4, lora_alpha 8, but lora_r 16, lora_alpha 32"):
+        _live(frozen)
+    vision = _live(whole, lora_r=4, lora_alpha=8, towers=["vision"])
+    vision.save(tmp_path / "vision")
+    blind = prepare(adapter=str(tmp_path / "vision"))[0]
+    with pytest.raises(VLMError, match="nothing in the language tower"):
+        _live(blind, lora_r=4, lora_alpha=8)
+
+
+def test_full_saves_a_complete_checkpoint(
+    prepare: Callable[..., Any], demo_checkpoint: Path, tmp_path: Path
+) -> None:
+    adapted = _live(prepare()[0], lora_r=4, lora_alpha=8)
+    _stir(adapted)
+    adapted.save(tmp_path / "adapter")
+    frozen, rows, _ = prepare(layers=[1], adapter=str(tmp_path / "adapter"))
+    live = _live(frozen, method="full")
+    _stir(live)
+    live.save(tmp_path / "tuned")
+    checkpoint = str(tmp_path / "tuned")
+    tuned, _, features = prepare(layers=[1], checkpoint=checkpoint)
+    with torch.no_grad():
+        torch.testing.assert_close(live.eval()(rows)[0], features, atol=5e-5, rtol=1e-4)
+    assert tuned.spec.digest != frozen.spec.digest
+    assert tuned.spec.document["tokenizer"] == frozen.spec.document["tokenizer"]
+    for name in ("config.json", "preprocessor_config.json", "tokenizer.json"):
+        assert (tmp_path / "tuned" / name).read_bytes() == (demo_checkpoint / name).read_bytes()
+
+    # Layers above the last that a slot reads are the base's, with the adapter merged.
+    names = load_file(demo_checkpoint / "model.safetensors").keys()
+    saved = load_file(tmp_path / "tuned" / "model.safetensors")
+    assert saved.keys() == names
+    above = prepare(adapter=str(tmp_path / "adapter"))[0].model._model.language_model.layers[3]
+    whole = prepare(checkpoint=checkpoint)[0].model._model.language_model.layers[3]
+    for one, other in zip(above.parameters(), whole.parameters(), strict=True):
+        torch.testing.assert_close(one, other)
+
+
+def test_full_keeps_the_dtype_of_its_base(
+    prepare: Callable[..., Any], demo_checkpoint: Path, tmp_path: Path
+) -> None:
+    base = shutil.copytree(demo_checkpoint, tmp_path / "base")
+    model = Qwen2_5_VLForConditionalGeneration.from_pretrained(base, dtype=torch.bfloat16)
+    model.save_pretrained(base)
+    frozen, rows, _ = prepare("bfloat16", dtype="bfloat16", checkpoint=str(base))
+    live = _live(frozen, method="full")
+    _stir(live)
+    live.save(tmp_path / "tuned")
+    saved = load_file(tmp_path / "tuned" / "model.safetensors")
+    assert {tensor.dtype for tensor in saved.values()} == {torch.bfloat16}
+    again = prepare("bfloat16", dtype="bfloat16", checkpoint=str(tmp_path / "tuned"))[2]
+    features, valid = live.eval()(rows)
+    assert _relative(features, again.float())[valid].max() < BF16_TOLERANCE
+
+
+@pytest.mark.parametrize("method", ["none", "lora", "full"])
+def test_a_copy_shares_what_is_frozen(prepare: Callable[..., Any], method: str) -> None:
+    frozen, rows, _ = prepare()
+    live = _live(frozen, method=method).eval()
+    memo = {id(p): p for p in live.parameters() if not p.requires_grad}
+    twin = copy.deepcopy(live, memo)
+    pairs = zip(live.named_parameters(), twin.named_parameters(), strict=True)
+    for (name, mine), (its_name, its) in pairs:
+        assert name == its_name
+        assert (mine is its) == (not mine.requires_grad)
+    before = live(rows)[0]
+    assert torch.equal(twin(rows)[0], before)
+    _stir(twin)
+    assert torch.equal(live(rows)[0], before)
+    assert method == "none" or (twin(rows)[0] - before).abs().max() > 1e-3
+
+
+def test_none_saves_nothing_and_float16_does_not_learn(
+    prepare: Callable[..., Any], tmp_path: Path
+) -> None:
+    frozen, _, _ = prepare()
+    _live(frozen, method="none").save(tmp_path / "nothing")
+    assert not (tmp_path / "nothing").exists()
+    half = prepare("float16", dtype="float16")[0]
+    with pytest.raises(VLMError, match="float16 is too narrow for gradients"):
+        _live(half)
