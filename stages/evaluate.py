@@ -1,14 +1,26 @@
 """Judge a trained policy on the episodes it has not seen, beside three baselines.
 
-Writes metrics.json, tables (CSV) and pictures (PNG) into `evaluate.output`.
+Writes metrics.json, tables (CSV) and pictures (PNG) into `evaluate.output`, and judged.json, which
+says what was judged on what. With `evaluate.modalities`, judges again with each stream spoilt.
 """
 
 from pipeline.batches import Windows
 from pipeline.checkpoint import find_policy, load_policy
 from pipeline.config import Params
 from pipeline.device import resolve_device
-from pipeline.evaluation import check_store, held_out_ticks, judge, table, write_tables
-from pipeline.plots import write_plots
+from pipeline.durable import write_document
+from pipeline.evaluation import (
+    JUDGED,
+    check_store,
+    held_out_ticks,
+    judge,
+    judge_modalities,
+    judged_document,
+    modality_table,
+    table,
+    write_tables,
+)
+from pipeline.plots import write_modalities_plot, write_plots
 from pipeline.store import FeatureStore
 from stages.command import run
 
@@ -22,23 +34,39 @@ def main(params: Params) -> None:
     store = FeatureStore.open(wanted.store or params.train_head.store or params.extract.store)
     check_store(checkpoint, store)
     ticks = held_out_ticks(store, checkpoint.held_out_ticks, checkpoint.held_out_content)
+    policy = checkpoint.policy(device)
+    judged = judged_document(checkpoint, policy, store, wanted.samples, wanted.batch_size)
     print(
         f"{folder} (step {checkpoint.step}) on {len(ticks)} held-out ticks of "
-        f"{len(checkpoint.held_out_ticks)} episode(s) in {store.path}, device {device}"
+        f"{len(checkpoint.held_out_ticks)} episode(s) in {store.path}, device {device}, "
+        f"{judged['policy']['samples']} chunk(s) a tick",
+        flush=True,
     )
     comparison, predictions = judge(
-        checkpoint.policy(device),
+        policy,
         store,
         ticks,
         Windows.of(checkpoint.params),
         wanted.batch_size,
         checkpoint.normalization,
         progress=True,
+        samples=wanted.samples,
     )
+    study = None
+    if wanted.modalities:
+        study = judge_modalities(
+            checkpoint, policy, store, ticks, wanted.batch_size, wanted.samples, progress=True
+        )
     wanted.output.mkdir(parents=True, exist_ok=True)
-    files = write_tables(wanted.output, comparison, predictions, store)
-    files += write_plots(wanted.output, comparison, predictions, store)
+    files = write_tables(wanted.output, comparison, predictions, store, study)
+    write_document(wanted.output / JUDGED, judged)
+    files += [wanted.output / JUDGED, *write_plots(wanted.output, comparison, predictions, store)]
     print(table(comparison))
+    if study is not None:
+        files += write_modalities_plot(wanted.output, study)
+        print(f"\n{modality_table(study)}")
+    elif wanted.modalities:
+        print("streams were not spoilt: no held-out tick lies 200 ms into its episode")
     print(f"{wanted.output}: {', '.join(file.name for file in files)}")
 
 

@@ -9,7 +9,16 @@ import pytest
 from matplotlib.figure import Figure
 
 from pipeline import plots
-from pipeline.evaluation import Comparison, Group, Predictions, baselines, compare
+from pipeline.evaluation import (
+    Comparison,
+    Experiment,
+    Group,
+    ModalityStudy,
+    Predictions,
+    Spoilt,
+    baselines,
+    compare,
+)
 
 Drawn = tuple[Comparison, Predictions, SimpleNamespace]
 
@@ -147,3 +156,86 @@ def test_a_picture_never_writes_through_a_link(tmp_path: Path) -> None:
     (report / "timeline.png").hardlink_to(cache)
     plots.write_plots(report, *evaluated(1))  # type: ignore[arg-type]
     assert cache.read_bytes() == b"cached"
+
+
+def heights(figure: Figure) -> list[list[float]]:
+    """The heights of the bars of each panel, from left to right."""
+    return [[patch.get_height() for patch in axis.patches] for axis in figure.axes]
+
+
+def studied(*errors: float) -> ModalityStudy:
+    """A study whose policy, in the first dimension of two, is wrong by these, intact first."""
+
+    def judged(error: float) -> Comparison:
+        recorded = np.zeros((4, 1, 1), np.float32)
+        ticks = np.arange(4)
+        predictions = Predictions(
+            ticks, ticks // 2, recorded + np.float32(error), recorded, np.ones((4, 1), bool)
+        )
+        rules = {
+            name: np.full((4, 1, 1), wrong, np.float32)
+            for name, wrong in (("zero_action", 5), ("mean_action", 3), ("repeat_last", 4))
+        }
+        one = (Group("translation", "mm", (0,)),)
+        return compare(predictions, rules, ["dx"], ["mm"], one, np.ones(1))
+
+    ways = (("sensor", "zeroed"), ("sensor", "delayed 50 ms"), ("features", "shuffled"))
+    spoilt = tuple(
+        Spoilt(stream, how, judged(error))
+        for (stream, how), error in zip(ways, errors[1:], strict=True)
+    )
+    return ModalityStudy(judged(errors[0]), spoilt, (), 4)
+
+
+def test_what_each_stream_is_worth_stands_beside_intact_and_best_baseline(tmp_path: Path) -> None:
+    figure = plots.modalities(studied(0.5, 1.0, 0.75, 2.0))
+    assert [axis.get_title() for axis in figure.axes] == ["sensor", "features"]
+    assert heights(figure) == [[2.0, 1.5], [4.0]]
+    for axis in figure.axes:
+        assert [line.get_ydata()[0] for line in axis.lines] == [1.0, 6.0]
+    assert "mean training action" in figure.legends[0].get_texts()[1].get_text()
+    assert "4 held-out ticks, 4 chunk(s) a tick" in figure.get_suptitle()
+    assert "zeroed: every value at its training mean" in figure.legends[0].get_title().get_text()
+    (file,) = plots.write_modalities_plot(tmp_path, studied(0.5, 1.0, 0.75, 2.0))
+    assert file.read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_policy_without_error_is_drawn_too() -> None:
+    assert heights(plots.modalities(studied(0.0, 1.0, 0.0, 2.0))) == [[1.0, 0.0], [2.0]]
+
+
+def compared(errors: dict[str, float], rules: dict[str, float]) -> list[Experiment]:
+    """Two experiments an expert."""
+    return [
+        Experiment(
+            f"{expert}-{fusion}", expert, fusion, 10, 100, 1,
+            {"overall": {"policy": error, **rules}}, None,
+        )
+        for expert, error in errors.items()
+        for fusion in ("concat", "gated")
+    ]  # fmt: skip
+
+
+def test_experiments_are_bars_and_baselines_lines(tmp_path: Path) -> None:
+    rules = {"zero_action": 3.0, "mean_action": 2.0, "repeat_last": 1.0}
+    experiments = compared({"regression": 0.3, "diffusion": 0.4}, rules)
+    (axis,) = plots.comparison_of_experiments(experiments).axes
+    assert [patch.get_width() for patch in axis.patches] == [0.3, 0.3, 0.4, 0.4]
+    assert [line.get_xdata()[0] for line in axis.lines] == list(rules.values())
+    assert [label.get_text() for label in axis.get_yticklabels()] == [e.name for e in experiments]
+    assert [text.get_text() for text in axis.texts] == ["0.300", "0.300", "0.400", "0.400"]
+    (file,) = plots.write_experiments_plot(tmp_path, experiments)
+    assert file.read_bytes().startswith(b"\x89PNG")
+
+
+def test_numbers_of_experiments_lie_on_nothing() -> None:
+    """Errors just short of a baseline, where a number at the bar's end would lie on its line."""
+    rules = {"zero_action": 0.52, "mean_action": 0.46, "repeat_last": 0.45}
+    figure = plots.comparison_of_experiments(
+        compared({"regression": 0.44, "diffusion": 0.5}, rules)
+    )
+    figure.draw_without_rendering()
+    (axis,) = figure.axes
+    for text in axis.texts:
+        assert text.get_window_extent().x0 > axis.get_window_extent().x1
+        assert text.get_window_extent().x1 < figure.bbox.x1

@@ -1,5 +1,12 @@
 """A policy judged on recordings it has not seen, beside baselines that see nothing."""
 
+from pipeline.evaluation.cells import write_rows
+from pipeline.evaluation.experiments import (
+    Experiment,
+    experiment_rows,
+    experiments_table,
+    read_experiments,
+)
 from pipeline.evaluation.held_out import (
     check_store,
     held_out_contents,
@@ -7,30 +14,55 @@ from pipeline.evaluation.held_out import (
     held_out_ticks,
     judge,
 )
+from pipeline.evaluation.judged import JUDGED, judged_document
+from pipeline.evaluation.modalities import ModalityStudy, Spoilt, judge_modalities
+from pipeline.evaluation.modality_tables import FOOTNOTE as MODALITY_FOOTNOTE
+from pipeline.evaluation.modality_tables import best_baseline, modality_table
 from pipeline.evaluation.names import episode_name, place, with_unit
-from pipeline.evaluation.predictions import BASELINES, METHODS, Predictions, baselines, predict
+from pipeline.evaluation.predictions import (
+    BASELINES,
+    METHODS,
+    FeedMaker,
+    Predictions,
+    baselines,
+    predict,
+)
 from pipeline.evaluation.scores import Comparison, Group, Scores, compare
 from pipeline.evaluation.tables import metrics, table, write_tables
 
 __all__ = [
     "BASELINES",
+    "JUDGED",
     "METHODS",
+    "MODALITY_FOOTNOTE",
     "Comparison",
+    "Experiment",
+    "FeedMaker",
     "Group",
+    "ModalityStudy",
     "Predictions",
     "Scores",
+    "Spoilt",
     "baselines",
+    "best_baseline",
     "check_store",
     "compare",
     "episode_name",
+    "experiment_rows",
+    "experiments_table",
     "held_out_contents",
     "held_out_ranges",
     "held_out_ticks",
     "judge",
+    "judge_modalities",
+    "judged_document",
     "metrics",
+    "modality_table",
     "place",
     "predict",
+    "read_experiments",
     "table",
     "with_unit",
+    "write_rows",
     "write_tables",
 ]

@@ -8,9 +8,9 @@ from pipeline.batches import Ticks, Windows
 from pipeline.checkpoint import PolicyCheckpoint, describe, source_differences, source_of
 from pipeline.errors import CheckpointMismatch
 from pipeline.evaluation.names import episode_name
-from pipeline.evaluation.predictions import Predictions, baselines, predict
+from pipeline.evaluation.predictions import FeedMaker, Predictions, baselines, predict
 from pipeline.evaluation.scores import Comparison, Group, compare
-from pipeline.models import Policy, action_groups
+from pipeline.models import Trainable, action_groups
 from pipeline.normalization import Normalization
 from pipeline.store import FeatureStore
 
@@ -93,19 +93,21 @@ def check_store(checkpoint: PolicyCheckpoint, store: FeatureStore) -> None:
 
 
 def judge(
-    policy: Policy,
+    policy: Trainable,
     store: FeatureStore,
     ticks: Ticks,
     windows: Windows,
     batch_size: int,
     normalization: Normalization,
     progress: bool = False,
+    samples: int = 1,
+    feed: FeedMaker | None = None,
 ) -> tuple[Comparison, Predictions]:
     """The policy beside the baselines on these ticks, and its predictions there.
 
-    Raises `NumericsError` as `predict` does.
+    `samples`, `feed` and what is raised are those of `predict`.
     """
-    predictions = predict(policy, store, ticks, windows, batch_size, progress)
+    predictions = predict(policy, store, ticks, windows, batch_size, progress, samples, feed)
     action, statistics = store.streams["action"], normalization.action
     # A channel that does not vary has a scale of 1 that is not its spread.
     spread = np.where(statistics.scale == statistics.std, statistics.std, 0.0)

@@ -1,21 +1,28 @@
 """What a policy does at recorded ticks, and what simple rules would have done there."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor, nn
 from tqdm import tqdm
 
-from pipeline.batches import Prefetch, Ticks, Windows, draws
+from pipeline.batches import Draw, Feed, Prefetch, Ticks, Windows, draws
 from pipeline.errors import NumericsError
 from pipeline.evaluation.names import place
-from pipeline.models import Policy
+from pipeline.models import Observation, Trainable
 from pipeline.store import FeatureStore
 
 Actions = NDArray[np.float32]
 METHODS = ("policy", "zero_action", "mean_action", "repeat_last")
 BASELINES = METHODS[1:]
+FeedMaker = Callable[[Sequence[Draw]], Feed]
+"""Makes the feed of a plan: what a policy is to see at these ticks."""
+_SEED = 0
+_CHUNKS_AT_ONCE = 1024
+"""Chunks sampled in one forward pass at most, but one a tick: what bounds the memory."""
 
 
 @dataclass(frozen=True)
@@ -34,33 +41,39 @@ class Predictions:
 
 
 def predict(
-    policy: Policy,
+    policy: Trainable,
     store: FeatureStore,
     ticks: Ticks,
     windows: Windows,
     batch_size: int,
     progress: bool = False,
+    samples: int = 1,
+    feed: FeedMaker | None = None,
 ) -> Predictions:
     """What the policy, in evaluation mode, does at these ticks, beside what was recorded.
 
-    Runs on the policy's device. Sampling experts draw from a generator of fixed seed, so that the
-    same weights give the same figures. `progress` shows a bar on a terminal. Raises
-    `NumericsError`, naming episode, tick and time, where a prediction or a recorded action is NaN
-    or infinite.
+    Of a stochastic policy, the mean of `samples` chunks; any other gives one. Their noise comes
+    from one generator of fixed seed, batch after batch: the same weights give the same figures for
+    the same ticks, `samples` and `batch_size`, and a stochastic policy others for another
+    `batch_size`. Runs on the policy's device, which sees what `feed` hands out: by default the
+    store as it is, gathered ahead. `progress` shows a bar on a terminal. Raises `NumericsError`,
+    naming episode, tick and time, where a prediction or a recorded action is NaN or infinite.
     """
+    assert isinstance(policy, nn.Module)
     device = next(policy.parameters()).device
-    generator = torch.Generator(device).manual_seed(0)
+    # On the CPU, so that every device is given the same noise.
+    generator = torch.Generator().manual_seed(_SEED)
     plan = draws(ticks, batch_size)
     predicted, recorded, valid = [], [], []
     with (
         torch.inference_mode(),
-        Prefetch(store, plan, windows, device) as batches,
+        Prefetch(store, plan, windows, device) if feed is None else feed(plan) as batches,
         tqdm(
             total=len(ticks), desc="predicting", unit="tick", disable=None if progress else True
         ) as bar,
     ):
         for draw, batch in batches:
-            action = policy.act(batch, generator=generator)
+            action = _mean_chunk(policy, batch, len(draw.ticks), samples, generator)
             predicted.append(action.float().cpu().numpy())
             recorded.append(batch.action.cpu().numpy().copy())
             valid.append(batch.action_valid.cpu().numpy().astype(bool))
@@ -99,6 +112,24 @@ def baselines(
         "mean_action": zero + mean,
         "repeat_last": last[:, None],
     }
+
+
+def _mean_chunk(
+    policy: Trainable,
+    observation: Observation,
+    ticks: int,
+    samples: int,
+    generator: torch.Generator,
+) -> Tensor:
+    """The mean of the sampled chunks, (tick, horizon, action_dim), in float32."""
+    samples = samples if policy.stochastic else 1
+    at_once = max(1, _CHUNKS_AT_ONCE // ticks)
+    total: Tensor | float = 0.0
+    for done in range(0, samples, at_once):
+        chunks = policy.sample(observation, min(at_once, samples - done), generator)
+        total = total + chunks.float().sum(dim=0)
+    assert isinstance(total, Tensor)
+    return total / samples
 
 
 def _refuse_not_finite(

@@ -1,12 +1,14 @@
 """Scores -> what is printed, what DVC shows, what others plot."""
 
-import csv
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.durable import disk_full_named, fresh, write_document
+from pipeline.durable import write_document
+from pipeline.evaluation.cells import aligned, cell, numbers, ratio, write_rows
+from pipeline.evaluation.modalities import ModalityStudy
+from pipeline.evaluation.modality_tables import modality_metrics, modality_rows
 from pipeline.evaluation.names import with_unit
 from pipeline.evaluation.predictions import METHODS, Predictions
 from pipeline.evaluation.scores import Comparison
@@ -16,6 +18,7 @@ FOOTNOTE = (
     "repeat last: at an episode's first tick, which has none before it, it does nothing; where "
     "actions are absolute, it takes the mean training action"
 )
+METRICS = "metrics.json"
 HEADINGS = {
     "policy": "policy",
     "zero_action": "zero",
@@ -34,13 +37,13 @@ def metrics(comparison: Comparison) -> dict[str, Any]:
     """
     document: dict[str, Any] = {
         "held_out": {"episodes": len(comparison.episodes), "ticks": comparison.ticks},
-        "overall": _numbers(
+        "overall": numbers(
             {method: comparison.overall(method) for method in METHODS}
             | {"relative": comparison.relative()}
         ),
     }
     for group in comparison.groups:
-        document[group.key] = _numbers(
+        document[group.key] = numbers(
             {method: comparison.group_mae(method, group) for method in METHODS}
             | {
                 "relative": comparison.relative(group),
@@ -48,7 +51,7 @@ def metrics(comparison: Comparison) -> dict[str, Any]:
             }
         )
     document["dimension"] = {
-        f"{name}_{unit}" if unit else name: _numbers(
+        f"{name}_{unit}" if unit else name: numbers(
             {method: float(comparison.scores[method].mae[index]) for method in METHODS}
         )
         for index, (name, unit) in enumerate(zip(comparison.names, comparison.units, strict=True))
@@ -72,33 +75,35 @@ def table(comparison: Comparison) -> str:
         lines.append(_line(with_unit(group.name, group.unit), errors, comparison.relative(group)))
     errors = [comparison.overall(method) for method in METHODS]
     lines.append(_line("overall [training std]", errors, comparison.relative()))
-    widths = [max(len(line[column]) for line in lines) for column in range(len(head))]
-    rows = [
-        "  ".join(
-            cell.ljust(width) if column == 0 else cell.rjust(width)
-            for column, (cell, width) in enumerate(zip(line, widths, strict=True))
-        )
-        for line in lines
-    ]
-    return "\n".join([*rows, FOOTNOTE])
+    return "\n".join([*aligned(lines), FOOTNOTE])
 
 
 def write_tables(
-    folder: Path, comparison: Comparison, predictions: Predictions, store: FeatureStore
+    folder: Path,
+    comparison: Comparison,
+    predictions: Predictions,
+    store: FeatureStore,
+    study: ModalityStudy | None = None,
 ) -> list[Path]:
-    """Write metrics.json and, for plots, one CSV each by dimension, horizon, episode and tick."""
+    """Write metrics.json and, for plots, one CSV each by dimension, horizon, episode and tick.
+
+    And one by spoilt stream, and its figures among the metrics, where there is a `study`.
+    """
+    document = metrics(comparison)
     files = {
         "dimensions.csv": _dimension_rows(comparison),
         "horizon.csv": _horizon_rows(comparison),
         "episodes.csv": _episode_rows(comparison, store),
         "predictions.csv": _prediction_rows(comparison, predictions, store),
     }
-    write_document(folder / "metrics.json", metrics(comparison))
-    with disk_full_named(folder):
-        for name, rows in files.items():
-            with fresh(folder / name).open("w", encoding="utf-8", newline="") as file:
-                csv.writer(file, lineterminator="\n").writerows(rows)
-    return [folder / "metrics.json", *(folder / name for name in files)]
+    if study is not None:
+        document["modalities"] = modality_metrics(study)
+        files["modalities.csv"] = modality_rows(study)
+    write_document(folder / METRICS, document)
+    return [
+        folder / METRICS,
+        *(write_rows(folder / name, rows) for name, rows in files.items()),
+    ]
 
 
 def _dimension_rows(comparison: Comparison) -> Iterable[Sequence[object]]:
@@ -107,8 +112,8 @@ def _dimension_rows(comparison: Comparison) -> Iterable[Sequence[object]]:
         yield [
             name,
             unit,
-            *(_cell(comparison.scores[method].mae[index]) for method in METHODS),
-            *(_cell(comparison.scores[method].rmse[index]) for method in METHODS),
+            *(cell(comparison.scores[method].mae[index]) for method in METHODS),
+            *(cell(comparison.scores[method].rmse[index]) for method in METHODS),
         ]
 
 
@@ -121,8 +126,8 @@ def _horizon_rows(comparison: Comparison) -> Iterable[Sequence[object]]:
                 step,
                 name,
                 unit,
-                *(_cell(score.mae_horizon[step, index]) for score in scores),
-                *(_cell(score.rmse_horizon[step, index]) for score in scores),
+                *(cell(score.mae_horizon[step, index]) for score in scores),
+                *(cell(score.rmse_horizon[step, index]) for score in scores),
             ]
 
 
@@ -132,7 +137,7 @@ def _episode_rows(comparison: Comparison, store: FeatureStore) -> Iterable[Seque
         episode = store.episodes[index]
         for group in comparison.groups:
             errors = [float(group.mean(comparison.scores[m].mae_episode[place])) for m in METHODS]
-            yield [episode.source, episode.id, group.name, group.unit, *map(_cell, errors)]
+            yield [episode.source, episode.id, group.name, group.unit, *map(cell, errors)]
 
 
 def _prediction_rows(
@@ -148,25 +153,15 @@ def _prediction_rows(
             episode.source,
             episode.id,
             f"{time_s[place]:.3f}",
-            *(_cell(value) for pair in pairs for value in pair),
+            *(cell(value) for pair in pairs for value in pair),
         ]
 
 
 def _line(name: str, errors: Sequence[float], relative: float | None) -> list[str]:
-    ratio = "-" if relative is None else f"{relative:.2f}"
-    return [name, *(f"{error:.4g}" for error in errors), ratio]
-
-
-def _numbers(values: dict[str, float | None] | dict[str, float]) -> dict[str, float]:
-    """Without what has no value; a NaN stays, and a JSON document refuses it."""
-    return {key: float(f"{value:.6g}") for key, value in values.items() if value is not None}
+    return [name, *(f"{error:.4g}" for error in errors), ratio(relative)]
 
 
 def _steps(errors: Sequence[float]) -> dict[str, float]:
     """Scores are NaN where no entry is valid."""
     steps = {f"step_{step}": error for step, error in enumerate(errors, start=1)}
-    return _numbers({name: error for name, error in steps.items() if not math.isnan(error)})
-
-
-def _cell(value: float) -> str:
-    return "" if math.isnan(value) else f"{float(value):.6g}"
+    return numbers({name: error for name, error in steps.items() if not math.isnan(error)})

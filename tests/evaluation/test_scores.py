@@ -121,8 +121,10 @@ class FirstFeature(torch.nn.Module):
         super().__init__()
         self.weight = torch.nn.Parameter(torch.ones(1))
 
-    def act(self, batch, generator=None):
-        return batch.features[:, :1, :1].expand(-1, 4, 5) * self.weight
+    stochastic = False
+
+    def sample(self, batch, samples=1, generator=None):
+        return batch.features[None, :, :1, :1].expand(samples, -1, 4, 5) * self.weight
 
 
 @pytest.mark.parametrize("batch_size", [1, 7, 64])

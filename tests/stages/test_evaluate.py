@@ -1,5 +1,6 @@
 """The command refuses a checkpoint and a store that do not belong together."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -92,3 +93,53 @@ def test_a_missing_checkpoint_says_what_to_run(
 def test_last_can_be_judged_too(trained: Path) -> None:
     last = f"evaluate.checkpoint={trained.parent / 'head/last'}"
     assert run("", evaluate.main, ["--params", str(trained), "--set", last]) == 0
+
+
+def test_the_report_says_what_was_judged_and_which_streams_are_used(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One held-out episode: nothing can be shuffled, and the report says so."""
+    arguments = ["--params", str(trained), "--set", f"evaluate.output={tmp_path / 'report'}"]
+    assert run("", evaluate.main, arguments) == 0
+    said = capsys.readouterr().out
+    assert "sensor    zeroed" in said
+    assert "sensor shuffled: not judged" in said
+    assert (tmp_path / "report/modalities.png").read_bytes().startswith(b"\x89PNG")
+    metrics = json.loads((tmp_path / "report/metrics.json").read_text())
+    assert metrics["modalities"]["sensor"]["delayed_50_ms"]["overall"] > 0
+    judged = json.loads((tmp_path / "report/judged.json").read_text())
+    assert judged["policy"]["model_type"] == "regression"
+    assert judged["policy"]["samples"] == 1
+    assert judged["drawn"] is None
+    assert next(iter(judged["on"]["held_out"].values()))["ticks"] == [0, 30]
+
+
+def test_streams_are_left_alone_where_nobody_asks(trained: Path, tmp_path: Path) -> None:
+    output = tmp_path / "report"
+    arguments = ["--set", f"evaluate.output={output}", "--set", "evaluate.modalities=false"]
+    assert run("", evaluate.main, ["--params", str(trained), *arguments]) == 0
+    assert not list(output.glob("modalities*"))
+    assert "modalities" not in json.loads((output / "metrics.json").read_text())
+
+
+def test_a_sampling_policy_is_judged_on_the_mean_of_samples(trained: Path, tmp_path: Path) -> None:
+    head = tmp_path / "head"
+    own = [
+        "train_head.model_type=flow_matching",
+        f"train_head.output={head}",
+        f"train_head.logs={tmp_path / 'logs'}",
+        f"evaluate.checkpoint={head}",
+        "evaluate.modalities=false",
+    ]
+    arguments = ["--params", str(trained), *(part for one in own for part in ("--set", one))]
+    assert run("", train_head.main, arguments) == 0
+    errors = []
+    for samples in (1, 8, 8):
+        output = tmp_path / f"report{len(errors)}"
+        more = ["--set", f"evaluate.samples={samples}", "--set", f"evaluate.output={output}"]
+        assert run("", evaluate.main, [*arguments, *more]) == 0
+        judged = json.loads((output / "judged.json").read_text())
+        assert judged["policy"]["samples"] == samples
+        assert judged["drawn"] == {"samples": samples, "batch_size": 64}
+        errors.append(json.loads((output / "metrics.json").read_text())["overall"]["policy"])
+    assert errors[1] == errors[2] != errors[0]

@@ -1,21 +1,14 @@
-"""Scores and predictions -> pictures; the same numbers give the same bytes.
-
-Every way of acting keeps its colour, marker and line in all pictures (Okabe and Ito's palette,
-which colour-blind readers can tell apart).
-"""
+"""The pictures of an evaluation: what a policy did beside what was recorded."""
 
 import math
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from pipeline.durable import disk_full_named, fresh
 from pipeline.evaluation import (
     METHODS,
     Comparison,
@@ -24,32 +17,9 @@ from pipeline.evaluation import (
     episode_name,
     with_unit,
 )
+from pipeline.plots.style import LABELS, RECORDED, STYLES, canvas, legend_below, write
 from pipeline.store import Episode, FeatureStore
 
-LABELS = {
-    "policy": "policy",
-    "zero_action": "baseline: zero action",
-    "mean_action": "baseline: mean training action",
-    "repeat_last": "baseline: repeat the last action",
-}
-STYLES: dict[str, dict[str, Any]] = {
-    "policy": {"color": "#0072B2", "marker": "o", "linestyle": "-", "zorder": 5},
-    "zero_action": {"color": "#E69F00", "marker": "s", "linestyle": "--", "fillstyle": "none"},
-    "mean_action": {"color": "#009E73", "marker": "^", "linestyle": "-."},
-    "repeat_last": {"color": "#CC79A7", "marker": "D", "linestyle": ":"},
-}
-RECORDED = "#333333"
-RC: dict[Any, Any] = {
-    "figure.constrained_layout.use": True,
-    "font.size": 10,
-    "axes.titlesize": 11,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.color": "#dddddd",
-    "axes.axisbelow": True,
-    "legend.frameon": False,
-}
 TIMELINES = 2
 """Episodes whose course is drawn: the one the policy follows best, and the one it follows worst."""
 SCATTER_POINTS = 4000
@@ -60,25 +30,22 @@ def write_plots(
     folder: Path, comparison: Comparison, predictions: Predictions, store: FeatureStore
 ) -> list[Path]:
     """Write the pictures of an evaluation into `folder` and return their paths."""
-    with mpl.rc_context(RC):
-        figures = {
-            "timeline.png": timeline(comparison, predictions, store),
-            "scatter.png": scatter(comparison, predictions),
-            "horizon.png": horizon(comparison, store.action_hz),
-            "episodes.png": episodes(comparison, store),
-        }
-        for name, figure in figures.items():
-            # Without its `Software` entry the file does not change with matplotlib's version.
-            with disk_full_named(folder):
-                figure.savefig(fresh(folder / name), dpi=120, metadata={"Software": None})
-    return [folder / name for name in figures]
+    return write(
+        folder,
+        {
+            "timeline.png": lambda: timeline(comparison, predictions, store),
+            "scatter.png": lambda: scatter(comparison, predictions),
+            "horizon.png": lambda: horizon(comparison, store.action_hz),
+            "episodes.png": lambda: episodes(comparison, store),
+        },
+    )
 
 
 def timeline(comparison: Comparison, predictions: Predictions, store: FeatureStore) -> Figure:
     """Recorded and predicted action over time, a row a dimension, a column an episode."""
     shown = _best_and_worst(comparison)
     rows = len(comparison.names)
-    figure = _figure(max(5.8 * len(shown) + 0.4, 8.0), 1.15 * rows + 1.4)
+    figure = canvas(max(5.8 * len(shown) + 0.4, 8.0), 1.15 * rows + 1.4)
     axes = figure.subplots(rows, len(shown), squeeze=False, sharex="col", sharey="row")
     for column, (title, index) in enumerate(shown):
         episode = store.episodes[index]
@@ -102,7 +69,7 @@ def timeline(comparison: Comparison, predictions: Predictions, store: FeatureSto
         axis.set_ylabel(with_unit(comparison.names[row], comparison.units[row]))
         _readable_range(axis, comparison.scale[row])
     figure.align_ylabels(axes[:, 0])
-    _legend(figure, axes[0, 0], 2)
+    legend_below(figure, axes[0, 0], 2)
     figure.suptitle("Held-out episodes: the recorded action, and what the policy would do next")
     return figure
 
@@ -113,7 +80,7 @@ def scatter(comparison: Comparison, predictions: Predictions) -> Figure:
     count = len(dimensions)
     columns = min(4, count)
     lines = math.ceil(count / columns)
-    figure = _figure(3.1 * columns, 3.1 * lines + 0.5)
+    figure = canvas(3.1 * columns, 3.1 * lines + 0.5)
     axes = figure.subplots(lines, columns, squeeze=False).ravel()
     step = math.ceil(len(predictions.ticks) / SCATTER_POINTS)
     for axis in axes[count:]:
@@ -138,7 +105,7 @@ def scatter(comparison: Comparison, predictions: Predictions) -> Figure:
 def horizon(comparison: Comparison, action_hz: float | None) -> Figure:
     """Mean absolute error by how far ahead an action lies, a panel an action group."""
     groups = _varying_groups(comparison)
-    figure = _figure(max(4.6 * len(groups), 8.5), 4.4)
+    figure = canvas(max(4.6 * len(groups), 8.5), 4.4)
     axes = figure.subplots(1, len(groups), squeeze=False)[0]
     for axis, group in zip(axes, groups, strict=True):
         for method in METHODS:
@@ -151,7 +118,7 @@ def horizon(comparison: Comparison, action_hz: float | None) -> Figure:
         axis.set_ylabel(with_unit("mean absolute error", group.unit))
         axis.set_ylim(bottom=0)
         axis.xaxis.get_major_locator().set_params(integer=True)
-    _legend(figure, axes[0], len(METHODS))
+    legend_below(figure, axes[0], len(METHODS))
     figure.suptitle("Error over the action chunk on held-out ticks (lower is better)")
     return figure
 
@@ -162,7 +129,7 @@ def episodes(comparison: Comparison, store: FeatureStore) -> Figure:
     if len(order) > EPISODE_LINES:
         order = order[np.linspace(0, len(order) - 1, EPISODE_LINES).round().astype(int)]
     groups = _varying_groups(comparison)
-    figure = _figure(max(3.6 * len(groups) + 3, 9.0), 0.3 * len(order) + 2)
+    figure = canvas(max(3.6 * len(groups) + 3, 9.0), 0.3 * len(order) + 2)
     axes = figure.subplots(1, len(groups), squeeze=False, sharey=True)[0]
     lines = np.arange(len(order))
     for axis, group in zip(axes, groups, strict=True):
@@ -174,7 +141,7 @@ def episodes(comparison: Comparison, store: FeatureStore) -> Figure:
         axis.set_xlim(left=0)
     axes[0].set_yticks(lines, [_short(store.episodes[comparison.episodes[i]]) for i in order])
     axes[0].set_ylim(-0.6, len(order) - 0.4)
-    _legend(figure, axes[0], len(METHODS))
+    legend_below(figure, axes[0], len(METHODS))
     some = (
         f" ({len(order)} of {len(comparison.episodes)})"
         if len(order) < len(comparison.episodes)
@@ -186,22 +153,11 @@ def episodes(comparison: Comparison, store: FeatureStore) -> Figure:
     return figure
 
 
-def _figure(width: float, height: float) -> Figure:
-    figure = Figure(figsize=(width, height))
-    FigureCanvasAgg(figure)
-    return figure
-
-
 def _marked(method: str) -> dict[str, Any]:
     wide = method == "policy"
     # An open, larger square stays visible where the mean action is next to no motion.
     size = {"policy": 6.5, "zero_action": 8.5}.get(method, 5)
     return STYLES[method] | {"linewidth": 2.4 if wide else 1.5, "markersize": size}
-
-
-def _legend(figure: Figure, axis: Axes, columns: int) -> None:
-    handles, labels = axis.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=columns)
 
 
 def _title(comparison: Comparison, group: Group) -> str:

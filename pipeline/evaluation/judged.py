@@ -1,0 +1,50 @@
+"""What an evaluation was made of, so that two of them can be told to be of the same things."""
+
+from typing import Any
+
+from pipeline.checkpoint import PolicyCheckpoint, source_of
+from pipeline.models import Trainable
+from pipeline.store import FeatureStore
+
+JUDGED = "judged.json"
+"""Its name in the folder of an evaluation, beside metrics.json."""
+
+
+def judged_document(
+    checkpoint: PolicyCheckpoint,
+    policy: Trainable,
+    store: FeatureStore,
+    samples: int,
+    batch_size: int,
+) -> dict[str, Any]:
+    """What was judged (`policy`), how it was sampled (`drawn`) and on what (`on`), as JSON.
+
+    `on` is equal for all evaluations whose errors may stand in one table, and `drawn` for those
+    of stochastic policies: the mean of fewer samples errs more, and a batch shares its noise. It
+    is null for policies that do not sample.
+    """
+    params = checkpoint.params
+    source = source_of(store)
+    drawn = {"samples": samples, "batch_size": batch_size} if policy.stochastic else None
+    return {
+        "policy": {
+            "model_type": params.model_type,
+            "fusion_strategy": params.fusion_strategy,
+            "step": checkpoint.step,
+            "parameters": sum(count for _, count in policy.parameter_table()),
+            "samples": drawn["samples"] if drawn else 1,
+            "logs": str(params.logs),
+        },
+        "drawn": drawn,
+        "on": {
+            "feature_spec": source["feature_spec"]["digest"],
+            "action": source["streams"]["action"],
+            "action_hz": source["action_hz"],
+            "vlm_reuse_count": source["vlm_reuse_count"],
+            "horizon": params.horizon,
+            "held_out": {
+                name: {"ticks": list(ticks), "content": checkpoint.held_out_content[name]}
+                for name, ticks in checkpoint.held_out_ticks.items()
+            },
+        },
+    }

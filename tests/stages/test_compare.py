@@ -1,0 +1,178 @@
+"""Evaluations stand in one table only where they were judged on the same things."""
+
+import csv
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import yaml
+
+from pipeline.evaluation import JUDGED, read_experiments
+from stages import compare, evaluate, train_head
+from stages.command import run
+
+ROOT = Path(__file__).resolve().parents[2]
+NAMES = ["regression-concat", "regression-gated", "diffusion-concat", "flow_matching-none"]
+
+
+@pytest.fixture(scope="module")
+def experiments(tiny_store: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A params.yaml and evaluated experiments."""
+    folder = tmp_path_factory.mktemp("compare")
+    document = {
+        "data": {"sources": [{"name": "left", "path": "a"}, {"name": "right", "path": "b"}]},
+        "vlm": {"checkpoint": "unused"},
+        "extract": {"store": str(tiny_store(folder))},
+        "train_head": {
+            "sensor_encoder": {"channels": [8], "layers": 0, "heads": 1, "output_dim": 8},
+            "state_encoder": {"dim": 8, "layers": 0, "heads": 1, "output_dim": 8},
+            "expert": {"dim": 8, "layers": 1, "heads": 1},
+            "batch_size": 8,
+            "max_steps": 3,
+            "sensor_window": 6,
+            "state_window": 5,
+            "device": "cpu",
+        },
+        "evaluate": {"modalities": False, "samples": 2},
+        "compare": {"reports": str(folder / "reports"), "output": str(folder / "comparison")},
+    }
+    path = folder / "params.yaml"
+    path.write_text(yaml.safe_dump(document))
+    for name in NAMES:
+        expert, fusion = name.split("-")
+        own = [
+            f"train_head.model_type={expert}",
+            f"train_head.fusion_strategy={fusion}",
+            f"train_head.output={folder / 'models' / name}",
+            f"train_head.logs={folder / 'logs' / name}",
+            f"evaluate.checkpoint={folder / 'models' / name}",
+            f"evaluate.output={folder / 'reports' / name}",
+        ]
+        arguments = ["--params", str(path), *(part for one in own for part in ("--set", one))]
+        assert run("", train_head.main, arguments) == 0
+        assert run("", evaluate.main, arguments) == 0
+    return path
+
+
+@pytest.fixture
+def reports(experiments: Path, tmp_path: Path) -> Path:
+    """A copy of the evaluations that a test may spoil."""
+    return shutil.copytree(experiments.parent / "reports", tmp_path / "reports")
+
+
+def refused(reports: Path, experiments: Path, capsys: pytest.CaptureFixture[str]) -> str:
+    arguments = ["--params", str(experiments), "--set", f"compare.reports={reports}"]
+    assert run("", compare.main, arguments) == 2
+    error = capsys.readouterr().err
+    assert "Traceback" not in error
+    return error
+
+
+def test_a_table_a_file_and_a_picture(
+    experiments: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("", compare.main, ["--params", str(experiments)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines[1:5]] == NAMES
+    assert lines[0].split()[-3:] == ["samples", "parameters", "trained"]
+    assert [line.split()[-4] for line in lines[1:5]] == ["1", "1", "2", "2"]
+    assert [line.split("  ")[0] for line in lines[5:8]] == [
+        "baseline: zero",
+        "baseline: mean",
+        "baseline: repeat last",
+    ]
+    output = experiments.parent / "comparison"
+    assert sorted(path.name for path in output.iterdir()) == ["experiments.csv", "experiments.png"]
+    assert (output / "experiments.png").read_bytes().startswith(b"\x89PNG")
+    rows = list(csv.DictReader((output / "experiments.csv").read_text().splitlines()))
+    for row in rows:
+        folder = experiments.parent / "reports" / row["experiment"]
+        overall = json.loads((folder / "metrics.json").read_text())["overall"]
+        assert float(row["overall_policy"]) == overall["policy"]
+        assert float(row["overall_mean_action"]) == overall["mean_action"]
+        assert row["samples"] == ("1" if row["model_type"] == "regression" else "2")
+    markdown = (experiments.parent / "comparison.md").read_text().splitlines()
+    assert markdown[1].startswith("| --- |")
+    assert len({line.count("|") for line in markdown}) == 1
+
+
+def test_the_training_time_is_read_from_beside_the_logs_and_not_tracked(experiments: Path) -> None:
+    reports = experiments.parent / "reports"
+    for one in read_experiments(reports):
+        assert one.training_s is not None
+        assert 0 < one.training_s < 60
+    (experiments.parent / "logs/regression-gated.speed.tsv").unlink()
+    found = {one.name: one.training_s for one in read_experiments(reports)}
+    assert found["regression-gated"] is None
+    assert "trained_s" not in (reports / "regression-concat" / JUDGED).read_text()
+
+
+def test_another_store_or_other_ticks_are_refused_by_name(
+    reports: Path, experiments: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = reports / "regression-gated" / JUDGED
+    document = json.loads(path.read_text())
+    document["on"]["feature_spec"] = "another"
+    next(iter(document["on"]["held_out"].values()))["ticks"] = [3, 30]
+    path.write_text(json.dumps(document))
+    error = refused(reports, experiments, capsys)
+    assert '"another" (regression-gated)' in error
+    assert "[3, 30] (regression-gated)" in error
+
+
+@pytest.mark.parametrize(("key", "value"), [("samples", 16), ("batch_size", 8)])
+def test_policies_that_were_sampled_otherwise_are_refused(
+    reports: Path, experiments: Path, capsys: pytest.CaptureFixture[str], key: str, value: int
+) -> None:
+    path = reports / "diffusion-concat" / JUDGED
+    document = json.loads(path.read_text())
+    found = document["drawn"][key]
+    document["drawn"][key] = value
+    path.write_text(json.dumps(document))
+    error = refused(reports, experiments, capsys)
+    assert f"{key}: {value} (diffusion-concat), {found} (flow_matching-none)" in error
+    assert "with one evaluate.samples and evaluate.batch_size" in error
+    shutil.rmtree(path.parent)
+    # What does not sample stands beside any.
+    assert len(read_experiments(reports)) == 3
+
+
+def test_other_baselines_are_refused(
+    reports: Path, experiments: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = reports / "regression-gated" / "metrics.json"
+    document = json.loads(path.read_text())
+    document["translation_mm"]["mean_action"] *= 1.01
+    path.write_text(json.dumps(document))
+    error = refused(reports, experiments, capsys)
+    assert "found mean_action (translation_mm)" in error
+    assert "trained on other recordings" in error
+
+
+@pytest.mark.parametrize("name", [JUDGED, "metrics.json"])
+def test_a_folder_that_is_no_evaluation_is_named(
+    reports: Path, experiments: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    (reports / "regression-gated" / name).unlink()
+    assert f"regression-gated, but it has no {name}" in refused(reports, experiments, capsys)
+    (reports / "regression-gated" / name).write_text("{")
+    assert "is no JSON" in refused(reports, experiments, capsys)
+    (reports / "regression-gated" / name).write_text("{}")
+    assert "regression-gated, but it lacks" in refused(reports, experiments, capsys)
+
+
+def test_nothing_to_compare_says_what_to_run(
+    experiments: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "dvc repro experiments/dvc.yaml" in refused(tmp_path / "none", experiments, capsys)
+
+
+@pytest.mark.parametrize(("stage", "of"), [("train", "train_head"), ("evaluate", "evaluate")])
+def test_the_matrix_depends_on_the_params_that_the_default_stages_depend_on(
+    stage: str, of: str
+) -> None:
+    matrix = yaml.safe_load((ROOT / "experiments/dvc.yaml").read_text())["stages"][stage]
+    default = yaml.safe_load((ROOT / "dvc.yaml").read_text())["stages"][of]
+    assert matrix["params"] == default["params"]
