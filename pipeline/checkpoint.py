@@ -7,7 +7,7 @@ A kill at any instant leaves the previous checkpoint or the new one.
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -79,15 +79,22 @@ class PolicyCheckpoint:
         }
 
 
-def write_policy(folder: Path, checkpoint: PolicyCheckpoint) -> None:
-    """Write the two files of a checkpoint into an existing folder, without regard to a kill."""
-    digest = write_tensors(folder / WEIGHTS, checkpoint.weights)
-    write_document(folder / DOCUMENT, checkpoint.document(digest))
+def save_policy(
+    folder: Path,
+    checkpoint: PolicyCheckpoint,
+    beside: Callable[[Path], None] = lambda folder: None,
+) -> None:
+    """Put a checkpoint at `folder`, in place of an older one there, atomically.
 
+    `beside` writes into the same folder what stands beside the policy. Raises `DiskFull`.
+    """
 
-def save_policy(folder: Path, checkpoint: PolicyCheckpoint) -> None:
-    """Put a checkpoint at `folder`, in place of an older one there, atomically."""
-    replace_folder(folder, lambda temporary: write_policy(temporary, checkpoint))
+    def write(temporary: Path) -> None:
+        digest = write_tensors(temporary / WEIGHTS, checkpoint.weights)
+        write_document(temporary / DOCUMENT, checkpoint.document(digest))
+        beside(temporary)
+
+    replace_folder(folder, write)
 
 
 def find_policy(path: Path) -> Path:
@@ -102,7 +109,8 @@ def find_policy(path: Path) -> Path:
     unfinished = f" There is an unfinished training in {part}." if part.exists() else ""
     raise CheckpointIncomplete(
         f"{path}: expected a checkpoint ({DOCUMENT} in it or in its folder best), found none."
-        f"{unfinished} Run stages.train_head to its end, or name another checkpoint."
+        f"{unfinished} Run stages.train_head (or stages.finetune) to its end, or name another "
+        "checkpoint."
     )
 
 

@@ -1,7 +1,21 @@
-"""Training a policy head from a store: one loop, resumable at every checkpoint."""
+"""Training a policy: one loop for every expert, from a store or with a live model in front.
 
+Resumable at every checkpoint; on one process, or on several that torchrun started.
+"""
+
+from pipeline.training.front import Cached, Front
 from pipeline.training.loop import Trainer
 from pipeline.training.run import Run, open_run
 from pipeline.training.statistics import fit_normalization
+from pipeline.training.world import World, process_group
 
-__all__ = ["Run", "Trainer", "fit_normalization", "open_run"]
+__all__ = [
+    "Cached",
+    "Front",
+    "Run",
+    "Trainer",
+    "World",
+    "fit_normalization",
+    "open_run",
+    "process_group",
+]

@@ -1,4 +1,4 @@
-"""An exponential moving average of a policy's weights."""
+"""An exponential moving average of a module's weights."""
 
 import copy
 from typing import Generic, TypeVar
@@ -11,22 +11,33 @@ Module = TypeVar("Module", bound=nn.Module)
 
 
 class WeightAverage(Generic[Module]):
-    """A second policy whose weights trail those of the first; it is the one that is judged.
+    """A second module whose weights trail those of a first; it is the one that is judged.
 
     After update t (from 1): average += (1 - d) (weights - average), d = min(decay, t / (t + 9)):
     the warm-up of Tarvainen and Valpola's mean teacher (2017) in the form of TensorFlow's
     ExponentialMovingAverage, without which a short run would still average in its random start.
-    Buffers stay those of the first: a policy's (normalisation, group weights) never change.
+    What does not learn is shared with the first, not copied: frozen parameters (those of a
+    vision-language model may be gigabytes) and buffers (normalisation, group weights).
     """
 
-    def __init__(self, policy: Module, decay: float) -> None:
-        self.policy = copy.deepcopy(policy).requires_grad_(False)
-        self.policy.eval()
+    def __init__(self, module: Module, decay: float) -> None:
+        frozen = [value for value in module.parameters() if not value.requires_grad]
+        shared = {id(value): value for value in (*frozen, *module.buffers())}
+        self.module = copy.deepcopy(module, shared).requires_grad_(False).eval()
+        learning = trainable(module)
+        self.weights = {n: v for n, v in self.module.named_parameters() if n in learning}
+        """The averaged parameters by name: those that learn in the first."""
+        # At every step: a walk through a vision-language model's modules would take its time.
+        self._learning, self._averaged = tuple(learning.values()), tuple(self.weights.values())
         self._decay = decay
 
     @torch.no_grad()
-    def update(self, policy: Module, updates: int) -> None:
-        """Take in the weights after the `updates`-th optimizer step, counted from 1."""
+    def update(self, updates: int) -> None:
+        """Take in the first's weights after the `updates`-th optimizer step, counted from 1."""
         decay = min(self._decay, updates / (updates + 9))
-        average = tuple(self.policy.parameters())
-        get_ema_multi_avg_fn(decay)(average, tuple(policy.parameters()), 0)
+        get_ema_multi_avg_fn(decay)(self._averaged, self._learning, 0)
+
+
+def trainable(module: nn.Module) -> dict[str, nn.Parameter]:
+    """The parameters that learn, by name."""
+    return {name: value for name, value in module.named_parameters() if value.requires_grad}

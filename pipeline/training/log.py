@@ -1,7 +1,6 @@
 """What a run writes down while it goes: curves for DVC, speed beside them."""
 
 import csv
-import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import TracebackType
@@ -9,8 +8,8 @@ from typing import Self
 
 from dvclive import Live
 
-from pipeline.batches import Prefetch
 from pipeline.durable import disk_full_named, fresh
+from pipeline.training.speed import Pace
 
 Row = tuple[int, Mapping[str, float]]
 """A step, counted from 1, and metrics by name."""
@@ -37,9 +36,9 @@ class TrainingLog:
     """Curves in `<folder>/plots/metrics/*.tsv`, their newest values in `<folder>/metrics.json`.
 
     What came before a stop is given back as `earlier` and written again: DVC may have deleted the
-    folder since, and a run that was killed has logged steps beyond its last checkpoint. Speed since
-    the last start goes to `speed_file`, so that the folder, which DVC tracks, holds nothing of the
-    clock. Raises `DiskFull`.
+    folder since, and a run that was killed has logged steps beyond its last checkpoint. Speed and
+    memory since the last start go to `speed_file`, so that the folder, which DVC tracks, holds
+    nothing of the clock. Raises `DiskFull`.
     """
 
     def __init__(self, folder: Path, earlier: Iterable[Row] = ()) -> None:
@@ -49,7 +48,9 @@ class TrainingLog:
         self._live = _Curves(str(folder), resume=False, dvcyaml=None, save_dvc_exp=False)
         self._speed = fresh(speed_file(folder)).open("w", encoding="utf-8", newline="")
         self._writer = csv.writer(self._speed, delimiter="\t")
-        self._writer.writerow(["step", "steps_per_s", "data_wait_share"])
+        self._writer.writerow(
+            ["step", "steps_per_s", "data_wait_share", "peak_memory_mib", "trained_s"]
+        )
         for step, metrics in earlier:
             self.write(step, metrics)
 
@@ -62,10 +63,18 @@ class TrainingLog:
                 self._live.log_metric(name, value)
             self._live.make_summary()
 
-    def write_speed(self, step: int, steps_per_s: float, data_wait_share: float) -> None:
-        """Add a line to `speed_file`; the share is the time spent waiting for batches."""
+    def write_speed(self, step: int, pace: Pace) -> None:
+        """Add a line to `speed_file`."""
         with disk_full_named(self._folder):
-            self._writer.writerow([step, f"{steps_per_s:.3f}", f"{data_wait_share:.4f}"])
+            self._writer.writerow(
+                [
+                    step,
+                    f"{pace.steps_per_s:.3f}",
+                    f"{pace.data_wait_share:.4f}",
+                    f"{pace.peak_memory / 2**20:.0f}",
+                    f"{pace.trained_s:.3f}",
+                ]
+            )
             self._speed.flush()
 
     def __enter__(self) -> Self:
@@ -79,21 +88,3 @@ class TrainingLog:
     ) -> None:
         self._speed.close()
         self._live.end()
-
-
-class Speed:
-    """Steps a second and the share of time spent waiting for batches, since the last reading."""
-
-    def __init__(self, batches: Prefetch, step: int) -> None:
-        self._batches = batches
-        self._step = step
-        self._time, self._waited = time.perf_counter(), batches.waited_s
-
-    def read(self, step: int) -> tuple[float, float]:
-        """Both figures at this step."""
-        now, waited = time.perf_counter(), self._batches.waited_s
-        elapsed = max(now - self._time, 1e-9)
-        steps = step - self._step
-        figures = steps / elapsed, (waited - self._waited) / elapsed
-        self._step, self._time, self._waited = step, now, waited
-        return figures

@@ -1,252 +1,247 @@
-"""The one training loop."""
+"""The one training loop: every expert, cached or live, on one process or several."""
 
-from collections.abc import Iterator, Mapping
-from pathlib import Path
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext
+from itertools import islice
 from typing import NoReturn
 
-import numpy as np
 import torch
+from torch import nn
 from tqdm import tqdm
 
-from pipeline.batches import Draw, Prefetch, Windows
-from pipeline.checkpoint import (
-    PolicyCheckpoint,
-    load_policy,
-    policy_shape,
-    save_policy,
-    source_of,
-    write_policy,
-)
+from pipeline.batches import Draw, Windows
+from pipeline.checkpoint import policy_shape
 from pipeline.config import TrainHeadParams
-from pipeline.device import resolve_device, use_bfloat16
-from pipeline.durable import replace_folder
 from pipeline.errors import NumericsError
-from pipeline.evaluation import held_out_contents, held_out_ranges, judge
 from pipeline.models import Policy
-from pipeline.sampling import Split, TickSampler, ticks_by_source
+from pipeline.sampling import Split
 from pipeline.store import Batch, FeatureStore
-from pipeline.training.ema import WeightAverage
+from pipeline.training.checkpoints import Checkpoints, read_last
+from pipeline.training.front import Cached, Front
 from pipeline.training.history import History
 from pipeline.training.interrupt import deferred_interrupt
-from pipeline.training.log import Row, Speed, TrainingLog
-from pipeline.training.optimizer import (
-    learning_rate,
-    make_optimizer,
-    optimizer_tensors,
-    restore_optimizer,
-    set_learning_rate,
-)
+from pipeline.training.judging import Standing, held_out_error, judged_ticks
+from pipeline.training.learner import Learner
+from pipeline.training.log import Row, TrainingLog
+from pipeline.training.optimizer import schedule
+from pipeline.training.plan import Plan
 from pipeline.training.run import Run
-from pipeline.training.state import TrainerState, read_trainer, write_trainer
+from pipeline.training.speed import Speed
+from pipeline.training.state import TrainerState
 from pipeline.training.statistics import fit_normalization
-from pipeline.training.summary import describe_data
+from pipeline.training.summary import closing, describe_data, describe_learner
+from pipeline.training.world import World, process_device
 
 LOG_EVERY = 10
-EVALUATION_TICKS = 1000
-"""Held-out ticks judged during training at most, evenly spaced; `stages.evaluate` takes all."""
 
 
 class Trainer:
     """A policy in training: begins anew or goes on from the run's last checkpoint.
 
-    What a step does follows from the seed and its number alone (its ticks, its dropout, its
-    learning rate), so that a run that was stopped at any checkpoint continues, on a CPU with as
-    many threads, to the same losses and weights bit for bit.
+    What a step does follows from the seed and its number alone (its ticks, its dropout, its noise,
+    its learning rate), so that a run that was stopped at any checkpoint continues, on a CPU with as
+    many threads, to the same losses and weights bit for bit; and N processes, each with its parts
+    of every step, follow the curve of one that accumulates N times as much, within float noise.
+    Within a `process_group` every process makes one, and all call the same methods.
     """
 
     def __init__(
-        self, store: FeatureStore, params: TrainHeadParams, split: Split, run: Run
+        self,
+        store: FeatureStore,
+        params: TrainHeadParams,
+        split: Split,
+        run: Run,
+        front: Front | None = None,
     ) -> None:
         self.store, self.params, self.split, self.run = store, params, split, run
-        self.device = resolve_device(params.device)
-        self.bfloat16 = use_bfloat16(params.amp, self.device)
-        self.windows = Windows.of(params)
-        self.sampler = TickSampler(
-            ticks_by_source(store, split.train), params.mixture, params.batch_size, params.seed
-        )
+        self.front = Cached(store) if front is None else front
+        self.world = World.current()
+        self.device = process_device(params.device)
+        self.plan = Plan(store, params, split, self.world, run.section)
         self.step = 0
-        self.best_error: float | None = None
+        self.standing = Standing.of(params, split)
         self.history = History()
         self._earlier: tuple[Row, ...] = ()
+        self._trained_s = 0.0
+        state: TrainerState | None = None
         if run.status == "resumed":
-            self._restore(load_policy(run.last), read_trainer(run.last))
+            self.normalization, self.shape, state = read_last(run, self.world)
         else:
-            self._begin()
+            self.normalization = self.world.shared(lambda: fit_normalization(store, split.train))
+            self.shape = policy_shape(store, self.normalization)
+        torch.manual_seed(params.seed)
+        policy = Policy(params, self.shape, self.normalization)
+        self.learner = Learner(self.front, policy, store, params, self.device, self.world)
+        self._checkpoints = Checkpoints(
+            run, store, params, split, self.front, self.normalization, self.shape
+        )
+        if state is not None:
+            self._restore(state)
+
+    @property
+    def policy(self) -> Policy:
+        """The policy in training."""
+        return self.front.policy_of(self.learner.module)
+
+    @property
+    def averaged(self) -> nn.Module:
+        """The module with the averaged weights, which is judged and kept."""
+        return self.learner.average.module
 
     def fit(self) -> None:
-        """Train to the last step and finish the run.
+        """Train to the last step, or until nothing gets better, and finish the run.
 
         Raises `NumericsError` on a loss or gradient that is not finite, naming the step and its
-        ticks. On Ctrl-C or SIGTERM the step ends, the last checkpoint is written and
-        `KeyboardInterrupt` raised.
+        ticks. On Ctrl-C or SIGTERM, to whichever process, all end the step, the last checkpoint is
+        written and `KeyboardInterrupt` raised.
         """
-        self.run.begin()
+        self.world.shared(self.run.begin)
+        steps = range(self.step, self.params.max_steps)
+        windows = Windows.of(self.params)
         with (
             deferred_interrupt() as interrupted,
-            TrainingLog(self.params.logs, self._earlier) as log,
-            Prefetch(self.store, self._plan(), self.windows, self.device) as batches,
-            tqdm(
-                initial=self.step, total=self.params.max_steps, unit="step", disable=None
-            ) as progress,
+            self._open_log() as log,
+            self.front.feed(self.plan.draws(steps), windows, self.device) as feed,
+            self._open_bar() as bar,
         ):
-            clock = Speed(batches, self.step)
-            for _, batch in batches:
-                self._train_step(batch)
-                progress.update()
-                self._after_step(log, clock, progress)
-                if interrupted() and self.step < self.params.max_steps:
-                    self._save_last(log)
+            batches, speed = iter(feed), Speed(feed, self.device, self.step, self._trained_s)
+            while not self._over:
+                stopped = self._train_step(batches, interrupted)
+                bar.update()
+                self._after_step(log, speed, bar, stopped)
+                if stopped and not self._over:
                     raise KeyboardInterrupt
-        self.run.finish()
+        self.world.shared(self.run.finish)
+        self.world.say(*closing(self.step, self.standing, speed.trained_s, self.device))
 
     def summary(self) -> list[str]:
         """What is trained, from what and on what, as lines for the user."""
-        precision = "bfloat16 autocast" if self.bfloat16 else "float32"
+        several = f" on {self.world.size} processes" if self.world.size > 1 else ""
+        precision = "bfloat16 autocast" if self.learner.bfloat16 else "float32"
         return [
             *describe_data(self.store, self.shape, self.params, self.split),
-            "parameters: "
-            + ", ".join(f"{part} {count:,}" for part, count in self.policy.parameter_table()),
-            f"device {self.device}, {precision}; steps {self.step} to {self.params.max_steps}",
+            *describe_learner(self.learner, self.policy),
+            f"device {self.device}{several}, {precision}"
+            f"{', compiled' if self.params.compile else ''}; "
+            f"steps {self.step} to {self.params.max_steps}",
         ]
 
-    def _plan(self) -> Iterator[Draw]:
-        steps = range(self.step, self.params.max_steps)
-        return (Draw(self.sampler.batch(step)) for step in steps)
+    @property
+    def _over(self) -> bool:
+        return self.step == self.params.max_steps or self.standing.exhausted
 
-    def _train_step(self, batch: Batch) -> None:
-        rate = learning_rate(self.step, self.params)
-        set_learning_rate(self.optimizer, rate)
-        # Dropout and sampled noise of a step depend on nothing that came before it.
-        torch.manual_seed(_step_seed(self.params.seed, self.step))
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
-            loss, parts = self.policy.loss(batch, batch.action, batch.action_valid)
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        norm = torch.nn.utils.clip_grad_norm_(self.policy.parameters(), self.params.grad_clip)
-        self.optimizer.step()
+    def _open_log(self) -> "TrainingLog | nullcontext[None]":
+        """Rank 0's; the others write nothing down."""
+        if not self.world.first:
+            return nullcontext()
+        return TrainingLog(self.params.logs, self._earlier)
+
+    def _open_bar(self) -> "tqdm[NoReturn]":
+        hidden = None if self.world.first else True
+        total = self.params.max_steps
+        return tqdm(initial=self.step, total=total, unit="step", disable=hidden)
+
+    def _train_step(
+        self, batches: Iterator[tuple[Draw, Batch]], interrupted: Callable[[], bool]
+    ) -> bool:
+        """One step of all processes; whether one of them was told to stop."""
+        parts = islice(batches, len(self.plan.own))
+        scalars, stopped = self.learner.step(self.step, parts, interrupted)
+        self.history.add(scalars)
         self.step += 1
-        self.average.update(self.policy, self.step)
-        self.history.add({"loss": loss.detach(), "grad_norm": norm, **parts})
+        return stopped
 
-    def _after_step(self, log: TrainingLog, clock: Speed, progress: "tqdm[NoReturn]") -> None:
-        ends = self.step == self.params.max_steps
-        if self.step % LOG_EVERY == 0 or ends:
-            self._log(log, clock, progress)
-        if self.step % self.params.eval_every == 0 or ends:
-            self._evaluate(log)
-        if self.step % self.params.checkpoint_every == 0 or ends:
-            self._save_last(log)
+    def _after_step(
+        self, log: TrainingLog | None, speed: Speed, bar: "tqdm[NoReturn]", stopped: bool
+    ) -> None:
+        if self.step % self.params.eval_every == 0 or self._over:
+            self._evaluate(log, speed)
+        if self.step % LOG_EVERY == 0 or self._over:
+            self._write_down(log, speed, bar)
+        if self.step % self.params.checkpoint_every == 0 or self._over or stopped:
+            self._save_last(log, speed)
 
-    def _log(self, log: TrainingLog, clock: Speed, progress: "tqdm[NoReturn]") -> None:
+    def _write_down(self, log: TrainingLog | None, speed: Speed, bar: "tqdm[NoReturn]") -> None:
         self._check_finite()
         means = self.history.mean((self.step - 1) // LOG_EVERY * LOG_EVERY, self.step)
-        rate = learning_rate(self.step - 1, self.params)
-        log.write(self.step, {f"train/{k}": v for k, v in means.items()} | {"lr": rate})
-        steps_per_s, waiting = clock.read(self.step)
-        log.write_speed(self.step, steps_per_s, waiting)
-        progress.set_postfix(loss=f"{means['loss']:.4f}", lr=f"{rate:.1e}", wait=f"{waiting:.0%}")
+        rate = self.params.lr * schedule(self.step - 1, self.params)
 
-    def _evaluate(self, log: TrainingLog) -> None:
+        def write() -> None:
+            assert log is not None
+            pace = speed.read(self.step)
+            log.write(self.step, {f"train/{k}": v for k, v in means.items()} | {"lr": rate})
+            log.write_speed(self.step, pace)
+            memory, waited = f"{pace.peak_memory / 2**30:.1f}G", f"{pace.data_wait_share:.0%}"
+            bar.set_postfix(loss=f"{means['loss']:.4f}", lr=f"{rate:.1e}", wait=waited, mem=memory)
+
+        self.world.shared(write)
+
+    def _evaluate(self, log: TrainingLog | None, speed: Speed) -> None:
         """Judge the averaged weights; save them where they are the best so far."""
         self._check_finite()
-        ticks = self.split.held_out
+        with speed.paused():
+            metrics = self.world.shared(lambda: self._judge(log))
+            if not metrics or self.standing.take(metrics["val/error"]):
+                self.world.shared(
+                    lambda: self._checkpoints.save_best(self.averaged, self.step, metrics)
+                )
+
+    def _judge(self, log: TrainingLog | None) -> dict[str, float]:
+        """The held-out metrics, written down and said; none where nothing is held out."""
+        assert log is not None
+        ticks = judged_ticks(self.split.held_out, self.front)
         if not len(ticks):
-            self._save_best({})
-            return
-        spread = np.linspace(0, len(ticks) - 1, min(len(ticks), EVALUATION_TICKS)).round()
-        comparison, _ = judge(
-            self.average.policy,
-            self.store,
-            ticks[spread.astype(np.int64)],
-            self.windows,
-            self.params.batch_size,
-            self.normalization,
+            return {}
+        metrics = held_out_error(
+            self.averaged, self.front, self.store, ticks, self.params, self.normalization
         )
-        error = comparison.overall("policy")
-        groups = {
-            f"val/{group.key}": comparison.group_mae("policy", group) for group in comparison.groups
-        }
-        log.write(self.step, {"val/error": error, **groups})
-        better = self.best_error is None or error < self.best_error
+        log.write(self.step, metrics)
+        error = metrics["val/error"]
         tqdm.write(
             f"step {self.step}: train loss {self.history.last('loss'):.4f}, held-out error "
-            f"{error:.4f} of the training std" + (" (best so far)" if better else "")
+            f"{error:.4f} of the training std"
+            + (" (best so far)" if self.standing.improves(error) else "")
         )
-        if better:
-            self.best_error = error
-            self._save_best({"val/error": error, **groups})
+        return metrics
 
     def _check_finite(self) -> None:
         bad = self.history.settle()
         if bad is not None:
-            ticks = self.sampler.batch(bad)
             last = self.run.last
             kept = f" {last} holds the run as it was before." if last.exists() else ""
             raise NumericsError(
                 f"step {bad + 1}: expected a finite loss and gradient, found "
                 f"{self.history.describe(bad)}. Its ticks in {self.store.path}: "
-                f"{ticks.tolist()}. Look at these recordings, lower train_head.lr or "
-                f"train_head.grad_clip.{kept}"
+                f"{self.plan.ticks(bad).tolist()}. Look at these recordings, lower "
+                f"{self.run.section}.lr or train_head.grad_clip.{kept}"
             )
 
-    def _save_best(self, metrics: Mapping[str, float]) -> None:
-        save_policy(self.run.best, self._checkpoint(metrics))
-
-    def _save_last(self, log: TrainingLog) -> None:
+    def _save_last(self, log: TrainingLog | None, speed: Speed) -> None:
         self._check_finite()
 
-        def write(folder: Path) -> None:
-            write_policy(folder, self._checkpoint({"train/loss": self.history.last("loss")}))
-            write_trainer(
-                folder,
-                TrainerState(
-                    step=self.step,
-                    weights=self.policy.state_dict(),
-                    optimizer=optimizer_tensors(self.optimizer, self.policy),
-                    history=self.history.tensor(),
-                    columns=self.history.columns,
-                    best_error=self.best_error,
-                    rows=tuple(log.rows),
-                ),
-            )
+        def save() -> None:
+            assert log is not None
+            metrics = {"train/loss": self.history.last("loss")}
+            state = self._state(tuple(log.rows), speed.trained_s)
+            self._checkpoints.save_last(self.averaged, metrics, state)
 
-        replace_folder(self.run.last, write)
+        with speed.paused():
+            self.world.shared(save)
 
-    def _checkpoint(self, metrics: Mapping[str, float]) -> PolicyCheckpoint:
-        ranges = held_out_ranges(self.store, self.split.held_out)
-        return PolicyCheckpoint(
-            params=self.params,
-            shape=self.shape,
-            normalization=self.normalization,
-            source=source_of(self.store),
-            held_out_ticks=ranges,
-            held_out_content=held_out_contents(self.store, ranges),
+    def _state(self, rows: tuple[Row, ...], trained_s: float) -> TrainerState:
+        return TrainerState(
             step=self.step,
-            weights=self.average.policy.state_dict(),
-            metrics=metrics,
+            **self.learner.tensors(),
+            history=self.history.tensor(),
+            columns=self.history.columns,
+            best_error=self.standing.best_error,
+            stalled=self.standing.stalled,
+            trained_s=trained_s,
+            rows=rows,
         )
 
-    def _begin(self) -> None:
-        torch.manual_seed(self.params.seed)
-        self.normalization = fit_normalization(self.store, self.split.train)
-        self.shape = policy_shape(self.store, self.normalization)
-        self._build(Policy(self.params, self.shape, self.normalization))
-
-    def _restore(self, checkpoint: PolicyCheckpoint, state: TrainerState) -> None:
-        self.normalization, self.shape = checkpoint.normalization, checkpoint.shape
-        policy = Policy(self.params, self.shape, self.normalization)
-        policy.load_state_dict(dict(state.weights))
-        self._build(policy)
-        self.average.policy.load_state_dict(dict(checkpoint.weights))
-        restore_optimizer(self.optimizer, self.policy, state.optimizer)
-        self.step, self.best_error, self._earlier = state.step, state.best_error, state.rows
+    def _restore(self, state: TrainerState) -> None:
+        self.learner.restore(state, self.run.last)
         self.history = History.of(state.columns, state.history)
-
-    def _build(self, policy: Policy) -> None:
-        self.policy = policy.to(self.device).train()
-        self.optimizer = make_optimizer(self.policy, self.params)
-        self.average = WeightAverage(self.policy, self.params.ema_decay)
-
-
-def _step_seed(seed: int, step: int) -> int:
-    return int(np.random.SeedSequence((seed, step)).generate_state(1, np.uint64)[0])
+        self.standing.best_error, self.standing.stalled = state.best_error, state.stalled
+        self.step, self._earlier, self._trained_s = state.step, state.rows, state.trained_s

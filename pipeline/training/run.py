@@ -11,6 +11,7 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 
 from pipeline.checkpoint import (
@@ -26,14 +27,18 @@ from pipeline.config import TrainHeadParams
 from pipeline.durable import damaged, read_document, recover_folder, write_document
 from pipeline.errors import CheckpointIncomplete, CheckpointMismatch, ConfigError
 from pipeline.store import FeatureStore
+from pipeline.training.world import World
 
-TRAINER_VERSION = 1
+TRAINER_VERSION = 2
 """Raised with every change of code that changes the numbers of a run: part of its identity, so
 that no run goes on under code other than it began with."""
 RUN, BEST, LAST = "run.json", "best", "last"
 TRAINER_WEIGHTS, TRAINER_DOCUMENT = "trainer.safetensors", "trainer.json"
-FREE_PARAMS = {"device", "output", "logs", "checkpoint_every", "store"}
-"""Params that may change between a stop and the next start: they decide no number of the run."""
+FREE_PARAMS = {"device", "output", "logs", "checkpoint_every", "store", "grad_accumulation"}
+"""Params that may change between a stop and the next start: they decide no number of the run, or
+not alone: `parts`, accumulation times processes, stands for the last."""
+
+_NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 Status = Literal["new", "resumed", "finished"]
 
@@ -47,6 +52,8 @@ class Run:
     notes: tuple[str, ...]
     """What was found and will be done, for the user."""
     identity: Mapping[str, Any]
+    section: str = "train_head"
+    """Of the params: the one that names this run's output, steps and rate."""
 
     @property
     def part(self) -> Path:
@@ -82,7 +89,7 @@ class Run:
 
     def finish(self) -> None:
         """Rename the part to the output, in place of an older run, and drop what only resuming
-        takes: the optimizer's state and the weights before averaging, three times the policy."""
+        takes: the optimizer's state and the weights before averaging, four times what learns."""
         replaced = _replaced(self.output)
         if self.output.exists():
             self.output.rename(replaced)
@@ -92,48 +99,59 @@ class Run:
         _drop_trainer_state(self.output)
 
 
-def open_run(params: TrainHeadParams, store: FeatureStore) -> Run:
+def open_run(
+    params: TrainHeadParams,
+    store: FeatureStore,
+    extra_identity: Mapping[str, Any] = _NOTHING,
+    section: str = "train_head",
+) -> Run:
     """The run of these params on this store: new, resumed or finished.
+
+    `extra_identity` is what else decides its numbers (`Front.identity`); `section` of the params
+    is the one that errors name.
 
     Begins nothing. A finished run with a damaged checkpoint is new: trained again, then replaced.
     Raises `CheckpointMismatch` when an unfinished run with a checkpoint saw other features or other
     streams, `CheckpointIncomplete` when its `run.json` is damaged, and `ConfigError` when the
     output is something that no training wrote.
     """
-    output, identity = params.output, run_identity(params, store)
+    output, identity = params.output, run_identity(params, store, extra_identity)
     part = _part(output)
     notes = []
     _recover(output)
     if output.exists():
-        finished = _finished_identity(output)
+        finished = _finished_identity(output, section)
         if finished != identity:
             notes.append(f"{output} holds another run; it is replaced when this one is finished")
         elif (why := _damage(output)) is None:
             _drop_trainer_state(output)
-            return Run(output, "finished", _finished_notes(params), identity)
+            return Run(output, "finished", _finished_notes(params), identity, section)
         else:
             notes.append(f"{output} is this very run, but damaged; it is trained again: {why}")
     if _has_checkpoint(part) and not (part / RUN).exists():
         raise ConfigError(
             f"{part} has checkpoints but no {RUN}, so it cannot be told what run they are of. "
-            "Move it away or choose another train_head.output."
+            f"Move it away or choose another {section}.output."
         )
     if (part / RUN).exists():
         recover_folder(part / BEST)
         recover_folder(part / LAST)
     if (part / RUN).exists() and _has_checkpoint(part):
-        differing = _compare(part, identity)
+        differing = _compare(part, identity, section)
         if differing:
             notes.append(
                 f"{part} is an unfinished run of something else; it is put aside as "
                 f"{_aside(part)}:\n{describe(differing, 'that run', 'now')}"
             )
         elif (part / LAST).exists():
-            return Run(output, "resumed", (*notes, f"resuming the run in {part}"), identity)
-    return Run(output, "new", tuple(notes), identity)
+            notes.append(f"resuming the run in {part}")
+            return Run(output, "resumed", tuple(notes), identity, section)
+    return Run(output, "new", tuple(notes), identity, section)
 
 
-def run_identity(params: TrainHeadParams, store: FeatureStore) -> dict[str, Any]:
+def run_identity(
+    params: TrainHeadParams, store: FeatureStore, extra_identity: Mapping[str, Any] = _NOTHING
+) -> dict[str, Any]:
     """Everything that decides the numbers of a run, as JSON."""
     episodes = [[e.source, e.id, e.digest, len(e.ticks)] for e in store.episodes]
     digest = hashlib.blake2b(json.dumps(episodes).encode(), digest_size=16)
@@ -141,6 +159,8 @@ def run_identity(params: TrainHeadParams, store: FeatureStore) -> dict[str, Any]
     decides = {
         "trainer_version": TRAINER_VERSION,
         "train_head": params.model_dump(mode="json", exclude=FREE_PARAMS),
+        "parts": World.current().size * params.grad_accumulation,
+        "front": dict(extra_identity),
         "recordings": {
             "episodes": len(store.episodes),
             "ticks": store.ticks,
@@ -150,13 +170,13 @@ def run_identity(params: TrainHeadParams, store: FeatureStore) -> dict[str, Any]
     return json.loads(json.dumps({"source": source_of(store), "decides": decides}))
 
 
-def _finished_identity(output: Path) -> Mapping[str, Any] | None:
+def _finished_identity(output: Path, section: str) -> Mapping[str, Any] | None:
     if (output / RUN).exists():
         return read_document(output / RUN)
     if output.is_dir() and not any(output.iterdir()):
         return None
     raise ConfigError(
-        f"train_head.output: {output} exists and is no training run (it has no {RUN}), and a "
+        f"{section}.output: {output} exists and is no training run (it has no {RUN}), and a "
         "finished run would replace it. Choose another output or move it away."
     )
 
@@ -179,7 +199,7 @@ def _finished_notes(params: TrainHeadParams) -> tuple[str, ...]:
     return said, f"its curves are left where they were written, in {logs}, not in {params.logs}"
 
 
-def _compare(part: Path, identity: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+def _compare(part: Path, identity: Mapping[str, Any], section: str) -> dict[str, tuple[Any, Any]]:
     """What else the unfinished run in `part` was to be; refused where its store was another."""
     prior = read_document(part / RUN)
     source = prior.get("source")
@@ -190,7 +210,7 @@ def _compare(part: Path, identity: Mapping[str, Any]) -> dict[str, tuple[Any, An
         raise CheckpointMismatch(
             f"{part}: this unfinished run cannot go on, its store was another one:\n"
             f"{describe(differing, 'the run', 'the store now')}\n"
-            f"Remove {part} to begin anew, choose another train_head.output, or name the store "
+            f"Remove {part} to begin anew, choose another {section}.output, or name the store "
             "it began with in train_head.store."
         )
     return differences(prior["decides"], identity["decides"])

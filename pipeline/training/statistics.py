@@ -21,7 +21,7 @@ Rows = range | NDArray[np.int64]
 
 class _Chunk(NamedTuple):
     rows: Rows
-    """Where in the store the values lie."""
+    """Where in the store the values lie; of features, each row has one value a variant."""
     values: NDArray[np.floating]
     valid: NDArray[np.bool_] | None
     """(row, slot) of features: False for what is neither checked nor counted."""
@@ -30,10 +30,11 @@ class _Chunk(NamedTuple):
 def fit_normalization(store: FeatureStore, ticks: Ticks) -> Normalization:
     """Statistics per channel over the training `ticks` and what was known at them.
 
-    Features over the VL rows that these ticks use, each once; sensor and state over the readings
-    from each episode's start to the last of its ticks; a stream that none of them has, has none.
-    Reads the store once, a chunk of about 64 MB at a time, with a bar on a terminal. Raises
-    `NumericsError` on NaN or inf, naming episode, tick or reading, time and channel.
+    Features over the VL rows that these ticks use, each once, and over all its variants alike, so
+    (slot, dim) of one variant; sensor and state over the readings from each episode's start to the
+    last of its ticks; a stream that none of them has, has none. Reads the store once, a chunk of
+    about 64 MB at a time, with a bar on a terminal. Raises `NumericsError` on NaN or inf, naming
+    episode, tick or reading, time and channel.
     """
     parts: dict[str, list[Rows]] = {
         "tick": _split(store.array("tick/action"), ticks),
@@ -78,13 +79,15 @@ def _refuse_not_finite(store: FeatureStore, stream: str, chunk: _Chunk, what: st
     bad = np.argwhere(~np.isfinite(chunk.values) & counted)
     if len(bad):
         row, *channel = (int(index) for index in bad[0])
+        stored, variant = divmod(row, len(chunk.values) // len(chunk.rows))
         name = ", ".join(map(str, channel))
         if stream != "vl":
             name = repr(store.streams[_streams_entry(stream)]["names"][channel[0]])
+        augmented = f" of variant {variant}" if variant else ""
         raise NumericsError(
             f"{what}: expected finite numbers, found {chunk.values[(row, *channel)]} at "
-            f"{place(store, stream, int(chunk.rows[row]))}, channel {name}, in {store.path}. Mend "
-            "or leave out the recording and run stages.extract again."
+            f"{place(store, stream, int(chunk.rows[stored]))}, channel {name}{augmented}, in "
+            f"{store.path}. Mend or leave out the recording and run stages.extract again."
         ) from None
 
 
@@ -115,5 +118,9 @@ def _chunks(store: FeatureStore, stream: str, parts: list[Rows]) -> Iterator[_Ch
         values = array[rows.start : rows.stop] if isinstance(rows, range) else array[rows]
         if values.dtype == np.uint16:
             values = torch.from_numpy(values).view(torch.bfloat16).float().numpy()
-        valid = store.array("vl/slot_valid")[rows].astype(bool) if stream == "vl" else None
+        valid = None
+        if stream == "vl":
+            slots = (-1, store.feature_shape[0])
+            values = values.reshape(*slots, values.shape[-1])
+            valid = store.array("vl/slot_valid")[rows].reshape(slots).astype(bool)
         yield _Chunk(rows, values, valid)

@@ -1,9 +1,15 @@
-"""What a run trains from, in words."""
+"""What a run trains, from what, and what it took, in words."""
+
+import torch
 
 from pipeline.config import TrainHeadParams
-from pipeline.models import PolicyShape
+from pipeline.models import Policy, PolicyShape
+from pipeline.models.cost import describe_cost
 from pipeline.sampling import Split
 from pipeline.store import FeatureStore
+from pipeline.training.judging import Standing
+from pipeline.training.learner import Learner
+from pipeline.training.speed import peak_memory_bytes
 
 
 def describe_data(
@@ -41,3 +47,29 @@ def describe_data(
         elif not enabled:
             lines.append(f"{stream}: disabled by train_head.{param}")
     return lines
+
+
+def describe_learner(learner: Learner, policy: Policy) -> list[str]:
+    """Lines on what the policy's parts cost, and on what else is trained or stays frozen."""
+    lines = describe_cost(policy)
+    if learner.module is not policy:
+        table = ", ".join(f"{part} {n:,}" for part, n in learner.trained.parameter_table())
+        lines.append(f"parameters with what is before it: {table}")
+    learning = sum(value.numel() for value in learner.learning.values())
+    whole = sum(value.numel() for value in learner.module.parameters())
+    if learning < whole:
+        lines.append(f"learns {learning:,} of {whole:,} parameters")
+    return lines
+
+
+def closing(step: int, standing: Standing, trained_s: float, device: torch.device) -> list[str]:
+    """Lines on what a run took: its steps, `trained_s` seconds of them, and this process's memory.
+
+    Evaluations and checkpoints are not in the seconds.
+    """
+    early = f"stopped early at step {step}: {standing.stalled} evaluations without a better one"
+    return [
+        *([early] if standing.exhausted else []),
+        f"trained {step} steps in {trained_s:.1f} s ({step / max(trained_s, 1e-9):.1f} steps/s), "
+        f"peak memory {peak_memory_bytes(device) / 2**30:.2f} GiB",
+    ]

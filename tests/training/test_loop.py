@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 
+from pipeline.batches import Windows
 from pipeline.checkpoint import load_policy
 from pipeline.config import TrainHeadParams
 from pipeline.durable import read_document
@@ -20,6 +21,7 @@ from pipeline.errors import NumericsError
 from pipeline.evaluation import judge
 from pipeline.store import FeatureStore
 from pipeline.training import Trainer
+from pipeline.training.checkpoints import Checkpoints
 from pipeline.training.run import TRAINER_VERSION
 from pipeline.training.state import read_trainer
 
@@ -37,7 +39,7 @@ def losses(trainer: Trainer) -> list[float]:
 
 
 def same_weights(one: Trainer, other: Trainer) -> bool:
-    pairs = [(one.policy, other.policy), (one.average.policy, other.average.policy)]
+    pairs = [(one.policy, other.policy), (one.averaged, other.averaged)]
     return all(
         torch.equal(value, b.state_dict()[name])
         for a, b in pairs
@@ -63,10 +65,10 @@ def test_killed_at_any_step_it_ends_the_same(
 ) -> None:
     real = Trainer._train_step
 
-    def killed(self: Trainer, batch: object) -> None:
+    def killed(self: Trainer, *rest: Any) -> bool:
         if self.step == stopped:
             raise Stop
-        real(self, batch)
+        return real(self, *rest)
 
     def killed_at_the_end(self: Trainer, *rest: object) -> None:
         raise Stop
@@ -85,34 +87,44 @@ def test_killed_at_any_step_it_ends_the_same(
     resumed.fit()
     assert losses(resumed) == losses(undisturbed)
     assert same_weights(resumed, undisturbed)
-    assert resumed.best_error == undisturbed.best_error
+    assert resumed.standing.best_error == undisturbed.standing.best_error
     logs, whole = resumed.params.logs, undisturbed.params.logs
     for file in whole.rglob("*.tsv"):
         assert (logs / file.relative_to(whole)).read_text() == file.read_text(), file
     assert (logs / "metrics.json").read_text() == (whole / "metrics.json").read_text()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_the_step_and_saves(
+@pytest.mark.parametrize(("number", "every"), [(signal.SIGINT, 5), (signal.SIGTERM, 13)])
+def test_a_signal_ends_the_step_and_saves_once(
     store: FeatureStore,
     params: Make,
     trainer: Make,
     undisturbed: Trainer,
     monkeypatch: pytest.MonkeyPatch,
     number: signal.Signals,
+    every: int,
 ) -> None:
     real = Trainer._train_step
 
-    def signalled(self: Trainer, batch: object) -> None:
+    def signalled(self: Trainer, *rest: Any) -> bool:
         if self.step == 12:
             os.kill(os.getpid(), number)
-        real(self, batch)
+        return real(self, *rest)
+
+    saved: list[int] = []
+    save = Checkpoints.save_last
+
+    def counted(self: Checkpoints, *rest: Any) -> None:
+        saved.append(rest[-1].step)
+        save(self, *rest)
 
     before = signal.getsignal(number)
     with monkeypatch.context() as patched:
         patched.setattr(Trainer, "_train_step", signalled)
+        patched.setattr(Checkpoints, "save_last", counted)
         with pytest.raises(KeyboardInterrupt):
-            trainer(store, params()).fit()
+            trainer(store, params(checkpoint_every=every)).fit()
+    assert saved == ([5, 10, 13] if every == 5 else [13]), "also where a checkpoint was due"
     assert signal.getsignal(number) is before
     resumed = trainer(store, params())
     assert resumed.step == 13
@@ -128,16 +140,16 @@ def test_what_a_finished_run_leaves(undisturbed: Trainer, store: FeatureStore) -
     assert not undisturbed.run.part.exists()
     last, best = load_policy(output / "last"), load_policy(output / "best")
     assert last.step == 20
-    assert best.metrics["val/error"] == undisturbed.best_error
-    for name, value in undisturbed.average.policy.state_dict().items():
+    assert best.metrics["val/error"] == undisturbed.standing.best_error
+    for name, value in undisturbed.averaged.state_dict().items():
         assert torch.equal(last.weights[name], value)
     with (logs / "plots/metrics/val/error.tsv").open() as file:
         curve = {
             int(row["step"]): float(row["error"]) for row in csv.DictReader(file, delimiter="\t")
         }
     assert set(curve) == {8, 16, 20}
-    assert min(curve.values()) == undisturbed.best_error
-    assert curve[best.step] == undisturbed.best_error
+    assert min(curve.values()) == undisturbed.standing.best_error
+    assert curve[best.step] == undisturbed.standing.best_error
     with (logs / "plots/metrics/train/loss.tsv").open() as file:
         rows = [float(row["loss"]) for row in csv.DictReader(file, delimiter="\t")]
     assert rows == pytest.approx(
@@ -189,7 +201,7 @@ def test_a_loss_that_is_not_finite_names_step_and_ticks(
     monkeypatch.setattr(stopped.policy, "loss", diverging)
     with pytest.raises(NumericsError, match="step 8: expected a finite loss") as caught:
         stopped.fit()
-    assert str(stopped.sampler.batch(7).tolist()) in str(caught.value)
+    assert str(stopped.plan.ticks(7).tolist()) in str(caught.value)
     # The checkpoint on disk is the one from before.
     assert read_trainer(stopped.run.last).step == 5
 
@@ -261,7 +273,7 @@ def test_autocast_trains_in_bfloat16(store: FeatureStore, params: Make, trainer:
 
 
 def test_the_average_shares_what_never_changes(undisturbed: Trainer) -> None:
-    held = dict(undisturbed.average.policy.named_buffers())
+    held = dict(undisturbed.averaged.named_buffers())
     assert held
     for name, value in undisturbed.policy.named_buffers():
         assert torch.equal(value, held[name]), name
@@ -291,10 +303,10 @@ def test_on_a_gpu_a_run_is_stopped_resumed_and_judged(
 ) -> None:
     real = Trainer._train_step
 
-    def killed(self: Trainer, batch: object) -> None:
+    def killed(self: Trainer, *rest: Any) -> bool:
         if self.step == 12:
             raise Stop
-        real(self, batch)
+        return real(self, *rest)
 
     with monkeypatch.context() as patched:
         patched.setattr(Trainer, "_train_step", killed)
@@ -306,6 +318,11 @@ def test_on_a_gpu_a_run_is_stopped_resumed_and_judged(
     assert np.isfinite(losses(resumed)).all()
     best = load_policy(resumed.run.output / "best")
     comparison, _ = judge(
-        best.policy("cuda"), store, resumed.split.held_out, resumed.windows, 8, best.normalization
+        best.policy("cuda"),
+        store,
+        resumed.split.held_out,
+        Windows.of(resumed.params),
+        8,
+        best.normalization,
     )
     assert comparison.overall("policy") == pytest.approx(best.metrics["val/error"], rel=1e-3)

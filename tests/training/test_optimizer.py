@@ -8,14 +8,15 @@ import torch
 from torch import nn
 
 from pipeline.config import TrainHeadParams
-from pipeline.training.ema import WeightAverage
+from pipeline.training.ema import WeightAverage, trainable
 from pipeline.training.history import History
 from pipeline.training.optimizer import (
     decay_groups,
-    learning_rate,
     make_optimizer,
     optimizer_tensors,
     restore_optimizer,
+    schedule,
+    set_learning_rates,
 )
 
 
@@ -33,8 +34,8 @@ class Toy(nn.Module):
 
 
 def test_the_rate_warms_up_peaks_and_ends_at_its_floor() -> None:
-    params = TrainHeadParams(lr=1.0, warmup_steps=10, max_steps=111, min_lr_fraction=0.1)
-    rates = [learning_rate(step, params) for step in range(111)]
+    params = TrainHeadParams(warmup_steps=10, max_steps=111, min_lr_fraction=0.1)
+    rates = [schedule(step, params) for step in range(111)]
     assert rates[:10] == pytest.approx([0.1 * step for step in range(1, 11)])
     assert rates[10] == 1.0
     assert rates[60] == pytest.approx(0.1 + 0.9 / 2)
@@ -44,10 +45,75 @@ def test_the_rate_warms_up_peaks_and_ends_at_its_floor() -> None:
 
 @pytest.mark.parametrize(("warmup", "steps"), [(0, 1), (0, 5), (5, 5), (100, 3), (1, 2)])
 def test_the_rate_is_sane_at_the_extremes(warmup: int, steps: int) -> None:
-    params = TrainHeadParams(lr=2.0, warmup_steps=warmup, max_steps=steps, min_lr_fraction=0)
-    rates = [learning_rate(step, params) for step in range(steps)]
-    assert all(0 <= rate <= 2.0 and math.isfinite(rate) for rate in rates)
-    assert max(rates) == 2.0
+    params = TrainHeadParams(warmup_steps=warmup, max_steps=steps, min_lr_fraction=0)
+    rates = [schedule(step, params) for step in range(steps)]
+    assert all(0 <= rate <= 1.0 and math.isfinite(rate) for rate in rates)
+    assert max(rates) == 1.0
+
+
+def test_a_trapezoid_stays_and_then_falls_in_a_line() -> None:
+    params = TrainHeadParams(
+        lr_schedule="trapezoid",
+        warmup_steps=10,
+        max_steps=100,
+        decay_fraction=0.2,
+        min_lr_fraction=0.1,
+    )
+    rates = [schedule(step, params) for step in range(100)]
+    assert rates[:10] == pytest.approx([0.1 * step for step in range(1, 11)])
+    assert set(rates[10:80]) == {1.0}
+    assert rates[89] == pytest.approx(0.55)
+    assert rates[99] == pytest.approx(0.1)
+    falls = [a - b for a, b in pairwise(rates[79:])]
+    assert falls == pytest.approx([0.9 / 20] * 20)
+
+
+def test_a_constant_rate_only_warms_up() -> None:
+    params = TrainHeadParams(lr_schedule="constant", warmup_steps=4, max_steps=50)
+    rates = [schedule(step, params) for step in range(50)]
+    assert rates[:4] == [0.25, 0.5, 0.75, 1.0]
+    assert set(rates[4:]) == {1.0}
+
+
+@pytest.mark.parametrize("kind", ["cosine", "trapezoid", "constant"])
+@pytest.mark.parametrize("decay", [0.0, 0.5, 1.0])
+def test_every_schedule_is_sane_at_the_extremes(kind: str, decay: float) -> None:
+    for warmup, steps in ((0, 1), (0, 2), (5, 5), (100, 3), (1, 2), (3, 40)):
+        params = TrainHeadParams.model_validate(
+            {
+                "lr_schedule": kind,
+                "decay_fraction": decay,
+                "warmup_steps": warmup,
+                "max_steps": steps,
+                "min_lr_fraction": 0,
+            }
+        )
+        rates = [schedule(step, params) for step in range(steps)]
+        assert all(0 <= rate <= 1 for rate in rates)
+        assert max(rates) == 1.0
+
+
+def test_every_group_follows_the_schedule_from_its_own_peak() -> None:
+    params = TrainHeadParams(lr=1e-3, weight_decay=0.1)
+    toy = Toy()
+    toy.embedding.requires_grad_(False)
+    optimizer = make_optimizer(toy, params, {"linear.weight": 0.5, "linear.bias": 0.5})
+    set_learning_rates(optimizer, 0.5)
+    found = {
+        name: (group["lr"], group["weight_decay"])
+        for group in optimizer.param_groups
+        for name, value in toy.named_parameters()
+        if any(value is member for member in group["params"])
+    }
+    assert found == {
+        "linear.weight": (0.25, 0.1),
+        "linear.bias": (0.25, 0.0),
+        "conv.weight": (5e-4, 0.1),
+        "conv.bias": (5e-4, 0.0),
+        "norm.weight": (5e-4, 0.0),
+        "norm.bias": (5e-4, 0.0),
+        "query": (5e-4, 0.0),
+    }
 
 
 def test_only_matrices_and_kernels_decay() -> None:
@@ -74,11 +140,11 @@ def test_the_optimizer_goes_on_where_it_was() -> None:
 
     torch.manual_seed(0)
     through = Toy()
-    optimizer = make_optimizer(through, params)
+    optimizer = make_optimizer(through, params, {})
     steps(through, optimizer, 3)
     stopped = Toy()
     stopped.load_state_dict(through.state_dict())
-    resumed = make_optimizer(stopped, params)
+    resumed = make_optimizer(stopped, params, {})
     restore_optimizer(resumed, stopped, optimizer_tensors(optimizer, through))
     steps(through, optimizer, 4)
     steps(stopped, resumed, 4)
@@ -93,20 +159,37 @@ def test_the_average_follows_its_formula() -> None:
     expected = 0.0
     for update in range(1, 30):
         nn.init.constant_(policy.weight, float(update))
-        average.update(policy, update)
+        average.update(update)
         decay = min(0.5, update / (update + 9))
         expected = decay * expected + (1 - decay) * update
-        assert average.policy.weight.item() == pytest.approx(expected, rel=1e-5)
-    assert not average.policy.training
-    assert not average.policy.weight.requires_grad
+        assert average.module.weight.item() == pytest.approx(expected, rel=1e-5)
+    assert not average.module.training
+    assert not average.module.weight.requires_grad
+
+
+def test_what_does_not_learn_is_shared_and_left_alone() -> None:
+    toy = Toy()
+    toy.linear.requires_grad_(False)
+    toy.register_buffer("statistics", torch.ones(3))
+    average = WeightAverage(toy, decay=0.5)
+    assert average.module.linear.weight is toy.linear.weight
+    assert average.module.statistics is toy.statistics
+    assert average.module.conv.weight is not toy.conv.weight
+    assert set(average.weights) == set(trainable(toy))
+    before = toy.linear.weight.clone()
+    nn.init.constant_(toy.conv.weight, 3.0)
+    average.update(1)
+    assert torch.equal(toy.linear.weight, before)
+    assert toy.conv.weight.requires_grad
+    assert not average.module.conv.weight.requires_grad
 
 
 def test_without_decay_the_average_is_the_policy() -> None:
     policy = nn.Linear(2, 2)
     average = WeightAverage(policy, decay=0.0)
     nn.init.normal_(policy.weight)
-    average.update(policy, 1)
-    assert torch.equal(average.policy.weight, policy.weight)
+    average.update(1)
+    assert torch.equal(average.module.weight, policy.weight)
 
 
 def test_history_settles_late_and_names_the_first_bad_step() -> None:

@@ -27,10 +27,10 @@ def unfinished(
     """A run stopped at step 11, its last checkpoint at step 10."""
     real = Trainer._train_step
 
-    def killed(self: Trainer, batch: object) -> None:
+    def killed(self: Trainer, *rest: Any) -> bool:
         if self.step == 11:
             raise Stop
-        real(self, batch)
+        return real(self, *rest)
 
     with monkeypatch.context() as patched:
         patched.setattr(Trainer, "_train_step", killed)
@@ -240,4 +240,4 @@ def test_code_of_other_numbers_goes_on_with_no_run(
     monkeypatch.setattr("pipeline.training.run.TRAINER_VERSION", 99)
     run = open_run(params(), store)
     assert run.status == "new"
-    assert "trainer_version: 1 (that run), 99 (now)" in run.notes[0]
+    assert "trainer_version: 2 (that run), 99 (now)" in run.notes[0]

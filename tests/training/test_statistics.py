@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import zarr
 
 from pipeline.errors import NumericsError
 from pipeline.store import FeatureStore
@@ -35,6 +36,36 @@ def test_statistics_are_those_of_the_training_ticks(
         assert statistics.count == len(values), name
         assert statistics.mean == pytest.approx(values.mean(0, np.float64), abs=1e-6), name
         assert statistics.std == pytest.approx(values.std(0, np.float64), abs=1e-6), name
+
+
+@pytest.mark.parametrize("chunk_bytes", [1, 2**26])
+def test_features_are_counted_over_all_variants(
+    tiny_store: Callable[..., Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    chunk_bytes: int,
+) -> None:
+    monkeypatch.setattr("pipeline.training.statistics.CHUNK_BYTES", chunk_bytes)
+    path = tiny_store(tmp_path, slots=6)
+    zarr.open_group(path, mode="r+").attrs["feature_spec"] = {"digest": "x", "variants": 3}
+    store = FeatureStore.open(path)
+    store.array("vl/slot_valid")[10:13, [1, 3, 5]] = 0
+    found = fit_normalization(store, np.arange(30, 60)).features
+    assert found is not None
+    assert found.mean.shape == (2, 8)
+    assert found.count == 3 * 10
+    for slot, rows in ((0, range(10, 20)), (1, range(13, 20))):
+        values = store.array("vl/features")[rows, slot::2].reshape(-1, 8)
+        assert found.mean[slot] == pytest.approx(values.mean(0, np.float64), abs=1e-6)
+        assert found.std[slot] == pytest.approx(values.std(0, np.float64), abs=1e-6)
+
+    store.array("vl/features")[12, 5, 3] = np.nan
+    fit_normalization(store, np.arange(30, 60))  # there, that slot is not valid
+    store.array("vl/features")[14, 5, 3] = np.nan
+    with pytest.raises(
+        NumericsError, match=r"episode_001, VL row 4 .*, channel 1, 3 of variant 2, in "
+    ):
+        fit_normalization(store, np.arange(30, 60))
 
 
 def test_absent_streams_have_none_and_bfloat16_is_read(

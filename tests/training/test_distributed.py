@@ -1,0 +1,306 @@
+"""Two processes that torchrun started do what one does, and stop together."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+
+from pipeline.checkpoint import load_policy
+from pipeline.config import load_params
+from pipeline.errors import ConfigError
+from pipeline.store import FeatureStore, build_lock
+from pipeline.training import Trainer, World, process_group
+from pipeline.training.world import process_device
+
+ROOT = Path(__file__).resolve().parents[2]
+Make = Callable[..., Any]
+TRAIN = """
+import os, sys, time
+import pipeline.training.loop as loop
+from pipeline.errors import StoreIncomplete
+from stages import train_head
+from stages.command import run
+
+loop.LOG_EVERY = 1
+slow = float(sys.argv.pop(1))
+step = loop.Trainer._train_step
+
+def train_step(self, *rest):
+    stopped = step(self, *rest)
+    if slow and self.world.first:
+        print("step", self.step, flush=True)
+    time.sleep(slow)
+    return stopped
+
+loop.Trainer._train_step = train_step
+place, rank = sys.argv.pop(1), os.environ["RANK"]
+fitted = loop.Trainer.fit
+
+def fail(*rest, **named):
+    raise StoreIncomplete(f"no store on the machine of {rank}")
+
+def fit(self):
+    self.learner.step = fail
+    fitted(self)
+
+if place == f"open {rank}":
+    train_head.FeatureStore.open = fail
+if place == f"step {rank}":
+    loop.Trainer.fit = fit
+sys.exit(run("", train_head.main, sys.argv[1:]))
+"""
+PRIMITIVES = """
+import torch
+from torch import nn
+from pipeline.errors import StoreLocked
+from pipeline.training import process_group
+from pipeline.training.gradients import sum_gradients
+from pipeline.training.speaker import SaidByFirst
+
+with process_group("cpu") as world:
+    rank = float(world.rank)
+    assert world.size == 2
+    assert world.shared(lambda: ("only", world.rank)) == ("only", 0)
+    kept = {"a": torch.full((2, 3), 7.0), "n": torch.tensor(5)}
+    found = world.tensors(kept if world.first else {})
+    assert found["a"].tolist() == [[7.0] * 3] * 2 and found["n"].item() == 5
+    assert world.any([world.rank == 1, False, True]) == [True, False, True]
+    double = torch.tensor([rank], dtype=torch.float64)
+    several = [torch.full((3,), rank), torch.tensor(rank + 1), double]
+    world.sum(several)
+    assert [t.tolist() for t in several] == [[1.0] * 3, 3.0, [1.0]]
+    # One parameter used by rank 1 alone, one by both, one by none.
+    used = nn.ParameterList(torch.zeros(2) for _ in range(3))
+    used[0].grad = torch.ones(2) if world.rank == 1 else None
+    used[1].grad = torch.full((2,), rank + 1)
+    loss = {"loss": torch.tensor(rank)}
+    assert sum_gradients(world, used, loss, stop=world.rank == 1)
+    assert used[0].grad.tolist() == [1.0, 1.0]
+    assert used[1].grad.tolist() == [3.0, 3.0]
+    assert used[2].grad is None
+    assert loss["loss"].item() == 1.0
+    def locked():
+        raise StoreLocked("held by another")
+    try:
+        world.shared(locked)
+    except StoreLocked:
+        assert world.first
+    except SaidByFirst as error:
+        assert not world.first and "held by another" in str(error)
+    else:
+        raise AssertionError("a failure on rank 0 went unheard")
+    print("done", world.rank, flush=True)
+"""
+
+
+def torchrun(script: Path, *arguments: object) -> "subprocess.Popen[str]":
+    """Two processes on this machine, which meet at a port of their own."""
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
+    return subprocess.Popen(
+        [*command, str(script), *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+    )
+
+
+@pytest.fixture
+def script(tmp_path: Path) -> Path:
+    path = tmp_path / "train.py"
+    path.write_text(TRAIN)
+    return path
+
+
+@pytest.fixture
+def write(store: FeatureStore, params: Make, tmp_path: Path) -> Make:
+    """`write(name, key=value, ...)`: a params.yaml of small params."""
+
+    def make(name: str, **changed: Any) -> Path:
+        places = {"output": tmp_path / name, "logs": tmp_path / f"{name}_logs"}
+        # Nine ticks cannot be halved, and chunks near an episode's end have fewer steps.
+        head = params(**{"batch_size": 9, "horizon": 9} | places | changed)
+        document = {
+            "data": {"sources": [{"name": "left", "path": "a"}, {"name": "right", "path": "b"}]},
+            "vlm": {"checkpoint": "unused"},
+            "extract": {"store": str(store.path)},
+            "train_head": head.model_dump(mode="json"),
+        }
+        path = tmp_path / f"{name}.yaml"
+        path.write_text(yaml.safe_dump(document))
+        return path
+
+    return make
+
+
+def curves(logs: Path) -> dict[str, list[float]]:
+    return {
+        str(file.relative_to(logs)): [
+            float(line.split("\t")[1]) for line in file.read_text().splitlines()[1:]
+        ]
+        for file in logs.rglob("*.tsv")
+    }
+
+
+def train_alone(trainer: Make, store: FeatureStore, written: Path) -> Trainer:
+    done = trainer(store, load_params(written).train_head)
+    done.fit()
+    return done
+
+
+def same(one: Path, other: Path) -> bool:
+    """Whether two checkpoints have the same weights within float noise."""
+    a, b = load_policy(one).weights, load_policy(other).weights
+    return all(torch.allclose(a[name], b[name], rtol=1e-3, atol=1e-5) for name in a)
+
+
+def test_two_processes_follow_the_curve_of_one_that_accumulates(
+    store: FeatureStore,
+    trainer: Make,
+    write: Make,
+    script: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """With dropout, uneven parts and accumulation on each; both stop early at the same step."""
+    chosen = {
+        "max_steps": 24,
+        "eval_every": 2,
+        "early_stopping": 1,
+        "ema_decay": 0.0,
+        "drop_sensor": 0.3,
+    }
+    together = write("together", grad_accumulation=2, **chosen)
+    process = torchrun(script, 0, "", "--params", together)
+    alone = write("alone", grad_accumulation=4, **chosen)
+    monkeypatch.setattr("pipeline.training.loop.LOG_EVERY", 1)
+    done = train_alone(trainer, store, alone)
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 0, err
+    assert "device cpu on 2 processes" in out
+    assert out.count("parameters") == 1, "one process speaks"
+    assert f"stopped early at step {done.step}" in out
+    assert done.step < 24
+    found, expected = curves(tmp_path / "together_logs"), curves(tmp_path / "alone_logs")
+    assert set(found) == set(expected)
+    for name, values in expected.items():
+        assert found[name] == pytest.approx(values, rel=1e-3, abs=1e-5), name
+    assert same(tmp_path / "together/last", tmp_path / "alone/last")
+
+
+def test_a_signal_to_torchrun_stops_all_after_one_step_and_one_process_can_go_on(
+    store: FeatureStore, trainer: Make, write: Make, script: Path, tmp_path: Path
+) -> None:
+    written = write("together", model_type="diffusion", checkpoint_every=1000, max_steps=30)
+    process = torchrun(script, 0.05, "", "--params", written)
+    assert process.stdout is not None
+    while "step 6" not in (line := process.stdout.readline()):
+        assert line, "ended before step 6"
+    process.send_signal(signal.SIGTERM)
+    _, err = process.communicate(timeout=60)
+    assert err.count("stopped; the same command continues from here") == 1
+    last = json.loads((tmp_path / "together.part/last/trainer.json").read_text())
+    assert 6 <= last["step"] <= 10
+    head = load_params(written, ["train_head.grad_accumulation=2"]).train_head
+    resumed = trainer(store, head)
+    assert (resumed.run.status, resumed.step) == ("resumed", last["step"])
+    resumed.fit()
+    train_alone(
+        trainer, store, write("alone", model_type="diffusion", max_steps=30, grad_accumulation=2)
+    )
+    assert same(tmp_path / "together/last", tmp_path / "alone/last")
+
+
+def test_a_loss_that_is_not_finite_is_said_once_and_nobody_waits(write: Make, script: Path) -> None:
+    process = torchrun(script, 0, "", "--params", write("together", lr=1e30))
+    _, err = process.communicate(timeout=100)
+    assert process.returncode == 1
+    assert err.count("error: step") == 1
+    assert "expected a finite loss and gradient" in err
+
+
+def test_what_only_rank_0_finds_ends_all(write: Make, script: Path, tmp_path: Path) -> None:
+    with build_lock(tmp_path / "together"):
+        process = torchrun(script, 0, "", "--params", write("together"))
+        _, err = process.communicate(timeout=100)
+    assert process.returncode == 1
+    assert err.count("being built by") == 1
+    assert "SaidByFirst" not in err
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("train_head.store=nowhere.zarr", "no finished store"),
+        ("train_head.device=cuda:0", "expected auto, cpu or cuda for 2 processes"),
+    ],
+)
+def test_what_all_processes_find_is_said_once(
+    write: Make, script: Path, override: str, said: str
+) -> None:
+    process = torchrun(script, 0, "", "--params", write("together"), "--set", override)
+    _, err = process.communicate(timeout=100)
+    assert process.returncode == 1
+    assert err.count("error: ") == 1
+    assert err.count(said) == 1
+    assert "process of rank" not in err, "rank 0 speaks"
+
+
+@pytest.mark.parametrize(("place", "rank"), [("open", 0), ("open", 1), ("step", 1)])
+def test_what_one_process_finds_is_said_and_nobody_waits(
+    write: Make, script: Path, place: str, rank: int
+) -> None:
+    process = torchrun(script, 0, f"{place} {rank}", "--params", write("together"))
+    _, err = process.communicate(timeout=100)
+    assert process.returncode == 1
+    assert err.count("error: ") == 1
+    assert err.count(f"no store on the machine of {rank}") == 1
+    assert ("error: process of rank 1: " in err) == (rank == 1)
+    assert "stopped; the same command" not in err
+    assert "Connection closed" not in err
+
+
+def test_what_processes_tell_each_other(tmp_path: Path) -> None:
+    script = tmp_path / "primitives.py"
+    script.write_text(PRIMITIVES)
+    out, err = torchrun(script).communicate(timeout=100)
+    assert "done 0" in out, err
+    assert "done 1" in out, err
+
+
+def test_a_process_alone_is_a_world() -> None:
+    world = World.current()
+    assert (world.rank, world.size, world.first) == (0, 1, True)
+    assert world.any([True, False]) == [True, False]
+    with pytest.raises(ConfigError), process_group("cpu") as group:
+        assert group == world
+        raise ConfigError("as it is")
+
+
+def test_an_incomplete_environment_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    monkeypatch.setenv("RANK", "0")
+    with pytest.raises(ConfigError, match="LOCAL_RANK, MASTER_ADDR, MASTER_PORT is missing"):
+        process_group("cpu").__enter__()
+
+
+def test_every_process_has_a_gpu_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    monkeypatch.setenv("LOCAL_RANK", "1")
+    with pytest.raises(ConfigError, match=r"cuda:0: expected auto, cpu or cuda for 2 processes"):
+        process_device("cuda:0")
+    assert process_device("cpu").type == "cpu"
+    asked: list[str] = []
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    monkeypatch.setattr("pipeline.training.world.resolve_device", asked.append)
+    for name in ("auto", "cuda"):
+        process_device(name)
+    assert asked == ["cuda:1", "cuda:1"]
