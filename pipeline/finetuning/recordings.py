@@ -1,0 +1,103 @@
+"""The recordings that a store was made from, found again and known to be the same."""
+
+from collections.abc import Sequence
+from contextlib import closing
+
+from tqdm import tqdm
+
+from pipeline.config import Params
+from pipeline.digests import ContentDigests
+from pipeline.errors import RecordingError, StoreMismatch
+from pipeline.extraction.survey import content_digest
+from pipeline.recordings import Opened, Recording, open_recordings
+from pipeline.store import Episode, FeatureStore
+from pipeline.vlm.feature_spec import FeatureSpec, differences, feature_spec
+
+_SHOWN = 5
+_EXTRACT = "python -m stages.extract"
+
+
+def find_recordings(store: FeatureStore, params: Params) -> tuple[Recording, ...]:
+    """The recording of each episode of the store, in its order, by source and id.
+
+    Only the store's views are kept. Reads metadata only. Raises `StoreMismatch` naming the
+    episodes that `data.sources` no longer have.
+    """
+    opened = open_recordings(params.data.sources, params.data.root, store.spec["views"])
+    known = {(one.source, one.id): one for one in opened.recordings}
+    missing = [one for one in store.episodes if (one.source, one.id) not in known]
+    if missing:
+        sources = {source.name for source in params.data.sources}
+        _refuse(store, [(one, _why_missing(one, sources, opened)) for one in missing])
+    return tuple(known[one.source, one.id] for one in store.episodes)
+
+
+def check_recordings(
+    store: FeatureStore, recordings: Sequence[Recording], digests: ContentDigests
+) -> None:
+    """Raise `StoreMismatch` where a recording is not what it was when the store was extracted.
+
+    `recordings` are those of `find_recordings`. A file is read where its digest is not known yet.
+    """
+    changed: list[tuple[Episode, str]] = []
+    pairs = list(zip(store.episodes, recordings, strict=True))
+    for episode, recording in tqdm(pairs, "check", unit="episode", disable=None, leave=False):
+        try:
+            if content_digest(recording, digests) != episode.content:
+                changed.append((episode, f"the files in {recording.path} changed since extraction"))
+            elif recording.instruction != episode.instruction:
+                said = f"{episode.instruction!r} at extraction, {recording.instruction!r} now"
+                changed.append((episode, f"its instruction was {said}"))
+        except RecordingError as error:
+            changed.append((episode, str(error)))
+    if changed:
+        _refuse(store, changed)
+
+
+def check_spec(store: FeatureStore, params: Params, digests: ContentDigests) -> FeatureSpec:
+    """The feature spec of the store, which `vlm` must give.
+
+    Raises `StoreMismatch` with the entries that differ, and `VLMError` where the checkpoint cannot
+    be used.
+    """
+    stored = store.spec
+    spec = feature_spec(params.vlm, stored["storage_dtype"], stored["views"], digests.of)
+    if spec.digest != stored["digest"]:
+        lines = "\n".join(f"  {line}" for line in differences(stored, spec.attrs()))
+        raise StoreMismatch(
+            f"{store.path}: tuning begins with the model whose features the store holds, but its "
+            f"feature spec is not that of vlm (store -> vlm):\n{lines}\n"
+            "Set vlm to what the store was extracted with, name another store in "
+            f"train_head.store, or extract one with these params: {_EXTRACT}"
+        )
+    return spec
+
+
+def known_digests(store: FeatureStore) -> "closing[ContentDigests]":
+    """The ledger that extraction keeps beside a store, to be closed."""
+    return closing(ContentDigests(store.path.with_name(f"{store.path.name}.files.sqlite")))
+
+
+def _why_missing(episode: Episode, sources: set[str], opened: Opened) -> str:
+    if episode.source not in sources:
+        return f"data.sources has no source {episode.source!r}"
+    for bad in opened.bad:
+        if bad.source == episode.source and bad.where.name == episode.id.rpartition("/")[2]:
+            return bad.reason
+    for line in opened.missing:
+        if line.startswith(f"{episode.source}: ") and episode.id in line:
+            return line
+    return f"it is not there; it was extracted from {episode.path}, relative to data.root"
+
+
+def _refuse(store: FeatureStore, wrong: Sequence[tuple[Episode, str]]) -> None:
+    lines = [f"  {one.source}/{one.id}: {why}" for one, why in wrong[:_SHOWN]]
+    if len(wrong) > _SHOWN:
+        lines.append(f"  … and {len(wrong) - _SHOWN} more")
+    raise StoreMismatch(
+        f"{store.path}: expected the recordings that the store was extracted from, but of its "
+        f"{len(store.episodes)} episodes {len(wrong)} cannot be found as they were:\n"
+        + "\n".join(lines)
+        + f"\nPut the recordings back (data.root, data.sources), or extract a store of what is "
+        f"there now: {_EXTRACT}"
+    )

@@ -1,0 +1,44 @@
+"""Tune the vision-language model end to end from recordings, with the policy of train_head on top.
+
+Ticks, streams, split and normalisation come from the store, frames from the recordings of
+data.sources. Writes checkpoints with an adapter (or a whole checkpoint) into finetune.output, for
+extract to compute better features with. Works in `<finetune.output>.part` and renames it when
+finished; stopped or killed, the same command continues from the last checkpoint.
+
+  python -m stages.finetune                                        low-rank adapters
+  python -m stages.finetune --set finetune.tuning.method=full      every weight
+  torchrun --nproc_per_node 2 -m stages.finetune                   on two GPUs
+"""
+
+from pipeline.config import Params
+from pipeline.finetuning import Live, head_params, next_steps, out_of_memory_named
+from pipeline.finetuning.params import left_out
+from pipeline.sampling import split_by_episode
+from pipeline.store import FeatureStore, build_lock
+from pipeline.training import Trainer, open_run, process_group
+from pipeline.training.world import process_device
+from stages.command import run
+
+
+def main(params: Params) -> None:
+    """Tune the model that `vlm` and `finetune` describe."""
+    with process_group(params.train_head.device) as world:
+        head = head_params(params)
+        store = FeatureStore.open(head.store or params.extract.store)
+        with world.holding(build_lock(head.output)), out_of_memory_named():
+            front = Live.open(store, params, process_device(head.device))
+            opened = world.shared(lambda: open_run(head, store, front.identity, "finetune"))
+            world.say(*left_out(params), *opened.notes)
+            if opened.status == "finished":
+                world.say("nothing to do", *next_steps(params.finetune, store))
+                return
+            split = split_by_episode(store, head.val_fraction, head.horizon)
+            trainer = Trainer(store, head, split, opened, front)
+            world.say(*trainer.summary(), *front.summary())
+            trainer.fit()
+        world.say(f"best and last checkpoint: {opened.output}; curves: {head.logs}")
+        world.say(*next_steps(params.finetune, store))
+
+
+if __name__ == "__main__":
+    raise SystemExit(run(__doc__ or "", main))

@@ -1,0 +1,217 @@
+"""`stages.finetune` as a user meets it: what it prints, how it stops, what it refuses."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from PIL import Image
+
+from stages import evaluate, extract, finetune, train_head
+from stages.command import run
+
+ROOT = Path(finetune.__file__).parents[1]
+SLOWED = """
+import sys, time
+from pipeline.training import Trainer
+from stages import finetune
+from stages.command import run
+
+step = Trainer._train_step
+def slow(self, *rest):
+    stopped = step(self, *rest)
+    print("step", self.step, flush=True)
+    time.sleep(0.05)
+    return stopped
+Trainer._train_step = slow
+sys.exit(run("", finetune.main, ["--params", sys.argv[1]]))
+"""
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    """Sums over several threads are taken in another order, so that bits differ."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="session")
+def extracted(tmp_path_factory: pytest.TempPathFactory, demo_checkpoint: Path) -> Path:
+    """A params.yaml whose store of three recordings is finished."""
+    root = tmp_path_factory.mktemp("finetune_stage")
+    for seed in range(3):
+        _write_episode(root / "recordings" / "Touch_dot" / f"episode_{seed}", seed)
+    document = {
+        "data": {"root": str(root / "recordings"), "sources": [{"name": "made", "path": "."}]},
+        "vlm": {
+            "checkpoint": str(demo_checkpoint),
+            "dtype": "float32",
+            "image_resize_height": 28,
+            "image_resize_width": 56,
+        },
+        "extract": {"store": str(root / "made.zarr"), "device": "cpu"},
+        "train_head": {
+            "robot_state_enabled": False,
+            "expert": {"dim": 8, "layers": 1, "heads": 1},
+            "val_fraction": 0.3,
+            "max_steps": 3,
+            "device": "cpu",
+            "output": str(root / "head"),
+            "logs": str(root / "head_logs"),
+        },
+        "finetune": {"batch_size": 4, "max_steps": 4, "eval_every": 2, "checkpoint_every": 2},
+        "evaluate": {"device": "cpu", "modalities": False},
+    }
+    path = root / "params.yaml"
+    path.write_text(yaml.safe_dump(document))
+    assert run("", extract.main, ["--params", str(path)]) == 0
+    return path
+
+
+def _write_episode(folder: Path, seed: int) -> None:
+    """Two seconds of one camera and of poses, in the windowed format."""
+    rng = np.random.default_rng(seed)
+    start = 1.7e9 + 10 * seed
+    (folder / "images" / "View1").mkdir(parents=True)
+    for frame in range(21):
+        pixels = rng.integers(0, 255, (24, 32, 3), np.uint8)
+        name = f"{start + frame / 10:.3f}.jpg"
+        Image.fromarray(pixels).save(folder / "images" / "View1" / name)
+    poses = np.cumsum(rng.normal(size=(201, 12)), axis=0).astype(np.float32) * 0.1
+    np.savez(
+        folder / "robot_states.npz", robot_states=poses, joints=poses[:, :6], poses=poses[:, 6:]
+    )
+    metadata = {
+        "episode_name": folder.name,
+        "start_time": start,
+        "end_time": start + 2.0,
+        "camera_views": ["View1"],
+        "robot_hz": 100,
+    }
+    (folder / "metadata.json").write_text(json.dumps(metadata))
+
+
+@pytest.fixture
+def write_params(extracted: Path, tmp_path: Path) -> Callable[..., Path]:
+    """`write_params(name, finetune={...}, ...)`: params that work below the test's folder."""
+
+    def write(name: str = "tuned", **sections: dict[str, Any]) -> Path:
+        document = yaml.safe_load(extracted.read_text())
+        document["finetune"] |= {
+            "output": str(tmp_path / name),
+            "logs": str(tmp_path / f"{name}_logs"),
+        }
+        for section, values in sections.items():
+            document[section] |= values
+        path = tmp_path / f"{name}.yaml"
+        path.write_text(yaml.safe_dump(document))
+        return path
+
+    return write
+
+
+def started(params: Path) -> "subprocess.Popen[str]":
+    return subprocess.Popen(
+        [sys.executable, "-c", SLOWED, str(params)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+    )
+
+
+def wait_for(process: "subprocess.Popen[str]", line: str) -> None:
+    assert process.stdout is not None
+    for said in process.stdout:
+        if said.strip() == line:
+            return
+    raise AssertionError(f"ended before {line!r}")
+
+
+def test_it_tunes_and_says_how_to_go_on_and_that_works(
+    write_params: Callable[..., Path],
+    extracted: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    params = str(write_params())
+    assert run("", finetune.main, ["--params", params]) == 0
+    captured = capsys.readouterr()
+    assert captured.err == "", "no progress where there is no terminal"
+    assert "vlm, learning" in captured.out
+    assert "vlm, frozen" in captured.out
+    assert "tuning: lora of rank 16 on the language and vision tower" in captured.out
+    assert "step 4: train loss" in captured.out
+    adapter, tuned = tmp_path / "tuned" / "best" / "adapter", extracted.parent / "made_tuned.zarr"
+    extracting = f"--set vlm.adapter={adapter} --set extract.store={tuned}"
+    training = f"--set train_head.store={tuned}"
+    assert f"python -m stages.extract {extracting}\n" in captured.out
+    assert f"python -m stages.train_head {training}\n" in captured.out
+
+    assert run("", finetune.main, ["--params", params]) == 0
+    assert "nothing to do" in capsys.readouterr().out
+
+    assert run("", extract.main, ["--params", params, *extracting.split()]) == 0
+    assert run("", train_head.main, ["--params", params, *training.split()]) == 0
+    report = tmp_path / "report"
+    judged = [f"evaluate.checkpoint={tmp_path / 'tuned'}", f"evaluate.output={report}"]
+    options = [part for one in judged for part in ("--set", one)]
+    assert run("", evaluate.main, ["--params", params, *training.split(), *options]) == 0
+    found = json.loads((report / "metrics.json").read_text())
+    best = json.loads((tmp_path / "tuned" / "best" / "policy.json").read_text())
+    # Held-out ticks are fewer than eval_ticks: tuning has judged the very same ones, live.
+    assert found["overall"]["policy"] == pytest.approx(best["metrics"]["val/error"], rel=1e-3)
+
+    capsys.readouterr()
+    assert run("", evaluate.main, ["--params", params, *options]) == 2
+    assert "feature_spec.adapter" in capsys.readouterr().err, "these features are not the tuned"
+
+
+def test_killed_in_mid_run_it_ends_where_an_undisturbed_run_ends(
+    write_params: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    process = started(write_params("killed"))
+    wait_for(process, "step 3")
+    assert run("", finetune.main, ["--params", str(write_params("killed"))]) == 2
+    assert "being built by process" in capsys.readouterr().err
+    process.kill()
+    process.communicate(timeout=60)
+    assert (tmp_path / "killed.part/last/adapter/adapter_config.json").exists()
+    for name in ("undisturbed", "killed"):
+        assert run("", finetune.main, ["--params", str(write_params(name))]) == 0
+    said = capsys.readouterr().out
+    assert "resuming the run in" in said
+    assert "steps 2 to 4" in said
+    for name in ("best", "last"):
+        for file in ("policy.safetensors", "adapter/adapter_model.safetensors"):
+            one, other = (tmp_path / run / name / file for run in ("undisturbed", "killed"))
+            assert one.read_bytes() == other.read_bytes()
+
+
+def test_mistakes_end_in_one_message(
+    write_params: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    params = write_params()
+    for override, said in (
+        ("finetune.tuning.method=none", "python -m stages.train_head"),
+        ("train_head.features_enabled=false", "would not see the model"),
+        ("finetune.lr=-1", "finetune.lr"),
+        ("train_head.store=nowhere.zarr", "no finished store"),
+        ("vlm.prompt=look", "prompt: '{instruction}"),
+        ("data.sources=[{name: other, path: .}]", "no source 'made'"),
+        ("vlm.dtype=float16", "compute_dtype: 'float32' -> 'float16'"),
+    ):
+        assert run("", finetune.main, ["--params", str(params), "--set", override]) == 2
+        err = capsys.readouterr().err
+        assert said in err
+        assert "Traceback" not in err
+    assert not (tmp_path / "tuned.part").exists(), "bad params leave nothing behind"
