@@ -1,0 +1,89 @@
+"""What a data set hands out, and how single samples become a batch."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float64, Int64, UInt8
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pipeline.errors import StoreMismatch
+from pipeline.store import Batch
+
+Images = Mapping[str, NDArray[np.uint8]]
+"""Frames (height, width, 3) RGB by view; a view that the episode lacks is not in it."""
+
+Sample = Mapping[str, Any]
+"""One tick: the fields of `UnifiedBatch` by name, without their batch axis."""
+
+
+@dataclass
+class UnifiedBatch(Batch):
+    """The store's batch, and what a tick looks like where there are no features of it.
+
+    It is an `Observation`: `policy.loss(batch, batch.action, batch.action_valid)` takes it, and
+    `QwenVLAUnified` its `inputs()`. With a store there are features and their `key`, without one
+    features have no slots and there are `images`.
+    """
+
+    tick: Int64[Tensor, " batch"]
+    """Index into `UnifiedVLADataset.store`."""
+    time: Float64[Tensor, " batch"]
+    """Seconds on the episode's clock."""
+    episode: Int64[Tensor, " batch"]
+    """Index into `UnifiedVLADataset.store.episodes`."""
+    vl_row: Int64[Tensor, " batch"]
+    """Equal for ticks that see the same frames."""
+    instruction: list[str]
+    images: list[Images] | None = None
+    """Of each sample; samples of one VL row share the arrays."""
+    key: UInt8[Tensor, "batch 16"] | None = None
+    """Digest of feature spec, prompt and frames: what the cached features are of."""
+
+    def __getitem__(self, index: int) -> Sample:
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"a batch of {len(self)} samples has no sample {index}")
+        return {
+            name: value if value is None else value[index] for name, value in vars(self).items()
+        }
+
+    def __iter__(self) -> Iterator[Sample]:
+        return (self[index] for index in range(len(self)))
+
+    def inputs(self) -> dict[str, Any]:
+        """Keyword arguments of `QwenVLAUnified.forward`; `actions` among them ask for a loss."""
+        streams = ("feature_age", "sensor", "sensor_valid", "state", "state_valid", "action_valid")
+        given = {name: getattr(self, name) for name in streams} | {"actions": self.action}
+        if self.images is not None:
+            return given | {"images": self.images, "text": self.instruction}
+        return given | {"features": self.features, "slot_valid": self.slot_valid}
+
+    pin_memory = Batch.pin
+    """What `DataLoader(pin_memory=True)` calls."""
+
+
+def unified_collate_fn(samples: Sequence[Sample] | UnifiedBatch) -> UnifiedBatch:
+    """The batch of these samples of one data set; a batch read in one go passes through.
+
+    Windows have one length already, so nothing is padded here: `*_valid` says what is real.
+    Raises `StoreMismatch` where some samples have features and others have frames.
+    """
+    if isinstance(samples, UnifiedBatch):
+        return samples
+    names = [field.name for field in fields(UnifiedBatch)]
+    cached = sum(sample["images"] is None for sample in samples)
+    if cached not in (0, len(samples)):
+        raise StoreMismatch(
+            f"a batch has features or frames, but {cached} of its {len(samples)} samples have "
+            "features of a store. Give all data sets a store, or none"
+        )
+    return UnifiedBatch(**{name: _together([one[name] for one in samples]) for name in names})
+
+
+def _together(values: list[Any]) -> Any:
+    if values[0] is None:
+        return None
+    return torch.stack(values) if isinstance(values[0], Tensor) else values

@@ -1,0 +1,157 @@
+"""Old and new recordings in one loader, drawn by weight."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from math import inf
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from torch.utils.data import DataLoader, Sampler
+
+from pipeline.config import Source
+from pipeline.datasets.batch import unified_collate_fn
+from pipeline.datasets.unified import UnifiedVLADataset
+from pipeline.errors import ConfigError
+from pipeline.sampling import TickSampler
+from pipeline.store import FeatureStore
+
+
+class MixtureBatches(Sampler[list[int]]):
+    """Batches of items, each a function of (seed, step); a batch sampler of a DataLoader.
+
+    The sources' shares of the draws are as `weights`, 1 where not named, whatever their sizes;
+    kept to one draw. An epoch is as many draws as there are items. An iteration goes from
+    `first_step` to the end of its epoch; its first batch moves `first_step` to the next epoch, so
+    that none is repeated where an iteration is broken off. To resume a run, set `first_step` to
+    the number of batches it has taken.
+
+    Raises `ConfigError` for weights that are negative or of a source that is not there, where no
+    source has both items and weight, and for batches without an item.
+    """
+
+    def __init__(
+        self,
+        by_source: Mapping[str, NDArray[np.int64]],
+        weights: Mapping[str, float],
+        batch_size: int,
+        seed: int,
+    ) -> None:
+        sizes = {name: len(items) for name, items in by_source.items()}
+        _check(sizes, weights, batch_size)
+        # TickSampler weighs items; divided by their number, weights are those of sources.
+        each = {name: weights.get(name, 1.0) / max(1, size) for name, size in sizes.items()}
+        self._sampler = TickSampler(by_source, each, batch_size, seed)
+        self.steps_per_epoch = -(-sum(sizes.values()) // batch_size)
+        self.first_step = 0
+
+    def __len__(self) -> int:
+        return self.steps_per_epoch - self.first_step % self.steps_per_epoch
+
+    def __iter__(self) -> Iterator[list[int]]:
+        # At the first batch, not before: a DataLoader with workers makes two iterators of an epoch.
+        begin = self.first_step
+        self.first_step += len(self)
+        for step in range(begin, self.first_step):
+            yield self.batch(step)
+
+    def batch(self, step: int) -> list[int]:
+        """The items of this step."""
+        return self._sampler.batch(step).tolist()
+
+
+def create_unified_dataloader(
+    old_dataset_patterns: str | Path | Sequence[str | Path] = (),
+    new_dataset_path: str | Path | Sequence[str | Path] | None = None,
+    old_weight: float = 1.0,
+    new_weight: float = 3.0,
+    batch_size: int = 8,
+    num_workers: int = 0,
+    horizon: int = 8,
+    vlm_reuse_count: int = 3,
+    sensor_window_size: int = 65,
+    *,
+    store: FeatureStore | str | Path | None = None,
+    seed: int = 0,
+    val_fraction: float = 0.0,
+    pin_memory: bool = False,
+    multiprocessing_context: str | None = None,
+    **settings: Any,
+) -> DataLoader[Any]:
+    """A loader of `UnifiedBatch`es: old and new recordings of one data set, 1 : 3 of the draws.
+
+    `old_weight` and `new_weight` are shares of the draws, whatever the sizes: 1 and 3 draw three
+    new items for an old one. The weights of `train_head.mixture` are another thing: they are of
+    each tick, and a source's share is its weight times its ticks.
+
+    `settings` go to the `UnifiedVLADataset`, which is the loader's `dataset`; of it, `val_fraction`
+    of the episodes are never drawn: `loader.dataset.split(val_fraction)[1]` has them. The loader's
+    `batch_sampler` is the `MixtureBatches`, by which a run is resumed. Where only a `store` is
+    named, its episodes are old and new by their formats. Raises what these raise.
+    """
+    named = {"old": _paths(old_dataset_patterns), "new": _paths(new_dataset_path)}
+    sources = [
+        Source.model_validate({"name": name, "path": paths, "format": name})
+        for name, paths in named.items()
+        if paths
+    ]
+    dataset = UnifiedVLADataset(
+        sources,
+        horizon=horizon,
+        vlm_reuse_count=vlm_reuse_count,
+        sensor_window_size=sensor_window_size,
+        store=store,
+        **settings,
+    )
+    drawn = np.array(
+        dataset.split(val_fraction)[0].indices if val_fraction else range(len(dataset))
+    )
+    items = {
+        name: of_name[np.isin(of_name, drawn)]
+        for name, of_name in dataset.items_by("source" if sources else "format").items()
+    }
+    batches = MixtureBatches(items, _weights(items, old_weight, new_weight), batch_size, seed)
+    return DataLoader(
+        dataset,
+        batch_sampler=batches,
+        num_workers=num_workers,
+        collate_fn=unified_collate_fn,
+        pin_memory=pin_memory,
+        multiprocessing_context=multiprocessing_context if num_workers else None,
+        persistent_workers=bool(num_workers),
+    )
+
+
+def _check(sizes: Mapping[str, int], weights: Mapping[str, float], batch_size: int) -> None:
+    if batch_size < 1:
+        raise ConfigError(f"batch_size: expected 1 or more items, found {batch_size}")
+    unknown = sorted(set(weights) - set(sizes))
+    if unknown:
+        raise ConfigError(
+            f"weights: expected names among {', '.join(sizes)}, found {', '.join(unknown)}"
+        )
+    wrong = {name: weight for name, weight in weights.items() if not 0 <= weight < inf}
+    if wrong:
+        raise ConfigError(f"weights: expected finite numbers from 0, found {wrong}")
+    if not any(size and weights.get(name, 1.0) for name, size in sizes.items()):
+        raise ConfigError(
+            f"nothing to draw from: {dict(sizes)} items under weights {dict(weights)}. Give a "
+            "source that has items a weight above 0"
+        )
+
+
+def _weights(names: Iterable[str], old_weight: float, new_weight: float) -> dict[str, float]:
+    weights = {"old": old_weight, "new": new_weight}
+    foreign = sorted(set(names) - set(weights))
+    if foreign:
+        raise ConfigError(
+            f"the store has episodes of the formats {', '.join(foreign)} beside old and new ones, "
+            "and no weight is theirs. Name old_dataset_patterns and new_dataset_path"
+        )
+    return {name: weights[name] for name in names}
+
+
+def _paths(given: str | Path | Sequence[str | Path] | None) -> tuple[str, ...]:
+    if given is None:
+        return ()
+    return tuple(map(str, [given] if isinstance(given, str | Path) else given))

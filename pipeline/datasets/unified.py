@@ -1,0 +1,225 @@
+"""One data set over every format, with frames or with cached features."""
+
+from collections.abc import Sequence
+from dataclasses import astuple
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch.utils.data import Dataset, Subset
+
+from pipeline.batches import Windows
+from pipeline.config import Source
+from pipeline.datasets.batch import Sample, UnifiedBatch
+from pipeline.datasets.cached import check_store, episodes_of_format, episodes_of_recordings
+from pipeline.datasets.frames import Frames
+from pipeline.datasets.streams import in_memory, read_episodes
+from pipeline.errors import ConfigError, RecordingError
+from pipeline.recordings import Recording, open_recordings
+from pipeline.sampling import split_by_episode
+from pipeline.store import Episode, FeatureStore
+from pipeline.timeline import choose_action_rotation
+
+Rotation = Literal["auto", "rotvec", "euler_delta"]
+Format = Literal["auto", "old", "new", "raw", "lerobot"]
+Place = str | Path | Source
+"""A path or glob of recordings, or a named source of them."""
+
+
+class UnifiedVLADataset(Dataset[Sample]):
+    """One item a tick: windows that end at it, the action chunk that begins at it, what it sees.
+
+    Without `store` the streams of all recordings are read into memory (2.7 MB a second of a
+    1,026-channel sensor at 650 Hz) and frames are decoded when a tick is asked for. With `store`
+    no stream and no frame of a recording is read: items hold the store's features, and `data` only
+    says of which recordings, None of all. Ticks and windows are those of training either way: see
+    `build_timeline` and `FeatureStore.gather`. Of a store's variants items show 0, the plain
+    frames; `stages.train_head` draws others too.
+
+    `horizon` is in ticks, the windows in readings, `action_hz` None takes recorded rows as ticks.
+    `instruction` replaces what the recordings say. Old and new recordings in one data set have
+    actions of one kind, `action_rotation`; `auto` is rotvec where every recording has poses.
+
+    Works in DataLoader workers however they are started: a pickle opens the data again. Use
+    `unified_collate_fn`. Raises `RecordingError` for recordings that are not there or broken,
+    `StoreMismatch` for a store of other ticks or without these recordings, `ConfigError` for
+    settings that contradict each other.
+    """
+
+    store: FeatureStore
+    """The store, or the recordings' streams in memory laid out as one without features."""
+    episodes: tuple[Episode, ...]
+    """Those of `store` that this data set is of, with the names that its sources have here."""
+    ticks: NDArray[np.int64]
+    """(item,) index of each item's tick in `store`."""
+
+    def __init__(
+        self,
+        data: Place | Sequence[Place] | None = None,
+        format: Format = "auto",
+        horizon: int = 8,
+        vlm_reuse_count: int = 3,
+        sensor_window_size: int = 65,
+        state_window_size: int = 100,
+        action_hz: float | None = 10.0,
+        *,
+        instruction: str | None = None,
+        views: Sequence[str] | None = None,
+        action_rotation: Rotation = "auto",
+        store: FeatureStore | str | Path | None = None,
+    ) -> None:
+        _check_one_of("format", format, get_args(Format))
+        _check_one_of("action_rotation", action_rotation, get_args(Rotation))
+        self.windows = Windows(horizon, sensor_window_size, state_window_size)
+        self.vlm_reuse_count, self.action_hz = vlm_reuse_count, action_hz
+        self.action_rotation: Rotation = action_rotation
+        self._sources = _sources(data, format, instruction)
+        self._format, self._views = format, views
+        self._cached = FeatureStore.open(store) if isinstance(store, str | Path) else store
+        if min(astuple(self.windows)) < 1 or vlm_reuse_count < 1:
+            raise ConfigError(
+                "horizon, windows and vlm_reuse_count count from 1, found "
+                f"{self.windows} and vlm_reuse_count={vlm_reuse_count}"
+            )
+        if self._cached is not None and (instruction is not None or views is not None):
+            raise ConfigError(
+                "instruction and views decide what a model sees, but the features of "
+                f"{self._cached.path} are computed already. Leave them out, or the store"
+            )
+        self._open()
+
+    def __len__(self) -> int:
+        return len(self.ticks)
+
+    def __getitem__(self, index: int) -> Sample:
+        return self.__getitems__([index])[0]
+
+    def __getitems__(self, indices: Sequence[int]) -> UnifiedBatch:
+        """These items in one gather; what torch's DataLoader calls for a batch."""
+        ticks = self.ticks[np.asarray(indices, np.int64)]
+        batch = self.store.gather(ticks, *astuple(self.windows))
+        rows = self.store.array("tick/vl_row")[ticks]
+        starts = self.store.array("episode/tick_start")
+        episodes = np.searchsorted(starts, ticks, side="right") - 1
+        said = [self.store.episodes[episode].instruction for episode in episodes.tolist()]
+        return UnifiedBatch(
+            **vars(batch),
+            tick=torch.from_numpy(ticks),
+            time=torch.from_numpy(self.store.array("tick/time")[ticks]),
+            episode=torch.from_numpy(episodes),
+            vl_row=torch.from_numpy(rows),
+            instruction=said,
+            **self._seen(rows),
+        )
+
+    def items_by(self, trait: Literal["source", "format"]) -> dict[str, NDArray[np.int64]]:
+        """The items of each source, or of each format, by its name."""
+        names = np.array([getattr(one, trait) for one in self.episodes])
+        of_item = np.repeat(names, [len(one.ticks) for one in self.episodes])
+        return {name: np.flatnonzero(of_item == name) for name in dict.fromkeys(names.tolist())}
+
+    def split(self, val_fraction: float = 0.1) -> tuple[Subset[Sample], Subset[Sample]]:
+        """Items to train on and items held out: whole episodes, by `split_by_episode`.
+
+        Over a store these are the sides that `stages.train_head` has. Over frames they are the
+        same where sources and episodes have the names that they have in the store: the side
+        follows from the hash of "source/id". Use `unified_collate_fn`.
+        """
+        if self._frames is not None:
+            rows, keys = self._frames.first_keys()
+            self.store.array("vl/key")[rows] = keys
+        split = split_by_episode(self.store, val_fraction, self.windows.horizon)
+        train, held_out = (
+            Subset(self, np.flatnonzero(np.isin(self.ticks, side)).tolist())
+            for side in (split.train, split.held_out)
+        )
+        return train, held_out
+
+    def _seen(self, rows: NDArray[np.int64]) -> dict[str, Any]:
+        if self._frames is None:
+            return {"key": torch.from_numpy(self.store.array("vl/key")[rows])}
+        frames = self._frames.read(rows)
+        return {"images": [frames[row] for row in rows.tolist()]}
+
+    def _open(self) -> None:
+        self._frames: Frames | None = None
+        if self._cached is None:
+            self._read(self._recordings())
+        else:
+            self.store = self._cached
+            check_store(self.store, self.vlm_reuse_count, self.action_hz, self.action_rotation)
+            self.episodes = tuple(
+                episodes_of_recordings(self.store, self._recordings())
+                if self._sources
+                else episodes_of_format(self.store, self._format)
+            )
+        ranges = [np.arange(one.ticks.start, one.ticks.stop) for one in self.episodes]
+        self.ticks = np.concatenate(ranges, dtype=np.int64)
+
+    def _read(self, recordings: Sequence[Recording]) -> None:
+        rotation = choose_action_rotation(self.action_rotation, recordings)
+        read = read_episodes(recordings, self.action_hz, self.vlm_reuse_count, rotation)
+        self.store = in_memory(read, self.action_hz, self.vlm_reuse_count)
+        self.episodes = self.store.episodes
+        self._frames = Frames(read, self.store.array("episode/vl_start"))
+
+    def _recordings(self) -> tuple[Recording, ...]:
+        if not self._sources:
+            raise ConfigError(
+                "a data set needs recordings or a store, found neither. Name a folder of "
+                "recordings, or pass store=cache_store/NAME.zarr"
+            )
+        opened = open_recordings(self._sources, views=self._views)
+        if opened.bad:
+            lines = [f"  {one.source}: {one.reason}" for one in opened.bad]
+            raise RecordingError(
+                "\n".join([f"{len(lines)} episodes cannot be used; mend or remove them:", *lines])
+            )
+        return opened.recordings
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Opened again where it is unpickled: streams and file handles are not sent.
+        opened = ("store", "episodes", "ticks", "_frames")
+        return {name: value for name, value in vars(self).items() if name not in opened}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._open()
+
+
+class AsyncInsertionMeca500DatasetWithSensor(UnifiedVLADataset):
+    """`UnifiedVLADataset(..., format="old")`."""
+
+    def __init__(self, data: Place | Sequence[Place] | None = None, **settings: Any) -> None:
+        super().__init__(data, "old", **settings)
+
+
+class NewAsyncInsertionDataset(UnifiedVLADataset):
+    """`UnifiedVLADataset(..., format="new")`."""
+
+    def __init__(self, data: Place | Sequence[Place] | None = None, **settings: Any) -> None:
+        super().__init__(data, "new", **settings)
+
+
+def _check_one_of(name: str, found: str, known: Sequence[str]) -> None:
+    if found not in known:
+        raise ConfigError(f"{name}: expected one of {', '.join(known)}, found {found!r}")
+
+
+def _sources(
+    data: Place | Sequence[Place] | None, format: Format, instruction: str | None
+) -> tuple[Source, ...]:
+    """The named sources, and all bare paths as one that is named after the format."""
+    if data is None:
+        return ()
+    places = [data] if isinstance(data, str | Path | Source) else list(data)
+    named = [place for place in places if isinstance(place, Source)]
+    paths = tuple(str(place) for place in places if not isinstance(place, Source))
+    if paths:
+        name = "recordings" if format == "auto" else format
+        named.append(Source(name=name, path=paths, format=format))
+    if instruction is not None:
+        named = [one.model_copy(update={"instruction": instruction}) for one in named]
+    return tuple(named)

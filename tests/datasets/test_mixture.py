@@ -1,0 +1,175 @@
+"""Old and new in one loader: shares to one draw, resumable, a function of (seed, step)."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.datasets import (
+    MixtureBatches,
+    UnifiedBatch,
+    create_unified_dataloader,
+    create_weighted_async_dataloader,
+)
+from pipeline.errors import ConfigError
+from pipeline.store import FeatureStore
+
+
+def batches(sizes: dict[str, int], **weights: float) -> MixtureBatches:
+    edges = np.cumsum([0, *sizes.values()])
+    items = {
+        name: np.arange(start, stop)
+        for name, start, stop in zip(sizes, edges, edges[1:], strict=False)
+    }
+    return MixtureBatches(items, weights, batch_size=7, seed=3)
+
+
+class TestShares:
+    @given(old=st.integers(1, 500), new=st.integers(1, 500), step=st.integers(0, 400))
+    def test_are_1_to_3_within_a_draw_whatever_the_sizes(self, old, new, step):
+        drawn = batches({"old": old, "new": new}, old=1.0, new=3.0)
+        of_old = sum(
+            sum(item < old for item in drawn.batch(each)) for each in range(step, step + 8)
+        )
+        assert abs(of_old - 56 / 4) <= 1 + 1e-9
+        assert abs(sum(item < old for item in drawn.batch(step)) - 7 / 4) <= 1 + 1e-9
+
+    def test_every_item_of_a_source_comes_before_one_comes_twice(self):
+        drawn = batches({"old": 20, "new": 30}, old=1.0, new=3.0)
+        new = [item for step in range(40) for item in drawn.batch(step) if item >= 20]
+        assert sorted(new[:30]) == list(range(20, 50))
+        assert sorted(new[30:60]) == list(range(20, 50))
+
+    def test_a_weight_of_0_leaves_a_source_out(self):
+        drawn = batches({"old": 20, "new": 30}, old=0.0, new=3.0)
+        assert min(drawn.batch(5)) >= 20
+        with pytest.raises(ConfigError, match=r"'old': 20.*'old': 0\.0"):
+            batches({"old": 20}, old=0.0)
+
+    @pytest.mark.parametrize(
+        ("weights", "batch_size", "said"),
+        [
+            ({"old": -1.0}, 7, r"weights: .*from 0, found \{'old': -1\.0\}"),
+            ({"old": float("nan")}, 7, "weights: .*finite"),
+            ({"older": 1.0}, 7, "weights: .*old, new, found older"),
+            ({}, 0, "batch_size: expected 1 or more items, found 0"),
+        ],
+    )
+    def test_what_cannot_be_drawn_is_said_in_the_words_of_the_caller(
+        self, weights: dict[str, float], batch_size: int, said: str
+    ) -> None:
+        items = {"old": np.arange(3), "new": np.arange(3, 9)}
+        with pytest.raises(ConfigError, match=said) as refused:
+            MixtureBatches(items, weights, batch_size, seed=0)
+        assert "train_head" not in str(refused.value)
+
+
+class TestResume:
+    def test_from_every_step_of_three_epochs(self):
+        whole = batches({"old": 20, "new": 30})
+        epochs = [list(whole) for _ in range(3)]
+        assert [len(epoch) for epoch in epochs] == [8, 8, 8]
+        taken = [batch for epoch in epochs for batch in epoch]
+        for step in range(len(taken)):
+            resumed = batches({"old": 20, "new": 30})
+            resumed.first_step = step
+            assert len(resumed) == 8 - step % 8
+            rest = list(resumed)
+            assert rest == taken[step : step + len(rest)]
+            assert resumed.first_step == (step // 8 + 1) * 8
+
+    def test_an_epoch_that_is_broken_off_is_not_repeated(self):
+        drawn = batches({"old": 20, "new": 30})
+        whole = [drawn.batch(step) for step in range(16)]
+        started = iter(drawn)
+        assert [next(started), next(started)] == whole[:2]
+        assert drawn.first_step == 8
+        assert list(drawn) == whole[8:16]
+        drawn.first_step = 2  # resumed where it was broken off
+        assert list(drawn) == whole[2:8]
+
+    def test_another_seed_is_another_order(self):
+        items = {"all": np.arange(50)}
+        orders = [MixtureBatches(items, {}, 10, seed).batch(0) for seed in (0, 0, 1)]
+        assert orders[0] == orders[1] != orders[2]
+
+
+@pytest.fixture(scope="module")
+def loader(recordings: Path) -> Any:
+    return create_unified_dataloader(recordings / "old", [recordings / "new"], batch_size=12)
+
+
+class TestLoader:
+    def test_an_epoch_that_is_broken_off_is_not_repeated(self, extracted: FeatureStore) -> None:
+        for workers in (0, 1):
+            loader = create_unified_dataloader(store=extracted, batch_size=40, num_workers=workers)
+            batches = loader.batch_sampler
+            steps = len(batches)
+            for epoch in range(3):
+                batch = next(iter(loader))
+                items = batches.batch(epoch * steps)
+                assert batch.tick.tolist() == loader.dataset.ticks[items].tolist()
+
+    def test_a_negative_weight_is_refused(self, extracted: FeatureStore) -> None:
+        with pytest.raises(ConfigError, match=r"weights: .*'new': -3"):
+            create_unified_dataloader(store=extracted, new_weight=-3.0)
+
+    def test_draws_old_and_new_recordings_1_to_3(self, loader: Any) -> None:
+        formats = [one.format for one in loader.dataset.store.episodes]
+        for _, batch in zip(range(4), loader, strict=False):
+            assert isinstance(batch, UnifiedBatch) and batch.images is not None
+            drawn = [formats[episode] for episode in batch.episode.tolist()]
+            assert (drawn.count("old"), drawn.count("new")) == (3, 9)
+
+    def test_gives_the_same_ticks_with_features_and_in_workers(
+        self, recordings: Path, extracted: FeatureStore, loader: Any
+    ) -> None:
+        cached = create_weighted_async_dataloader(
+            recordings / "old", recordings / "new", batch_size=12, num_workers=1, store=extracted
+        )
+        batch = next(iter(cached))
+        items = loader.batch_sampler.batch(0)
+        assert torch.equal(batch.action, loader.dataset.__getitems__(items).action)
+        assert batch.features.shape[1:] == extracted.feature_shape
+
+    def test_a_store_alone_is_old_and_new_by_format(self, extracted: FeatureStore) -> None:
+        loader = create_unified_dataloader(store=extracted, batch_size=8)
+        batch = next(iter(loader))
+        formats = [extracted.episodes[index].format for index in batch.episode.tolist()]
+        assert formats.count("old") == 2
+
+    def test_formats_without_a_weight_are_refused(self, tiny_store: Any, tmp_path: Path) -> None:
+        path = tiny_store(tmp_path)
+        loader = create_unified_dataloader(store=path, batch_size=8)
+        assert len(next(iter(loader))) == 8
+        raw = FeatureStore.open(path)
+        for index in range(len(raw.episodes)):
+            object.__setattr__(raw.episodes[index], "format", "raw")
+        with pytest.raises(ConfigError, match="raw"):
+            create_unified_dataloader(store=raw)
+
+    def test_held_out_episodes_are_never_drawn(self, recordings: Path) -> None:
+        loader = create_unified_dataloader(
+            recordings / "old", recordings / "new", batch_size=16, val_fraction=0.3
+        )
+        held_out = set(loader.dataset.split(0.3)[1].indices)
+        steps = range(2 * len(loader))
+        assert held_out
+        assert not held_out & {item for step in steps for item in loader.batch_sampler.batch(step)}
+
+    def test_one_side_alone_is_a_mixture_of_one(self, recordings: Path) -> None:
+        loader = create_unified_dataloader(new_dataset_path=recordings / "new", batch_size=4)
+        assert len(next(iter(loader))) == 4
+        with pytest.raises(ConfigError, match="recordings or a store"):
+            create_unified_dataloader()
+
+    def test_real_recordings_1_to_3(self, shared_data: Path) -> None:
+        root = shared_data / "insertion"
+        loader = create_unified_dataloader([root / "old" / "*"], root / "new", batch_size=8)
+        batch = next(iter(loader))
+        old = sum(loader.dataset.episodes[i].format == "old" for i in batch.episode.tolist())
+        assert old == 2

@@ -1,0 +1,118 @@
+"""Every public name imports in a fresh process, and stage two runs without transformers."""
+
+import ast
+import json
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+SEEDS = {
+    "pipeline.models": (
+        "SensorEncoder",
+        "ForceAwareSensorEncoder",
+        "RobotStateEncoder",
+        "RegressionActionExpert",
+        "DiffusionActionExpert",
+        "FlowMatchingActionExpert",
+        "QwenVLAUnified",
+        "QwenVLAWithSensorDiffusion",
+        "QwenVLAWithSensor",
+        "Not_freeze_QwenVLAWithSensor",
+    ),
+    "pipeline.datasets": (
+        "UnifiedVLADataset",
+        "unified_collate_fn",
+        "create_unified_dataloader",
+        "AsyncInsertionMeca500DatasetWithSensor",
+        "NewAsyncInsertionDataset",
+        "async_collate_fn_with_sensor",
+        "create_weighted_async_dataloader",
+    ),
+}
+"""The names that the old code's users know; each is a class or a function."""
+
+
+def declared() -> dict[str, list[str]]:
+    """`__all__` of every package that has one, read without importing it."""
+    found: dict[str, list[str]] = {}
+    for path in sorted(ROOT.glob("pipeline/**/__init__.py")):
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
+                found[".".join(path.parent.relative_to(ROOT).parts)] = ast.literal_eval(node.value)
+    return found
+
+
+DECLARED = declared()
+NAMES = {
+    module: sorted({*DECLARED.get(module, ()), *SEEDS.get(module, ())})
+    for module in sorted({*DECLARED, *SEEDS})
+}
+
+IMPORTED = """
+import json, sys
+found = {}
+for name in sys.argv[2:]:
+    try:
+        exec(f"from {sys.argv[1]} import {name} as it")
+        found[name] = "callable" if callable(it) else "a value"
+    except Exception as error:
+        found[name] = f"{type(error).__name__}: {error}"
+print(json.dumps(found))
+"""
+
+WITHOUT = "import sys; sys.modules.update(transformers=None, peft=None)\n"
+"""Makes importing these an ImportError."""
+
+
+def python(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, *arguments], capture_output=True, text=True, check=False, timeout=120
+    )
+
+
+@cache
+def imported(module: str) -> dict[str, str]:
+    """What each public name of a module is, or why it does not import; one process."""
+    done = python("-c", IMPORTED, module, *NAMES[module])
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize(
+    ("module", "name"), [(module, name) for module, names in NAMES.items() for name in names]
+)
+def test_a_public_name_imports(module: str, name: str) -> None:
+    called = name in SEEDS.get(module, ())
+    assert imported(module)[name] in (("callable",) if called else ("callable", "a value"))
+
+
+def test_packages_declare_what_people_import() -> None:
+    for module in ("datasets", "models", "sampling", "store", "training"):
+        assert DECLARED[f"pipeline.{module}"]
+    assert {"Batch", "FeatureStore"} <= set(DECLARED["pipeline.store"])
+    assert "Policy" in DECLARED["pipeline.models"]
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import pipeline.datasets; "
+        "from pipeline.models import Policy, DiffusionActionExpert, FlowMatchingActionExpert",
+        "import runpy; sys.argv[1:] = ['--help']; "
+        "runpy.run_module('stages.train_head', run_name='__main__')",
+        "import runpy; sys.argv[1:] = ['--help']; "
+        "runpy.run_module('stages.evaluate', run_name='__main__')",
+    ],
+)
+def test_stage_two_runs_without_transformers(code: str) -> None:
+    done = python("-c", WITHOUT + code)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_block_blocks() -> None:
+    assert "ModuleNotFoundError" in python("-c", WITHOUT + "import transformers").stderr
