@@ -19,11 +19,12 @@
 `batches`      gathered ahead, in a background thread
 `extraction`   recordings x vlm -> store
 `evaluation`   predictions -> figures of merit
-`datasets`     the recordings and the store as torch data sets, under the names of the old code
+`datasets`     recordings and store as torch data sets, under the names of the old code
 `training`     one loop for every expert
 `finetuning`   the same loop with the model in front of the policy learning too
 `plots`        arrays -> pictures
 
 Imports go only upwards in this list, and never within {recordings, vlm, store, normalization,
-models}, but for `models.unified`, the policy with a live model in front; `tests/test_architecture.py` keeps that true.
+models}, but for `models.unified`, the policy with a live model in front;
+`tests/test_architecture.py` keeps that true.
 """

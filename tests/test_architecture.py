@@ -112,12 +112,30 @@ def has_code(path: Path) -> bool:
     )
 
 
-@pytest.mark.parametrize("stage", ["demo", "extract", "train_head", "evaluate"])
-def test_every_module_a_stage_runs_is_among_its_deps(stage):
-    document = yaml.safe_load((ROOT / "dvc.yaml").read_text())
-    deps = {ROOT / dep for dep in document["stages"][stage]["deps"] if "$" not in dep}
+@pytest.mark.parametrize(
+    ("pipeline", "stage", "module"),
+    [
+        ("dvc.yaml", "demo", "stages.demo"),
+        ("dvc.yaml", "extract", "stages.extract"),
+        ("dvc.yaml", "train_head", "stages.train_head"),
+        ("dvc.yaml", "evaluate", "stages.evaluate"),
+        ("experiments/dvc.yaml", "train", "stages.train_head"),
+        ("experiments/dvc.yaml", "evaluate", "stages.evaluate"),
+        ("experiments/dvc.yaml", "compare", "stages.compare"),
+        ("experiments/finetune/dvc.yaml", "finetune", "stages.finetune"),
+        ("experiments/finetune/dvc.yaml", "extract", "stages.extract"),
+        ("experiments/finetune/dvc.yaml", "train", "stages.train_head"),
+        ("experiments/finetune/dvc.yaml", "evaluate", "stages.evaluate"),
+    ],
+)
+def test_every_module_a_stage_runs_is_among_its_deps(pipeline, stage, module):
+    """Deps are relative to the folder in which the command runs."""
+    document = yaml.safe_load((ROOT / pipeline).read_text())["stages"][stage]
+    assert f"python -m {module}" in document["cmd"]
+    runs_in = (ROOT / pipeline).parent / document.get("wdir", ".")
+    deps = {(runs_in / dep).resolve() for dep in document["deps"] if "$" not in dep}
     needed = set()
-    for name in reached(f"stages.{stage}"):
+    for name in reached(module):
         path = MODULES[name]
         if has_code(path):
             covering = {dep for dep in deps if dep == path or dep in path.parents}

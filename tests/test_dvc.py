@@ -63,7 +63,7 @@ class Project:
 
     def stale(self) -> dict[str, list]:
         """The stages whose own params, code or data changed."""
-        return json.loads(self.dvc("status", "--json"))
+        return json.loads(self.dvc("status", "dvc.yaml", "--json"))
 
     def _git(self, folder: Path, *arguments: str) -> str:
         return subprocess.run(

@@ -89,7 +89,12 @@ class TrainHeadParams(Section):
     val_fraction: Fraction = 0.1
     """Share of episodes held out."""
     mixture: dict[str, Weight] = Field(default_factory=dict)
-    """Sampling weight of each source; 1 where not named."""
+    """Weight of each tick of a source; 1 where not named.
+
+    A source's share of the draws is its weight times its ticks: weight 3 shows one of its ticks
+    three times as often. (The weights of `create_unified_dataloader` are shares, whatever the
+    sizes.)
+    """
     eval_every: int = Field(default=200, ge=1)
     """Steps between evaluations on held-out ticks."""
     eval_samples: int = Field(default=4, ge=1)
