@@ -30,7 +30,7 @@ class _Shared:
 
 
 _SAME_TICKS = _Shared(
-    "evaluations on the same held-out ticks of the same store", "Evaluate all of them on one store"
+    "evaluations on the same held-out ticks", "Evaluate all of them on the same recordings"
 )
 _SAMPLED_ALIKE = _Shared(
     "evaluations of stochastic policies from as many samples and ticks a batch",
@@ -63,14 +63,14 @@ def read_experiments(reports: Path) -> tuple[Experiment, ...]:
     """The evaluations in the folders of `reports`, ordered by expert, fusion and name.
 
     Raises `ConfigError` where there is none, where a folder is no evaluation, where they were not
-    judged on the same ticks of the same store, and where stochastic policies were not sampled
+    judged on the same ticks, and where stochastic policies were not sampled
     alike.
     """
     folders = sorted(path for path in reports.glob("*") if path.is_dir())
     if not folders:
         raise ConfigError(
-            f"compare.reports: expected a folder an experiment in {reports}, found none. Run "
-            "stages.evaluate for each with its own evaluate.output there, or "
+            f"compare.reports: expected one folder for each experiment in {reports}, found none. "
+            "Run stages.evaluate for each with its own evaluate.output there, or "
             "dvc repro experiments/dvc.yaml."
         )
     judged = [_read(folder, JUDGED, "policy", "drawn", "on") for folder in folders]

@@ -19,7 +19,8 @@ def judged_document(
 ) -> dict[str, Any]:
     """What was judged (`policy`), how it was sampled (`drawn`) and on what (`on`), as JSON.
 
-    `on` is equal for all evaluations whose errors may stand in one table, and `drawn` for those
+    `on` is equal for all evaluations whose errors may stand in one table, whatever features the
+    policies saw: which are better is a question to ask. `drawn` is equal for those
     of stochastic policies: the mean of fewer samples errs more, and a batch shares its noise. It
     is null for policies that do not sample.
     """
@@ -36,8 +37,8 @@ def judged_document(
             "logs": str(params.logs),
         },
         "drawn": drawn,
+        "feature_spec": source["feature_spec"]["digest"],
         "on": {
-            "feature_spec": source["feature_spec"]["digest"],
             "action": source["streams"]["action"],
             "action_hz": source["action_hz"],
             "vlm_reuse_count": source["vlm_reuse_count"],

@@ -174,8 +174,12 @@ def next_steps(finetune: FinetuneParams, store: FeatureStore) -> list[str]:
     setting = f"--set vlm.adapter={learned}"
     if finetune.tuning.method == "full":
         setting = f"--set vlm.checkpoint={learned} --set vlm.adapter=null"
+    name = f"{store.path.stem}_tuned"
     return [
-        "next, extract the tuned model's features and train a head on them:",
+        "next, extract the tuned model's features, train a head on them and judge it:",
         f"  python -m stages.extract {setting} --set extract.store={tuned}",
-        f"  python -m stages.train_head --set train_head.store={tuned}",
+        f"  python -m stages.train_head --set train_head.store={tuned} "
+        f"--set train_head.output=models/{name} --set train_head.logs=reports/{name}_training",
+        f"  python -m stages.evaluate --set evaluate.store={tuned} "
+        f"--set evaluate.checkpoint=models/{name} --set evaluate.output=reports/{name}",
     ]

@@ -22,7 +22,7 @@ def resolve_checkpoint(
     folder = Path(checkpoint).expanduser()
     if folder.is_dir():
         return folder
-    if not _could_be_hub_id(checkpoint):
+    if not could_be_hub_id(checkpoint):
         raise VLMError(
             f"{setting} {checkpoint}: no such folder. Expected a folder in the hub's format (a "
             "JSON config and *.safetensors) or a hub id such as Qwen/Qwen2.5-VL-3B-Instruct. The "
@@ -31,7 +31,8 @@ def resolve_checkpoint(
     return _cached(checkpoint, revision) or _downloaded(checkpoint, revision, setting)
 
 
-def _could_be_hub_id(checkpoint: str) -> bool:
+def could_be_hub_id(checkpoint: str) -> bool:
+    """Whether a text has the form of one: an owner and a name."""
     parts = checkpoint.split("/")
     return len(parts) == 2 and all(parts) and parts[0][0] not in ".~"
 

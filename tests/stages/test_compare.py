@@ -114,11 +114,11 @@ def test_another_store_or_other_ticks_are_refused_by_name(
 ) -> None:
     path = reports / "regression-gated" / JUDGED
     document = json.loads(path.read_text())
-    document["on"]["feature_spec"] = "another"
+    document["on"]["action_hz"] = 5
     next(iter(document["on"]["held_out"].values()))["ticks"] = [3, 30]
     path.write_text(json.dumps(document))
     error = refused(reports, experiments, capsys)
-    assert '"another" (regression-gated)' in error
+    assert "5 (regression-gated)" in error
     assert "[3, 30] (regression-gated)" in error
 
 

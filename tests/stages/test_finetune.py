@@ -154,8 +154,10 @@ def test_it_tunes_and_says_how_to_go_on_and_that_works(
     adapter, tuned = tmp_path / "tuned" / "best" / "adapter", extracted.parent / "made_tuned.zarr"
     extracting = f"--set vlm.adapter={adapter} --set extract.store={tuned}"
     training = f"--set train_head.store={tuned}"
+    apart = "--set train_head.output=models/made_tuned --set train_head.logs=reports/made_tuned"
     assert f"python -m stages.extract {extracting}\n" in captured.out
-    assert f"python -m stages.train_head {training}\n" in captured.out
+    assert f"python -m stages.train_head {training} {apart}_training\n" in captured.out
+    assert f"python -m stages.evaluate --set evaluate.store={tuned} " in captured.out
 
     assert run("", finetune.main, ["--params", params]) == 0
     assert "nothing to do" in capsys.readouterr().out
