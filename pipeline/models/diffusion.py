@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pipeline.models.attention import Projected
 from pipeline.models.denoiser import Denoiser
-from pipeline.models.expert import ActionExpert, GroupedLoss, standard_normal, uniform
+from pipeline.models.expert import ActionExpert, standard_normal, uniform
 from pipeline.models.noise_schedule import NoiseSchedule, Prediction, ScheduleKind
 
 
@@ -44,8 +44,7 @@ class DiffusionActionExpert(ActionExpert):
         groups: Sequence[str] | None = None,
         group_weights: Mapping[str, float] | None = None,
     ) -> None:
-        super().__init__()
-        self.horizon, self.action_dim = horizon, action_dim
+        super().__init__(horizon, action_dim, groups, group_weights, "mse")
         self.prediction: Prediction = prediction
         self.sampler, self.eta, self.clip = sampler, eta, clip
         self.schedule = NoiseSchedule(timesteps, schedule)
@@ -54,7 +53,6 @@ class DiffusionActionExpert(ActionExpert):
             horizon=horizon, action_dim=action_dim, dim=dim, layers=layers, heads=heads,
             dropout=dropout,
         )  # fmt: skip
-        self.grouped = GroupedLoss(groups or ("other",) * action_dim, group_weights or {}, "mse")
 
     def loss(
         self,

@@ -11,6 +11,8 @@ from torch.nn import functional as F
 
 from pipeline.errors import ConfigError
 
+ErrorKind = Literal["smooth_l1", "mse"]
+
 
 class ActionExpert(nn.Module, ABC):
     """Context in, action chunk out; all actions are normalised units.
@@ -22,8 +24,20 @@ class ActionExpert(nn.Module, ABC):
     """
 
     stochastic: ClassVar[bool]
-    horizon: int
-    action_dim: int
+
+    def __init__(
+        self,
+        horizon: int,
+        action_dim: int,
+        groups: Sequence[str] | None,
+        group_weights: Mapping[str, float] | None,
+        error: ErrorKind,
+    ) -> None:
+        """`groups` names the loss group of each action channel, all `other` where None."""
+        super().__init__()
+        self.horizon, self.action_dim = horizon, action_dim
+        named = groups or ("other",) * action_dim
+        self.grouped = GroupedLoss(named, group_weights or {}, error)
 
     @abstractmethod
     def loss(
@@ -59,7 +73,7 @@ class GroupedLoss(nn.Module):
         self,
         groups: Sequence[str],
         weights: Mapping[str, float],
-        kind: Literal["smooth_l1", "mse"] = "smooth_l1",
+        kind: ErrorKind = "smooth_l1",
     ) -> None:
         super().__init__()
         self.error = F.smooth_l1_loss if kind == "smooth_l1" else F.mse_loss

@@ -9,7 +9,7 @@ from scipy.special import betaincinv
 from torch import Tensor, nn
 
 from pipeline.models.denoiser import Denoiser
-from pipeline.models.expert import ActionExpert, GroupedLoss, standard_normal, uniform
+from pipeline.models.expert import ActionExpert, standard_normal, uniform
 
 Solver = Literal["euler", "midpoint", "rk4"]
 Velocity = Callable[[Tensor, float], Tensor]
@@ -88,8 +88,7 @@ class FlowMatchingActionExpert(ActionExpert):
         groups: Sequence[str] | None = None,
         group_weights: Mapping[str, float] | None = None,
     ) -> None:
-        super().__init__()
-        self.horizon, self.action_dim = horizon, action_dim
+        super().__init__(horizon, action_dim, groups, group_weights, "mse")
         self.sampling_steps = sampling_steps
         self.solver: Solver = solver
         self.times = BetaTimes(alpha, beta) if time == "beta" else nn.Identity()
@@ -97,7 +96,6 @@ class FlowMatchingActionExpert(ActionExpert):
             horizon=horizon, action_dim=action_dim, dim=dim, layers=layers, heads=heads,
             dropout=dropout,
         )  # fmt: skip
-        self.grouped = GroupedLoss(groups or ("other",) * action_dim, group_weights or {}, "mse")
 
     def loss(
         self,

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from pipeline.models.attention import TransformerLayer, learned
-from pipeline.models.expert import ActionExpert, GroupedLoss
+from pipeline.models.expert import ActionExpert
 
 
 class RegressionActionExpert(ActionExpert):
@@ -33,8 +33,8 @@ class RegressionActionExpert(ActionExpert):
         groups: Sequence[str] | None = None,
         group_weights: Mapping[str, float] | None = None,
     ) -> None:
-        super().__init__()
-        self.horizon, self.action_dim, self.refinements = horizon, action_dim, refinements
+        super().__init__(horizon, action_dim, groups, group_weights, "smooth_l1")
+        self.refinements = refinements
         self.queries = learned(horizon, dim)
         # The first proposal is zeros: with a single round there is nothing to read.
         self.read = nn.Linear(action_dim, dim) if refinements > 1 else None
@@ -45,7 +45,6 @@ class RegressionActionExpert(ActionExpert):
         self.head = nn.Linear(dim, action_dim)
         nn.init.normal_(self.head.weight, std=0.02)
         nn.init.zeros_(self.head.bias)
-        self.grouped = GroupedLoss(groups or ("other",) * action_dim, group_weights or {})
 
     def predict(
         self, context: Float[Tensor, "batch token dim"]
