@@ -101,8 +101,7 @@ class UnifiedVLADataset(Dataset[Sample]):
         ticks = self.ticks[np.asarray(indices, np.int64)]
         batch = self.store.gather(ticks, *astuple(self.windows))
         rows = self.store.array("tick/vl_row")[ticks]
-        starts = self.store.array("episode/tick_start")
-        episodes = np.searchsorted(starts, ticks, side="right") - 1
+        episodes = self.store.episode_of(ticks)
         said = [self.store.episodes[episode].instruction for episode in episodes.tolist()]
         return UnifiedBatch(
             **vars(batch),

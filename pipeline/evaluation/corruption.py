@@ -111,7 +111,7 @@ def donors_of(store: FeatureStore, ticks: Ticks, stream: str, seed: int = 0) -> 
     A tick whose episode lacks the stream gives it to nobody and keeps what it has. None where
     fewer than two episodes have the stream.
     """
-    episode = np.searchsorted(store.array("episode/tick_start"), ticks, side="right") - 1
+    episode = store.episode_of(ticks)
     having = ticks
     if stream != "features":
         count = np.diff(store.array(f"episode/{stream}_start"))

@@ -63,8 +63,7 @@ def read_experiments(reports: Path) -> tuple[Experiment, ...]:
     """The evaluations in the folders of `reports`, ordered by expert, fusion and name.
 
     Raises `ConfigError` where there is none, where a folder is no evaluation, where they were not
-    judged on the same ticks, and where stochastic policies were not sampled
-    alike.
+    judged on the same ticks, and where stochastic policies were not sampled alike.
     """
     folders = sorted(path for path in reports.glob("*") if path.is_dir())
     if not folders:
@@ -130,9 +129,14 @@ def experiment_rows(experiments: Sequence[Experiment]) -> Iterable[Sequence[obje
         ]
 
 
+def speed_file(logs: Path) -> Path:
+    """Where a training writes its speed: beside its logs, for DVC tracks all that is in them."""
+    return logs.with_name(f"{logs.name}.speed.tsv")
+
+
 def training_seconds(logs: Path) -> float | None:
     """What the speed file beside these logs says that the training took; None without it."""
-    path = logs.with_name(f"{logs.name}.speed.tsv")
+    path = speed_file(logs)
     if not path.exists():
         return None
     rows = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines(), delimiter="\t"))

@@ -223,7 +223,7 @@ def _tick_s(store: FeatureStore) -> float:
 
 def _settled(store: FeatureStore, ticks: Ticks) -> Ticks:
     """The ticks at which every delay still finds something of their own episode."""
-    episode = np.searchsorted(store.array("episode/tick_start"), ticks, side="right") - 1
+    episode = store.episode_of(ticks)
     time_s, row = store.array("tick/time"), store.array("tick/vl_row")
     since_s = time_s[ticks] - time_s[store.array("episode/tick_start")[episode]]
     rows = row[ticks] - store.array("episode/vl_start")[episode]

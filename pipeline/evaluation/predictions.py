@@ -83,7 +83,7 @@ def predict(
             bar.update(len(draw.ticks))
     return Predictions(
         ticks=ticks,
-        episodes=np.searchsorted(store.array("episode/tick_start"), ticks, side="right") - 1,
+        episodes=store.episode_of(ticks),
         predicted=np.concatenate(predicted),
         recorded=np.concatenate(recorded),
         valid=np.concatenate(valid),

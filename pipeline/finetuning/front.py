@@ -174,7 +174,7 @@ def next_steps(finetune: FinetuneParams, store: FeatureStore) -> list[str]:
     setting = f"--set vlm.adapter={learned}"
     if finetune.tuning.method == "full":
         setting = f"--set vlm.checkpoint={learned} --set vlm.adapter=null"
-    name = f"{store.path.stem}_tuned"
+    name = tuned.stem
     return [
         "next, extract the tuned model's features, train a head on them and judge it:",
         f"  python -m stages.extract {setting} --set extract.store={tuned}",

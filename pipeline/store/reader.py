@@ -165,6 +165,10 @@ class FeatureStore:
             )
         return tuple(found)
 
+    def episode_of(self, ticks: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The index of the episode of each of these store-global ticks."""
+        return np.searchsorted(self._arrays["episode/tick_start"], ticks, side="right") - 1
+
     def gather(
         self,
         ticks: Sequence[int] | NDArray[np.int64],

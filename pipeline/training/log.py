@@ -9,15 +9,11 @@ from typing import Self
 from dvclive import Live
 
 from pipeline.durable import disk_full_named, fresh
+from pipeline.evaluation.experiments import speed_file
 from pipeline.training.speed import Pace
 
 Row = tuple[int, Mapping[str, float]]
 """A step, counted from 1, and metrics by name."""
-
-
-def speed_file(logs: Path) -> Path:
-    """Where the speed of a run is written: beside its logs, for DVC tracks all that is in them."""
-    return logs.with_name(f"{logs.name}.speed.tsv")
 
 
 class _Curves(Live):

@@ -104,7 +104,7 @@ def _split(array: NDArray[Any], rows: NDArray[np.int64]) -> list[Rows]:
 def _readings(store: FeatureStore, ticks: Ticks, stream: str) -> list[Rows]:
     """The readings from each episode's start to the last of its ticks, where it has any."""
     starts = store.array(f"episode/{stream}_start")
-    episode = np.searchsorted(store.array("episode/tick_start"), ticks, side="right") - 1
+    episode = store.episode_of(ticks)
     ends = np.array(starts, np.int64)
     np.maximum.at(ends, episode, store.array(f"tick/{stream}_end")[ticks].astype(np.int64))
     return [range(starts[index], ends[index]) for index in np.flatnonzero(ends > starts)]

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 import torch
 
+from pipeline.evaluation.experiments import speed_file
 from pipeline.store import FeatureStore
-from pipeline.training.log import speed_file
 from pipeline.training.speed import Speed, peak_memory_bytes
 
 Make = Callable[..., Any]
