@@ -1,18 +1,60 @@
 """What every command shares: its options, its exit codes, a clean stop."""
 
 import argparse
+import json
 import signal
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 from pipeline.config import Params, load_params
 from pipeline.errors import PipelineError
 
 
+@dataclass(frozen=True)
+class Shorthand:
+    """An option or argument of a command that stands for `--set <key>=<its value>`."""
+
+    name: str
+    """`--option`, or the name of a positional argument."""
+    key: str
+    """section.key of params.yaml."""
+    help: str
+    value: str | None = None
+    """What the value is called in the help; None for an option that takes none and means true."""
+    nargs: str | None = None
+    """As argparse has it; `"*"` makes a list."""
+
+    @property
+    def destination(self) -> str:
+        """Under which name argparse hands the value out."""
+        return self.name.lstrip("-").replace("-", "_")
+
+    def add_to(self, parser: argparse.ArgumentParser) -> None:
+        """Declare it."""
+        said = f"{self.help} (--set {self.key}=…)"
+        if self.value is None:
+            parser.add_argument(self.name, action="store_const", const=True, help=said)
+        else:
+            parser.add_argument(self.name, metavar=self.value, nargs=self.nargs, help=said)
+
+    def override(self, options: argparse.Namespace) -> list[str]:
+        """The `section.key=value` it stands for, if it was given."""
+        given: Any = getattr(options, self.destination)
+        if given is None or given == []:
+            return []
+        # A word stays as it was typed, so that 8 is a number; a list of paths becomes JSON.
+        return [f"{self.key}={given if isinstance(given, str) else json.dumps(given)}"]
+
+
 def run(
-    summary: str, work: Callable[[Params], None], arguments: Sequence[str] | None = None
+    summary: str,
+    work: Callable[[Params], None],
+    arguments: Sequence[str] | None = None,
+    shorthands: Sequence[Shorthand] = (),
 ) -> int:
     """Parse the options, do the work, return the exit code.
 
@@ -31,10 +73,16 @@ def run(
         metavar="section.key=value",
         help="lay a value (YAML) over the file; may be given several times",
     )
+    for shorthand in shorthands:
+        shorthand.add_to(parser)
     options = parser.parse_args(arguments)
+    overrides = [
+        *options.overrides,
+        *(one for each in shorthands for one in each.override(options)),
+    ]
     signal.signal(signal.SIGTERM, _terminate)
     try:
-        work(load_params(options.params, options.overrides))
+        work(load_params(options.params, overrides))
     except PipelineError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

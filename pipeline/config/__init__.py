@@ -3,7 +3,8 @@
 Every section is a frozen model that forbids unknown keys, so that a misspelt key is an error and
 not a default; all errors are reported at once. `stage_one` has the sections of the demo,
 the data and extraction, `stage_two` those of training and evaluation, `policy` those of the
-policy's parts, `finetune` that of tuning the model itself; `load` reads the file.
+policy's parts, `finetune` that of tuning the model itself, `stores` those of what is done with
+stores; `load` reads the file.
 """
 
 from pipeline.config.finetune import FinetuneParams, TuningParams
@@ -35,8 +36,16 @@ from pipeline.config.stage_two import (
     ModelType,
     TrainHeadParams,
 )
+from pipeline.config.stores import (
+    ArchiveParams,
+    ProbeParams,
+    StoresParams,
+    VerifyParams,
+    Workers,
+)
 
 __all__ = [
+    "ArchiveParams",
     "AugmentationParams",
     "CompareParams",
     "DataParams",
@@ -52,13 +61,17 @@ __all__ = [
     "ModelType",
     "Params",
     "Pooling",
+    "ProbeParams",
     "RecordingFormat",
     "RegressionParams",
     "SensorEncoderParams",
     "Source",
     "StateEncoderParams",
+    "StoresParams",
     "TrainHeadParams",
     "TuningParams",
     "VLMParams",
+    "VerifyParams",
+    "Workers",
     "load_params",
 ]

@@ -6,6 +6,7 @@ from pipeline.config.finetune import FinetuneParams
 from pipeline.config.section import Section
 from pipeline.config.stage_one import DataParams, DemoParams, ExtractParams, VLMParams
 from pipeline.config.stage_two import CompareParams, EvaluateParams, TrainHeadParams
+from pipeline.config.stores import ArchiveParams, ProbeParams, StoresParams, VerifyParams
 
 
 class Params(Section):
@@ -19,6 +20,10 @@ class Params(Section):
     evaluate: EvaluateParams = EvaluateParams()
     finetune: FinetuneParams = FinetuneParams()
     compare: CompareParams = CompareParams()
+    verify: VerifyParams = VerifyParams()
+    archive: ArchiveParams = ArchiveParams()
+    probe: ProbeParams = ProbeParams()
+    stores: StoresParams = StoresParams()
 
     @model_validator(mode="after")
     def _mixture_names_sources(self) -> "Params":

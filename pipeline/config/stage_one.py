@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 from pydantic import Field, field_validator
 
 from pipeline.config.section import Section, Seed
+from pipeline.config.stores import Workers
 
 RecordingFormat = Literal["auto", "raw", "new", "old", "lerobot"]
 Pooling = Literal["mean", "image_mean", "text_mean", "view_mean", "grid", "last"]
@@ -141,9 +142,14 @@ class ExtractParams(Section):
     sensor_dtype: Literal["float32", "float16"] = "float32"
     """Of the stored sensor stream."""
     batch_size: Literal["auto"] | Annotated[int, Field(ge=1)] = "auto"
-    """Rows a forward pass; halved when memory runs out."""
-    workers: Literal[0] = 0
-    """Local processes or a scheduler address; so far only 0, this process."""
+    """Rows a forward pass, halved when memory runs out; auto finds the fastest that fits."""
+    workers: Workers = 0
+    """0: this process; N: local dask processes; or the address of a dask scheduler."""
+    retries: int = Field(default=2, ge=0)
+    """Times that a task of a worker is tried again before its recording is given up."""
+    compile: bool = False
+    """Compile the model with torch.compile (with CUDA graphs on a GPU): slow to begin, then faster;
+    the same features within the noise of vlm.dtype."""
     device: str = "auto"
     """auto, cpu, cuda or cuda:N."""
     decode_threads: int = Field(default=2, ge=1)

@@ -1,0 +1,89 @@
+"""Sections of what is done with stores: check, keep, compare their slots, tidy."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from pipeline.config.section import Section, Seed
+
+Workers = Annotated[int, Field(ge=0)] | Annotated[str, Field(pattern=r"^[a-z]+://.+")]
+"""0: this process; N: local processes; or the address of a dask scheduler."""
+
+
+class VerifyParams(Section):
+    """What is checked of a store."""
+
+    store: Path | None = None
+    """`extract.store` where null."""
+    reextract: int = Field(default=0, ge=0)
+    """Random rows that are computed again with today's software and hardware."""
+    tolerance: float | None = Field(default=None, gt=0)
+    """Largest deviation of a recomputed row, relative to the root mean square of its slot; null
+    goes by the dtypes that it was computed and stored in."""
+    seed: Seed = 0
+    """Of the choice of rows."""
+    repair: bool = False
+    """Begin a new build without what is damaged, for stages.extract to complete."""
+    threads: int = Field(default=4, ge=1)
+    """That read and check at a time in this process."""
+    workers: Workers = 0
+    """0: this process; N: local processes; or the address of a dask scheduler."""
+
+
+class ArchiveParams(Section):
+    """Where the copy for keeping and sharing lies."""
+
+    store: Path | None = None
+    """`extract.store` where null."""
+    output: Path | None = None
+    """The archive; `<name>.archive.zarr` beside the store where null."""
+    restore: bool = False
+    """Make the store from the archive, bit for bit, instead."""
+    level: int = Field(default=5, ge=1, le=22)
+    """Of zstd: higher is smaller and slower to write."""
+    threads: int = Field(default=4, ge=1)
+    """That compress or decompress at a time."""
+
+
+class ProbeParams(Section):
+    """How slots are ranked by what a linear reader finds in them."""
+
+    store: Path | None = None
+    """`extract.store` where null."""
+    horizon: int = Field(default=8, ge=1)
+    """Ticks of the action chunk that is read out."""
+    folds: int = Field(default=5, ge=2)
+    """Groups of episodes, each held out once."""
+    penalties: tuple[Annotated[float, Field(gt=0)], ...] = Field(
+        default=(1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0), min_length=1
+    )
+    """Ridge penalties a row, of standardised inputs; each fold takes the best one on the episodes
+    that it trains on."""
+    max_ticks: int | None = Field(default=None, ge=1)
+    """Ticks used at most, evenly spread; null uses all."""
+    sensor_window: int = Field(default=65, ge=1)
+    """Readings before the tick, of which the mean, the last and the spread are read."""
+    state_window: int = Field(default=100, ge=1)
+    """Readings before the tick, likewise."""
+    threads: int = Field(default=2, ge=1)
+    """That work at a time."""
+    output: Path = Path("reports/probe")
+    """Folder of the table and the picture."""
+
+
+class StoresParams(Section):
+    """Housekeeping among the stores of a folder."""
+
+    action: Literal["list", "merge", "gc"] = "list"
+    """Say what is there, make one store of several, or remove what nothing needs."""
+    folder: Path = Path("cache_store")
+    """Where the stores are."""
+    checkpoints: tuple[Path, ...] = (Path("models"),)
+    """Folders of trained policies, which say what store they were trained on."""
+    inputs: tuple[Path, ...] = ()
+    """Of `merge`: the stores that become one."""
+    output: Path | None = None
+    """Of `merge`: the new store."""
+    remove: bool = False
+    """Of `gc`: remove what is listed; else it is only listed."""
