@@ -1,11 +1,12 @@
 """Read params.yaml: the only place that reads YAML."""
 
 from collections.abc import Sequence
+from difflib import get_close_matches
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import yaml
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from pipeline.config.sections import Params
 from pipeline.errors import ConfigError
@@ -64,10 +65,32 @@ def _all_problems(error: ValidationError, path: Path) -> str:
     lines = [f"{path}: {error.error_count()} problem(s)"]
     for problem in error.errors():
         place = ".".join(str(part) for part in problem["loc"]) or "params"
-        found = (
-            ""
-            if problem["type"] in ("missing", "extra_forbidden")
-            else (f" (found {problem['input']!r:.200})")
-        )
-        lines.append(f"  {place}: {problem['msg']}{found}")
+        match problem["type"]:
+            case "extra_forbidden":
+                said = _unknown_key(problem["loc"])
+            case "missing":
+                said = problem["msg"]
+            case _:
+                said = f"{problem['msg']} (found {problem['input']!r:.200})"
+        lines.append(f"  {place}: {said}")
     return "\n".join(lines)
+
+
+def _unknown_key(place: tuple[int | str, ...]) -> str:
+    """The key that was likely meant, else all that may stand there."""
+    section: Any = Params
+    for part in place[:-1]:
+        if isinstance(part, str) and part in section.model_fields:
+            section = _section_in(section.model_fields[part].annotation)
+    known = list(section.model_fields)
+    meant = get_close_matches(str(place[-1]), known, n=1)
+    if meant:
+        return f"unknown key; did you mean {meant[0]}?"
+    return f"unknown key; expected one of: {', '.join(known)}"
+
+
+def _section_in(annotation: Any) -> Any:
+    """The section that a field holds, or that its tuple does."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    return _section_in(next(part for part in get_args(annotation) if part is not Ellipsis))

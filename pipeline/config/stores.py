@@ -1,13 +1,23 @@
 """Sections of what is done with stores: check, keep, compare their slots, tidy."""
 
+import re
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
 from pipeline.config.section import Section, Seed
 
-Workers = Annotated[int, Field(ge=0)] | Annotated[str, Field(pattern=r"^[a-z]+://.+")]
+
+def _workers(value: Any) -> Any:
+    if type(value) is int and value >= 0:
+        return value
+    if isinstance(value, str) and re.fullmatch(r"[a-z]+://.+", value):
+        return value
+    raise ValueError("expected a number of processes, or an address such as tcp://host:8786")
+
+
+Workers = Annotated[int | str, BeforeValidator(_workers)]
 """0: this process; N: local processes; or the address of a dask scheduler."""
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import RecordingError
-from stages.command import run
+from stages.command import Shorthand, run
 
 ROOT = Path(__file__).resolve().parents[2]
 PARAMS = str(ROOT / "params.yaml")
@@ -41,7 +41,49 @@ def test_two_for_a_place_that_cannot_be_used(capsys, tmp_path):
 
 def test_two_for_bad_params(capsys):
     assert run("Summary.", print, ["--params", PARAMS, "--set", "nothing.like=it"]) == 2
-    assert "nothing: Extra inputs are not permitted" in capsys.readouterr().err
+    assert "nothing: unknown key; expected one of: demo, data, vlm" in capsys.readouterr().err
+
+
+def test_a_misspelt_key_is_told_which_was_meant(capsys):
+    wrong = [
+        "--set",
+        "train_head.expert.layer=2",
+        "--set",
+        'data.sources=[{"name": "a", "paths": "x"}]',
+    ]
+    assert run("Summary.", print, ["--params", PARAMS, *wrong]) == 2
+    said = capsys.readouterr().err
+    assert "train_head.expert.layer: unknown key; did you mean layers?" in said
+    assert "data.sources.0.paths: unknown key; did you mean path?" in said
+    assert "data.sources.0.path: Field required" in said
+
+
+SHORTHANDS = (
+    Shorthand("--repair", "verify.repair", "mend"),
+    Shorthand("--reextract", "verify.reextract", "rows", "N"),
+    Shorthand("inputs", "stores.inputs", "stores", "STORE", nargs="*"),
+)
+
+
+def test_shorthands_stand_for_a_set(capsys):
+    seen = []
+    arguments = ["--params", PARAMS, "--repair", "--reextract", "8", "a b.zarr", "c,d.zarr"]
+    assert run("Summary.", seen.append, arguments, SHORTHANDS) == 0
+    assert seen[0].verify.repair is True
+    assert seen[0].verify.reextract == 8
+    assert seen[0].stores.inputs == (Path("a b.zarr"), Path("c,d.zarr"))
+
+
+def test_shorthands_left_out_change_nothing(capsys):
+    seen = []
+    assert run("Summary.", seen.append, ["--params", PARAMS], SHORTHANDS) == 0
+    assert seen[0].verify.repair is False
+    assert seen[0].stores.inputs == ()
+
+
+def test_a_shorthands_value_is_checked_as_the_key_is(capsys):
+    assert run("Summary.", print, ["--params", PARAMS, "--reextract", "-1"], SHORTHANDS) == 2
+    assert "verify.reextract: Input should be greater than or equal to 0" in capsys.readouterr().err
 
 
 def test_a_bug_keeps_its_traceback():
@@ -66,7 +108,21 @@ def test_one_and_a_word_when_stopped(capsys, sent):
     assert "the same command continues from here" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("stage", ["demo", "extract", "train_head", "evaluate"])
+@pytest.mark.parametrize(
+    "stage",
+    [
+        "demo",
+        "extract",
+        "train_head",
+        "evaluate",
+        "compare",
+        "finetune",
+        "verify",
+        "archive",
+        "probe",
+        "store",
+    ],
+)
 def test_help_explains_each_stage_from_any_folder(stage, tmp_path):
     done = subprocess.run(
         [sys.executable, "-m", f"stages.{stage}", "--help"],
