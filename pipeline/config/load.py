@@ -71,7 +71,8 @@ def _all_problems(error: ValidationError, path: Path) -> str:
             case "missing":
                 said = problem["msg"]
             case _:
-                said = f"{problem['msg']} (found {problem['input']!r:.200})"
+                reason = problem["msg"].removeprefix("Value error, ")
+                said = f"{reason} (found {problem['input']!r:.200})"
         lines.append(f"  {place}: {said}")
     return "\n".join(lines)
 

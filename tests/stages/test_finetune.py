@@ -1,9 +1,7 @@
 """`stages.finetune` as a user meets it: what it prints, how it stops, what it refuses."""
 
 import json
-import os
 import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -17,7 +15,7 @@ from PIL import Image
 from stages import evaluate, extract, finetune, train_head
 from stages.command import run
 
-ROOT = Path(finetune.__file__).parents[1]
+Start = Callable[..., "subprocess.Popen[str]"]
 SLOWED = """
 import sys, time
 from pipeline.training import Trainer
@@ -119,24 +117,6 @@ def write_params(extracted: Path, tmp_path: Path) -> Callable[..., Path]:
     return write
 
 
-def started(params: Path) -> "subprocess.Popen[str]":
-    return subprocess.Popen(
-        [sys.executable, "-c", SLOWED, str(params)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
-    )
-
-
-def wait_for(process: "subprocess.Popen[str]", line: str) -> None:
-    assert process.stdout is not None
-    for said in process.stdout:
-        if said.strip() == line:
-            return
-    raise AssertionError(f"ended before {line!r}")
-
-
 def test_it_tunes_and_says_how_to_go_on_and_that_works(
     write_params: Callable[..., Path],
     extracted: Path,
@@ -179,10 +159,12 @@ def test_it_tunes_and_says_how_to_go_on_and_that_works(
 
 
 def test_killed_in_mid_run_it_ends_where_an_undisturbed_run_ends(
-    write_params: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    started_until: Start,
+    write_params: Callable[..., Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    process = started(write_params("killed"))
-    wait_for(process, "step 3")
+    process = started_until(SLOWED, write_params("killed"), "step 3")
     assert run("", finetune.main, ["--params", str(write_params("killed"))]) == 2
     assert "being built by process" in capsys.readouterr().err
     process.kill()

@@ -4,7 +4,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ import yaml
 from stages import evaluate, train_head
 from stages.command import run
 
-ROOT = Path(train_head.__file__).parents[1]
+Start = Callable[..., "subprocess.Popen[str]"]
 WITHOUT_VLM = """
 import sys
 
@@ -90,24 +89,6 @@ def write_params(tiny_store: Callable[..., Path], tmp_path: Path) -> Callable[..
     return write
 
 
-def python(code: str, params: Path) -> "subprocess.Popen[str]":
-    return subprocess.Popen(
-        [sys.executable, "-c", code, str(params)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
-    )
-
-
-def wait_for(process: "subprocess.Popen[str]", line: str) -> None:
-    assert process.stdout is not None
-    for said in process.stdout:
-        if said.strip() == line:
-            return
-    raise AssertionError(f"ended before {line!r}")
-
-
 def test_it_trains_evaluates_and_then_has_nothing_to_do(
     write_params: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -152,26 +133,30 @@ def test_evaluating_twice_gives_the_same_bytes(
     assert written[0] == written[1]
 
 
-def test_stage_two_needs_neither_transformers_nor_peft(write_params: Callable[..., Path]) -> None:
-    process = python(WITHOUT_VLM, write_params(max_steps=4))
+def test_stage_two_needs_neither_transformers_nor_peft(
+    started: Start, write_params: Callable[..., Path]
+) -> None:
+    process = started(WITHOUT_VLM, write_params(max_steps=4))
     out, err = process.communicate(timeout=120)
     assert process.returncode == 0, err
     assert "overall [training std]" in out
 
 
 def test_killed_in_mid_run_it_ends_where_an_undisturbed_run_ends(
-    write_params: Callable[..., Path], tmp_path: Path
+    started: Start,
+    started_until: Start,
+    write_params: Callable[..., Path],
+    tmp_path: Path,
 ) -> None:
     undisturbed, killed = write_params("undisturbed"), write_params("killed")
-    process = python(SLOWED, killed)
-    wait_for(process, "step 18")
+    process = started_until(SLOWED, killed, "step 18")
     process.kill()
     process.communicate(timeout=60)
     part = tmp_path / "killed/head.part"
     assert (part / "last/policy.json").exists()
     assert not (tmp_path / "killed/head").exists()
     for params in (undisturbed, killed):
-        done = python(SLOWED, params)
+        done = started(SLOWED, params)
         out, err = done.communicate(timeout=120)
         assert done.returncode == 0, err
     assert "resuming the run in" in out
@@ -185,10 +170,11 @@ def test_killed_in_mid_run_it_ends_where_an_undisturbed_run_ends(
 
 
 def test_a_sigterm_leaves_the_step_it_came_in(
-    write_params: Callable[..., Path], tmp_path: Path
+    started_until: Start,
+    write_params: Callable[..., Path],
+    tmp_path: Path,
 ) -> None:
-    process = python(SLOWED, write_params(checkpoint_every=1000))
-    wait_for(process, "step 6")
+    process = started_until(SLOWED, write_params(checkpoint_every=1000), "step 6")
     process.send_signal(signal.SIGTERM)
     _, err = process.communicate(timeout=60)
     assert process.returncode == 1
@@ -199,11 +185,12 @@ def test_a_sigterm_leaves_the_step_it_came_in(
 
 
 def test_a_second_training_of_the_same_output_is_refused(
-    write_params: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+    started_until: Start,
+    write_params: Callable[..., Path],
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     params = write_params()
-    process = python(SLOWED, params)
-    wait_for(process, "step 1")
+    process = started_until(SLOWED, params, "step 1")
     try:
         assert run("", train_head.main, ["--params", str(params)]) == 2
         assert "being built by process" in capsys.readouterr().err

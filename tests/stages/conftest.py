@@ -1,0 +1,43 @@
+"""Stages as processes of their own."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+Process = subprocess.Popen[str]
+
+
+@pytest.fixture
+def started() -> Callable[[str, Path], Process]:
+    """`started(code, params)`: a process that runs this Python with the file of params."""
+
+    def start(code: str, params: Path) -> Process:
+        return subprocess.Popen(
+            [sys.executable, "-c", code, str(params)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+        )
+
+    return start
+
+
+@pytest.fixture
+def started_until(started: Callable[[str, Path], Process]) -> Callable[[str, Path, str], Process]:
+    """`started_until(code, params, line)`: the process once it has printed that line."""
+
+    def start(code: str, params: Path, line: str) -> Process:
+        process = started(code, params)
+        assert process.stdout is not None
+        for said in process.stdout:
+            if said.strip() == line:
+                return process
+        raise AssertionError(f"ended before {line!r}")
+
+    return start
