@@ -1,82 +1,132 @@
 """Group prepared rows by shape and run the model over their variants."""
 
-import sys
 from collections import defaultdict
-from collections.abc import Iterator
-from typing import Any, NoReturn
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any, Literal, NoReturn
 
 import torch
 from numpy.typing import NDArray
 
-from pipeline.errors import NumericsError, VLMError
+from pipeline.errors import NumericsError
+from pipeline.extraction.batch_size import BatchSize
 from pipeline.extraction.rows import ReadyRow
-from pipeline.vlm.qwen import FrozenVLM
+from pipeline.vlm.qwen import FrozenVLM, Pending
+
+Encoded = tuple[list[ReadyRow], NDArray[Any]]
+"""Rows, and their features (row, variant x slot, dim) as they are stored."""
+
+
+@dataclass(frozen=True)
+class _Submitted:
+    """Rows that the model works on, variant after variant, in one pass or several."""
+
+    rows: list[ReadyRow]
+    passes: list[Pending]
+    full: int | None
+    """The batch size, where there are as many rows as it allows."""
 
 
 class Encoder:
     """Encodes rows in batches of equal shape; an out-of-memory halves the batch and goes on.
 
-    `batch_size` counts what the model takes: each variant of a row is one.
+    The batch size counts what the model takes: each variant of a row is one.
     """
 
-    def __init__(self, vlm: FrozenVLM, batch_size: int, variants: int = 1) -> None:
-        self.batch_size = batch_size
+    def __init__(
+        self, vlm: FrozenVLM, batch_size: int | Literal["auto"], variants: int = 1
+    ) -> None:
+        """With "auto" the first batches are measured, and the size settles where it is fastest."""
+        self.model_s = 0.0
+        """Seconds that the model worked on what was handed out so far."""
         self._vlm = vlm
+        self._size = BatchSize(batch_size, vlm.device.type)
         self._variants = variants
-        self._waiting: dict[Any, list[ReadyRow]] = defaultdict(list)
 
-    def add(self, row: ReadyRow) -> list[ReadyRow]:
-        """Let a row wait for others of its shape; returns a full batch when there is one.
+    @property
+    def batch_size(self) -> int:
+        """How many prepared rows the model takes at a time, as of now."""
+        return self._size.current
 
-        So that waiting rows stay few, the largest group is handed out when many shapes wait.
+    @property
+    def settled(self) -> bool:
+        """Whether only memory running out would change the batch size."""
+        return self._size.settled
+
+    def encoded(self, rows: Iterable[ReadyRow]) -> Iterator[Encoded]:
+        """Every row once, batch by batch as the model is done with them, in no given order.
+
+        On a GPU one batch is ahead of what is handed out, so that it works while the caller does;
+        what is done is not held back. Raises
+        `NumericsError` that names the row, and variant, of a feature that is not finite, and
+        `VLMError` where memory does not suffice for a single row.
         """
-        shape = row.variants[0].shape_key
-        self._waiting[shape].append(row)
-        if len(self._waiting[shape]) >= self._rows:
-            return self._waiting.pop(shape)
-        if sum(map(len, self._waiting.values())) >= 4 * self._rows:
-            return self._waiting.pop(max(self._waiting, key=lambda key: len(self._waiting[key])))
-        return []
+        ahead: _Submitted | None = None
+        for batch in self._batches(rows):
+            for submitted in self._submitted(batch):
+                if ahead is not None:
+                    yield from self._finished(ahead)
+                ahead = submitted
+                if all(one.done for one in submitted.passes):
+                    yield from self._finished(ahead)
+                    ahead = None
+        if ahead is not None:
+            yield from self._finished(ahead)
 
-    def rest(self) -> Iterator[list[ReadyRow]]:
-        """What still waits, shape by shape."""
-        yield from self._waiting.values()
-        self._waiting.clear()
+    def _batches(self, rows: Iterable[ReadyRow]) -> Iterator[list[ReadyRow]]:
+        """Full batches of equal shape as they come together, at last what is left of each shape.
 
-    def encode(self, rows: list[ReadyRow]) -> Iterator[tuple[list[ReadyRow], NDArray[Any]]]:
-        """Each batch with its features (row, variant x slot, dim) as they are stored."""
-        while rows:
-            batch = rows[: self._rows]
-            try:
-                features = self._features(batch)
-            except RuntimeError as error:
-                if not _out_of_memory(error):
-                    raise
-                self._halve(min(self.batch_size, len(batch) * self._variants), error)
-                continue
-            except NumericsError as error:
-                if len(batch) == 1:
-                    self._refuse(batch[0], error)
-                for one in batch:  # alone, the row that is not finite names itself
-                    yield from self.encode([one])
-            else:
-                yield batch, stored_bits(features)
-            rows = rows[len(batch) :]
+        So that waiting rows stay few, the largest group goes when many shapes wait.
+        """
+        waiting: dict[Any, list[ReadyRow]] = defaultdict(list)
+        for row in rows:
+            shape = row.variants[0].shape_key
+            waiting[shape].append(row)
+            if len(waiting[shape]) >= self._rows:
+                yield waiting.pop(shape)
+            elif sum(map(len, waiting.values())) >= 4 * self._rows:
+                yield waiting.pop(max(waiting, key=lambda key: len(waiting[key])))
+        yield from waiting.values()
 
     @property
     def _rows(self) -> int:
         """Whole rows a batch: at least one, whose variants may then take several passes."""
         return max(1, self.batch_size // self._variants)
 
-    def _features(self, rows: list[ReadyRow]) -> torch.Tensor:
-        """The slots (row, variant x slot, dim) of each row, variant after variant."""
-        every = [prepared for row in rows for prepared in row.variants]
-        passes = [
-            self._vlm.encode(every[start : start + self.batch_size])[0]
-            for start in range(0, len(every), self.batch_size)
-        ]
-        features = torch.cat(passes)
-        return features.reshape(len(rows), -1, features.shape[-1])
+    def _submitted(self, rows: list[ReadyRow]) -> Iterator[_Submitted]:
+        """The rows in as many batches as the batch size makes of them."""
+        while rows:
+            batch = rows[: self._rows]
+            every = [prepared for row in batch for prepared in row.variants]
+            size = self.batch_size
+            try:
+                parts = (every[start : start + size] for start in range(0, len(every), size))
+                passes = [self._vlm.submit(part) for part in parts]
+            except RuntimeError as error:
+                if not _out_of_memory(error):
+                    raise
+                self._size.halve(min(size, len(every)), error)
+                continue
+            yield _Submitted(batch, passes, size if len(batch) == self._rows else None)
+            rows = rows[len(batch) :]
+
+    def _finished(self, submitted: _Submitted) -> Iterator[Encoded]:
+        rows = submitted.rows
+        try:
+            features = torch.cat([one.result()[0] for one in submitted.passes])
+        except NumericsError as error:
+            if len(rows) == 1:
+                self._refuse(rows[0], error)
+            for one in rows:  # alone, the row that is not finite names itself
+                for alone in self._submitted([one]):
+                    yield from self._finished(alone)
+            return
+        seconds = sum(one.model_s for one in submitted.passes)
+        self.model_s += seconds
+        if submitted.full is not None:
+            tokens = len(rows) * self._variants * rows[0].variants[0].layout.length
+            self._size.note(submitted.full, tokens, seconds)
+        yield rows, stored_bits(features.reshape(len(rows), -1, features.shape[-1]))
 
     def _refuse(self, row: ReadyRow, error: NumericsError) -> NoReturn:
         where = row.where
@@ -91,16 +141,6 @@ class Encoder:
             except NumericsError:
                 return str(variant)
         return "unknown (each is finite alone)"
-
-    def _halve(self, failed: int, error: RuntimeError) -> None:
-        if failed == 1:
-            raise VLMError(
-                f"out of memory with a single row ({error}). Use a GPU with more memory, a smaller "
-                "vlm.image_resize_height and _width, or fewer data.views."
-            ) from error
-        self.batch_size = failed // 2
-        torch.cuda.empty_cache()
-        print(f"out of memory: going on with batches of {self.batch_size}", file=sys.stderr)
 
 
 def _out_of_memory(error: RuntimeError) -> bool:

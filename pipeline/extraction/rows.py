@@ -2,9 +2,10 @@
 
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any, Self, TypeVar
 
 import numpy as np
@@ -85,6 +86,16 @@ class ReadyRow:
     """Recording and row, for messages."""
 
 
+@dataclass(frozen=True)
+class RepeatedRow:
+    """A row that shows and says what another row of this run does."""
+
+    row: int
+    key: bytes
+    first: int
+    """The row of the same key that the model is given."""
+
+
 def spans_of(
     recordings: Sequence[Recording],
     vl_start: NDArray[np.int64],
@@ -115,48 +126,69 @@ class RowPreparation:
         self._preparer = preparer
         self._spec = spec
         self._donors = donors
-        self._donors_lock = threading.Lock()
+        self._firsts: dict[bytes, int] = {}
+        self._lock = threading.Lock()
 
     def prepare(self, span: Span) -> list[KnownRow | ReadyRow]:
         """The rows of a span, each decoded frame held only while its row is made."""
-        recording = span.recording
-        prompt = self._preparer.render(recording.instruction, list(span.frames))
-        made: list[KnownRow | ReadyRow] = []
+        return [
+            self._known(row, key) or self._ready(span, row, key, frames)
+            for row, key, frames in self._keyed(span)
+        ]
+
+    def prepare_once(self, span: Span) -> list[KnownRow | ReadyRow | RepeatedRow]:
+        """As `prepare`, but of all rows of equal key only one is made ready."""
+        return [
+            self._known(row, key) or self._repeated(row, key) or self._ready(span, row, key, frames)
+            for row, key, frames in self._keyed(span)
+        ]
+
+    def _keyed(self, span: Span) -> Iterator[tuple[int, bytes, dict[str, NDArray[np.uint8]]]]:
+        prompt = self._preparer.render(span.recording.instruction, list(span.frames))
         for row, frames in span.read():
-            key = row_key(self._spec, prompt, frames)
-            known = self._known(row, key)
-            made.append(
-                known
-                or ReadyRow(
-                    row,
-                    key,
-                    self._preparer.prepare_variants(recording.instruction, frames, key),
-                    f"{recording.path}, VL row {row}",
-                )
-            )
-        return made
+            yield row, row_key(self._spec, prompt, frames), frames
 
     def _known(self, row: int, key: bytes) -> KnownRow | None:
-        with self._donors_lock:
+        with self._lock:
             for donor in self._donors:
                 features = donor.take(key)
                 if features is not None:
                     return KnownRow(row, key, features, donor.environment_of(key))
         return None
 
+    def _repeated(self, row: int, key: bytes) -> RepeatedRow | None:
+        with self._lock:
+            first = self._firsts.setdefault(key, row)
+        return RepeatedRow(row, key, first) if first != row else None
+
+    def _ready(
+        self, span: Span, row: int, key: bytes, frames: dict[str, NDArray[np.uint8]]
+    ) -> ReadyRow:
+        variants = self._preparer.prepare_variants(span.recording.instruction, frames, key)
+        return ReadyRow(row, key, variants, f"{span.recording.path}, VL row {row}")
+
 
 def in_background(
-    work: Iterable[Work], make: Callable[[Work], list[Made]], threads: int
-) -> Iterator[Made]:
-    """`make` of each piece of work, in order, up to `threads + 1` pieces ahead of the reader."""
+    work: Iterable[Work],
+    make: Callable[[Work], list[Made]],
+    threads: int,
+    ahead: Callable[[], int] = lambda: 0,
+) -> Generator[Made]:
+    """`make` of each piece of work, in order, as many pieces before the reader as `ahead` says.
+
+    At least `threads + 1`, so that no thread waits for the reader.
+    """
     with ThreadPoolExecutor(threads, thread_name_prefix="decode") as pool:
-        ahead: deque[Future[list[Made]]] = deque()
+        pieces = iter(work)
+        made: deque[Future[list[Made]]] = deque()
         try:
-            for piece in work:
-                ahead.append(pool.submit(make, piece))
-                if len(ahead) > threads:
-                    yield from ahead.popleft().result()
-            while ahead:
-                yield from ahead.popleft().result()
+            while True:
+                wanted = max(threads + 1, ahead())
+                made.extend(
+                    pool.submit(make, piece) for piece in islice(pieces, wanted - len(made))
+                )
+                if not made:
+                    return
+                yield from made.popleft().result()
         finally:
             pool.shutdown(cancel_futures=True)

@@ -1,35 +1,19 @@
 """Prepared rows -> pooled features, differentiable: what the frozen and the live model share."""
 
-from collections.abc import Generator, Iterable, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int64, UInt8
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
+from transformers.masking_utils import create_causal_mask, create_sliding_window_causal_mask
 
+from pipeline.vlm.collation import Batch, Collator
 from pipeline.vlm.pixels import PixelSettings, patchify
-from pipeline.vlm.pooling import batch_weights, pool
-from pipeline.vlm.preparation import Layout, PreparedRow
+from pipeline.vlm.pooling import pool
+from pipeline.vlm.preparation import PreparedRow
 from pipeline.vlm.slots import Slot
-
-
-@dataclass(frozen=True)
-class _Batch:
-    """Rows side by side, padded on the right, on the model's device."""
-
-    token_ids: Int64[Tensor, "batch token"]
-    real: Bool[Tensor, "batch token"] | None
-    """Which tokens are not padding; None where none is."""
-    positions: Int64[Tensor, "3 batch token"]
-    pixels: UInt8[Tensor, "image height width 3"]
-    image_tokens: Int64[Tensor, " image_token"]
-    """Indices of the image tokens in the flattened (batch x token)."""
-    weights: Float[Tensor, "batch place token"]
-    valid: Bool[Tensor, "batch place"]
-    """Which places have a token at all; on the CPU."""
+from pipeline.vlm.vision import TowerPlan, VisionTower
 
 
 def layers_needed(slots: Iterable[Slot]) -> int:
@@ -40,106 +24,112 @@ def layers_needed(slots: Iterable[Slot]) -> int:
 class Extractor:
     """Collates rows, runs an inner `Qwen2_5_VLModel` and pools what its layers give.
 
-    Whether gradients flow, and in which precision, is the caller's.
+    Whether gradients flow, and in which precision, is the caller's. Between a batch's first tensor
+    and its features nothing waits for the device.
     """
 
-    def __init__(self, model: Any, settings: PixelSettings, slots: tuple[Slot, ...]) -> None:
-        """`model` may be cut after the last layer that a slot reads."""
+    def __init__(
+        self,
+        model: Any,
+        settings: PixelSettings,
+        slots: tuple[Slot, ...],
+        compiled: bool = False,
+    ) -> None:
+        """`model` may be cut after the last layer that a slot reads.
+
+        With `compiled`, vision and text are each compiled as a whole, for static shapes.
+        """
         self.model = model
         self._settings = settings
         # Slots repeat the same places for every (layer, norm): pooled with one set of weights.
         self._reads = tuple(dict.fromkeys((slot.layer, slot.norm) for slot in slots))
-        self._places: tuple[Slot, ...] = slots[: len(slots) // len(self._reads)]
-        self._positions: dict[Layout, Int64[Tensor, "3 token"]] = {}
+        places = slots[: len(slots) // len(self._reads)]
+        self._tower = VisionTower(model.visual, settings.grid)
+        self._collator = Collator(model, settings, places, self._tower, static=compiled)
+        self._compiled: dict[str, Callable[..., Tensor]] = {}
+        if compiled:
+            mode = "reduce-overhead" if model.device.type == "cuda" else None
+            self._compiled = {
+                part.__name__: torch.compile(part, dynamic=False, mode=mode)
+                for part in (self._see, self._read)
+            }
 
     def extract(
         self, rows: Sequence[PreparedRow]
     ) -> tuple[Float[Tensor, "batch slot dim"], Bool[Tensor, "batch slot"]]:
         """Features of each row in float32 on the model's device; which are valid, on the CPU."""
-        batch = self._collate(rows)
-        read = self._forward(batch)
-        features = torch.cat([read[key] for key in self._reads], dim=1)
-        return features, batch.valid.repeat(1, len(self._reads))
+        batch = self.collate(rows)
+        return self.features(batch), self.valid(batch)
 
-    def _collate(self, rows: Sequence[PreparedRow]) -> _Batch:
-        layouts = [row.layout for row in rows]
-        length = max(layout.length for layout in layouts)
-        token_ids = torch.zeros(len(rows), length, dtype=torch.int64)
-        real = torch.zeros(len(rows), length, dtype=torch.bool)
-        positions = torch.zeros(3, len(rows), length, dtype=torch.int64)
-        for index, row in enumerate(rows):
-            filled = slice(0, row.layout.length)
-            token_ids[index, filled] = torch.tensor(row.token_ids)
-            real[index, filled] = True
-            positions[:, index, filled] = self._rope_positions(row.layout)
-        image_tokens = np.concatenate(
-            [index * length + layout.image_tokens() for index, layout in enumerate(layouts)]
-        )
-        weights = batch_weights(self._places, layouts, length)
-        device = self.model.device
-        return _Batch(
-            token_ids.to(device),
-            None if bool(real.all()) else real.to(device),
-            positions.to(device),
-            torch.from_numpy(np.concatenate([row.pixels for row in rows])).to(device),
-            torch.from_numpy(image_tokens).to(device),
-            weights.to(device),
-            (weights != 0).any(dim=-1),
-        )
+    def collate(self, rows: Sequence[PreparedRow]) -> Batch:
+        """The rows as `features` takes them, sent to the model's device without waiting."""
+        return self._collator.collate(rows)
 
-    def _rope_positions(self, layout: Layout) -> Int64[Tensor, "3 token"]:
-        """Time, height and width position of each token; computed once a layout, on the CPU."""
-        if layout not in self._positions:
-            kinds = torch.zeros(1, layout.length, dtype=torch.int64)
-            kinds[0, torch.from_numpy(layout.image_tokens())] = 1
-            grids = self._grids(len(layout.image_starts)) if layout.image_starts else None
-            found, _ = self.model.get_rope_index(
-                torch.zeros_like(kinds), mm_token_type_ids=kinds, image_grid_thw=grids
-            )
-            self._positions[layout] = found[:, 0]
-        return self._positions[layout]
+    def valid(self, batch: Batch) -> Bool[Tensor, "batch slot"]:
+        """Which slots have a token at all; on the CPU."""
+        return batch.arrangement.valid.repeat(1, len(self._reads))
 
-    def _grids(self, images: int) -> Int64[Tensor, "image 3"]:
-        """Patches in time, height and width of each image."""
-        return torch.tensor([(1, *self._settings.grid)] * images)
+    def features(self, batch: Batch) -> Float[Tensor, "batch slot dim"]:
+        """The slots of each row, in float32 on the model's device.
 
-    def _forward(self, batch: _Batch) -> dict[tuple[int, bool], Float[Tensor, "batch place dim"]]:
+        What a compiled extractor gives is overwritten by its next batch.
+        """
+        if self._compiled:
+            torch.compiler.cudagraph_mark_step_begin()
+        see, read = (self._compiled.get(part.__name__, part) for part in (self._see, self._read))
+        places = batch.arrangement
+        embedded = self.model.language_model.embed_tokens(batch.token_ids)
+        if batch.plan is not None:
+            patches = patchify(batch.pixels, self._settings).to(self.model.dtype)
+            seen = see(patches, batch.plan).index_select(0, batch.shown)
+            embedded.flatten(0, 1).index_copy_(0, places.image_tokens, seen.to(embedded.dtype))
+        masks = self._masks(embedded)
+        return read(embedded, places.positions, masks, places.weights, places.real)
+
+    def _see(
+        self, patches: Float[Tensor, "patch value"], plan: TowerPlan
+    ) -> Float[Tensor, "token dim"]:
+        return self._tower(patches, plan)
+
+    def _masks(self, embedded: Float[Tensor, "batch token dim"]) -> Mapping[str, Tensor | None]:
+        """The mask of each kind of layer; None where the kernel itself is causal.
+
+        Attention is causal and padding stands last, so no real token sees any: a mask for it would
+        only cost its memory and the fast causal kernel.
+        """
         text = self.model.language_model
-        embedded = text.embed_tokens(batch.token_ids)
-        if len(batch.pixels):
-            seen = self.model.visual(
-                patchify(batch.pixels, self._settings).to(self.model.dtype),
-                grid_thw=self._grids(len(batch.pixels)).to(self.model.device),
-            ).pooler_output
-            embedded.flatten(0, 1).index_copy_(0, batch.image_tokens, seen.to(embedded.dtype))
-        with self._reading(batch) as read:
-            # Attention is causal and padding stands last, so no real token sees any: a mask would
-            # only cost its memory and the fast causal kernel.
-            text(inputs_embeds=embedded, position_ids=batch.positions, use_cache=False)
-        return read
+        given: dict[str, Any] = {
+            "config": text.config,
+            "inputs_embeds": embedded,
+            "attention_mask": None,
+            "past_key_values": None,
+            "position_ids": None,
+        }
+        masks: dict[str, Any] = {"full_attention": create_causal_mask(**given)}
+        if text.has_sliding_layers:
+            masks["sliding_attention"] = create_sliding_window_causal_mask(**given)
+        return masks
 
-    @contextmanager
-    def _reading(self, batch: _Batch) -> Generator[dict[tuple[int, bool], Tensor]]:
-        """Pool what each layer gives as soon as it gives it, so that no layer is kept alive."""
+    def _read(
+        self,
+        embedded: Float[Tensor, "batch token dim"],
+        positions: Int64[Tensor, "3 batch token"],
+        masks: Mapping[str, Tensor | None],
+        weights: Float[Tensor, "batch place token"],
+        real: Bool[Tensor, "batch token"] | None,
+    ) -> Float[Tensor, "batch slot dim"]:
+        """Run the layers, pooling what each gives as soon as it gives it: none is kept alive."""
         text = self.model.language_model
+        rotary = text.rotary_emb(embedded, positions)
         read: dict[tuple[int, bool], Tensor] = {}
-
-        def pool_layer(layer: int, hidden: Tensor) -> None:
+        hidden = embedded
+        for number, layer in enumerate(text.layers):
+            mask = masks[text.config.layer_types[number]]
+            hidden = layer(hidden, attention_mask=mask, position_embeddings=rotary, use_cache=False)
             for key in self._reads:
-                if key[0] == layer:
+                if key[0] == number:
                     tokens = text.norm(hidden) if key[1] else hidden
                     # Sums over thousands of tokens stay in float32 whatever the caller's autocast.
                     with torch.autocast(tokens.device.type, enabled=False):
-                        read[key] = pool(tokens, batch.weights, batch.real)
-
-        hooks = [
-            text.layers[layer].register_forward_hook(
-                lambda _module, _inputs, hidden, layer=layer: pool_layer(layer, hidden)
-            )
-            for layer in sorted({layer for layer, _ in self._reads})
-        ]
-        try:
-            yield read
-        finally:
-            for hook in hooks:
-                hook.remove()
+                        read[key] = pool(tokens, weights, real)
+        return torch.cat([read[key] for key in self._reads], dim=1)

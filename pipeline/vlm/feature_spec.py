@@ -32,6 +32,7 @@ __all__ = [
     "FeatureSpec",
     "Slot",
     "differences",
+    "document_digest",
     "feature_spec",
     "resolve_checkpoint",
     "row_key",
@@ -110,6 +111,11 @@ def feature_spec(
     }
     digest = _digest(document)
     return FeatureSpec(document, digest, slots, ordered, dim, pixels.image_size, vlm.variants)
+
+
+def document_digest(attrs: Mapping[str, Any]) -> str:
+    """The digest that a spec, as a store keeps it, must carry."""
+    return _digest({name: value for name, value in attrs.items() if name != "digest"})
 
 
 def row_key(spec: FeatureSpec, prompt: str, frames: Mapping[str, NDArray[np.uint8]]) -> bytes:

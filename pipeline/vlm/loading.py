@@ -19,6 +19,7 @@ from pipeline.config import VLMParams
 from pipeline.errors import VLMError
 from pipeline.vlm.checkpoint_folder import adapter_files, resolve_checkpoint, weight_files
 from pipeline.vlm.pixels import PixelSettings
+from pipeline.vlm.vision import tower_attention
 
 _UNUSED = {"lm_head.weight"}
 """Weights that a feature never meets: a checkpoint may lack them."""
@@ -66,7 +67,7 @@ def environment(model: Any, device: torch.device) -> dict[str, str]:
     cuda = device.type == "cuda"
     return {
         "attention": str(model.language_model.config._attn_implementation),
-        "vision_attention": str(model.visual.config._attn_implementation),
+        "vision_attention": tower_attention(model.visual),
         "torch": torch.__version__,
         "transformers": transformers.__version__,
         "pillow": PIL.__version__,

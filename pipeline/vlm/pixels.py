@@ -5,6 +5,7 @@ the model is, from uint8. The layout is that of transformers' Qwen2-VL image pro
 """
 
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -117,9 +118,21 @@ def patchify(
     )
     # image, block row, block column, row in block, column in block, channel, y, x
     patches = blocks.permute(0, 1, 4, 2, 5, 7, 3, 6).to(torch.float32)
-    shape = (-1, 1, 1)
-    mean = torch.tensor(settings.image_mean, device=images.device).reshape(shape)
-    std = torch.tensor(settings.image_std, device=images.device).reshape(shape)
-    patches = (patches * settings.rescale_factor - mean) / std
+    scale, offset = _normalisation(settings, images.device)
+    patches = torch.addcmul(offset, patches, scale)
     frames = patches.unsqueeze(6).expand(*[-1] * 6, settings.temporal_patch_size, -1, -1)
     return frames.reshape(len(images) * rows * columns, -1)
+
+
+@lru_cache(maxsize=8)
+def _normalisation(settings: PixelSettings, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Scale and offset of each channel (channel, 1, 1), so that one pass rescales and normalises.
+
+    Sent once: sending waits.
+    """
+    mean, std = (
+        torch.tensor(values, dtype=torch.float64).reshape(-1, 1, 1)
+        for values in (settings.image_mean, settings.image_std)
+    )
+    scale, offset = settings.rescale_factor / std, -mean / std
+    return scale.float().to(device), offset.float().to(device)

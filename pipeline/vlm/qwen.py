@@ -1,6 +1,8 @@
 """The frozen Qwen2.5-VL: load, adapt, encode."""
 
-from collections.abc import Sequence
+import math
+import time
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -14,7 +16,7 @@ from pipeline.vlm.extractor import Extractor, layers_needed
 from pipeline.vlm.feature_spec import FeatureSpec
 from pipeline.vlm.loading import environment, load_model, pixel_settings
 from pipeline.vlm.pixels import PixelSettings
-from pipeline.vlm.preparation import PreparedRow
+from pipeline.vlm.preparation import Layout, PreparedRow
 
 
 class FrozenVLM:
@@ -24,27 +26,41 @@ class FrozenVLM:
     """Attention backend, library versions and device: recorded, not part of the identity."""
 
     def __init__(
-        self, model: Any, settings: PixelSettings, spec: FeatureSpec, device: torch.device
+        self,
+        model: Any,
+        settings: PixelSettings,
+        spec: FeatureSpec,
+        device: torch.device,
+        compiled: bool = False,
     ) -> None:
         """Wrap an inner `Qwen2_5_VLModel` that is already on `device`."""
         self._model = model
-        self._extractor = Extractor(model, settings, spec.slots)
+        self._extractor = Extractor(model, settings, spec.slots, compiled)
         self._spec = spec
         self._storage_dtype = getattr(torch, spec.document["storage_dtype"])
-        self.environment = environment(model, device)
+        self._compiled = compiled
+        self._fullest: dict[Layout, int] = {}
+        self.environment = environment(model, device) | ({"compiled": "true"} if compiled else {})
 
     @classmethod
-    def load(cls, vlm: VLMParams, spec: FeatureSpec, device: str = "auto") -> "FrozenVLM":
+    def load(
+        cls, vlm: VLMParams, spec: FeatureSpec, device: str = "auto", compile: bool = False
+    ) -> "FrozenVLM":
         """The checkpoint (and adapter) of `vlm` in its dtype, cut after the last layer needed.
 
-        `device` is a torch device or "auto": CUDA where there is one. Raises `VLMError` where the
+        `device` is a torch device or "auto": CUDA where there is one. With `compile`, the first
+        batch of a shape takes minutes and the others less time. Raises `VLMError` where the
         folder is incomplete, a weight is missing or left over, or the adapter does not fit.
         """
         target = resolve_device(device)
         model = load_model(vlm, layers_needed(spec.slots), target)
-        return cls(model, pixel_settings(vlm), spec, target)
+        return cls(model, pixel_settings(vlm), spec, target, compile)
 
-    @torch.no_grad()
+    @property
+    def device(self) -> torch.device:
+        """Where the model is."""
+        return self._model.device
+
     def encode(
         self, rows: Sequence[PreparedRow]
     ) -> tuple[Float[Tensor, "batch slot dim"], Bool[Tensor, "batch slot"]]:
@@ -54,14 +70,36 @@ class FrozenVLM:
         dtype's noise, whatever rows stand beside it; rows of equal `shape_key` are fastest.
         Raises `NumericsError` naming row and slot where a feature is NaN or infinite.
         """
-        features, valid = self._extractor.extract(rows)
-        features = features.to(self._storage_dtype).cpu()
-        self._check_finite(features)
-        return features, valid
+        return self.submit(rows).result()
+
+    @torch.no_grad()
+    def submit(self, rows: Sequence[PreparedRow]) -> "Pending":
+        """Begin to encode rows: on a GPU this returns while it works, elsewhere when it is done.
+
+        What went wrong with the features is raised by the `result`, out of memory here.
+        """
+        batch = self._extractor.collate(self._padded(rows))
+        clock = _Clock(self._model.device)
+        # Cut and converted before they leave the device: a padded row is nobody's.
+        features = self._extractor.features(batch)[: len(rows)].to(self._storage_dtype)
+        valid = self._extractor.valid(batch)[: len(rows)]
+        return Pending(features, valid, clock, self._check_finite)
+
+    def _padded(self, rows: Sequence[PreparedRow]) -> Sequence[PreparedRow]:
+        """What a compiled model is given: as many rows as it has seen of this shape.
+
+        So that the last batch of a shape is not compiled anew.
+        """
+        layout = rows[0].layout
+        if not self._compiled or any(row.layout != layout for row in rows):
+            return rows
+        full = self._fullest[layout] = max(len(rows), self._fullest.get(layout, 0))
+        return [*rows, *[rows[-1]] * (full - len(rows))]
 
     def _check_finite(self, features: Float[Tensor, "batch slot dim"]) -> None:
-        bad = ~torch.isfinite(features).all(dim=-1)
-        if bool(bad.any()):
+        least, most = torch.aminmax(features)  # in one pass; of a NaN, both are NaN
+        if not math.isfinite(least) or not math.isfinite(most):
+            bad = ~torch.isfinite(features).all(dim=-1)
             row, slot = (int(index) for index in bad.nonzero()[0])
             raise NumericsError(
                 f"row {row} of the batch, slot {self._spec.slots[slot].document()}: expected "
@@ -70,3 +108,85 @@ class FrozenVLM:
                 f"{self._spec.document['storage_dtype']}: try bfloat16 or float32 for vlm.dtype "
                 "and extract.dtype."
             )
+
+
+class Pending:
+    """Features that are being computed, or on their way to the CPU."""
+
+    def __init__(
+        self,
+        features: Float[Tensor, "batch slot dim"],
+        valid: Bool[Tensor, "batch slot"],
+        clock: "_Clock",
+        check: Callable[[Float[Tensor, "batch slot dim"]], None],
+    ) -> None:
+        """Begin to copy `features` to the CPU; `clock` began when the model did."""
+        self._valid = valid
+        self._clock = clock
+        self._check = check
+        clock.stop()
+        self._features = features
+        if features.device.type == "cuda":
+            self._features = torch.empty(features.shape, dtype=features.dtype, pin_memory=True)
+            self._features.copy_(features, non_blocking=True)
+        clock.copied()
+
+    def result(self) -> tuple[Float[Tensor, "batch slot dim"], Bool[Tensor, "batch slot"]]:
+        """What `FrozenVLM.encode` gives, when it is there; raises as it does."""
+        self._clock.wait()
+        self._check(self._features)
+        return self._features, self._valid
+
+    @property
+    def done(self) -> bool:
+        """Whether the `result` is there, without waiting for it."""
+        return self._clock.done
+
+    @property
+    def model_s(self) -> float:
+        """Seconds that the model worked; waits for the `result`."""
+        return self._clock.model_s
+
+
+class _Clock:
+    """What the model takes, by the device's own clock where it has one: the host does not wait."""
+
+    def __init__(self, device: torch.device) -> None:
+        self._stream = torch.cuda.current_stream(device) if device.type == "cuda" else None
+        self._events = [self._event()]
+        self._begun, self._took = time.perf_counter(), 0.0
+
+    def stop(self) -> None:
+        """The model is done."""
+        self._events.append(self._event())
+        self._took = time.perf_counter() - self._begun
+
+    def copied(self) -> None:
+        """The result is on the CPU."""
+        self._events.append(self._event())
+
+    @property
+    def done(self) -> bool:
+        last = self._events[-1]
+        return last is None or last.query()
+
+    def wait(self) -> None:
+        """Wait until it is."""
+        if last := self._events[-1]:
+            last.synchronize()
+
+    @property
+    def model_s(self) -> float:
+        begun, done, _ = self._events
+        if begun is None or done is None:
+            return self._took
+        self.wait()
+        return begun.elapsed_time(done) / 1000
+
+    def _event(self) -> torch.cuda.Event | None:
+        """This moment in the device's work; nothing on the CPU, whose work is done by then."""
+        if self._stream is None:
+            return None
+        event = torch.cuda.Event(enable_timing=True)
+        event.record(self._stream)
+        return event

@@ -28,13 +28,13 @@ def run(params) -> tuple[object, list[str]]:
 def counted(monkeypatch):
     """How many rows the model is asked for."""
     rows: list[int] = []
-    real = FrozenVLM.encode
+    real = FrozenVLM.submit
 
-    def encode(self, batch):
+    def submit(self, batch):
         rows.append(len(batch))
         return real(self, batch)
 
-    monkeypatch.setattr(FrozenVLM, "encode", encode)
+    monkeypatch.setattr(FrozenVLM, "submit", submit)
     return rows
 
 
@@ -290,14 +290,14 @@ class TestOutOfMemory:
         run(params)
         expected = FeatureStore.open(params.extract.store).array("vl/features").copy()
         shutil.rmtree(params.extract.store)
-        real = FrozenVLM.encode
+        real = FrozenVLM.submit
 
-        def encode(self, batch):
+        def submit(self, batch):
             if len(batch) > 1:
                 raise torch.OutOfMemoryError("no memory for two")
             return real(self, batch)
 
-        monkeypatch.setattr(FrozenVLM, "encode", encode)
+        monkeypatch.setattr(FrozenVLM, "submit", submit)
         run(params)
         found = FeatureStore.open(params.extract.store).array("vl/features")
         assert np.allclose(found, expected, atol=2e-5)

@@ -1,21 +1,16 @@
 """`vlm.variants`: one extraction stores each row as its frames are, and augmented."""
 
-import dataclasses
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from pipeline.config import Params
-from pipeline.errors import DiskFull, NumericsError, VLMError
+from pipeline.errors import DiskFull
 from pipeline.extraction import extract
-from pipeline.extraction.encoder import Encoder
-from pipeline.extraction.rows import ReadyRow
 from pipeline.store import FeatureStore, StoreBuild
 from pipeline.store.schema import ARRAY_NAMES
-from pipeline.vlm.preparation import Layout, PreparedRow
 
 K = 3
 
@@ -175,80 +170,3 @@ def test_the_plan_and_the_disk_check_count_every_variant(extracted, varied, monk
     monkeypatch.setattr("pipeline.extraction.layout.free_bytes", lambda path: needed[K] - 1)
     with pytest.raises(DiskFull, match=r"fewer vlm\.pooling slots or vlm\.variants"):
         run(varied())
-
-
-class FakeVLM:
-    """Says of each row its pixel value in both slots; refuses more rows than it has memory for."""
-
-    def __init__(self, room: int = 10**6, dtype: torch.dtype = torch.float32) -> None:
-        self.room = room
-        self.dtype = dtype
-        self.batches: list[int] = []
-
-    def encode(self, rows):
-        self.batches.append(len(rows))
-        if len(rows) > self.room:
-            raise torch.OutOfMemoryError("too many")
-        values = torch.tensor([float(row.pixels.flat[0]) for row in rows])
-        if (bad := (values == 255).nonzero()).numel():
-            raise NumericsError(f"row {int(bad[0])} of the batch: expected finite features")
-        return (values[:, None, None] + torch.tensor([0.0, 0.5])[:, None]).to(self.dtype), None
-
-
-def ready(row: int, values: list[int]) -> ReadyRow:
-    layout = Layout(1, (), (1, 1))
-    plain = PreparedRow("p", np.zeros(1, np.int64), np.zeros((1, 1, 1, 3), np.uint8), layout)
-    variants = tuple(
-        dataclasses.replace(plain, pixels=np.full((1, 1, 1, 3), value, np.uint8))
-        for value in values
-    )
-    return ReadyRow(row, bytes(16), variants, f"recording, VL row {row}")
-
-
-class TestEncoder:
-    @pytest.mark.parametrize(
-        ("batch_size", "room", "passes"),
-        [
-            (6, 99, [6, 6, 3]),
-            (7, 99, [6, 6, 3]),
-            (2, 99, [2, 1] * 5),  # less than a row's variants: a row takes two passes
-            (1, 99, [1] * 15),
-            (12, 4, [12, 6, 3, 3, 3, 3, 3]),  # out of memory: 12 -> 6 -> 3
-            (12, 2, [12, 6, 3, 1, 1, 1, *[1] * 12]),
-        ],
-    )
-    def test_any_batch_size_gives_the_rows_variant_after_variant(self, batch_size, room, passes):
-        vlm = FakeVLM(room)
-        rows = [ready(row, [10 * row, 10 * row + 1, 10 * row + 2]) for row in range(5)]
-        found = {}
-        for batch, features in Encoder(vlm, batch_size, K).encode(rows):
-            assert features.shape == (len(batch), K * 2, 1)
-            found |= {one.row: features[i, :, 0].tolist() for i, one in enumerate(batch)}
-        assert found == {
-            row: [10 * row + variant + half for variant in range(K) for half in (0, 0.5)]
-            for row in range(5)
-        }
-        assert vlm.batches == passes
-
-    def test_bfloat16_is_stored_as_its_bits(self):
-        encoder = Encoder(FakeVLM(dtype=torch.bfloat16), 2, K)
-        ((_, bits),) = encoder.encode([ready(0, [1, 2, 3])])
-        assert bits.dtype == np.uint16
-        values = torch.from_numpy(bits).view(torch.bfloat16)[0, :, 0]
-        assert values.tolist() == [1.0, 1.5, 2.0, 2.5, 3.0, 3.5]
-
-    def test_no_room_for_a_single_variant_is_an_error(self):
-        with pytest.raises(VLMError, match="out of memory with a single row"):
-            list(Encoder(FakeVLM(0), 8, K).encode([ready(0, [1, 2, 3])]))
-
-    def test_a_feature_that_is_not_finite_names_row_and_variant(self):
-        encoder = Encoder(FakeVLM(), 8, K)
-        rows = [ready(0, [1, 2, 3]), ready(1, [4, 5, 255])]
-        with pytest.raises(NumericsError, match="recording, VL row 1, variant 2: row 2 of the"):
-            list(encoder.encode(rows))
-
-    def test_a_batch_is_full_when_its_variants_are(self):
-        encoder = Encoder(FakeVLM(), 6, K)
-        assert not encoder.add(ready(0, [0, 1, 2]))
-        full = encoder.add(ready(1, [0, 1, 2]))
-        assert [one.row for one in full] == [0, 1]

@@ -1,0 +1,176 @@
+"""Prepared rows -> tensors on the model's device, without waiting for it."""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int64, UInt8
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pipeline.vlm.pixels import PixelSettings
+from pipeline.vlm.pooling import batch_weights
+from pipeline.vlm.preparation import Layout, PreparedRow
+from pipeline.vlm.slots import Slot
+from pipeline.vlm.vision import TowerPlan, VisionTower, sent
+
+_KEPT = 8
+"""Arrangements that are remembered."""
+
+_STEP = 64
+"""Static lengths are multiples of it."""
+
+_SAMPLE = 1024
+"""Values of an image that are looked at before images are compared as a whole."""
+
+
+@dataclass(frozen=True)
+class Arrangement:
+    """What follows from the rows' layouts alone, on the model's device."""
+
+    length: int
+    real: Bool[Tensor, "batch token"] | None
+    """Which tokens are not padding; None where none is."""
+    positions: Int64[Tensor, "3 batch token"]
+    image_tokens: Int64[Tensor, " image_token"]
+    """Indices of the image tokens in the flattened (batch x token)."""
+    weights: Float[Tensor, "batch place token"]
+    valid: Bool[Tensor, "batch place"]
+    """Which places have a token at all; on the CPU."""
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Rows side by side, padded on the right, on the model's device."""
+
+    arrangement: Arrangement
+    token_ids: Int64[Tensor, "batch token"]
+    pixels: UInt8[Tensor, "image height width 3"]
+    """Each distinct image once."""
+    plan: TowerPlan | None
+    """How the tower takes them; None where there is no image."""
+    shown: Int64[Tensor, " image_token"]
+    """For each image token of the batch, which of the tower's it is."""
+
+
+class Collator:
+    """Makes batches; what layouts and image counts decide is worked out once."""
+
+    def __init__(
+        self,
+        model: Any,
+        settings: PixelSettings,
+        places: tuple[Slot, ...],
+        tower: VisionTower,
+        static: bool = False,
+    ) -> None:
+        """With `static`, batches of as many rows of one layout have one shape: images that are
+        shown twice stay, and lengths are rounded up."""
+        self._model = model
+        self._settings = settings
+        self._places = places
+        self._tower = tower
+        self._static = static
+        self._positions: dict[Layout, Int64[Tensor, "3 token"]] = {}
+        self._arrangements: dict[tuple[Layout, ...], Arrangement] = {}
+
+    def collate(self, rows: Sequence[PreparedRow]) -> Batch:
+        """The batch of these rows."""
+        arrangement = self._arrangement(tuple(row.layout for row in rows))
+        token_ids = self._pinned((len(rows), arrangement.length), torch.int64)
+        token_ids.zero_()
+        for ids, row in zip(token_ids.numpy(), rows, strict=True):
+            ids[: len(row.token_ids)] = row.token_ids
+        images = [image for row in rows for image in row.pixels]
+        distinct, which = (images, list(range(len(images)))) if self._static else unique(images)
+        pixels = self._pinned((len(distinct), *self._settings.image_size, 3), torch.uint8)
+        for place, image in zip(pixels.numpy(), distinct, strict=True):
+            place[:] = image
+        plan = self._tower.plan(len(distinct), self._device) if distinct else None
+        shown = torch.from_numpy(self._shown(which, plan))
+        device = self._device
+        return Batch(
+            arrangement, sent(token_ids, device), sent(pixels, device), plan, sent(shown, device)
+        )
+
+    @property
+    def _device(self) -> torch.device:
+        return self._model.device
+
+    def _shown(self, which: list[int], plan: TowerPlan | None) -> NDArray[np.int64]:
+        if plan is None:
+            return np.empty(0, np.int64)
+        rows, columns = self._settings.merged_grid
+        return plan.place.reshape(-1, rows * columns)[which].reshape(-1)
+
+    def _arrangement(self, layouts: tuple[Layout, ...]) -> Arrangement:
+        if layouts not in self._arrangements:
+            if len(self._arrangements) == _KEPT:
+                del self._arrangements[next(iter(self._arrangements))]
+            self._arrangements[layouts] = self._arranged(layouts)
+        return self._arrangements[layouts]
+
+    def _arranged(self, layouts: tuple[Layout, ...]) -> Arrangement:
+        length = max(layout.length for layout in layouts)
+        if self._static:
+            length = -(-length // _STEP) * _STEP
+        real = torch.zeros(len(layouts), length, dtype=torch.bool)
+        positions = torch.zeros(3, len(layouts), length, dtype=torch.int64)
+        for index, layout in enumerate(layouts):
+            real[index, : layout.length] = True
+            positions[:, index, : layout.length] = self._rope_positions(layout)
+        image_tokens = np.concatenate(
+            [index * length + layout.image_tokens() for index, layout in enumerate(layouts)]
+        )
+        weights = batch_weights(self._places, layouts, length)
+        device = self._device
+        return Arrangement(
+            length,
+            None if bool(real.all()) else sent(real, device),
+            sent(positions, device),
+            sent(torch.from_numpy(image_tokens), device),
+            sent(weights, device),
+            (weights != 0).any(dim=-1),
+        )
+
+    def _rope_positions(self, layout: Layout) -> Int64[Tensor, "3 token"]:
+        """Time, height and width position of each token; computed once a layout, on the CPU."""
+        if layout not in self._positions:
+            kinds = torch.zeros(1, layout.length, dtype=torch.int64)
+            kinds[0, torch.from_numpy(layout.image_tokens())] = 1
+            grid = (1, *self._settings.grid)
+            images = len(layout.image_starts)
+            found, _ = self._model.get_rope_index(
+                torch.zeros_like(kinds),
+                mm_token_type_ids=kinds,
+                image_grid_thw=torch.tensor([grid] * images) if images else None,
+            )
+            self._positions[layout] = found[:, 0]
+        return self._positions[layout]
+
+    def _pinned(self, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+        """Memory that the device can copy from while both go on."""
+        return torch.empty(shape, dtype=dtype, pin_memory=self._device.type == "cuda")
+
+
+def unique(images: Sequence[NDArray[np.uint8]]) -> tuple[list[NDArray[np.uint8]], list[int]]:
+    """The images that differ, in order, and which of them each image is.
+
+    Equal means every value: a sample only saves most comparisons.
+    """
+    distinct: list[NDArray[np.uint8]] = []
+    alike: dict[bytes, list[int]] = defaultdict(list)
+    which: list[int] = []
+    for image in images:
+        flat = image.reshape(-1)
+        sampled = alike[flat[:: max(1, flat.size // _SAMPLE)].tobytes()]
+        found = next((one for one in sampled if np.array_equal(distinct[one], image)), None)
+        if found is None:
+            found = len(distinct)
+            distinct.append(image)
+            sampled.append(found)
+        which.append(found)
+    return distinct, which

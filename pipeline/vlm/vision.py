@@ -1,0 +1,212 @@
+"""The vision tower's forward pass, with every length known beforehand.
+
+transformers' own, without flash-attention, attends to one window after the other and asks the
+device for each one's length. All images of a batch have one grid here, so what depends on it is
+worked out once on the host and nothing is read back; patches are put in an order in which windows
+of equal length are neighbours, and each length is one batched call.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import accumulate
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int64
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from transformers import AttentionInterface
+from transformers.integrations.sdpa_attention import sdpa_attention_forward
+from transformers.models.qwen2_5_vl.modeling_qwen2_5_vl import eager_attention_forward
+from transformers.vision_utils import get_vision_position_ids, get_vision_window_index
+
+_KEPT = 64
+"""Plans that are remembered: equal images are seen once, so batches show more or fewer."""
+
+
+@dataclass(frozen=True)
+class Windows:
+    """How patches stand: by window length, then image, then window."""
+
+    images: int
+    lengths: tuple[tuple[int, int], ...]
+    """Windows of an image, and patches of a window, for each length that there is."""
+    whole: bool = False
+    """Whether a block attends over whole images."""
+
+
+@dataclass(frozen=True)
+class TowerPlan:
+    """What the tower has to know of a number of images, on its device."""
+
+    order: Int64[Tensor, " token"]
+    """Which image token stands where: the tower works in an order of its own."""
+    place: NDArray[np.int64]
+    """(token,) where each image token stands; on the host."""
+    windowed: dict[str, Any]
+    """Arguments of the blocks that attend within windows."""
+    whole: dict[str, Any]
+    """Arguments of the blocks that attend within images."""
+
+
+class VisionTower:
+    """Runs the parts of a `Qwen2_5_VisionTransformerPretrainedModel` over images of one grid.
+
+    What it gives is the model's own, in the order of the plan; gradients flow, and blocks are
+    checkpointed as the model is set.
+    """
+
+    def __init__(self, visual: Any, grid: tuple[int, int]) -> None:
+        """`grid` is rows and columns of patches. Sets the attention that `visual` uses."""
+        self.visual = visual
+        attention = str(visual.config._attn_implementation)
+        self._flash = attention.startswith("flash_attention")
+        if attention in _GROUPED:
+            visual.config._attn_implementation = _GROUPED[attention]
+        self._one = torch.tensor([[1, *grid]])
+        index, edges = get_vision_window_index(
+            self._one, visual.spatial_merge_size, visual.window_size, visual.patch_size
+        )
+        sizes = np.diff(edges.numpy()) // visual.spatial_merge_unit
+        self._windows = np.split(index.numpy(), np.cumsum(sizes)[:-1])
+        positions = get_vision_position_ids(self._one, visual.spatial_merge_size)
+        tables = visual.rotary_pos_emb(visual.rotary_pos_emb.inv_freq.cpu(), positions)
+        self._rotary = [table.unflatten(0, (-1, visual.spatial_merge_unit)) for table in tables]
+        self._plans: dict[int, TowerPlan] = {}
+
+    def plan(self, images: int, device: torch.device) -> TowerPlan:
+        """What a pass over this many images needs; worked out once, on the host."""
+        if images not in self._plans:
+            if len(self._plans) == _KEPT:
+                del self._plans[next(iter(self._plans))]
+            self._plans[images] = self._planned(images, device)
+        return self._plans[images]
+
+    def __call__(
+        self, patches: Float[Tensor, "patch value"], plan: TowerPlan
+    ) -> Float[Tensor, "token dim"]:
+        """The image tokens, in the plan's order."""
+        visual = self.visual
+        unit = visual.spatial_merge_unit
+        hidden = self._embedded(patches)
+        hidden = hidden.unflatten(0, (-1, unit)).index_select(0, plan.order).flatten(0, 1)
+        inside = plan.order % len(self._rotary[0])
+        rotary = tuple(table.index_select(0, inside).flatten(0, 1) for table in self._rotary)
+        for number, block in enumerate(visual.blocks):
+            lengths = plan.whole if number in visual.fullatt_block_indexes else plan.windowed
+            hidden = block(hidden, position_embeddings=rotary, **lengths)
+        return visual.merger(hidden)
+
+    def _embedded(self, patches: Float[Tensor, "patch value"]) -> Float[Tensor, "patch dim"]:
+        """A convolution whose kernel is its stride and its input is one product, and far faster."""
+        projection = self.visual.patch_embed.proj
+        if type(projection) is not nn.Conv3d:  # an adapter stands on it
+            return self.visual.patch_embed(patches)
+        weight = projection.weight.flatten(1)
+        return nn.functional.linear(patches.to(weight.dtype), weight)
+
+    def _planned(self, images: int, device: torch.device) -> TowerPlan:
+        tokens = sum(map(len, self._windows))
+        every = [(image, window) for image in range(images) for window in self._windows]
+        if not self._flash:
+            every.sort(key=lambda one: len(one[1]))  # stable: then by image and by window
+        order = np.concatenate([image * tokens + window for image, window in every])
+        place = np.empty_like(order)
+        place[order] = np.arange(len(order))
+        self._rotary = [table.to(device) for table in self._rotary]
+        lengths = [len(window) * self.visual.spatial_merge_unit for _, window in every]
+        windowed, whole = self._spans(images, lengths, device)
+        return TowerPlan(sent(torch.from_numpy(order), device), place, windowed, whole)
+
+    def _spans(
+        self, images: int, lengths: list[int], device: torch.device
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """What a block is told of windows that stand one behind the other, and of whole images."""
+        patches = sum(lengths) // images
+        if self._flash:
+            windows, wholes = (
+                {
+                    "cu_seqlens": torch.tensor([0, *accumulate(each)], dtype=torch.int32).to(
+                        device
+                    ),
+                    "max_seqlen": max(each),
+                }
+                for each in (lengths, [patches] * images)
+            )
+            return windows, wholes
+        counts = tuple((count // images, length) for length, count in Counter(lengths).items())
+        told = {"cu_seqlens": None, "max_seqlen": patches}
+        return (
+            told | {"windows": Windows(images, counts)},
+            told | {"windows": Windows(images, counts, whole=True)},
+        )
+
+
+def tower_attention(visual: Any) -> str:
+    """What a tower attends with, as it is recorded."""
+    return str(visual.config._attn_implementation).replace("grouped_flash_", "grouped ")
+
+
+def sent(tensor: Tensor, device: torch.device) -> Tensor:
+    """The tensor of the CPU on its way to a device, which nobody waits for."""
+    if device.type == "cuda" and not tensor.is_pinned():
+        tensor = tensor.pin_memory()
+    return tensor.to(device, non_blocking=True)
+
+
+def _grouped_attention(
+    module: nn.Module,
+    query: Float[Tensor, "1 head patch dim"],
+    key: Float[Tensor, "1 head patch dim"],
+    value: Float[Tensor, "1 head patch dim"],
+    attention_mask: None,
+    *,
+    each: Callable[..., tuple[Tensor, Any]],
+    windows: Windows,
+    scaling: float,
+    dropout: float,
+    **_: object,
+) -> tuple[Float[Tensor, "1 patch head dim"], None]:
+    """Attention of each window, or of each image, by one call of `each` for every length."""
+    # Patches first: windows of equal length are then one view, without a copy.
+    flat = [tensor[0].transpose(0, 1) for tensor in (query, key, value)]
+    group = _of_images if windows.whole else _of_windows
+    found = [
+        each(module, *batched, attention_mask, scaling=scaling, dropout=dropout, is_causal=False)[0]
+        for batched in zip(*(group(tensor, windows) for tensor in flat), strict=True)
+    ]
+    if windows.whole:
+        (images,) = found
+        found = images.split([count * length for count, length in windows.lengths], dim=1)
+    return torch.cat([tensor.flatten(0, 1) for tensor in found])[None], None
+
+
+def _slabs(tensor: Float[Tensor, "patch head dim"], windows: Windows) -> Sequence[Tensor]:
+    """The patches of each window length."""
+    return tensor.split([windows.images * count * length for count, length in windows.lengths])
+
+
+def _of_windows(tensor: Float[Tensor, "patch head dim"], windows: Windows) -> list[Tensor]:
+    """(window, head, patch, dim) of each window length."""
+    slabs = zip(_slabs(tensor, windows), windows.lengths, strict=True)
+    return [slab.unflatten(0, (-1, length)).transpose(1, 2) for slab, (_, length) in slabs]
+
+
+def _of_images(tensor: Float[Tensor, "patch head dim"], windows: Windows) -> list[Tensor]:
+    """(image, head, patch, dim)"""
+    parts = [slab.unflatten(0, (windows.images, -1)) for slab in _slabs(tensor, windows)]
+    return [torch.cat(parts, dim=1).transpose(1, 2)]
+
+
+_GROUPED = {"sdpa": "grouped_flash_sdpa", "eager": "grouped_flash_eager"}
+"""A name has to hold "flash" for transformers to leave windows together."""
+
+AttentionInterface.register(
+    _GROUPED["sdpa"], partial(_grouped_attention, each=sdpa_attention_forward)
+)
+AttentionInterface.register(
+    _GROUPED["eager"], partial(_grouped_attention, each=eager_attention_forward)
+)

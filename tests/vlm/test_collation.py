@@ -1,0 +1,89 @@
+"""Equal images reach the tower once; a batch of equal layout keeps its shape."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.typing import NDArray
+
+from pipeline.vlm.collation import unique
+from pipeline.vlm.qwen import FrozenVLM
+
+
+@given(st.lists(arrays(np.uint8, (2, 3, 3), elements=st.integers(0, 1)), max_size=12))
+def test_unique_says_which_image_is_which(images: list[NDArray[np.uint8]]) -> None:
+    distinct, which = unique(images)
+    assert len(distinct) == len({image.tobytes() for image in images})
+    assert all(
+        np.array_equal(distinct[one], image) for one, image in zip(which, images, strict=True)
+    )
+
+
+def test_images_that_differ_where_nobody_looks_are_told_apart() -> None:
+    image = np.zeros((80, 80, 3), np.uint8)
+    other = image.copy()
+    other[0, 0, 1] = 1
+    distinct, which = unique([image, other, image.copy()])
+    assert len(distinct) == 2
+    assert which == [0, 1, 0]
+
+
+@pytest.fixture
+def seen(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many images each pass of the tower sees."""
+    from pipeline.vlm.vision import VisionTower
+
+    counts: list[int] = []
+    real = VisionTower.plan
+
+    def plan(self: VisionTower, images: int, device: torch.device) -> Any:
+        counts.append(images)
+        return real(self, images, device)
+
+    monkeypatch.setattr(VisionTower, "plan", plan)
+    return counts
+
+
+def test_equal_images_of_a_batch_are_seen_once(
+    extractor: Callable[..., Any], make_frame: Callable[..., NDArray[np.uint8]], seen: list[int]
+) -> None:
+    ours = extractor(pooling=["mean", "view_mean"])
+    a, b, c = (make_frame(seed) for seed in range(3))
+    rows = [
+        ours.preparer.prepare("insert", {"View1": a, "View2": b, "View3": a}),
+        ours.preparer.prepare("pull it out", {"View1": a, "View3": c}),
+        ours.preparer.prepare("hold", {}),
+        ours.preparer.prepare("hold", {"View2": c}),
+    ]
+    together, _ = ours.model.encode(rows)
+    assert seen == [3]
+    alone = torch.cat([ours.model.encode([row])[0] for row in rows])
+    assert seen == [3, 2, 2, 1]
+    torch.testing.assert_close(together, alone, atol=2e-5, rtol=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:`torch.jit.script_method`:DeprecationWarning")
+def test_a_compiled_model_gives_the_same_features_and_is_compiled_once_a_shape(
+    extractor: Callable[..., Any], make_frame: Callable[..., NDArray[np.uint8]]
+) -> None:
+    plain = extractor(pooling=["mean", "grid"], layers=[-1, 1], norms=[True, False])
+    compiled = FrozenVLM.load(plain.vlm, plain.spec, "cpu", compile=True)
+    frames = [{view: make_frame(7 * i + j) for j, view in enumerate(VIEWS)} for i in range(4)]
+    rows = [plain.preparer.prepare("insert the needle", one) for one in frames]
+    torch._dynamo.utils.counters.clear()
+    for batch in (rows, rows[:1], rows[1:], [rows[0]] * 4):
+        found, valid = compiled.encode(batch)
+        expected, expected_valid = plain.model.encode(batch)
+        torch.testing.assert_close(found, expected, atol=2e-5, rtol=1e-4)
+        assert torch.equal(valid, expected_valid)
+    assert torch._dynamo.utils.counters["stats"]["unique_graphs"] == 2
+    assert not torch._dynamo.utils.counters["graph_break"]
+
+
+VIEWS = ("View1", "View2", "View3")

@@ -1,0 +1,132 @@
+"""The tower gives what transformers' own gives, in few calls and without asking the device."""
+
+from collections.abc import Callable
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from transformers import Qwen2_5_VLForConditionalGeneration
+
+from pipeline.vlm.extractor import Extractor
+from pipeline.vlm.pixels import PixelSettings, patchify
+from pipeline.vlm.vision import VisionTower
+
+CPU = torch.device("cpu")
+SIZES = [(112, 112), (112, 140), (140, 196), (56, 56), (252, 112)]
+"""Pixels: no window at an edge, at one edge, at both (four lengths), one small window, many."""
+
+
+@pytest.fixture(scope="module")
+def load(demo_checkpoint: Path) -> Callable[..., Any]:
+    def load(attention: str = "sdpa") -> Any:
+        whole = Qwen2_5_VLForConditionalGeneration.from_pretrained(
+            demo_checkpoint, dtype=torch.float32, attn_implementation=attention
+        )
+        return whole.model.eval()
+
+    return load
+
+
+def images(count: int, size: tuple[int, int], seed: int = 0) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randint(0, 256, (count, *size, 3), generator=generator, dtype=torch.uint8)
+
+
+def ours(tower: VisionTower, patches: Tensor, count: int) -> Tensor:
+    plan = tower.plan(count, CPU)
+    return tower(patches, plan)[torch.from_numpy(plan.place)]
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("count", [1, 2, 5])
+@pytest.mark.parametrize("attention", ["sdpa", "eager"])
+def test_tokens_are_those_of_transformers_in_any_batch_and_order(
+    load: Callable[..., Any],
+    demo_checkpoint: Path,
+    size: tuple[int, int],
+    count: int,
+    attention: str,
+) -> None:
+    settings = PixelSettings.read(demo_checkpoint, size)
+    assert settings.image_size == size
+    theirs, visual = load(attention).visual, load(attention).visual
+    pictures = images(count, size)
+    patches = patchify(pictures, settings)
+    grids = torch.tensor([(1, *settings.grid)] * count)
+    tower = VisionTower(visual, settings.grid)
+    with torch.no_grad():
+        expected = theirs(patches, grid_thw=grids).pooler_output
+        found = ours(tower, patches, count)
+        torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
+        turned = ours(tower, patchify(pictures.flip(0), settings), count)
+        back = turned.unflatten(0, (count, -1)).flip(0).flatten(0, 1)
+        torch.testing.assert_close(back, expected, atol=1e-5, rtol=1e-5)
+
+
+def test_each_window_length_is_one_call(
+    load: Callable[..., Any], demo_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = PixelSettings.read(demo_checkpoint, (140, 196))
+    tower = VisionTower(load().visual, settings.grid)
+    shapes: list[tuple[int, int]] = []
+    real = torch.nn.functional.scaled_dot_product_attention
+
+    def counted(query: Tensor, *args: Any, **kwargs: Any) -> Tensor:
+        shapes.append((query.shape[0], query.shape[2]))
+        return real(query, *args, **kwargs)
+
+    monkeypatch.setattr(torch.nn.functional, "scaled_dot_product_attention", counted)
+    with torch.no_grad():
+        ours(tower, patchify(images(3, (140, 196)), settings), 3)
+    # 5 x 7 tokens of 4 patches: windows of 4 x 4, 4 x 3, 1 x 4 and 1 x 3 tokens, of three images.
+    windowed, whole = [(3, 12), (3, 16), (3, 48), (3, 64)], [(3, 140)]
+    assert shapes == [*windowed, *whole, *windowed, *whole]
+
+
+def test_gradients_are_those_of_transformers(
+    load: Callable[..., Any], demo_checkpoint: Path
+) -> None:
+    settings = PixelSettings.read(demo_checkpoint, (140, 196))
+    patches = patchify(images(2, (140, 196)), settings)
+    theirs, visual = load().visual, load().visual
+    tower = VisionTower(visual, settings.grid)
+    found = ours(tower, patches, 2)
+    weights = torch.randn(found.shape, generator=torch.Generator().manual_seed(1))
+    (found * weights).sum().backward()
+    expected = theirs(patches, grid_thw=torch.tensor([(1, *settings.grid)] * 2)).pooler_output
+    (expected * weights).sum().backward()
+    for (name, mine), (its, other) in zip(
+        visual.named_parameters(), theirs.named_parameters(), strict=True
+    ):
+        assert name == its
+        assert mine.grad is not None
+        scale = float(other.grad.abs().max())
+        torch.testing.assert_close(mine.grad, other.grad, atol=1e-4 * scale, rtol=1e-3)
+
+
+def test_a_batch_asks_nothing_of_its_device(
+    extractor: Callable[..., Any],
+    make_frame: Callable[..., Any],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Tensors of the meta device have no values: reading one back raises."""
+    monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())  # which it has not
+    made = extractor(pooling=["mean", "grid"], layers=[-1, 1], norms=[True, False])
+    frames = {view: make_frame(seed) for seed, view in enumerate(("View1", "View2", "View3"))}
+    rows = [
+        made.preparer.prepare("insert the needle", frames),
+        made.preparer.prepare("stop", {"View2": frames["View2"]}),
+    ]
+    settings = PixelSettings.read(Path(made.vlm.checkpoint), (112, 140))
+    nowhere = Extractor(made.model._model, settings, made.spec.slots)
+    made.model._model.to("meta")
+    with torch.no_grad():
+        features, valid = nowhere.extract(rows)
+    assert features.device.type == "meta"
+    assert features.shape == (2, len(made.spec.slots), made.spec.dim)
+    assert valid.device.type == "cpu"
+    with pytest.raises((RuntimeError, NotImplementedError)):
+        features.sum().item()
