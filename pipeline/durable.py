@@ -32,9 +32,17 @@ def disk_full_named(place: Path) -> Generator[None]:
         if not said and getattr(error, "errno", None) not in FULL:
             raise
         raise DiskFull(
-            f"{place}: no space left on the device. What was complete before is kept: make room "
-            "and run the same command again."
+            f"{place}: no space left on the device ({free_bytes(place) / 2**20:.0f} MiB free). "
+            "What was complete before is kept: make room and run the same command again."
         ) from error
+
+
+def free_bytes(path: Path) -> int:
+    """Bytes free on the file system that holds `path` or its nearest existing parent."""
+    while not path.exists():
+        path = path.parent
+    status = os.statvfs(path)
+    return status.f_bavail * status.f_frsize
 
 
 def fresh(path: Path) -> Path:

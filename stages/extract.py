@@ -22,8 +22,13 @@ def main(params: Params) -> None:
         rate = report.computed / report.seconds if report.seconds else 0.0
         print(
             f"{store}: {report.rows} rows, {report.computed} computed ({rate:.1f} rows/s), "
-            f"{report.taken} taken over"
+            f"{report.taken} taken over, {report.repeated} equal to another"
         )
+        if report.model_share is not None and report.waited_share is not None:
+            print(
+                f"the model worked {report.model_share:.0%} of the time and waited "
+                f"{report.waited_share:.0%} for frames"
+            )
 
 
 if __name__ == "__main__":

@@ -8,11 +8,12 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from pipeline.config import Params
+from pipeline.durable import free_bytes
 from pipeline.errors import DiskFull, NumericsError
 from pipeline.extraction.check import CheckedEpisode, embodiment_of
 from pipeline.extraction.survey import Survey, shown_path
 from pipeline.recordings import Stream
-from pipeline.store import SCHEMA, Donor, Sizes, StoreBuild, arrays, free_bytes
+from pipeline.store import SCHEMA, Donor, Sizes, StoreBuild, arrays
 from pipeline.store.episodes import EpisodeRows, episode_arrays, episode_edges
 from pipeline.store.schema import ArraySpec
 from pipeline.timeline import Timeline

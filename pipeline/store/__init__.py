@@ -5,7 +5,7 @@ over from an older one, `reader` maps a finished one and gathers batches from it
 """
 
 from pipeline.store.batch import Batch
-from pipeline.store.chunks import free_bytes
+from pipeline.store.chunks import check_trailers
 from pipeline.store.donor import Donor
 from pipeline.store.lock import build_lock
 from pipeline.store.reader import Episode, FeatureStore
@@ -24,7 +24,7 @@ __all__ = [
     "StoreBuild",
     "arrays",
     "build_lock",
-    "free_bytes",
+    "check_trailers",
     "part_path",
     "read_plan",
     "recover",

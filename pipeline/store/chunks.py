@@ -5,17 +5,25 @@ Never through a map: a full disk must be an error of `pwrite`, not a SIGBUS.
 
 import errno
 import os
-from collections.abc import Generator, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import google_crc32c
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
-from pipeline.errors import DiskFull, StoreIncomplete
-from pipeline.store.schema import TRAILER_BYTES, ArraySpec, chunk_paths
+from pipeline.durable import disk_full_named
+from pipeline.errors import StoreIncomplete
+from pipeline.store.schema import TRAILER_BYTES, ArraySpec, chunk_paths, read_specs
+
+MEND = (
+    "Run stages.verify --repair, which keeps what is sound, and then stages.extract; an unfinished "
+    "build (.part) has to be removed."
+)
+"""What to do about a file that is not as it was written."""
 
 _BLOCK = 16 * 2**20
 _MOST_OPEN = 32
@@ -28,35 +36,32 @@ def row_checksums(rows: NDArray[Any]) -> NDArray[np.uint32]:
     return np.where(sums == 0, np.uint32(1), sums)
 
 
-@contextmanager
-def disk_full_named(path: Path) -> Generator[None]:
-    """Turn "no space left" and "quota exceeded" into `DiskFull` naming the place."""
-    try:
-        yield
-    except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
-            raise
-        free = free_bytes(path)
-        raise DiskFull(
-            f"{path}: no space left on the device ({free / 2**20:.0f} MiB free). What was "
-            "committed is kept: make room and run the same command again."
-        ) from error
+def check_trailers(root: Path) -> None:
+    """Read a finished store once, every byte of it, with a bar on a terminal.
 
-
-def free_bytes(path: Path) -> int:
-    """Bytes free on the file system that holds `path` or its nearest existing parent."""
-    while not path.exists():
-        path = path.parent
-    status = os.statvfs(path)
-    return status.f_bavail * status.f_frsize
+    Raises `StoreIncomplete` where a chunk does not give the checksum that was written behind it.
+    """
+    specs = read_specs(root).values()
+    total = sum(spec.chunk_count * spec.chunk_bytes for spec in specs)
+    with tqdm(
+        total=total, desc="checksums", unit="B", unit_scale=True, leave=False, disable=None
+    ) as bar:
+        for spec in specs:
+            with closing(ChunkFiles(root, spec, writable=False)) as files:
+                files.check(bar.update)
 
 
 class ChunkFiles:
-    """Row-wise access to the files of one array of a build."""
+    """Row-wise access to the files of one array of a build.
 
-    def __init__(self, root: Path, spec: ArraySpec) -> None:
+    Those of a store that is only read from, which may lie where nothing can be written, are opened
+    with `writable=False`.
+    """
+
+    def __init__(self, root: Path, spec: ArraySpec, *, writable: bool = True) -> None:
         self.spec = spec
         self.paths = chunk_paths(root, spec)
+        self._writable = writable
         self._descriptors: dict[int, int] = {}
         self._unsynced: set[int] = set()
 
@@ -118,10 +123,28 @@ class ChunkFiles:
                     self._descriptor(chunk), wanted - len(part), self._offset(first) + len(part)
                 )
                 if not more:
-                    raise StoreIncomplete(f"{self.paths[chunk]}: the file ends early; rebuild it")
+                    raise StoreIncomplete(f"{self.paths[chunk]}: the file ends early. {MEND}")
                 part += more
             raw += part
         return np.frombuffer(raw, self.spec.dtype).reshape(count, *self.spec.shape[1:])
+
+    def sound(self, chunk: int) -> bool:
+        """Whether a chunk of a finished store gives its trailer."""
+        found = self._crc(chunk).to_bytes(TRAILER_BYTES, "little")
+        return os.pread(self._descriptor(chunk), TRAILER_BYTES, self.spec.chunk_bytes) == found
+
+    def check(self, checked: Callable[[int], object] = lambda size: None) -> None:
+        """Raise `StoreIncomplete` where a chunk of a finished store does not give its trailer.
+
+        `checked` is told the bytes of each sound chunk.
+        """
+        for chunk, path in enumerate(self.paths):
+            if not self.sound(chunk):
+                raise StoreIncomplete(
+                    f"{path}: the chunk does not give the crc32c behind it, so that nothing can be "
+                    f"taken from this store. {MEND}"
+                )
+            checked(self.spec.chunk_bytes)
 
     def sync(self) -> None:
         """Return once everything written has reached the disk."""
@@ -152,7 +175,7 @@ class ChunkFiles:
         while offset < size:
             block = os.pread(self._descriptor(chunk), min(_BLOCK, size - offset), offset)
             if not block:
-                raise StoreIncomplete(f"{self.paths[chunk]}: the file ends early; rebuild it")
+                raise StoreIncomplete(f"{self.paths[chunk]}: the file ends early. {MEND}")
             crc = google_crc32c.extend(crc, block)
             offset += len(block)
         return crc
@@ -162,8 +185,12 @@ class ChunkFiles:
             if len(self._descriptors) >= _MOST_OPEN:
                 self.sync()
                 self.close()
-            flags = os.O_RDONLY if self.is_linked(chunk) else os.O_RDWR | os.O_CREAT
-            self._descriptors[chunk] = os.open(self.paths[chunk], flags, 0o644)
+            writable = self._writable and not self.is_linked(chunk)
+            flags = os.O_RDWR | os.O_CREAT if writable else os.O_RDONLY
+            try:
+                self._descriptors[chunk] = os.open(self.paths[chunk], flags, 0o644)
+            except FileNotFoundError:
+                raise StoreIncomplete(f"{self.paths[chunk]}: no such file. {MEND}") from None
         return self._descriptors[chunk]
 
     def _offset(self, row: int) -> int:

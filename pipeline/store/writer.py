@@ -10,6 +10,7 @@ import json
 import os
 import shutil
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,9 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
+from pipeline.durable import disk_full_named, sync
 from pipeline.errors import StoreIncomplete
-from pipeline.store.chunks import ChunkFiles, disk_full_named, row_checksums
+from pipeline.store.chunks import ChunkFiles, row_checksums
 from pipeline.store.environments import EnvironmentLog
 from pipeline.store.schema import CHECKSUMS, FEATURES, INCREMENTAL, KEYS, ArraySpec
 
@@ -69,11 +71,14 @@ class StoreBuild:
         return min(rows // spec.chunk_rows, spec.chunk_count, donor_spec.chunk_count)
 
     def link_unchanged(self, name: str, donor: Path, donor_spec: ArraySpec, rows: int) -> None:
-        """Take the linkable chunks of the first `rows` rows from a finished store."""
-        source = ChunkFiles(donor, donor_spec)
-        for chunk in range(self.linkable(name, donor_spec, rows)):
-            if not self.files(name).link(chunk, source.paths[chunk]):
-                return
+        """Take the linkable chunks of the first `rows` rows from a finished store.
+
+        One that does not give its trailer is left to be written anew.
+        """
+        with closing(ChunkFiles(donor, donor_spec, writable=False)) as source:
+            for chunk in range(self.linkable(name, donor_spec, rows)):
+                if source.sound(chunk) and not self.files(name).link(chunk, source.paths[chunk]):
+                    return
 
     def write(self, name: str, start: int, values: NDArray[Any]) -> None:
         """Write consecutive rows of a stream, tick or episode array."""
@@ -117,15 +122,34 @@ class StoreBuild:
         environment: int,
     ) -> None:
         """Write feature rows (row, slot, dim), wait for the disk, then mark them as done."""
-        order = np.argsort(rows, kind="stable")
-        rows = np.asarray(rows, np.int64)[order]
-        features = np.asarray(features)[order]
-        names = np.frombuffer(b"".join(keys), np.uint8).reshape(len(rows), -1)[order]
-        checksums = row_checksums(features)
-        runs = np.split(np.arange(len(rows)), np.flatnonzero(np.diff(rows) != 1) + 1)
-        for run in runs:
+        self.mark(rows, keys, self.write_features(rows, features), environment)
+
+    def write_features(
+        self, rows: Sequence[int] | NDArray[np.int64], features: NDArray[Any]
+    ) -> NDArray[np.uint32]:
+        """Write feature rows (row, slot, dim) and wait for the disk; their checksums, for `mark`.
+
+        Another process or host may call it, with rows that nobody else writes.
+        """
+        features = np.asarray(features)
+        for run in _runs(rows):
             self.files(FEATURES).write(int(rows[run[0]]), features[run])
         self.files(FEATURES).sync()
+        return row_checksums(features)
+
+    def mark(
+        self,
+        rows: Sequence[int] | NDArray[np.int64],
+        keys: Sequence[bytes],
+        checksums: NDArray[np.uint32],
+        environment: int,
+    ) -> None:
+        """Say that feature rows are on disk: their keys, their environment, at last the checksums.
+
+        For the coordinating process alone.
+        """
+        names = np.frombuffer(b"".join(keys), np.uint8).reshape(len(rows), -1)
+        runs = _runs(rows)
         for run in runs:
             start = int(rows[run[0]])
             with disk_full_named(self.part):
@@ -141,6 +165,7 @@ class StoreBuild:
         Idempotent: a kill in the middle is mended by running it again. Raises `StoreIncomplete`
         when rows are missing.
         """
+        self.files(FEATURES).close()  # a file system over the network shows what others wrote anew
         missing = self.missing()
         if missing.size:
             raise StoreIncomplete(
@@ -175,7 +200,7 @@ class StoreBuild:
             shutil.rmtree(old, ignore_errors=True)
             self.target.rename(old)
         self.part.rename(self.target)
-        _sync(self.target.parent)
+        sync(self.target.parent)
         if old.exists():
             shutil.rmtree(old)
 
@@ -186,6 +211,13 @@ class StoreBuild:
             ranges = self._environments.ranges()
             group.attrs.put({**group.attrs.asdict(), "environment": ranges})
         self._environments.remove()
+
+
+def _runs(rows: Sequence[int] | NDArray[np.int64]) -> list[NDArray[np.intp]]:
+    """Where among `rows` each run of consecutive ones stands, in order."""
+    order = np.argsort(rows, kind="stable")
+    gaps = np.flatnonzero(np.diff(np.asarray(rows, np.int64)[order]) != 1) + 1
+    return np.split(order, gaps)
 
 
 def recover(target: Path) -> None:
@@ -220,14 +252,6 @@ def read_plan(store: Path) -> str | None:
 def _sync_folders(root: Path) -> None:
     """Wait for every folder and zarr's metadata; chunk files are synced as they are sealed."""
     for folder, _, files in os.walk(root):
-        _sync(Path(folder))
+        sync(Path(folder))
         if "zarr.json" in files:
-            _sync(Path(folder) / "zarr.json")
-
-
-def _sync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+            sync(Path(folder) / "zarr.json")

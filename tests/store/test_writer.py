@@ -1,9 +1,12 @@
 """A build loses at most what was in flight, whatever kills it."""
 
+import errno
 import os
 import shutil
+import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -274,6 +277,56 @@ class TestLock:
             with pytest.raises(StoreLocked, match=f"process {holder.pid}"), build_lock(target):
                 pass
             holder.kill()
+        with build_lock(target):
+            pass
+
+    def left_by(self, folder: Path, holder: str, age_s: float) -> Path:
+        """A lock file that a process left behind, `age_s` after its last sign of life."""
+        path = folder / "s.zarr.lock"
+        path.write_text(f"{holder}\n")
+        then = time.time() - age_s
+        os.utime(path, (then, then))
+        return folder / "s.zarr"
+
+    def test_a_dead_process_of_this_host_left_nothing(self, tmp_path):
+        target = self.left_by(tmp_path, f"process 1 on {socket.gethostname()}", 0)
+        with build_lock(target):
+            assert f"process {os.getpid()}" in (tmp_path / "s.zarr.lock").read_text()
+
+    def test_another_host_is_believed_while_it_gives_signs_of_life(self, tmp_path):
+        """A shared file system may keep flock to each host: the file itself is asked too."""
+        target = self.left_by(tmp_path, "process 7 on elsewhere", 30)
+        refusal = r"process 7 on elsewhere.*sign of life 30 s ago"
+        for _ in range(2):  # being refused is no sign of life
+            with pytest.raises(StoreLocked, match=refusal), build_lock(target):
+                pass
+        with build_lock(self.left_by(tmp_path, "process 7 on elsewhere", 61)):
+            pass
+
+    def test_a_holder_gives_signs_of_life(self, tmp_path, monkeypatch):
+        monkeypatch.setattr("pipeline.store.lock._BEAT_S", 0.01)
+        path = tmp_path / "s.zarr.lock"
+        with build_lock(tmp_path / "s.zarr"):
+            os.utime(path, (1, 1))
+            deadline = time.monotonic() + 10
+            while path.stat().st_mtime == 1 and time.monotonic() < deadline:
+                time.sleep(0.01)
+            assert path.stat().st_mtime > 1
+        assert path.read_text() == ""
+
+    def test_without_flock_the_file_alone_says_who_builds(self, tmp_path, monkeypatch, capsys):
+        def unsupported(*_: object) -> None:
+            raise OSError(errno.EOPNOTSUPP, "Operation not supported")
+
+        monkeypatch.setattr("fcntl.flock", unsupported)
+        target = tmp_path / "s.zarr"
+        with (
+            build_lock(target),
+            pytest.raises(StoreLocked, match=f"process {os.getpid()}"),
+            build_lock(target),
+        ):
+            pass
+        assert "has no locks" in capsys.readouterr().err
         with build_lock(target):
             pass
 

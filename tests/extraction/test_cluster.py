@@ -1,0 +1,443 @@
+"""Stage one on dask workers: the same store, whatever dies on the way."""
+
+import json
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+import dask
+import numpy as np
+import pytest
+import yaml
+from distributed import LocalCluster
+
+from pipeline import errors
+from pipeline.digests import file_digest
+from pipeline.errors import ConfigError, PipelineError, RecordingError, StoreIncomplete, VLMError
+from pipeline.extraction import extract
+from pipeline.extraction.worker import Job, check_place, device_of
+from pipeline.store import Donor, FeatureStore, StoreBuild, part_path, read_plan
+from pipeline.store.schema import ARRAY_NAMES, read_specs
+from pipeline.vlm.feature_spec import feature_spec
+
+BATCH = 4
+PRELOADED = """
+import os, signal, time
+from contextlib import suppress
+from pathlib import Path
+from pipeline.errors import NumericsError
+from pipeline.extraction.encoder import Encoder
+from pipeline.extraction.worker import RangeComputer
+
+control = Path({control!r})
+prepare, encode = RangeComputer.prepared, Encoder.encoded
+
+def prepared(self, piece, prepare=prepare):
+    name = Path(piece.recording.path).name
+    with (control / "tried").open("a") as log:
+        log.write(f"{{name}}\\n")
+    if (control / f"raises-{{name}}").exists():
+        raise ValueError(f"a frame of {{name}} cannot be read")
+    if (control / f"kills-{{name}}").exists():
+        os.kill(os.getpid(), signal.SIGKILL)
+    return prepare(self, piece)
+
+def encoded(self, rows, encode=encode):
+    for batch, features in encode(self, rows):
+        with (control / "computed").open("a") as log:
+            log.write(" ".join(map(str, (os.getpid(), *(one.row for one in batch)))) + "\\n")
+        for one in batch:
+            name = Path(one.where.split(",")[0]).name
+            if (control / f"nan-{{name}}").exists():
+                raise NumericsError(f"{{one.where}}: expected finite features")
+        deadline = time.monotonic() + 60
+        while (control / "wait-for-three").exists() and time.monotonic() < deadline:
+            lines = (control / "computed").read_text().splitlines()
+            if len({{line.split()[0] for line in lines}}) == 3:
+                break
+            time.sleep(0.02)
+        if (control / "kill").exists():
+            with suppress(FileNotFoundError):
+                (control / "kill").unlink()
+                time.sleep(0.5)  # what was done before has been reported
+                os.kill(os.getpid(), signal.SIGKILL)
+        yield batch, features
+
+if prepare.__module__ == RangeComputer.__module__:  # a worker may run this twice
+    RangeComputer.prepared, Encoder.encoded = prepared, encoded
+"""
+"""Run by each worker as it starts: it notes what it does, and does what the tests ask for."""
+
+
+@dataclass(frozen=True)
+class Workers:
+    """A cluster of two processes that notes what it computes."""
+
+    cluster: LocalCluster
+    control: Path
+    preload: Path
+
+    @property
+    def address(self) -> str:
+        return self.cluster.scheduler_address
+
+    def ask(self, what: str) -> None:
+        (self.control / what).touch()
+
+    def computed(self) -> tuple[Counter[int], set[int]]:
+        """How often the model was given each row, and the processes that did."""
+        lines = [line.split() for line in self._lines("computed")]
+        return Counter(int(row) for line in lines for row in line[1:]), {
+            int(line[0]) for line in lines
+        }
+
+    def tried(self) -> Counter[str]:
+        """How often a piece of each episode was begun."""
+        return Counter(self._lines("tried"))
+
+    def forget(self) -> None:
+        for path in self.control.iterdir():
+            path.unlink()
+
+    def _lines(self, name: str) -> list[str]:
+        path = self.control / name
+        return path.read_text().splitlines() if path.exists() else []
+
+
+@pytest.fixture(scope="module")
+def two_workers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Workers]:
+    control = tmp_path_factory.mktemp("control")
+    preload = tmp_path_factory.mktemp("preload") / "noting.py"
+    preload.write_text(PRELOADED.format(control=str(control)))
+    patient = dask.config.set({"distributed.deploy.lost-worker-timeout": "1h"})
+    with (
+        patient,
+        LocalCluster(
+            n_workers=2,
+            threads_per_worker=2,
+            memory_limit=0,
+            dashboard_address="127.0.0.1:0",
+            silence_logs=50,
+            scheduler_kwargs={"allowed_failures": 0},
+            preload=str(preload),
+        ) as cluster,
+    ):
+        yield Workers(cluster, control, preload)
+
+
+@pytest.fixture
+def workers(two_workers: Workers) -> Workers:
+    two_workers.cluster.wait_for_workers(2, timeout=120)  # one that was killed comes back
+    two_workers.forget()
+    return two_workers
+
+
+@pytest.fixture
+def here(changed, tmp_path) -> FeatureStore:
+    """The store that this process makes of the same recordings."""
+    params = changed(extract={"store": str(tmp_path / "here.zarr")})
+    extract(params, lambda line: None)
+    return FeatureStore.open(params.extract.store)
+
+
+def run(params):
+    return extract(params, lambda line: None)
+
+
+def assert_same(store: Path, expected: FeatureStore) -> None:
+    """All exactly, but features, whose batches differ, within the noise of float32."""
+    found = FeatureStore.open(store)
+    for name in set(ARRAY_NAMES) - {"vl/features", "vl/checksum"}:
+        assert np.array_equal(found.array(name), expected.array(name), equal_nan=True), name
+    assert np.allclose(found.array("vl/features"), expected.array("vl/features"), atol=2e-5)
+
+
+def missing_of(store: Path) -> set[int]:
+    part = part_path(store)
+    plan = read_plan(part)
+    assert plan is not None
+    build = StoreBuild(store, read_specs(part), plan)
+    try:
+        return set(build.missing().tolist())
+    finally:
+        build.close()
+
+
+class TestStore:
+    def test_equals_that_of_one_process(self, changed, workers, here):
+        params = changed(extract={"workers": workers.address})
+        report = run(params)
+        assert report is not None
+        assert report.computed == report.rows == len(here.array("vl/time"))
+        assert_same(params.extract.store, here)
+        times, processes = workers.computed()
+        assert set(times.values()) == {1}
+        assert len(processes) == 2
+
+    def test_rows_of_known_frames_are_taken_over_in_the_workers(self, changed, recordings, workers):
+        params = changed(extract={"workers": workers.address})
+        run(params)
+        before = FeatureStore.open(params.extract.store).array("vl/features").copy()
+        for path in recordings.rglob("metadata.json"):
+            path.write_text(path.read_text() + "\n")  # other files, the same frames
+        workers.forget()
+        report = run(params)
+        assert report is not None
+        assert (report.computed, report.taken) == (0, report.rows)
+        assert not workers.computed()[0]
+        store = FeatureStore.open(params.extract.store)
+        assert np.array_equal(store.array("vl/features"), before)
+        assert "torch" in store.attrs["environment"][0]
+
+
+class TestDeaths:
+    def test_a_killed_worker_loses_one_batch(self, changed, workers, here):
+        workers.ask("kill")
+        params = changed(extract={"workers": workers.address})
+        run(params)
+        assert_same(params.extract.store, here)
+        times, _ = workers.computed()
+        assert 1 <= times.total() - len(times) <= BATCH
+
+    def test_a_worker_that_joins_later_takes_part(self, changed, workers, here, monkeypatch):
+        mark = StoreBuild.mark
+        joined: list[subprocess.Popen[bytes]] = []
+
+        def joined_after_first(self, *args):
+            if not joined:
+                joined.append(begun("worker", workers.address, *WORKER, "--preload", preload))
+                workers.cluster.wait_for_workers(3, timeout=120)
+                workers.ask("wait-for-three")
+            mark(self, *args)
+
+        preload = str(workers.preload)
+        monkeypatch.setattr(StoreBuild, "mark", joined_after_first)
+        monkeypatch.setattr("pipeline.extraction.handout._COUNT_THREADS_EVERY_S", 0.0)
+        params = changed(extract={"workers": workers.address, "batch_size": 1})
+        try:
+            run(params)
+        finally:
+            for process in joined:
+                process.kill()
+                process.wait()
+        assert_same(params.extract.store, here)
+        assert len(workers.computed()[1]) == 3
+
+    def test_poisoned_recordings_are_reported_when_all_others_are_done(
+        self, changed, recordings, write_episode, workers, tmp_path
+    ):
+        write_episode(recordings / "Touch_dot" / "episode_4", 4)
+        workers.ask("raises-episode_1")
+        workers.ask("kills-episode_3")
+        workers.ask("nan-episode_4")
+        params = changed(extract={"workers": workers.address, "retries": 1})
+        with pytest.raises(RecordingError, match="3 episodes could not be computed") as raised:
+            run(params)
+        said = str(raised.value)
+        assert "a frame of episode_1 cannot be read" in said
+        assert "episode_3" in said
+        assert "worker died" in said
+        assert "episode_4, VL row" in said
+        tried = workers.tried()
+        # Of two ranges: a death may take one away before it begins, or its answer with it.
+        assert 1 <= tried["episode_1"] <= 6
+        assert 2 <= tried["episode_3"] <= 4
+        done = set(workers.computed()[0])
+        missing = missing_of(params.extract.store)
+        edges = self.edges(params.extract.store)
+        assert not missing & set(edges["episode_2"])
+        for name in ("episode_1", "episode_3", "episode_4"):
+            assert missing >= set(edges[name])
+
+        workers.forget()
+        run(params)
+        times, _ = workers.computed()
+        assert set(times) == missing
+        assert set(times.values()) == {1}
+        assert done - missing
+        expected = changed(extract={"store": str(tmp_path / "expected.zarr")})
+        run(expected)
+        assert_same(params.extract.store, FeatureStore.open(expected.extract.store))
+
+    def edges(self, store: Path) -> dict[str, range]:
+        build = Donor(part_path(store))
+        starts = build.episode_edges("vl")
+        said = [Path(one["id"]).name for one in build._said]
+        build.close()
+        spans = [range(*edges) for edges in pairwise(starts.tolist())]
+        return dict(zip(said, spans, strict=True))
+
+
+class TestRefusals:
+    def test_a_model_that_cannot_be_loaded_stops_at_once(self, changed, workers):
+        params = changed(
+            vlm={"attention": "flash_attention_2"}, extract={"workers": workers.address}
+        )
+        with pytest.raises(VLMError, match="flash_attention_2 needs CUDA"):
+            run(params)
+        assert max(workers.tried().values()) <= 4, "no range is tried again"
+
+    @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense://here"])
+    def test_a_wrong_address(self, changed, monkeypatch, address):
+        monkeypatch.setattr("pipeline.extraction.connection._TIMEOUT_S", 1)
+        with pytest.raises(ConfigError, match="no dask scheduler answers at"):
+            run(changed(extract={"workers": address}))
+
+    def test_a_worker_elsewhere(self, params, changed, tmp_path, monkeypatch):
+        spec = feature_spec(params.vlm, params.extract.dtype, ["View1", "View2"], file_digest)
+        job = Job(params.extract.store, "plan", spec, params, (), Path.cwd(), local=False)
+        with pytest.raises(StoreIncomplete, match=r"does not see the build .*made\.zarr\.part"):
+            check_place(job)
+        monkeypatch.setattr("pipeline.extraction.worker.read_plan", lambda part: "plan")
+        check_place(job)
+        other = replace(job, params=changed(vlm={"layers": [0]}))
+        with pytest.raises(ConfigError, match="would compute other features"):
+            check_place(other)
+        monkeypatch.chdir(tmp_path)
+        with pytest.raises(ConfigError, match=f"runs in {tmp_path}"):
+            check_place(job)
+
+    @pytest.mark.parametrize(
+        ("wanted", "local", "name", "device"),
+        [
+            ("auto", True, 3, "cuda:1"),
+            ("cuda", True, 0, "cuda:0"),
+            ("cuda:0", True, 3, "cuda:0"),
+            ("cpu", True, 3, "cpu"),
+            ("auto", False, 3, "auto"),
+        ],
+    )
+    def test_local_workers_take_turns_over_the_gpus(self, monkeypatch, wanted, local, name, device):
+        monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
+        assert device_of(wanted, local, name) == device
+
+    def test_errors_survive_the_way_from_a_worker(self):
+        children = [
+            kind
+            for kind in vars(errors).values()
+            if isinstance(kind, type) and issubclass(kind, PipelineError)
+        ]
+        assert len(children) > 8
+        for kind in children:
+            back = pickle.loads(pickle.dumps(kind("what, where, what to run")))
+            assert type(back) is kind
+            assert str(back) == "what, where, what to run"
+
+
+class TestScheduler:
+    def test_a_killed_scheduler_is_said_and_the_next_run_completes(
+        self, changed, here, tmp_path, monkeypatch
+    ):
+        address_file = tmp_path / "scheduler.json"
+        options = ["--scheduler-file", str(address_file)]
+        scheduler = begun("scheduler", "--port", "0", "--no-dashboard", *options)
+        worker = begun("worker", *WORKER, *options)
+        mark = StoreBuild.mark
+        marked: list[int] = []
+
+        def then_killed(self, rows, *args):
+            mark(self, rows, *args)
+            marked.extend(rows)
+            scheduler.kill()
+
+        try:
+            while not address_file.exists():
+                time.sleep(0.05)
+            monkeypatch.setattr("pipeline.extraction.connection._TIMEOUT_S", 2)
+            monkeypatch.setattr(StoreBuild, "mark", then_killed)
+            address = json.loads(address_file.read_text())["address"]
+            params = changed(extract={"workers": address, "batch_size": 1})
+            with pytest.raises(PipelineError, match="connection to the dask scheduler was lost"):
+                run(params)
+        finally:
+            for process in (scheduler, worker):
+                process.kill()
+                process.wait()
+        monkeypatch.setattr(StoreBuild, "mark", mark)
+        everything = set(range(len(here.array("vl/time"))))
+        assert missing_of(params.extract.store) == everything - set(marked)
+        run(changed())
+        assert_same(params.extract.store, here)
+
+
+class TestLocalProcesses:
+    def test_ctrl_c_leaves_no_process_and_the_next_run_completes(
+        self, changed, document, here, tmp_path
+    ):
+        file = tmp_path / "params.yaml"
+        file.write_text(yaml.safe_dump(document))
+        process = subprocess.Popen(
+            [sys.executable, "-c", STAGE, "--params", str(file), "--set", "extract.workers=2"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        assert process.stderr is not None
+        assert process.stderr.readline() == "marked\n"
+        os.killpg(process.pid, signal.SIGINT)
+        _, said = process.communicate(timeout=60)
+        assert process.returncode == 1
+        assert set(said.splitlines()) <= {
+            "marked",
+            "stopped; the same command continues from here",
+        }
+        assert not of_group(process.pid)
+        store = Path(document["extract"]["store"])
+        missing = missing_of(store)
+        assert missing
+        report = run(changed())
+        assert report is not None
+        assert report.computed + report.repeated == len(missing)
+        assert_same(store, here)
+
+
+STAGE = """
+import sys, time
+from pipeline.store import StoreBuild
+from stages.command import run
+from stages.extract import main
+
+def mark(self, *args, mark=StoreBuild.mark):
+    mark(self, *args)
+    print("marked", file=sys.stderr, flush=True)
+    time.sleep(0.5)
+
+if __name__ == "__main__":
+    StoreBuild.mark = mark
+    raise SystemExit(run("", main, sys.argv[1:]))
+"""
+"""The stage, which says when rows are marked and leaves time to stop it."""
+
+
+WORKER = ("--nthreads", "2", "--no-nanny", "--death-timeout", "60", "--no-dashboard")
+
+
+def begun(role: str, *options: str) -> "subprocess.Popen[bytes]":
+    """A process of dask's command line."""
+    return subprocess.Popen(
+        [sys.executable, "-m", f"distributed.cli.dask_{role}", *options],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+
+
+def of_group(group: int) -> list[str]:
+    """The processes of a process group that still run."""
+    found = []
+    for status in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = status.read_text().rpartition(")")[2].split()
+        except (FileNotFoundError, ProcessLookupError):
+            continue
+        if int(fields[2]) == group and fields[0] != "Z":
+            found.append((status.parent / "cmdline").read_text())
+    return found

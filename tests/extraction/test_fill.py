@@ -1,0 +1,161 @@
+"""Rows on their way: equal ones once, commits behind the model, and what a report says of it."""
+
+import shutil
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.digests import ContentDigests
+from pipeline.errors import DiskFull
+from pipeline.extraction import extract
+from pipeline.extraction.rows import in_background
+from pipeline.store import FeatureStore, StoreBuild
+from pipeline.vlm.qwen import FrozenVLM
+
+
+def run(params):
+    return extract(params, lambda line: None)
+
+
+@pytest.fixture
+def asked(monkeypatch) -> list[int]:
+    """How many rows each batch of the model's has."""
+    rows: list[int] = []
+    real = FrozenVLM.submit
+
+    def submit(self, batch):
+        rows.append(len(batch))
+        return real(self, batch)
+
+    monkeypatch.setattr(FrozenVLM, "submit", submit)
+    return rows
+
+
+def stand_still(episode: Path) -> None:
+    """Each camera of an episode shows its first frame throughout."""
+    for view in (episode / "images").iterdir():
+        first, *others = sorted(view.iterdir())
+        for frame in others:
+            shutil.copyfile(first, frame)
+
+
+class TestEqualRows:
+    def test_are_computed_once_and_the_store_is_the_same(
+        self, params, changed, recordings, asked, monkeypatch
+    ):
+        for episode in ("episode_1", "episode_2"):
+            stand_still(recordings / "Touch_dot" / episode)
+        report = run(params)
+        store = FeatureStore.open(params.extract.store)
+        keys = [bytes(key) for key in store.array("vl/key")]
+        assert len(set(keys)) < len(keys) - 10
+        assert sum(asked) == report.computed == len(set(keys))
+        assert report.repeated == len(keys) - len(set(keys))
+        other = changed(extract={"store": str(params.extract.store.with_name("each.zarr"))})
+        monkeypatch.setattr(
+            "pipeline.extraction.rows.RowPreparation.prepare_once",
+            lambda self, span: self.prepare(span),
+        )
+        assert run(other).computed == len(keys)
+        each = FeatureStore.open(other.extract.store)
+        assert [bytes(key) for key in each.array("vl/key")] == keys
+        assert np.allclose(store.array("vl/features"), each.array("vl/features"), atol=2e-5)
+        assert store.attrs["environment"] == each.attrs["environment"]
+
+    def test_go_on_after_a_kill(self, params, recordings, monkeypatch):
+        stand_still(recordings / "Touch_dot" / "episode_2")
+        real = StoreBuild.commit
+
+        def commit(self, rows, *rest):
+            real(self, rows, *rest)
+            raise KeyboardInterrupt
+
+        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+            patch.setattr(StoreBuild, "commit", commit)
+            run(params)
+        report = run(params)
+        assert report.taken == 0
+        assert report.computed + report.repeated == report.rows - params.extract.batch_size
+
+
+class TestCommits:
+    def test_run_beside_the_model_in_order_on_one_thread(self, params, monkeypatch):
+        real, threads, rows = StoreBuild.commit, set(), []
+
+        def commit(self, numbers, *rest):
+            threads.add(threading.current_thread().name)
+            rows.extend(numbers)
+            real(self, numbers, *rest)
+
+        monkeypatch.setattr(StoreBuild, "commit", commit)
+        report = run(params)
+        assert threads == {"commit"}
+        assert sorted(rows) == list(range(report.rows))
+
+    def test_a_failure_stops_the_model_at_once(self, params, asked, monkeypatch):
+        def commit(self, *args):
+            raise DiskFull("no room at all")
+
+        monkeypatch.setattr(StoreBuild, "commit", commit)
+        with pytest.raises(DiskFull, match="no room at all"):
+            run(params)
+        assert len(asked) <= 4
+        assert not [one for one in threading.enumerate() if one.name == "commit"]
+
+    def test_what_is_computed_is_kept_when_the_model_fails(self, params, monkeypatch):
+        real, calls = FrozenVLM.submit, []
+
+        def submit(self, batch):
+            calls.append(len(batch))
+            if len(calls) == 4:
+                raise RuntimeError("the device fell off the bus")
+            return real(self, batch)
+
+        with monkeypatch.context() as patch, pytest.raises(RuntimeError, match="fell off"):
+            patch.setattr(FrozenVLM, "submit", submit)
+            run(params)
+        report = run(params)
+        assert report.computed == report.rows - sum(calls[:3])
+
+
+def test_the_report_says_how_the_time_was_spent(params):
+    report = run(params)
+    assert 0 < report.model_share <= 1
+    assert 0 <= report.waited_share < 1
+    assert report.model_share + report.waited_share <= 1
+
+
+def test_a_batch_size_that_was_found_is_not_searched_again(changed, asked, monkeypatch):
+    monkeypatch.setattr("pipeline.extraction.batch_size._FIRST", 1)
+    monkeypatch.setattr("pipeline.extraction.batch_size._MOST", {"cpu": 2})
+    params = changed(extract={"batch_size": "auto"})
+    run(params)
+    assert asked[0] == 1
+    digests = ContentDigests(Path(f"{params.extract.store}.files.sqlite"))
+    ((name, size),) = digests._database.execute("SELECT * FROM batch_size").fetchall()
+    assert digests.batch_size(name) == size
+    digests.note_batch_size(name, 7)
+    digests.close()
+    shutil.rmtree(params.extract.store)
+    asked.clear()
+    run(params)
+    assert asked[0] == 7
+
+
+def test_pieces_are_made_in_order_as_far_ahead_as_is_asked():
+    begun, ahead = [], [0]
+
+    def make(piece: int) -> list[int]:
+        begun.append(piece)
+        return [piece, -piece]
+
+    made = in_background(range(1, 21), make, 2, lambda: ahead[0])
+    assert next(made) == 1
+    assert len(begun) <= 3
+    ahead[0] = 9
+    assert [next(made), next(made)] == [-1, 2]
+    assert len(list(made)) == 2 * 20 - 3
+    assert sorted(begun) == list(range(1, 21))
+    assert not [one for one in threading.enumerate() if one.name.startswith("decode")]
