@@ -10,12 +10,21 @@ import numpy as np
 from pipeline.config import Params
 from pipeline.device import resolve_device
 from pipeline.digests import ContentDigests
+from pipeline.durable import free_bytes
 from pipeline.extraction.check import CheckedEpisode, check_episodes
 from pipeline.extraction.fill import ExtractionReport, fill, rate_name
 from pipeline.extraction.layout import build_arrays, check_space, lay_out
 from pipeline.extraction.plan import ExtractionPlan, known_rows, reasons, store_bytes
 from pipeline.extraction.survey import Survey, survey
-from pipeline.store import Donor, StoreBuild, build_lock, free_bytes, part_path, read_plan, recover
+from pipeline.store import (
+    Donor,
+    FeatureStore,
+    StoreBuild,
+    build_lock,
+    part_path,
+    read_plan,
+    recover,
+)
 from pipeline.store.schema import read_specs
 from pipeline.vlm.feature_spec import differences
 
@@ -34,26 +43,38 @@ def extract(params: Params, say: Say) -> ExtractionReport | None:
         if not params.extract.plan:
             stack.enter_context(build_lock(target))
             recover(target)
-        digests = stack.enter_context(closing(ContentDigests(_beside(target, ".files.sqlite"))))
+        digests = stack.enter_context(closing(ContentDigests(ledger_path(target))))
         surveyed = survey(params, digests)
         if surveyed.bad and params.data.on_bad_episode == "stop":
             check_episodes(surveyed, params)  # lists them with whatever else is wrong
-        if read_plan(target) == surveyed.plan:
-            _say_survey(surveyed, params, say)
-            say(f"{target}: up to date, nothing to do")
-            return None
-        if read_plan(part_path(target)) == surveyed.plan:
-            _say_survey(surveyed, params, say)
-            return _resume(surveyed, params, digests, say)
-        surveyed, checked = _checked(surveyed, params, digests)
+        if surveyed.plan in _plans(target):
+            return _go_on(surveyed, params, digests, say)
+        surveyed, checked = sound_episodes(surveyed, params, digests)
+        if surveyed.plan in _plans(target):
+            return _go_on(surveyed, params, digests, say)
         _say_survey(surveyed, params, say)
-        if read_plan(target) == surveyed.plan:
-            say(f"{target}: up to date, nothing to do")
-            return None
         return _begin(surveyed, checked, params, digests, say)
 
 
-def _checked(
+def _plans(target: Path) -> tuple[str | None, str | None]:
+    """Of the unfinished build, and of the store."""
+    return read_plan(part_path(target)), read_plan(target)
+
+
+def _go_on(
+    surveyed: Survey, params: Params, digests: ContentDigests, say: Say
+) -> ExtractionReport | None:
+    """Complete what was begun; beside a finished store of the same plan, that is its repair."""
+    target = params.extract.store
+    _say_survey(surveyed, params, say)
+    if read_plan(part_path(target)) == surveyed.plan:
+        return _resume(surveyed, params, digests, say)
+    FeatureStore.open(target)  # refuses a store that files are missing from
+    say(f"{target}: up to date, nothing to do")
+    return None
+
+
+def sound_episodes(
     surveyed: Survey, params: Params, digests: ContentDigests
 ) -> tuple[Survey, list[CheckedEpisode]]:
     """Every sound episode; the survey again without those that have to be skipped.
@@ -69,7 +90,7 @@ def _checked(
     if again.action_rotation == surveyed.action_rotation:
         kept = {one.digest for one in again.episodes}
         return again, [one for one in checked if one.surveyed.digest in kept]
-    return _checked(again, params, digests)
+    return sound_episodes(again, params, digests)
 
 
 def _resume(
@@ -78,7 +99,9 @@ def _resume(
     """Go on with the build of this very plan."""
     target = params.extract.store
     build = StoreBuild(target, read_specs(part_path(target)), surveyed.plan)
-    with closing(build), _donors([*_set_aside(target), target], surveyed) as donors:
+    repairs = read_plan(target) == surveyed.plan
+    reason = "completing the repair" if repairs else "continuing the interrupted build"
+    with closing(build), _donors(_known_places(target), surveyed) as donors:
         missing = build.missing()
         rows, episodes = (build.specs[name].shape[0] for name in ("vl/time", "episode/source"))
         plan = ExtractionPlan(
@@ -90,7 +113,7 @@ def _resume(
             bytes=store_bytes(build.specs),
             free=free_bytes(build.part),
             rows_per_s=digests.rate(rate_name(surveyed, params)),
-            reasons=(f"continuing the interrupted build {build.part}",),
+            reasons=(f"{reason} {build.part}",),
         )
         for line in plan.lines():
             say(line)
@@ -115,7 +138,7 @@ def _begin(
     if any(one.recording.has_poses for one in surveyed.episodes):
         say(f"actions: rotations as {surveyed.action_rotation}")
     with closing(build):
-        with _donors([*_set_aside(target), part, target], surveyed) as donors:
+        with _donors([part, *_known_places(target)], surveyed) as donors:
             plan = _new_plan(build, checked, surveyed, donors, params, digests)
             for line in plan.lines():
                 say(line)
@@ -123,7 +146,7 @@ def _begin(
                 return None
             check_space(build, checked, donors)
         _make_room(target, surveyed, say)
-        with _donors([*_set_aside(target), target], surveyed) as donors:
+        with _donors(_known_places(target), surveyed) as donors:
             lay_out(build, checked, surveyed, params, donors)
             everything = np.arange(plan.rows)
             report = fill(build, surveyed, donors, params, digests, everything)
@@ -141,7 +164,8 @@ def _new_plan(
     digests: ContentDigests,
 ) -> ExtractionPlan:
     before = {digest for donor in donors for digest in donor.episode_digests}
-    store = Donor(build.target) if build.target.exists() else None
+    before_it = build.target if build.target in _known_places(build.target) else build.part
+    store = Donor(before_it) if read_plan(before_it) is not None else None
     return ExtractionPlan(
         episodes=len(checked),
         unchanged=sum(one.surveyed.digest in before for one in checked),
@@ -194,6 +218,16 @@ def _make_room(target: Path, surveyed: Survey, say: Say) -> None:
         say(f"the unfinished build {part} is given up: {line}")
 
 
+def _known_places(target: Path) -> list[Path]:
+    """Builds that were set aside, and the store, unless a repair of it has begun.
+
+    A repair leaves out what is damaged: that must not come back from the store that it mends.
+    """
+    aside = _set_aside(target)
+    repairs = {read_plan(place) for place in [*aside, part_path(target)]} - {None}
+    return aside if read_plan(target) in repairs else [*aside, target]
+
+
 def _set_aside(target: Path) -> list[Path]:
     return sorted(target.parent.glob(f"{target.name}.known-*"))
 
@@ -201,6 +235,11 @@ def _set_aside(target: Path) -> list[Path]:
 def _remove(folders: Sequence[Path]) -> None:
     for folder in folders:
         shutil.rmtree(folder)
+
+
+def ledger_path(target: Path) -> Path:
+    """Where the digests of files are remembered."""
+    return _beside(target, ".files.sqlite")
 
 
 def _beside(target: Path, suffix: str) -> Path:

@@ -10,6 +10,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
+from pipeline.errors import StoreIncomplete
 from pipeline.store.chunks import ChunkFiles, row_checksums
 from pipeline.store.environments import EnvironmentLog
 from pipeline.store.schema import CHECKSUMS, FEATURES, KEYS, ArraySpec, read_specs
@@ -19,13 +20,14 @@ class Donor:
     """Known feature rows by key, and streams by episode.
 
     Works on a finished store and on a laid-out build alike: it reads chunk files, not chunks.
+    Raises `StoreIncomplete` where a finished store's keys or episodes are not as they were written.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.specs: dict[str, ArraySpec] = read_specs(path)
         self.attrs: dict[str, Any] = zarr.open_group(path, mode="r").attrs.asdict()
-        self._features = ChunkFiles(path, self.specs[FEATURES])
+        self._features = ChunkFiles(path, self.specs[FEATURES], writable=False)
         self._edges: dict[str, NDArray[np.int64]] = {}
 
     @property
@@ -75,11 +77,14 @@ class Donor:
         }
 
     def take(self, key: bytes) -> NDArray[Any] | None:
-        """The feature row (slot, dim) of a key; None where it is unknown or fails its checksum."""
+        """The feature row (slot, dim) of a key; None where it is unknown or damaged."""
         row = self.rows.get(key)
         if row is None:
             return None
-        values = self._features.read(row, 1)
+        try:
+            values = self._features.read(row, 1)
+        except StoreIncomplete:  # its file is cut short or gone: the row is computed again
+            return None
         return values[0] if row_checksums(values)[0] == self._checksums[row] else None
 
     def environment_of(self, key: bytes) -> dict[str, Any]:
@@ -124,8 +129,10 @@ class Donor:
         return self._read(KEYS)
 
     def _read(self, name: str) -> NDArray[Any]:
-        files = ChunkFiles(self.path, self.specs[name])
+        files = ChunkFiles(self.path, self.specs[name], writable=False)
         try:
+            if self.path.suffix == ".zarr":  # a build has no trailers yet
+                files.check()
             return files.read(0, self.specs[name].shape[0])
         finally:
             files.close()

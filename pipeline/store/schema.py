@@ -172,23 +172,29 @@ def read_specs(root: Path) -> dict[str, ArraySpec]:
 
     Raises `StoreIncomplete` where one is missing.
     """
-    specs = {}
-    for name in ARRAY_NAMES:
-        try:
-            array = zarr.open_array(root, path=name, mode="r")
-        except FileNotFoundError:
-            raise StoreIncomplete(
-                f"{root}: the array {name} is missing. The store is damaged: remove it and run "
-                "stages.extract again."
-            ) from None
-        names = getattr(array.metadata, "dimension_names", None) or ()
-        dimensions = tuple(str(axis) for axis in names)
-        specs[name] = ArraySpec(
-            name,
-            array.shape,
-            array.dtype,
-            dimensions,
-            array.attrs.asdict(),
-            stored_chunk_rows=array.chunks[0],
-        )
-    return specs
+    return {name: read_spec(root, name) for name in ARRAY_NAMES}
+
+
+def read_spec(root: Path, name: str) -> ArraySpec:
+    """An array of a store or a build as its metadata on disk say.
+
+    Raises `StoreIncomplete` where they are missing or cannot be read.
+    """
+    mend = "The store is damaged: run stages.verify --repair, then stages.extract."
+    try:
+        array = zarr.open_array(root, path=name, mode="r")
+    except FileNotFoundError:
+        raise StoreIncomplete(f"{root}: the array {name} is missing. {mend}") from None
+    except (ValueError, KeyError, TypeError) as error:
+        raise StoreIncomplete(
+            f"{root / name / 'zarr.json'}: not the metadata of a zarr array ({error}). {mend}"
+        ) from None
+    names = getattr(array.metadata, "dimension_names", None) or ()
+    return ArraySpec(
+        name,
+        array.shape,
+        array.dtype,
+        tuple(str(axis) for axis in names),
+        array.attrs.asdict(),
+        stored_chunk_rows=array.chunks[0],
+    )

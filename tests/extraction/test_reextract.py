@@ -1,0 +1,154 @@
+"""Rows computed again are the stored ones, or what differs is named."""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pipeline.config import Params
+from pipeline.errors import StoreMismatch
+from pipeline.extraction import extract
+from pipeline.extraction.reextract import TOLERANCES, Deviation, Reextraction, reextract
+from pipeline.store.schema import chunk_paths, read_spec
+
+
+def quiet(line: str) -> None:
+    """What is said is not looked at."""
+
+
+@pytest.fixture(scope="module")
+def extracted(make_document, tmp_path_factory) -> dict[str, Any]:
+    document = make_document(tmp_path_factory.mktemp("extracted"))
+    document["vlm"]["variants"] = 2
+    extract(Params.model_validate(document), quiet)
+    return document
+
+
+@pytest.fixture
+def document(extracted, tmp_path) -> dict[str, Any]:
+    """Of copies of the store and of its recordings."""
+    store, root = tmp_path / "copy.zarr", tmp_path / "recordings"
+    shutil.copytree(extracted["extract"]["store"], store)
+    shutil.copytree(extracted["data"]["root"], root)
+    return {
+        **extracted,
+        "data": extracted["data"] | {"root": str(root)},
+        "extract": extracted["extract"] | {"store": str(store)},
+    }
+
+
+def again(document: dict[str, Any], rows: int = 100, **verify: Any) -> Reextraction:
+    params = Params.model_validate(document | {"verify": {"reextract": rows, **verify}})
+    return reextract(params.extract.store, params, quiet)
+
+
+def overwrite(document: dict[str, Any], array: str, row: int, change) -> None:
+    store = Path(document["extract"]["store"])
+    spec = read_spec(store, array)
+    path = chunk_paths(store, spec)[0]
+    content = bytearray(path.read_bytes())
+    values = np.frombuffer(memoryview(content)[:-4], spec.dtype).reshape(-1, *spec.shape[1:])
+    change(values[row])
+    path.write_bytes(content)
+
+
+class TestSoundStore:
+    def test_every_row_with_all_its_variants(self, document):
+        found = again(document)
+        assert sorted(one.row for one in found.deviations) == list(range(24))
+        assert found.deviations[0].relative < 1e-4
+        assert not found.beyond
+        assert found.tolerance == TOLERANCES["float32"]
+        assert all(one.same_pixels for one in found.deviations)
+        assert not found.environment
+        assert "computed 24 rows again" in found.lines()[0]
+
+    def test_another_batch_size_stays_within_the_tolerance(self, document):
+        document["extract"] = document["extract"] | {"batch_size": 7}
+        found = again(document, rows=10)
+        assert len(found.deviations) == 10
+        assert not found.beyond
+
+    def test_the_choice_goes_by_the_seed(self, document):
+        def rows(seed: int) -> set[int]:
+            return {one.row for one in again(document, rows=4, seed=seed).deviations}
+
+        assert rows(1) == rows(1)
+        assert rows(1) != rows(2)
+
+
+class TestDeviations:
+    def test_a_changed_variant_of_a_row_is_named(self, document):
+        slots = read_spec(Path(document["extract"]["store"]), "vl/features").shape[1]
+
+        def change(row):
+            row[slots - 1] *= 1.01
+
+        overwrite(document, "vl/features", 11, change)
+        found = again(document)
+        (beyond,) = found.beyond
+        assert (beyond.row, beyond.slot) == (11, slots - 1)
+        assert 1e-2 < beyond.relative < 1e-1
+        assert found.deviations[0] == beyond
+        assert "VL row 11" in found.refusals()[0]
+        assert not again(document, tolerance=0.2).beyond
+
+    def test_a_nan_is_beyond_every_tolerance(self, document):
+        overwrite(document, "vl/features", 3, lambda row: row.fill(np.nan))
+        found = again(document, tolerance=1e9)
+        assert [one.row for one in found.beyond] == [3]
+        assert found.deviations[0].row == 3
+
+    def test_other_pixels_are_named_as_such(self, document, monkeypatch):
+        opened = Image.Image.convert
+
+        def brighter(image, mode=None, *args, **kwargs):
+            return opened(image, mode, *args, **kwargs).point(lambda value: min(255, value + 8))
+
+        monkeypatch.setattr(Image.Image, "convert", brighter)
+        found = again(document, rows=3)
+        assert not any(one.same_pixels for one in found.deviations)
+        assert "the decoder of today gives other pixels" in "\n".join(found.lines())
+
+    def test_what_a_slot_of_zeros_deviates(self):
+        none = Deviation(0, 0.0, 0.0, 0, True, "here")
+        some = Deviation(1, 1.0, np.inf, 0, True, "there")
+        assert Reextraction((some, none), 1e-3, (), ()).beyond == [some]
+
+
+class TestOtherThanTheStore:
+    def test_environments_are_compared(self, document, monkeypatch):
+        from pipeline.vlm.qwen import FrozenVLM
+
+        load = FrozenVLM.load.__func__
+
+        def elsewhere(cls, *args, **kwargs):
+            vlm = load(cls, *args, **kwargs)
+            vlm.environment = vlm.environment | {"torch": "99"}
+            return vlm
+
+        monkeypatch.setattr(FrozenVLM, "load", classmethod(elsewhere))
+        assert any("-> '99'" in line for line in again(document, rows=1).environment)
+
+    def test_params_of_other_features_are_refused(self, document):
+        document["vlm"] = document["vlm"] | {"prompt": "{images}"}
+        with pytest.raises(StoreMismatch, match=r"other features.*\n  example_prompt"):
+            again(document)
+
+    def test_episodes_whose_recordings_changed_are_named_and_left_out(self, document):
+        image = next(Path(document["data"]["root"]).glob("Press/episode_3/images/View2/*.jpg"))
+        Image.fromarray(np.zeros((24, 32, 3), np.uint8)).save(image)
+        found = again(document)
+        assert found.unchecked == ("episode_3",)
+        assert len(found.deviations) < 24
+        assert not found.beyond
+        assert found.lines()[-1].endswith("changed or is gone: episode_3")
+
+    def test_no_recording_is_left_as_it_was(self, document):
+        document["data"] = document["data"] | {"action_hz": 5}
+        found = again(document)
+        assert found.lines()[0] == "no row can be computed again"
+        assert len(found.unchecked) == 3

@@ -1,0 +1,253 @@
+"""Damage of every kind, found, repaired and completed: the store is the undamaged one again."""
+
+import errno
+import json
+import os
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import google_crc32c
+import numpy as np
+import pytest
+
+from pipeline.config import Params
+from pipeline.errors import DiskFull, StoreIncomplete, StoreLocked, StoreMismatch
+from pipeline.extraction import extract
+from pipeline.extraction.repair import repair, with_identity
+from pipeline.store import FeatureStore, build_lock, part_path
+from pipeline.store.integrity import verify
+from pipeline.store.schema import chunk_paths, read_spec
+
+
+def quiet(line: str) -> None:
+    """What is said is not looked at."""
+
+
+@pytest.fixture(scope="module")
+def extracted(make_document, tmp_path_factory) -> dict[str, Any]:
+    """The document of an extracted store; one row a batch, so that a row's bits are its own."""
+    document = make_document(tmp_path_factory.mktemp("extracted"))
+    document["extract"]["batch_size"] = 1
+    extract(Params.model_validate(document), quiet)
+    return document
+
+
+@dataclass
+class Case:
+    """A copy of the extracted store, to be damaged."""
+
+    document: dict[str, Any]
+    original: Path
+
+    @property
+    def params(self) -> Params:
+        return Params.model_validate(self.document)
+
+    @property
+    def store(self) -> Path:
+        return self.params.extract.store
+
+    def file(self, array: str, chunk: int = 0) -> Path:
+        return chunk_paths(self.store, read_spec(self.store, array))[chunk]
+
+    def flip(self, array: str, byte: int) -> Path:
+        path = self.file(array)
+        content = bytearray(path.read_bytes())
+        content[byte] ^= 0x20
+        path.write_bytes(content)
+        return path
+
+    def findings(self):
+        return with_identity(verify(self.store, threads=1))
+
+    def mended(self):
+        """Repair and complete; returns what the repair said it did, and what extract did."""
+        before = contents(self.store)
+        begun = repair(self.findings(), self.params, quiet)
+        assert contents(self.store) == before, "the damaged store stays until it is replaced"
+        return begun, extract(self.params, quiet)
+
+
+@pytest.fixture
+def case(extracted, tmp_path) -> Case:
+    original = Path(extracted["extract"]["store"])
+    copy = tmp_path / "copy.zarr"
+    shutil.copytree(original, copy)
+    document = extracted | {"extract": extracted["extract"] | {"store": str(copy)}}
+    return Case(document, original)
+
+
+def contents(store: Path) -> dict[str, bytes]:
+    return {
+        path.relative_to(store).as_posix(): path.read_bytes()
+        for path in store.rglob("*")
+        if path.is_file()
+    }
+
+
+def row_bytes(case: Case) -> int:
+    return read_spec(case.store, "vl/features").row_bytes
+
+
+def flipped_feature(case: Case) -> Path:
+    return case.flip("vl/features", 5 * row_bytes(case) + 9)
+
+
+def truncated(case: Case) -> Path:
+    path = case.file("vl/features")
+    os.truncate(path, 15 * row_bytes(case) + 3)
+    return path
+
+
+def deleted(case: Case) -> Path:
+    path = case.file("vl/checksum")
+    path.unlink()
+    return path
+
+
+def deleted_sensor(case: Case) -> Path:
+    path = case.file("sensor/values")
+    path.unlink()
+    return path
+
+
+@pytest.mark.parametrize(
+    ("harm", "computed", "anew"),
+    [
+        (flipped_feature, 1, False),
+        (truncated, 9, False),
+        (deleted, 0, False),
+        (lambda case: case.flip("vl/key", 40), 24, False),
+        (lambda case: case.flip("sensor/values", 10_000), 0, True),
+        (deleted_sensor, 0, True),
+        (lambda case: case.flip("episode/tick_start", 8), 0, True),
+        (lambda case: case.flip("episode/text", 3), 0, True),
+        (lambda case: case.flip("vl/frame_time", 24), 0, True),
+    ],
+)
+def test_damage_is_found_and_mended_to_the_byte(case, harm, computed, anew):
+    place = harm(case)
+    findings = case.findings()
+    assert any(str(place) in line for line in findings.lines()), findings.lines()
+    begun, report = case.mended()
+    assert begun.laid_out_anew is anew
+    assert begun.rows - begun.carried == computed
+    assert report is not None
+    assert (report.computed, report.taken) == (computed, 0)
+    assert contents(case.store) == contents(case.original)
+    assert case.findings().sound
+    assert extract(case.params, quiet) is None, "up to date"
+
+
+def test_a_nan_that_was_stored_with_right_checksums_does_not_come_back(case):
+    spec = read_spec(case.store, "vl/features")
+    nan = np.full(spec.shape[1:], np.nan, spec.dtype).tobytes()
+    for array, at, value in (
+        ("vl/features", 7 * spec.row_bytes, nan),
+        ("vl/checksum", 7 * 4, google_crc32c.value(nan).to_bytes(4, "little")),
+    ):
+        content = bytearray(case.file(array).read_bytes()[:-4])
+        content[at : at + len(value)] = value
+        trailer = google_crc32c.value(bytes(content)).to_bytes(4, "little")
+        case.file(array).write_bytes(content + trailer)
+    assert case.findings().bad_rows.tolist() == [7]
+    _, report = case.mended()
+    assert report is not None
+    assert report.computed == 1
+    assert contents(case.store) == contents(case.original)
+
+
+def test_metadata_of_the_features_that_are_lost_cost_the_rows(case):
+    (case.store / "vl" / "features" / "zarr.json").unlink()
+    begun, report = case.mended()
+    assert begun.carried == 0
+    assert report is not None
+    assert report.computed == begun.rows
+    assert contents(case.store) == contents(case.original)
+
+
+def test_a_spec_that_is_not_what_its_digest_says(case):
+    place = case.store / "zarr.json"
+    document = json.loads(place.read_text())
+    document["attributes"]["feature_spec"]["prompt"] += "!"
+    place.write_text(json.dumps(document))
+    (line,) = case.findings().lines()
+    assert "expected the digest" in line
+    begun, _ = case.mended()
+    assert begun.laid_out_anew
+    assert contents(case.store) == contents(case.original)
+
+
+def test_streams_cannot_be_mended_from_other_recordings(case):
+    case.flip("sensor/values", 10_000)
+    case.document["data"] = case.document["data"] | {"vlm_reuse_count": 2}
+    with pytest.raises(StoreMismatch, match="the params describe another store"):
+        repair(case.findings(), case.params, quiet)
+    assert not part_path(case.store).exists()
+
+
+def test_a_repair_that_has_begun_is_not_begun_again(case):
+    flipped_feature(case)
+    repair(case.findings(), case.params, quiet)
+    with pytest.raises(StoreMismatch, match=r"a repair of it has begun. Run stages.extract"):
+        repair(case.findings(), case.params, quiet)
+
+
+def test_a_store_that_no_longer_says_what_it_is(case):
+    case.flip("vl/key", 3)
+    place = case.store / "zarr.json"
+    document = json.loads(place.read_text())
+    del document["attributes"]["plan"]
+    place.write_text(json.dumps(document))
+    with pytest.raises(StoreIncomplete, match="no longer says what it was made of"):
+        repair(case.findings(), case.params, quiet)
+
+
+def test_a_full_disk_leaves_nothing_behind(case, monkeypatch):
+    flipped_feature(case)
+    findings = case.findings()
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    with pytest.raises(DiskFull, match="make room"):
+        repair(findings, case.params, quiet)
+    names = sorted(path.name for path in case.store.parent.iterdir())
+    assert names == ["copy.zarr", "copy.zarr.lock"]
+
+
+def test_a_repair_waits_for_no_extraction(case):
+    flipped_feature(case)
+    findings = case.findings()
+    with build_lock(case.store), pytest.raises(StoreLocked, match="being built by process"):
+        repair(findings, case.params, quiet)
+
+
+def test_nothing_is_taken_over_by_damaged_keys(case, tmp_path):
+    """Other params want rows by key: a key that may be wrong is refused, then repaired around."""
+    case.flip("vl/key", 40)
+    findings, before = case.findings(), case.params
+    case.document["data"] = case.document["data"] | {"action_hz": 5.0}
+    with pytest.raises(StoreIncomplete, match=r"vl/key.*stages\.verify --repair"):
+        extract(case.params, quiet)
+    repair(findings, before, quiet)
+    report = extract(case.params, quiet)
+    assert report is not None
+    assert report.taken == 0
+    fresh = Params.model_validate(
+        case.document | {"extract": {"store": str(tmp_path / "fresh.zarr"), "batch_size": 1}}
+    )
+    extract(fresh, quiet)
+    assert contents(case.store) == contents(fresh.extract.store)
+
+
+def test_training_goes_on_from_the_old_store_meanwhile(case):
+    """A map of the damaged store stays what it was after the mended one took its place."""
+    flipped_feature(case)
+    mapped = FeatureStore.open(case.store).array("vl/features")
+    before = mapped[4:8].copy()
+    case.mended()
+    assert np.array_equal(mapped[4:8], before)
