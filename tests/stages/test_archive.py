@@ -1,0 +1,83 @@
+"""`stages.archive` as a user meets it."""
+
+import filecmp
+from pathlib import Path
+
+import pytest
+import yaml
+
+from stages.archive import RESTORE, main
+from stages.command import run
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def call(tmp_path, tiny_store):
+    """`call(*arguments)` runs the stage on a small store, whose path is `call.store`."""
+    store = tiny_store(tmp_path)
+    params = tmp_path / "params.yaml"
+    document = yaml.safe_load((ROOT / "params.yaml").read_text())
+    document["extract"]["store"] = str(store)
+    params.write_text(yaml.safe_dump(document))
+
+    def called(*arguments: str) -> int:
+        return run("", main, ["--params", str(params), *arguments], shorthands=[RESTORE])
+
+    called.store = store
+    return called
+
+
+def test_archive_and_restore_beside_the_store(call, tmp_path, capsys):
+    assert call() == 0
+    said = capsys.readouterr().out
+    output = tmp_path / "tiny.archive.zarr"
+    lines = said.splitlines()
+    assert lines[0].split() == ["array", "MB", "ratio", "codec", "on", "samples"]
+    assert any(line.startswith("vl/features ") for line in lines)
+    assert lines[-1].startswith(f"{output}: ")
+    assert ": 1)" in lines[-1]
+    kept = call.store.rename(tmp_path / "kept.zarr")
+    assert call("--restore") == 0
+    assert f"as archived in {output}" in capsys.readouterr().out
+    files = [p.relative_to(kept).as_posix() for p in kept.rglob("*") if p.is_file()]
+    assert filecmp.cmpfiles(kept, call.store, files, shallow=False) == (files, [], [])
+
+
+def test_again_is_nothing_to_do(call, capsys):
+    assert call() == call() == 0
+    assert "nothing to do" in capsys.readouterr().out
+    assert call("--restore") == 0
+
+
+def refused(call, capsys, *overrides: str) -> str:
+    options = [part for override in overrides for part in ("--set", override)]
+    assert call(*options) == 2
+    return capsys.readouterr().err
+
+
+def test_the_archive_is_not_the_store(call, capsys):
+    for output in (call.store, call.store / "a.zarr", call.store / "vl/../../tiny.zarr"):
+        assert "itself or lies in it" in refused(call, capsys, f"archive.output={output}")
+    assert not (call.store / "a.zarr.lock").exists()
+
+
+def test_an_archive_is_named_as_zarr(call, capsys, tmp_path):
+    assert "ends in .zarr" in refused(call, capsys, f"archive.output={tmp_path / 'kept'}")
+
+
+def test_something_else_in_its_place_is_left_alone(call, capsys, tmp_path):
+    other = tmp_path / "other.zarr"
+    other.mkdir()
+    (other / "notes").write_text("mine")
+    assert "not an archive of" in refused(call, capsys, f"archive.output={other}")
+    assert (other / "notes").read_text() == "mine"
+
+
+def test_a_store_that_is_not_there(call, capsys, tmp_path):
+    assert "Run stages.extract" in refused(call, capsys, f"archive.store={tmp_path / 'no.zarr'}")
+
+
+def test_an_archive_that_is_not_there(call, capsys):
+    assert call("--restore") == 2
+    assert "make it with stages.archive" in capsys.readouterr().err
