@@ -42,6 +42,10 @@ class DiskFull(PipelineError, OSError):
     """Too little space for what has to be written."""
 
 
+class TooManyMaps(PipelineError, OSError):
+    """The kernel maps no more files into this process."""
+
+
 class NumericsError(PipelineError, ArithmeticError):
     """A NaN or an infinity where a number must be."""
 

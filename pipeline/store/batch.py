@@ -42,8 +42,15 @@ class Batch:
         return self._each(lambda tensor: tensor.to(device, non_blocking=non_blocking))
 
     def pin(self) -> Self:
-        """The same in page-locked memory, from where copies to a GPU are asynchronous."""
-        return self._each(lambda tensor: tensor.pin_memory())
+        """The same in page-locked memory, from where copies to a GPU are asynchronous.
+
+        What is not in host memory stays as it is.
+        """
+        return self._each(lambda tensor: tensor.pin_memory() if tensor.is_cpu else tensor)
+
+    def touch(self) -> Self:
+        """Itself, zeroed: every page of its memory is there before it is filled at speed."""
+        return self._each(lambda tensor: tensor.zero_())
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> Self:
         values = {field.name: getattr(self, field.name) for field in fields(self)}

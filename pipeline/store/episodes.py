@@ -1,4 +1,7 @@
-"""Episodes one behind the other: the arrays of a store that need no model and no stream."""
+"""Episodes one behind the other: the arrays of a store that need no model and no stream.
+
+`episode_arrays` makes them, `read_episodes` says what they hold.
+"""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -7,6 +10,53 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One episode and the rows of each array that belong to it."""
+
+    index: int
+    id: str
+    source: str
+    path: str
+    format: str
+    instruction: str
+    content: str
+    """Digest of its files."""
+    digest: str
+    """Digest of its content and of everything else that decides its rows."""
+    ticks: range
+    vl_rows: range
+    readings: range
+    states: range
+
+
+def read_episodes(
+    arrays: Mapping[str, NDArray[Any]], sources: Sequence[str]
+) -> tuple[Episode, ...]:
+    """All episodes of a store with these arrays, in order; `sources` as `episode/source` counts."""
+    edges = {
+        kind: arrays[f"episode/{kind}_start"].tolist()
+        for kind in ("tick", "vl", "sensor", "state", "text")
+    }
+    text = arrays["episode/text"].tobytes()
+    found: list[Episode] = []
+    for index, source in enumerate(arrays["episode/source"]):
+        rows = {kind: range(edge[index], edge[index + 1]) for kind, edge in edges.items()}
+        said = json.loads(text[rows["text"].start : rows["text"].stop])
+        found.append(
+            Episode(
+                index=index,
+                source=sources[int(source)],
+                ticks=rows["tick"],
+                vl_rows=rows["vl"],
+                readings=rows["sensor"],
+                states=rows["state"],
+                **said,
+            )
+        )
+    return tuple(found)
 
 
 class Ticks(Protocol):

@@ -1,11 +1,12 @@
 """Gather windows and rows out of flat maps into reused buffers.
 
-Everything is an index computation followed by one `index_select` into the buffer, which runs at the
-speed of a row gather in C; no sample is touched from Python.
+Arithmetic on whole batches of indices, then one `index_select` a stream into its buffer, which runs
+at the speed of a row gather in C; no sample is touched from Python.
 """
 
-from collections.abc import Mapping
-from functools import cached_property
+import os
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,43 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pipeline.store.batch import Batch
+from pipeline.store.mapping import available_bytes, fitting, read_at_random, will_need
+
+# OpenMP's threads do not survive a fork, and a forked process that waits for them waits for ever.
+os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
+
+WIDE = {
+    "action": "tick/action",
+    "features": "vl/features",
+    "state": "state/values",
+    "sensor": "sensor/values",
+}
+"""The fields of a batch that are copied out of an array as wide as they are, and that array."""
+_BLOCK_ELEMENTS = 32768
+"""Most elements of a block of readings that is copied at once: beyond it, torch divides each block
+among its threads in turn instead of dividing the blocks among them, and copies more slowly."""
+_CACHE_LINE = 64
+
+Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """Which readings each sample of a batch sees: the `valid` (batch,) ones before `end` (batch,),
+    right-aligned in a window that is never shorter."""
+
+    end: Index
+    valid: Index
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """Where the wide fields of a batch lie in their arrays, as `Gatherer.tensor` shows them."""
+
+    rows: Mapping[str, Index]
+    """`features` (batch,) and `action` (batch x horizon,)."""
+    windows: Mapping[str, Window]
+    """`sensor` and `state`."""
 
 
 class Gatherer:
@@ -26,128 +64,188 @@ class Gatherer:
         self._arrays = arrays
         self._variants = variants
         self._tensors: dict[str, Tensor] = {}
+        wide = {name: arrays[array] for name, array in WIDE.items()}
+        self.in_memory = fitting(wide, available_bytes())
+        """The wide fields whose arrays fit in memory together, the smallest first."""
+        for name in wide.keys() - {*self.in_memory}:
+            read_at_random(wide[name])
 
-    def gather(
+    def select(
         self,
         batch: Batch,
-        tick: NDArray[np.int64],
+        tick: Index,
         feature_lag: int,
         sensor_lag_s: float,
         state_lag_s: float,
-        variant: NDArray[np.int64] | None,
-    ) -> None:
-        """Fill `batch` with what belongs to these ticks; see `FeatureStore.gather`."""
-        episode = np.searchsorted(self._arrays["episode/tick_start"], tick, side="right") - 1
-        self._features(batch, tick, episode, feature_lag, variant)
-        for stream, window, counts, lag_s in (
-            ("sensor", batch.sensor, batch.sensor_valid, sensor_lag_s),
-            ("state", batch.state, batch.state_valid, state_lag_s),
-        ):
-            first = self._arrays[f"episode/{stream}_start"][episode]
-            end = self._window_ends(stream, tick, first, lag_s)
-            self._window(f"{stream}/values", window, counts, first, end)
-        self._action(batch, tick, episode)
+        variant: Index | None,
+    ) -> Selection:
+        """Fill all but the wide fields of `batch`, and say where those lie.
 
-    def empty_batch(self, batch: int, horizon: int, sensor_window: int, state_window: int) -> Batch:
-        """Buffers for `gather(..., out=)`."""
-        _, slots, dim = self._tensor("vl/features").shape
-        action = (batch, horizon, self._arrays["tick/action"].shape[1])
-        return Batch(
-            features=torch.empty((batch, slots, dim), dtype=self._tensor("vl/features").dtype),
-            slot_valid=torch.empty((batch, slots), dtype=torch.bool),
-            feature_age=torch.empty(batch),
-            sensor=torch.empty(
-                (batch, sensor_window, self._arrays["sensor/values"].shape[1]),
-                dtype=self._tensor("sensor/values").dtype,
-            ),
-            sensor_valid=torch.empty(batch, dtype=torch.int64),
-            state=torch.empty((batch, state_window, self._arrays["state/values"].shape[1])),
-            state_valid=torch.empty(batch, dtype=torch.int64),
-            action=torch.empty(action),
-            action_valid=torch.empty(action[:2], dtype=torch.bool),
+        See `FeatureStore.gather`.
+        """
+        episode = np.searchsorted(self._arrays["episode/tick_start"], tick, side="right") - 1
+        return Selection(
+            {
+                "features": self._features(batch, tick, episode, feature_lag, variant),
+                "action": self._action(batch, tick, episode),
+            },
+            {
+                "sensor": self._window("sensor", batch, tick, episode, sensor_lag_s),
+                "state": self._window("state", batch, tick, episode, state_lag_s),
+            },
         )
 
-    def _features(
+    def copy(self, selection: Selection, batch: Batch, but: Collection[str] = ()) -> None:
+        """Fill the wide fields of `batch`; those named in `but` stay as they are."""
+        for name, rows in selection.rows.items():
+            if name not in but:
+                self._expect(name, rows, 1)
+                out: Tensor = getattr(batch, name)
+                flat = out.view(len(rows), *self.tensor(name).shape[1:])
+                torch.index_select(self.tensor(name), 0, torch.from_numpy(rows), out=flat)
+        for name, window in selection.windows.items():
+            out = getattr(batch, name)
+            if name not in but and out.numel():
+                self._expect(name, window.end - out.shape[1], out.shape[1])
+                copy_windows(self.tensor(name), window, out)
+
+    def empty_batch(
         self,
-        batch: Batch,
-        tick: NDArray[np.int64],
-        episode: NDArray[np.int64],
-        lag: int,
-        variant: NDArray[np.int64] | None,
-    ) -> None:
+        batch: int,
+        horizon: int,
+        sensor_window: int,
+        state_window: int,
+        but: Collection[str] = (),
+    ) -> Batch:
+        """Buffers for `gather(..., out=)`; those named in `but` have a shape, but no memory."""
+
+        def wide(name: str, *shape: int) -> Tensor:
+            like = self.tensor(name)
+            if name in but:
+                return torch.empty((*shape, *like.shape[1:]), dtype=like.dtype, device="meta")
+            return _buffer((*shape, *like.shape[1:]), like.dtype)
+
+        slots = self.tensor("features").shape[1]
+        return Batch(
+            features=wide("features", batch),
+            slot_valid=torch.empty((batch, slots), dtype=torch.bool),
+            feature_age=torch.empty(batch),
+            sensor=wide("sensor", batch, sensor_window),
+            sensor_valid=torch.empty(batch, dtype=torch.int64),
+            state=wide("state", batch, state_window),
+            state_valid=torch.empty(batch, dtype=torch.int64),
+            action=wide("action", batch, horizon),
+            action_valid=torch.empty((batch, horizon), dtype=torch.bool),
+        )
+
+    def tensor(self, name: str) -> Tensor:
+        """The map that a wide field is gathered from; of the features, (vl_row x variant, …)."""
+        if name not in self._tensors:
+            array = self._arrays[WIDE[name]]
+            tensor = torch.from_numpy(array)
+            if name == "features":
+                tensor = tensor.view(torch.bfloat16) if array.dtype == np.uint16 else tensor
+                tensor = tensor.view(*self._by_variant(array))
+            self._tensors[name] = tensor
+        return self._tensors[name]
+
+    def array(self, name: str) -> NDArray[Any]:
+        """The same as it is in the store."""
+        return self._arrays[WIDE[name]]
+
+    def _by_variant(self, array: NDArray[Any]) -> tuple[int, ...]:
+        rows, slots, *rest = array.shape
+        return rows * self._variants, slots // self._variants, *rest
+
+    def _features(
+        self, batch: Batch, tick: Index, episode: Index, lag: int, variant: Index | None
+    ) -> Index:
         row = self._arrays["tick/vl_row"][tick]
         if lag:
             row = np.maximum(row - lag, self._arrays["episode/vl_start"][episode])
-        view = row * self._variants + (0 if variant is None else variant)
-        index = torch.from_numpy(view)
-        torch.index_select(self._tensor("vl/features"), 0, index, out=batch.features)
-        batch.slot_valid.copy_(self._tensor("vl/slot_valid").index_select(0, index))
-        age = self._arrays["tick/time"][tick] - self._newest_frame[row]
+        view = row if self._variants == 1 else row * self._variants
+        view = view if variant is None else view + variant
+        valid = self._arrays["vl/slot_valid"]
+        np.not_equal(valid.reshape(self._by_variant(valid))[view], 0, out=batch.slot_valid.numpy())
+        age = self._arrays["tick/time"][tick] - self._newest_frame(row)
         batch.feature_age.copy_(torch.from_numpy(age))
+        return view
 
-    @cached_property
-    def _newest_frame(self) -> NDArray[np.float64]:
+    def _newest_frame(self, row: Index) -> NDArray[np.float64]:
         """Capture time of each VL row's newest frame; its tick where it has no frame at all."""
-        frames = self._arrays["vl/frame_time"]
-        shown = np.isfinite(frames)
-        newest = np.max(frames, axis=1, where=shown, initial=-np.inf)
-        return np.where(shown.any(axis=1), newest, self._arrays["vl/time"])
-
-    def _window_ends(
-        self, stream: str, tick: NDArray[np.int64], first: NDArray[np.int64], lag_s: float
-    ) -> NDArray[np.int64]:
-        end = self._arrays[f"tick/{stream}_end"][tick]
-        if not lag_s:
-            return end
-        clock = self._arrays[f"{stream}/time"]
-        until = self._arrays["tick/time"][tick] - lag_s
-        return np.array(
-            [
-                start + np.searchsorted(clock[start:stop], instant, side="right")
-                for start, stop, instant in zip(first, end, until, strict=True)
-            ],
-            np.int64,
-        )
+        shown = self._arrays["vl/frame_time"][row]
+        newest = np.fmax.reduce(shown, axis=1, initial=-np.inf)
+        return np.where(np.isfinite(newest), newest, self._arrays["vl/time"][row])
 
     def _window(
-        self,
-        name: str,
-        out: Tensor,
-        counts: Tensor,
-        first: NDArray[np.int64],
-        end: NDArray[np.int64],
-    ) -> None:
-        window = out.shape[1]
-        real = np.minimum(end - first, window)
-        counts.copy_(torch.from_numpy(real))
-        if not out.numel():
-            return
-        index = end[:, None] - np.arange(window, 0, -1)
-        before = index < first[:, None]
-        readings = self._tensor(name)
-        inside = np.where(before, 0, index)
-        flat = out.view(-1, out.shape[2])
-        torch.index_select(readings, 0, torch.from_numpy(inside.ravel()), out=flat)
-        if before.any():
-            flat[torch.from_numpy(before.ravel())] = 0
+        self, stream: str, batch: Batch, tick: Index, episode: Index, lag_s: float
+    ) -> Window:
+        first = self._arrays[f"episode/{stream}_start"][episode]
+        end = self._arrays[f"tick/{stream}_end"][tick]
+        if lag_s:
+            until = self._arrays["tick/time"][tick] - lag_s
+            end = _first_after(self._arrays[f"{stream}/time"], first, end, until)
+        window, counts = getattr(batch, stream).shape[1], getattr(batch, f"{stream}_valid")
+        return Window(end, np.minimum(end - first, window, out=counts.numpy()))
 
-    def _action(self, batch: Batch, tick: NDArray[np.int64], episode: NDArray[np.int64]) -> None:
+    def _action(self, batch: Batch, tick: Index, episode: Index) -> Index:
         horizon = batch.action.shape[1]
-        stop = self._arrays["episode/tick_start"][episode + 1]
+        stop = self._arrays["episode/tick_start"][episode + 1][:, None]
         index = tick[:, None] + np.arange(horizon)
-        batch.action_valid.copy_(torch.from_numpy(index < stop[:, None]))
-        kept = torch.from_numpy(np.minimum(index, stop[:, None] - 1).ravel())
-        flat = batch.action.view(-1, batch.action.shape[2])
-        torch.index_select(self._tensor("tick/action"), 0, kept, out=flat)
+        np.less(index, stop, out=batch.action_valid.numpy())
+        return np.minimum(index, stop - 1).ravel()
 
-    def _tensor(self, name: str) -> Tensor:
-        """An array as it is gathered from: those of the slots as (vl_row x variant, slot, …)."""
-        if name not in self._tensors:
-            tensor = torch.from_numpy(self._arrays[name])
-            if name == "vl/features" and self._arrays[name].dtype == np.uint16:
-                tensor = tensor.view(torch.bfloat16)
-            if name in ("vl/features", "vl/slot_valid"):
-                rows, slots, *rest = tensor.shape
-                tensor = tensor.view(rows * self._variants, slots // self._variants, *rest)
-            self._tensors[name] = tensor
-        return self._tensors[name]
+    def _expect(self, name: str, first: Index, rows: int) -> None:
+        """Have the disk read what is about to be copied from a map that memory has no room for."""
+        if name not in self.in_memory:
+            variants = self._variants if name == "features" else 1
+            will_need(self.array(name), first // variants, rows)
+
+
+def copy_windows(readings: Tensor, window: Window, out: Tensor) -> None:
+    """Fill `out` (batch, window, channel) from `readings` (reading, channel), zeros on the left."""
+    batch, length, channels = out.shape
+    if len(window.end) and len(readings) and window.end.min() >= length:
+        # Overlapping blocks of readings, one beginning at each: few, long copies.
+        block = _block(length, channels)
+        blocks = readings.as_strided((len(readings) - block + 1, block * channels), (channels, 1))
+        index = window.end[:, None] + np.arange(-length, 0, block)
+        flat = out.view(-1, block * channels)
+        torch.index_select(blocks, 0, torch.from_numpy(index.ravel()), out=flat)
+    elif len(readings):
+        index = np.maximum(window.end[:, None] + np.arange(-length, 0), 0)
+        flat = out.view(-1, channels)
+        torch.index_select(readings, 0, torch.from_numpy(index.ravel()), out=flat)
+    if len(window.valid) and window.valid.min() < length:
+        before = np.flatnonzero(np.arange(length) < length - window.valid[:, None])
+        out.view(batch * length, channels).index_fill_(0, torch.from_numpy(before), 0)
+
+
+def _block(length: int, channels: int) -> int:
+    """The most readings a copy, so that whole copies make a window of `length`."""
+    most = max(1, _BLOCK_ELEMENTS // channels)
+    return next(size for size in range(min(length, most), 0, -1) if length % size == 0)
+
+
+def _first_after(
+    clock: NDArray[np.float64], low: Index, high: Index, instant: NDArray[np.float64]
+) -> Index:
+    """For each sample, the first reading in low..high - 1 later than its instant, else `high`.
+
+    Bisection of all samples at a time: each has a stretch of the clock of its own, within which
+    alone the clock ascends.
+    """
+    while (searching := low < high).any():
+        middle = (low + high) // 2
+        seen = clock[np.where(searching, middle, 0)] <= instant
+        low = np.where(searching & seen, middle + 1, low)
+        high = np.where(searching & ~seen, middle, high)
+    return low
+
+
+def _buffer(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+    """Uninitialised memory; numpy asks the kernel for huge pages for it, which torch does not."""
+    size = int(np.prod(shape)) * dtype.itemsize
+    raw = np.empty(size + _CACHE_LINE, np.uint8)
+    begin = -raw.ctypes.data % _CACHE_LINE
+    return torch.from_numpy(raw[begin : begin + size]).view(dtype).view(shape)

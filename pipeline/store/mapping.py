@@ -3,18 +3,27 @@
 One range of addresses is reserved, each file is mapped into its place (`MAP_FIXED`), and one
 ndarray spans the whole, so that speed does not depend on how an array is cut into files. Maps are
 private and copy-on-write: a write by mistake changes neither the file nor kills the process.
+
+How a map is paged in depends on whether it fits in memory. What fits is populated once: every page
+is read in the files' order and entered in the page table, so that no gather stops at a page fault.
+Of what does not, the kernel is told to read no page but those asked for, and each batch's rows are
+asked for at once before the first is copied; without that, read-ahead brings hundreds of times the
+useful bytes.
 """
 
 import ctypes
+import errno
 import mmap
 import os
 import weakref
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
+
+from pipeline.errors import TooManyMaps
 
 _LIBC = ctypes.CDLL(None, use_errno=True)
 _LIBC.mmap.restype = ctypes.c_void_p
@@ -27,10 +36,16 @@ _LIBC.mmap.argtypes = (
     ctypes.c_long,
 )
 _LIBC.munmap.argtypes = (ctypes.c_void_p, ctypes.c_size_t)
+_LIBC.madvise.argtypes = (ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int)
 _PROT_NONE = 0
 _MAP_FIXED = 0x10
 _MAP_NORESERVE = 0x4000
 _PRIVATE = mmap.MAP_PRIVATE | _MAP_NORESERVE
+_MADV_POPULATE_READ = 22
+"""Of Linux 5.14; `mmap` does not name it."""
+_POPULATE_STEP = 256 * 2**20
+_MEMORY_SHARE = 0.8
+"""Of the available memory, what maps may fill: the rest is for who reads them."""
 
 
 def map_flat(
@@ -67,5 +82,80 @@ def _mmap(address: int | None, length: int, protection: int, flags: int, descrip
     mapped = _LIBC.mmap(address, length, protection, flags, descriptor, 0)
     if mapped == ctypes.c_void_p(-1).value:
         code = ctypes.get_errno()
+        if code == errno.ENOMEM:
+            limit = Path("/proc/sys/vm/max_map_count").read_text(encoding="ascii").strip()
+            raise TooManyMaps(
+                f"the kernel refuses to map another file; a process may have {limit} maps, and a "
+                "store takes one a chunk file. Raise it (sysctl vm.max_map_count), or extract into "
+                "several stores."
+            )
         raise OSError(code, f"mmap of {length} bytes: {os.strerror(code)}")
     return int(mapped)
+
+
+def available_bytes() -> int:
+    """Memory that can be had without swapping; file pages that can be dropped count as free."""
+    for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
+        if line.startswith("MemAvailable:"):
+            return int(line.split()[1]) * 1024
+    raise OSError("/proc/meminfo has no MemAvailable; Linux since 3.14 has")
+
+
+def fitting(arrays: Mapping[str, NDArray[Any]], available: int) -> list[str]:
+    """Which maps memory has room for: the smallest ones first, as many as fit together."""
+    left = int(available * _MEMORY_SHARE)
+    names: list[str] = []
+    for name in sorted(arrays, key=lambda name: arrays[name].nbytes):
+        left -= arrays[name].nbytes
+        if left >= 0:
+            names.append(name)
+    return names
+
+
+def populate(array: NDArray[Any]) -> None:
+    """Read a map from `map_flat` into memory, in order; returns when all of it is there.
+
+    On a kernel that cannot (before Linux 5.14) reading is begun, and page faults remain.
+    """
+    start, stop = _pages(array, 0, array.nbytes)
+    for begin in range(start, stop, _POPULATE_STEP):
+        length = min(_POPULATE_STEP, stop - begin)
+        try:
+            _madvise(begin, length, _MADV_POPULATE_READ)
+        except OSError as error:
+            if error.errno != errno.EINVAL:
+                raise
+            _madvise(begin, length, mmap.MADV_WILLNEED)
+
+
+def read_at_random(array: NDArray[Any]) -> None:
+    """Tell the kernel to read no page of a map ahead of the one that is asked for."""
+    if array.nbytes:
+        start, stop = _pages(array, 0, array.nbytes)
+        _madvise(start, stop - start, mmap.MADV_RANDOM)
+
+
+def will_need(array: NDArray[Any], first: NDArray[np.int64], rows: int) -> None:
+    """Begin to read rows `first[i]` to `first[i] + rows - 1` of a map, all at once.
+
+    A call into the kernel for each: what it saves is a wait for the disk each.
+    """
+    if not array.nbytes:
+        return
+    row_bytes = array.nbytes // len(array)
+    for row in np.unique(first).tolist():
+        start, stop = _pages(array, row * row_bytes, (row + rows) * row_bytes)
+        _madvise(start, stop - start, mmap.MADV_WILLNEED)
+
+
+def _pages(array: NDArray[Any], begin: int, end: int) -> tuple[int, int]:
+    """The addresses of the whole pages that hold these bytes of an array."""
+    address = array.ctypes.data
+    start = (address + max(0, begin)) // mmap.PAGESIZE * mmap.PAGESIZE
+    return start, address + min(end, array.nbytes)
+
+
+def _madvise(address: int, length: int, advice: int) -> None:
+    if _LIBC.madvise(address, length, advice):
+        code = ctypes.get_errno()
+        raise OSError(code, f"madvise({advice}) of {length} bytes: {os.strerror(code)}")

@@ -1,8 +1,7 @@
 """Open a finished store and gather batches from it at memory speed."""
 
-import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import threading
+from collections.abc import Collection, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -10,32 +9,15 @@ from typing import Any
 import numpy as np
 import zarr
 from numpy.typing import NDArray
+from torch import Tensor
 
 from pipeline.errors import StoreIncomplete, StoreMismatch
 from pipeline.store.batch import Batch
-from pipeline.store.gather import Gatherer
-from pipeline.store.mapping import map_flat
+from pipeline.store.chunks import MEND
+from pipeline.store.episodes import Episode, read_episodes
+from pipeline.store.gather import Gatherer, Selection
+from pipeline.store.mapping import map_flat, populate
 from pipeline.store.schema import SCHEMA, TRAILER_BYTES, ArraySpec, chunk_paths, read_specs
-
-
-@dataclass(frozen=True)
-class Episode:
-    """One episode and the rows of each array that belong to it."""
-
-    index: int
-    id: str
-    source: str
-    path: str
-    format: str
-    instruction: str
-    content: str
-    """Digest of its files."""
-    digest: str
-    """Digest of its content and of everything else that decides its rows."""
-    ticks: range
-    vl_rows: range
-    readings: range
-    states: range
 
 
 class FeatureStore:
@@ -48,6 +30,7 @@ class FeatureStore:
         self.path = path
         self.attrs = attrs
         self._arrays = arrays
+        self._warmed = False
 
     @classmethod
     def open(cls, path: str | Path) -> "FeatureStore":
@@ -68,6 +51,12 @@ class FeatureStore:
                 f"{root / 'zarr.json'}: not a zarr group's metadata ({error}). Remove {root} and "
                 "run stages.extract again."
             ) from None
+        if "archive" in attrs:
+            raise StoreMismatch(
+                f"{root}: expected a store, found an archive of one. stages.train_head and "
+                "stages.evaluate restore it where train_head.feed is auto or compressed; to make "
+                f"the store of it: python -m stages.archive --restore --set archive.output={root}"
+            )
         if attrs.get("schema") != SCHEMA:
             raise StoreMismatch(
                 f"{root}: expected store schema {SCHEMA}, found {attrs.get('schema')!r}. "
@@ -142,28 +131,7 @@ class FeatureStore:
     @cached_property
     def episodes(self) -> tuple[Episode, ...]:
         """All episodes, in order."""
-        edges = {
-            kind: self._arrays[f"episode/{kind}_start"].tolist()
-            for kind in ("tick", "vl", "sensor", "state", "text")
-        }
-        text = self._arrays["episode/text"].tobytes()
-        source = self._arrays["episode/source"]
-        found = []
-        for index in range(len(source)):
-            rows = {kind: range(edge[index], edge[index + 1]) for kind, edge in edges.items()}
-            said = json.loads(text[rows["text"].start : rows["text"].stop])
-            found.append(
-                Episode(
-                    index=index,
-                    source=self.sources[source[index]],
-                    ticks=rows["tick"],
-                    vl_rows=rows["vl"],
-                    readings=rows["sensor"],
-                    states=rows["state"],
-                    **said,
-                )
-            )
-        return tuple(found)
+        return read_episodes(self._arrays, self.sources)
 
     def episode_of(self, ticks: NDArray[np.int64]) -> NDArray[np.int64]:
         """The index of the episode of each of these store-global ticks."""
@@ -191,29 +159,71 @@ class FeatureStore:
         Raises `IndexError` for a tick the store does not have and `ValueError` for a variant it
         does not have, an `out` of other sizes, or a negative lag, which would show the future.
         """
-        if min(feature_lag, sensor_lag_s, state_lag_s) < 0:
+        lags = (feature_lag, sensor_lag_s, state_lag_s)
+        batch, selection = self.select(
+            ticks, (horizon, sensor_window, state_window), lags, out, variants
+        )
+        self.copy(selection, batch)
+        return batch
+
+    def select(
+        self,
+        ticks: Sequence[int] | NDArray[np.int64],
+        windows: tuple[int, int, int],
+        lags: tuple[int, float, float],
+        out: Batch | None,
+        variants: NDArray[np.int64] | None,
+    ) -> tuple[Batch, Selection]:
+        """The first half of `gather`: all but the wide fields of a batch, and where those lie."""
+        if min(lags) < 0:
             raise ValueError(
-                f"a lag goes back in time and cannot be negative: feature_lag={feature_lag}, "
-                f"sensor_lag_s={sensor_lag_s}, state_lag_s={state_lag_s}"
+                "a lag goes back in time and cannot be negative: "
+                "feature_lag={}, sensor_lag_s={}, state_lag_s={}".format(*lags)
             )
         tick = np.asarray(ticks, np.int64)
         if tick.size and (tick.min() < 0 or tick.max() >= self.ticks):
             raise IndexError(f"{self.path}: ticks lie in 0..{self.ticks - 1}, asked for {tick}")
         if variants is not None:
             self._check_variants(variants, len(tick))
-        sizes = (len(tick), horizon, sensor_window, state_window)
+        sizes = (len(tick), *windows)
         batch = self.empty_batch(*sizes) if out is None else out
         if batch.sizes != sizes:
             raise ValueError(
                 "`out` has (batch, horizon, sensor_window, state_window) "
                 f"{batch.sizes}, asked for {sizes}"
             )
-        self._gatherer.gather(batch, tick, feature_lag, sensor_lag_s, state_lag_s, variants)
-        return batch
+        return batch, self._gatherer.select(batch, tick, *lags, variants)
 
-    def empty_batch(self, batch: int, horizon: int, sensor_window: int, state_window: int) -> Batch:
-        """Buffers for `gather(..., out=)`."""
-        return self._gatherer.empty_batch(batch, horizon, sensor_window, state_window)
+    def copy(self, selection: Selection, batch: Batch, but: Collection[str] = ()) -> None:
+        """The second half of `gather`: the wide fields of `batch`, without those named in `but`."""
+        self._gatherer.copy(selection, batch, but)
+
+    def empty_batch(
+        self,
+        batch: int,
+        horizon: int,
+        sensor_window: int,
+        state_window: int,
+        but: Collection[str] = (),
+    ) -> Batch:
+        """Buffers for `gather(..., out=)`; those named in `but` have a shape, but no memory."""
+        return self._gatherer.empty_batch(batch, horizon, sensor_window, state_window, but)
+
+    def tensor(self, field: str) -> Tensor:
+        """The map that a wide field of a batch (`WIDE`) is gathered from, row by row."""
+        return self._gatherer.tensor(field)
+
+    def warm(self, but: Collection[str] = ()) -> None:
+        """Begin to read what memory has room for, once, in the background; no field of `but`.
+
+        The thread that reads ends with the process, and a forked one does without it: page faults
+        bring what it has not read.
+        """
+        if not self._warmed:
+            self._warmed = True
+            fields = [field for field in self._gatherer.in_memory if field not in but]
+            arrays = [self._gatherer.array(field) for field in fields]
+            threading.Thread(target=_populate, args=(arrays,), name="warm", daemon=True).start()
 
     @cached_property
     def _gatherer(self) -> Gatherer:
@@ -231,6 +241,11 @@ class FeatureStore:
             )
 
 
+def _populate(arrays: Sequence[NDArray[Any]]) -> None:
+    for array in arrays:
+        populate(array)
+
+
 def _mapped(root: Path, spec: ArraySpec) -> NDArray[Any]:
     paths = chunk_paths(root, spec)
     wanted = spec.chunk_bytes + TRAILER_BYTES
@@ -239,7 +254,6 @@ def _mapped(root: Path, spec: ArraySpec) -> NDArray[Any]:
         if size != wanted:
             found = "no file" if size is None else f"{size} bytes"
             raise StoreIncomplete(
-                f"{path}: expected {wanted} bytes, found {found}. The store is damaged: remove "
-                f"{root} and run stages.extract again."
+                f"{path}: expected {wanted} bytes, found {found}. The store is damaged. {MEND}"
             )
     return map_flat(paths, spec.chunk_bytes, spec.shape, spec.dtype)

@@ -1,13 +1,13 @@
 """Where a training's features come from: the seam between one loop and its two ways."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
 import torch
 from torch import nn
 
-from pipeline.batches import Draw, Feed, Prefetch, Windows
+from pipeline.batches import Draw, Feed, Prefetch, Resident, Windows
 from pipeline.models import Policy
 from pipeline.models.policy import Trainable
 from pipeline.store import FeatureStore
@@ -43,13 +43,19 @@ class Front(Protocol):
 
 
 class Cached:
-    """Features from the store: the policy is all that is trained, kept and saved."""
+    """Features from the store: the policy is all that is trained, kept and saved.
+
+    The wide fields of a batch that `on_device` names live on the device that is fed; they are
+    copied to it when the first batches are asked for, once for all feeds.
+    """
 
     identity: Mapping[str, Any] = {}
     eval_ticks: int | None = None
 
-    def __init__(self, store: FeatureStore) -> None:
+    def __init__(self, store: FeatureStore, on_device: Collection[str] = ()) -> None:
         self._store = store
+        self._on_device = on_device
+        self._resident: Resident | None = None
 
     def attach(self, policy: Policy) -> Trainable:
         """The policy itself."""
@@ -65,8 +71,10 @@ class Cached:
         return None
 
     def feed(self, plan: Iterable[Draw], windows: Windows, device: torch.device) -> Feed:
-        """Batches of the store, gathered ahead of time."""
-        return Prefetch(self._store, plan, windows, device)
+        """Batches of the store, gathered ahead of time or on the device."""
+        if self._on_device and self._resident is None:
+            self._resident = Resident(self._store, self._on_device, device)
+        return Prefetch(self._store, plan, windows, device, resident=self._resident)
 
     def save(self, folder: Path, module: nn.Module) -> None:
         """Nothing: the policy's files say it all."""

@@ -9,7 +9,7 @@ import torch
 from torch import nn
 from tqdm import tqdm
 
-from pipeline.batches import Draw, Windows
+from pipeline.batches import Draw, Windows, choose_feed
 from pipeline.checkpoint import policy_shape
 from pipeline.config import TrainHeadParams
 from pipeline.errors import NumericsError
@@ -54,9 +54,14 @@ class Trainer:
         front: Front | None = None,
     ) -> None:
         self.store, self.params, self.split, self.run = store, params, split, run
-        self.front = Cached(store) if front is None else front
         self.world = World.current()
         self.device = process_device(params.device)
+        self._feed_note: list[str] = []
+        if front is None:
+            chosen = choose_feed(params.feed, store, self.device)
+            self._feed_note = [chosen.why]
+            front = Cached(store, chosen.on_device)
+        self.front = front
         self.plan = Plan(store, params, split, self.world, run.section)
         self.step = 0
         self.standing = Standing.of(params, split)
@@ -121,6 +126,7 @@ class Trainer:
         return [
             *describe_data(self.store, self.shape, self.params, self.split),
             *describe_learner(self.learner, self.policy),
+            *self._feed_note,
             f"device {self.device}{several}, {precision}"
             f"{', compiled' if self.params.compile else ''}; "
             f"steps {self.step} to {self.params.max_steps}",

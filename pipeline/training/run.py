@@ -5,13 +5,10 @@ is finished. DVC deletes an output before it runs a stage, but not the `.part` b
 stopped run goes on under `dvc repro` too.
 """
 
-import hashlib
-import json
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Literal
 
 from pipeline.checkpoint import (
@@ -21,25 +18,15 @@ from pipeline.checkpoint import (
     differences,
     load_policy,
     source_differences,
-    source_of,
 )
 from pipeline.config import TrainHeadParams
 from pipeline.durable import damaged, read_document, recover_folder, write_document
 from pipeline.errors import CheckpointIncomplete, CheckpointMismatch, ConfigError
 from pipeline.store import FeatureStore
-from pipeline.training.world import World
+from pipeline.training.identity import NOTHING, run_identity
 
-TRAINER_VERSION = 2
-"""Raised with every change of code that changes the numbers of a run: part of its identity, so
-that no run goes on under code other than it began with."""
 RUN, BEST, LAST = "run.json", "best", "last"
 TRAINER_WEIGHTS, TRAINER_DOCUMENT = "trainer.safetensors", "trainer.json"
-FREE_PARAMS = {"device", "output", "logs", "checkpoint_every", "store", "grad_accumulation"}
-"""Params that may change between a stop and the next start: they decide no number of the run, or
-not alone: `parts`, accumulation times processes, stands for the last."""
-
-_NOTHING: Mapping[str, Any] = MappingProxyType({})
-
 Status = Literal["new", "resumed", "finished"]
 
 
@@ -102,7 +89,7 @@ class Run:
 def open_run(
     params: TrainHeadParams,
     store: FeatureStore,
-    extra_identity: Mapping[str, Any] = _NOTHING,
+    extra_identity: Mapping[str, Any] = NOTHING,
     section: str = "train_head",
 ) -> Run:
     """The run of these params on this store: new, resumed or finished.
@@ -147,27 +134,6 @@ def open_run(
             notes.append(f"resuming the run in {part}")
             return Run(output, "resumed", tuple(notes), identity, section)
     return Run(output, "new", tuple(notes), identity, section)
-
-
-def run_identity(
-    params: TrainHeadParams, store: FeatureStore, extra_identity: Mapping[str, Any] = _NOTHING
-) -> dict[str, Any]:
-    """Everything that decides the numbers of a run, as JSON."""
-    episodes = [[e.source, e.id, e.digest, len(e.ticks)] for e in store.episodes]
-    digest = hashlib.blake2b(json.dumps(episodes).encode(), digest_size=16)
-    digest.update(store.array("vl/key").tobytes())
-    decides = {
-        "trainer_version": TRAINER_VERSION,
-        "train_head": params.model_dump(mode="json", exclude=FREE_PARAMS),
-        "parts": World.current().size * params.grad_accumulation,
-        "front": dict(extra_identity),
-        "recordings": {
-            "episodes": len(store.episodes),
-            "ticks": store.ticks,
-            "digest": digest.hexdigest(),
-        },
-    }
-    return json.loads(json.dumps({"source": source_of(store), "decides": decides}))
 
 
 def _finished_identity(output: Path, section: str) -> Mapping[str, Any] | None:

@@ -1,6 +1,6 @@
 """The normalisation, fitted on what training may see and nothing else."""
 
-from collections.abc import Iterator
+from functools import partial
 from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
@@ -11,10 +11,12 @@ from tqdm import tqdm
 from pipeline.batches import Ticks
 from pipeline.errors import NumericsError
 from pipeline.evaluation import place
-from pipeline.normalization import ChannelStatistics, Normalization, fit_channels
+from pipeline.normalization import Block, ChannelStatistics, Normalization, fit_channels
 from pipeline.store import FeatureStore
 
 CHUNK_BYTES = 64 * 2**20
+THREAD_BYTES = 2**20
+"""Of a part on average, below which it costs more to hand it to a thread than to read it."""
 Rows = range | NDArray[np.int64]
 """Rows of one of the store's arrays."""
 
@@ -27,25 +29,29 @@ class _Chunk(NamedTuple):
     """(row, slot) of features: False for what is neither checked nor counted."""
 
 
-def fit_normalization(store: FeatureStore, ticks: Ticks) -> Normalization:
+def fit_normalization(
+    store: FeatureStore, ticks: Ticks, threads: int | None = None
+) -> Normalization:
     """Statistics per channel over the training `ticks` and what was known at them.
 
     Features over the VL rows that these ticks use, each once, and over all its variants alike, so
     (slot, dim) of one variant; sensor and state over the readings from each episode's start to the
-    last of its ticks; a stream that none of them has, has none. Reads the store once, a chunk of
-    about 64 MB at a time, with a bar on a terminal. Raises `NumericsError` on NaN or inf, naming
-    episode, tick or reading, time and channel.
+    last of its ticks; a stream that none of them has, has none. Reads the store once, in chunks of
+    about 64 MB, a few at a time on `threads` threads (as many as torch has, where None), with a bar
+    on a terminal; the same bits for any number of them. Raises `NumericsError` on NaN or inf,
+    naming episode, tick or reading, time and channel.
     """
+    threads = torch.get_num_threads() if threads is None else threads
     parts: dict[str, list[Rows]] = {
-        "tick": _split(store.array("tick/action"), ticks),
-        "vl": _split(store.array("vl/features"), np.unique(store.array("tick/vl_row")[ticks])),
+        "tick": _split(_array(store, "tick"), ticks),
+        "vl": _split(_array(store, "vl"), np.unique(store.array("tick/vl_row")[ticks])),
         "sensor": _readings(store, ticks, "sensor"),
         "state": _readings(store, ticks, "state"),
     }
     total = sum(len(rows) for several in parts.values() for rows in several)
     with tqdm(total=total, desc="normalisation", unit="row", leave=False, disable=None) as bar:
         fitted = {
-            stream: _fit(store, stream, several, bar)
+            stream: _fit(store, stream, several, bar, threads)
             for stream, several in parts.items()
             if several or stream == "tick"
         }
@@ -53,24 +59,27 @@ def fit_normalization(store: FeatureStore, ticks: Ticks) -> Normalization:
 
 
 def _fit(
-    store: FeatureStore, stream: str, parts: list[Rows], bar: "tqdm[NoReturn]"
+    store: FeatureStore, stream: str, parts: list[Rows], bar: "tqdm[NoReturn]", threads: int
 ) -> ChannelStatistics:
     what = {"tick": "training actions", "vl": "training features"}.get(
         stream, f"training readings of {stream}"
     )
 
-    def chunks() -> Iterator[Any]:
-        for chunk in _chunks(store, stream, parts):
-            yield chunk.values if chunk.valid is None else (chunk.values, chunk.valid)
-            bar.update(len(chunk.rows))
+    def read(rows: Rows) -> Block:
+        chunk = _chunk(store, stream, rows)
+        bar.update(len(rows))
+        return chunk.values if chunk.valid is None else (chunk.values, chunk.valid)
 
+    array = _array(store, stream)
+    size = sum(map(len, parts)) * array.dtype.itemsize * int(np.prod(array.shape[1:]))
+    threads = threads if size >= THREAD_BYTES * len(parts) else 1
     names = None if stream == "vl" else store.streams[_streams_entry(stream)]["names"]
     try:
-        return fit_channels(chunks(), what, names)
+        return fit_channels([partial(read, rows) for rows in parts], what, names, threads)
     except NumericsError:
         # It knows the row of what it was given, which says nothing to who made the recordings.
-        for chunk in _chunks(store, stream, parts):
-            _refuse_not_finite(store, stream, chunk, what)
+        for rows in parts:
+            _refuse_not_finite(store, stream, _chunk(store, stream, rows), what)
         raise
 
 
@@ -110,17 +119,18 @@ def _readings(store: FeatureStore, ticks: Ticks, stream: str) -> list[Rows]:
     return [range(starts[index], ends[index]) for index in np.flatnonzero(ends > starts)]
 
 
-def _chunks(store: FeatureStore, stream: str, parts: list[Rows]) -> Iterator[_Chunk]:
-    array = store.array(
-        {"tick": "tick/action", "vl": "vl/features"}.get(stream, f"{stream}/values")
-    )
-    for rows in parts:
-        values = array[rows.start : rows.stop] if isinstance(rows, range) else array[rows]
-        if values.dtype == np.uint16:
-            values = torch.from_numpy(values).view(torch.bfloat16).float().numpy()
-        valid = None
-        if stream == "vl":
-            slots = (-1, store.feature_shape[0])
-            values = values.reshape(*slots, values.shape[-1])
-            valid = store.array("vl/slot_valid")[rows].reshape(slots).astype(bool)
-        yield _Chunk(rows, values, valid)
+def _chunk(store: FeatureStore, stream: str, rows: Rows) -> _Chunk:
+    array = _array(store, stream)
+    values = array[rows.start : rows.stop] if isinstance(rows, range) else array[rows]
+    if values.dtype == np.uint16:
+        values = torch.from_numpy(values).view(torch.bfloat16).float().numpy()
+    valid = None
+    if stream == "vl":
+        slots = (-1, store.feature_shape[0])
+        values = values.reshape(*slots, values.shape[-1])
+        valid = store.array("vl/slot_valid")[rows].reshape(slots).astype(bool)
+    return _Chunk(rows, values, valid)
+
+
+def _array(store: FeatureStore, stream: str) -> NDArray[Any]:
+    return store.array({"tick": "tick/action", "vl": "vl/features"}.get(stream, f"{stream}/values"))

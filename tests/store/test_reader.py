@@ -1,6 +1,11 @@
 """The reader agrees with plain zarr, and gathers what a loop over ticks would gather."""
 
+import multiprocessing
+import os
 import pickle
+import subprocess
+import sys
+import threading
 from pathlib import Path
 
 import dask.array
@@ -239,3 +244,88 @@ class TestOpen:
         zarr.open_group(path, mode="r+").attrs["schema"] = 99
         with pytest.raises(StoreMismatch, match="99"):
             FeatureStore.open(path)
+
+
+def gathered(store: FeatureStore, ticks: list[int], answers) -> None:
+    """What a worker process does."""
+    batch = store.gather(ticks, sensor_window=9)
+    answers.put({name: value.numpy().tobytes() for name, value in vars(batch).items()})
+
+
+class TestProcesses:
+    @pytest.mark.parametrize("method", ["fork", "spawn", "forkserver"])
+    def test_workers_gather_what_their_parent_gathers(self, path, method):
+        store = FeatureStore.open(path)
+        store.gather([0])
+        store.warm()
+        context = multiprocessing.get_context(method)
+        answers = context.Queue()
+        worker = context.Process(target=gathered, args=(store, [0, 7, 100], answers))
+        worker.start()
+        found = answers.get(timeout=60)
+        worker.join()
+        assert worker.exitcode == 0
+        batch = store.gather([0, 7, 100], sensor_window=9)
+        assert found == {name: value.numpy().tobytes() for name, value in vars(batch).items()}
+
+    def test_a_fork_does_not_wait_for_threads_that_it_does_not_have(self, path):
+        program = f"""
+import os, signal, sys
+import numpy as np, torch
+from pipeline.store import FeatureStore
+torch.set_num_threads(2)
+store = FeatureStore.open({str(path)!r})
+ticks = np.tile(np.arange(store.ticks), 20)
+expected = store.gather(ticks).sensor  # large enough for all threads
+if os.fork() == 0:
+    signal.alarm(20)
+    os._exit(0 if torch.equal(store.gather(ticks).sensor, expected) else 3)
+sys.exit(os.waitstatus_to_exitcode(os.wait()[1]))
+"""
+        environment = {**os.environ, "OMP_NUM_THREADS": "2"}
+        subprocess.run([sys.executable, "-c", program], check=True, env=environment, timeout=60)
+
+
+class TestMemory:
+    def test_a_store_larger_than_memory_gives_the_same(self, path, store, monkeypatch):
+        asked = []
+        monkeypatch.setattr("pipeline.store.gather.available_bytes", lambda: 0)
+        monkeypatch.setattr(
+            "pipeline.store.gather.will_need",
+            lambda array, first, rows: asked.append((array.shape, first.tolist(), rows)),
+        )
+        large = FeatureStore.open(path)
+        batch = large.gather([31, 95], horizon=2, sensor_window=9, state_window=5)
+        expected = store.gather([31, 95], horizon=2, sensor_window=9, state_window=5)
+        for name, value in vars(expected).items():
+            assert torch.equal(getattr(batch, name), value)
+        ends = store.array("tick/sensor_end")[[31, 95]]
+        assert (store.array("sensor/values").shape, (ends - 9).tolist(), 9) in asked
+        rows = store.array("tick/vl_row")[[31, 95]].tolist()
+        assert (store.array("vl/features").shape, rows, 1) in asked
+        assert len(asked) == 4
+
+    def test_rows_of_variants_are_asked_for_by_their_row(self, varied, monkeypatch):
+        asked = []
+        monkeypatch.setattr("pipeline.store.gather.available_bytes", lambda: 0)
+        monkeypatch.setattr(
+            "pipeline.store.gather.will_need",
+            lambda array, first, rows: asked.append((array.shape, first.tolist(), rows)),
+        )
+        large = FeatureStore.open(varied.path)
+        large.gather([30, 60], variants=np.array([2, 1]))
+        rows = varied.array("tick/vl_row")[[30, 60]].tolist()
+        assert (varied.array("vl/features").shape, rows, 1) in asked
+
+    def test_what_fits_is_read_once_in_the_background(self, path, monkeypatch):
+        read = []
+        monkeypatch.setattr("pipeline.store.reader.populate", lambda array: read.append(array))
+        store = FeatureStore.open(path)
+        for _ in range(2):
+            store.warm(but={"sensor"})
+        for thread in threading.enumerate():
+            if thread.name == "warm":
+                thread.join()
+        names = ("tick/action", "vl/features", "state/values")
+        assert {id(array) for array in read} == {id(store.array(name)) for name in names}
+        assert len(read) == 3

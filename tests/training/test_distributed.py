@@ -52,7 +52,7 @@ def fit(self):
     fitted(self)
 
 if place == f"open {rank}":
-    train_head.FeatureStore.open = fail
+    train_head.open_store = fail
 if place == f"step {rank}":
     loop.Trainer.fit = fit
 sys.exit(run("", train_head.main, sys.argv[1:]))

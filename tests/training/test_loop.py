@@ -22,7 +22,7 @@ from pipeline.evaluation import judge
 from pipeline.store import FeatureStore
 from pipeline.training import Trainer
 from pipeline.training.checkpoints import Checkpoints
-from pipeline.training.run import TRAINER_VERSION
+from pipeline.training.identity import TRAINER_VERSION
 from pipeline.training.state import read_trainer
 
 Make = Callable[..., Any]
@@ -242,7 +242,9 @@ def test_the_golden_run(store: FeatureStore, params: Make, trainer: Make) -> Non
         pytest.fail(f"{GOLDEN.name} was missing and has been written: run the test again")
     golden = json.loads(GOLDEN.read_text())
     assert golden["trainer"] == TRAINER_VERSION, f"delete {GOLDEN.name} and run the test again"
-    changed = "other numbers: if that is meant, raise TRAINER_VERSION in pipeline/training/run.py"
+    changed = (
+        "other numbers: if that is meant, raise TRAINER_VERSION in pipeline/training/identity.py"
+    )
     if golden["machine"] == machine:
         assert losses(done) == golden["losses"], changed
     assert losses(done) == pytest.approx(golden["losses"], rel=1e-4), changed

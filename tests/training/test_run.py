@@ -237,7 +237,7 @@ def test_a_run_without_a_checkpoint_refuses_no_other_store(
 def test_code_of_other_numbers_goes_on_with_no_run(
     store: FeatureStore, params: Make, unfinished: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.training.run.TRAINER_VERSION", 99)
+    monkeypatch.setattr("pipeline.training.identity.TRAINER_VERSION", 99)
     run = open_run(params(), store)
     assert run.status == "new"
     assert "trainer_version: 2 (that run), 99 (now)" in run.notes[0]

@@ -106,3 +106,24 @@ def test_a_number_that_is_none_is_named_by_episode_and_time(
 def test_no_ticks_are_no_statistics(tiny_store: Callable[..., Path], tmp_path: Path) -> None:
     with pytest.raises(NumericsError, match="no rows"):
         fit_normalization(FeatureStore.open(tiny_store(tmp_path)), np.arange(0))
+
+
+@pytest.mark.parametrize("chunk_bytes", [300, 2**26])
+def test_threads_change_no_bit(
+    tiny_store: Callable[..., Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    chunk_bytes: int,
+) -> None:
+    monkeypatch.setattr("pipeline.training.statistics.CHUNK_BYTES", chunk_bytes)
+    monkeypatch.setattr("pipeline.training.statistics.THREAD_BYTES", 0)
+    monkeypatch.setattr("pipeline.normalization._PIECE_VALUES", 40)
+    store = FeatureStore.open(tiny_store(tmp_path))
+    store.array("vl/slot_valid")[12, 1] = 0
+    ticks = np.arange(20, 160)
+    alone = fit_normalization(store, ticks, threads=1).document()
+    assert fit_normalization(store, ticks, threads=3).document() == alone
+
+    store.array("state/values")[121, 0] = np.inf
+    with pytest.raises(NumericsError, match=r"episode_001, state reading 1 \(at 0.025 s\)"):
+        fit_normalization(store, ticks, threads=3)

@@ -10,61 +10,14 @@ import time
 from collections.abc import Iterable, Iterator
 from dataclasses import astuple, dataclass
 from types import TracebackType
-from typing import Protocol, Self
+from typing import Self
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from pipeline.config import TrainHeadParams
+from pipeline.batches.draw import NO_LAGS, Draw, Lags, Windows
+from pipeline.batches.resident import Resident
 from pipeline.store import Batch, FeatureStore
-
-Ticks = NDArray[np.int64]
-
-
-@dataclass(frozen=True, eq=False)
-class Draw:
-    """What one batch is made of."""
-
-    ticks: Ticks
-    """(batch,) store-global."""
-    variants: NDArray[np.int64] | None = None
-    """(batch,) which stored variant of its VL row each tick sees; None: all 0, the plain frames."""
-
-
-def draws(ticks: Ticks, batch_size: int) -> list[Draw]:
-    """The ticks in their order, `batch_size` at a time."""
-    return [Draw(part) for part in np.split(ticks, range(batch_size, len(ticks), batch_size))]
-
-
-@dataclass(frozen=True)
-class Lags:
-    """How late each stream is: `features` in whole VL rows, the others in seconds."""
-
-    features: int = 0
-    sensor_s: float = 0.0
-    state_s: float = 0.0
-
-
-NO_LAGS = Lags()
-
-
-@dataclass(frozen=True)
-class Windows:
-    """How much of each stream a sample sees, in ticks (`horizon`) and readings."""
-
-    horizon: int
-    sensor_window: int
-    state_window: int
-
-    @classmethod
-    def of(cls, params: TrainHeadParams) -> Self:
-        """What this policy needs; of a stream whose encoder is off, a single reading."""
-        return cls(
-            params.horizon,
-            params.sensor_window if params.sensor_enabled else 1,
-            params.state_window if params.robot_state_enabled else 1,
-        )
+from pipeline.store.gather import Selection
 
 
 @dataclass
@@ -72,25 +25,11 @@ class _Buffer:
     """A reused host batch, and the copy out of it that has to end before it is filled again."""
 
     batch: Batch | None = None
+    selection: Selection | None = None
+    """Where what the batch still lacks lies on the device."""
+    whole: Batch | None = None
+    """With that too; on CUDA only made when it is handed out."""
     copied: torch.cuda.Event | None = None
-
-
-class Feed(Protocol):
-    """Batches in the order of a plan: what a training and an evaluation iterate over."""
-
-    waited_s: float
-    """Time that the consumer has spent waiting for data."""
-
-    def __enter__(self) -> Self: ...
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None: ...
-
-    def __iter__(self) -> Iterator[tuple[Draw, Batch]]: ...
 
 
 class Prefetch(Iterator[tuple[Draw, Batch]]):
@@ -99,7 +38,12 @@ class Prefetch(Iterator[tuple[Draw, Batch]]):
     The plan is consumed in the background thread, at most `buffers` draws ahead. On the CPU a
     batch stays as it is until the next one is asked for; on CUDA it is a copy on the device, made
     from pinned memory, that is never overwritten. An exception in the plan or in the store comes
-    out of `next` at the batch it belongs to. Use as a context manager, or call `close`.
+    out of `next` at the batch it belongs to. Use as a context manager, or call `close`. The thread
+    does not survive a fork: a forked process reads from the same store with a `Prefetch` it makes.
+
+    What `resident` holds of the store is gathered on its device, into fresh memory; on CUDA when
+    the batch is handed out, in the order of the consumer's stream. The rest of the store is read
+    into memory in the background, as far as it fits.
     """
 
     def __init__(
@@ -110,6 +54,7 @@ class Prefetch(Iterator[tuple[Draw, Batch]]):
         device: torch.device,
         buffers: int = 2,
         lags: Lags = NO_LAGS,
+        resident: Resident | None = None,
     ) -> None:
         assert buffers >= 2, "one buffer in use, one being filled"
         self.waited_s = 0.0
@@ -118,6 +63,8 @@ class Prefetch(Iterator[tuple[Draw, Batch]]):
         self._windows = windows
         self._lags = lags
         self._device = device
+        self._resident = resident
+        self._on_device = frozenset[str]() if resident is None else resident.fields
         self._free: queue.SimpleQueue[_Buffer | None] = queue.SimpleQueue()
         self._filled: queue.SimpleQueue[tuple[Draw, _Buffer] | BaseException | None] = (
             queue.SimpleQueue()
@@ -144,9 +91,11 @@ class Prefetch(Iterator[tuple[Draw, Batch]]):
             if item is None:
                 raise StopIteration
             raise item
-        draw, buffer = item
-        self._in_use = buffer
-        return draw, self._deliver(buffer)
+        draw, self._in_use = item
+        started = time.perf_counter()
+        batch = self._deliver(self._in_use)
+        self.waited_s += time.perf_counter() - started
+        return draw, batch
 
     def close(self) -> None:
         """Stop the thread and wait for it; the last batch handed out stays valid."""
@@ -167,14 +116,19 @@ class Prefetch(Iterator[tuple[Draw, Batch]]):
         self.close()
 
     def _deliver(self, buffer: _Buffer) -> Batch:
-        assert buffer.batch is not None
         if self._device.type == "cpu":
-            return buffer.batch
-        delivered = buffer.batch.to(self._device, non_blocking=self._device.type == "cuda")
-        if self._device.type == "cuda":
-            buffer.copied = torch.cuda.Event()
-            buffer.copied.record(torch.cuda.current_stream(self._device))
+            assert buffer.whole is not None
+            return buffer.whole
+        delivered = self._complete(buffer).to(self._device, non_blocking=True)
+        buffer.copied = torch.cuda.Event()
+        buffer.copied.record(torch.cuda.current_stream(self._device))
         return delivered
+
+    def _complete(self, buffer: _Buffer) -> Batch:
+        assert buffer.batch is not None and buffer.selection is not None
+        if self._resident is None:
+            return buffer.batch
+        return self._resident.complete(buffer.batch, buffer.selection)
 
     def _release(self) -> None:
         if self._in_use is not None:
@@ -183,6 +137,7 @@ class Prefetch(Iterator[tuple[Draw, Batch]]):
 
     def _work(self, plan: Iterable[Draw]) -> None:
         try:
+            self._store.warm(but=self._on_device)
             for draw in plan:
                 buffer = self._free.get()
                 if buffer is None or self._closing.is_set():
@@ -196,16 +151,13 @@ class Prefetch(Iterator[tuple[Draw, Batch]]):
     def _fill(self, buffer: _Buffer, draw: Draw) -> None:
         if buffer.copied is not None:
             buffer.copied.synchronize()
-        sizes = astuple(self._windows)
-        if buffer.batch is None or len(buffer.batch) != len(draw.ticks):
-            empty = self._store.empty_batch(len(draw.ticks), *sizes)
-            buffer.batch = empty.pin() if self._device.type == "cuda" else empty
-        self._store.gather(
-            draw.ticks,
-            *sizes,
-            feature_lag=self._lags.features,
-            sensor_lag_s=self._lags.sensor_s,
-            state_lag_s=self._lags.state_s,
-            variants=draw.variants,
-            out=buffer.batch,
+        windows, count = astuple(self._windows), len(draw.ticks)
+        if buffer.batch is None or len(buffer.batch) != count:
+            empty = self._store.empty_batch(count, *windows, but=self._on_device)
+            buffer.batch = empty.pin() if self._device.type == "cuda" else empty.touch()
+        _, buffer.selection = self._store.select(
+            draw.ticks, windows, astuple(self._lags), buffer.batch, draw.variants
         )
+        self._store.copy(buffer.selection, buffer.batch, but=self._on_device)
+        if self._device.type == "cpu":
+            buffer.whole = self._complete(buffer)

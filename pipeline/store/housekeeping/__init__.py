@@ -1,0 +1,19 @@
+"""What lies in a folder of stores, and what of it nothing needs any more.
+
+`inventory` takes stock, `contents` says what an entry holds, `listing` shows it to people,
+`leftovers` finds and removes what is of no use.
+"""
+
+from pipeline.store.housekeeping.inventory import Inventory, take_inventory
+from pipeline.store.housekeeping.leftovers import kept_back, leftovers, remove
+from pipeline.store.housekeeping.listing import size, table
+
+__all__ = [
+    "Inventory",
+    "kept_back",
+    "leftovers",
+    "remove",
+    "size",
+    "table",
+    "take_inventory",
+]

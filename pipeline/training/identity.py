@@ -1,0 +1,57 @@
+"""What decides the numbers of a training run: only a run of the same goes on."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+from pipeline.checkpoint import source_of
+from pipeline.config import TrainHeadParams
+from pipeline.store import FeatureStore
+from pipeline.training.world import World
+
+TRAINER_VERSION = 2
+"""Raised with every change of code that changes the numbers of a run: part of its identity, so
+that no run goes on under code other than it began with."""
+FREE_PARAMS = {
+    "device",
+    "feed",
+    "check_store",
+    "scratch",
+    "output",
+    "logs",
+    "checkpoint_every",
+    "store",
+    "grad_accumulation",
+}
+"""Params that may change between a stop and the next start: they decide no number of the run, or
+not alone: `parts`, accumulation times processes, stands for the last."""
+
+NOTHING: Mapping[str, Any] = MappingProxyType({})
+
+
+def run_identity(
+    params: TrainHeadParams, store: FeatureStore, extra_identity: Mapping[str, Any] = NOTHING
+) -> dict[str, Any]:
+    """Everything that decides the numbers of a run, as JSON."""
+    decides = {
+        "trainer_version": TRAINER_VERSION,
+        "train_head": params.model_dump(mode="json", exclude=FREE_PARAMS),
+        "parts": World.current().size * params.grad_accumulation,
+        "front": dict(extra_identity),
+        "recordings": recordings_of(store),
+    }
+    return json.loads(json.dumps({"source": source_of(store), "decides": decides}))
+
+
+def recordings_of(store: FeatureStore) -> dict[str, Any]:
+    """Which episodes and rows a store holds, as a run remembers it."""
+    episodes = [[e.source, e.id, e.digest, len(e.ticks)] for e in store.episodes]
+    digest = hashlib.blake2b(json.dumps(episodes).encode(), digest_size=16)
+    digest.update(store.array("vl/key").tobytes())
+    return {
+        "episodes": len(store.episodes),
+        "ticks": store.ticks,
+        "digest": digest.hexdigest(),
+    }

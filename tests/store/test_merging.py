@@ -1,0 +1,406 @@
+"""Two stores become one, episode by episode and row by row, and nothing is computed."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+
+from pipeline.errors import ConfigError, DiskFull, StoreIncomplete, StoreLocked, StoreMismatch
+from pipeline.store import FeatureStore, StoreBuild, build_lock
+from pipeline.store.merging import merge
+from pipeline.store.schema import ARRAY_NAMES
+
+Make = Callable[..., Path]
+WINDOWS = {"horizon": 3, "sensor_window": 6, "state_window": 5}
+
+
+def quiet(line: str) -> None:
+    """Says nothing."""
+
+
+def of_episode(store: FeatureStore, episode) -> dict[str, np.ndarray]:
+    """Everything a store holds of an episode, indices counted from the episode's own beginning."""
+    rows = {
+        "tick": episode.ticks,
+        "vl": episode.vl_rows,
+        "sensor": episode.readings,
+        "state": episode.states,
+    }
+    counted = {"tick/vl_row": "vl", "tick/sensor_end": "sensor", "tick/state_end": "state"}
+    held = {}
+    for name in ARRAY_NAMES:
+        kind = name.split("/")[0]
+        if kind != "episode":
+            held[name] = store.array(name)[rows[kind].start : rows[kind].stop]
+            if name in counted:
+                held[name] = held[name] - rows[counted[name]].start
+    return held
+
+
+def assert_holds(merged: FeatureStore, store: FeatureStore, names: dict[str, str] | None = None):
+    """Every episode of `store` stands in `merged`, equal in every array; `names`: id -> new id."""
+    there = {(one.source, one.id): one for one in merged.episodes}
+    for episode in store.episodes:
+        found = there[episode.source, (names or {}).get(episode.id, episode.id)]
+        assert (found.digest, found.content, found.path) == (
+            episode.digest,
+            episode.content,
+            episode.path,
+        )
+        ours, theirs = of_episode(merged, found), of_episode(store, episode)
+        for name, values in theirs.items():
+            if values.shape[0]:
+                assert np.array_equal(ours[name], values, equal_nan=True), (episode.id, name)
+
+
+def renamed(store: Path, ids: Callable[[str], str], digests: Callable[[str], str]) -> Path:
+    """Rewrite what a finished store says of its episodes, as another extraction would have."""
+    opened = FeatureStore.open(store)
+    said = [
+        {
+            name: getattr(one, name)
+            for name in ("id", "path", "format", "instruction", "content", "digest")
+        }
+        | {"id": ids(one.id), "digest": digests(one.digest)}
+        for one in opened.episodes
+    ]
+    texts = [json.dumps(one).encode() for one in said]
+    for name, values in {
+        "episode/text": np.frombuffer(b"".join(texts), np.uint8),
+        "episode/text_start": np.cumsum([0, *map(len, texts)]),
+    }.items():
+        array = zarr.open_array(store, path=name, mode="r+")
+        array.resize(len(values))
+        array[:] = values
+    return store
+
+
+def test_all_episodes_stand_one_behind_the_other(tiny_store: Make, tmp_path: Path) -> None:
+    first = tiny_store(tmp_path, name="first", seed=1)
+    second = renamed(
+        tiny_store(tmp_path, name="second", seed=2, episodes=3, ticks=17), lambda i: f"b_{i}", str
+    )
+    report = merge([first, second], tmp_path / "both.zarr", quiet)
+    merged, a, b = (FeatureStore.open(tmp_path / f"{n}.zarr") for n in ("both", "first", "second"))
+    assert report is not None
+    assert (report.episodes, report.twice) == (9, 0)
+    assert report.rows == len(merged.array("vl/time")) == 6 * 10 + 3 * 6
+    assert merged.sources == ["left", "right"]
+    assert_holds(merged, a)
+    assert_holds(merged, b)
+    assert [one.id for one in merged.episodes] == [
+        *(one.id for one in a.episodes),
+        *(one.id for one in b.episodes),
+    ]
+    ticks = np.arange(3 * 17)
+    ours, theirs = merged.gather(ticks + a.ticks, **WINDOWS), b.gather(ticks, **WINDOWS)
+    for name in ("features", "sensor", "sensor_valid", "state", "action", "action_valid"):
+        assert np.array_equal(getattr(ours, name), getattr(theirs, name)), name
+    group = zarr.open_group(merged.path, mode="r")
+    assert np.array_equal(group["vl/features"][60:], b.array("vl/features")), "plain zarr reads it"
+
+
+def test_equal_episodes_once_equal_content_under_another_name_twice(
+    tiny_store: Make, tmp_path: Path
+) -> None:
+    first = tiny_store(tmp_path, name="first")
+    again = tiny_store(tmp_path / "again", name="first")
+    other = renamed(
+        tiny_store(tmp_path, name="other"), lambda name: f"other_{name}", lambda d: f"other {d}"
+    )
+    report = merge([first, again, other], tmp_path / "all.zarr", quiet)
+    assert report is not None
+    assert (report.episodes, report.twice) == (12, 6)
+    merged = FeatureStore.open(tmp_path / "all.zarr")
+    keys = merged.array("vl/key")
+    assert np.array_equal(keys[:60], keys[60:])
+    assert np.array_equal(merged.array("vl/features")[:60], merged.array("vl/features")[60:])
+
+
+def test_an_input_that_is_held_in_part_gives_the_rest(tiny_store: Make, tmp_path: Path) -> None:
+    whole = tiny_store(tmp_path, name="whole")
+    some = renamed(
+        tiny_store(tmp_path, name="some"),
+        lambda name: name if name < "episode_002" or name > "episode_003" else f"new_{name}",
+        lambda digest: digest if digest not in ("0-2", "0-3") else f"new {digest}",
+    )
+    report = merge([some, whole], tmp_path / "all.zarr", quiet)
+    assert report is not None
+    assert (report.episodes, report.twice) == (8, 4)
+    merged = FeatureStore.open(tmp_path / "all.zarr")
+    assert [one.id for one in merged.episodes][6:] == ["episode_002", "episode_003"]
+    assert_holds(merged, FeatureStore.open(whole))
+    assert_holds(merged, FeatureStore.open(some))
+
+
+def test_different_episodes_of_one_name_are_named_apart(tiny_store: Make, tmp_path: Path) -> None:
+    first = tiny_store(tmp_path, name="first", seed=1)
+    second = tiny_store(tmp_path, name="second", seed=2, episodes=1)
+    third = tiny_store(tmp_path / "third", name="second", seed=3, episodes=1)
+    said: list[str] = []
+    merge([first, second, third], tmp_path / "all.zarr", said.append)
+    assert "left/episode_000 is one episode in" in said[0]
+    merged = FeatureStore.open(tmp_path / "all.zarr")
+    assert [one.id for one in merged.episodes][6:] == [
+        "second/episode_000",
+        "second-2/episode_000",
+    ]
+    assert_holds(merged, FeatureStore.open(second), {"episode_000": "second/episode_000"})
+    assert_holds(merged, FeatureStore.open(third), {"episode_000": "second-2/episode_000"})
+
+
+def test_a_stream_that_one_lacks_is_that_of_the_other(tiny_store: Make, tmp_path: Path) -> None:
+    blind = tiny_store(tmp_path, name="blind", sensor_channels=0, seed=1)
+    whole = tiny_store(tmp_path, name="whole", seed=2)
+    merge([blind, whole], tmp_path / "both.zarr", quiet)
+    merged = FeatureStore.open(tmp_path / "both.zarr")
+    assert merged.sensor_channels == 5
+    assert merged.streams["sensor"] == FeatureStore.open(whole).streams["sensor"]
+    assert not merged.gather(np.arange(180), **WINDOWS).sensor_valid.any()
+    assert merged.gather(np.arange(180, 360), **WINDOWS).sensor_valid.all()
+
+
+def test_rows_keep_the_environment_they_were_computed_in(tiny_store: Make, tmp_path: Path) -> None:
+    first, second = tiny_store(tmp_path, name="a", seed=1), tiny_store(tmp_path, name="b", seed=2)
+    group = zarr.open_group(second, mode="r+")
+    noted = [{"rows": [0, 25], "torch": "old"}, {"rows": [25, 60], "torch": "test"}]
+    group.attrs.put({**group.attrs.asdict(), "environment": noted})
+    merge([first, second], tmp_path / "both.zarr", quiet)
+    assert FeatureStore.open(tmp_path / "both.zarr").attrs["environment"] == [
+        {"rows": [0, 60], "torch": "test"},
+        {"rows": [60, 85], "torch": "old"},
+        {"rows": [85, 120], "torch": "test"},
+    ]
+
+
+def test_whole_chunks_of_the_first_are_linked(
+    tiny_store: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipeline.store.schema.CHUNK_BYTES", 4096)
+    first = tiny_store(tmp_path, name="first", seed=1, episodes=40)  # 9,600 readings
+    second = tiny_store(tmp_path, name="second", seed=2)
+    merge([first, second], tmp_path / "both.zarr", quiet)
+    places = [
+        sorted(place.glob("sensor/values/c/*/0")) for place in (first, tmp_path / "both.zarr")
+    ]
+    inodes = [[path.stat().st_ino for path in paths] for paths in places]
+    assert len(inodes[0]) == len(inodes[1]) == 3
+    assert inodes[0][:2] == inodes[1][:2]
+    assert inodes[0][2] != inodes[1][2], "holds the end of the one and the beginning of the other"
+    merged = FeatureStore.open(tmp_path / "both.zarr")
+    assert_holds(merged, FeatureStore.open(first))
+
+
+def test_merging_again_does_nothing(tiny_store: Make, tmp_path: Path) -> None:
+    inputs = [tiny_store(tmp_path, name=str(seed), seed=seed) for seed in (1, 2)]
+    merge(inputs, tmp_path / "both.zarr", quiet)
+    before = (tmp_path / "both.zarr").stat().st_ino
+    said: list[str] = []
+    assert merge(inputs, tmp_path / "both.zarr", said.append) is None
+    assert said[-1].endswith("up to date, nothing to do")
+    assert (tmp_path / "both.zarr").stat().st_ino == before
+
+
+class TestRefusals:
+    @pytest.mark.parametrize(
+        ("changed", "said"),
+        [
+            ({"spec_digest": "another"}, r"feature spec.digest: tiny-spec -> another"),
+            ({"reuse": 2}, r"vlm_reuse_count: 3 -> 2"),
+            ({"sensor_channels": 4}, r"sensor.names: 5 entries -> 4 entries"),
+            ({"state_dim": 3}, r"state.names: 4 entries -> 3 entries"),
+            ({"dtype": "float16"}, r'features.dtype: "float32" -> "float16"'),
+            ({"dim": 9}, r"features.row: \[3, 8\] -> \[3, 9\]"),
+        ],
+    )
+    def test_what_differs_is_named(self, tiny_store: Make, tmp_path: Path, changed, said) -> None:
+        inputs = [tiny_store(tmp_path, name="a"), tiny_store(tmp_path, name="b", **changed)]
+        with pytest.raises(StoreMismatch, match=rf"(?s)a\.zarr and .*b\.zarr.*{said}"):
+            merge(inputs, tmp_path / "both.zarr", quiet)
+        assert not list(tmp_path.glob("both.zarr.part"))
+
+    def test_the_sources_of_a_spec_entry_and_of_the_clock(
+        self, tiny_store: Make, tmp_path: Path
+    ) -> None:
+        inputs = [tiny_store(tmp_path, name=name) for name in "ab"]
+        group = zarr.open_group(inputs[1], mode="r+")
+        attrs = group.attrs.asdict()
+        attrs["feature_spec"] = {"digest": "x", "prompt": "{images}", "processor": {"size": [1, 2]}}
+        attrs["action_hz"] = 5.0
+        group.attrs.put(attrs)
+        with pytest.raises(StoreMismatch) as caught:
+            merge(inputs, tmp_path / "both.zarr", quiet)
+        assert 'feature spec.prompt: "{instruction}" -> "{images}"' in str(caught.value)
+        assert "action_hz: 10.0 -> 5.0" in str(caught.value)
+
+    def test_paths(self, tiny_store: Make, tmp_path: Path) -> None:
+        a, b = (tiny_store(tmp_path, name=name, seed=seed) for seed, name in enumerate("ab"))
+        with pytest.raises(ConfigError, match="two or more stores"):
+            merge([a], tmp_path / "c.zarr", quiet)
+        with pytest.raises(ConfigError, match="named more than once"):
+            merge([a, tmp_path / "x" / ".." / "a.zarr"], tmp_path / "c.zarr", quiet)
+        for output in (a, tmp_path / "c"):
+            with pytest.raises(ConfigError, match="whose name ends in"):
+                merge([a, b], output, quiet)
+        with pytest.raises(StoreIncomplete, match="no finished store"):
+            merge([a, tmp_path / "nowhere.zarr"], tmp_path / "c.zarr", quiet)
+
+    def test_another_store_or_build_in_its_place_is_left_alone(
+        self, tiny_store: Make, tmp_path: Path
+    ) -> None:
+        inputs = [tiny_store(tmp_path, name=str(seed), seed=seed) for seed in (1, 2)]
+        other = tiny_store(tmp_path, name="other", seed=3)
+        before = {path: path.read_bytes() for path in other.rglob("*") if path.is_file()}
+        with pytest.raises(StoreMismatch, match="found another store"):
+            merge(inputs, other, quiet)
+        build = other.rename(tmp_path / "new.zarr.part")
+        with pytest.raises(StoreMismatch, match="unfinished build of something else"):
+            merge(inputs, tmp_path / "new.zarr", quiet)
+        build.rename(other)
+        assert {path: path.read_bytes() for path in before} == before
+
+    def test_a_build_under_way_there_is_named(self, tiny_store: Make, tmp_path: Path) -> None:
+        inputs = [tiny_store(tmp_path, name=str(seed), seed=seed) for seed in (1, 2)]
+        with (
+            build_lock(tmp_path / "both.zarr"),
+            pytest.raises(StoreLocked, match=f"process {os.getpid()}"),
+        ):
+            merge(inputs, tmp_path / "both.zarr", quiet)
+
+
+class TestDamage:
+    @pytest.mark.parametrize("array", ["vl/features", "sensor/values", "tick/action"])
+    def test_a_flipped_bit_is_never_copied(self, tiny_store: Make, tmp_path: Path, array) -> None:
+        inputs = [tiny_store(tmp_path, name=str(seed), seed=seed) for seed in (1, 2)]
+        chunk = next(path for path in (inputs[1] / array / "c").rglob("*") if path.is_file())
+        flip(chunk, 100)
+        with pytest.raises(StoreIncomplete, match=r"(?s)2\.zarr.*stages\.verify"):
+            merge(inputs, tmp_path / "both.zarr", quiet)
+        assert not (tmp_path / "both.zarr").exists()
+
+    def test_a_row_that_rots_between_check_and_copy_is_named(
+        self, tiny_store: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        inputs = [tiny_store(tmp_path, name=str(seed), seed=seed) for seed in (1, 2)]
+        real = StoreBuild.finish_layout
+
+        def rotting(self: StoreBuild, *rest) -> None:
+            real(self, *rest)
+            chunk = next(
+                path for path in (inputs[1] / "vl/features/c").rglob("0") if path.is_file()
+            )
+            flip(chunk, 7 * 3 * 8 * 4)
+
+        monkeypatch.setattr(StoreBuild, "finish_layout", rotting)
+        with pytest.raises(StoreIncomplete, match=r"2\.zarr: row 7 of vl/features does not"):
+            merge(inputs, tmp_path / "both.zarr", quiet)
+
+    def test_an_input_replaced_in_the_middle_is_noticed(
+        self, tiny_store: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        inputs = [tiny_store(tmp_path, name=str(seed), seed=seed) for seed in (1, 2)]
+        other = tiny_store(tmp_path / "other", name="2", seed=5)
+        real = StoreBuild.create
+
+        def replacing(self: StoreBuild) -> None:
+            real(self)
+            if other.exists():
+                shutil.rmtree(inputs[1])
+                other.rename(inputs[1])
+
+        monkeypatch.setattr(StoreBuild, "create", replacing)
+        with pytest.raises(StoreMismatch, match="was replaced while"):
+            merge(inputs, tmp_path / "both.zarr", quiet)
+        merge(inputs, tmp_path / "both.zarr", quiet)
+        assert_holds(FeatureStore.open(tmp_path / "both.zarr"), FeatureStore.open(inputs[0]))
+
+
+def flip(path: Path, offset: int) -> None:
+    with path.open("r+b") as file:
+        file.seek(offset)
+        byte = file.read(1)
+        file.seek(offset)
+        file.write(bytes([byte[0] ^ 1]))
+
+
+class Killed(BaseException):
+    """Stands for SIGKILL: nothing may catch it."""
+
+
+@pytest.mark.parametrize("kill_at", [0, 23, 41, 60, 85])
+def test_a_kill_at_any_write_ends_in_the_undisturbed_store(
+    tiny_store: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kill_at: int
+) -> None:
+    """`pwrite` is what every byte of a build goes through."""
+    inputs = [tiny_store(tmp_path, name=str(seed), seed=seed, ticks=12) for seed in (1, 2)]
+    monkeypatch.setattr("pipeline.store.merging.copying._BLOCK", 700)
+    merge(inputs, tmp_path / "whole.zarr", quiet)
+    writes, real = iter(range(10**6)), os.pwrite
+
+    def pwrite(descriptor, block, offset):
+        if next(writes) == kill_at:
+            real(descriptor, bytes(block)[: len(block) // 2], offset)
+            raise Killed
+        return real(descriptor, block, offset)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "pwrite", pwrite)
+        with pytest.raises(Killed):
+            merge(inputs, tmp_path / "killed.zarr", quiet)
+    assert not (tmp_path / "killed.zarr").exists()
+    merge(inputs, tmp_path / "killed.zarr", quiet)
+    whole, killed = (FeatureStore.open(tmp_path / f"{name}.zarr") for name in ("whole", "killed"))
+    for name in ARRAY_NAMES:
+        assert np.array_equal(whole.array(name), killed.array(name), equal_nan=True), name
+    assert dict(whole.attrs) == dict(killed.attrs)
+
+
+def test_memory_stays_bounded(tiny_store: Make, tmp_path: Path) -> None:
+    """Two stores of 80 MB of sensor each are merged with less than that beyond the imports."""
+    inputs = [
+        tiny_store(
+            tmp_path,
+            name=str(seed),
+            seed=seed,
+            episodes=4,
+            sensor_channels=500,
+            readings_a_tick=350,
+        )
+        for seed in (1, 2)
+    ]
+    code = """
+import resource, sys
+from pathlib import Path
+from pipeline.store.merging import copying
+from pipeline.store.merging import merge
+copying._BLOCK = 2 * 2**20
+paths = [Path(each) for each in sys.argv[1:]]
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+merge(paths[:2], paths[2], print)
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code, *inputs, tmp_path / "both.zarr"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert int(done.stdout.split()[-1]) * 1024 < 60 * 2**20
+
+
+class TestDisk:
+    def test_too_little_room_is_said_before_a_byte_is_written(
+        self, tiny_store: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        inputs = [tiny_store(tmp_path, name=str(seed), seed=seed) for seed in (1, 2)]
+        monkeypatch.setattr("pipeline.store.merging.union.free_bytes", lambda path: 1000)
+        with pytest.raises(DiskFull, match=r"both\.zarr: the merged store needs .* MiB"):
+            merge(inputs, tmp_path / "both.zarr", quiet)
+        assert not (tmp_path / "both.zarr.part").exists()
