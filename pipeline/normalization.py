@@ -3,8 +3,9 @@
 Numpy only; `pipeline.models.normalizer` applies them to tensors.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,9 @@ from pipeline.errors import CheckpointMismatch, NumericsError
 
 Block = NDArray[Any] | tuple[NDArray[Any], NDArray[np.bool_]]
 """Rows of values, or such rows and which of their values are valid."""
+
+Reading = Block | Callable[[], Block]
+"""A block, or what reads one: on the thread that needs it, and again where an error is named."""
 
 _PIECE_VALUES = 4_194_304
 """Values converted to float64 at a time: 32 MB, whatever the size of the blocks."""
@@ -97,23 +101,25 @@ class Normalization:
 
 
 def fit_channels(
-    blocks: Iterable[Block], what: str, names: Sequence[str] | None = None
+    blocks: Iterable[Reading], what: str, names: Sequence[str] | None = None, threads: int = 1
 ) -> ChannelStatistics:
     """Statistics over all rows of `blocks`, each (row, channel…) of floating point, in one pass.
 
     A block may be a pair (values, valid): `valid` is bool over the leading axes of `values`, such
     as (row, slot) for features (row, slot, dim), and what is not valid is neither checked nor
-    counted. Moments are merged in float64 after Chan, Golub and LeVeque (1983), eq. 2.1.
+    counted. Moments are merged in float64 after Chan, Golub and LeVeque (1983), eq. 2.1, in the
+    order of the blocks: the same bits, whatever the `threads` of dask's scheduler that read them.
     Raises `NumericsError`, naming `what`, channel and row, on NaN, inf, or where there is no row.
     """
     moments: _Moments | None = None
     rows = 0
-    for values, valid in _pieces(blocks):
-        if not np.issubdtype(values.dtype, np.floating):
-            raise TypeError(f"{what}: expected floating point, found {values.dtype}")
-        piece = _moments(values, valid, what, names, rows)
-        moments = piece if moments is None else _merge(moments, piece)
-        rows += len(values)
+    for block, measured in _measured_in_order(blocks, what, threads):
+        for index, (piece, count) in enumerate(measured):
+            if not np.isfinite(piece.squares).all():
+                values, valid = next(islice(_pieces(block), index, None))
+                _refuse(values, valid, what, names, rows)
+            moments = piece if moments is None else _merge(moments, piece)
+            rows += count
     if moments is None:
         raise NumericsError(f"{what}: no rows to fit the normalisation on; check the split")
     variance = moments.squares / np.maximum(moments.count, 1)
@@ -129,23 +135,54 @@ class _Moments:
     squares: NDArray[np.float64]
 
 
-def _pieces(blocks: Iterable[Block]) -> Iterator[tuple[NDArray[Any], NDArray[np.bool_] | None]]:
-    for block in blocks:
-        values, valid = block if isinstance(block, tuple) else (block, None)
-        channels = int(np.prod(values.shape[1:]))
-        rows = max(1, _PIECE_VALUES // max(1, channels))
-        for start in range(0, len(values), rows):
-            part = slice(start, start + rows)
-            yield values[part], None if valid is None else valid[part]
+_Measured = list[tuple[_Moments, int]]
+"""Of each piece of a block, and how many rows it has."""
 
 
-def _moments(
-    values: NDArray[Any],
-    valid: NDArray[np.bool_] | None,
-    what: str,
-    names: Sequence[str] | None,
-    first_row: int,
-) -> _Moments:
+def _measured_in_order(
+    blocks: Iterable[Reading], what: str, threads: int
+) -> Iterator[tuple[Reading, _Measured]]:
+    """A few blocks at a time, so that memory does not grow with their number."""
+    if threads == 1:
+        yield from ((block, _measured(block, what)) for block in blocks)
+        return
+    import dask  # here, as most commands never need it
+
+    waiting = iter(blocks)
+    while some := list(islice(waiting, 2 * threads)):
+        jobs = [dask.delayed(_Job(block, what), pure=False)() for block in some]
+        found = dask.compute(*jobs, scheduler="threads", num_workers=threads)
+        yield from zip(some, found, strict=True)
+
+
+@dataclass(frozen=True, eq=False)
+class _Job:
+    """A block to measure; in one piece, as dask looks for tasks inside the arguments of others."""
+
+    block: Reading
+    what: str
+
+    def __call__(self) -> _Measured:
+        return _measured(self.block, self.what)
+
+
+def _measured(block: Reading, what: str) -> _Measured:
+    return [(_moments(*piece, what), len(piece[0])) for piece in _pieces(block)]
+
+
+def _pieces(block: Reading) -> Iterator[tuple[NDArray[Any], NDArray[np.bool_] | None]]:
+    read = block() if callable(block) else block
+    values, valid = read if isinstance(read, tuple) else (read, None)
+    channels = int(np.prod(values.shape[1:]))
+    rows = max(1, _PIECE_VALUES // max(1, channels))
+    for start in range(0, len(values), rows):
+        part = slice(start, start + rows)
+        yield values[part], None if valid is None else valid[part]
+
+
+def _moments(values: NDArray[Any], valid: NDArray[np.bool_] | None, what: str) -> _Moments:
+    if not np.issubdtype(values.dtype, np.floating):
+        raise TypeError(f"{what}: expected floating point, found {values.dtype}")
     with np.errstate(invalid="ignore", over="ignore"):
         piece = values.astype(np.float64)
         if valid is None:
@@ -159,8 +196,6 @@ def _moments(
             mean = piece.sum(axis=0) / np.maximum(count, 1)
             piece = np.where(weight, piece - mean, 0.0)
         squares = np.einsum("r...,r...->...", piece, piece)
-    if not np.isfinite(squares).all():
-        _refuse(values, valid, what, names, first_row)
     return _Moments(np.asarray(count), mean, squares)
 
 

@@ -19,6 +19,8 @@ from pipeline.evaluation import (
     baselines,
     compare,
 )
+from pipeline.plots import probe
+from pipeline.probing import Finding, Folds, Score, SlotName, Study
 
 Drawn = tuple[Comparison, Predictions, SimpleNamespace]
 
@@ -239,3 +241,78 @@ def test_numbers_of_experiments_lie_on_nothing() -> None:
     for text in axis.texts:
         assert text.get_window_extent().x0 > axis.get_window_extent().x1
         assert text.get_window_extent().x1 < figure.bbox.x1
+
+
+def score(mean: float, spread: float = 0.02) -> Score:
+    """Over three folds and two targets, of which one does not vary."""
+    by_fold = mean + spread * np.array([-1.0, 0.0, 1.0])
+    r2 = np.stack([by_fold, np.full(3, np.nan)], axis=1)
+    return Score(r2, np.full(3, 10.0), (1.0,) * 3)
+
+
+def found(name: SlotName, mean: float | None, slots: int = 1, streams: bool = True) -> Finding:
+    """Alone half as good as beside; None could not be scored."""
+    beside = score(mean) if mean is not None and streams else None
+    alone = None if mean is None else score(mean / 2)
+    without = score(0.2) if streams else None
+    return Finding(name, tuple(range(slots)), 8 * slots, 8 * slots, 1.0, alone, beside, without)
+
+
+def probed(streams: bool = True, layers: int = 2, scored: bool = True) -> Study:
+    """Each layer has a mean, a mean a view and a grid of 2 x 2 cells a view."""
+    slots, groups = [], []
+    for layer in range(layers):
+        for norm in (True, False):
+            places = [("mean", None, None), *(("view_mean", view, None) for view in "AB")]
+            cells = [(row, column) for row in range(2) for column in range(2)]
+            places += [("grid", view, cell) for view in "AB" for cell in cells]
+            for pooling, view, cell in places:
+                place = (cell or (0, 0))[0] * 0.1 + (cell or (0, 0))[1] * 0.01
+                mean = 0.3 + 0.1 * layer + place if scored else None
+                name = SlotName(layer, norm, pooling, view, cell)
+                slots.append(found(name, mean, streams=streams))
+            groups += [
+                found(SlotName(layer, norm, pooling), 0.5 if scored else None, count, streams)
+                for pooling, count in (("mean", 1), ("view_mean", 2), ("grid", 8))
+            ]
+    folds = Folds(np.arange(30), np.arange(30) // 10, (0, 1, 2), 3, ())
+    known = score(0.2) if streams else None
+    return Study(2, ("dx",), folds, score(-0.01), known, 5, tuple(slots), tuple(groups))
+
+
+def test_slots_are_a_map_over_layers_and_cells_a_map_a_view(tmp_path: Path) -> None:
+    figure = probe.heat_map(probed())
+    overview, *maps, bar = figure.axes
+    assert [label.get_text() for label in overview.get_yticklabels()] == [
+        "layer 0",
+        "layer 0, no norm",
+        "layer 1",
+        "layer 1, no norm",
+    ]
+    columns = [label.get_text() for label in overview.get_xticklabels()]
+    assert columns == ["mean", "view_mean", "view_mean\nA", "view_mean\nB", "grid"]
+    assert "beside state + sensor" in bar.get_ylabel()
+    assert len(maps) == 4 * 2
+    cells = maps[-1].images[0].get_array()
+    np.testing.assert_allclose(cells, [[0.4, 0.41], [0.5, 0.51]])
+    assert {axis.images[0].get_clim() for axis in (overview, *maps)} == {(0.3, 0.51)}
+    files = probe.write_probe_plots(tmp_path, probed())
+    assert [file.name for file in files] == ["probe.png", "probe_bars.png"]
+    assert all(file.read_bytes().startswith(b"\x89PNG") for file in files)
+
+
+def test_choices_are_bars_in_order_with_the_spread_over_folds() -> None:
+    (axis,) = probe.bars(probed()).axes
+    assert len(axis.patches) == 2 * 12
+    assert sorted({round(patch.get_width(), 9) for patch in axis.patches}) == [0.25, 0.5]
+    labels = [text.get_text() for text in axis.get_yticklabels()]
+    assert "layer 1\ngrid (8 slots)" in labels
+    lines = [
+        line.get_xdata()[0] for line in axis.lines if line.get_label() == "state + sensor alone"
+    ]
+    assert lines == pytest.approx([0.2])
+
+
+@pytest.mark.parametrize("study", [probed(streams=False, layers=1), probed(scored=False)])
+def test_what_is_missing_is_left_white(study: Study, tmp_path: Path) -> None:
+    assert len(probe.write_probe_plots(tmp_path, study)) == 2

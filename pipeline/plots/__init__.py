@@ -1,4 +1,7 @@
-"""Figures of merit -> pictures; the same numbers give the same bytes."""
+"""Figures of merit -> pictures; the same numbers give the same bytes.
+
+The pictures of a probe are in `pipeline.plots.probe`, apart from these: they know another room.
+"""
 
 from pipeline.plots.experiments import comparison_of_experiments, write_experiments_plot
 from pipeline.plots.modalities import modalities, write_modalities_plot

@@ -5,6 +5,12 @@ saved to resume, and resuming at any step gives the same stream.
 """
 
 from pipeline.sampling.mixture import TickSampler, ticks_by_source
-from pipeline.sampling.split import Split, split_by_episode
+from pipeline.sampling.split import Split, episodes_by_recording, split_by_episode
 
-__all__ = ["Split", "TickSampler", "split_by_episode", "ticks_by_source"]
+__all__ = [
+    "Split",
+    "TickSampler",
+    "episodes_by_recording",
+    "split_by_episode",
+    "ticks_by_source",
+]

@@ -40,7 +40,7 @@ def split_by_episode(store: FeatureStore, val_fraction: float, horizon: int = 8)
     of `horizon` actions is not over by then belong to neither side. Raises `ConfigError` where that
     leaves nothing to train on, `StoreMismatch` where the store has no tick.
     """
-    recordings = _recordings(store)
+    recordings = episodes_by_recording(store)
     if not recordings:
         raise StoreMismatch(
             f"{store.path}: expected ticks to train on, found none. Look at data.sources and run "
@@ -64,8 +64,11 @@ def split_by_episode(store: FeatureStore, val_fraction: float, horizon: int = 8)
     return Split(_ticks(train), _ticks(held_out), _names(held_out), note)
 
 
-def _recordings(store: FeatureStore) -> dict[str, list[Episode]]:
-    """Episodes that have ticks, by the first name among those with the same first VL key."""
+def episodes_by_recording(store: FeatureStore) -> dict[str, list[Episode]]:
+    """Episodes that have ticks, by the first name among those with the same first VL key.
+
+    Those are one recording in several formats: what is learnt from one is known of the others.
+    """
     keys = store.array("vl/key")
     frame_time = store.array("vl/frame_time")
     by_key: dict[bytes, list[Episode]] = {}

@@ -1,0 +1,228 @@
+"""Every slot and every group of slots, scored by what a linear reader finds in it."""
+
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from typing import NoReturn, TypeVar
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from pipeline.config import ProbeParams
+from pipeline.probing.accumulation import Table
+from pipeline.probing.folds import Folds, fold_by_recording
+from pipeline.probing.moments import Moments
+from pipeline.probing.readers import Reader, SlotName, fit_reader, groups_of, slot_names
+from pipeline.probing.ridge import Score, cross_validate
+from pipeline.probing.summaries import summarize
+from pipeline.store import FeatureStore
+
+_Result = TypeVar("_Result")
+
+MEMORY_BYTES = 2**30
+"""Of sums at a time; as many slots share a pass over the rows as fit."""
+_RUN_BYTES = 16 * 2**10
+"""Of a row that one thread reads at least: several pages, so that few are read twice."""
+
+
+@dataclass(frozen=True, eq=False)
+class Finding:
+    """What is found in a slot or a group of slots; a score is None where too few folds have it."""
+
+    name: SlotName
+    slots: tuple[int, ...]
+    channels: int
+    """Of all its slots together."""
+    inputs: int
+    """That the reader had of them."""
+    valid_share: float
+    """Of the ticks."""
+    alone: Score | None
+    beside: Score | None
+    """With state + sensor."""
+    without: Score | None
+    """State + sensor alone, on the same ticks."""
+
+    @property
+    def best(self) -> Score | None:
+        """What it is ranked by: beside state + sensor, where there are any."""
+        return self.beside or self.alone
+
+    @property
+    def gain(self) -> float | None:
+        """What it adds to state + sensor."""
+        if self.beside is None or self.without is None:
+            return None
+        return self.beside.mean - self.without.mean
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """All findings, and what they are measured against."""
+
+    horizon: int
+    action_names: tuple[str, ...]
+    folds: Folds
+    mean_action: Score
+    streams: Score | None
+    """State + sensor alone; None where the store has neither."""
+    stream_inputs: int
+    slots: tuple[Finding, ...]
+    """In the store's order."""
+    groups: tuple[Finding, ...]
+
+
+@dataclass(frozen=True)
+class _Task:
+    name: SlotName
+    slots: tuple[int, ...]
+
+
+def probe(store: FeatureStore, params: ProbeParams) -> Study:
+    """Ridge regression from every slot of variant 0 to the action chunk, cross-validated.
+
+    Alone, and beside the last, mean and spread of the causal windows of state and sensor; each slot
+    by itself and each choice of layer, norm and pooling as a whole. Folds hold whole recordings, so
+    nothing that tells a recording from another helps. A slot is read once, or twice where its group
+    has more of them; memory grows with the square of the inputs, not with the rows. The same store
+    and params give the same bits, whatever the threads.
+
+    Raises `StoreMismatch` where fewer than two recordings are long enough, and `NumericsError` on
+    NaN or inf, naming the place.
+    """
+    folds = fold_by_recording(store, params.folds, params.horizon, params.max_ticks)
+    with _one_thread_each():
+        summaries = summarize(store, folds.ticks, params.sensor_window, params.state_window)
+        table = Table(store, folds, summaries, params.horizon)
+        names = slot_names(store)
+        singles = [_Task(name, (index,)) for index, name in enumerate(names)]
+        groups = [_Task(name, slots) for name, slots in groups_of(names).items()]
+        several = [task for task in groups if len(task.slots) > 1]
+        with tqdm(
+            total=len(singles) + len(several), desc="slots", unit="slot", leave=False, disable=None
+        ) as bar:
+            work = _Work(table, params, bar)
+            mean_action, streams = work.baselines()
+            found = work.findings(singles)
+            of_group = {one.name: one for task in several for one in work.findings([task])}
+    alone = {one.name.group: one for one in found}
+    return Study(
+        horizon=params.horizon,
+        action_names=tuple(store.streams["action"]["names"]),
+        folds=folds,
+        mean_action=mean_action,
+        streams=streams,
+        stream_inputs=table.beside,
+        slots=tuple(found),
+        groups=tuple(of_group.get(task.name) or alone[task.name] for task in groups),
+    )
+
+
+class _Work:
+    """The passes over the rows and the regressions, shared out among threads."""
+
+    def __init__(self, table: Table, params: ProbeParams, bar: "tqdm[NoReturn]") -> None:
+        self._table = table
+        self._params = params
+        self._bar = bar
+        self._parts = range(len(table.folds.fold_of_part))
+        self._streams: Score | None = None
+
+    def baselines(self) -> tuple[Score, Score | None]:
+        """The mean action, and state + sensor alone."""
+        parts = [self._table.moments(part, [Reader((), ())])[0] for part in self._parts]
+        mean_action = self._scored(parts, torch.arange(0))
+        assert mean_action is not None, "every fold has ticks"
+        if self._table.beside:
+            self._streams = self._scored(parts, torch.arange(self._table.beside))
+        return mean_action, self._streams
+
+    def findings(self, tasks: Sequence[_Task]) -> list[Finding]:
+        """Of each, in order; those that fit into memory together share a pass."""
+        columns = self._table.store.feature_shape[1] + self._table.beside + self._table.targets
+        room = max(1, MEMORY_BYTES // (8 * columns**2 * len(self._parts)))
+        found = []
+        for first in range(0, len(tasks), room):
+            some = tasks[first : first + room]
+            fitted = partial(fit_reader, self._table.store, self._table.rows)
+            readers = self._in_order([partial(fitted, task.slots) for task in some])
+            sums = self._accumulated(readers)
+            found += self._in_order(
+                [
+                    partial(self._finding, task, reader, parts)
+                    for task, reader, parts in zip(some, readers, sums, strict=True)
+                ]
+            )
+        return found
+
+    def _accumulated(self, readers: Sequence[Reader]) -> list[list[Moments]]:
+        """The moments of each reader, of each part."""
+        features = self._table.store.array("vl/features")
+        slot_bytes = features.dtype.itemsize * features.shape[2]
+        run = -(-_RUN_BYTES // max(1, slot_bytes))
+        runs = [readers[first : first + run] for first in range(0, len(readers), run)]
+        by_job = self._in_order(
+            [partial(self._table.moments, part, some) for some in runs for part in self._parts]
+        )
+        count = len(self._parts)
+        by_run = [by_job[first : first + count] for first in range(0, len(by_job), count)]
+        return [list(parts) for some in by_run for parts in zip(*some, strict=True)]
+
+    def _finding(self, task: _Task, reader: Reader, parts: Sequence[Moments]) -> Finding:
+        inputs = torch.arange(reader.width)
+        known = reader.width + torch.arange(self._table.beside)
+        share = self._table.valid_share(task.slots)
+        without, both = self._streams, None
+        if self._table.beside and share < 1:
+            without = self._scored(parts, known)
+        if without is not None:
+            both = self._scored(parts, inputs, known, without)
+        finding = Finding(
+            name=task.name,
+            slots=task.slots,
+            channels=len(task.slots) * self._table.store.feature_shape[1],
+            inputs=reader.width,
+            valid_share=share,
+            alone=self._scored(parts, inputs),
+            beside=both,
+            without=without,
+        )
+        self._bar.update()
+        return finding
+
+    def _scored(
+        self,
+        parts: Sequence[Moments],
+        inputs: Tensor,
+        known: Tensor | None = None,
+        known_score: Score | None = None,
+    ) -> Score | None:
+        """By these columns; by none, the mean action."""
+        folds, penalties = self._table.folds.fold_of_part, self._params.penalties
+        targets = self._table.targets
+        return cross_validate(parts, folds, inputs, targets, penalties, known, known_score)
+
+    def _in_order(self, jobs: Sequence[Callable[[], _Result]]) -> list[_Result]:
+        """The results of the jobs, run on dask's threads."""
+        import dask  # here, as most commands never need it
+
+        return list(
+            dask.compute(
+                *(dask.delayed(job, pure=False)() for job in jobs),
+                scheduler="threads",
+                num_workers=self._params.threads,
+            )
+        )
+
+
+@contextmanager
+def _one_thread_each() -> Generator[None]:
+    """Linear algebra on the thread that asks: the same bits, whatever the machine's cores."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -1,0 +1,31 @@
+"""Rank the slots of a store by how well a ridge regression reads the action chunk from them.
+
+Each slot by itself and each choice of layer, norm and pooling as a whole, alone and beside state +
+sensor, cross-validated by recording. Prints the ranking and the line for params.yaml that the
+evidence supports; writes metrics.json, slots.csv, groups.csv, targets.csv and pictures (PNG) into
+`probe.output`.
+"""
+
+from pipeline.config import Params
+from pipeline.plots.probe import write_probe_plots
+from pipeline.probing import advice, probe, table, write_tables
+from pipeline.store import FeatureStore
+from stages.command import run
+
+
+def main(params: Params) -> None:
+    """Probe the store that `probe` names."""
+    wanted = params.probe
+    store = FeatureStore.open(wanted.store or params.extract.store)
+    slots, dim = store.feature_shape
+    print(f"{store.path}: {slots} slots of {dim} channels at {store.ticks} ticks", flush=True)
+    study = probe(store, wanted)
+    wanted.output.mkdir(parents=True, exist_ok=True)
+    files = [*write_tables(wanted.output, study), *write_probe_plots(wanted.output, study)]
+    print(table(study))
+    print(advice(study))
+    print(f"{wanted.output}: {', '.join(file.name for file in files)}")
+
+
+if __name__ == "__main__":
+    raise SystemExit(run(__doc__ or "", main))

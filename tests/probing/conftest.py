@@ -1,0 +1,82 @@
+"""Small stores whose actions follow from what a test says, and a plain ridge regression."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zarr
+
+from pipeline.store import FeatureStore
+
+Rewrite = Callable[[FeatureStore, np.random.Generator], None]
+
+
+@pytest.fixture
+def store(tiny_store: Callable[..., Path], tmp_path: Path) -> FeatureStore:
+    """Six episodes of 30 ticks, three slots of eight; what is written into it stays in memory."""
+    return FeatureStore.open(tiny_store(tmp_path))
+
+
+@pytest.fixture
+def renamed() -> Callable[..., FeatureStore]:
+    """`renamed(path, slots, **spec)`: the store with its slots named so, its spec changed so."""
+
+    def rename(path: Path, slots: list[dict[str, Any]], **spec: Any) -> FeatureStore:
+        attrs = zarr.open_group(path, mode="r+").attrs
+        attrs["slots"] = slots
+        attrs["feature_spec"] = {**dict(attrs["feature_spec"]), **spec}
+        return FeatureStore.open(path)
+
+    return rename
+
+
+def fitted(
+    x: np.ndarray, y: np.ndarray, penalty: float | np.ndarray
+) -> Callable[[np.ndarray], np.ndarray]:
+    """Ridge regression written down as in the textbook, on the rows themselves."""
+    mean, spread = x.mean(0), x.std(0)
+    spread[spread < 1e-9] = np.inf
+    standard = (x - mean) / spread
+    ridge = np.diag(np.broadcast_to(penalty, x.shape[1])) * len(x)
+    weights = np.linalg.solve(standard.T @ standard + ridge, standard.T @ (y - y.mean(0)))
+    return lambda other: (other - mean) / spread @ weights + y.mean(0)
+
+
+@pytest.fixture
+def nested() -> Callable[..., tuple[np.ndarray, np.ndarray]]:
+    """`nested(x, y, fold, penalties)`: (fold, target) R^2 and the chosen penalties, row by row.
+
+    `known` is the number of last columns that have the penalties `of_known` (fold,) instead.
+    """
+
+    def score(
+        x: np.ndarray,
+        y: np.ndarray,
+        fold: np.ndarray,
+        penalties: tuple[float, ...],
+        known: int = 0,
+        of_known: tuple[float, ...] = (),
+    ) -> tuple[np.ndarray, np.ndarray]:
+        r2, chosen = [], []
+        for held in np.unique(fold):
+            train = fold != held
+            lost = np.zeros(len(penalties))
+            ridges = [np.full(x.shape[1], penalty) for penalty in penalties]
+            for ridge in ridges:
+                ridge[x.shape[1] - known :] = of_known[held] if known else 0
+            for out in np.unique(fold[train]):
+                inside, test = train & (fold != out), fold == out
+                for index, ridge in enumerate(ridges):
+                    error = (y[test] - fitted(x[inside], y[inside], ridge)(x[test])) ** 2
+                    varies = y[train].std(0) > 0
+                    lost[index] += (error[:, varies] / y[train][:, varies].var(0)).sum()
+            best = int(lost.argmin())
+            predicted = fitted(x[train], y[train], ridges[best])(x[~train])
+            with np.errstate(divide="ignore", invalid="ignore"):
+                r2.append(1 - ((y[~train] - predicted) ** 2).mean(0) / y.var(0))
+            chosen.append(penalties[best])
+        return np.array(r2), np.array(chosen)
+
+    return score

@@ -1,0 +1,77 @@
+"""Folds hold whole recordings, and no chunk that is not whole."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.errors import StoreMismatch
+from pipeline.probing import fold_by_recording
+from pipeline.store import FeatureStore
+
+
+def test_each_recording_is_in_one_fold_with_its_other_formats(store: FeatureStore) -> None:
+    store.array("vl/key")[40] = store.array("vl/key")[10]  # episode 4 is episode 1
+    folds = fold_by_recording(store, 5, 8)
+    episode = folds.ticks // 30
+    fold = np.array(folds.fold_of_part)[folds.part]
+    of = {int(one): set(fold[episode == one].tolist()) for one in np.unique(episode)}
+    assert all(len(several) == 1 for several in of.values())
+    assert of[1] == of[4]
+    assert folds.count == len(set.union(*of.values())) == 5
+    assert folds.recordings == 5
+    assert not folds.notes
+
+
+def test_chunks_end_within_their_episode(store: FeatureStore) -> None:
+    folds = fold_by_recording(store, 3, 8)
+    assert (folds.ticks % 30 <= 22).all()
+    assert len(folds.ticks) == 6 * 23
+
+
+def test_fewer_recordings_are_fewer_folds_and_it_is_said(
+    tiny_store: Callable[..., Path], tmp_path: Path
+) -> None:
+    store = FeatureStore.open(tiny_store(tmp_path, episodes=3))
+    folds = fold_by_recording(store, 5, 8)
+    assert folds.count == 3
+    assert folds.notes == ("3 recordings make 3 folds, not 5",)
+
+
+def test_two_recordings_are_two_folds_of_two_halves(
+    tiny_store: Callable[..., Path], tmp_path: Path
+) -> None:
+    store = FeatureStore.open(tiny_store(tmp_path, episodes=2))
+    folds = fold_by_recording(store, 5, 8)
+    assert folds.fold_of_part == (0, 0, 1, 1)
+    assert "2 recordings make 2 folds, not 5" in folds.notes
+    assert set(folds.part.tolist()) == {0, 1, 2, 3}
+    assert (folds.part // 2 == folds.ticks // 30).all()
+    rows = store.array("tick/vl_row")[folds.ticks]
+    assert all(len(set(folds.part[rows == row].tolist())) == 1 for row in np.unique(rows))
+
+
+def test_two_folds_of_many_recordings_are_halved_by_recording(store: FeatureStore) -> None:
+    folds = fold_by_recording(store, 2, 8)
+    episode = folds.ticks // 30
+    assert all(len(set(folds.part[episode == one].tolist())) == 1 for one in range(6))
+    assert set(folds.part.tolist()) == {0, 1, 2, 3}
+
+
+def test_one_recording_is_refused(tiny_store: Callable[..., Path], tmp_path: Path) -> None:
+    store = FeatureStore.open(tiny_store(tmp_path, episodes=1))
+    with pytest.raises(StoreMismatch, match=r"at least two recordings .* found 1"):
+        fold_by_recording(store, 5, 8)
+
+
+def test_recordings_shorter_than_the_chunk_do_not_count(store: FeatureStore) -> None:
+    with pytest.raises(StoreMismatch, match=r"found 0.*shorter probe.horizon"):
+        fold_by_recording(store, 5, 31)
+
+
+def test_a_limit_takes_ticks_evenly(store: FeatureStore) -> None:
+    folds = fold_by_recording(store, 5, 8, max_ticks=20)
+    assert len(folds.ticks) == 20
+    assert set(folds.ticks // 30) == set(range(6))
+    assert folds.notes == ("20 of the ticks are read, evenly spread",)

@@ -1,0 +1,241 @@
+"""The slot that carries the action is found, and nothing that only looks as if it did."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.config import ProbeParams
+from pipeline.errors import NumericsError
+from pipeline.probing import Study, advice, metrics, probe, ranked, recommend, table
+from pipeline.store import FeatureStore
+
+PENALTIES = (1e-3, 1e-1, 1.0, 10.0)
+
+
+def probed(store: FeatureStore, **changed: Any) -> Study:
+    """With small windows and chunks."""
+    small = {"horizon": 2, "sensor_window": 4, "state_window": 4, "penalties": PENALTIES}
+    return probe(store, ProbeParams.model_validate(small | changed))
+
+
+def test_the_slot_that_carries_the_action_is_first(
+    tiny_store: Callable[..., Path], tmp_path: Path
+) -> None:
+    store = FeatureStore.open(tiny_store(tmp_path, episodes=40, slots=5))
+    rows = store.array("tick/vl_row")
+    features = store.array("vl/features")
+    weights = np.random.default_rng(1).normal(size=(8, 4)).astype(np.float32)
+    store.array("tick/action")[:, :4] = features[rows, 3] @ weights
+    study = probed(store, horizon=1)
+    first, *others = ranked(study.slots)
+    assert first.slots == (3,)
+    assert first.alone is not None
+    assert first.alone.mean > 0.99
+    assert first.gain is not None
+    assert first.gain > 0.9
+    assert study.streams is not None
+    assert abs(study.streams.mean) < 0.1
+    for other in others:
+        assert other.alone is not None
+        assert abs(other.alone.mean) < 0.1
+
+
+def test_scores_are_those_of_a_plain_ridge_regression(
+    store: FeatureStore, nested: Callable[..., tuple[np.ndarray, np.ndarray]]
+) -> None:
+    """Every tick a row of its own, although the store is read a VL row at a time."""
+    study = probed(store, folds=3)
+    ticks, fold = study.folds.ticks, study.folds.part
+    x = store.array("vl/features")[store.array("tick/vl_row")[ticks]].astype(np.float64)
+    action = store.array("tick/action").astype(np.float64)
+    y = action[ticks[:, None] + np.arange(2)].reshape(len(ticks), -1)
+    for index, found in enumerate(study.slots):
+        r2, chosen = nested(x[:, index], y, fold, PENALTIES)
+        assert found.alone is not None
+        varies = y.std(0) > 0
+        np.testing.assert_allclose(found.alone.r2[:, varies], r2[:, varies], atol=1e-8)
+        np.testing.assert_array_equal(found.alone.penalties, chosen)
+    (group,) = study.groups
+    assert group.alone is not None
+    r2, _ = nested(x.reshape(len(x), -1), y, fold, PENALTIES)
+    np.testing.assert_allclose(group.alone.r2[:, varies], r2[:, varies], atol=1e-8)
+    assert (group.channels, group.inputs) == (24, 24)
+
+
+def test_what_only_tells_recordings_apart_does_not_help(
+    tiny_store: Callable[..., Path], tmp_path: Path
+) -> None:
+    """Each recording has its own action and its own constant feature, unrelated to each other."""
+    store = FeatureStore.open(tiny_store(tmp_path, episodes=20, slots=2, dim=32))
+    rng = np.random.default_rng(3)
+    episode = np.arange(store.ticks) // 30
+    own = rng.normal(size=(20, 32)).astype(np.float32)
+    store.array("vl/features")[:, 1] = own[np.arange(200) // 10]
+    action = rng.normal(size=(20, 4)).astype(np.float32)
+    store.array("tick/action")[:, :4] = action[episode] + 0.01 * rng.normal(size=(600, 4))
+    found = probed(store).slots[1]
+    assert found.alone is not None
+    assert found.alone.mean < 0.1
+    # By sample it would seem to know everything.
+    x = own[episode].astype(np.float64)
+    x = np.hstack([x - x.mean(0), np.ones((600, 1))])
+    weights = np.linalg.lstsq(x[::2], store.array("tick/action")[::2, :4], rcond=None)[0]
+    error = ((store.array("tick/action")[1::2, :4] - x[1::2] @ weights) ** 2).mean(0)
+    assert (1 - error / store.array("tick/action")[:, :4].var(0)).min() > 0.9
+
+
+def test_a_slot_is_scored_where_it_is_valid(
+    store: FeatureStore, nested: Callable[..., tuple[np.ndarray, np.ndarray]]
+) -> None:
+    store.array("vl/slot_valid")[12:17, 1] = 0
+    store.array("vl/features")[12:17, 1] = np.nan  # what is not valid is not read
+    study = probed(store, folds=3)
+    ticks, fold = study.folds.ticks, study.folds.part
+    rows = store.array("tick/vl_row")[ticks]
+    there = ~np.isin(rows, range(12, 17))
+    assert study.slots[0].valid_share == 1
+    assert study.slots[1].valid_share == pytest.approx(there.mean())
+    y = store.array("tick/action").astype(np.float64)[ticks[:, None] + np.arange(2)]
+    y = y.reshape(len(y), -1)[there]
+    varies = y.std(0) > 0
+    x = store.array("vl/features")[rows[there], 1].astype(np.float64)
+    r2, _ = nested(x, y, fold[there], PENALTIES)
+    alone, without = study.slots[1].alone, study.slots[1].without
+    assert alone is not None
+    np.testing.assert_allclose(alone.r2[:, varies], r2[:, varies], atol=1e-8)
+    assert without is not None
+    assert without.rows.tolist() == alone.rows.tolist() == np.bincount(fold[there]).tolist()
+    # The group has its other slots at these ticks, and this one at its mean.
+    assert study.groups[0].valid_share == 1
+    assert study.groups[0].alone is not None
+
+
+def test_a_slot_of_too_few_recordings_is_not_scored(store: FeatureStore) -> None:
+    store.array("vl/slot_valid")[10:, 1] = 0
+    study = probed(store)
+    assert study.slots[1].alone is None
+    assert study.slots[1].best is None
+    assert ranked(study.slots)[-1].slots == (1,)
+    assert "-" in table(study)
+    metrics(study)
+
+
+@pytest.mark.parametrize(("dtype", "within"), [("bfloat16", 2e-2), ("float16", 1e-3)])
+def test_stored_dtypes_say_the_same(
+    tiny_store: Callable[..., Path], tmp_path: Path, dtype: str, within: float
+) -> None:
+    exact = probed(FeatureStore.open(tiny_store(tmp_path)))
+    rounded = probed(FeatureStore.open(tiny_store(tmp_path, name="rounded", dtype=dtype)))
+    for one, other in zip(exact.slots, rounded.slots, strict=True):
+        assert one.alone is not None
+        assert other.alone is not None
+        assert other.alone.mean == pytest.approx(one.alone.mean, abs=within)
+
+
+def test_only_the_plain_variant_is_read(
+    tiny_store: Callable[..., Path], tmp_path: Path, renamed: Callable[..., FeatureStore]
+) -> None:
+    plain = {"layer": 1, "norm": True, "pooling": "mean"}
+    slots = [{**plain, "pooling": pooling} for pooling in ("mean", "last")]
+    path = tiny_store(tmp_path, slots=6)
+    store = renamed(path, [one | {"variant": v} for v in range(3) for one in slots], variants=3)
+    before = probed(store)
+    assert [one.name.pooling for one in before.slots] == ["mean", "last"]
+    store.array("vl/features")[:, 2:] = np.nan
+    after = probed(store)
+    for one, other in zip(before.slots, after.slots, strict=True):
+        assert one.alone is not None
+        assert other.alone is not None
+        np.testing.assert_array_equal(one.alone.r2, other.alone.r2)
+
+
+def test_a_wide_group_is_read_along_its_main_directions(
+    store: FeatureStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipeline.probing.readers.GROUP_WIDTH", 12)
+    (group,) = probed(store).groups
+    assert (group.channels, group.inputs) == (24, 12)
+    assert "24 channels are read along 12 main directions, 4 a slot" in table(probed(store))
+
+
+@pytest.mark.parametrize("changed", [{"threads": 3}, {}])
+def test_threads_and_memory_change_no_bit(
+    store: FeatureStore, monkeypatch: pytest.MonkeyPatch, changed: dict[str, int]
+) -> None:
+    before = probed(store, threads=1)
+    monkeypatch.setattr("pipeline.probing.run.MEMORY_BYTES", 1)
+    after = probed(store, **changed)
+    for one, other in zip(
+        [*before.slots, *before.groups], [*after.slots, *after.groups], strict=True
+    ):
+        assert one.beside is not None
+        assert other.beside is not None
+        np.testing.assert_array_equal(one.beside.r2, other.beside.r2)
+
+
+@pytest.mark.parametrize("blocks", [1, 2**26])
+def test_blocks_change_nothing_but_rounding(
+    store: FeatureStore, monkeypatch: pytest.MonkeyPatch, blocks: int
+) -> None:
+    before = probed(store)
+    monkeypatch.setattr("pipeline.probing.accumulation._BLOCK_ROWS", 3)
+    monkeypatch.setattr("pipeline.probing.accumulation._LEAST_ROWS", 1)
+    monkeypatch.setattr("pipeline.probing.accumulation._BLOCK_BYTES", blocks)
+    after = probed(store)
+    for one, other in zip(before.slots, after.slots, strict=True):
+        assert one.beside is not None
+        assert other.beside is not None
+        np.testing.assert_allclose(one.beside.r2, other.beside.r2, atol=1e-9)
+
+
+@pytest.mark.parametrize("ticks", [None, 60])
+def test_a_number_that_is_none_is_named(store: FeatureStore, ticks: int | None) -> None:
+    store.array("vl/features")[12, 1, 4] = np.nan
+    with pytest.raises(NumericsError, match=r"right/episode_001, VL row 2 .*, slot 1, channel 4"):
+        probed(store, max_ticks=ticks)
+    store.array("vl/features")[12, 1, 4] = 0
+    store.array("tick/action")[40, 1] = np.inf
+    with pytest.raises(NumericsError, match=r"actions: .* found inf in row 40, channel 'dy'"):
+        probed(store)
+
+
+def test_a_store_without_streams_is_ranked_alone(
+    tiny_store: Callable[..., Path], tmp_path: Path
+) -> None:
+    study = probed(FeatureStore.open(tiny_store(tmp_path, sensor_channels=0, state_dim=0)))
+    assert study.streams is None
+    assert all(one.beside is None and one.best is one.alone for one in study.slots)
+    assert "beside state" not in table(study).splitlines()[1]
+
+
+def test_the_cheapest_of_those_that_are_tied_is_recommended(
+    tiny_store: Callable[..., Path], tmp_path: Path, renamed: Callable[..., FeatureStore]
+) -> None:
+    """Two layers hold the same numbers, a third pooling holds noise."""
+    slots = [
+        {"layer": 7, "norm": True, "pooling": "mean"},
+        {"layer": 2, "norm": False, "pooling": "mean"},
+        {"layer": 2, "norm": False, "pooling": "last"},
+    ]
+    store = renamed(tiny_store(tmp_path, episodes=20), slots)
+    store.array("vl/features")[:, 1] = store.array("vl/features")[:, 0]
+    study = probed(store, horizon=1)
+    found = recommend(study)
+    assert found is not None
+    assert found.helps
+    assert [one.name.layer for one in found.tied] in ([2], [7])
+    said = advice(study)
+    assert "vlm: {layers: [2], norms: [false], pooling: [mean]}" in said
+    assert "within one standard error of the best" in said
+
+
+def test_features_that_do_not_help_are_said_not_to(
+    tiny_store: Callable[..., Path], tmp_path: Path
+) -> None:
+    store = FeatureStore.open(tiny_store(tmp_path, episodes=12))
+    rng = np.random.default_rng(5)
+    store.array("tick/action")[:, :4] = rng.normal(size=(store.ticks, 4))
+    assert "does not show that a linear reader gains" in advice(probed(store))

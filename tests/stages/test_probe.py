@@ -1,0 +1,101 @@
+"""The command prints a ranking and what to write into params.yaml, and keeps both as files."""
+
+import csv
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+import zarr
+
+from pipeline.store import FeatureStore
+from stages import probe
+from stages.command import run
+
+FILES = ["groups.csv", "metrics.json", "probe.png", "probe_bars.png", "slots.csv", "targets.csv"]
+
+
+@pytest.fixture
+def params(tiny_store: Callable[..., Path], tmp_path: Path) -> Path:
+    """A params.yaml beside a store of one mean and of four cells of one view."""
+    path = tiny_store(tmp_path, slots=5, episodes=12)
+    cells = [[row, column] for row in range(2) for column in range(2)]
+    place = {"layer": 3, "norm": True, "pooling": "grid", "view": "View1"}
+    slots = [{"layer": 3, "norm": True, "pooling": "mean"}, *(place | {"cell": c} for c in cells)]
+    zarr.open_group(path, mode="r+").attrs["slots"] = slots
+    document = {
+        "data": {"sources": [{"name": "left", "path": "a"}]},
+        "vlm": {"checkpoint": "unused"},
+        "extract": {"store": str(path)},
+        "probe": {
+            "output": str(tmp_path / "report"),
+            "horizon": 2,
+            "sensor_window": 4,
+            "state_window": 4,
+        },
+    }
+    file = tmp_path / "params.yaml"
+    file.write_text(yaml.safe_dump(document))
+    return file
+
+
+def test_a_ranking_files_and_pictures(params: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("", probe.main, ["--params", str(params)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    report = params.parent / "report"
+    assert sorted(file.name for file in report.iterdir()) == FILES
+    # The action's first two channels are those of slot 0, which is the mean.
+    assert lines[5].startswith("layer 3, mean")
+    assert lines[-2].endswith("vlm: {layers: [3], norms: [true], pooling: [mean]}")
+    assert sum("View1 cell" in line for line in lines) == 4
+
+    slots = list(csv.DictReader((report / "slots.csv").read_text().splitlines()))
+    assert [one["pooling"] for one in slots] == ["mean"] + ["grid"] * 4
+    assert {one["cell"] for one in slots[1:]} == {"0,0", "0,1", "1,0", "1,1"}
+    groups = list(csv.DictReader((report / "groups.csv").read_text().splitlines()))
+    assert [(one["pooling"], one["slots"]) for one in groups] == [("mean", "1"), ("grid", "4")]
+    found = json.loads((report / "metrics.json").read_text())
+    assert found["recommended"]["group"] == "layer 3, mean"
+    assert found["groups"]["layer 3, mean"]["beside"]["r2"] == float(groups[0]["r2_beside"])
+
+    targets = list(csv.DictReader((report / "targets.csv").read_text().splitlines()))
+    assert len(targets) == 2 * 2 * 5
+    of_mean = {(one["step"], one["channel"]): one["r2_beside"] for one in targets[:10]}
+    assert of_mean["1", "gripper"] == ""
+    assert float(of_mean["1", "dx"]) > 0.5
+    told = [float(one) for one in of_mean.values() if one]
+    assert np.mean(told) == pytest.approx(float(groups[0]["r2_beside"]), abs=1e-5)
+
+
+def test_the_same_again_gives_the_same_bytes(params: Path) -> None:
+    report = params.parent / "report"
+    assert run("", probe.main, ["--params", str(params)]) == 0
+    before = {name: (report / name).read_bytes() for name in FILES}
+    again = ["--params", str(params), "--set", "probe.threads=1"]
+    assert run("", probe.main, again) == 0
+    assert {name: (report / name).read_bytes() for name in FILES} == before
+
+
+def test_what_cannot_be_probed_is_said(
+    params: Path,
+    tiny_store: Callable[..., Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    lonely = tiny_store(tmp_path, name="lonely", episodes=1)
+    arguments = ["--params", str(params), "--set", f"probe.store={lonely}"]
+    assert run("", probe.main, arguments) == 2
+    assert "two recordings" in capsys.readouterr().err
+    assert run("", probe.main, ["--params", str(params), "--set", "probe.horizon=31"]) == 2
+    assert "shorter probe.horizon" in capsys.readouterr().err
+    assert not (params.parent / "report").exists()
+
+
+def test_the_store_is_left_as_it_is(params: Path) -> None:
+    path = params.parent / "tiny.zarr"
+    before = {file: file.read_bytes() for file in path.rglob("*") if file.is_file()}
+    assert run("", probe.main, ["--params", str(params)]) == 0
+    assert {file: file.read_bytes() for file in path.rglob("*") if file.is_file()} == before
+    FeatureStore.open(path)
