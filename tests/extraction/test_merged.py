@@ -1,0 +1,37 @@
+"""After a merge, an extraction over all the sources finds every row by its key."""
+
+import pytest
+
+from pipeline.extraction import extract
+from pipeline.store import FeatureStore
+from pipeline.store.merging import merge
+from pipeline.vlm.qwen import FrozenVLM
+
+
+def test_a_merged_store_gives_every_row_to_an_extraction_of_all_sources(
+    changed, recordings, tmp_path, monkeypatch: pytest.MonkeyPatch
+):
+    """Both views in both, for the union of views is part of a feature's identity."""
+    sources = [
+        {"name": "first", "path": "Touch_dot/episode_1"},
+        {"name": "second", "path": "Touch_dot/episode_2"},
+    ]
+    for source in sources:
+        store = str(tmp_path / f"{source['name']}.zarr")
+        extract(changed(data={"sources": [source]}, extract={"store": store}), print)
+    target = tmp_path / "both.zarr"
+    merge([tmp_path / "first.zarr", tmp_path / "second.zarr"], target)
+    merged = FeatureStore.open(target)
+    before = {one.id: merged.array("vl/features")[list(one.vl_rows)] for one in merged.episodes}
+
+    def refuse(*args, **kwargs):
+        raise AssertionError("nothing needs the model")
+
+    monkeypatch.setattr(FrozenVLM, "load", refuse)
+    report = extract(changed(data={"sources": sources}, extract={"store": str(target)}), print)
+    assert report is not None
+    assert (report.computed, report.taken) == (0, report.rows)
+    after = FeatureStore.open(target)
+    assert after.sources == ["first", "second"]
+    for one in after.episodes:
+        assert (after.array("vl/features")[list(one.vl_rows)] == before[one.id]).all()

@@ -1,0 +1,176 @@
+"""One extracted store for all faults, copied for each, and stages as processes of their own."""
+
+import importlib
+import importlib.util
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from pipeline.config import Params
+from pipeline.extraction import extract
+from stages.command import run
+
+ROOT = Path(__file__).resolve().parents[2]
+
+_place = ROOT / "tests" / "extraction" / "conftest.py"
+_spec = importlib.util.spec_from_file_location("extraction_conftest", _place)
+assert _spec is not None
+assert _spec.loader is not None
+_extraction = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(_extraction)
+write_episode = _extraction.write_episode
+make_document = _extraction.make_document
+
+SMALL_HEAD: dict[str, Any] = {
+    "sensor_encoder": {"channels": [8], "layers": 0, "heads": 1, "output_dim": 8},
+    "state_encoder": {"dim": 8, "layers": 0, "heads": 1, "output_dim": 8},
+    "expert": {"dim": 8, "layers": 1, "heads": 1},
+    "horizon": 3,
+    "sensor_window": 6,
+    "state_window": 5,
+    "batch_size": 8,
+    "max_steps": 30,
+    "warmup_steps": 3,
+    "eval_every": 10,
+    "checkpoint_every": 4,
+    "device": "cpu",
+}
+
+
+@pytest.fixture(scope="session")
+def extracted(
+    make_document: Callable[[Path], dict[str, Any]], tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, dict[str, Any]]:
+    """A folder with recordings and the store that was made of them, and its params."""
+    folder = tmp_path_factory.mktemp("extracted")
+    document = make_document(folder)
+    extract(Params.model_validate(document), lambda line: None)
+    return folder, document
+
+
+@pytest.fixture
+def document(extracted: tuple[Path, dict[str, Any]], tmp_path: Path) -> dict[str, Any]:
+    """The params of a copy of those recordings and of that store, and of a small head."""
+    folder, document = extracted
+    shutil.copytree(folder / "recordings", tmp_path / "recordings")
+    shutil.copytree(folder / "stores", tmp_path / "stores")
+    return document | {
+        "data": document["data"] | {"root": str(tmp_path / "recordings")},
+        "extract": document["extract"] | {"store": str(tmp_path / "stores" / "made.zarr")},
+        "train_head": SMALL_HEAD
+        | {"output": str(tmp_path / "head"), "logs": str(tmp_path / "logs")},
+        "evaluate": {
+            "checkpoint": str(tmp_path / "head"),
+            "output": str(tmp_path / "report"),
+            "device": "cpu",
+        },
+    }
+
+
+@pytest.fixture
+def store(document: dict[str, Any]) -> Path:
+    """The copy of the store."""
+    return Path(document["extract"]["store"])
+
+
+@pytest.fixture
+def recordings(document: dict[str, Any]) -> Path:
+    """The copy of the recordings."""
+    return Path(document["data"]["root"])
+
+
+@pytest.fixture
+def params(document: dict[str, Any], tmp_path: Path) -> Path:
+    """params.yaml of these."""
+    return write_params(document, tmp_path)
+
+
+def write_params(document: dict[str, Any], folder: Path) -> Path:
+    path = folder / "params.yaml"
+    path.write_text(yaml.safe_dump(document))
+    return path
+
+
+@pytest.fixture
+def head_params(tmp_path: Path) -> Callable[..., Path]:
+    """`head_params(store, name, ...)`: params.yaml of a small head on a store."""
+
+    def write(store: Path, name: str = "run", **sections: dict[str, Any]) -> Path:
+        folder = tmp_path / name
+        folder.mkdir()
+        head = SMALL_HEAD | {"output": str(folder / "head"), "logs": str(folder / "logs")}
+        document: dict[str, dict[str, Any]] = {
+            "data": {"sources": [{"name": "left", "path": "a"}, {"name": "right", "path": "b"}]},
+            "vlm": {"checkpoint": "unused"},
+            "extract": {"store": str(store)},
+            "train_head": head,
+            "evaluate": {
+                "checkpoint": str(folder / "head"),
+                "output": str(folder / "report"),
+                "device": "cpu",
+            },
+        }
+        for section, values in sections.items():
+            document[section] = document.get(section, {}) | values
+        return write_params(document, folder)
+
+    return write
+
+
+Started = subprocess.Popen[str]
+
+
+@pytest.fixture
+def start() -> Callable[..., Started]:
+    """`start("stages.extract", params, *options)`, or Python code in place of a stage's name."""
+
+    def start(what: str, params: Path, *options: str) -> Started:
+        module = ["-m", what] if what.startswith("stages.") else ["-c", what]
+        return subprocess.Popen(
+            [sys.executable, *module, "--params", str(params), *options],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+        )
+
+    return start
+
+
+@pytest.fixture
+def stage(start: Callable[..., Started]) -> Callable[..., tuple[int, str, str]]:
+    """`stage(...)`: as `start`, run to its end: exit code, what it said, what it complained of.
+
+    It never ends in a SIGBUS, nor in a traceback.
+    """
+
+    def run_apart(what: str, params: Path, *options: str) -> tuple[int, str, str]:
+        process = start(what, params, *options)
+        said, complained = process.communicate(timeout=240)
+        assert process.returncode >= 0, f"ended by signal {-process.returncode}"
+        assert "Traceback" not in complained, complained
+        return process.returncode, said, complained
+
+    return run_apart
+
+
+@pytest.fixture
+def here(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+    """`here("stages.verify", params, *options)`: the same in this process, which is quicker."""
+
+    def run_here(name: str, params: Path, *options: str) -> tuple[int, str, str]:
+        module = importlib.import_module(name)
+        capsys.readouterr()
+        arguments = ["--params", str(params), *options]
+        code = run("", module.main, arguments, getattr(module, "SHORTHANDS", ()))
+        said, complained = capsys.readouterr()
+        return code, said, complained
+
+    return run_here

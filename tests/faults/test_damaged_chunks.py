@@ -1,0 +1,80 @@
+"""A chunk file cut off, bit-flipped or gone: an error that names it, or a correct result."""
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.config import Params
+from pipeline.errors import StoreIncomplete
+from pipeline.extraction import extract
+from pipeline.store import FeatureStore
+from pipeline.store.schema import ARRAY_NAMES
+
+
+def flip(chunk: Path) -> None:
+    """One bit of the second VL row, or some bit of another array."""
+    with chunk.open("r+b") as file:
+        file.seek(1000)
+        byte = file.read(1)
+        file.seek(1000)
+        file.write(bytes([byte[0] ^ 16]))
+
+
+HARMS: dict[str, Callable[[Path], None]] = {
+    "cut": lambda chunk: os.truncate(chunk, 1000),
+    "flipped": flip,
+    "gone": Path.unlink,
+}
+CHUNKS = ["vl/features/c/0/0/0", "sensor/values/c/0/0", "tick/action/c/0/0"]
+
+
+def nothing(line: str) -> None:
+    """Says nothing."""
+
+
+@pytest.mark.parametrize("chunk", CHUNKS)
+@pytest.mark.parametrize("harm", HARMS)
+def test_it_is_named_by_everything_that_reads(store: Path, params: Path, here, harm, chunk) -> None:
+    HARMS[harm](store / chunk)
+    if harm != "flipped":
+        with pytest.raises(StoreIncomplete, match=f"{chunk}.*damaged"):
+            FeatureStore.open(store)
+    if chunk == CHUNKS[0]:
+        code, _, complained = here("stages.verify", params)
+        assert code == 2
+        assert chunk in complained
+        if harm == "flipped":
+            assert "VL row" in complained
+        else:
+            code, _, complained = here("stages.train_head", params)
+            assert code == 2
+            assert chunk in complained
+
+
+@pytest.mark.parametrize("chunk", CHUNKS)
+@pytest.mark.parametrize("harm", HARMS)
+def test_an_extraction_beside_it_takes_no_wrong_row(
+    document, store: Path, recordings: Path, write_episode, tmp_path: Path, harm, chunk
+) -> None:
+    """Of the old store only rows that give their checksums are taken; streams are read anew."""
+    whole = tmp_path / "whole.zarr"
+    shutil.copytree(store, whole)
+    write_episode(recordings / "Touch_dot" / "episode_4", 4)
+    other = document | {"extract": document["extract"] | {"store": str(whole)}}
+    extract(Params.model_validate(other), nothing)
+    HARMS[harm](store / chunk)
+    if chunk == CHUNKS[0] and harm != "flipped":
+        with pytest.raises(StoreIncomplete, match=chunk):
+            extract(Params.model_validate(document), nothing)
+        return
+    extract(Params.model_validate(document), nothing)
+    mended, right = FeatureStore.open(store), FeatureStore.open(whole)
+    assert len(mended.episodes) == 4
+    for name in set(ARRAY_NAMES) - {"vl/features", "vl/checksum"}:
+        assert np.array_equal(mended.array(name), right.array(name), equal_nan=True), name
+    # Rows that were lost are computed again, within the noise of float32.
+    assert np.allclose(mended.array("vl/features"), right.array("vl/features"), atol=2e-5)

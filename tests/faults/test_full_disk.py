@@ -1,0 +1,106 @@
+"""A disk that fills up: exit 2, a message that names the place, and the next run completes."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from pipeline.store import FeatureStore
+from pipeline.store.archive import is_archive
+
+UNCHECKED = """
+import sys
+from importlib import import_module
+name = sys.argv.pop()
+for room in ("pipeline.extraction.layout", "pipeline.store.merging.union"):
+    import_module(room).free_bytes = lambda path: 2**40  # as where another program fills the disk
+stage = import_module(name)
+from stages.command import run
+sys.exit(run("", stage.main, sys.argv[1:], getattr(stage, "SHORTHANDS", ())))
+"""
+
+
+def fill(disk: Path, leave: int) -> Path:
+    """Write a file that leaves so many bytes free."""
+    ballast = disk / "ballast"
+    with ballast.open("wb") as file:
+        try:
+            while True:
+                file.write(bytes(2**16))
+                file.flush()
+        except OSError:
+            pass
+    size = ballast.stat().st_size
+    with ballast.open("r+b") as file:
+        file.truncate(max(0, size - leave))
+    return ballast
+
+
+@pytest.fixture
+def full_then_free(stage, here, small_disk: Path) -> Callable[..., None]:
+    """`full_then_free(leave, name, params, *options)`: on a disk with no more room, then with it.
+
+    The first run is a process of its own: a SIGBUS would end this one.
+    """
+
+    def check(leave: int, name: str, params: Path, *options: str) -> None:
+        ballast = fill(small_disk, leave)
+        code, _, complained = stage(UNCHECKED, params, *options, name)
+        assert code == 2, complained
+        assert complained.startswith("error: ")
+        assert str(small_disk) in complained
+        assert re.search("no space left|disk is full", complained, re.IGNORECASE)
+        assert "run the same" in complained
+        ballast.unlink()
+        code, _, complained = here(name, params, *options)
+        assert code == 0, complained
+
+    return check
+
+
+@pytest.mark.parametrize("leave", [50_000, 1_500_000])
+def test_extract(document, small_disk: Path, full_then_free, params: Path, leave: int) -> None:
+    target = small_disk / "made.zarr"
+    options = ["--set", f"extract.store={target}", "--set", "extract.sensor_dtype=float16"]
+    full_then_free(leave, "stages.extract", params, *options)
+    assert FeatureStore.open(target).ticks == 68
+
+
+def test_train_and_evaluate(
+    tiny_store: Callable[..., Path], head_params, small_disk: Path, full_then_free, tmp_path: Path
+) -> None:
+    store = tiny_store(tmp_path)
+    output, report = small_disk / "head", small_disk / "report"
+    params = head_params(
+        store,
+        train_head={"output": str(output)},
+        evaluate={"checkpoint": str(output), "output": str(report)},
+    )
+    full_then_free(20_000, "stages.train_head", params)
+    assert (output / "best" / "policy.json").exists()
+    full_then_free(5_000, "stages.evaluate", params)
+    assert (report / "metrics.json").exists()
+
+
+def test_archive(
+    tiny_store: Callable[..., Path], head_params, small_disk: Path, full_then_free, tmp_path: Path
+) -> None:
+    store = tiny_store(tmp_path, episodes=20, sensor_channels=50)
+    output = small_disk / "copy.archive.zarr"
+    params = head_params(store, archive={"output": str(output)})
+    full_then_free(300_000, "stages.archive", params)
+    assert is_archive(output)
+
+
+def test_merge(
+    tiny_store: Callable[..., Path], head_params, small_disk: Path, full_then_free, tmp_path: Path
+) -> None:
+    inputs = [
+        str(tiny_store(tmp_path, name=name, seed=seed, sensor_channels=50))
+        for seed, name in enumerate("ab")
+    ]
+    words = ["merge", *inputs, "--into", str(small_disk / "both.zarr")]
+    params = head_params(Path("unused.zarr"))
+    full_then_free(200_000, "stages.store", params, *words)
+    assert len(FeatureStore.open(small_disk / "both.zarr").episodes) == 12

@@ -1,0 +1,149 @@
+"""`stages.store` as a user meets it."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import yaml
+
+from pipeline.store import FeatureStore
+from stages import store as stage
+from stages import train_head
+from stages.command import run
+
+Make = Callable[..., Path]
+ROOT = Path(stage.__file__).parents[1]
+
+
+@pytest.fixture
+def params(tmp_path: Path) -> Path:
+    (tmp_path / "stores").mkdir()
+    small = {
+        "sensor_encoder": {"channels": [4], "layers": 0, "heads": 1, "output_dim": 4},
+        "state_encoder": {"dim": 4, "layers": 0, "heads": 1, "output_dim": 4},
+        "expert": {"dim": 4, "layers": 1, "heads": 1},
+        "horizon": 2,
+        "sensor_window": 3,
+        "state_window": 3,
+        "max_steps": 2,
+        "device": "cpu",
+        "output": str(tmp_path / "models" / "head"),
+        "logs": str(tmp_path / "logs"),
+    }
+    document = {
+        "data": {"sources": [{"name": "left", "path": "a"}, {"name": "right", "path": "b"}]},
+        "vlm": {"checkpoint": "unused"},
+        "extract": {"store": str(tmp_path / "stores" / "one.zarr")},
+        "train_head": small,
+        "stores": {
+            "folder": str(tmp_path / "stores"),
+            "checkpoints": [str(tmp_path / "models")],
+        },
+    }
+    path = tmp_path / "params.yaml"
+    path.write_text(yaml.safe_dump(document))
+    return path
+
+
+def command(params: Path, *arguments: str) -> int:
+    return run("", stage.main, ["--params", str(params), *arguments], stage.SHORTHANDS)
+
+
+def test_list_names_what_was_trained_on_a_store(
+    params: Path, tiny_store: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stores = tmp_path / "stores"
+    tiny_store(stores, name="one")
+    tiny_store(stores, name="two", seed=1)
+    assert run("", train_head.main, ["--params", str(params)]) == 0
+    best = tmp_path / "models" / "head" / "best"
+    subprocess.run(["cp", "-r", best, tmp_path / "models" / "lone"], check=True)
+    (tmp_path / "models" / "broken").mkdir()
+    (tmp_path / "models" / "broken" / "run.json").write_text("{")
+    capsys.readouterr()
+    assert command(params, "list") == 0
+    said = capsys.readouterr()
+    lines = said.out.splitlines()
+    first, second = (
+        next(i for i, x in enumerate(lines) if x.startswith(n)) for n in ("one", "two")
+    )
+    of_first = "\n".join(lines[first:second])
+    of_second = "\n".join(lines[second:])
+    assert f"{tmp_path}/models/head: trained on it" in of_first
+    assert f"{tmp_path}/models/lone: can be judged on it" in of_first
+    assert "models" not in of_second
+    assert "spec tiny-spe: 3 slots x 8 in float32" in said.out
+    assert "prompt '{instruction}'" in said.out
+    assert "broken/run.json" in said.err
+
+
+def test_merge_gives_a_store_that_trains(
+    params: Path, tiny_store: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    a, b = (str(tiny_store(tmp_path, name=name, seed=seed)) for seed, name in enumerate("ab"))
+    into = tmp_path / "stores" / "one.zarr"
+    assert command(params, "merge", a, b, "--into", str(into)) == 0
+    said = capsys.readouterr().out
+    assert f"{into}: 12 episodes, 120 rows, none computed" in said
+    assert run("", train_head.main, ["--params", str(params)]) == 0
+    assert "12 episodes, 360 ticks" in capsys.readouterr().out
+    assert command(params, "merge", a, b, "--into", str(into)) == 0
+    assert "up to date, nothing to do" in capsys.readouterr().out
+
+
+def test_mistakes_end_in_one_message(
+    params: Path, tiny_store: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    a = str(tiny_store(tmp_path, name="a"))
+    other = str(tiny_store(tmp_path, name="b", reuse=2))
+    into = ["--into", str(tmp_path / "c.zarr")]
+    for arguments, said in (
+        (["merge", a, other], "stores.output"),
+        (["merge", a, *into], "two or more stores"),
+        (["merge", a, other, *into], "vlm_reuse_count: 3 -> 2"),
+        (["merge", a, str(tmp_path / "x.zarr"), *into], "no finished store"),
+        (["tidy"], "stores.action"),
+        (["list", "--set", f"stores.folder={tmp_path / 'nowhere'}"], "stores.folder"),
+    ):
+        assert command(params, *arguments) == 2
+        err = capsys.readouterr().err
+        assert err.startswith("error: ")
+        assert said in err
+
+
+def test_gc_lists_and_removes_only_when_told_to(
+    params: Path, tiny_store: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stores = tmp_path / "stores"
+    tiny_store(stores, name="one")
+    tiny_store(stores, name="two").rename(stores / "two.zarr.part")
+    assert command(params, "gc") == 0
+    said = capsys.readouterr().out
+    assert f"unneeded: {stores}/two.zarr.part" in said
+    assert "60 of 60 rows done; stages.extract would resume it" in said
+    assert "--remove removes them" in said
+    assert sorted(os.listdir(stores)) == ["one.zarr", "two.zarr.part"]
+    assert command(params, "gc", "--remove") == 0
+    assert f"removed: {stores}/two.zarr.part" in capsys.readouterr().out
+    assert os.listdir(stores) == ["one.zarr"]
+    assert FeatureStore.open(stores / "one.zarr").ticks == 180
+    assert command(params, "gc", "--remove") == 0
+    assert "nothing to remove" in capsys.readouterr().out
+
+
+def test_without_a_word_it_lists_and_progress_is_silent(
+    params: Path, tiny_store: Make, tmp_path: Path
+) -> None:
+    tiny_store(tmp_path / "stores", name="one")
+    done = subprocess.run(
+        [sys.executable, "-m", "stages.store", "--params", str(params)],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+    )
+    assert "one.zarr" in done.stdout
+    assert done.stderr == ""
