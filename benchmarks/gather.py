@@ -1,0 +1,250 @@
+"""How fast batches come out of a store, beside memory itself and beside other formats.
+
+A store of 200,000 VL rows (2,048 x float16) and 2 GB of sensor readings (1,026 x float32) is built
+in a scratch folder with the project's writer and gathered from with one thread, warm, in rounds
+that every contender shares. The ceiling is a row gather in C from a copy of the array in RAM: the
+faster of `numpy.take(mode="clip")` and `torch.index_select`, both into a reused buffer.
+"""
+
+import argparse
+import gc
+import itertools
+import shutil
+import statistics
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from benchmarks.contests import (
+    CEILINGS,
+    OURS,
+    OURS_2,
+    batch_race,
+    draws,
+    row_race,
+    window_race,
+)
+from benchmarks.formats import evict
+from benchmarks.loading import stream_rates
+from benchmarks.stores import write_store
+from benchmarks.timing import Race, Work, arguments, at_least, at_most, race, report
+from pipeline.store import FeatureStore
+from pipeline.store import gather as gathering
+from pipeline.store.mapping import populate
+
+FULL = {
+    "episodes": 40,
+    "ticks": 15_000,
+    "readings": 12_200,
+    "states": 15_000,
+    "files": 20_000,
+    "draws": 400,
+    "window_draws": 48,
+    "rows": 256,
+    "windows": 64,
+    "lengths": (65, 650),
+    "least_s": 0.05,
+    "long_store": 1_000_000,
+}
+QUICK = FULL | {
+    "episodes": 2,
+    "ticks": 2_100,
+    "readings": 1_500,
+    "states": 2_100,
+    "files": 300,
+    "draws": 8,
+    "window_draws": 3,
+    "windows": 4,
+    "lengths": (13,),
+    "least_s": 0.001,
+    "long_store": 20_000,
+}
+
+
+def main() -> None:
+    """Build, measure, print, clean up."""
+    parser = arguments(__doc__ or "")
+    parser.add_argument("--folder", type=Path, default=None, help="scratch; a temporary one")
+    options = parser.parse_args()
+    sizes: dict[str, Any] = QUICK if options.quick else FULL
+    folder = Path(tempfile.mkdtemp(prefix="gather-", dir=options.folder))
+    try:
+        torch.set_num_threads(1)
+        results, ratios, targets = measure(folder, sizes, options)
+    finally:
+        shutil.rmtree(folder)
+    report(
+        "gather",
+        settings=sizes | {"baseline": "the faster ceiling", "cold": COLD},
+        results=results,
+        ratios=ratios,
+        targets=targets,
+        quick=options.quick,
+    )
+
+
+COLD = (
+    "pages of the files dropped with posix_fadvise(DONTNEED) before each call and the store mapped "
+    "anew; what lies below the operating system (a host's cache) is not"
+)
+
+
+def measure(
+    folder: Path, sizes: Mapping[str, Any], options: argparse.Namespace
+) -> tuple[dict[str, Any], dict[str, Any], list[dict[str, Any]]]:
+    """All parts of the benchmark, one after the other."""
+    streams = {name: sizes[name] for name in ("episodes", "ticks", "readings", "states")}
+    path = write_store(folder / "bench.zarr", **streams)
+    rounds = options.rounds or (2 if options.quick else 15)
+    slow = min(rounds, 3)
+    store = FeatureStore.open(path)
+    results: dict[str, Any] = {}
+    ratios: dict[str, Any] = {}
+    targets: list[dict[str, Any]] = []
+
+    def add(part: str, found: Race, amount: Mapping[str, float]) -> str:
+        ceiling = min(CEILINGS, key=found.median)
+        results[part] = found.results(amount)
+        ratios[part] = {"baseline": ceiling, **found.ratios(ceiling)}
+        return ceiling
+
+    rows, slow_rows = row_race(store, folder / "rows", sizes, rounds, slow)
+    count = sizes["rows"]
+    amount = {
+        "rows": count,
+        "GB": count * store.tensor("features").nbytes / len(store.tensor("features")) / 1e9,
+    }
+    targets.append(against_ceiling("rows", rows, add("rows", rows, amount), 0.95))
+    results["rows, slow ways"] = slow_rows.results(amount)
+    ratios["rows, slow ways"] = {"baseline": OURS, **slow_rows.ratios(OURS)}
+    pt = slow_rows.median(".pt a sample")
+    targets.append(at_least("rows: times as fast as .pt files", pt / rows.median(OURS), 200))
+    two = pt / rows.median(OURS_2)
+    targets.append(at_least("rows: times as fast as .pt files, 2 threads", two, 300))
+    for length in sizes["lengths"]:
+        part = f"windows of {length}"
+        warm, slower = window_race(store, folder / "windows", sizes, length, rounds, slow)
+        amount = {"windows": sizes["windows"], "GB": sizes["windows"] * length * 4104 / 1e9}
+        targets.append(against_ceiling(part, warm, add(part, warm, amount), 0.95))
+        results[f"{part}, slow ways"] = slower.results(amount)
+        ratios[f"{part}, slow ways"] = {"baseline": OURS, **slower.ratios(OURS)}
+        part = f"batch of {sizes['windows']}, windows of {length}"
+        whole = batch_race(store, sizes["windows"], length, sizes, rounds)
+        targets.append(against_ceiling(part, whole, add(part, whole, {}), 0.9))
+    part = f"batch of {count}, windows of {sizes['lengths'][0]}"
+    whole = batch_race(store, count, sizes["lengths"][0], sizes, rounds)
+    targets.append(against_ceiling(part, whole, add(part, whole, {}), 0.9))
+    results["stream"] = stream_rates(store, sizes["lengths"][0], 12 if options.quick else 60)
+    shutil.rmtree(folder / "windows")
+    del store
+    gc.collect()
+    results["cold"] = cold(path, folder / "rows", sizes, slow)
+    opened = open_race(path, folder, sizes["long_store"], rounds)
+    results["open"] = opened.results()
+    ratio = statistics.median(
+        long / short
+        for long, short in zip(opened.seconds["long"], opened.seconds["10 k ticks"], strict=True)
+    )
+    targets.append(at_most(f"open {sizes['long_store']} ticks / 10 k ticks", ratio, 2))
+    return results, ratios, targets
+
+
+def against_ceiling(part: str, found: Race, ceiling: str, wanted: float) -> dict[str, Any]:
+    """The target of a part: its speed as a share of the ceiling's."""
+    return at_least(f"{part}: share of {ceiling}", found.speed(OURS, ceiling), wanted)
+
+
+class Fresh:
+    """A store that is opened anew, with nothing of its files in the page cache, for each call."""
+
+    def __init__(self, path: Path, available: int | None = None) -> None:
+        self._path, self._available = path, available
+        self.store: FeatureStore | None = None
+
+    def prepare(self) -> None:
+        """Let go of the last one, drop its pages, map it again."""
+        self.store = None
+        gc.collect()
+        evict(self._path)
+        real = gathering.available_bytes
+        try:
+            if self._available is not None:
+                gathering.available_bytes = lambda: self._available
+            self.store = FeatureStore.open(self._path)
+            self.store.empty_batch(1, 1, 1, 1)  # here it decides how to page
+        finally:
+            gathering.available_bytes = real
+
+    def gather(self, ticks: NDArray[np.int64], window: int) -> None:
+        """One batch."""
+        assert self.store is not None
+        self.store.gather(ticks, 8, window, 100)
+
+    def populate(self) -> None:
+        """All wide streams, in order."""
+        assert self.store is not None
+        for name in gathering.WIDE.values():
+            populate(self.store.array(name))
+
+
+def cold(path: Path, rows: Path, sizes: Mapping[str, Any], rounds: int) -> dict[str, Any]:
+    """A first batch from a store that is not in memory, and from sample files that are not."""
+    fits, larger = Fresh(path), Fresh(path, available=0)
+    ticks = draws(64, sizes["rows"], 0, sizes["episodes"] * sizes["ticks"])
+    files = draws(64, sizes["rows"], 0, sizes["files"])
+    kept = {int(file.stem) for file in (rows / "files").glob("*.pt")}
+    order, file_order = itertools.cycle(ticks), itertools.cycle(files)
+
+    def pt() -> None:
+        for row in next(file_order).tolist():
+            if row in kept:
+                torch.load(rows / "files" / f"{row}.pt")
+
+    contenders: dict[str, Work] = {
+        "batch of rows, store as one that fits": lambda: fits.gather(next(order), 1),
+        "batch of rows, store as one larger than memory": lambda: larger.gather(next(order), 1),
+        "batch of windows, store as one that fits": lambda: fits.gather(next(order), 65),
+        "batch of windows, store as one larger than memory": lambda: larger.gather(next(order), 65),
+        "populate the whole store": fits.populate,
+        ".pt a sample": pt,
+    }
+    before = {
+        name: fits.prepare if "fits" in name or "populate" in name else larger.prepare
+        for name in contenders
+    }
+    before[".pt a sample"] = lambda: evict(rows / "files")
+    found = race(contenders, rounds, warmup=0, before=before)
+    size = sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
+    results: dict[str, Any] = found.results()
+    results["populate the whole store"]["GB_per_s"] = (
+        size / 1e9 / found.median("populate the whole store")
+    )
+    return results
+
+
+def open_race(path: Path, folder: Path, long_store: int, rounds: int) -> Race:
+    """Opening: a short store, a long one of the same kind, and the large one of this benchmark."""
+    narrow = {"readings": 200, "states": 200, "dim": 64, "channels": 16, "ticks": 200}
+    short = write_store(folder / "short.zarr", episodes=50, **narrow)
+    long = write_store(folder / "long.zarr", episodes=long_store // 200, **narrow)
+
+    def first_batch(store: Path) -> Work:
+        return lambda: FeatureStore.open(store).gather(np.arange(64))
+
+    contenders: dict[str, Work] = {
+        "10 k ticks": lambda: FeatureStore.open(short),
+        "long": lambda: FeatureStore.open(long),
+        "wide": lambda: FeatureStore.open(path),
+        "10 k ticks, and a batch": first_batch(short),
+        "long, and a batch": first_batch(long),
+    }
+    return race(contenders, rounds, least_s=0.05)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,65 @@
+"""Stage one as a contender: its own `fill`, in steady state, with the model loaded beforehand."""
+
+from itertools import chain, repeat
+from unittest.mock import patch
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.workload import Workload
+from pipeline.extraction.encoder import Encoder
+from pipeline.extraction.fill import fill
+from pipeline.extraction.rows import ReadyRow, RowPreparation, in_background
+from pipeline.vlm.preparation import Preparer
+from pipeline.vlm.qwen import FrozenVLM
+
+
+class StageOne:
+    """Fills a laid-out store with the workload's rows."""
+
+    def __init__(self, workload: Workload, vlm: FrozenVLM, batch_size: int | None) -> None:
+        """Without a batch size, the one that `auto` settles on."""
+        self._workload, self._vlm = workload, vlm
+        self.batch_size = batch_size or _settled(workload, vlm)
+        self.shares: list[tuple[float, float]] = []
+        """Of each run's time since it had its model: what that worked, and waited for frames."""
+        self._build = workload.fresh_build()
+
+    def prepare(self) -> None:
+        """Lay out an empty store in place of the one before."""
+        self._build.close()
+        self._build = self._workload.fresh_build()
+
+    def run(self) -> None:
+        """Fill the store."""
+        work = self._workload
+        extract = work.params.extract.model_copy(update={"batch_size": self.batch_size})
+        params = work.params.model_copy(update={"extract": extract})
+        # Stage one takes the model that is there instead of loading it again.
+        with patch.object(FrozenVLM, "load", return_value=self._vlm):
+            done = fill(self._build, work.survey, [], params, work.digests, work.missing)
+        assert done.computed + done.repeated == len(work.missing), done
+        assert done.model_share is not None and done.waited_share is not None
+        self.shares.append((done.model_share, done.waited_share))
+
+    def features(self) -> NDArray[np.float32]:
+        """Features (row, dim) of the last run."""
+        return self._build.files("vl/features").read(0, len(self._workload.missing))[:, 0]
+
+
+def _settled(workload: Workload, vlm: FrozenVLM) -> int:
+    """The batch size that `auto` settles on when it sees these rows over and over."""
+    params, spec = workload.params, workload.survey.spec
+    preparation = RowPreparation(Preparer(params.vlm, spec), spec, [])
+    threads = params.extract.decode_threads
+    rows = [
+        row
+        for row in in_background(workload.spans(), preparation.prepare, threads)
+        if isinstance(row, ReadyRow)
+    ]
+    encoder = Encoder(vlm, "auto")
+    for _ in encoder.encoded(chain.from_iterable(repeat(rows))):
+        if encoder.settled:
+            # In a larger batch, rows would stand twice and be seen once.
+            return min(encoder.batch_size, len(rows))
+    raise AssertionError("rows without end came to an end")
