@@ -2,9 +2,10 @@
 
 Writes metrics.json, tables (CSV) and pictures (PNG) into `evaluate.output`, and judged.json, which
 says what was judged on what. With `evaluate.modalities`, judges again with each stream spoilt.
+An archive of a store serves as well: it is restored once, to `train_head.scratch`.
 """
 
-from pipeline.batches import Windows
+from pipeline.batches import Windows, open_store
 from pipeline.checkpoint import find_policy, load_policy
 from pipeline.config import Params
 from pipeline.device import resolve_device
@@ -21,7 +22,7 @@ from pipeline.evaluation import (
     write_tables,
 )
 from pipeline.plots import write_modalities_plot, write_plots
-from pipeline.store import FeatureStore
+from pipeline.store import check_trailers
 from stages.command import run
 
 
@@ -31,7 +32,10 @@ def main(params: Params) -> None:
     device = resolve_device(wanted.device)
     folder = find_policy(wanted.checkpoint)
     checkpoint = load_policy(folder)
-    store = FeatureStore.open(wanted.store or params.train_head.store or params.extract.store)
+    path = wanted.store or params.train_head.store or params.extract.store
+    store = open_store(path, "auto", params.train_head.scratch, print)
+    if params.train_head.check_store:
+        check_trailers(store.path)
     check_store(checkpoint, store)
     ticks = held_out_ticks(store, checkpoint.held_out_ticks, checkpoint.held_out_content)
     policy = checkpoint.policy(device)

@@ -146,9 +146,11 @@ def write_tiny_store(
     }
     for array, values in contents.items():
         build.write(array, 0, np.asarray(values))
+    said_of_slots = [{"layer": 0, "norm": True, "pooling": "mean"}] * slots
     build.finish_layout(
         {
             "schema": SCHEMA,
+            "slots": said_of_slots,
             "feature_spec": {"digest": spec_digest, "prompt": "{instruction}"},
             "sources": ["left", "right"],
             "streams": streams,
@@ -156,7 +158,7 @@ def write_tiny_store(
             "vlm_reuse_count": reuse,
             "environment": [],
         },
-        {"slots": [{"layer": 0, "norm": True, "pooling": "mean"}] * slots},
+        {"slots": said_of_slots},
     )
     keys = [rng.bytes(16) for _ in range(len(features))]
     stored = features

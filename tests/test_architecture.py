@@ -16,7 +16,7 @@ TIERS = (
     {"timeline", "simulation", "sampling", "checkpoint"},
     {"batches", "extraction"},
     {"evaluation", "datasets"},
-    {"training"},
+    {"training", "probing"},
     {"finetuning"},
     {"plots"},
 )

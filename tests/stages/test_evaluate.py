@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from pipeline.store.archive import archive
 from stages import evaluate, train_head
 from stages.command import run
 
@@ -143,3 +144,22 @@ def test_a_sampling_policy_is_judged_on_the_mean_of_samples(trained: Path, tmp_p
         assert judged["drawn"] == {"samples": samples, "batch_size": 64}
         errors.append(json.loads((output / "metrics.json").read_text())["overall"]["policy"])
     assert errors[1] == errors[2] != errors[0]
+
+
+def test_an_archive_does_what_its_store_does(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    packed = tmp_path / "tiny.archive.zarr"
+    archive(trained.parent / "tiny.zarr", packed, level=1, threads=1)
+    arguments = ["--params", str(trained), "--set", f"train_head.scratch={tmp_path / 'scratch'}"]
+    from_store, from_archive = tmp_path / "from_store", tmp_path / "from_archive"
+    told = [*arguments, "--set", f"evaluate.output={from_store}"]
+    assert run("", evaluate.main, told) == 0
+    archived = [*arguments, "--set", f"extract.store={packed}"]
+    assert run("", train_head.main, archived) == 0
+    said = capsys.readouterr().out
+    assert "feed: compressed" in said and "nothing to do" in said
+    assert run("", evaluate.main, [*archived, "--set", f"evaluate.output={from_archive}"]) == 0
+    assert (from_archive / "metrics.json").read_bytes() == (
+        from_store / "metrics.json"
+    ).read_bytes()
