@@ -16,11 +16,12 @@
 `simulation`   a simulated needle insertion, and the demo recordings
 `sampling`     split by episode, mixture weights, resumable order
 `checkpoint`   a trained policy on disk
-`batches`      gathered ahead, in a background thread
-`extraction`   recordings x vlm -> store
+`batches`      gathered ahead, from the map, the device or an archive
+`extraction`   recordings x vlm -> store, here or on dask workers
 `evaluation`   predictions -> figures of merit
 `datasets`     recordings and store as torch data sets, under the names of the old code
 `training`     one loop for every expert
+`probing`      which slots carry the action, by ridge regression
 `finetuning`   the same loop with the model in front of the policy learning too
 `plots`        arrays -> pictures
 
