@@ -10,7 +10,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from pipeline.config import Params, load_params
+from pipeline.config import Params, described_keys, load_params
 from pipeline.errors import PipelineError
 
 
@@ -55,11 +55,13 @@ def run(
     work: Callable[[Params], None],
     arguments: Sequence[str] | None = None,
     shorthands: Sequence[Shorthand] = (),
+    sections: Sequence[str] = (),
 ) -> int:
     """Parse the options, do the work, return the exit code.
 
     0 done; 2 something the user can mend, said in one message without a traceback; 1 stopped by
-    Ctrl-C or SIGTERM, or a bug, which keeps its traceback.
+    Ctrl-C or SIGTERM, or a bug, which keeps its traceback. `sections` are those of params.yaml that
+    `--keys` lists.
     """
     parser = argparse.ArgumentParser(
         description=summary, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -73,9 +75,17 @@ def run(
         metavar="section.key=value",
         help="lay a value (YAML) over the file; may be given several times",
     )
+    parser.add_argument(
+        "--keys",
+        action="store_true",
+        help=f"list the keys of {', '.join(sections) or 'params.yaml'}, with defaults, and exit",
+    )
     for shorthand in shorthands:
         shorthand.add_to(parser)
     options = parser.parse_args(arguments)
+    if options.keys:
+        print("\n".join(described_keys(sections or tuple(Params.model_fields))))
+        return 0
     overrides = [
         *options.overrides,
         *(one for each in shorthands for one in each.override(options)),
@@ -92,11 +102,12 @@ def run(
         print(f"error: {said}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("stopped; the same command continues from here", file=sys.stderr)
+        print("stopped; run the same command again", file=sys.stderr)
         return 1
     return 0
 
 
 def _terminate(signum: int, frame: FrameType | None) -> None:
-    """Make SIGTERM stop as Ctrl-C does: through every `finally`."""
+    """Make SIGTERM stop as Ctrl-C does, through every `finally`, which no second one may cut."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
     raise KeyboardInterrupt

@@ -28,4 +28,4 @@ def main(params: Params) -> None:
 
 
 if __name__ == "__main__":
-    raise SystemExit(run(__doc__ or "", main))
+    raise SystemExit(run(__doc__ or "", main, sections=("compare",)))

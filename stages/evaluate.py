@@ -34,9 +34,9 @@ def main(params: Params) -> None:
     checkpoint = load_policy(folder)
     path = wanted.store or params.train_head.store or params.extract.store
     store = open_store(path, "auto", params.train_head.scratch, print)
+    check_store(checkpoint, store)
     if params.train_head.check_store:
         check_trailers(store.path)
-    check_store(checkpoint, store)
     ticks = held_out_ticks(store, checkpoint.held_out_ticks, checkpoint.held_out_content)
     policy = checkpoint.policy(device)
     judged = judged_document(checkpoint, policy, store, wanted.samples, wanted.batch_size)
@@ -75,4 +75,4 @@ def main(params: Params) -> None:
 
 
 if __name__ == "__main__":
-    raise SystemExit(run(__doc__ or "", main))
+    raise SystemExit(run(__doc__ or "", main, sections=("evaluate",)))

@@ -14,7 +14,7 @@ from pipeline.config import Params
 from pipeline.finetuning import Live, head_params, next_steps, out_of_memory_named
 from pipeline.finetuning.params import left_out
 from pipeline.sampling import split_by_episode
-from pipeline.store import FeatureStore, build_lock
+from pipeline.store import FeatureStore, build_lock, check_trailers
 from pipeline.training import Trainer, open_run, process_group
 from pipeline.training.world import process_device
 from stages.command import run
@@ -32,6 +32,8 @@ def main(params: Params) -> None:
             if opened.status == "finished":
                 world.say("nothing to do", *next_steps(params.finetune, store))
                 return
+            if head.check_store:
+                world.shared(lambda: check_trailers(store.path))
             split = split_by_episode(store, head.val_fraction, head.horizon)
             trainer = Trainer(store, head, split, opened, front)
             world.say(*trainer.summary(), *front.summary())
@@ -41,4 +43,4 @@ def main(params: Params) -> None:
 
 
 if __name__ == "__main__":
-    raise SystemExit(run(__doc__ or "", main))
+    raise SystemExit(run(__doc__ or "", main, sections=("finetune", "train_head")))

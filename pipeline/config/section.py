@@ -11,4 +11,6 @@ Seed = Annotated[int, Field(ge=0)]
 class Section(BaseModel):
     """Base of every section: immutable, no unknown keys, no NaN or infinity."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True
+    )

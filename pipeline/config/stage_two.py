@@ -111,7 +111,7 @@ class TrainHeadParams(Section):
     """How batches are made: gathered from the mapped store; on the device, which holds the streams
     that fit; or from an archive, restored once to `scratch`. `auto` picks and says why."""
     check_store: bool = True
-    """Read the store once before training and before evaluation, and refuse a chunk that does not
+    """Read the store once before training, tuning and evaluation, and refuse a chunk that does not
     give its checksum; false where that takes too long."""
     scratch: Path | None = None
     """Folder for the restored archive; the system's temporary folder where null."""

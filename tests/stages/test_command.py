@@ -86,6 +86,23 @@ def test_a_shorthands_value_is_checked_as_the_key_is(capsys):
     assert "verify.reextract: Input should be greater than or equal to 0" in capsys.readouterr().err
 
 
+def test_keys_are_listed_with_defaults_and_meaning(capsys):
+    assert run("Summary.", print, ["--keys"], sections=("verify", "train_head")) == 0
+    said = capsys.readouterr().out
+    assert "verify: What is checked of a store." in said
+    assert "  verify.reextract = 0\n      Random rows that are computed again" in said
+    assert "  train_head.expert.dim = " in said
+    assert '  train_head.output = "models/head"\n' in said
+    assert "extract.store" not in said.replace("`extract.store`", "")
+
+
+def test_without_sections_all_keys_are_listed(capsys):
+    assert run("Summary.", print, ["--keys"]) == 0
+    said = capsys.readouterr().out
+    assert "  vlm.checkpoint = (has to be given)" in said
+    assert "  stores.remove = false" in said
+
+
 def test_a_bug_keeps_its_traceback():
     def work(params):
         raise KeyError("bug")
@@ -105,7 +122,7 @@ def test_one_and_a_word_when_stopped(capsys, sent):
         assert run("Summary.", work, ["--params", PARAMS]) == 1
     finally:
         signal.signal(signal.SIGTERM, before)
-    assert "the same command continues from here" in capsys.readouterr().err
+    assert "run the same command again" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
