@@ -88,7 +88,7 @@ def bytes_table() -> str:
     rows.append(_bytes_row("state, float32", _sum(stores["float16"], "state/")))
     rest = sum(spec.data_bytes for spec in stores["float16"].values())
     rest -= sum(_sum(stores["float16"], part) for part in ("vl/features", "sensor/", "state/"))
-    rows.append(_bytes_row("all else (ticks, keys, checksums, times, episodes)", rest))
+    rows.append(_bytes_row("all else, 1 slot of 3 views (ticks, keys, checksums, times)", rest))
     return _table(["part", "a tick", "an hour", *(f"{name} ticks" for name in AMOUNTS)], rows)
 
 

@@ -51,7 +51,7 @@ def row_race(
     slower |= {name: each(few, read) for name, read in files.items()}
     warm(store)
     return (
-        race(fast, rounds, least_s=sizes["least_s"]),
+        race(fast, rounds, least_s=sizes["least_s"], before=all_drawn(fast, len(drawn))),
         race({OURS: each(drawn, ours), **slower}, slow),
     )
 
@@ -68,7 +68,7 @@ def window_race(
     folder.mkdir(exist_ok=True)
     count, mapped = sizes["windows"], store.tensor("sensor")
     ram = mapped.clone()
-    drawn = draws(sizes["window_draws"], count, length, len(mapped))
+    drawn = draws(window_draws(sizes, count, length), count, length, len(mapped))
     batch = store.empty_batch(count, 1, length, 1).touch()
     out, full = torch.zeros_like(batch.sensor), np.full(count, length)
     flat, place = out.view(-1, mapped.shape[1]), np.arange(-length, 0)
@@ -89,12 +89,12 @@ def window_race(
     files = min(len(values) // length, 65_000 // length)
     samples = values[: files * length].reshape(files, length, -1)
     by_file = file_readers(folder / f"files {length}", samples)
-    few = draws(sizes["window_draws"], count, 0, files)
+    few = draws(len(drawn), count, 0, files)
     warm(store)
     slower = {name: each(drawn, read) for name, read in readers.items()}
     slower |= {name: each(few, read) for name, read in by_file.items()}
     return (
-        race(fast, rounds, least_s=sizes["least_s"]),
+        race(fast, rounds, least_s=sizes["least_s"], before=all_drawn(fast, len(drawn))),
         race({OURS: each(drawn, ours), **slower}, slow),
     )
 
@@ -104,7 +104,7 @@ def batch_race(
 ) -> Race:
     """A whole `Batch` from its ticks, against its wide fields' rows gathered from RAM."""
     wanted = (8, length, 100)
-    drawn = draws(sizes["window_draws"], count, store.ticks // 8, store.ticks)
+    drawn = draws(window_draws(sizes, count, length), count, store.ticks // 8, store.ticks)
     out = store.empty_batch(count, *wanted).touch()
     ram = {name: store.tensor(name).clone() for name in WIDE}
     warm(store)
@@ -127,7 +127,12 @@ def batch_race(
         OURS: each(drawn, ours),
         OURS_2: two_threads(each(drawn, ours)),
     }
-    return race(contenders, rounds, least_s=sizes["least_s"])
+    return race(
+        contenders,
+        rounds,
+        least_s=sizes["least_s"],
+        before=all_drawn(contenders, len(drawn)),
+    )
 
 
 def warm(store: FeatureStore) -> None:
@@ -169,6 +174,20 @@ def draws(count: int, size: int, low: int, high: int) -> list[Index]:
     """Random indices, the same in every run: more of them than a cache holds."""
     rng = np.random.default_rng(0)
     return [rng.integers(low, high, size) for _ in range(count)]
+
+
+def window_draws(sizes: Mapping[str, Any], count: int, length: int) -> int:
+    """So many draws that together they read more than a cache holds."""
+    return max(2, sizes["readings_drawn"] // (count * length))
+
+
+def all_drawn(contenders: Mapping[str, Work], draws: int) -> dict[str, Work]:
+    """Each contender's way to read all its draws once: what it does before its turn."""
+
+    def through(work: Work) -> Work:
+        return lambda: [work() for _ in range(draws)]
+
+    return {name: through(work) for name, work in contenders.items()}
 
 
 def each(drawn: Sequence[Index], read: Callable[[Index], object]) -> Work:

@@ -26,12 +26,7 @@ def row_readers(folder: Path, store: Path, name: str, values: NDArray[Any]) -> d
 
     What is not the store's own file is written below `folder` first.
     """
-    raw = folder / "rows.bin"
-    values.tofile(raw)
-    memmap = np.memmap(raw, values.dtype, "r", shape=values.shape)
-    with h5py.File(folder / "rows.h5", "w") as file:
-        file["rows"] = values
-    contiguous = h5py.File(folder / "rows.h5", "r")["rows"]
+    contiguous, memmap = _one_file(folder / "rows.h5", values)
     array = zarr.open_array(store, path=name, mode="r")
     lazy = dask.array.from_zarr(array)
     cached = _tensorstore(store / name)
@@ -58,13 +53,7 @@ def window_readers(
     folder: Path, store: Path, name: str, values: NDArray[Any], length: int
 ) -> dict[str, Read]:
     """Readers of the windows of `length` readings that end before these, one way each."""
-    raw = folder / "readings.bin"
-    if not raw.exists():
-        values.tofile(raw)
-        with h5py.File(folder / "readings.h5", "w") as file:
-            file["rows"] = values
-    memmap = np.memmap(raw, values.dtype, "r", shape=values.shape)
-    contiguous = h5py.File(folder / "readings.h5", "r")["rows"]
+    contiguous, memmap = _one_file(folder / "readings.h5", values)
     array = zarr.open_array(store, path=name, mode="r")
     lazy = dask.array.from_zarr(array)
     cached = _tensorstore(store / name)
@@ -115,6 +104,15 @@ def evict(folder: Path) -> None:
                 os.posix_fadvise(descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
             finally:
                 os.close(descriptor)
+
+
+def _one_file(path: Path, values: NDArray[Any]) -> tuple[Any, NDArray[Any]]:
+    """The values in one contiguous file, as h5py reads it and as numpy maps it."""
+    if not path.exists():
+        with h5py.File(path, "w") as file:
+            file["rows"] = values
+    rows = h5py.File(path, "r")["rows"]
+    return rows, np.memmap(path, values.dtype, "r", rows.id.get_offset(), values.shape)
 
 
 def _lmdb(folder: Path, values: NDArray[Any]) -> Read:

@@ -2,7 +2,7 @@
 
 Each decodes with the project's own reader and stretches to the same size, prepares in line with
 transformers' image processor and the checkpoint's tokenizer, and takes the mean over the last
-layer's real tokens after the final norm.
+layer's real tokens after the final norm. Without torchvision, that is the processor's Pillow kind.
 """
 
 import time
@@ -60,7 +60,8 @@ class PlainWays:
         self.preparing_s, done = 0.0, 0
         rows, dim = len(self._workload.missing), self._workload.survey.spec.dim
         array = open_memmap(self._folder / "features.npy", "w+", np.float32, (rows, dim))
-        for inputs in self._batches(batch_size):
+        # Frames have the right size by then: to resize them again would change no pixel.
+        for inputs in self._batches(batch_size, do_resize=False):
             with torch.inference_mode():
                 hidden = self._whole.model(**inputs, use_cache=False).last_hidden_state
                 features = _mean(hidden, inputs["attention_mask"]).cpu()
@@ -76,18 +77,18 @@ class PlainWays:
         """Features (row, dim) that `without_head` wrote."""
         return np.load(self._folder / "features.npy")
 
-    def _batches(self, size: int) -> Iterator[dict[str, Tensor]]:
+    def _batches(self, size: int, **processing: Any) -> Iterator[dict[str, Tensor]]:
         rows = self._workload.read()
         while True:
             begun = time.perf_counter()
             batch = list(islice(rows, size))
             if not batch:
                 return
-            inputs = self._prepared(batch)
+            inputs = self._prepared(batch, processing)
             self.preparing_s += time.perf_counter() - begun
             yield inputs
 
-    def _prepared(self, rows: Sequence[Row]) -> dict[str, Tensor]:
+    def _prepared(self, rows: Sequence[Row], processing: dict[str, Any]) -> dict[str, Tensor]:
         """What transformers' own processor gives, which itself needs torchvision."""
         height, width = self._workload.survey.spec.image_size
         images = [
@@ -95,7 +96,7 @@ class PlainWays:
             for _, frames in rows
             for view in sorted(frames)
         ]
-        seen = self._processor(images=images, return_tensors="pt")
+        seen = self._processor(images=images, return_tensors="pt", **processing)
         merged = int(seen["image_grid_thw"][0].prod()) // self._processor.merge_size**2
         texts = [
             self._renderer.render(instruction, len(frames)).replace(

@@ -1,5 +1,7 @@
 """Stage one as a contender: its own `fill`, in steady state, with the model loaded beforehand."""
 
+from collections.abc import Sequence
+from contextlib import ExitStack
 from itertools import chain, repeat
 from unittest.mock import patch
 
@@ -30,6 +32,15 @@ class StageOne:
         self._build.close()
         self._build = self._workload.fresh_build()
 
+    def run_every_frame(self) -> None:
+        """Fill the store, computing anew what is shown again: no row or frame is spared."""
+        with ExitStack() as stack:
+            stack.enter_context(
+                patch.object(RowPreparation, "prepare_once", RowPreparation.prepare)
+            )
+            stack.enter_context(patch("pipeline.vlm.collation.unique", _all))
+            self.run()
+
     def run(self) -> None:
         """Fill the store."""
         work = self._workload
@@ -45,6 +56,11 @@ class StageOne:
     def features(self) -> NDArray[np.float32]:
         """Features (row, dim) of the last run."""
         return self._build.files("vl/features").read(0, len(self._workload.missing))[:, 0]
+
+
+def _all(images: Sequence[NDArray[np.uint8]]) -> tuple[Sequence[NDArray[np.uint8]], list[int]]:
+    """Every image, as if they all differed."""
+    return images, list(range(len(images)))
 
 
 def _settled(workload: Workload, vlm: FrozenVLM) -> int:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from pipeline.store import SCHEMA, Sizes, StoreBuild, arrays
+from pipeline.store.schema import ArraySpec
 
 ACTION_DIM = 7
 _BLOCK_BYTES = 64 * 2**20
@@ -123,7 +124,7 @@ def _write_random(build: StoreBuild, name: str) -> None:
     spec = build.specs[name]
     if not spec.data_bytes:
         return
-    block = _random_rows(_BLOCK_BYTES // spec.row_bytes, spec.shape[1:], spec.dtype)
+    block = _random_rows(spec)
     with tqdm(total=spec.data_bytes, desc=name, unit="B", unit_scale=True, disable=None) as bar:
         for start in range(0, spec.shape[0], len(block)):
             part = block[: spec.shape[0] - start]
@@ -133,7 +134,7 @@ def _write_random(build: StoreBuild, name: str) -> None:
 
 def _commit_random(build: StoreBuild) -> None:
     spec = build.specs["vl/features"]
-    block = _random_rows(_BLOCK_BYTES // spec.row_bytes, spec.shape[1:], spec.dtype)
+    block = _random_rows(spec)
     keys = [index.to_bytes(16, "little") for index in range(spec.shape[0])]
     environment = build.environment_index({"synthetic": True})
     for start in tqdm(range(0, spec.shape[0], len(block)), desc=spec.name, disable=None):
@@ -142,8 +143,8 @@ def _commit_random(build: StoreBuild) -> None:
         build.commit(rows, part, keys[start : start + len(part)], environment)
 
 
-def _random_rows(
-    rows: int, shape: tuple[int, ...], dtype: np.dtype[np.generic]
-) -> NDArray[np.generic]:
+def _random_rows(spec: ArraySpec) -> NDArray[np.generic]:
+    """A block of rows of an array, or all of them where it has fewer."""
+    rows = min(spec.shape[0], max(1, _BLOCK_BYTES // spec.row_bytes))
     rng = np.random.default_rng(0)
-    return rng.standard_normal((max(1, rows), *shape), np.float32).astype(dtype)
+    return rng.standard_normal((rows, *spec.shape[1:]), np.float32).astype(spec.dtype)

@@ -85,17 +85,22 @@ def race(
     calls = dict.fromkeys(contenders, 1)
     seconds: dict[str, list[float]] = {name: [] for name in contenders}
     steps = (warmup + rounds) * len(contenders)
-    with tqdm(total=steps, unit="run", desc="benchmark", disable=None) as progress:
-        for number in range(warmup + rounds):
-            for name, work in contenders.items():
-                progress.set_postfix_str(name)
-                prepare.get(name, _nothing)()
-                taken = _clocked(work, calls[name])
-                if number < warmup:
-                    calls[name] = max(1, ceil(least_s / max(taken, 1e-9)))
-                else:
-                    seconds[name].append(taken)
-                progress.update()
+    gc.collect()
+    gc.freeze()  # what is there already need not be looked through before every call
+    try:
+        with tqdm(total=steps, unit="run", desc="benchmark", disable=None) as progress:
+            for number in range(warmup + rounds):
+                for name, work in contenders.items():
+                    progress.set_postfix_str(name)
+                    prepare.get(name, _nothing)()
+                    taken = _clocked(work, calls[name])
+                    if number < warmup:
+                        calls[name] = max(1, ceil(least_s / max(taken, 1e-9)))
+                    else:
+                        seconds[name].append(taken)
+                    progress.update()
+    finally:
+        gc.unfreeze()
     return Race(seconds)
 
 

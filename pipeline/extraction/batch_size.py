@@ -7,12 +7,17 @@ import torch
 
 from pipeline.errors import VLMError
 
-_FIRST = 4
+_FIRST = 8
+"""Fewer are slower on any device; where they do not fit, memory running out says so."""
+
 _MOST = {"cpu": 64, "cuda": 512}
 """Past these, more rows gain nothing and only hold memory."""
 
-_MEASURED = 2
-"""Batches of a size that are timed; the one before them warms up."""
+_MEASURED = 3
+"""Batches of a size that are timed; the one before them warms up.
+
+The fastest counts: whatever else the machine does makes a batch slower, never faster.
+"""
 
 _GAIN = 1.03
 """How much faster more rows must be to be worth their memory."""

@@ -1,29 +1,26 @@
-"""Hand the missing rows out to dask workers and gather what they wrote.
+"""Hand the missing rows out to dask workers and mark what they wrote.
 
 The client is the coordinator: workers write feature rows, it alone marks them.
 """
 
 import math
 import socket
-from collections.abc import Generator, Sequence
-from contextlib import contextmanager
+import time
+from collections import Counter
+from collections.abc import Generator, Iterable, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 
-import numpy as np
 from distributed import Client
-from numpy.typing import NDArray
 
-from pipeline.config import Params
 from pipeline.errors import ConfigError
 from pipeline.extraction.connection import connected
 from pipeline.extraction.handout import Handout, Task
+from pipeline.extraction.job import Job, Piece, WrittenRows
 from pipeline.extraction.ranges import by_episode, ranges_of, rows_between_pages
-from pipeline.extraction.worker import ExtractionPlugin, Job, Piece, WrittenRows
-from pipeline.recordings import Recording
-from pipeline.store import FEATURES, StoreBuild
-from pipeline.vlm.feature_spec import FeatureSpec
-
-__all__ = ["WrittenRows", "compute_on_cluster"]
+from pipeline.extraction.work import Computed, Work
+from pipeline.extraction.worker import ExtractionPlugin
+from pipeline.store import FEATURES
 
 _AUTO_RANGE_ROWS = 32
 """Rows a task where each worker finds its own batch size."""
@@ -32,56 +29,72 @@ _LOCAL_PATIENCE_S = 120.0
 """For processes of this machine to come back after a death."""
 
 
-def compute_on_cluster(
-    build: StoreBuild,
-    spec: FeatureSpec,
-    recordings: Sequence[Recording],
-    vl_start: NDArray[np.int64],
-    frame_time: NDArray[np.float64],
-    missing: NDArray[np.int64],
-    donors: Sequence[Path],
-    params: Params,
-) -> Generator[WrittenRows]:
-    """Compute missing rows on `extract.workers`; yields what is to be marked, as it is written.
+def compute_on_cluster(work: Work) -> Computed:
+    """Have `extract.workers` compute every missing row, and mark each as it is written.
 
     Raises at once what stops every row: `ConfigError` for a wrong address or a worker elsewhere,
     `VLMError`, `DiskFull`, `PipelineError` where the scheduler is lost. Raises `RecordingError`
-    after all other rows where some failed more often than `extract.retries`. Close it when it is
-    not read to its end: that stops the workers.
+    after all other rows where some failed more often than `extract.retries`.
     """
-    extract = params.extract
-    local = isinstance(extract.workers, int)
-    target = build.target.absolute()
-    job = Job(
+    extract = work.params.extract
+    job = _job(work)
+    patience_s = _LOCAL_PATIENCE_S if job.local else math.inf
+    with connected(extract) as client, _plugged(client, job):
+        handout = Handout(client, job.name, _tasks(work, job.local), extract.retries, patience_s)
+        with closing(handout.results()) as written:
+            return _marked(work, written)
+
+
+def _job(work: Work) -> Job:
+    """With every path that the coordinator may have given relative to its own folder."""
+    extract = work.params.extract
+    target = work.build.target.absolute()
+    return Job(
         target,
-        build.plan,
-        spec,
-        params.model_copy(update={"extract": extract.model_copy(update={"store": target})}),
-        tuple(path.absolute() for path in donors),
+        work.build.plan,
+        work.spec,
+        work.params.model_copy(update={"extract": extract.model_copy(update={"store": target})}),
+        tuple(donor.path.absolute() for donor in work.donors),
         Path.cwd(),
-        local,
+        isinstance(extract.workers, int),
     )
-    array = build.specs[FEATURES]
-    batch = _AUTO_RANGE_ROWS if extract.batch_size == "auto" else extract.batch_size
+
+
+def _tasks(work: Work, local: bool) -> Iterator[Task]:
+    """A range of about one batch each; where hosts may differ, none shares a page with another."""
+    array, size = work.build.specs[FEATURES], work.params.extract.batch_size
+    batch = _AUTO_RANGE_ROWS if size == "auto" else size
     ranges = ranges_of(
-        missing,
-        vl_start,
+        work.missing,
+        work.vl_start,
         array.chunk_rows,
-        max(1, batch // spec.variants),
+        max(1, batch // work.spec.variants),
         1 if local else rows_between_pages(array.row_bytes),
     )
-    tasks = (
-        Task(
+    for one in ranges:
+        pieces = by_episode(one, work.vl_start)
+        yield Task(
             [
-                Piece(episode, recordings[episode], rows, frame_time[rows])
-                for episode, rows in by_episode(one, vl_start)
+                Piece(episode, work.recordings[episode], rows, work.frame_time[rows])
+                for episode, rows in pieces
             ]
         )
-        for one in ranges
-    )
-    with connected(extract) as client, _plugged(client, job):
-        patience_s = _LOCAL_PATIENCE_S if local else math.inf
-        yield from Handout(client, job.name, tasks, extract.retries, patience_s).results()
+
+
+def _marked(work: Work, written: Iterable[WrittenRows]) -> Computed:
+    """The rate is that after the first block: until then workers start and load the model."""
+    rows: Counter[str] = Counter()
+    begun, before = 0.0, 0
+    for block in written:
+        number = work.build.environment_index(block.environment)
+        work.build.mark(block.rows, block.keys, block.checksums, number)
+        work.done(len(block.rows))
+        rows[block.came] += len(block.rows)
+        if not before:
+            begun, before = time.monotonic(), rows["computed"]
+    later = rows["computed"] - before
+    rate = later / (time.monotonic() - begun) if later else None
+    return Computed(rows["computed"], rows["known"], rows["repeated"], rate)
 
 
 @contextmanager

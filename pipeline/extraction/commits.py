@@ -17,7 +17,7 @@ from pipeline.store.schema import FEATURES
 _WAITING = 1
 """Commits that may wait for the disk; the model waits when there are more, and a kill loses few."""
 
-_TOGETHER = 64
+TOGETHER = 64
 """Known or repeated rows that are committed in one go: each commit waits for the disk."""
 
 
@@ -50,10 +50,12 @@ class Commits:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        if error is None:
-            self._flush()
-        self._jobs.put(None)
-        self._thread.join()
+        try:
+            if error is None:
+                self._flush()
+        finally:
+            self._jobs.put(None)
+            self._thread.join()
         if error is None:
             self._check()
 
@@ -74,11 +76,11 @@ class Commits:
                 yield row
             elif isinstance(row, KnownRow):
                 self._known.append(row)
-                if len(self._known) == _TOGETHER:
+                if len(self._known) == TOGETHER:
                     self._commit_known()
             else:
                 self._repeated.append(row)
-                if len(self._repeated) % _TOGETHER == 0:
+                if len(self._repeated) % TOGETHER == 0:
                     self._commit_repeated()
 
     def _flush(self) -> None:

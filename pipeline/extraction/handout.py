@@ -9,7 +9,7 @@ import sys
 import time
 import uuid
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from itertools import groupby
@@ -20,7 +20,8 @@ from distributed import Client, Future, KilledWorker, as_completed
 from tqdm import tqdm
 
 from pipeline.errors import PipelineError, RecordingError
-from pipeline.extraction.worker import Outcome, Piece, WrittenRows, compute_pieces
+from pipeline.extraction.job import Outcome, Piece, WrittenRows
+from pipeline.extraction.worker import compute_pieces
 
 _TASKS_A_THREAD = 2
 """Handed out ahead, so that no worker waits and a scheduler never holds millions."""
@@ -80,13 +81,17 @@ class Handout:
         self._dead: set[str] = set()
         self._any_written = False
 
-    def results(self) -> Iterator[WrittenRows]:
+    def results(self) -> Generator[WrittenRows]:
         """What workers wrote; raises at the end what could not be computed."""
         self._hand_out()
         while self._under_way:
             written: list[WrittenRows] = []
-            for future, result in self._finished():
-                written += self._judged(self._under_way.pop(future), future, result)
+            try:
+                for future, result in self._finished():
+                    written += self._judged(self._under_way.pop(future), result)
+            except Exception:  # stops the run; what others wrote is kept
+                yield from together(written)
+                raise
             self._any_written |= bool(written)
             self._hand_out()
             yield from together(written)
@@ -130,9 +135,7 @@ class Handout:
 
     def _next(self) -> Task | None:
         """The next task that may be computed beside others."""
-        while (
-            task := self._again.popleft() if self._again else next(self._fresh, None)
-        ) is not None:
+        while (task := self._again_or_fresh()) is not None:
             if not self._without_given_up(task).pieces:
                 continue
             if self._suspected.isdisjoint(piece.episode for piece in task.pieces):
@@ -159,9 +162,11 @@ class Handout:
         self._under_way[future] = task
         self._completed.add(future)
 
-    def _judged(self, task: Task, future: Future[Any], result: Any) -> Sequence[WrittenRows]:
+    def _judged(self, task: Task, result: Any) -> Sequence[WrittenRows]:
         if isinstance(result, Outcome):
             failed = [(task.pieces[place], reason) for place, reason in result.failed.items()]
+            if task.alone:
+                self._survived(task)
             if failed:
                 again = Task([piece for piece, _ in failed], task.failures + 1)
                 self._failed(again, {piece.episode: reason for piece, reason in failed})
@@ -196,16 +201,22 @@ class Handout:
                 "at their logs, or run with extract.workers=0."
             )
         task.failures += 1 + error.allowed_failures
-        episodes = [piece.episode for piece in task.pieces]
-        if task.alone and task.failures > self._retries:
-            for piece in task.pieces:
-                rows = f"{piece.recording.path}, VL rows {piece.rows[0]} to {piece.rows[-1]}"
-                self._given_up[piece.episode] = (
-                    f"{rows}: each worker died that computed them alone ({task.failures} deaths)"
-                )
+        if task.alone and len(task.pieces) == 1 and task.failures > self._retries:
+            piece = task.pieces[0]
+            self._given_up[piece.episode] = (
+                f"{piece.recording.path}, VL rows {piece.rows[0]} to {piece.rows[-1]}: every "
+                f"worker died that computed them alone ({task.failures} deaths)"
+            )
             return
-        self._suspected |= set(episodes)
-        self._suspects.append(task)
+        # Piece by piece: a recording that shares a page with a poisoned one is not at fault.
+        self._suspected |= {piece.episode for piece in task.pieces}
+        self._suspects.extend(Task([piece], task.failures) for piece in task.pieces)
+
+    def _survived(self, task: Task) -> None:
+        """The other ranges of its episodes, which were only set aside, need not wait any more."""
+        self._suspected -= {piece.episode for piece in task.pieces}
+        self._again.extend(one for one in self._suspects if not one.failures)
+        self._suspects = deque(one for one in self._suspects if one.failures)
 
     def _report(self) -> str:
         lines = [f"{len(self._given_up)} episodes could not be computed:"]
@@ -220,8 +231,8 @@ class Handout:
 def together(written: Sequence[WrittenRows]) -> Iterator[WrittenRows]:
     """The same rows in as few blocks as there are kinds: marking waits for the disk each time."""
 
-    def kind(one: WrittenRows) -> tuple[bool, str]:
-        return one.computed, repr(sorted(one.environment.items()))
+    def kind(one: WrittenRows) -> tuple[str, str]:
+        return one.came, repr(sorted(one.environment.items()))
 
     for _, alike in groupby(sorted(written, key=kind), kind):
         blocks = list(alike)
@@ -230,5 +241,5 @@ def together(written: Sequence[WrittenRows]) -> Iterator[WrittenRows]:
             [key for block in blocks for key in block.keys],
             np.concatenate([block.checksums for block in blocks]),
             blocks[0].environment,
-            blocks[0].computed,
+            blocks[0].came,
         )

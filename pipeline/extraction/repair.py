@@ -24,6 +24,7 @@ from pipeline.store.integrity.repair import (
     repair_build,
 )
 from pipeline.store.integrity.structure import read_arrays
+from pipeline.store.mending import extract_command, gc_command, start_over
 from pipeline.vlm.feature_spec import document_digest
 
 
@@ -37,6 +38,8 @@ class Repair:
     """Feature rows that were taken over as they were."""
     laid_out_anew: bool
     """Streams, ticks and episodes were written again from the recordings."""
+    completed_by: str
+    """The command."""
 
     def lines(self) -> list[str]:
         """For people."""
@@ -48,7 +51,7 @@ class Repair:
         return [
             f"{self.part}: a new build, {layout}, {self.carried} of {self.rows} feature rows taken "
             f"over, {self.rows - self.carried} to compute",
-            "run next: python -m stages.extract, which completes it and then replaces the store",
+            f"run next: {self.completed_by}, which completes it and then replaces the store",
         ]
 
 
@@ -66,8 +69,8 @@ def repair(findings: Findings, params: Params, say: Callable[[str], None]) -> Re
         plan = read_plan(store)
         if plan is None:
             raise StoreIncomplete(
-                f"{store / 'zarr.json'}: the store no longer says what it was made of, so nothing "
-                f"can be taken over. Remove {store} and run stages.extract."
+                f"{store / 'zarr.json'}: the metadata no longer say what the store was made of. "
+                f"{start_over(store)}"
             )
         _refuse_other_build(store, plan)
         try:
@@ -88,7 +91,8 @@ def _begin(findings: Findings, plan: str, params: Params, say: Callable[[str], N
     with closing(build):
         carried = carry_rows(store, build, findings) if _rows_can_be_read(store, build) else 0
         put_in_place(build, store)
-    return Repair(part_path(store), build.specs[FEATURES].shape[0], carried, not sound)
+    rows = build.specs[FEATURES].shape[0]
+    return Repair(part_path(store), rows, carried, not sound, _completed_by(store, plan))
 
 
 def with_identity(findings: Findings) -> Findings:
@@ -104,13 +108,20 @@ def with_identity(findings: Findings) -> Findings:
     return replace(findings, damaged=(*findings.damaged, Damage("", None, place, what)))
 
 
+def _completed_by(store: Path, plan: str) -> str:
+    if plan.startswith("merge-"):
+        return f"the same python -m stages.store merge --into {store} that made it"
+    return extract_command(store)
+
+
 def _refuse_other_build(store: Path, plan: str) -> None:
     unfinished = read_plan(part_path(store))
     if unfinished is None:
         return
     what = "a repair of it has begun" if unfinished == plan else "another build is unfinished"
     raise StoreMismatch(
-        f"{part_path(store)}: {what}. Run stages.extract, which completes it, or remove it."
+        f"{part_path(store)}: {what}. Run {_completed_by(store, unfinished)}, which completes it, "
+        f"or remove it: {gc_command(part_path(store))}"
     )
 
 

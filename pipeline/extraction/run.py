@@ -1,4 +1,4 @@
-"""Recordings x frozen model -> store, on one machine."""
+"""Recordings x frozen model -> store."""
 
 import shutil
 from collections.abc import Callable, Generator, Sequence
@@ -25,6 +25,7 @@ from pipeline.store import (
     read_plan,
     recover,
 )
+from pipeline.store.metadata import check_metadata
 from pipeline.store.schema import read_specs
 from pipeline.vlm.feature_spec import differences
 
@@ -70,6 +71,7 @@ def _go_on(
     if read_plan(part_path(target)) == surveyed.plan:
         return _resume(surveyed, params, digests, say)
     FeatureStore.open(target)  # refuses a store that files are missing from
+    check_metadata(target)
     say(f"{target}: up to date, nothing to do")
     return None
 

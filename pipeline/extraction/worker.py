@@ -10,7 +10,6 @@ import socket
 import threading
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,71 +18,19 @@ import torch
 from distributed import Worker, WorkerPlugin, get_worker
 from numpy.typing import NDArray
 
-from pipeline.config import Params
 from pipeline.digests import file_digest
 from pipeline.errors import ConfigError, NumericsError, StoreIncomplete
 from pipeline.extraction.encoder import Encoder
+from pipeline.extraction.job import Came, Job, Outcome, Piece, WrittenRows
 from pipeline.extraction.rows import KnownRow, ReadyRow, RowPreparation, Span
-from pipeline.recordings import CameraStream, Recording
+from pipeline.recordings import CameraStream
 from pipeline.store import Donor, StoreBuild, part_path, read_plan
 from pipeline.store.schema import read_specs
-from pipeline.vlm.feature_spec import FeatureSpec, differences, feature_spec
+from pipeline.vlm.feature_spec import differences, feature_spec
 from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.qwen import FrozenVLM
 
 _OPEN_EPISODES = 8
-
-
-@dataclass(frozen=True)
-class Job:
-    """What every worker of an extraction must know."""
-
-    target: Path
-    """Absolute."""
-    plan: str
-    spec: FeatureSpec
-    params: Params
-    donors: tuple[Path, ...]
-    folder: Path
-    """Where the coordinator runs: relative paths of recordings and checkpoint begin there."""
-    local: bool
-    """Whether the workers are the coordinator's own processes, on its host."""
-
-    @property
-    def name(self) -> str:
-        """Of the plugin: an extraction that was killed is replaced by the next on its store."""
-        return f"extraction of {self.target}"
-
-
-@dataclass(frozen=True)
-class Piece:
-    """Missing rows of one episode, ascending, and the capture times (row, view) of their frames."""
-
-    episode: int
-    recording: Recording
-    rows: NDArray[np.int64]
-    frame_time: NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class WrittenRows:
-    """Feature rows that lie in the build and only need marking."""
-
-    rows: NDArray[np.int64]
-    keys: Sequence[bytes]
-    checksums: NDArray[np.uint32]
-    environment: Mapping[str, Any]
-    computed: bool
-    """False: taken over by key."""
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What became of the pieces of a task."""
-
-    written: tuple[WrittenRows, ...]
-    failed: Mapping[int, str]
-    """Why, by the piece's place in the task."""
 
 
 class ExtractionPlugin(WorkerPlugin):
@@ -153,53 +100,74 @@ class RangeComputer:
         self._cameras: dict[int, Mapping[str, CameraStream]] = {}
         self._encoder: Encoder | None = None
         self._environment: Mapping[str, Any] = {}
+        self._cameras_turn = threading.Lock()
         self._model_turn = threading.Lock()
         self._disk_turn = threading.Lock()
+        self._closed = False
 
     def close(self) -> None:
-        """Close the files."""
-        self._build.close()
+        """Close the files, between two writes; a range that is still computed writes no more."""
+        with self._disk_turn:
+            self._closed = True
+            self._build.close()
         for donor in self._donors:
             donor.close()
 
     def prepared(self, piece: Piece) -> list[KnownRow | ReadyRow]:
         """The decoded and prepared rows of a piece; raises what its recording makes it raise."""
-        cameras = self._cameras.get(piece.episode) or piece.recording.cameras()
-        self._cameras[piece.episode] = cameras
-        if len(self._cameras) > _OPEN_EPISODES:
-            self._cameras.pop(next(iter(self._cameras)), None)
         views = self._job.spec.views
+        cameras = self._cameras_of(piece)
         span = Span.of(piece.recording, cameras, piece.rows, piece.frame_time, views)
         return self._preparation.prepare(span)
 
     def written(self, made: Sequence[KnownRow | ReadyRow]) -> Iterator[WrittenRows]:
-        """Encode what has to be encoded, write it all, and say what is to be marked."""
+        """Encode what has to be encoded, write it all, and say what is to be marked.
+
+        Rows of equal key are encoded once.
+        """
         known: dict[str, list[KnownRow]] = defaultdict(list)
+        ready: dict[bytes, list[ReadyRow]] = defaultdict(list)
         for row in made:
             if isinstance(row, KnownRow):
                 known[json.dumps(row.environment, sort_keys=True)].append(row)
+            else:
+                ready[row.key].append(row)
         for rows in known.values():
             features = np.stack([one.features for one in rows])
-            yield self._write(rows, features, rows[0].environment, computed=False)
-        ready = [row for row in made if isinstance(row, ReadyRow)]
+            yield self._write(rows, features, rows[0].environment, "known")
         if ready:
             with self._model_turn:
-                batches = list(self._loaded().encoded(ready))
+                batches = list(self._loaded().encoded(rows[0] for rows in ready.values()))
             for rows, features in batches:
-                yield self._write(rows, features, self._environment, computed=True)
+                yield self._write(rows, features, self._environment, "computed")
+                again = [(equal, at) for at, row in enumerate(rows) for equal in ready[row.key][1:]]
+                if again:
+                    equals, places = zip(*again, strict=True)
+                    copies = features[list(places)]
+                    yield self._write(equals, copies, self._environment, "repeated")
+
+    def _cameras_of(self, piece: Piece) -> Mapping[str, CameraStream]:
+        """Opened once an episode, for the next ranges are of the same."""
+        with self._cameras_turn:
+            if piece.episode not in self._cameras:
+                if len(self._cameras) == _OPEN_EPISODES:
+                    del self._cameras[next(iter(self._cameras))]
+                self._cameras[piece.episode] = piece.recording.cameras()
+            return self._cameras[piece.episode]
 
     def _write(
         self,
         rows: Sequence[KnownRow | ReadyRow],
         features: NDArray[Any],
         environment: Mapping[str, Any],
-        *,
-        computed: bool,
+        came: Came,
     ) -> WrittenRows:
         numbers = np.array([one.row for one in rows], np.int64)
         with self._disk_turn:
+            if self._closed:
+                raise StoreIncomplete(f"{self._job.name} has ended; its rows are nobody's")
             checksums = self._build.write_features(numbers, features)
-        return WrittenRows(numbers, [one.key for one in rows], checksums, environment, computed)
+        return WrittenRows(numbers, [one.key for one in rows], checksums, environment, came)
 
     def _loaded(self) -> Encoder:
         if self._encoder is None:

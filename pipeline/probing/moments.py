@@ -27,10 +27,9 @@ class Moments:
     def __add__(self, other: "Moments") -> "Moments":
         return Moments(self.rows + other.rows, self.sum + other.sum, self.gram + other.gram)
 
-    def of(self, columns: Tensor) -> "Moments":
-        """Of these columns alone."""
-        gram = self.gram.index_select(0, columns).index_select(1, columns)
-        return Moments(self.rows, self.sum[columns], gram)
+    def last(self, columns: int) -> "Moments":
+        """Of so many last columns alone."""
+        return Moments(self.rows, self.sum[-columns:], self.gram[-columns:, -columns:])
 
 
 def total(parts: Sequence[Moments]) -> Moments:
@@ -39,12 +38,6 @@ def total(parts: Sequence[Moments]) -> Moments:
     for one in parts[1:]:
         summed = summed + one
     return summed
-
-
-def centred(moments: Moments, mean: Tensor) -> Tensor:
-    """Sum of (z - mean)(z - mean)'."""
-    crossed = torch.outer(mean, moments.sum)
-    return moments.gram - crossed - crossed.T + moments.rows * torch.outer(mean, mean)
 
 
 def variance(moments: Moments, targets: int) -> Tensor:

@@ -7,7 +7,6 @@ from functools import partial
 from typing import NoReturn, TypeVar
 
 import torch
-from torch import Tensor
 from tqdm import tqdm
 
 from pipeline.config import ProbeParams
@@ -15,7 +14,7 @@ from pipeline.probing.accumulation import Table
 from pipeline.probing.folds import Folds, fold_by_recording
 from pipeline.probing.moments import Moments
 from pipeline.probing.readers import Reader, SlotName, fit_reader, groups_of, slot_names
-from pipeline.probing.ridge import Score, cross_validate
+from pipeline.probing.ridge import Score, Scores, cross_validate
 from pipeline.probing.summaries import summarize
 from pipeline.store import FeatureStore
 
@@ -133,10 +132,10 @@ class _Work:
     def baselines(self) -> tuple[Score, Score | None]:
         """The mean action, and state + sensor alone."""
         parts = [self._table.moments(part, [Reader((), ())])[0] for part in self._parts]
-        mean_action = self._scored(parts, torch.arange(0))
+        mean_action = self._known([part.last(self._table.targets) for part in parts])
         assert mean_action is not None, "every fold has ticks"
         if self._table.beside:
-            self._streams = self._scored(parts, torch.arange(self._table.beside))
+            self._streams = self._known(parts)
         return mean_action, self._streams
 
     def findings(self, tasks: Sequence[_Task]) -> list[Finding]:
@@ -171,38 +170,35 @@ class _Work:
         return [list(parts) for some in by_run for parts in zip(*some, strict=True)]
 
     def _finding(self, task: _Task, reader: Reader, parts: Sequence[Moments]) -> Finding:
-        inputs = torch.arange(reader.width)
-        known = reader.width + torch.arange(self._table.beside)
+        beside = self._table.beside
         share = self._table.valid_share(task.slots)
-        without, both = self._streams, None
-        if self._table.beside and share < 1:
-            without = self._scored(parts, known)
-        if without is not None:
-            both = self._scored(parts, inputs, known, without)
+        without = self._streams
+        if beside and share < 1:
+            without = self._known([part.last(beside + self._table.targets) for part in parts])
+        scores = self._scored(parts, beside, without)
         finding = Finding(
             name=task.name,
             slots=task.slots,
             channels=len(task.slots) * self._table.store.feature_shape[1],
             inputs=reader.width,
             valid_share=share,
-            alone=self._scored(parts, inputs),
-            beside=both,
+            alone=None if scores is None else scores.alone,
+            beside=None if scores is None else scores.beside,
             without=without,
         )
         self._bar.update()
         return finding
 
+    def _known(self, parts: Sequence[Moments]) -> Score | None:
+        """By all columns but the targets; by none, the mean action."""
+        scores = self._scored(parts)
+        return None if scores is None else scores.alone
+
     def _scored(
-        self,
-        parts: Sequence[Moments],
-        inputs: Tensor,
-        known: Tensor | None = None,
-        known_score: Score | None = None,
-    ) -> Score | None:
-        """By these columns; by none, the mean action."""
+        self, parts: Sequence[Moments], known: int = 0, known_score: Score | None = None
+    ) -> Scores | None:
         folds, penalties = self._table.folds.fold_of_part, self._params.penalties
-        targets = self._table.targets
-        return cross_validate(parts, folds, inputs, targets, penalties, known, known_score)
+        return cross_validate(parts, folds, self._table.targets, penalties, known, known_score)
 
     def _in_order(self, jobs: Sequence[Callable[[], _Result]]) -> list[_Result]:
         """The results of the jobs, run on dask's threads."""

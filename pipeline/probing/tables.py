@@ -87,21 +87,30 @@ def table(study: Study) -> str:
     lines += [_line(one, beside) for one in ranked(study.groups)]
     single = [one for one in ranked(study.slots) if one.name != one.name.group]
     lines += [_line(one, beside) for one in single[:TOP]]
-    head = (
-        f"R2 of the action chunk of {study.horizon} ticks on held-out recordings: "
+    head = [
+        f"R2 of the action chunk of {study.horizon} ticks on recordings that were held out, mean "
+        "over channels and steps (1: exact, 0: no better than their mean)",
         f"{len(study.folds.ticks)} ticks of {study.folds.recordings} recordings in "
-        f"{study.folds.count} folds; +- is the standard error over folds, of which some are "
-        "harder for everyone, so a gain is compared fold by fold; beside: with state + sensor"
-    )
+        f"{study.folds.count} folds; +-: standard error over folds",
+    ]
+    if beside:
+        head.append(
+            "beside: together with state + sensor; gain: what that adds to them, fold by fold, as "
+            "some folds are harder for everyone"
+        )
     wide = [one for one in study.groups if one.inputs < one.channels]
     notes = [
         f"{one.name.label}: its {one.channels} channels are read along {one.inputs} main "
-        f"directions, {one.inputs // len(one.slots)} a slot"
+        f"directions, {one.inputs // len(one.slots)} a slot, of the inputs of all folds"
         for one in wide
     ]
+    if any(one.valid_share < 1 for one in [*study.groups, *study.slots]):
+        notes.append(
+            "slots valid at fewer ticks are scored on these alone: compare their gain, not R2"
+        )
     if len(single) > TOP:
         notes.append(f"the other {len(single) - TOP} slots are in slots.csv")
-    return "\n".join([head, *aligned(lines), *study.folds.notes, *notes])
+    return "\n".join([*head, *aligned(lines), *study.folds.notes, *notes])
 
 
 def advice(study: Study) -> str:
@@ -130,6 +139,11 @@ def advice(study: Study) -> str:
         f"recommended for params.yaml: vlm: {{layers: [{name.layer}], "
         f"norms: [{json.dumps(name.norm)}], pooling: [{name.pooling}]}}"
     )
+    if len(study.groups) > 1:
+        lines.append(
+            "to train on it alone: write that into params.yaml, run stages.extract into a store of "
+            "its own (extract.store), then stages.train_head"
+        )
     return "\n".join(lines)
 
 

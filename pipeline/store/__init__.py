@@ -9,8 +9,9 @@ from pipeline.store.chunks import check_trailers
 from pipeline.store.donor import Donor
 from pipeline.store.lock import build_lock
 from pipeline.store.reader import Episode, FeatureStore
+from pipeline.store.replacement import recover
 from pipeline.store.schema import FEATURES, KEY_BYTES, SCHEMA, Sizes, arrays
-from pipeline.store.writer import StoreBuild, part_path, read_plan, recover
+from pipeline.store.writer import StoreBuild, part_path, read_plan
 
 __all__ = [
     "FEATURES",

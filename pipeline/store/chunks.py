@@ -5,6 +5,7 @@ Never through a map: a full disk must be an error of `pwrite`, not a SIGBUS.
 
 import errno
 import os
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
@@ -15,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.durable import disk_full_named
+from pipeline.durable import disk_full_named, sync
 from pipeline.errors import StoreIncomplete
+from pipeline.store.chunk_pass import ChunkPass
 from pipeline.store.schema import TRAILER_BYTES, ArraySpec, chunk_paths, read_specs
 
 MEND = (
@@ -25,7 +27,6 @@ MEND = (
 )
 """What to do about a file that is not as it was written."""
 
-_BLOCK = 16 * 2**20
 _MOST_OPEN = 32
 
 
@@ -34,6 +35,18 @@ def row_checksums(rows: NDArray[Any]) -> NDArray[np.uint32]:
     flat = np.ascontiguousarray(rows).reshape(len(rows), -1).view(np.uint8)
     sums = np.fromiter((google_crc32c.value(row) for row in flat), np.uint32, len(flat))
     return np.where(sums == 0, np.uint32(1), sums)
+
+
+def check_row_checksums(
+    store: Path, spec: ArraySpec, start: int, features: NDArray[Any], wanted: NDArray[np.uint32]
+) -> None:
+    """Raise `StoreIncomplete` where feature rows from `start` do not give these checksums."""
+    bad = start + np.flatnonzero(row_checksums(features) != wanted)
+    if bad.size:
+        raise StoreIncomplete(
+            f"{chunk_paths(store, spec)[bad[0] // spec.chunk_rows]}: rows {bad[0]} to {bad[-1]} of "
+            f"{spec.name} do not give their checksum: the store is damaged. {MEND}"
+        )
 
 
 def check_trailers(root: Path) -> None:
@@ -55,13 +68,17 @@ class ChunkFiles:
     """Row-wise access to the files of one array of a build.
 
     Those of a store that is only read from, which may lie where nothing can be written, are opened
-    with `writable=False`.
+    with `writable=False`. A linked chunk belongs to another store too and is never written: rows of
+    it count as there already or, `owned`, go into a copy that takes its place.
     """
 
-    def __init__(self, root: Path, spec: ArraySpec, *, writable: bool = True) -> None:
+    def __init__(
+        self, root: Path, spec: ArraySpec, *, writable: bool = True, owned: bool = False
+    ) -> None:
         self.spec = spec
         self.paths = chunk_paths(root, spec)
         self._writable = writable
+        self._owned = owned
         self._descriptors: dict[int, int] = {}
         self._unsynced: set[int] = set()
 
@@ -95,7 +112,7 @@ class ChunkFiles:
         return True
 
     def write(self, start: int, values: NDArray[Any]) -> None:
-        """Write consecutive rows from `start`; rows in linked chunks are there already."""
+        """Write consecutive rows from `start`."""
         if not self.spec.row_bytes or not len(values):
             return
         block = np.ascontiguousarray(values, self.spec.dtype)
@@ -104,7 +121,9 @@ class ChunkFiles:
         raw = block.reshape(len(block), -1).view(np.uint8)
         for chunk, first, count in self._spans(start, len(block)):
             if self.is_linked(chunk):
-                continue
+                if not self._owned:
+                    continue
+                self._unlink(chunk)
             lines = raw[first - start : first - start + count]
             with disk_full_named(self.paths[chunk]):
                 _write_all(self._descriptor(chunk), lines.ravel().data, self._offset(first))
@@ -128,10 +147,9 @@ class ChunkFiles:
             raw += part
         return np.frombuffer(raw, self.spec.dtype).reshape(count, *self.spec.shape[1:])
 
-    def sound(self, chunk: int) -> bool:
-        """Whether a chunk of a finished store gives its trailer."""
-        found = self._crc(chunk).to_bytes(TRAILER_BYTES, "little")
-        return os.pread(self._descriptor(chunk), TRAILER_BYTES, self.spec.chunk_bytes) == found
+    def damage(self, chunk: int) -> str | None:
+        """What is wrong with a chunk file of a finished store; None where it gives its trailer."""
+        return self._passed(chunk).damage
 
     def check(self, checked: Callable[[int], object] = lambda size: None) -> None:
         """Raise `StoreIncomplete` where a chunk of a finished store does not give its trailer.
@@ -139,10 +157,9 @@ class ChunkFiles:
         `checked` is told the bytes of each sound chunk.
         """
         for chunk, path in enumerate(self.paths):
-            if not self.sound(chunk):
+            if what := self.damage(chunk):
                 raise StoreIncomplete(
-                    f"{path}: the chunk does not give the crc32c behind it, so that nothing can be "
-                    f"taken from this store. {MEND}"
+                    f"{path}: {what}, so that nothing can be taken from this store. {MEND}"
                 )
             checked(self.spec.chunk_bytes)
 
@@ -155,10 +172,16 @@ class ChunkFiles:
 
     def seal(self) -> None:
         """Write each chunk's trailer; running it again changes nothing."""
+        sealed = self.spec.chunk_bytes + TRAILER_BYTES
         for chunk, path in enumerate(self.paths):
             if self.is_linked(chunk):
-                continue
-            trailer = self._crc(chunk).to_bytes(TRAILER_BYTES, "little")
+                if path.stat().st_size == sealed:
+                    continue
+                self._unlink(chunk)  # its other name is no store's: a copy of the build, say
+            data = self._passed(chunk)
+            if not data.complete:
+                raise StoreIncomplete(f"{path}: the file ends early. {MEND}")
+            trailer = data.crc.to_bytes(TRAILER_BYTES, "little")
             with disk_full_named(path):
                 descriptor = self._descriptor(chunk)
                 _write_all(descriptor, memoryview(trailer), self.spec.chunk_bytes)
@@ -170,15 +193,22 @@ class ChunkFiles:
             os.close(descriptor)
         self._descriptors.clear()
 
-    def _crc(self, chunk: int) -> int:
-        crc, offset, size = 0, 0, self.spec.chunk_bytes
-        while offset < size:
-            block = os.pread(self._descriptor(chunk), min(_BLOCK, size - offset), offset)
-            if not block:
-                raise StoreIncomplete(f"{self.paths[chunk]}: the file ends early. {MEND}")
-            crc = google_crc32c.extend(crc, block)
-            offset += len(block)
-        return crc
+    def _unlink(self, chunk: int) -> None:
+        """Put a copy in the place of a linked file."""
+        self.close()
+        path = self.paths[chunk]
+        copy = path.with_name(path.name + ".partial")
+        with disk_full_named(path):
+            shutil.copyfile(path, copy)
+            sync(copy)
+        copy.replace(path)
+
+    def _passed(self, chunk: int) -> ChunkPass:
+        """A pass over the whole file."""
+        with closing(ChunkPass(self.paths[chunk], self.spec)) as data:
+            for _ in data.blocks():
+                pass
+        return data
 
     def _descriptor(self, chunk: int) -> int:
         if chunk not in self._descriptors:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import StoreIncomplete
 from pipeline.store.chunks import ChunkFiles, row_checksums
-from pipeline.store.environments import EnvironmentLog
+from pipeline.store.environments import EnvironmentLog, environment_at
 from pipeline.store.schema import CHECKSUMS, FEATURES, KEYS, ArraySpec, read_specs
 
 
@@ -89,11 +89,7 @@ class Donor:
 
     def environment_of(self, key: bytes) -> dict[str, Any]:
         """With which software and hardware a known row was computed; empty where not noted."""
-        row = self.rows[key]
-        for noted in self._environments:
-            if noted["rows"][0] <= row < noted["rows"][1]:
-                return {name: value for name, value in noted.items() if name != "rows"}
-        return {}
+        return environment_at(self._environments, self.rows[key])
 
     def close(self) -> None:
         """Close its files."""

@@ -6,12 +6,23 @@ file of its own; sealing folds it into ranges of rows in the store's attributes.
 
 import json
 import os
-from collections.abc import Mapping
+from bisect import bisect_right
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from pipeline.durable import sync
+
+
+def environment_at(ranges: Sequence[Mapping[str, Any]], row: int) -> dict[str, Any]:
+    """What a row was computed with, by the ranges of a store; empty where it is not noted."""
+    at = bisect_right(ranges, row, key=lambda noted: noted["rows"][0]) - 1
+    if at < 0 or row >= ranges[at]["rows"][1]:
+        return {}
+    return {name: value for name, value in ranges[at].items() if name != "rows"}
 
 
 class EnvironmentLog:
@@ -33,6 +44,7 @@ class EnvironmentLog:
         if environment not in known:
             known.append(dict(environment))
             self._temporary.write_text(json.dumps(known))
+            sync(self._temporary)
             self._temporary.replace(self._listed)
         return known.index(dict(environment))
 

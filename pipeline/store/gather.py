@@ -167,8 +167,8 @@ class Gatherer:
         view = view if variant is None else view + variant
         valid = self._arrays["vl/slot_valid"]
         np.not_equal(valid.reshape(self._by_variant(valid))[view], 0, out=batch.slot_valid.numpy())
-        age = self._arrays["tick/time"][tick] - self._newest_frame(row)
-        batch.feature_age.copy_(torch.from_numpy(age))
+        now, age = self._arrays["tick/time"][tick], batch.feature_age.numpy()
+        np.subtract(now, self._newest_frame(row), out=age, casting="same_kind")
         return view
 
     def _newest_frame(self, row: Index) -> NDArray[np.float64]:

@@ -6,6 +6,7 @@ import os
 import socket
 import sys
 import threading
+import time
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
@@ -45,6 +46,25 @@ def build_lock(target: Path) -> Generator[None]:
                 yield
         finally:
             file.truncate(0)  # an empty one was left by its holder: nobody need wait for it
+
+
+def lock_holder(path: Path) -> str | None:
+    """Who holds a lock file, as it says; None where no living process does.
+
+    A holder on another host, whose lock the kernel may not show here, is believed for a minute
+    after its last sign of life, as `build_lock` believes it.
+    """
+    with path.open("r", encoding="utf-8") as file:
+        try:
+            # Shared, so that two that ask do not take each other for a builder.
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            held = False
+        except OSError:
+            held = True
+        holder = _holder(file)
+        here = not holder or holder.endswith(f" on {socket.gethostname()}")
+        alive = held or (not here and time.time() - path.stat().st_mtime < _STALE_S)
+    return (holder or "another process") if alive else None
 
 
 def _flocked(file: TextIO, target: Path, path: Path) -> bool:

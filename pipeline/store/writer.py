@@ -22,6 +22,7 @@ from pipeline.durable import disk_full_named, sync
 from pipeline.errors import StoreIncomplete
 from pipeline.store.chunks import ChunkFiles, row_checksums
 from pipeline.store.environments import EnvironmentLog
+from pipeline.store.replacement import put_in_place
 from pipeline.store.schema import CHECKSUMS, FEATURES, INCREMENTAL, KEYS, ArraySpec
 
 
@@ -77,7 +78,9 @@ class StoreBuild:
         """
         with closing(ChunkFiles(donor, donor_spec, writable=False)) as source:
             for chunk in range(self.linkable(name, donor_spec, rows)):
-                if source.sound(chunk) and not self.files(name).link(chunk, source.paths[chunk]):
+                if source.damage(chunk) is not None:
+                    continue
+                if not self.files(name).link(chunk, source.paths[chunk]):
                     return
 
     def write(self, name: str, start: int, values: NDArray[Any]) -> None:
@@ -165,6 +168,11 @@ class StoreBuild:
         Idempotent: a kill in the middle is mended by running it again. Raises `StoreIncomplete`
         when rows are missing.
         """
+        self.finish()
+        self.put_in_place()
+
+    def finish(self) -> None:
+        """The first half of `seal`: all of the store is on the disk, still beside its place."""
         self.files(FEATURES).close()  # a file system over the network shows what others wrote anew
         missing = self.missing()
         if missing.size:
@@ -176,11 +184,14 @@ class StoreBuild:
             self.files(name).seal()
         with disk_full_named(self.part):
             self._note_environments()
-        for partial in self.part.glob("*.partial"):  # of a zarr write that was killed
+        for partial in self.part.rglob("*.partial"):  # of a write that was killed
             partial.unlink()
         self.close()
         _sync_folders(self.part)
-        self._put_in_place()
+
+    def put_in_place(self) -> None:
+        """The second half of `seal`: an instant."""
+        put_in_place(self.part, self.target)
 
     def close(self) -> None:
         """Close every file."""
@@ -191,18 +202,9 @@ class StoreBuild:
     def files(self, name: str) -> ChunkFiles:
         """The chunk files of one array."""
         if name not in self._files:
-            self._files[name] = ChunkFiles(self.part, self.specs[name])
+            owned = name in INCREMENTAL
+            self._files[name] = ChunkFiles(self.part, self.specs[name], owned=owned)
         return self._files[name]
-
-    def _put_in_place(self) -> None:
-        old = _old_path(self.target)
-        if self.target.exists():
-            shutil.rmtree(old, ignore_errors=True)
-            self.target.rename(old)
-        self.part.rename(self.target)
-        sync(self.target.parent)
-        if old.exists():
-            shutil.rmtree(old)
 
     def _note_environments(self) -> None:
         """Fold the environment of each row into the attributes."""
@@ -218,20 +220,6 @@ def _runs(rows: Sequence[int] | NDArray[np.int64]) -> list[NDArray[np.intp]]:
     order = np.argsort(rows, kind="stable")
     gaps = np.flatnonzero(np.diff(np.asarray(rows, np.int64)[order]) != 1) + 1
     return np.split(order, gaps)
-
-
-def recover(target: Path) -> None:
-    """Mend what a kill between the two renames of a replacement left behind."""
-    old = _old_path(target)
-    if old.exists():
-        if target.exists():
-            shutil.rmtree(old)
-        else:
-            old.rename(target)
-
-
-def _old_path(target: Path) -> Path:
-    return target.with_name(target.name + ".old")
 
 
 def read_plan(store: Path) -> str | None:

@@ -15,6 +15,9 @@ from pipeline.vlm.preparation import PreparedRow
 from pipeline.vlm.slots import Slot
 from pipeline.vlm.vision import TowerPlan, VisionTower
 
+_SHAPES = 64
+"""Of batches, that are compiled: sizes that are tried, times prompt lengths, times views."""
+
 
 def layers_needed(slots: Iterable[Slot]) -> int:
     """How many decoder layers must run for these slots."""
@@ -48,6 +51,10 @@ class Extractor:
         self._collator = Collator(model, settings, places, self._tower, static=compiled)
         self._compiled: dict[str, Callable[..., Tensor]] = {}
         if compiled:
+            from torch._dynamo import config  # takes a second
+
+            # Past this many shapes dynamo would go on uncompiled, and hardly say so.
+            config.recompile_limit = _SHAPES
             mode = "reduce-overhead" if model.device.type == "cuda" else None
             self._compiled = {
                 part.__name__: torch.compile(part, dynamic=False, mode=mode)

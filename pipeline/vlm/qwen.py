@@ -2,6 +2,7 @@
 
 import math
 import time
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from pipeline.config import VLMParams
 from pipeline.device import resolve_device
-from pipeline.errors import NumericsError
+from pipeline.errors import NumericsError, VLMError
 from pipeline.vlm.extractor import Extractor, layers_needed
 from pipeline.vlm.feature_spec import FeatureSpec
 from pipeline.vlm.loading import environment, load_model, pixel_settings
@@ -39,7 +40,7 @@ class FrozenVLM:
         self._spec = spec
         self._storage_dtype = getattr(torch, spec.document["storage_dtype"])
         self._compiled = compiled
-        self._fullest: dict[Layout, int] = {}
+        self._fitted: dict[Layout, set[int]] = defaultdict(set)
         self.environment = environment(model, device) | ({"compiled": "true"} if compiled else {})
 
     @classmethod
@@ -76,24 +77,35 @@ class FrozenVLM:
     def submit(self, rows: Sequence[PreparedRow]) -> "Pending":
         """Begin to encode rows: on a GPU this returns while it works, elsewhere when it is done.
 
-        What went wrong with the features is raised by the `result`, out of memory here.
+        What went wrong with the features is raised by the `result`, out of memory here, and
+        `VLMError` where the model cannot be compiled.
         """
-        batch = self._extractor.collate(self._padded(rows))
-        clock = _Clock(self._model.device)
-        # Cut and converted before they leave the device: a padded row is nobody's.
-        features = self._extractor.features(batch)[: len(rows)].to(self._storage_dtype)
-        valid = self._extractor.valid(batch)[: len(rows)]
-        return Pending(features, valid, clock, self._check_finite)
+        layout, padded = rows[0].layout, self._padded(rows)
+        # Pinned memory and events belong to the thread's current device, which need not be ours.
+        with torch.cuda.device(self.device if self.device.type == "cuda" else -1):
+            try:
+                batch = self._extractor.collate(padded)
+                clock = _Clock(self.device)
+                # Cut and converted before they leave the device: a padded row is nobody's.
+                features = self._extractor.features(batch)[: len(rows)].to(self._storage_dtype)
+            except RuntimeError as error:
+                self._fitted[layout].discard(len(padded))
+                if self._compiled:
+                    raise _of_compiler(error) from None
+                raise
+            self._fitted[layout].add(len(padded))
+            valid = self._extractor.valid(batch)[: len(rows)]
+            return Pending(features, valid, clock, self._check_finite)
 
     def _padded(self, rows: Sequence[PreparedRow]) -> Sequence[PreparedRow]:
-        """What a compiled model is given: as many rows as it has seen of this shape.
+        """What a compiled model is given: as many rows as it has been given before, or more.
 
         So that the last batch of a shape is not compiled anew.
         """
         layout = rows[0].layout
         if not self._compiled or any(row.layout != layout for row in rows):
             return rows
-        full = self._fullest[layout] = max(len(rows), self._fullest.get(layout, 0))
+        full = min((size for size in self._fitted[layout] if size >= len(rows)), default=len(rows))
         return [*rows, *[rows[-1]] * (full - len(rows))]
 
     def _check_finite(self, features: Float[Tensor, "batch slot dim"]) -> None:
@@ -190,3 +202,20 @@ class _Clock:
         event = torch.cuda.Event(enable_timing=True)
         event.record(self._stream)
         return event
+
+
+def _of_compiler(error: RuntimeError) -> RuntimeError | VLMError:
+    """What torch.compile's error means to a user; the error itself where that did not raise it."""
+    from torch._dynamo.exc import BackendCompilerFailed, TorchDynamoException  # takes a second
+
+    if not isinstance(error, TorchDynamoException):
+        return error
+    if isinstance(error, BackendCompilerFailed) and isinstance(
+        error.inner_exception, torch.OutOfMemoryError
+    ):
+        return torch.OutOfMemoryError(str(error.inner_exception))
+    return VLMError(
+        f"the model cannot be compiled here: {str(error).splitlines()[0]}. torch.compile needs a "
+        "working C++ compiler (g++), and on a GPU a C compiler for Triton (gcc). Install one, or "
+        "set extract.compile to false."
+    )

@@ -12,6 +12,9 @@ from benchmarks import real_shape
 from benchmarks.cases import Case
 from benchmarks.extract import _deviation, measure
 from benchmarks.profiling import Stopwatch
+from benchmarks.stage_one import StageOne
+from pipeline.extraction.rows import RowPreparation
+from pipeline.vlm import collation
 
 OPTIONS = Namespace(batch_size=2, rounds=1, profile=True, compile=False)
 
@@ -38,8 +41,11 @@ def test_a_real_shape_with_five_views_goes_through_every_contender(tmp_path, mon
     vlm = {"dtype": "bfloat16", "image_resize_height": 84, "image_resize_width": 140}
     case = Case("small", "cpu", 5, (1, 2), {"seeds": 1.0}, vlm, 5, (90, 160), real_shape=True)
     found = measure(case, tmp_path, OPTIONS)
-    assert set(found.results) == {"seeds", "seeds_by_8", "plain", "ours"}
+    ways = {"seeds", "seeds_by_8", "plain", "ours", "ours_every_frame"}
+    assert set(found.results) == ways
     assert all(one["rows_per_s"] > 0 for one in found.results.values())
+    assert all(one["cpu_ms_a_row"] > 0 for one in found.results.values())
+    assert {"plain", "plain, every frame"} <= set(found.ratios)
     assert 0 < found.results["plain"]["preparing_share"] < 1
     assert 0 < found.results["ours"]["model_share"] <= 1
     assert found.settings["views"] == 5
@@ -65,6 +71,21 @@ def test_contenders_that_differ_are_refused():
     assert ran == ["ours", 1, 8]
     with pytest.raises(AssertionError, match="contenders differ"):
         _deviation(case, ways, ours(plain * 1.1))
+
+
+def test_no_frame_and_no_row_is_spared_where_every_frame_is_asked_for():
+    ours = object.__new__(StageOne)
+    frame = np.zeros((2, 2, 3), np.uint8)
+    seen: list[Any] = []
+
+    def run() -> None:
+        seen.append(collation.unique([frame, frame])[1])
+        seen.append(RowPreparation.prepare_once is RowPreparation.prepare)
+
+    ours.run = run  # type: ignore[method-assign]
+    ours.run_every_frame()
+    run()
+    assert seen == [[0, 1], True, [0, 0], False]
 
 
 def test_a_step_is_charged_without_the_steps_that_it_calls():

@@ -1,6 +1,7 @@
 """Small recordings in the windowed format, and params that extract them."""
 
 import json
+import shutil
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -64,6 +65,19 @@ def _write_episode(
         )
     (folder / "metadata.json").write_text(json.dumps(metadata))
     return folder
+
+
+@pytest.fixture(scope="session")
+def stand_still() -> Callable[[Path], None]:
+    """`stand_still(episode)`: each camera of an episode shows its first frame throughout."""
+
+    def still(episode: Path) -> None:
+        for view in (episode / "images").iterdir():
+            first, *others = sorted(view.iterdir())
+            for frame in others:
+                shutil.copyfile(first, frame)
+
+    return still
 
 
 @pytest.fixture(scope="session")

@@ -178,7 +178,7 @@ def test_auto_settles_where_more_rows_gain_nothing(variants):
     assert found == list(range(600))
     assert encoder.settled
     assert encoder.batch_size == 32 * variants if variants == 1 else encoder.batch_size == 64
-    assert vlm.batches[0] == 4 // variants * variants
+    assert vlm.batches[0] == 8 // variants * variants
     assert max(vlm.batches) == 64 // variants * variants
 
 

@@ -33,17 +33,9 @@ def asked(monkeypatch) -> list[int]:
     return rows
 
 
-def stand_still(episode: Path) -> None:
-    """Each camera of an episode shows its first frame throughout."""
-    for view in (episode / "images").iterdir():
-        first, *others = sorted(view.iterdir())
-        for frame in others:
-            shutil.copyfile(first, frame)
-
-
 class TestEqualRows:
     def test_are_computed_once_and_the_store_is_the_same(
-        self, params, changed, recordings, asked, monkeypatch
+        self, params, changed, recordings, asked, stand_still, monkeypatch
     ):
         for episode in ("episode_1", "episode_2"):
             stand_still(recordings / "Touch_dot" / episode)
@@ -64,7 +56,7 @@ class TestEqualRows:
         assert np.allclose(store.array("vl/features"), each.array("vl/features"), atol=2e-5)
         assert store.attrs["environment"] == each.attrs["environment"]
 
-    def test_go_on_after_a_kill(self, params, recordings, monkeypatch):
+    def test_go_on_after_a_kill(self, params, recordings, stand_still, monkeypatch):
         stand_still(recordings / "Touch_dot" / "episode_2")
         real = StoreBuild.commit
 

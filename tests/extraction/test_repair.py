@@ -172,11 +172,30 @@ def test_a_spec_that_is_not_what_its_digest_says(case):
     place = case.store / "zarr.json"
     document = json.loads(place.read_text())
     document["attributes"]["feature_spec"]["prompt"] += "!"
+    del document["attributes"]["metadata_digest"]  # as an earlier version wrote it
     place.write_text(json.dumps(document))
     (line,) = case.findings().lines()
     assert "expected the digest" in line
     begun, _ = case.mended()
     assert begun.laid_out_anew
+    assert contents(case.store) == contents(case.original)
+
+
+@pytest.mark.parametrize("place", ["zarr.json", "vl/zarr.json"])
+def test_changed_metadata_are_written_again_and_every_row_is_kept(case, place):
+    document = json.loads((case.store / place).read_text())
+    attributes = document["attributes"]
+    if place == "zarr.json":
+        attributes["action_hz"] = 30.0
+    else:
+        attributes["slots"][0]["pooling"] = "last"
+    (case.store / place).write_text(json.dumps(document))
+    with pytest.raises(StoreIncomplete, match="the metadata were changed"):
+        extract(case.params, quiet)
+    begun, report = case.mended()
+    assert begun.carried == begun.rows
+    assert report is not None
+    assert report.computed == 0
     assert contents(case.store) == contents(case.original)
 
 
@@ -191,7 +210,7 @@ def test_streams_cannot_be_mended_from_other_recordings(case):
 def test_a_repair_that_has_begun_is_not_begun_again(case):
     flipped_feature(case)
     repair(case.findings(), case.params, quiet)
-    with pytest.raises(StoreMismatch, match=r"a repair of it has begun. Run stages.extract"):
+    with pytest.raises(StoreMismatch, match=r"a repair of it has begun. Run python -m stages.ext"):
         repair(case.findings(), case.params, quiet)
 
 
@@ -201,7 +220,7 @@ def test_a_store_that_no_longer_says_what_it_is(case):
     document = json.loads(place.read_text())
     del document["attributes"]["plan"]
     place.write_text(json.dumps(document))
-    with pytest.raises(StoreIncomplete, match="no longer says what it was made of"):
+    with pytest.raises(StoreIncomplete, match="no longer say what the store was made of"):
         repair(case.findings(), case.params, quiet)
 
 

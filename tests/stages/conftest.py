@@ -12,6 +12,20 @@ ROOT = Path(__file__).resolve().parents[2]
 Process = subprocess.Popen[str]
 
 
+@pytest.fixture(scope="session")
+def flip() -> Callable[[Path, str], Path]:
+    """`flip(store, array)`: the chunk file of which one bit was turned; again turns it back."""
+
+    def turn(store: Path, array: str) -> Path:
+        (file,) = (one for one in (store / array / "c").rglob("*") if one.is_file())
+        content = bytearray(file.read_bytes())
+        content[len(content) // 100] ^= 1
+        file.write_bytes(content)
+        return file
+
+    return turn
+
+
 @pytest.fixture
 def started() -> Callable[[str, Path], Process]:
     """`started(code, params)`: a process that runs this Python with the file of params."""

@@ -83,6 +83,25 @@ def test_another_store_is_refused_by_name(
     assert "Traceback" not in error
 
 
+@pytest.mark.parametrize("array", ["sensor/values", "vl/features"])
+def test_a_flipped_bit_is_refused_where_it_would_be_judged_on(
+    trained: Path,
+    tiny_store: Callable[..., Path],
+    flip: Callable[[Path, str], Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    array: str,
+) -> None:
+    store = tiny_store(tmp_path, name="flipped")
+    file = flip(store, array)
+    arguments = ["--params", str(trained), "--set", f"evaluate.store={store}"]
+    arguments += ["--set", f"evaluate.output={tmp_path / 'report'}"]
+    assert run("", evaluate.main, arguments) == 2
+    assert f"{file}: " in capsys.readouterr().err
+    assert not (tmp_path / "report").exists()
+    assert run("", evaluate.main, [*arguments, "--set", "train_head.check_store=false"]) == 0
+
+
 def test_a_missing_checkpoint_says_what_to_run(
     trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -117,6 +117,23 @@ def write_params(extracted: Path, tmp_path: Path) -> Callable[..., Path]:
     return write
 
 
+def test_a_flipped_bit_is_refused_before_tuning(
+    write_params: Callable[..., Path],
+    extracted: Path,
+    flip: Callable[[Path, str], Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    store = extracted.parent / "made.zarr"
+    file = flip(store, "tick/action")
+    try:
+        assert run("", finetune.main, ["--params", str(write_params())]) == 2
+    finally:
+        flip(store, "tick/action")
+    assert f"{file}: " in capsys.readouterr().err
+    assert not (tmp_path / "tuned.part").exists()
+
+
 def test_it_tunes_and_says_how_to_go_on_and_that_works(
     write_params: Callable[..., Path],
     extracted: Path,

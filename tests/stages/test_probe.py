@@ -47,8 +47,9 @@ def test_a_ranking_files_and_pictures(params: Path, capsys: pytest.CaptureFixtur
     report = params.parent / "report"
     assert sorted(file.name for file in report.iterdir()) == FILES
     # The action's first two channels are those of slot 0, which is the mean.
-    assert lines[5].startswith("layer 3, mean")
-    assert lines[-2].endswith("vlm: {layers: [3], norms: [true], pooling: [mean]}")
+    assert lines[7].startswith("layer 3, mean")
+    assert lines[-3].endswith("vlm: {layers: [3], norms: [true], pooling: [mean]}")
+    assert "run stages.extract" in lines[-2]
     assert sum("View1 cell" in line for line in lines) == 4
 
     slots = list(csv.DictReader((report / "slots.csv").read_text().splitlines()))

@@ -215,6 +215,29 @@ def test_mistakes_end_in_one_message(
     assert not (tmp_path / "params/head.part").exists(), "bad params leave nothing behind"
 
 
+@pytest.mark.parametrize("array", ["sensor/values", "vl/features"])
+def test_a_flipped_bit_is_refused_where_it_would_be_learnt_from(
+    write_params: Callable[..., Path],
+    flip: Callable[[Path, str], Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    array: str,
+) -> None:
+    arguments = ["--params", str(write_params(max_steps=3))]
+    file = flip(tmp_path / "params.zarr", array)
+    assert run("", train_head.main, arguments) == 2
+    error = capsys.readouterr().err
+    assert f"{file}: " in error
+    assert "stages.verify --repair" in error
+    assert not (tmp_path / "params/head.part").exists()
+
+    assert run("", train_head.main, [*arguments, "--set", "train_head.check_store=false"]) == 0
+    capsys.readouterr()
+    # A finished run reads no number of the store, and is the same run with the check as without.
+    assert run("", train_head.main, arguments) == 0
+    assert "nothing to do" in capsys.readouterr().out
+
+
 def test_progress_is_silent_where_there_is_no_terminal(
     write_params: Callable[..., Path], capsys: pytest.CaptureFixture[str]
 ) -> None:

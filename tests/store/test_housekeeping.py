@@ -176,9 +176,15 @@ class TestLeftovers:
         tiny_store(tmp_path)
         unfinish(tiny_store(tmp_path, name="begun"), 12)
         (tmp_path / "new.zarr.part").mkdir()
+        shutil.copytree(tmp_path / "tiny.zarr", tmp_path / "tiny.zarr.repair.part")
         for name in ("tiny.zarr.old", "tiny.zarr.known-0"):
             shutil.copytree(tmp_path / "tiny.zarr", tmp_path / name)
-        for name in ("gone.zarr.files.sqlite", "tiny.zarr.files.sqlite", "tiny.zarr.lock"):
+        for name in (
+            "gone.zarr.files.sqlite",
+            "tiny.zarr.files.sqlite",
+            "tiny.zarr.lock",
+            "b.zarr.wait",
+        ):
             (tmp_path / name).touch()
         found = leftovers(take_inventory(tmp_path))
         assert {one.path.name: one.why for one in found} == {
@@ -192,6 +198,9 @@ class TestLeftovers:
             "stages.extract takes over",
             "tiny.zarr.lock": "held by no process",
             "tiny.zarr.old": "tiny.zarr has taken its place",
+            "tiny.zarr.repair.part": "a repair that was stopped before it was a build; the next "
+            "begins anew",
+            "b.zarr.wait": "held by no process",
         }
         for one in found:
             remove(one)

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from pipeline.errors import StoreIncomplete, StoreMismatch
 from pipeline.store import FeatureStore
+from pipeline.store.archive import archive
 from pipeline.store.integrity import verify
 from pipeline.store.integrity.findings import MOST_LINES, Findings
 from pipeline.store.integrity.scan import ChunkReport
@@ -98,7 +99,7 @@ class TestSound:
 
     def test_over_several_chunks_and_blocks(self, tiny_store, tmp_path, monkeypatch):
         monkeypatch.setattr("pipeline.store.schema.CHUNK_BYTES", 4096)
-        monkeypatch.setattr("pipeline.store.integrity.scan._BLOCK_BYTES", 10_000)
+        monkeypatch.setattr("pipeline.store.chunk_pass.BLOCK_BYTES", 10_000)
         monkeypatch.setattr("pipeline.store.integrity.relations.BLOCK_ROWS", 7)
         store = tiny_store(tmp_path, readings_a_tick=60)
         assert found_in(store).sound
@@ -158,6 +159,14 @@ class TestFeatureRows:
         overwrite(store, "vl/slot_valid", 22, 0)
         assert found_in(store).sound
 
+    def test_a_nan_is_one_where_the_file_that_excuses_it_is_gone(self, store):
+        nan_with_right_checksums(store, 22)
+        overwrite(store, "vl/slot_valid", 22, 0)
+        chunk_file(store, "vl/slot_valid").unlink()
+        findings = found_in(store)
+        assert findings.bad_rows.tolist() == [22]
+        assert findings.damaged_arrays() == {"vl/slot_valid"}
+
     def test_rows_behind_the_end_of_a_truncated_file(self, store):
         os.truncate(chunk_file(store, "vl/features"), 50 * 3 * 8 * 4 + 10)
         findings = found_in(store)
@@ -174,7 +183,7 @@ class TestFeatureRows:
         assert findings.lines()[-1].startswith("and 40 more")
 
     def test_rows_on_a_disk_that_fails(self, store, monkeypatch):
-        monkeypatch.setattr("pipeline.store.integrity.scan._BLOCK_BYTES", 10 * 3 * 8 * 4)
+        monkeypatch.setattr("pipeline.store.chunk_pass.BLOCK_BYTES", 10 * 3 * 8 * 4)
         read, inode = os.preadv, chunk_file(store, "vl/features").stat().st_ino
 
         def failing(descriptor, buffers, offset):
@@ -315,7 +324,17 @@ class TestOtherThings:
         with pytest.raises(StoreIncomplete, match="a file system that they share"):
             verify(store, threads=1, workers="tcp://elsewhere:8786")
 
-    def test_an_archive(self, store, monkeypatch):
-        monkeypatch.setattr("pipeline.store.archive.is_archive", lambda path: path == store)
+    def test_an_archive(self, store, tmp_path):
+        archive(store, tmp_path / "copy.zarr", level=1, threads=1)
         with pytest.raises(StoreMismatch, match=r"an archive.*stages.archive --restore"):
+            verify(tmp_path / "copy.zarr", threads=1)
+
+    def test_another_store_in_its_place_meanwhile(self, store, monkeypatch):
+        def replaced(root, specs):
+            store.rename(store.with_name("before.zarr"))
+            shutil.copytree(store.with_name("before.zarr"), store)
+            return []
+
+        monkeypatch.setattr("pipeline.store.integrity.verification.strange_files", replaced)
+        with pytest.raises(StoreMismatch, match="another store took its place"):
             verify(store, threads=1)

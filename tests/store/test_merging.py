@@ -14,6 +14,8 @@ import zarr
 
 from pipeline.errors import ConfigError, DiskFull, StoreIncomplete, StoreLocked, StoreMismatch
 from pipeline.store import FeatureStore, StoreBuild, build_lock
+from pipeline.store.integrity import verify
+from pipeline.store.integrity.repair import carry_rows, copy_layout, put_in_place
 from pipeline.store.merging import merge
 from pipeline.store.schema import ARRAY_NAMES
 
@@ -208,6 +210,23 @@ def test_merging_again_does_nothing(tiny_store: Make, tmp_path: Path) -> None:
     assert (tmp_path / "both.zarr").stat().st_ino == before
 
 
+def test_merging_again_completes_a_repair(tiny_store: Make, tmp_path: Path) -> None:
+    inputs = [tiny_store(tmp_path, name=str(seed), seed=seed) for seed in (1, 2)]
+    output = tmp_path / "both.zarr"
+    merge(inputs, output, quiet)
+    whole = {path: path.read_bytes() for path in output.rglob("*") if path.is_file()}
+    flip(output / "vl/features/c/0/0/0", 1000)
+    findings = verify(output, threads=1)
+    build = copy_layout(output)
+    assert carry_rows(output, build, findings) == 119
+    put_in_place(build, output)
+    merge(inputs, output, quiet)
+    assert {path: path.read_bytes() for path in output.rglob("*") if path.is_file()} == whole
+    (output / "vl/features/c/0/0/0").unlink()
+    with pytest.raises(StoreIncomplete, match=r"no file.*stages\.verify --repair"):
+        merge(inputs, output, quiet)
+
+
 class TestRefusals:
     @pytest.mark.parametrize(
         ("changed", "said"),
@@ -299,7 +318,7 @@ class TestDamage:
             flip(chunk, 7 * 3 * 8 * 4)
 
         monkeypatch.setattr(StoreBuild, "finish_layout", rotting)
-        with pytest.raises(StoreIncomplete, match=r"2\.zarr: row 7 of vl/features does not"):
+        with pytest.raises(StoreIncomplete, match=r"2\.zarr/.*: rows 7 to 7 of vl/features do not"):
             merge(inputs, tmp_path / "both.zarr", quiet)
 
     def test_an_input_replaced_in_the_middle_is_noticed(
@@ -316,7 +335,7 @@ class TestDamage:
                 other.rename(inputs[1])
 
         monkeypatch.setattr(StoreBuild, "create", replacing)
-        with pytest.raises(StoreMismatch, match="was replaced while"):
+        with pytest.raises(StoreMismatch, match="another store took its place"):
             merge(inputs, tmp_path / "both.zarr", quiet)
         merge(inputs, tmp_path / "both.zarr", quiet)
         assert_holds(FeatureStore.open(tmp_path / "both.zarr"), FeatureStore.open(inputs[0]))

@@ -9,6 +9,7 @@ import google_crc32c
 import numpy as np
 import pytest
 
+from pipeline.errors import StoreMismatch
 from pipeline.store import FeatureStore, StoreBuild, part_path, read_plan
 from pipeline.store.integrity import verify
 from pipeline.store.integrity.repair import carry_rows, copy_layout, layout_is_sound, put_in_place
@@ -146,6 +147,16 @@ def test_they_are_copied_where_not(original, store, monkeypatch):
     build = repaired(store)
     assert build.missing().tolist() == [17]
     assert contents(completed(build, original)) == contents(original)
+
+
+def test_a_store_that_was_replaced_since_it_was_checked_gives_no_row(original, store):
+    flip_row_17(chunk_file(store, "vl/features"))
+    findings = verify(store, threads=1)
+    store.rename(store.with_name("before.zarr"))
+    shutil.copytree(original, store)
+    build = copy_layout(store)
+    with pytest.raises(StoreMismatch, match=r"another store took its place.*Run the same"):
+        carry_rows(store, build, findings)
 
 
 class Killed(BaseException):

@@ -1,6 +1,7 @@
 """A build loses at most what was in flight, whatever kills it."""
 
 import errno
+import fcntl
 import os
 import shutil
 import socket
@@ -194,8 +195,53 @@ class TestSeal:
         self.full(tmp_path, "after").seal()
         assert {path: path.read_bytes() for path in before} == before
 
+    def test_a_store_behind_a_symbolic_link_loses_the_link_alone(self, tmp_path):
+        self.full(tmp_path / "disk", "before", seed=1).seal()
+        (tmp_path / "s.zarr").symlink_to(tmp_path / "disk" / "s.zarr")
+        self.full(tmp_path, "after").seal()
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["disk", "s.zarr"]
+        assert not (tmp_path / "s.zarr").is_symlink()
+        behind = FeatureStore.open(tmp_path / "disk" / "s.zarr")
+        assert np.array_equal(behind.array(FEATURES), rows_of(1, ROWS))
+        (tmp_path / "s.zarr.old").symlink_to(tmp_path / "disk" / "s.zarr")  # as a kill leaves it
+        recover(tmp_path / "s.zarr")
+        assert not (tmp_path / "s.zarr.old").is_symlink()
+        assert behind.path.exists()
+
 
 class TestLinks:
+    def test_a_build_that_was_copied_by_links_goes_on_and_leaves_the_copy_alone(self, tmp_path):
+        build = begun(tmp_path)
+        build.commit(range(5), rows_of(0, 5), [bytes(16)] * 5, 0)
+        build.close()
+        kept = tmp_path / "kept"
+        subprocess.run(["cp", "-al", build.part, kept], check=True)
+        before = {path: path.read_bytes() for path in kept.rglob("c/**/*") if path.is_file()}
+        again = resumed(build)
+        again.commit(range(5, ROWS), rows_of(1, 7), [bytes(16)] * 7, 0)
+        again.seal()
+        wanted = np.concatenate([rows_of(0, 5), rows_of(1, 7)])
+        assert np.array_equal(FeatureStore.open(again.target).array(FEATURES), wanted)
+        assert np.array_equal(zarr.open_array(again.target, path=FEATURES, mode="r")[:], wanted)
+        assert {path: path.read_bytes() for path in before} == before
+
+    @pytest.mark.parametrize("harm", [lambda path: os.truncate(path, 99), Path.unlink])
+    def test_a_chunk_that_is_not_whole_is_written_anew(self, tmp_path, monkeypatch, harm):
+        monkeypatch.setattr("pipeline.store.schema.CHUNK_BYTES", 4096)
+        build, values = self._with_sensor(tmp_path, 9000, "one")
+        build.seal()
+        harm(build.target / "sensor/values/c/0/0")
+        other, _ = self._specs(tmp_path, 9000, "two")
+        other.create()
+        spec = other.specs["sensor/values"]
+        other.link_unchanged("sensor/values", build.target, spec, 9000)
+        assert [other.files("sensor/values").is_linked(chunk) for chunk in (0, 1)] == [False, True]
+        other.allocate()
+        other.write("sensor/values", 0, values)
+        self._finish(other)
+        other.seal()
+        assert np.array_equal(FeatureStore.open(other.target).array("sensor/values"), values)
+
     def test_unchanged_chunks_are_linked_and_others_are_not(self, tmp_path, monkeypatch):
         monkeypatch.setattr("pipeline.store.schema.CHUNK_BYTES", 4096)
         build, values = self._with_sensor(tmp_path, 9000, "one")
@@ -278,6 +324,18 @@ class TestLock:
                 pass
             holder.kill()
         with build_lock(target):
+            pass
+
+    def test_a_file_tidied_away_before_it_was_locked_excludes_nobody(self, tmp_path, monkeypatch):
+        real = fcntl.flock
+
+        def late(file, how) -> None:
+            (tmp_path / "s.zarr.lock").unlink()
+            real(file, how)
+
+        monkeypatch.setattr("fcntl.flock", late)
+        refused = pytest.raises(StoreLocked, match="removed by another process")
+        with refused, build_lock(tmp_path / "s.zarr"):
             pass
 
     def left_by(self, folder: Path, holder: str, age_s: float) -> Path:

@@ -206,7 +206,7 @@ def test_a_signal_to_torchrun_stops_all_after_one_step_and_one_process_can_go_on
         assert line, "ended before step 6"
     process.send_signal(signal.SIGTERM)
     _, err = process.communicate(timeout=60)
-    assert err.count("stopped; the same command continues from here") == 1
+    assert err.count("stopped; run the same command again") == 1
     last = json.loads((tmp_path / "together.part/last/trainer.json").read_text())
     assert 6 <= last["step"] <= 10
     head = load_params(written, ["train_head.grad_accumulation=2"]).train_head

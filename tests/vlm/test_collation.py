@@ -1,6 +1,8 @@
 """Equal images reach the tower once; a batch of equal layout keeps its shape."""
 
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +13,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from pipeline.vlm.collation import unique
+from pipeline.errors import VLMError
+from pipeline.vlm.collation import Collator, unique
 from pipeline.vlm.qwen import FrozenVLM
 
 
@@ -84,6 +87,54 @@ def test_a_compiled_model_gives_the_same_features_and_is_compiled_once_a_shape(
         assert torch.equal(valid, expected_valid)
     assert torch._dynamo.utils.counters["stats"]["unique_graphs"] == 2
     assert not torch._dynamo.utils.counters["graph_break"]
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit.script_method`:DeprecationWarning")
+def test_a_compiled_model_is_given_sizes_that_it_has_seen_and_that_fit(
+    extractor: Callable[..., Any],
+    make_frame: Callable[..., NDArray[np.uint8]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(torch, "compile", lambda part, **options: part)
+    plain = extractor(pooling=["mean"])
+    compiled = FrozenVLM.load(plain.vlm, plain.spec, "cpu", compile=True)
+    given, real, room = [], Collator.collate, [99]
+
+    def collate(self: Collator, rows: Any) -> Any:
+        given.append(len(rows))
+        if len(rows) > room[0]:
+            raise torch.OutOfMemoryError("too many")
+        return real(self, rows)
+
+    monkeypatch.setattr(Collator, "collate", collate)
+    row = plain.preparer.prepare("insert the needle", {"View1": make_frame(0)})
+    for size in (2, 8, 4, 3, 5, 8, 1):
+        compiled.encode([row] * size)
+    assert given == [2, 8, 8, 8, 8, 8, 2]
+    room[0] = 4
+    for size in (8, 4, 3):
+        with suppress(torch.OutOfMemoryError):
+            compiled.encode([row] * size)
+    assert given[7:] == [8, 4, 4], "what did not fit is not padded to again"
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:`torch.jit.script_method`:DeprecationWarning")
+def test_no_compiler_is_said(
+    extractor: Callable[..., Any],
+    make_frame: Callable[..., NDArray[np.uint8]],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    from torch._inductor import config
+
+    monkeypatch.setattr(config.cpp, "cxx", (str(tmp_path / "no_compiler"),))
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))
+    plain = extractor(pooling=["mean"])
+    compiled = FrozenVLM.load(plain.vlm, plain.spec, "cpu", compile=True)
+    row = plain.preparer.prepare("insert the needle", {"View1": make_frame(0)})
+    with pytest.raises(VLMError, match=r"cannot be compiled here: .*set extract\.compile to false"):
+        compiled.encode([row])
 
 
 VIEWS = ("View1", "View2", "View3")

@@ -4,7 +4,7 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -30,14 +30,15 @@ from pipeline.store.archive.manifest import (
 from pipeline.store.archive.report import ArchiveReport
 from pipeline.store.archive.source import (
     all_rows,
-    check_features,
     checked_rows,
     chunk_crcs,
     samples,
     trailer,
 )
+from pipeline.store.chunks import check_row_checksums
 from pipeline.store.lock import build_lock
 from pipeline.store.reader import FeatureStore
+from pipeline.store.replacement import inode_of, refuse_replaced
 from pipeline.store.schema import CHECKSUMS, FEATURES, ArraySpec, chunk_paths, read_specs
 from pipeline.store.writer import part_path
 
@@ -96,7 +97,7 @@ def _write(store: Path, part: Path, level: int) -> dict[str, ArchivedArray]:
     """Everything of an archive, its manifest last, all of it on the disk."""
     if part.exists():
         shutil.rmtree(part)
-    folder, metadata, specs = store.stat(), read_metadata(store), read_specs(store)
+    inode, metadata, specs = inode_of(store), read_metadata(store), read_specs(store)
     checksums = all_rows(store, specs[CHECKSUMS])
     total = sum(spec.data_bytes for spec in specs.values())
     _create_groups(part, metadata)
@@ -107,11 +108,7 @@ def _write(store: Path, part: Path, level: int) -> dict[str, ArchivedArray]:
             choice = _choice(store, spec, level, total)
             of_rows = checksums if name == FEATURES else None
             arrays[name] = _write_array(store, part, spec, choice, of_rows, progress)
-    if metadata != read_metadata(store) or not os.path.samestat(folder, store.stat()):
-        raise StoreMismatch(
-            f"{store}: another store took its place while it was archived. Run stages.archive "
-            "again."
-        )
+    refuse_replaced(store, inode)
     group = zarr.open_group(part, mode="r+")
     group.attrs.put({**group.attrs.asdict(), ATTRIBUTE: Manifest(metadata, arrays).document()})
     for place, _, files in os.walk(part):
@@ -156,12 +153,11 @@ def _write_array(
     `checksums` are those of feature rows.
     """
     array = create_array(part, spec, choice.codec)
-    paths = chunk_paths(store, spec)
     sizes: list[int] = []
     crcs: list[int] = []
     for shard, chunks in enumerate(shards(spec, array)):
         path = shard_path(part, array, shard)
-        crcs += _write_shard(array, path, paths, spec, chunks, checksums)
+        crcs += _write_shard(store, array, path, spec, chunks, checksums)
         sizes.append(path.stat().st_size if path.exists() else 0)
         progress.update(len(rows_of(spec, chunks)) * spec.row_bytes)
     digest = file_digest(part / spec.name / ROOT)
@@ -171,18 +167,19 @@ def _write_array(
 
 
 def _write_shard(
+    store: Path,
     array: "zarr.Array[Any]",
     path: Path,
-    paths: Sequence[Path],
     spec: ArraySpec,
     chunks: range,
     checksums: NDArray[np.uint32] | None,
 ) -> list[int]:
     """One shard, on the disk and read back; the checksum of each chunk file that it holds."""
-    values, crcs = checked_rows(paths, spec, chunks)
+    values, crcs = checked_rows(chunk_paths(store, spec), spec, chunks)
     rows = rows_of(spec, chunks)
     if checksums is not None:
-        check_features(paths, spec, values, checksums, rows.start)
+        wanted = checksums[rows.start : rows.stop]
+        check_row_checksums(store, spec, rows.start, values, wanted)
     array[rows.start : rows.stop] = values
     del values  # a shard may be large: what is read back takes its place
     if path.exists():

@@ -10,7 +10,7 @@ import zarr
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.durable import disk_full_named
+from pipeline.durable import disk_full_named, sync
 from pipeline.errors import StoreMismatch
 from pipeline.store.archive.layout import open_array, rows_of, shard_path, shards
 from pipeline.store.archive.manifest import (
@@ -24,8 +24,9 @@ from pipeline.store.archive.manifest import (
 )
 from pipeline.store.archive.source import checked_rows, chunk_crcs
 from pipeline.store.lock import build_lock
+from pipeline.store.replacement import recover
 from pipeline.store.schema import ArraySpec, chunk_paths, read_specs
-from pipeline.store.writer import StoreBuild, part_path, read_plan, recover
+from pipeline.store.writer import StoreBuild, part_path, read_plan
 
 
 def restore(archive: Path, target: Path, threads: int) -> None:
@@ -42,7 +43,7 @@ def restore(archive: Path, target: Path, threads: int) -> None:
         recover(target)
         if target.exists():
             return _check_same(manifest, target)
-        _check_no_other_build(manifest, target)
+        _check_no_build(target)
         part = part_path(target)
         try:
             with disk_full_named(target), zarr.config.set({"async.concurrency": threads}):
@@ -65,9 +66,13 @@ def _build(manifest: Manifest, archive: Path, target: Path) -> None:
         with _progress("restore", manifest) as progress:
             for name, record in manifest.arrays.items():
                 _restore_array(archive, build, name, record, progress)
-        # The root's attributes hold the plan: from here on an extraction would take it as a build.
+        build.finish()
+        # With the root's attributes, which hold the plan, it is what an extraction would go on
+        # with, or an earlier one have left, and so nothing that another restoration may remove.
         _write_text(part / ROOT, manifest.metadata[ROOT])
-        build.seal()
+        sync(part / ROOT)
+        sync(part)
+        build.put_in_place()
     finally:
         build.close()
 
@@ -142,13 +147,14 @@ def _check_same(manifest: Manifest, target: Path) -> None:
                 progress.update(values.nbytes)
 
 
-def _check_no_other_build(manifest: Manifest, target: Path) -> None:
-    """An unfinished extraction may hold rows that exist nowhere else."""
-    plan = read_plan(part_path(target))
-    if plan is not None and plan != manifest.plan:
+def _check_no_build(target: Path) -> None:
+    """An unfinished extraction or repair may hold rows that exist nowhere else, of any plan."""
+    part = part_path(target)
+    if read_plan(part) is not None:
         raise StoreMismatch(
-            f"{part_path(target)}: an unfinished build of another store. Finish it with "
-            "stages.extract, remove it, or restore to another place with archive.store."
+            f"{part}: expected nothing there, found an unfinished build. Finish it with "
+            "stages.extract, remove it with `python -m stages.store gc --remove`, or restore to "
+            "another place with archive.store."
         )
 
 

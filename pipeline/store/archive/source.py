@@ -6,8 +6,9 @@ writing, so that a read-only store will do.
 
 import os
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import google_crc32c
 import numpy as np
@@ -15,7 +16,8 @@ from numpy.typing import NDArray
 
 from pipeline.errors import StoreIncomplete
 from pipeline.store.archive.layout import rows_of
-from pipeline.store.chunks import row_checksums
+from pipeline.store.chunk_pass import ChunkPass
+from pipeline.store.chunks import MEND
 from pipeline.store.schema import TRAILER_BYTES, ArraySpec, chunk_paths
 
 
@@ -24,19 +26,21 @@ def checked_rows(
 ) -> tuple[NDArray[Any], list[int]]:
     """The rows of consecutive chunk files, and the crc32c of the data of each file.
 
-    Raises `StoreIncomplete` naming array, file and rows where a file does not give its checksum.
+    Raises `StoreIncomplete` naming array, file and rows where a file does not give its trailer.
     """
     block = np.empty((len(chunks), spec.chunk_bytes), np.uint8)
     crcs: list[int] = []
     for data, chunk in zip(block, chunks, strict=True):
-        with paths[chunk].open("rb", buffering=0) as file:
-            read = _read_into(file.fileno(), data)
-            trailer = os.read(file.fileno(), TRAILER_BYTES + 1)
-        crc = google_crc32c.value(data)
-        if read != data.nbytes or trailer != crc.to_bytes(TRAILER_BYTES, "little"):
+        with closing(ChunkPass(paths[chunk], spec)) as file:
+            for _ in file.blocks(data):
+                pass
+        if file.damage:
             bad = spec.chunk_rows_of(chunk)
-            raise _damaged(paths[chunk], spec.name, bad.start, bad.stop - 1)
-        crcs.append(crc)
+            raise StoreIncomplete(
+                f"{paths[chunk]}: rows {bad.start} to {bad.stop - 1} of {spec.name}: "
+                f"{file.damage}. {MEND}"
+            )
+        crcs.append(file.crc)
     rows, flat = len(rows_of(spec, chunks)), block.reshape(-1)
     used = rows * spec.row_bytes
     if flat[used:].any():
@@ -63,24 +67,6 @@ def all_rows(store: Path, spec: ArraySpec) -> NDArray[Any]:
     if not chunks:
         return np.zeros(spec.shape, spec.dtype)
     return checked_rows(chunk_paths(store, spec), spec, chunks)[0]
-
-
-def check_features(
-    paths: Sequence[Path],
-    spec: ArraySpec,
-    values: NDArray[Any],
-    checksums: NDArray[np.uint32],
-    start: int,
-) -> None:
-    """Raise `StoreIncomplete` where feature rows, from `start`, do not give their checksums.
-
-    `checksums` are those of all rows.
-    """
-    wanted = checksums[start : start + len(values)]
-    bad = np.flatnonzero(row_checksums(values) != wanted) + start
-    if bad.size:
-        first, last = int(bad[0]), int(bad[-1])
-        raise _damaged(paths[first // spec.chunk_rows], spec.name, first, last)
 
 
 def samples(store: Path, spec: ArraySpec, rows: int, wanted: int) -> list[NDArray[Any]]:
@@ -112,18 +98,3 @@ def trailer(path: Path) -> int:
     with path.open("rb") as file:
         file.seek(-TRAILER_BYTES, os.SEEK_END)
         return int.from_bytes(file.read(), "little")
-
-
-def _read_into(descriptor: int, data: NDArray[np.uint8]) -> int:
-    """Fill the buffer; fewer bytes than it holds only where the file ends."""
-    view, filled = memoryview(cast(Any, data)), 0
-    while filled < len(view) and (more := os.readv(descriptor, [view[filled:]])):
-        filled += more
-    return filled
-
-
-def _damaged(path: Path, name: str, first: int, last: int) -> StoreIncomplete:
-    return StoreIncomplete(
-        f"{path}: rows {first} to {last} of {name} do not give their checksum: the store is "
-        "damaged. Run stages.verify to see how much of it."
-    )

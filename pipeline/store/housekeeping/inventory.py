@@ -4,11 +4,8 @@ Reads metadata and a few small arrays only, whatever the size. A damaged store i
 reason; it stops nothing.
 """
 
-import fcntl
 import os
 import re
-import socket
-import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -18,24 +15,27 @@ from typing import Literal
 from pipeline.errors import ConfigError, PipelineError
 from pipeline.store.archive import is_archive
 from pipeline.store.housekeeping.contents import Contents, contents_of, contents_of_archive
+from pipeline.store.lock import lock_holder
 from pipeline.store.reader import FeatureStore
 from pipeline.store.writer import read_plan
 
 GROUPS: tuple[str, ...] = ("features", "sensor", "state", "rest")
-Kind = Literal["store", "archive", "build", "set aside", "replaced", "lock", "ledger", "unknown"]
-STALE_S = 60.0
-"""Without a sign of life for so long, a holder on another host is dead."""
+Kind = Literal[
+    "store", "archive", "build", "repair", "set aside", "replaced", "lock", "ledger", "unknown"
+]
 
 _SUFFIXES: Mapping[str, Kind] = {
     "": "store",
     ".part": "build",
+    ".repair.part": "repair",
     ".known": "set aside",
     ".old": "replaced",
     ".lock": "lock",
+    ".wait": "lock",
     ".files.sqlite": "ledger",
 }
 _NAME = re.compile(
-    r"(?P<base>.+?\.zarr)(?:(?P<suffix>\.part|\.known|\.old|\.lock|\.files\.sqlite)"
+    rf"(?P<base>.+?\.zarr)(?:(?P<suffix>{'|'.join(re.escape(one) for one in _SUFFIXES if one)})"
     r"(?:-(?:\d+|wal|shm))?)?"
 )
 _UNREADABLE = (PipelineError, OSError, ValueError, KeyError, TypeError, AttributeError, IndexError)
@@ -125,25 +125,6 @@ def take_inventory(folder: Path) -> Inventory:
             "--set stores.folder=…"
         )
     return Inventory(folder, tuple(_entry(*found) for found in _walk(folder)))
-
-
-def lock_holder(path: Path) -> str | None:
-    """Who holds a lock file, as it says; None where no living process does.
-
-    A holder on another host, whose lock the kernel may not show here, is believed for a minute
-    after its last sign of life, as `build_lock` believes it.
-    """
-    with path.open("r", encoding="utf-8") as file:
-        try:
-            # Shared, so that two that ask do not take each other for a builder.
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-            held = False
-        except OSError:
-            held = True
-        holder = file.read().strip()
-        here = not holder or holder.endswith(f" on {socket.gethostname()}")
-        alive = held or (not here and time.time() - path.stat().st_mtime < STALE_S)
-    return (holder or "another process") if alive else None
 
 
 def _walk(folder: Path) -> Iterator[tuple[Path, Kind, Path]]:

@@ -28,7 +28,7 @@ class Leftover:
 
 def leftovers(inventory: Inventory) -> list[Leftover]:
     """What may be removed, with the reason, by path."""
-    kinds = ("build", "set aside", "replaced", "ledger", "lock", "unknown")
+    kinds = ("build", "repair", "set aside", "replaced", "ledger", "lock", "unknown")
     return [
         Leftover(one.path, one.base, _freed(inventory, one), why)
         for one in inventory.of_kind(*kinds)
@@ -74,6 +74,8 @@ def _why(inventory: Inventory, entry: Entry) -> str | None:
     match entry.kind:
         case "build":
             return _why_build(entry)
+        case "repair":
+            return "a repair that was stopped before it was a build; the next begins anew"
         case "set aside":
             rows = f"{entry.contents.done} feature rows" if entry.contents else "rows"
             return f"{rows} of an interrupted build, which the next stages.extract takes over"

@@ -64,9 +64,9 @@ def _details(inventory: Inventory, entry: Entry, dependents: Iterable[str]) -> I
         yield _embodiment(entry.contents)
     if entry.path.is_symlink():
         yield f"a link to {entry.path.resolve()}"
-    if entry.kind in ("build", "set aside", "replaced"):
+    if entry.kind in ("build", "repair", "set aside", "replaced"):
         begun = entry.contents is not None or entry.damage is not None
-        yield f"belongs to {entry.base.name}{'' if begun else '; not laid out yet'}"
+        yield f"belongs to {entry.base.name}{'' if begun else '; of no use unfinished'}"
     holder = inventory.holders.get(entry.base)
     if holder and entry.kind != "archive":
         yield f"being built by {holder}" if entry.kind == "build" else f"locked by {holder}"
@@ -103,11 +103,12 @@ def _specs(things: Sequence[Entry]) -> Iterator[str]:
         slots, dim, dtype = held.features
         said = [f"{slots} slots x {dim} in {dtype}", f"sensor in {held.sensor_dtype}"]
         spec = held.spec
+        said += _read_out(spec)
         for name, place in (
             ("weights", ("weights",)),
             ("adapter", ("adapter",)),
             ("pixels", ("processor", "image_size")),
-            ("computed in", ("dtype",)),
+            ("computed in", ("compute_dtype",)),
             ("variants", ("variants",)),
         ):
             if (value := _at(spec, place)) is not None:
@@ -115,6 +116,15 @@ def _specs(things: Sequence[Entry]) -> Iterator[str]:
         if isinstance(prompt := spec.get("prompt"), str):
             said.append(f"prompt {_first_words(prompt)!r}")
         yield f"spec {digest}: {', '.join(said)}"
+
+
+def _read_out(spec: Mapping[str, Any]) -> list[str]:
+    """From which layers and how the slots were pooled: what tells two specs apart at a glance."""
+    slots = [one for one in spec.get("slots", ()) if isinstance(one, Mapping)]
+    if not slots:
+        return []
+    kinds = dict.fromkeys((_at(one, ("layer",)), _at(one, ("pooling",))) for one in slots)
+    return [" + ".join(f"{pooling} of layer {layer}" for layer, pooling in kinds)]
 
 
 def _total(inventory: Inventory) -> Iterator[str]:

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.store.replacement import Inode
+
 MOST_LINES = 20
 """Of one kind that are shown; the rest is counted."""
 
@@ -64,6 +66,8 @@ class Findings:
     bytes: int
     """Read and checked."""
     seconds: float
+    inode: Inode | None = None
+    """Of the store that was checked: another may have taken its place since."""
     damaged: tuple[Damage, ...] = ()
     """Arrays and chunk files."""
     problems: tuple[str, ...] = ()

@@ -18,6 +18,7 @@ from pipeline.durable import disk_full_named, sync
 from pipeline.store.chunks import ChunkFiles, row_checksums
 from pipeline.store.environments import EnvironmentLog
 from pipeline.store.integrity.findings import Findings
+from pipeline.store.replacement import refuse_replaced
 from pipeline.store.schema import (
     CHECKSUMS,
     FEATURES,
@@ -62,8 +63,10 @@ def carry_rows(store: Path, build: StoreBuild, findings: Findings) -> int:
     """Take the sound feature rows over, each to its place, and mark them; returns how many.
 
     Not those whose key lies in a damaged chunk of keys, for a key has no checksum of its own. The
-    rows that are not marked are for `stages.extract` to compute.
+    rows that are not marked are for `stages.extract` to compute. Raises `StoreMismatch` where
+    another store took the place of the one that was checked.
     """
+    refuse_replaced(store, findings.inode)
     rows = build.specs[FEATURES].shape[0]
     sound = np.ones(rows, np.bool_)
     sound[findings.bad_rows] = False

@@ -64,6 +64,8 @@ def check_attributes(
     ]
     if attrs.get("schema") != SCHEMA:
         wrong.append(f"expected schema {SCHEMA}, found {attrs.get('schema')!r}")
+    if not wrong and attrs["vlm_reuse_count"] < 1:
+        wrong.append(f"expected a vlm_reuse_count of 1 or more, found {attrs['vlm_reuse_count']}")
     if not wrong:
         wrong += _widths(root, attrs, specs)
     return [Damage("", None, root / "zarr.json", what) for what in wrong]

@@ -16,10 +16,12 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from pipeline.errors import StoreIncomplete, StoreMismatch
+from pipeline.store.archive import is_archive
 from pipeline.store.integrity.findings import MOST_LINES, Damage, Findings, Places
 from pipeline.store.integrity.relations import EpisodeTable, RelationTask, relation_tasks
 from pipeline.store.integrity.scan import CHANGED, UNREADABLE, UNWRITTEN, ChunkReport, ChunkTask
 from pipeline.store.integrity.structure import check_attributes, read_arrays, strange_files
+from pipeline.store.replacement import inode_of, refuse_replaced
 from pipeline.store.schema import CHECKSUMS, FEATURES, ArraySpec, chunk_paths
 
 Report = TypeVar("Report", covariant=True)
@@ -30,10 +32,11 @@ def verify(path: Path, threads: int, workers: int | str = 0) -> Findings:
 
     `workers` is 0 for `threads` of this process, a number of local dask processes, or the address
     of a scheduler whose workers see the store under the same path. Raises `StoreIncomplete` where
-    there is no finished store, `StoreMismatch` where it is an archive.
+    there is no finished store, `StoreMismatch` where it is an archive, or was replaced meanwhile.
     """
     begun = time.monotonic()
     _refuse_other_things(path)
+    inode = inode_of(path)
     specs, damaged = read_arrays(path)
     attrs, unreadable = _attributes(path)
     damaged += unreadable or check_attributes(path, attrs, specs)
@@ -51,13 +54,16 @@ def verify(path: Path, threads: int, workers: int | str = 0) -> Findings:
         relations += _relations(path, blocks, run_tasks(blocks, threads, workers, "agree"), places)
     for task, report in zip(tasks, reports, strict=True):
         damaged += _file_damage(task, report, places)
+    problems = tuple(strange_files(path, specs))
+    refuse_replaced(path, inode)
     return Findings(
         store=path,
+        inode=inode,
         rows=specs[FEATURES].shape[0] if FEATURES in specs else 0,
         bytes=sum(report.bytes for report in reports),
         seconds=time.monotonic() - begun,
         damaged=tuple(damaged + relations),
-        problems=tuple(strange_files(path, specs)),
+        problems=problems,
         faults=_row_faults(specs, reports),
         places=places,
     )
@@ -129,8 +135,6 @@ def _call(task: Task[Report]) -> Report:
 
 
 def _refuse_other_things(path: Path) -> None:
-    from pipeline.store.archive import is_archive  # which checks stores with this module
-
     part = path.with_name(path.name + ".part")
     if path.suffix == ".part" and path.exists():
         raise StoreIncomplete(f"{path}: an unfinished build. Run stages.extract, then verify.")

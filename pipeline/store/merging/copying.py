@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import StoreIncomplete
-from pipeline.store.chunks import ChunkFiles, row_checksums
+from pipeline.store.chunks import ChunkFiles, check_row_checksums
+from pipeline.store.environments import environment_at
 from pipeline.store.merging.joining import Run
 from pipeline.store.reader import FeatureStore
 from pipeline.store.schema import CHECKSUMS, FEATURES, KEYS, ArraySpec, read_specs
@@ -57,40 +57,23 @@ def copy_features(build: StoreBuild, run: Run, rows: NDArray[np.int64]) -> Itera
             number = build.environment_index(environment)
             for start, count in _blocks(stretch, spec.row_bytes):
                 values = features.read(start, count)
-                _check_rows(store, start, values)
+                wanted = store.array(CHECKSUMS)[start : start + count]
+                check_row_checksums(store.path, spec, start, values, wanted)
                 keys = [key.tobytes() for key in store.array(KEYS)[start : start + count]]
                 build.commit(np.arange(start, start + count) + shift, values, keys, number)
                 yield count
-
-
-def _check_rows(store: FeatureStore, start: int, values: NDArray[Any]) -> None:
-    wanted = store.array(CHECKSUMS)[start : start + len(values)]
-    differing = np.flatnonzero(row_checksums(values) != wanted)
-    if len(differing):
-        raise StoreIncomplete(
-            f"{store.path}: row {start + differing[0]} of {FEATURES} does not give its checksum: "
-            "damaged just now. Look at the disk, then at `python -m stages.verify`, which "
-            "mends it with --repair and stages.extract."
-        )
 
 
 def _stretches(
     store: FeatureStore, rows: NDArray[np.int64]
 ) -> Iterator[tuple[dict[str, Any], range]]:
     """Consecutive rows that were computed in one environment, and that environment."""
-    starts = [noted["rows"][0] for noted in store.attrs["environment"]]
-    cuts = np.searchsorted(rows, starts)
+    noted = store.attrs["environment"]
+    cuts = np.searchsorted(rows, [edge for one in noted for edge in one["rows"]])
     gaps = np.flatnonzero(np.diff(rows) != 1) + 1
     for part in np.split(rows, np.union1d(cuts, gaps)):
         if len(part):
-            yield _environment(store, int(part[0])), range(int(part[0]), int(part[-1]) + 1)
-
-
-def _environment(store: FeatureStore, row: int) -> dict[str, Any]:
-    for noted in store.attrs["environment"]:
-        if noted["rows"][0] <= row < noted["rows"][1]:
-            return {name: value for name, value in noted.items() if name != "rows"}
-    return {}
+            yield environment_at(noted, int(part[0])), range(int(part[0]), int(part[-1]) + 1)
 
 
 def _blocks(rows: range, row_bytes: int) -> Iterator[tuple[int, int]]:

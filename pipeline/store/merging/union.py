@@ -3,7 +3,8 @@
 The merged store is a build like any other: laid out first, then filled with feature rows and their
 keys, resumed after a kill, sealed at last. Nothing is computed. Its plan is its own, for it cannot
 know the params that would describe all its recordings: `stages.extract` over the union of the
-sources lays it out anew, and takes every row from it by key without loading the model.
+sources lays it out anew, and takes every row from it by key without loading the model. The repair
+of a merged store is completed by merging the same stores again.
 """
 
 import hashlib
@@ -25,6 +26,7 @@ from pipeline.store.lock import build_lock
 from pipeline.store.merging.copying import axis_kind, copy_features, copy_stream
 from pipeline.store.merging.joining import Joined, join
 from pipeline.store.reader import FeatureStore
+from pipeline.store.replacement import Inode, inode_of, recover, refuse_replaced
 from pipeline.store.schema import (
     FEATURES,
     INCREMENTAL,
@@ -33,10 +35,9 @@ from pipeline.store.schema import (
     arrays,
     read_specs,
 )
-from pipeline.store.writer import StoreBuild, part_path, read_plan, recover
+from pipeline.store.writer import StoreBuild, part_path, read_plan
 
 Say = Callable[[str], None]
-_Inode = tuple[int, int]
 _THREADS = 4
 """That check an input."""
 
@@ -65,12 +66,14 @@ def merge(inputs: Sequence[Path], output: Path, say: Say = print) -> MergeReport
     _check_paths(inputs, output)
     with build_lock(output):
         recover(output)
-        inodes = [_inode(path) for path in inputs]
+        inodes = [inode_of(path) for path in inputs]
         joined = join([FeatureStore.open(path) for path in inputs])
         for line in joined.notes:
             say(line)
         plan = _plan(joined)
-        if read_plan(output) == plan:
+        part = read_plan(part_path(output))
+        if read_plan(output) == plan and part != plan:  # else a repair of it has begun
+            FeatureStore.open(output)  # refuses a store that files are missing from
             say(f"{output}: up to date, nothing to do")
             return None
         _check_free(output, plan)
@@ -109,7 +112,7 @@ def _check_paths(inputs: Sequence[Path], output: Path) -> None:
 
 def _check_free(output: Path, plan: str) -> None:
     """Refuse where something else stands, or is being built, in the place of the output."""
-    if output.exists():
+    if output.exists() and read_plan(output) != plan:
         raise StoreMismatch(
             f"{output}: expected nothing there, or these very stores merged; found another store. "
             "Choose another name with --into, or remove it first."
@@ -172,7 +175,7 @@ def _sensor_dtype(stores: Sequence[FeatureStore]) -> np.dtype[Any]:
     return having[0].array("sensor/values").dtype
 
 
-def _lay_out(build: StoreBuild, joined: Joined, inodes: Sequence[_Inode | None]) -> None:
+def _lay_out(build: StoreBuild, joined: Joined, inodes: Sequence[Inode | None]) -> None:
     """Everything but the feature rows; whole chunks at the first input's beginning are linked."""
     first = joined.runs[0]
     specs = {store.path: read_specs(store.path) for store in joined.stores}
@@ -193,12 +196,8 @@ def _lay_out(build: StoreBuild, joined: Joined, inodes: Sequence[_Inode | None])
         build.write(f"episode/{kind}_start", 0, edge)
     build.write("episode/source", 0, joined.source_indices)
     build.write("episode/text", 0, joined.text)
-    # A finished store is never modified, but an extraction may put another in its place.
     for store, before in zip(joined.stores, inodes, strict=True):
-        if _inode(store.path) != before:
-            raise StoreMismatch(
-                f"{store.path}: was replaced while it was being read. Run the same command again."
-            )
+        refuse_replaced(store.path, before)
     vl = zarr.open_group(first.store.path, path="vl", mode="r").attrs.asdict()
     build.finish_layout(_attributes(joined), vl)
 
@@ -241,11 +240,3 @@ def _fill(build: StoreBuild, joined: Joined) -> None:
             first, stop = np.searchsorted(missing, [rows.start + shift, rows.stop + shift])
             for count in copy_features(build, run, missing[first:stop] - shift):
                 progress.update(count)
-
-
-def _inode(path: Path) -> _Inode | None:
-    try:
-        status = path.stat()
-    except FileNotFoundError:
-        return None
-    return status.st_dev, status.st_ino
