@@ -178,7 +178,7 @@ def test_a_sigterm_leaves_the_step_it_came_in(
     process.send_signal(signal.SIGTERM)
     _, err = process.communicate(timeout=60)
     assert process.returncode == 1
-    assert "the same command continues" in err
+    assert "run the same command again" in err
     assert "Traceback" not in err
     last = json.loads((tmp_path / "params/head.part/last/trainer.json").read_text())
     assert 6 <= last["step"] <= 8
