@@ -32,10 +32,10 @@ def main(params: Params) -> None:
         print(f"{store}: as archived in {output}, {time.perf_counter() - begun:.1f} s")
         return
     report = archive(store, output, params.archive.level, params.archive.threads)
-    print("\n".join(report.lines()))
     if report.seconds is None:
         print(f"{output}: there already, of this very store; nothing to do")
         return
+    print("\n".join(report.lines()))
     ratio = report.raw_bytes / max(1, report.stored_bytes)
     rate = report.raw_bytes / 1e6 / report.seconds
     print(
@@ -59,4 +59,4 @@ def _places(params: Params) -> tuple[Path, Path]:
 
 
 if __name__ == "__main__":
-    raise SystemExit(run(__doc__ or "", main, shorthands=[RESTORE]))
+    raise SystemExit(run(__doc__ or "", main, shorthands=[RESTORE], sections=("archive",)))

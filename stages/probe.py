@@ -3,13 +3,21 @@
 Each slot by itself and each choice of layer, norm and pooling as a whole, alone and beside state +
 sensor, cross-validated by recording. Prints the ranking and the line for params.yaml that the
 evidence supports; writes metrics.json, slots.csv, groups.csv, targets.csv and pictures (PNG) into
-`probe.output`.
+`probe.output`. Reads the store's checksums once before it begins (`train_head.check_store`).
+
+What is most often changed, with --set:
+    probe.output=FOLDER    where the files go
+    probe.max_ticks=N      read that many ticks, evenly spread: a first look at a large store
+    probe.folds=N          groups of recordings, each predicted from the others
+    probe.horizon=N        ticks of the action chunk that is predicted
 """
+
+from functools import partial
 
 from pipeline.config import Params
 from pipeline.plots.probe import write_probe_plots
 from pipeline.probing import advice, probe, table, write_tables
-from pipeline.store import FeatureStore
+from pipeline.store import FeatureStore, check_trailers
 from stages.command import run
 
 
@@ -19,7 +27,9 @@ def main(params: Params) -> None:
     store = FeatureStore.open(wanted.store or params.extract.store)
     slots, dim = store.feature_shape
     print(f"{store.path}: {slots} slots of {dim} channels at {store.ticks} ticks", flush=True)
-    study = probe(store, wanted)
+    if params.train_head.check_store:
+        check_trailers(store.path)
+    study = probe(store, wanted, partial(print, flush=True))
     wanted.output.mkdir(parents=True, exist_ok=True)
     files = [*write_tables(wanted.output, study), *write_probe_plots(wanted.output, study)]
     print(table(study))
@@ -28,4 +38,4 @@ def main(params: Params) -> None:
 
 
 if __name__ == "__main__":
-    raise SystemExit(run(__doc__ or "", main))
+    raise SystemExit(run(__doc__ or "", main, sections=("probe",)))

@@ -5,7 +5,9 @@ python -m stages.store merge A.zarr B.zarr --into C.zarr
                                                         one store of several, nothing computed
 python -m stages.store gc                               what nothing needs, and why
 python -m stages.store gc --remove                      remove it; never a finished store, nor
-                                                        what a living process is building
+                                                        what a living process is building, nor an
+                                                        unfinished build that holds rows
+python -m stages.store gc A.zarr.part --remove          remove that one, its rows too
 """
 
 import sys
@@ -16,8 +18,10 @@ from pipeline.errors import ConfigError, PipelineError, StoreLocked
 from pipeline.store import FeatureStore
 from pipeline.store.housekeeping import (
     Inventory,
+    Leftover,
     kept_back,
     leftovers,
+    named,
     remove,
     size,
     table,
@@ -29,7 +33,13 @@ from stages.command import Shorthand, run
 
 SHORTHANDS = (
     Shorthand("action", "stores.action", "list, merge or gc", "ACTION", "?"),
-    Shorthand("inputs", "stores.inputs", "the stores to merge", "STORE", "*"),
+    Shorthand(
+        "inputs",
+        "stores.inputs",
+        "the stores to merge; the unfinished builds that gc removes",
+        "STORE",
+        "*",
+    ),
     Shorthand("--into", "stores.output", "the store to merge into", "STORE"),
     Shorthand("--remove", "stores.remove", "gc removes what it lists"),
 )
@@ -48,6 +58,11 @@ def main(params: Params) -> None:
 
 
 def _list(wanted: StoresParams) -> None:
+    if wanted.inputs:
+        raise ConfigError(
+            f"stores.inputs: list takes no paths, found {', '.join(map(str, wanted.inputs))}. It "
+            "lists all of stores.folder: name another with --set stores.folder=…"
+        )
     inventory = take_inventory(wanted.folder)
     for line in table(inventory, _dependents(inventory, wanted)):
         print(line)
@@ -74,7 +89,7 @@ def _merge(wanted: StoresParams) -> None:
             "stores.output: expected the store to merge into, found none. Name it: "
             "python -m stages.store merge A.zarr B.zarr --into C.zarr"
         )
-    report = merge(wanted.inputs, wanted.output)
+    report = merge([_input(path, wanted.folder) for path in wanted.inputs], wanted.output)
     if report is not None:
         print(
             f"{report.store}: {report.episodes} episodes, {report.rows} rows, none computed; "
@@ -82,29 +97,59 @@ def _merge(wanted: StoresParams) -> None:
         )
 
 
+def _input(path: Path, folder: Path) -> Path:
+    """A store as it is named, or the one of that name in `stores.folder`."""
+    inside = folder / path
+    if path.exists() or not inside.exists():
+        return path
+    print(f"{path}: taking {inside}")
+    return inside
+
+
 def _gc(wanted: StoresParams) -> None:
-    inventory = take_inventory(wanted.folder)
-    for line in kept_back(inventory):
-        print(f"kept: {line}")
-    found = leftovers(inventory)
+    found = _selected(wanted) if wanted.inputs else _unneeded(wanted)
+    done: list[Leftover] = []
     locked: list[PipelineError] = []
     for one in found:
-        if wanted.remove:
-            try:
+        try:
+            if wanted.remove:
                 remove(one)
-            except StoreLocked as error:
-                locked.append(error)
-                continue
-        done = "removed" if wanted.remove else "unneeded"
-        print(f"{done}: {one.path}, {size(one.bytes)}: {one.why}")
-    freed = size(sum(one.bytes for one in found))
+            done.append(one)
+        except StoreLocked as error:
+            locked.append(error)
+    word = "removed" if wanted.remove else "unneeded"
+    for one in done:
+        if not one.idle_lock:
+            print(f"{word}: {one.path}, {size(one.bytes)}: {one.why}")
+    if idle := sum(one.idle_lock for one in done):
+        print(f"{word}: {idle} empty lock file(s), held by no process")
     if not found:
         print(f"{wanted.folder}: nothing to remove")
     elif not wanted.remove:
-        print(f"{wanted.folder}: {freed} in {len(found)} place(s); --remove removes them")
+        freed = size(sum(one.bytes for one in found))
+        print(f"{freed} in {len(found)} place(s); --remove removes them")
     if locked:
         raise locked[0]
 
 
+def _unneeded(wanted: StoresParams) -> list[Leftover]:
+    inventory = take_inventory(wanted.folder)
+    for line in kept_back(inventory):
+        print(f"kept: {line}")
+    return leftovers(inventory)
+
+
+def _selected(wanted: StoresParams) -> list[Leftover]:
+    """What is named, wherever it lies; only what lies beside it is looked at."""
+    by_folder: dict[Path, list[Path]] = {}
+    for path in wanted.inputs:
+        by_folder.setdefault(path.parent, []).append(path)
+    return [
+        one
+        for folder, paths in by_folder.items()
+        for one in named(take_inventory(folder, subfolders=False), paths)
+    ]
+
+
 if __name__ == "__main__":
-    raise SystemExit(run(__doc__ or "", main, shorthands=SHORTHANDS))
+    raise SystemExit(run(__doc__ or "", main, shorthands=SHORTHANDS, sections=("stores",)))

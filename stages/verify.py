@@ -29,7 +29,7 @@ def main(params: Params) -> None:
     store = params.verify.store or params.extract.store
     checked = verify(store, params.verify.threads, params.verify.workers)
     findings = with_identity(checked)
-    print(findings.summary())
+    print("\n".join([findings.summary(), *findings.notes]))
     if not findings.sound and params.verify.repair:
         print("\n".join(findings.lines()))
         print("\n".join(repair(findings, params, print).lines()))
@@ -47,4 +47,4 @@ def main(params: Params) -> None:
 
 
 if __name__ == "__main__":
-    raise SystemExit(run(__doc__ or "", main, shorthands=SHORTHANDS))
+    raise SystemExit(run(__doc__ or "", main, shorthands=SHORTHANDS, sections=("verify",)))

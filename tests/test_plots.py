@@ -1,6 +1,7 @@
 """Pictures are written for any shape of data, whole, and the same for the same numbers."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -292,10 +293,20 @@ def test_slots_are_a_map_over_layers_and_cells_a_map_a_view(tmp_path: Path) -> N
     columns = [label.get_text() for label in overview.get_xticklabels()]
     assert columns == ["mean", "view_mean", "view_mean\nA", "view_mean\nB", "grid"]
     assert "beside state + sensor" in bar.get_ylabel()
-    assert len(maps) == 4 * 2
-    cells = maps[-1].images[0].get_array()
+    assert "state + sensor alone, 0.20" in bar.get_ylabel()
+    # Layer 1 is better than layer 0, of which two maps are left out.
+    assert [axis.get_title() for axis in maps[:4]] == [
+        "layer 1, A",
+        "layer 1, B",
+        "layer 1, no norm, A",
+        "layer 1, no norm, B",
+    ]
+    assert len(maps) == 6
+    assert "the 6 best of 8 maps" in figure.get_suptitle()
+    cells = maps[0].images[0].get_array()
     np.testing.assert_allclose(cells, [[0.4, 0.41], [0.5, 0.51]])
-    assert {axis.images[0].get_clim() for axis in (overview, *maps)} == {(0.3, 0.51)}
+    assert {axis.images[0].get_clim() for axis in (overview, *maps)} == {(0.2, 0.51)}
+    assert bar.lines[-1].get_ydata()[0] == pytest.approx(0.2)
     files = probe.write_probe_plots(tmp_path, probed())
     assert [file.name for file in files] == ["probe.png", "probe_bars.png"]
     assert all(file.read_bytes().startswith(b"\x89PNG") for file in files)
@@ -311,6 +322,21 @@ def test_choices_are_bars_in_order_with_the_spread_over_folds() -> None:
         line.get_xdata()[0] for line in axis.lines if line.get_label() == "state + sensor alone"
     ]
     assert lines == pytest.approx([0.2])
+
+
+def test_what_is_far_below_the_mean_action_is_a_number_at_the_edge() -> None:
+    study = probed()
+    groups = [replace(study.groups[0], beside=score(-34.1, 20.0)), *study.groups[1:]]
+    study = replace(study, groups=tuple(groups), streams=score(-1109.4))
+    (axis,) = probe.bars(study).axes
+    assert axis.get_xlim()[0] == -0.2
+    assert axis.get_xlim()[1] <= 1
+    assert [text.get_text() for text in axis.texts] == ["◀ -34.10"]
+    labels = [str(line.get_label()) for line in axis.lines]
+    assert "state + sensor alone (-1109.40, left of the axis)" in labels
+    overview, *maps, bar = probe.heat_map(study).axes
+    assert {axis.images[0].get_clim() for axis in (overview, *maps)} == {(-0.49, 0.51)}
+    assert bar.lines[-1].get_ydata()[0] == pytest.approx(-0.49)
 
 
 @pytest.mark.parametrize("study", [probed(streams=False, layers=1), probed(scored=False)])

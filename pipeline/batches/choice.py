@@ -13,6 +13,7 @@ from pipeline.store import FeatureStore
 from pipeline.store.archive import is_archive
 from pipeline.store.gather import WIDE
 from pipeline.store.mapping import available_bytes
+from pipeline.store.mending import restore_command
 
 FeedName = Literal["auto", "mapped", "device", "compressed"]
 _DEVICE_SHARE = 0.6
@@ -44,7 +45,7 @@ def open_store(
         raise ConfigError(
             f"train_head.feed is {feed}, which takes a store, but {path} is an archive. Set "
             "train_head.feed=auto to restore it to train_head.scratch, or make the store of it: "
-            f"python -m stages.archive --restore --set archive.output={path}"
+            f"{restore_command(path)}"
         )
     if not archived and feed == "compressed" and path.exists():
         raise ConfigError(

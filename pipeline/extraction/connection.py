@@ -2,26 +2,40 @@
 
 import logging
 import os
+import signal
 import sys
+import time
 from collections.abc import Generator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from multiprocessing import active_children, resource_tracker
 from typing import Any
 
 import dask
 from distributed import Client, LocalCluster
 
 from pipeline.config import ExtractParams
-from pipeline.errors import ConfigError
+from pipeline.errors import ConfigError, PipelineError
 
 _TIMEOUT_S = 10
 """For reaching a scheduler, and for reaching it again when the connection is lost."""
+
+_LOOK_EVERY_S = 0.05
+
+
+def check_scheduler(extract: ExtractParams) -> None:
+    """Raise `ConfigError` where `extract.workers` is an address at which no scheduler answers."""
+    if isinstance(extract.workers, str):
+        with _quiet(), _client_of(extract.workers):
+            pass
 
 
 @contextmanager
 def connected(extract: ExtractParams) -> Generator[Client]:
     """A client of `extract.workers`; local processes end with it.
 
-    Raises `ConfigError` where no scheduler answers at the address.
+    Raises `ConfigError` where no scheduler answers at the address, `PipelineError` where local
+    processes cannot be started.
     """
     with _quiet():
         if isinstance(extract.workers, int):
@@ -33,10 +47,49 @@ def connected(extract: ExtractParams) -> Generator[Client]:
                 yield client
         else:
             with _client_of(extract.workers) as client:
+                if not client.nthreads():
+                    said = "the scheduler has no worker yet; waiting for one"
+                    print(f"{extract.workers}: {said}", file=sys.stderr)
                 yield client
 
 
-def _local_cluster(workers: int, decode_threads: int) -> LocalCluster:
+@contextmanager
+def _local_cluster(workers: int, decode_threads: int) -> Generator[LocalCluster]:
+    """Worker processes of this host, all of them up; raises `PipelineError` where they cannot be.
+
+    Dask cannot be interrupted while they start without noise and orphans, so a thread starts them
+    and an interrupted coordinator kills what was begun: then that thread ends by itself.
+    """
+    others = active_children()
+    with ThreadPoolExecutor(1) as pool:
+        # Ctrl-C reaches the whole process group, but only the coordinator may act on it: threads
+        # and processes, also workers begun again later, inherit the mask of the one that made them.
+        resource_tracker.ensure_running()  # now, for it unblocks SIGINT in whoever starts it
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        starting = pool.submit(_started, workers, decode_threads)
+        try:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            try:
+                cluster = starting.result()
+            except (RuntimeError, OSError) as error:
+                raise PipelineError(
+                    f"extract.workers: {workers} worker processes could not be started "
+                    f"({error.__cause__ or error}). One was killed, or ran out of memory as it "
+                    "began: run the same command again, with fewer extract.workers where memory "
+                    "is short, or with extract.workers=0."
+                ) from None
+            yield cluster
+        finally:
+            while not starting.done():
+                for child in active_children():
+                    if child not in others:
+                        child.kill()
+                time.sleep(_LOOK_EVERY_S)
+            if starting.exception() is None:
+                starting.result().close()
+
+
+def _started(workers: int, decode_threads: int) -> LocalCluster:
     """One thread of each process has the model, the others prepare.
 
     A process that died is begun again however long its imports take (dask gives it up after 15 s).
@@ -60,22 +113,22 @@ def _local_cluster(workers: int, decode_threads: int) -> LocalCluster:
 
 def _client_of(address: str) -> Client:
     try:
-        client = Client(address, timeout=_TIMEOUT_S, set_as_default=False)
+        return Client(address, timeout=_TIMEOUT_S, set_as_default=False)
     except (OSError, ValueError) as error:
         raise ConfigError(
             f"extract.workers: no dask scheduler answers at {address}: {error}. Start one with "
             "`dask scheduler` and workers with `dask worker`, or set extract.workers to a number "
             "of processes on this machine."
         ) from None
-    if not client.nthreads():
-        print(f"{address}: the scheduler has no worker yet; waiting for one", file=sys.stderr)
-    return client
 
 
 @contextmanager
 def _quiet() -> Generator[None]:
-    """Keep dask's log off stderr: what matters of it is raised, or said by us."""
-    loggers: list[Any] = [logging.getLogger(name) for name in ("distributed", "tornado")]
+    """Keep dask's log off stderr: what matters of it is raised, or said by us.
+
+    That of asyncio, too: dask leaves the failures of processes that never came up to it.
+    """
+    loggers: list[Any] = [logging.getLogger(name) for name in ("distributed", "tornado", "asyncio")]
     levels = [logger.level for logger in loggers]
     for logger in loggers:
         logger.setLevel(logging.CRITICAL)

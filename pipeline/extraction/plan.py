@@ -34,7 +34,7 @@ class ExtractionPlan:
         if not left:
             time = "none, the model is not needed"
         elif self.rows_per_s is None:
-            time = "not known before a first session with this model and device"
+            time = "not known before a first session of this store with this model and device"
         else:
             seconds = left / self.rows_per_s
             time = f"about {_duration(seconds)} at {self.rows_per_s:.1f} rows/s, as last measured"

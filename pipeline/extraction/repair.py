@@ -131,10 +131,10 @@ def _lay_out_anew(store: Path, plan: str, params: Params) -> StoreBuild:
         surveyed, checked = sound_episodes(survey(params, digests), params, digests)
     if surveyed.plan != plan:
         raise StoreMismatch(
-            f"{store}: streams, ticks or episodes are damaged, and the params describe another "
-            "store than this one (recordings, data, vlm or dtypes changed), so that they cannot be "
-            "written again. Restore the recordings and params, or remove the store and run "
-            "stages.extract for a new one."
+            f"{store}: metadata, streams, ticks or episodes are damaged, and the params describe "
+            "another store than this one (recordings, data, vlm or dtypes changed), so that they "
+            "cannot be written again. Restore the recordings and params, or remove the store and "
+            f"run {extract_command(store)} for a new one."
         )
     build = StoreBuild(repair_build(store), build_arrays(checked, surveyed, params), plan)
     check_space(build, checked, ())

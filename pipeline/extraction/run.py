@@ -72,7 +72,7 @@ def _go_on(
         return _resume(surveyed, params, digests, say)
     FeatureStore.open(target)  # refuses a store that files are missing from
     check_metadata(target)
-    say(f"{target}: up to date, nothing to do")
+    say(f"{target}: up to date, nothing to do (stages.verify reads what it holds)")
     return None
 
 
@@ -147,6 +147,10 @@ def _begin(
             if params.extract.plan:
                 return None
             check_space(build, checked, donors)
+        if isinstance(params.extract.workers, str):
+            from pipeline.extraction.connection import check_scheduler  # dask: a second to import
+
+            check_scheduler(params.extract)
         _make_room(target, surveyed, say)
         with _donors(_known_places(target), surveyed) as donors:
             lay_out(build, checked, surveyed, params, donors)

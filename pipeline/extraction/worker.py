@@ -5,7 +5,6 @@ the model: while one encodes, the others prepare.
 """
 
 import json
-import signal
 import socket
 import threading
 from collections import defaultdict
@@ -45,8 +44,6 @@ class ExtractionPlugin(WorkerPlugin):
         self._worker_name = worker.name
         self._opening = threading.Lock()
         self._computer: RangeComputer | None = None
-        if self.job.local:  # Ctrl-C reaches the whole group; the coordinator stops its workers
-            signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def teardown(self, worker: Worker) -> None:
         """Let go of the model and the files."""

@@ -14,6 +14,11 @@ from pipeline.probing import Finding, SlotName, Study, ranked
 
 _BARS = 20
 """Choices that a picture still shows legibly."""
+_MAPS = 6
+"""Maps of the cells of a view; most layers of a model look alike."""
+_MAPS_A_ROW = 3
+_LEAST = -0.2
+"""Of the axis of scores: how much worse than the mean action makes no difference."""
 _ALONE, _BESIDE = "#56B4E9", "#0072B2"
 
 
@@ -24,9 +29,10 @@ def write_probe_plots(folder: Path, study: Study) -> list[Path]:
 
 
 def heat_map(study: Study) -> Figure:
-    """R^2 of every slot: layers against what is pooled over, and a small map of the cells a view.
+    """R^2 of every slot: layers against what is pooled over, and the best maps of a view's cells.
 
-    Beside state + sensor, where the store has them. Each map takes its colours from one scale.
+    Beside state + sensor, where the store has them. All take their colours from one scale, which
+    spans what is shown; what is more than 1 below its best has the darkest.
     """
     plain = [one for one in study.slots if one.name.cell is None]
     poolings = list({one.name.pooling: None for one in study.groups})
@@ -34,28 +40,37 @@ def heat_map(study: Study) -> Figure:
     kinds = {_column(one.name): None for one in named}
     rows = {_row(one.name): None for one in study.slots}
     maps = _maps(study)
-    values = [_value(one) for one in (*study.slots, *study.groups)]
-    low, high = _limits(values)
-    columns = max([len(view) for view in maps.values()], default=0)
-    height = 1.6 + 0.5 * len(rows) + 2.2 * len(maps)
-    figure = canvas(max(7.5, 2.0 + 1.25 * len(kinds), 1.5 + 2.3 * columns), height)
-    ratios = [0.6 + 0.5 * len(rows)] + [2.2] * len(maps)
-    panels = figure.add_gridspec(1 + len(maps), max(1, columns), height_ratios=ratios)
+    shown = sorted(maps, key=lambda place: _best(maps[place]), reverse=True)[:_MAPS]
+    lines = -(-len(shown) // _MAPS_A_ROW)
+    values = [_value(one) for one in (*named, *(one for place in shown for one in maps[place]))]
+    limits = _limits(values if study.streams is None else [*values, study.streams.mean])
+    columns = max(1, min(_MAPS_A_ROW, len(shown)))
+    height = 1.8 + 0.5 * len(rows) + 2.2 * lines
+    figure = canvas(max(8.5, 2.0 + 1.25 * len(kinds), 1.5 + 2.3 * columns), height)
+    ratios = [0.6 + 0.5 * len(rows)] + [2.2] * lines
+    panels = figure.add_gridspec(1 + lines, columns, height_ratios=ratios)
     axes = [figure.add_subplot(panels[0, :])]
-    image = _overview(axes[0], study, list(rows), list(kinds), (low, high))
-    for place, (row, views) in enumerate(maps.items(), start=1):
-        for column, (view, found) in enumerate(views.items()):
-            axis = figure.add_subplot(panels[place, column])
-            axes.append(axis)
-            _cells(axis, found, f"{row}, {view}", (low, high))
-    said = "beside state + sensor" if study.streams is not None else "alone"
-    figure.colorbar(image, ax=axes, label=f"held-out R², {said}", shrink=min(1.0, 4 / height))
-    figure.suptitle(_title(study, "Where a linear reader finds the action"))
+    image = _overview(axes[0], study, list(rows), list(kinds), limits)
+    if study.streams is not None:
+        axes[0].set_title(f"state + sensor alone: {study.streams.mean:.2f}", fontsize=9)
+    for index, place in enumerate(shown):
+        line, column = divmod(index, _MAPS_A_ROW)
+        axis = figure.add_subplot(panels[1 + line, column])
+        axes.append(axis)
+        _cells(axis, maps[place], ", ".join(place), limits)
+    _scale(figure, axes, image, study, min(values, default=0) < limits[0])
+    said = "Where a linear reader finds the action"
+    if len(shown) < len(maps):
+        said += f" (the {len(shown)} best of {len(maps)} maps of a view; all are in slots.csv)"
+    figure.suptitle(_title(study, said))
     return figure
 
 
 def bars(study: Study) -> Figure:
-    """The choices of layer, norm and pooling, ranked, alone and beside state + sensor."""
+    """The choices of layer, norm and pooling, ranked, alone and beside state + sensor.
+
+    A bar that would end left of the axis ends at an arrow and its number.
+    """
     shown = [one for one in ranked(study.groups) if one.best is not None][:_BARS][::-1]
     figure = canvas(8.5, 2.4 + 0.55 * len(shown))
     axis = figure.subplots()
@@ -70,17 +85,36 @@ def bars(study: Study) -> Figure:
         style = {"ecolor": RECORDED, "capsize": 3, "lw": 1}
         height = 0.38 if len(kinds) > 1 else 0.6
         axis.barh(where, heights, height, xerr=errors, color=colour, label=label, error_kw=style)
-    if study.streams is not None:
-        axis.axvline(
-            study.streams.mean, color=RECORDED, ls="--", lw=1.8, label="state + sensor alone"
-        )
+        for place, value in zip(where, heights, strict=True):
+            if value < _LEAST:
+                _off_axis(axis, float(place), value)
+    _state_sensor(axis, study)
     axis.axvline(0, color=RECORDED, lw=1)
+    low, high = axis.get_xlim()
+    axis.set_xlim(max(low, _LEAST), min(max(high, 0.1), 1.0))
     axis.set_yticks(at, [_bar_name(one) for one in shown])
     axis.grid(axis="y", visible=False)
-    axis.set_xlabel("held-out R², mean over channels and steps (bars: standard error over folds)")
+    axis.set_xlabel("held-out R², mean over channels and steps (lines: standard error over folds)")
     legend_below(figure, axis, 3)
     figure.suptitle(_title(study, "What each choice of features says of the action"))
     return figure
+
+
+def _state_sensor(axis: Axes, study: Study) -> None:
+    """Where state + sensor are by themselves, if only in the legend."""
+    if study.streams is None:
+        return
+    mean = study.streams.mean
+    label = "state + sensor alone"
+    if mean < _LEAST:
+        label += f" ({mean:.2f}, left of the axis)"
+    axis.axvline(max(mean, _LEAST), color=RECORDED, ls="--", lw=1.8, label=label)
+
+
+def _off_axis(axis: Axes, place: float, value: float) -> None:
+    """On the bar, at the left end of the axis."""
+    said = f"◀ {value:.2f}"
+    axis.text(_LEAST + 0.005, place, said, ha="left", va="center", color="white", size=8)
 
 
 def _overview(
@@ -112,6 +146,21 @@ def _cells(axis: Axes, found: list[Finding], title: str, limits: tuple[float, fl
     _number(axis, grid, image)
 
 
+def _scale(
+    figure: Figure, axes: Sequence[Axes], image: AxesImage, study: Study, below: bool
+) -> None:
+    """The colours' numbers, and among them state + sensor by themselves."""
+    known = study.streams
+    said = "alone" if known is None else "beside state + sensor"
+    if known is not None:
+        said += f"\n(line: state + sensor alone, {known.mean:.2f})"
+    bar = figure.colorbar(
+        image, ax=axes, label=f"held-out R², {said}", extend="min" if below else "neither"
+    )
+    if known is not None:
+        bar.ax.axhline(max(known.mean, image.get_clim()[0]), color="#D55E00", lw=2.5)
+
+
 def _map(axis: Axes, grid: np.ndarray, limits: tuple[float, float]) -> AxesImage:
     colours = mpl.colormaps["viridis"].with_extremes(bad="#eeeeee")
     axis.grid(visible=False)
@@ -126,14 +175,17 @@ def _number(axis: Axes, grid: np.ndarray, image: AxesImage) -> None:
             axis.text(column, row, f"{value:.2f}", ha="center", va="center", color=colour, size=8)
 
 
-def _maps(study: Study) -> dict[str, dict[str, list[Finding]]]:
-    """The slots that are cells, by layer and by view."""
-    found: dict[str, dict[str, list[Finding]]] = {}
+def _maps(study: Study) -> dict[tuple[str, str], list[Finding]]:
+    """The slots that are cells, by layer and view."""
+    found: dict[tuple[str, str], list[Finding]] = {}
     for one in study.slots:
         if one.name.cell is not None:
-            views = found.setdefault(_row(one.name), {})
-            views.setdefault(str(one.name.view), []).append(one)
+            found.setdefault((_row(one.name), str(one.name.view)), []).append(one)
     return found
+
+
+def _best(cells: Sequence[Finding]) -> float:
+    return max((value for one in cells if np.isfinite(value := _value(one))), default=-np.inf)
 
 
 def _limits(values: Sequence[float]) -> tuple[float, float]:

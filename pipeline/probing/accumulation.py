@@ -69,6 +69,12 @@ class Table:
         """The VL rows that the ticks use, ascending."""
         return np.unique(self._vl_row)
 
+    @cached_property
+    def row_fold(self) -> NDArray[np.int64]:
+        """(row,) of `rows`, the fold that each is held out in."""
+        first = np.unique(self._vl_row, return_index=True)[1]
+        return self.folds.fold[first]
+
     def valid_share(self, slots: Sequence[int]) -> float:
         """The share of ticks at which one of these slots is valid."""
         valid = self.store.array("vl/slot_valid")[:, list(slots)].max(axis=1)

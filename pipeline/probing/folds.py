@@ -28,6 +28,11 @@ class Folds:
     """What the reader of a score has to know about the folds."""
 
     @property
+    def fold(self) -> NDArray[np.int64]:
+        """(tick,) the fold that each is held out in."""
+        return np.asarray(self.fold_of_part)[self.part]
+
+    @property
     def count(self) -> int:
         """Number of folds."""
         return max(self.fold_of_part) + 1
@@ -54,7 +59,7 @@ def fold_by_recording(
             f"each is predicted from the others, found {len(recordings)}. Add recordings to "
             "data.sources and run stages.extract, or set a shorter probe.horizon."
         )
-    notes = []
+    notes = _left_out(store, len(recordings), horizon)
     if len(recordings) < folds:
         notes.append(f"{len(recordings)} recordings make {len(recordings)} folds, not {folds}")
     count = min(folds, len(recordings))
@@ -73,6 +78,20 @@ def fold_by_recording(
         ticks = ticks[np.linspace(0, len(ticks) - 1, max_ticks).round().astype(np.int64)]
         notes.append(f"{len(ticks)} of the ticks are read, evenly spread")
     return Folds(ticks, part[ticks], fold_of_part, len(recordings), tuple(notes))
+
+
+def _left_out(store: FeatureStore, recordings: int, horizon: int) -> list[str]:
+    """Why there are fewer ticks and recordings than the store has ticks and episodes."""
+    notes = [
+        f"of {store.ticks} ticks, the last {horizon - 1} of each episode are left out, as their "
+        f"chunk of {horizon} would pass its end"
+    ]
+    if recordings < len(store.episodes):
+        notes.append(
+            f"{len(store.episodes)} episodes make {recordings} recordings: those of one recording "
+            f"in several formats count once, and those shorter than {horizon} ticks not at all"
+        )
+    return notes if horizon > 1 else notes[1:]
 
 
 def _dealt(recordings: dict[str, list[Episode]], hands: int) -> list[list[str]]:

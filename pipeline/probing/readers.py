@@ -95,13 +95,21 @@ def groups_of(names: list[SlotName]) -> dict[SlotName, tuple[int, ...]]:
     return {name: tuple(slots) for name, slots in found.items()}
 
 
-def fit_reader(store: FeatureStore, rows: NDArray[np.int64], slots: tuple[int, ...]) -> Reader:
+def fit_reader(
+    store: FeatureStore,
+    rows: NDArray[np.int64],
+    fold: NDArray[np.int64],
+    slots: tuple[int, ...],
+) -> Reader:
     """The reader of these slots, fitted on a sample of the VL `rows` that are read.
+
+    `fold` (row,) is the fold that each of them is held out in.
 
     A single slot is read whole. Several share `GROUP_WIDTH` inputs, each on its main directions,
     where their own channels are more. Raises `NumericsError` on NaN or inf.
     """
-    sample = rows[:: -(-len(rows) // _SAMPLE_ROWS)]
+    step = -(-len(rows) // _SAMPLE_ROWS)
+    sample, held = rows[::step], fold[::step]
     width = GROUP_WIDTH // len(slots) if len(slots) > 1 else None
     projections = []
     for slot in slots:
@@ -110,8 +118,9 @@ def fit_reader(store: FeatureStore, rows: NDArray[np.int64], slots: tuple[int, .
         check(store, sample[valid], values[:, None], slot)
         there = as_floats(values).double()
         # A slot that is valid nowhere is at its mean everywhere, whatever that is.
-        there = there if len(there) else torch.zeros((1, there.shape[1]), dtype=torch.float64)
-        projections.append(Projection.fit(there, width))
+        if not len(there):
+            there, valid = torch.zeros((1, there.shape[1]), dtype=torch.float64), slice(1)
+        projections.append(Projection.fit(there, held[valid], width))
     return Reader(slots, tuple(projections))
 
 

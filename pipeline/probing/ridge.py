@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pipeline.errors import NumericsError
-from pipeline.probing.moments import VARIES, Moments, total, variance
+from pipeline.probing.moments import Moments, total, variance
+from pipeline.probing.projection import STILL
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,11 +83,13 @@ def cross_validate(
     """The scores of ridge regression from the columns before the last `known + targets`.
 
     Each fold is predicted from the others, with the penalty that predicts best when of those one
-    part at a time is left out in turn, over all targets in units of their spread there. Beside the
-    inputs the `known` columns stand with the penalty that `known_score`, from them alone, chose for
-    the same fold: one penalty for both would make a few good inputs pay for many idle ones (a
-    penalty an input is Hoerl & Kennard's general form, 1970, section 5). None where the rows lie in
-    too few folds. Raises `NumericsError` for a penalty that is too small for float64.
+    part at a time is left out in turn, over all targets in units of their spread there (but those
+    that hardly vary there, by `STILL`, which would outweigh the others). Beside the inputs the
+    `known` columns stand with the penalty that `known_score`, from them alone, chose for the same
+    fold: one penalty for both would make a few good inputs pay for many idle ones (a penalty an
+    input is Hoerl & Kennard's general form, 1970, section 5). Inputs have about spread 1 over all
+    folds; one below `STILL` of it in what is trained on is not used. None where the rows lie in too
+    few folds. Raises `NumericsError` for a penalty that is too small for float64.
     """
     held = {
         fold: [i for i, one in enumerate(fold_of_part) if one == fold and parts[i].rows > 0]
@@ -133,7 +136,7 @@ class _Folded:
         for fold, several in self.trained.items():
             fit = self._fit(several)
             within = self._variance([self.parts[i] for i in several])
-            varies = within > 0
+            varies = (within > 0) & (within > STILL**2 * spread)
             test = total([self.parts[i] for i in self.held[fold]])
             rows[fold] = test.rows
             for index, reading in enumerate(readings):
@@ -187,8 +190,9 @@ class _Fit:
         self._mean = train.sum / train.rows
         gram = (train.gram / train.rows).addr_(self._mean, self._mean, alpha=-1)
         spread = gram.diagonal().clamp(min=0).sqrt()
-        # What does not vary says nothing: 0 after standardisation.
-        self._scale = torch.where(spread > VARIES, 1 / spread, 0.0)
+        # Inputs spread by 1 over all folds. What hardly varies here says nothing of what it does
+        # elsewhere, and in units of so little a row elsewhere would outweigh all others.
+        self._scale = torch.where(spread > STILL, 1 / spread, 0.0)
         self._scale[-targets:] = 1
         self._gram = gram.mul_(self._scale).mul_(self._scale[:, None])
 

@@ -11,6 +11,7 @@ from tqdm import tqdm
 
 from pipeline.config import ProbeParams
 from pipeline.probing.accumulation import Table
+from pipeline.probing.effort import foretold
 from pipeline.probing.folds import Folds, fold_by_recording
 from pipeline.probing.moments import Moments
 from pipeline.probing.readers import Reader, SlotName, fit_reader, groups_of, slot_names
@@ -22,6 +23,8 @@ _Result = TypeVar("_Result")
 
 MEMORY_BYTES = 2**30
 """Of sums at a time; as many slots share a pass over the rows as fit."""
+_OTHER_STEPS = 2
+"""Of each reader, beside a pass over every part: what it is fitted on, and its regressions."""
 _RUN_BYTES = 16 * 2**10
 """Of a row that one thread reads at least: several pages, so that few are read twice."""
 
@@ -79,29 +82,35 @@ class _Task:
     slots: tuple[int, ...]
 
 
-def probe(store: FeatureStore, params: ProbeParams) -> Study:
+def probe(
+    store: FeatureStore, params: ProbeParams, say: Callable[[str], None] = lambda _: None
+) -> Study:
     """Ridge regression from every slot of variant 0 to the action chunk, cross-validated.
 
     Alone, and beside the last, mean and spread of the causal windows of state and sensor; each slot
     by itself and each choice of layer, norm and pooling as a whole. Folds hold whole recordings, so
     nothing that tells a recording from another helps. A slot is read once, or twice where its group
     has more of them; memory grows with the square of the inputs, not with the rows. The same store
-    and params give the same bits, whatever the threads.
+    and params give the same bits, whatever the threads. `say` is told what is to be done before
+    the long part of it; a bar shows it on a terminal.
 
     Raises `StoreMismatch` where fewer than two recordings are long enough, and `NumericsError` on
     NaN or inf, naming the place.
     """
     folds = fold_by_recording(store, params.folds, params.horizon, params.max_ticks)
     with _one_thread_each():
-        summaries = summarize(store, folds.ticks, params.sensor_window, params.state_window)
+        summaries = summarize(
+            store, folds.ticks, folds.fold, params.sensor_window, params.state_window
+        )
         table = Table(store, folds, summaries, params.horizon)
         names = slot_names(store)
         singles = [_Task(name, (index,)) for index, name in enumerate(names)]
         groups = [_Task(name, slots) for name, slots in groups_of(names).items()]
         several = [task for task in groups if len(task.slots) > 1]
-        with tqdm(
-            total=len(singles) + len(several), desc="slots", unit="slot", leave=False, disable=None
-        ) as bar:
+        sizes = [len(task.slots) for task in (*singles, *several)]
+        say(foretold(table, sizes, len(params.penalties), params.threads))
+        steps = len(sizes) * (len(folds.fold_of_part) + _OTHER_STEPS)
+        with tqdm(total=steps, desc="probing", unit="step", leave=False, disable=None) as bar:
             work = _Work(table, params, bar)
             mean_action, streams = work.baselines()
             found = work.findings(singles)
@@ -145,8 +154,7 @@ class _Work:
         found = []
         for first in range(0, len(tasks), room):
             some = tasks[first : first + room]
-            fitted = partial(fit_reader, self._table.store, self._table.rows)
-            readers = self._in_order([partial(fitted, task.slots) for task in some])
+            readers = self._in_order([partial(self._reader, task) for task in some])
             sums = self._accumulated(readers)
             found += self._in_order(
                 [
@@ -156,6 +164,17 @@ class _Work:
             )
         return found
 
+    def _reader(self, task: _Task) -> Reader:
+        table = self._table
+        reader = fit_reader(table.store, table.rows, table.row_fold, task.slots)
+        self._bar.update()
+        return reader
+
+    def _summed(self, part: int, readers: Sequence[Reader]) -> list[Moments]:
+        moments = self._table.moments(part, readers)
+        self._bar.update(len(readers))
+        return moments
+
     def _accumulated(self, readers: Sequence[Reader]) -> list[list[Moments]]:
         """The moments of each reader, of each part."""
         features = self._table.store.array("vl/features")
@@ -163,7 +182,7 @@ class _Work:
         run = -(-_RUN_BYTES // max(1, slot_bytes))
         runs = [readers[first : first + run] for first in range(0, len(readers), run)]
         by_job = self._in_order(
-            [partial(self._table.moments, part, some) for some in runs for part in self._parts]
+            [partial(self._summed, part, some) for some in runs for part in self._parts]
         )
         count = len(self._parts)
         by_run = [by_job[first : first + count] for first in range(0, len(by_job), count)]

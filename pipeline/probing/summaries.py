@@ -38,19 +38,24 @@ class Summaries:
 
 
 def summarize(
-    store: FeatureStore, ticks: NDArray[np.int64], sensor_window: int, state_window: int
+    store: FeatureStore,
+    ticks: NDArray[np.int64],
+    fold: NDArray[np.int64],
+    sensor_window: int,
+    state_window: int,
 ) -> Summaries:
     """The last, the mean and the spread of every channel over the window before each tick.
 
     Channels of one unit that are more than `GROUP_WIDTH`, as those of an A-scan, are projected on
     that many main directions of each summary, so a force beside them is not lost. The windows are
     those of `FeatureStore.gather`, so nothing is later than its tick; a tick without a reading has
-    the mean of those with one, and a column that says so. Raises `NumericsError` on NaN or inf.
+    the mean of those with one, and a column that says so. `fold` (tick,) is the fold that each is
+    held out in, for the limits of `Projection`. Raises `NumericsError` on NaN or inf.
     """
     windows = Windows(1, sensor_window, state_window)
-    sample = ticks[:: -(-len(ticks) // _SAMPLE_TICKS)]
+    step = -(-len(ticks) // _SAMPLE_TICKS)
     groups = {stream: _groups(store, stream) for stream in ("sensor", "state")}
-    projections = _fitted(store, sample, windows, groups)
+    projections = _fitted(store, ticks[::step], fold[::step], windows, groups)
     width = sum(one.width + 1 for one in projections.values())
     if not width:
         return Summaries(np.empty((len(ticks), 0), np.float32))
@@ -71,6 +76,7 @@ def summarize(
 def _fitted(
     store: FeatureStore,
     sample: NDArray[np.int64],
+    fold: NDArray[np.int64],
     windows: Windows,
     groups: dict[str, list[Tensor]],
 ) -> dict[str, GroupedProjection]:
@@ -78,16 +84,19 @@ def _fitted(
     there = [stream for stream in groups if groups[stream]]
     if not there:
         return {}
-    seen: dict[str, list[Tensor]] = {stream: [] for stream in there}
+    seen: dict[str, list[tuple[Tensor, Tensor]]] = {stream: [] for stream in there}
     for batch in _batches(store, sample, windows, "directions of state + sensor"):
         for stream in there:
             summary, known = _summary(batch, stream)
-            seen[stream].append(summary[known[:, 0]])
-    return {
-        stream: GroupedProjection.fit(rows, groups[stream], GROUP_WIDTH)
-        for stream, several in seen.items()
-        if len(rows := torch.cat(several))
-    }
+            seen[stream].append((summary, known[:, 0]))
+    fitted = {}
+    for stream, several in seen.items():
+        known = torch.cat([known for _, known in several])
+        if known.any():
+            rows = torch.cat([summary for summary, _ in several])[known]
+            at = fold[known.numpy()]
+            fitted[stream] = GroupedProjection.fit(rows, at, groups[stream], GROUP_WIDTH)
+    return fitted
 
 
 def _groups(store: FeatureStore, stream: str) -> list[Tensor]:

@@ -70,7 +70,7 @@ def metrics(study: Study) -> dict[str, Any]:
             "group": advice.chosen.name.label,
             "best": advice.best.name.label,
             "tied": [one.name.label for one in advice.tied],
-            "helps": advice.helps,
+            "reading": advice.reading,
         }
     return document
 
@@ -95,8 +95,8 @@ def table(study: Study) -> str:
     ]
     if beside:
         head.append(
-            "beside: together with state + sensor; gain: what that adds to them, fold by fold, as "
-            "some folds are harder for everyone"
+            "beside: together with state + sensor; gain: what that adds to them. Choices are "
+            "compared by their gains fold by fold, as some folds are harder for everyone"
         )
     wide = [one for one in study.groups if one.inputs < one.channels]
     notes = [
@@ -115,25 +115,35 @@ def table(study: Study) -> str:
 
 def advice(study: Study) -> str:
     """The lines of params.yaml that the evidence supports, and how sure it is."""
-    found = recommend(study)
-    if found is None:
+    if all(one.best is None for one in study.groups):
         return "no slot is valid in enough recordings to be scored: nothing to recommend"
+    found = recommend(study)
+    beside = study.streams is not None
+    if found is None:
+        over = "state + sensor, nor alone over the mean action" if beside else "the mean action"
+        return (
+            f"no recommendation: no choice gains over {over}, by more than one standard error and "
+            "in most folds. So this store does not show that a linear reader gains from features; "
+            "more recordings may."
+        )
     lines = []
+    if beside and found.reading == "alone":
+        lines.append(
+            "features alone predict better than the mean action; beside state + sensor no choice "
+            "is better than both these and the mean action, by more than one standard error and in "
+            "most folds. What follows rests on R2 alone."
+        )
     if found.tied:
         labels = "; ".join(one.name.label for one in found.tied)
         lines.append(
-            f"within one standard error of the best ({found.best.name.label}): {labels}. Of these "
-            "the one with the fewest slots is recommended."
+            f"the best ({found.best.name.label}) is not ahead of these by more than one standard "
+            f"error of their difference by fold, and in most folds: {labels}. Of all of them the "
+            "one with the fewest slots is recommended."
         )
     elif len(study.groups) > 1:
-        lines.append("ahead of every other choice by more than one standard error")
+        lines.append("ahead of every other choice that gains, fold by fold")
     else:
         lines.append("the only choice in this store: extract more layers or poolings to compare")
-    if not found.helps:
-        lines.append(
-            "but it adds less than one standard error to what is known without features: this "
-            "store does not show that a linear reader gains from them"
-        )
     name = found.chosen.name
     lines.append(
         f"recommended for params.yaml: vlm: {{layers: [{name.layer}], "

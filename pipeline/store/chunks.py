@@ -19,13 +19,9 @@ from tqdm import tqdm
 from pipeline.durable import disk_full_named, sync
 from pipeline.errors import StoreIncomplete
 from pipeline.store.chunk_pass import ChunkPass
+from pipeline.store.mending import mend
+from pipeline.store.metadata import check_metadata
 from pipeline.store.schema import TRAILER_BYTES, ArraySpec, chunk_paths, read_specs
-
-MEND = (
-    "Run stages.verify --repair, which keeps what is sound, and then stages.extract; an unfinished "
-    "build (.part) has to be removed."
-)
-"""What to do about a file that is not as it was written."""
 
 _MOST_OPEN = 32
 
@@ -45,15 +41,17 @@ def check_row_checksums(
     if bad.size:
         raise StoreIncomplete(
             f"{chunk_paths(store, spec)[bad[0] // spec.chunk_rows]}: rows {bad[0]} to {bad[-1]} of "
-            f"{spec.name} do not give their checksum: the store is damaged. {MEND}"
+            f"{spec.name} do not give their checksum: the store is damaged. {mend(store)}"
         )
 
 
 def check_trailers(root: Path) -> None:
     """Read a finished store once, every byte of it, with a bar on a terminal.
 
-    Raises `StoreIncomplete` where a chunk does not give the checksum that was written behind it.
+    Raises `StoreIncomplete` where a chunk does not give the checksum that was written behind it,
+    or the metadata do not give their digest.
     """
+    check_metadata(root)
     specs = read_specs(root).values()
     total = sum(spec.chunk_count * spec.chunk_bytes for spec in specs)
     with tqdm(
@@ -75,6 +73,7 @@ class ChunkFiles:
     def __init__(
         self, root: Path, spec: ArraySpec, *, writable: bool = True, owned: bool = False
     ) -> None:
+        self._root = root
         self.spec = spec
         self.paths = chunk_paths(root, spec)
         self._writable = writable
@@ -142,7 +141,7 @@ class ChunkFiles:
                     self._descriptor(chunk), wanted - len(part), self._offset(first) + len(part)
                 )
                 if not more:
-                    raise StoreIncomplete(f"{self.paths[chunk]}: the file ends early. {MEND}")
+                    raise self._incomplete(chunk, "the file ends early")
                 part += more
             raw += part
         return np.frombuffer(raw, self.spec.dtype).reshape(count, *self.spec.shape[1:])
@@ -156,10 +155,10 @@ class ChunkFiles:
 
         `checked` is told the bytes of each sound chunk.
         """
-        for chunk, path in enumerate(self.paths):
+        for chunk in range(len(self.paths)):
             if what := self.damage(chunk):
-                raise StoreIncomplete(
-                    f"{path}: {what}, so that nothing can be taken from this store. {MEND}"
+                raise self._incomplete(
+                    chunk, f"{what}, so that nothing can be taken from this store"
                 )
             checked(self.spec.chunk_bytes)
 
@@ -180,7 +179,7 @@ class ChunkFiles:
                 self._unlink(chunk)  # its other name is no store's: a copy of the build, say
             data = self._passed(chunk)
             if not data.complete:
-                raise StoreIncomplete(f"{path}: the file ends early. {MEND}")
+                raise self._incomplete(chunk, "the file ends early")
             trailer = data.crc.to_bytes(TRAILER_BYTES, "little")
             with disk_full_named(path):
                 descriptor = self._descriptor(chunk)
@@ -220,8 +219,11 @@ class ChunkFiles:
             try:
                 self._descriptors[chunk] = os.open(self.paths[chunk], flags, 0o644)
             except FileNotFoundError:
-                raise StoreIncomplete(f"{self.paths[chunk]}: no such file. {MEND}") from None
+                raise self._incomplete(chunk, "no such file") from None
         return self._descriptors[chunk]
+
+    def _incomplete(self, chunk: int, what: str) -> StoreIncomplete:
+        return StoreIncomplete(f"{self.paths[chunk]}: {what}. {mend(self._root)}")
 
     def _offset(self, row: int) -> int:
         return row % self.spec.chunk_rows * self.spec.row_bytes

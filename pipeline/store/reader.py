@@ -13,10 +13,10 @@ from torch import Tensor
 
 from pipeline.errors import StoreIncomplete, StoreMismatch
 from pipeline.store.batch import Batch
-from pipeline.store.chunks import MEND
 from pipeline.store.episodes import Episode, read_episodes
 from pipeline.store.gather import Gatherer, Selection
 from pipeline.store.mapping import map_flat, populate
+from pipeline.store.mending import extract_command, mend, restore_command, start_over
 from pipeline.store.schema import SCHEMA, TRAILER_BYTES, ArraySpec, chunk_paths, read_specs
 
 
@@ -43,19 +43,20 @@ class FeatureStore:
         if not (root / "zarr.json").exists():
             part = root.with_name(root.name + ".part")
             found = f"only the unfinished build {part}" if part.exists() else "nothing there"
-            raise StoreIncomplete(f"{root}: no finished store ({found}). Run stages.extract.")
+            raise StoreIncomplete(
+                f"{root}: no finished store ({found}). Run {extract_command(root)}."
+            )
         try:
             attrs = zarr.open_group(root, mode="r").attrs.asdict()
         except (ValueError, KeyError) as error:
             raise StoreIncomplete(
-                f"{root / 'zarr.json'}: not a zarr group's metadata ({error}). Remove {root} and "
-                "run stages.extract again."
+                f"{root / 'zarr.json'}: not a zarr group's metadata ({error}). {start_over(root)}"
             ) from None
         if "archive" in attrs:
             raise StoreMismatch(
                 f"{root}: expected a store, found an archive of one. stages.train_head and "
                 "stages.evaluate restore it where train_head.feed is auto or compressed; to make "
-                f"the store of it: python -m stages.archive --restore --set archive.output={root}"
+                f"the store of it: {restore_command(root)}"
             )
         if attrs.get("schema") != SCHEMA:
             raise StoreMismatch(
@@ -253,7 +254,6 @@ def _mapped(root: Path, spec: ArraySpec) -> NDArray[Any]:
         size = path.stat().st_size if path.exists() else None
         if size != wanted:
             found = "no file" if size is None else f"{size} bytes"
-            raise StoreIncomplete(
-                f"{path}: expected {wanted} bytes, found {found}. The store is damaged. {MEND}"
-            )
+            said = f"{path}: expected {wanted} bytes, found {found}: the store is damaged"
+            raise StoreIncomplete(f"{said}. {mend(root)}")
     return map_flat(paths, spec.chunk_bytes, spec.shape, spec.dtype)

@@ -17,6 +17,7 @@ import zarr
 from zarr.codecs import BytesCodec, Crc32cCodec
 
 from pipeline.errors import StoreIncomplete
+from pipeline.store.mending import mend
 
 SCHEMA = 1
 ROW_MULTIPLE = 4096
@@ -180,14 +181,13 @@ def read_spec(root: Path, name: str) -> ArraySpec:
 
     Raises `StoreIncomplete` where they are missing or cannot be read.
     """
-    mend = "The store is damaged: run stages.verify --repair, then stages.extract."
     try:
         array = zarr.open_array(root, path=name, mode="r")
     except FileNotFoundError:
-        raise StoreIncomplete(f"{root}: the array {name} is missing. {mend}") from None
+        raise StoreIncomplete(f"{root}: the array {name} is missing. {mend(root)}") from None
     except (ValueError, KeyError, TypeError) as error:
         raise StoreIncomplete(
-            f"{root / name / 'zarr.json'}: not the metadata of a zarr array ({error}). {mend}"
+            f"{root / name / 'zarr.json'}: not the metadata of a zarr array ({error}). {mend(root)}"
         ) from None
     names = getattr(array.metadata, "dimension_names", None) or ()
     return ArraySpec(

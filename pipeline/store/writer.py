@@ -22,6 +22,8 @@ from pipeline.durable import disk_full_named, sync
 from pipeline.errors import StoreIncomplete
 from pipeline.store.chunks import ChunkFiles, row_checksums
 from pipeline.store.environments import EnvironmentLog
+from pipeline.store.mending import start_over
+from pipeline.store.metadata import note_metadata
 from pipeline.store.replacement import put_in_place
 from pipeline.store.schema import CHECKSUMS, FEATURES, INCREMENTAL, KEYS, ArraySpec
 
@@ -184,6 +186,8 @@ class StoreBuild:
             self.files(name).seal()
         with disk_full_named(self.part):
             self._note_environments()
+            if (self.part / "zarr.json").exists():  # a restoration writes the archived one after
+                note_metadata(self.part)
         for partial in self.part.rglob("*.partial"):  # of a write that was killed
             partial.unlink()
         self.close()
@@ -230,8 +234,7 @@ def read_plan(store: Path) -> str | None:
         return None
     except (json.JSONDecodeError, KeyError, UnicodeDecodeError):
         raise StoreIncomplete(
-            f"{store / 'zarr.json'}: not a zarr group's metadata. Remove {store} and run "
-            "stages.extract again."
+            f"{store / 'zarr.json'}: not a zarr group's metadata. {start_over(store)}"
         ) from None
     plan = attributes.get("plan")
     return plan if isinstance(plan, str) else None

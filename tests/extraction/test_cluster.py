@@ -24,6 +24,7 @@ from pipeline import errors
 from pipeline.digests import ContentDigests, file_digest
 from pipeline.errors import ConfigError, PipelineError, RecordingError, StoreIncomplete, VLMError
 from pipeline.extraction import extract
+from pipeline.extraction.connection import check_scheduler
 from pipeline.extraction.fill import rate_name
 from pipeline.extraction.job import Job
 from pipeline.extraction.run import ledger_path
@@ -309,8 +310,10 @@ class TestRefusals:
     @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense://here"])
     def test_a_wrong_address(self, changed, monkeypatch, address):
         monkeypatch.setattr("pipeline.extraction.connection._TIMEOUT_S", 1)
-        with pytest.raises(ConfigError, match="no dask scheduler answers at"):
-            run(changed(extract={"workers": address}))
+        wrong = changed(extract={"workers": address})
+        for reach in (run, lambda params: check_scheduler(params.extract)):
+            with pytest.raises(ConfigError, match="no dask scheduler answers at"):
+                reach(wrong)
 
     def test_a_worker_elsewhere(self, params, changed, tmp_path, monkeypatch):
         spec = feature_spec(params.vlm, params.extract.dtype, ["View1", "View2"], file_digest)
@@ -411,10 +414,7 @@ class TestLocalProcesses:
             "marked",
             "stopped; run the same command again",
         }
-        deadline = time.monotonic() + 20
-        while of_group(process.pid) and time.monotonic() < deadline:
-            time.sleep(0.05)  # they see that their parent is gone, and end
-        assert not of_group(process.pid)
+        assert not left_of_group(process.pid)
         store = Path(document["extract"]["store"])
         missing = missing_of(store)
         assert missing
@@ -427,6 +427,51 @@ class TestLocalProcesses:
         rate = ContentDigests(ledger_path(store)).rate(rate_name(surveyed, with_workers))
         assert rate is not None
         assert 0 < rate < math.inf
+
+
+class TestStart:
+    """Of local processes, which takes long enough to be cut short."""
+
+    def test_a_worker_killed_as_it_starts_is_said(self, document, tmp_path):
+        process, starting = self.begun(document, tmp_path)
+        os.kill(starting, signal.SIGKILL)
+        _, said = process.communicate(timeout=90)
+        assert process.returncode == 2
+        assert said.startswith("error: extract.workers: 2 worker processes could not be started")
+        assert len(said.splitlines()) == 1
+        assert not left_of_group(process.pid)
+
+    @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+    def test_stopped_as_workers_start(self, document, tmp_path, how):
+        process, _ = self.begun(document, tmp_path)
+        if how == signal.SIGINT:
+            os.killpg(process.pid, how)  # as a terminal does
+        else:
+            process.send_signal(how)
+        _, said = process.communicate(timeout=30)
+        assert (process.returncode, said) == (1, "stopped; run the same command again\n")
+        assert not left_of_group(process.pid)
+
+    def begun(self, document, tmp_path: Path) -> "tuple[subprocess.Popen[str], int]":
+        """The command, and the process of a worker that imports what it needs."""
+        file = tmp_path / "params.yaml"
+        file.write_text(yaml.safe_dump(document))
+        process = subprocess.Popen(
+            [sys.executable, "-c", STAGE, "--params", str(file), "--set", "extract.workers=2"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        deadline = time.monotonic() + 60
+        while time.monotonic() < deadline:
+            for pid, command in of_group(process.pid).items():
+                if "spawn_main" in command:
+                    time.sleep(0.5)
+                    return process, pid
+            time.sleep(0.02)
+        process.kill()
+        pytest.fail(f"no worker was begun: {process.communicate()}")
 
 
 STAGE = """
@@ -459,14 +504,22 @@ def begun(role: str, *options: str) -> "subprocess.Popen[bytes]":
     )
 
 
-def of_group(group: int) -> list[str]:
-    """The processes of a process group that still run."""
-    found = []
+def left_of_group(group: int) -> list[str]:
+    """The processes of a process group that do not see that their parent is gone, and end."""
+    deadline = time.monotonic() + 20
+    while (left := of_group(group)) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return list(left.values())
+
+
+def of_group(group: int) -> dict[int, str]:
+    """The processes of a process group that still run, and their commands."""
+    found: dict[int, str] = {}
     for status in Path("/proc").glob("[0-9]*/stat"):
         try:
             fields = status.read_text().rpartition(")")[2].split()
+            if int(fields[2]) == group and fields[0] != "Z":
+                found[int(status.parent.name)] = (status.parent / "cmdline").read_text()
         except (FileNotFoundError, ProcessLookupError):
             continue
-        if int(fields[2]) == group and fields[0] != "Z":
-            found.append((status.parent / "cmdline").read_text())
     return found

@@ -136,7 +136,9 @@ class TestWhatItTakesOver:
         no_model_later()
         report, said = run(params)
         assert report is None
-        assert said == [f"{params.extract.store}: up to date, nothing to do"]
+        assert said == [
+            f"{params.extract.store}: up to date, nothing to do (stages.verify reads what it holds)"
+        ]
 
     def test_an_added_episode_computes_only_its_rows(
         self, params, recordings, counted, write_episode

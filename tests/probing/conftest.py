@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import zarr
 
+from pipeline.probing.projection import LIMIT, STILL
 from pipeline.store import FeatureStore
 
 Rewrite = Callable[[FeatureStore, np.random.Generator], None]
@@ -35,13 +36,37 @@ def renamed() -> Callable[..., FeatureStore]:
 def fitted(
     x: np.ndarray, y: np.ndarray, penalty: float | np.ndarray
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """Ridge regression written down as in the textbook, on the rows themselves."""
+    """Ridge regression written down as in the textbook, on the rows themselves.
+
+    An input that hardly varies here is not used: `x` spreads by about 1 over all folds.
+    """
     mean, spread = x.mean(0), x.std(0)
-    spread[spread < 1e-9] = np.inf
+    spread[spread <= STILL] = np.inf
     standard = (x - mean) / spread
     ridge = np.diag(np.broadcast_to(penalty, x.shape[1])) * len(x)
     weights = np.linalg.solve(standard.T @ standard + ridge, standard.T @ (y - y.mean(0)))
     return lambda other: (other - mean) / spread @ weights + y.mean(0)
+
+
+@pytest.fixture
+def limited() -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """`limited(x, fold)`: inputs as a reader gives them, each column by the formula itself."""
+
+    def limit(x: np.ndarray, fold: np.ndarray) -> np.ndarray:
+        found = np.zeros(x.shape)
+        for column in range(x.shape[1]):
+            values = x[:, column]
+            trained = [values[fold != held] for held in np.unique(fold)]
+            if min(one.std() for one in trained) <= STILL * values.std():
+                continue
+            lower = max(one.mean() - LIMIT * one.std() for one in trained)
+            upper = min(one.mean() + LIMIT * one.std() for one in trained)
+            if upper > lower:
+                kept = np.clip(values, lower, upper)
+                found[:, column] = (kept - kept.mean()) / kept.std()
+        return found
+
+    return limit
 
 
 @pytest.fixture
@@ -70,7 +95,7 @@ def nested() -> Callable[..., tuple[np.ndarray, np.ndarray]]:
                 inside, test = train & (fold != out), fold == out
                 for index, ridge in enumerate(ridges):
                     error = (y[test] - fitted(x[inside], y[inside], ridge)(x[test])) ** 2
-                    varies = y[train].std(0) > 0
+                    varies = y[train].std(0) > STILL * y.std(0)
                     lost[index] += (error[:, varies] / y[train][:, varies].var(0)).sum()
             best = int(lost.argmin())
             predicted = fitted(x[train], y[train], ridges[best])(x[~train])

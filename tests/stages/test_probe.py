@@ -29,6 +29,8 @@ def params(tiny_store: Callable[..., Path], tmp_path: Path) -> Path:
         "data": {"sources": [{"name": "left", "path": "a"}]},
         "vlm": {"checkpoint": "unused"},
         "extract": {"store": str(path)},
+        # Its attributes were written over, as no store is that was extracted so.
+        "train_head": {"check_store": False},
         "probe": {
             "output": str(tmp_path / "report"),
             "horizon": 2,
@@ -47,7 +49,7 @@ def test_a_ranking_files_and_pictures(params: Path, capsys: pytest.CaptureFixtur
     report = params.parent / "report"
     assert sorted(file.name for file in report.iterdir()) == FILES
     # The action's first two channels are those of slot 0, which is the mean.
-    assert lines[7].startswith("layer 3, mean")
+    assert lines[8].startswith("layer 3, mean")
     assert lines[-3].endswith("vlm: {layers: [3], norms: [true], pooling: [mean]}")
     assert "run stages.extract" in lines[-2]
     assert sum("View1 cell" in line for line in lines) == 4
@@ -100,3 +102,36 @@ def test_the_store_is_left_as_it_is(params: Path) -> None:
     assert run("", probe.main, ["--params", str(params)]) == 0
     assert {file: file.read_bytes() for file in path.rglob("*") if file.is_file()} == before
     FeatureStore.open(path)
+
+
+def test_a_damaged_store_is_refused(
+    params: Path,
+    tiny_store: Callable[..., Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    store = tiny_store(tmp_path, name="sound", episodes=6)
+    arguments = ["--params", str(params), "--set", f"probe.store={store}"]
+    checked = [*arguments, "--set", "train_head.check_store=true"]
+    assert run("", probe.main, checked) == 0
+    said = capsys.readouterr().out
+    assert "scoring 3 slots one by one, groups of slots: 1; 174 ticks" in said
+    assert "5 folds, 6 penalties: a few seconds" in said
+    (params.parent / "report" / "metrics.json").unlink()
+    chunk = store / "vl" / "features" / "c" / "0" / "0" / "0"
+    damaged = bytearray(chunk.read_bytes())
+    damaged[100] ^= 1
+    chunk.write_bytes(damaged)
+    assert run("", probe.main, checked) == 2
+    error = capsys.readouterr().err
+    assert "vl/features" in error
+    assert "stages.verify" in error
+    assert not (params.parent / "report" / "metrics.json").exists()
+    assert run("", probe.main, arguments) == 0
+
+
+def test_the_help_names_what_is_most_often_changed(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        run(probe.__doc__ or "", probe.main, ["--help"])
+    said = capsys.readouterr().out
+    assert all(key in said for key in ("probe.max_ticks", "probe.folds", "probe.output"))

@@ -94,6 +94,17 @@ def test_merge_gives_a_store_that_trains(
     assert "up to date, nothing to do" in capsys.readouterr().out
 
 
+def test_merge_finds_inputs_in_the_folder_of_stores(
+    params: Path, tiny_store: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for seed, name in enumerate("ab"):
+        tiny_store(tmp_path / "stores", name=name, seed=seed)
+    into = str(tmp_path / "both.zarr")
+    assert command(params, "merge", "a.zarr", "b.zarr", "--into", into) == 0
+    assert f"a.zarr: taking {tmp_path}/stores/a.zarr" in capsys.readouterr().out
+    assert FeatureStore.open(into).ticks == 360
+
+
 def test_mistakes_end_in_one_message(
     params: Path, tiny_store: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -106,6 +117,8 @@ def test_mistakes_end_in_one_message(
         (["merge", a, other, *into], "vlm_reuse_count: 3 -> 2"),
         (["merge", a, str(tmp_path / "x.zarr"), *into], "no finished store"),
         (["tidy"], "stores.action"),
+        (["list", a], "list takes no paths"),
+        (["gc", a, "--remove"], "a finished store, which is never removed"),
         (["list", "--set", f"stores.folder={tmp_path / 'nowhere'}"], "stores.folder"),
     ):
         assert command(params, *arguments) == 2
@@ -120,13 +133,21 @@ def test_gc_lists_and_removes_only_when_told_to(
     stores = tmp_path / "stores"
     tiny_store(stores, name="one")
     tiny_store(stores, name="two").rename(stores / "two.zarr.part")
+    (stores / "new.zarr.part").mkdir()
+    for name in ("one.zarr.lock", "new.zarr.lock"):
+        (stores / name).touch()
     assert command(params, "gc") == 0
     said = capsys.readouterr().out
-    assert f"unneeded: {stores}/two.zarr.part" in said
-    assert "60 of 60 rows done; stages.extract would resume it" in said
+    assert f"unneeded: {stores}/new.zarr.part" in said
+    assert "unneeded: 2 empty lock file(s), held by no process" in said
+    assert f"kept: {stores}/two.zarr.part: unfinished build, 60 of 60 rows done" in said
     assert "--remove removes them" in said
-    assert sorted(os.listdir(stores)) == ["one.zarr", "two.zarr.part"]
+    assert len(os.listdir(stores)) == 5
     assert command(params, "gc", "--remove") == 0
+    assert f"removed: {stores}/new.zarr.part" in capsys.readouterr().out
+    assert sorted(os.listdir(stores)) == ["one.zarr", "two.zarr.part"]
+    elsewhere = ["--set", f"stores.folder={tmp_path / 'nowhere'}"]
+    assert command(params, "gc", str(stores / "two.zarr.part"), "--remove", *elsewhere) == 0
     assert f"removed: {stores}/two.zarr.part" in capsys.readouterr().out
     assert os.listdir(stores) == ["one.zarr"]
     assert FeatureStore.open(stores / "one.zarr").ticks == 180

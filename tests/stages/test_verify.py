@@ -63,7 +63,8 @@ def test_a_damaged_store_says_what_is_wrong_and_what_to_run_next(verified, store
     err = capsys.readouterr().err
     assert err.startswith(f"error: {store}: the store is damaged:\n")
     assert "VL row 17 (episode 'episode_001', tick 51)" in err
-    assert "python -m stages.verify --repair, then python -m stages.extract" in err
+    assert f"python -m stages.verify --repair --set verify.store={store}, which" in err
+    assert f"then python -m stages.extract --set extract.store={store}" in err
 
 
 def test_repair_begins_a_build(verified, store, capsys):
@@ -71,7 +72,7 @@ def test_repair_begins_a_build(verified, store, capsys):
     assert verified("--repair") == 0
     said = capsys.readouterr().out
     assert "59 of 60 feature rows taken over, 1 to compute" in said
-    assert "run next: python -m stages.extract" in said
+    assert f"run next: python -m stages.extract --set extract.store={store}, which" in said
     assert part_path(store).is_dir()
     assert verified("--repair") == 2
     assert "a repair of it has begun" in capsys.readouterr().err

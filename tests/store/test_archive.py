@@ -307,13 +307,18 @@ class TestDamagedStore:
         row = read_specs(store)["vl/features"].chunk_rows + 100
         self.refused(store, rf"c/1/0/0: rows {row} to {row} of vl/features.*stages\.verify")
 
+    def test_changed_metadata(self, archived):
+        place = archived[0] / "vl" / "zarr.json"
+        place.write_text(place.read_text().replace('"slots"', '"other"'))
+        self.refused(archived[0], r"metadata were changed.*stages\.verify --repair")
+
     def test_a_file_cut_short(self, archived):
         path = archived[0] / "state/values/c/0/0"
         os.truncate(path, path.stat().st_size - 1)
         self.refused(archived[0], r"state/values/c/0/0: expected \d+ bytes")
 
     def test_no_store_at_all(self, tmp_path):
-        self.refused(tmp_path / "s.zarr", r"Run stages\.extract")
+        self.refused(tmp_path / "s.zarr", r"Run python -m stages\.extract")
 
 
 def sensor_shard(root: Path) -> Path:

@@ -14,7 +14,7 @@ from pipeline.errors import ConfigError, StoreLocked
 from pipeline.store import FeatureStore, StoreBuild, build_lock
 from pipeline.store.archive import archive
 from pipeline.store.housekeeping.inventory import Entry, Inventory, take_inventory
-from pipeline.store.housekeeping.leftovers import kept_back, leftovers, remove
+from pipeline.store.housekeeping.leftovers import kept_back, leftovers, named, remove
 from pipeline.store.housekeeping.listing import table
 from pipeline.store.schema import read_specs
 
@@ -174,11 +174,10 @@ class TestLeftovers:
         self, tiny_store: Make, tmp_path: Path
     ) -> None:
         tiny_store(tmp_path)
-        unfinish(tiny_store(tmp_path, name="begun"), 12)
+        unfinish(tiny_store(tmp_path, name="none"), 0)
         (tmp_path / "new.zarr.part").mkdir()
         shutil.copytree(tmp_path / "tiny.zarr", tmp_path / "tiny.zarr.repair.part")
-        for name in ("tiny.zarr.old", "tiny.zarr.known-0"):
-            shutil.copytree(tmp_path / "tiny.zarr", tmp_path / name)
+        shutil.copytree(tmp_path / "tiny.zarr", tmp_path / "tiny.zarr.old")
         for name in (
             "gone.zarr.files.sqlite",
             "tiny.zarr.files.sqlite",
@@ -188,14 +187,11 @@ class TestLeftovers:
             (tmp_path / name).touch()
         found = leftovers(take_inventory(tmp_path))
         assert {one.path.name: one.why for one in found} == {
-            "begun.zarr.part": (
-                "an unfinished build, 12 of 60 rows done; stages.extract would resume it"
-            ),
             "gone.zarr.files.sqlite": "content digests for a store that is not there",
-            "new.zarr.part": "a build that was stopped before it was laid out; there is nothing "
+            "new.zarr.part": "a build that was stopped before any row was done; there is nothing "
             "to resume",
-            "tiny.zarr.known-0": "60 feature rows of an interrupted build, which the next "
-            "stages.extract takes over",
+            "none.zarr.part": "a build that was stopped before any row was done; there is nothing "
+            "to resume",
             "tiny.zarr.lock": "held by no process",
             "tiny.zarr.old": "tiny.zarr has taken its place",
             "tiny.zarr.repair.part": "a repair that was stopped before it was a build; the next "
@@ -206,6 +202,28 @@ class TestLeftovers:
             remove(one)
         assert sorted(os.listdir(tmp_path)) == ["tiny.zarr", "tiny.zarr.files.sqlite"]
         assert FeatureStore.open(tmp_path / "tiny.zarr").ticks == 180
+
+    def test_work_is_kept_unless_it_is_named(self, tiny_store: Make, tmp_path: Path) -> None:
+        begun = unfinish(tiny_store(tmp_path, name="begun"), 12)
+        store = tiny_store(tmp_path)
+        aside = Path(shutil.copytree(store, tmp_path / "tiny.zarr.known-0"))
+        unread = Path(shutil.copytree(begun, tmp_path / "unread.zarr.part"))
+        (unread / "vl" / "key" / "zarr.json").write_text("{")
+        inventory = take_inventory(tmp_path)
+        assert leftovers(inventory) == []
+        lines = kept_back(inventory)
+        assert lines[0] == (
+            f"{begun}: unfinished build, 12 of 60 rows done; stages.extract resumes it, and "
+            f"python -m stages.store gc {begun} --remove removes it"
+        )
+        assert f"{aside}: unfinished build, 60 of 60 rows done; stages.extract takes" in lines[1]
+        assert f"{unread}: unfinished build that cannot be read" in lines[2]
+        for path in (store, tmp_path / "gone.zarr.part"):
+            with pytest.raises(ConfigError, match=rf"{path}: .*Nothing was removed"):
+                named(inventory, [begun, path])
+        for one in named(inventory, [begun, aside, unread]):
+            remove(one)
+        assert os.listdir(tmp_path) == ["tiny.zarr"]
 
     def test_the_only_copy_of_a_store_is_no_leftover(
         self, tiny_store: Make, tmp_path: Path
@@ -224,10 +242,11 @@ class TestLeftovers:
 
     def test_what_is_being_built_is_not_touched(self, tiny_store: Make, tmp_path: Path) -> None:
         part = unfinish(tiny_store(tmp_path), 5)
-        (listed,) = leftovers(take_inventory(tmp_path))
+        (listed,) = named(take_inventory(tmp_path), [part])
         with held(tmp_path / "tiny.zarr") as process:
             inventory = take_inventory(tmp_path)
-            assert leftovers(inventory) == []
+            with pytest.raises(ConfigError, match="in use by process"):
+                named(inventory, [part])
             assert kept_back(inventory)[0].startswith(f"{part}: in use by process {process}")
             with pytest.raises(StoreLocked, match="not removed"):
                 remove(listed)

@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import StoreIncomplete, StoreMismatch
-from pipeline.store import FeatureStore
+from pipeline.store import FeatureStore, check_trailers
 from pipeline.store.archive import archive
 from pipeline.store.integrity import verify
 from pipeline.store.integrity.findings import MOST_LINES, Findings
@@ -95,6 +95,9 @@ class TestSound:
         findings = found_in(store)
         files = [path for path in store.rglob("*") if path.is_file() and path.name != "zarr.json"]
         assert findings.bytes == sum(path.stat().st_size for path in files)
+        specs = [read_spec(store, path.parent.relative_to(store)) for path in store.glob("*/*/c")]
+        assert findings.row_bytes == sum(spec.data_bytes for spec in specs)
+        assert f"{findings.row_bytes / 2**20:.1f} MiB of rows in" in findings.summary()
         assert findings.rows == 6 * ROWS
 
     def test_over_several_chunks_and_blocks(self, tiny_store, tmp_path, monkeypatch):
@@ -171,6 +174,7 @@ class TestFeatureRows:
         os.truncate(chunk_file(store, "vl/features"), 50 * 3 * 8 * 4 + 10)
         findings = found_in(store)
         assert findings.bad_rows.tolist() == list(range(50, 60))
+        assert findings.rows == 50
         assert "expected 393220 bytes, found 4810" in findings.lines()[0]
         assert all("not in its file" in line for line in findings.lines()[1:])
 
@@ -179,8 +183,18 @@ class TestFeatureRows:
         findings = found_in(store)
         assert findings.bad_rows.tolist() == list(range(60))
         assert "found none (No such file or directory)" in findings.lines()[0]
-        assert len(findings.lines()) == 1 + MOST_LINES + 1
-        assert findings.lines()[-1].startswith("and 40 more")
+        assert findings.rows == 0
+        assert findings.lines()[1:] == [
+            "VL rows 0 (episode 'episode_000', tick 0) to 59 (episode 'episode_005', tick 177): "
+            "not in its file"
+        ]
+
+    def test_many_runs_of_rows_are_capped(self, store):
+        for row in range(0, 60, 2):
+            overwrite(store, "vl/features", row, 1.0)
+        lines = found_in(store).lines()
+        assert len(lines) == MOST_LINES + 1
+        assert lines[-1].startswith("and 10 more VL rows")
 
     def test_rows_on_a_disk_that_fails(self, store, monkeypatch):
         monkeypatch.setattr("pipeline.store.chunk_pass.BLOCK_BYTES", 10 * 3 * 8 * 4)
@@ -289,9 +303,40 @@ class TestStructure:
         assert findings.damaged_arrays() == {""}
         assert any(said in line for line in findings.lines()), findings.lines()
 
+    @pytest.mark.parametrize(
+        ("place", "change"),
+        [
+            ("zarr.json", lambda at: at.update(action_hz=30.0)),
+            ("zarr.json", lambda at: at["streams"]["action"]["units"].reverse()),
+            ("vl/zarr.json", lambda at: at["slots"][0].update(pooling="last")),
+            ("sensor/values/zarr.json", lambda at: at.update(note="mine")),
+            ("tick/zarr.json", lambda at: at.update(note="mine")),
+        ],
+    )
+    def test_plausible_metadata_that_were_changed(self, store, place, change):
+        edit(store / place, lambda document: change(document["attributes"]))
+        findings = found_in(store)
+        assert not findings.sound
+        assert findings.damaged_arrays() >= {""} or "sensor" in place
+        with pytest.raises(StoreIncomplete, match=rf"metadata were changed.*verify.store={store}"):
+            check_trailers(store)
+
+    def test_metadata_of_an_earlier_version_have_no_digest(self, store):
+        edit(store / "zarr.json", lambda document: document["attributes"].pop("metadata_digest"))
+        findings = found_in(store)
+        assert findings.sound
+        assert "attributes cannot be checked" in findings.notes[0]
+        check_trailers(store)
+
     def test_metadata_that_are_no_json(self, store):
         (store / "zarr.json").write_text("{")
-        assert "not a zarr group's metadata" in found_in(store).lines()[0]
+        findings = found_in(store)
+        assert "not a zarr group's metadata" in findings.lines()[0]
+        assert "--repair cannot begin" in findings.advice()
+        assert "--restore" not in findings.advice()
+        (store.with_name("tiny.archive.zarr")).mkdir()
+        (store.with_name("tiny.archive.zarr") / "zarr.json").touch()
+        assert f"archive.store={store}" in findings.advice()
 
     def test_files_that_have_no_place(self, store):
         (store / "tick" / "notes.txt").touch()
@@ -308,6 +353,14 @@ class TestOtherThings:
     def test_nothing_there(self, tmp_path):
         with pytest.raises(StoreIncomplete, match="nothing there"):
             verify(tmp_path / "no.zarr", threads=1)
+
+    @pytest.mark.parametrize("name", ["empty", "other"])
+    def test_a_folder_that_is_no_store(self, tmp_path, monkeypatch, name):
+        (tmp_path / name).mkdir()
+        (tmp_path / "other" / "x").mkdir(parents=True)
+        monkeypatch.setattr(os, "walk", lambda _: pytest.fail("walked"))
+        with pytest.raises(StoreIncomplete, match=r"no store.*verify\.store"):
+            verify(tmp_path / name, threads=1)
 
     def test_an_unfinished_build(self, store):
         store.rename(store.with_name("tiny.zarr.part"))

@@ -13,10 +13,11 @@ import pytest
 import zarr
 
 from pipeline.errors import ConfigError, DiskFull, StoreIncomplete, StoreLocked, StoreMismatch
-from pipeline.store import FeatureStore, StoreBuild, build_lock
+from pipeline.store import FeatureStore, StoreBuild, build_lock, check_trailers
 from pipeline.store.integrity import verify
 from pipeline.store.integrity.repair import carry_rows, copy_layout, put_in_place
 from pipeline.store.merging import merge
+from pipeline.store.metadata import note_metadata
 from pipeline.store.schema import ARRAY_NAMES
 
 Make = Callable[..., Path]
@@ -81,6 +82,7 @@ def renamed(store: Path, ids: Callable[[str], str], digests: Callable[[str], str
         array = zarr.open_array(store, path=name, mode="r+")
         array.resize(len(values))
         array[:] = values
+    note_metadata(store)
     return store
 
 
@@ -105,6 +107,7 @@ def test_all_episodes_stand_one_behind_the_other(tiny_store: Make, tmp_path: Pat
     ours, theirs = merged.gather(ticks + a.ticks, **WINDOWS), b.gather(ticks, **WINDOWS)
     for name in ("features", "sensor", "sensor_valid", "state", "action", "action_valid"):
         assert np.array_equal(getattr(ours, name), getattr(theirs, name)), name
+    check_trailers(merged.path)
     group = zarr.open_group(merged.path, mode="r")
     assert np.array_equal(group["vl/features"][60:], b.array("vl/features")), "plain zarr reads it"
 
@@ -174,6 +177,7 @@ def test_rows_keep_the_environment_they_were_computed_in(tiny_store: Make, tmp_p
     group = zarr.open_group(second, mode="r+")
     noted = [{"rows": [0, 25], "torch": "old"}, {"rows": [25, 60], "torch": "test"}]
     group.attrs.put({**group.attrs.asdict(), "environment": noted})
+    note_metadata(second)
     merge([first, second], tmp_path / "both.zarr", quiet)
     assert FeatureStore.open(tmp_path / "both.zarr").attrs["environment"] == [
         {"rows": [0, 60], "torch": "test"},
@@ -258,6 +262,18 @@ class TestRefusals:
             merge(inputs, tmp_path / "both.zarr", quiet)
         assert 'feature spec.prompt: "{instruction}" -> "{images}"' in str(caught.value)
         assert "action_hz: 10.0 -> 5.0" in str(caught.value)
+
+    def test_views_and_slots_are_named_before_the_example_prompt(
+        self, tiny_store: Make, tmp_path: Path
+    ) -> None:
+        inputs = [tiny_store(tmp_path, name=name) for name in "ab"]
+        for path, said in zip(inputs, ("one", "two"), strict=True):
+            spec = {"digest": said, "example_prompt": said, "prompt": said, "slots": said}
+            zarr.open_group(path, mode="r+").attrs["feature_spec"] = spec
+        with pytest.raises(StoreMismatch) as caught:
+            merge(inputs, tmp_path / "both.zarr", quiet)
+        places = [line.split(":")[0] for line in str(caught.value).splitlines()[1:-1]]
+        assert [place.split(".")[1] for place in places] == ["slots", "prompt", "example_prompt"]
 
     def test_paths(self, tiny_store: Make, tmp_path: Path) -> None:
         a, b = (tiny_store(tmp_path, name=name, seed=seed) for seed, name in enumerate("ab"))

@@ -37,6 +37,8 @@ from pipeline.store.archive.source import (
 )
 from pipeline.store.chunks import check_row_checksums
 from pipeline.store.lock import build_lock
+from pipeline.store.metadata import ATTRIBUTE as METADATA_DIGEST
+from pipeline.store.metadata import check_metadata
 from pipeline.store.reader import FeatureStore
 from pipeline.store.replacement import inode_of, refuse_replaced
 from pipeline.store.schema import CHECKSUMS, FEATURES, ArraySpec, chunk_paths, read_specs
@@ -46,6 +48,8 @@ SAMPLES = 4
 """Inner chunks of an array that its codec is chosen by."""
 _WORTH = 0.01
 """Share of the store that a codec outside of zarr's specification must save."""
+_OF_A_STORE = ("schema", "plan", METADATA_DIGEST)
+"""Attributes of the root that would be false of an archive."""
 
 
 def archive(store: Path, output: Path, level: int, threads: int) -> ArchiveReport:
@@ -61,6 +65,7 @@ def archive(store: Path, output: Path, level: int, threads: int) -> ArchiveRepor
     """
     begun = time.perf_counter()
     FeatureStore.open(store)  # says what is wrong with something that is no finished store
+    check_metadata(store)
     with build_lock(output):
         if output.exists():
             return ArchiveReport(output, _archived_already(store, output).arrays, None)
@@ -119,13 +124,13 @@ def _write(store: Path, part: Path, level: int) -> dict[str, ArchivedArray]:
 
 
 def _create_groups(part: Path, metadata: Mapping[str, str]) -> None:
-    """The groups with their attributes; the root's without those that make it a store."""
+    """The groups with their attributes."""
     for path in sorted(metadata, key=lambda path: path.count("/")):  # parents first
         document = json.loads(metadata[path])
         if document["node_type"] == "group":
             attributes = document.get("attributes", {})
             if path == ROOT:
-                attributes = {k: v for k, v in attributes.items() if k not in ("schema", "plan")}
+                attributes = {k: v for k, v in attributes.items() if k not in _OF_A_STORE}
             name = path.removesuffix(ROOT).rstrip("/")
             zarr.create_group(part, path=name, attributes=attributes)
 

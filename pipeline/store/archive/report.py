@@ -6,6 +6,9 @@ from pathlib import Path
 
 from pipeline.store.archive.manifest import ArchivedArray
 
+_SMALL = 0.01
+"""Share of the bytes up to which an array has no line: of a tiny one, padding makes the ratio."""
+
 
 @dataclass(frozen=True)
 class ArchiveReport:
@@ -27,12 +30,19 @@ class ArchiveReport:
         return sum(array.stored_bytes for array in self.arrays.values())
 
     def lines(self) -> list[str]:
-        """One line an array: its size, its codec, its ratio, and what the candidates promised."""
+        """A line a large array: its size, its codec, its ratio, what the candidates promised."""
         lines = [f"{'array':<20}{'MB':>10}{'ratio':>9}  {'codec':<22}on samples"]
-        for name, array in self.arrays.items():
+        large = {
+            name: array
+            for name, array in self.arrays.items()
+            if array.raw_bytes > _SMALL * self.raw_bytes
+        }
+        for name, array in large.items():
             size = f"{name:<20}{array.raw_bytes / 1e6:>10.3f}"
             ratio = _ratio(array.raw_bytes, array.stored_bytes)
             lines.append(f"{size}{ratio:>9}  {array.codec:<22}{_promised(array)}".rstrip())
+        if small := len(self.arrays) - len(large):
+            lines.append(f"and {small} small arrays")
         ratio = _ratio(self.raw_bytes, self.stored_bytes)
         return [*lines, f"{'all':<20}{self.raw_bytes / 1e6:>10.3f}{ratio:>9}"]
 

@@ -24,6 +24,7 @@ from pipeline.store.archive.manifest import (
 )
 from pipeline.store.archive.source import checked_rows, chunk_crcs
 from pipeline.store.lock import build_lock
+from pipeline.store.mending import extract_command, gc_command
 from pipeline.store.replacement import recover
 from pipeline.store.schema import ArraySpec, chunk_paths, read_specs
 from pipeline.store.writer import StoreBuild, part_path, read_plan
@@ -153,8 +154,8 @@ def _check_no_build(target: Path) -> None:
     if read_plan(part) is not None:
         raise StoreMismatch(
             f"{part}: expected nothing there, found an unfinished build. Finish it with "
-            "stages.extract, remove it with `python -m stages.store gc --remove`, or restore to "
-            "another place with archive.store."
+            f"{extract_command(target)}, remove it with {gc_command(part)}, or restore to another "
+            "place with archive.store."
         )
 
 

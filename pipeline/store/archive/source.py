@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pipeline.errors import StoreIncomplete
 from pipeline.store.archive.layout import rows_of
 from pipeline.store.chunk_pass import ChunkPass
-from pipeline.store.chunks import MEND
+from pipeline.store.mending import mend
 from pipeline.store.schema import TRAILER_BYTES, ArraySpec, chunk_paths
 
 
@@ -38,7 +38,7 @@ def checked_rows(
             bad = spec.chunk_rows_of(chunk)
             raise StoreIncomplete(
                 f"{paths[chunk]}: rows {bad.start} to {bad.stop - 1} of {spec.name}: "
-                f"{file.damage}. {MEND}"
+                f"{file.damage}. {mend(paths[chunk])}"
             )
         crcs.append(file.crc)
     rows, flat = len(rows_of(spec, chunks)), block.reshape(-1)

@@ -5,13 +5,15 @@
 """
 
 from pipeline.store.housekeeping.inventory import Inventory, take_inventory
-from pipeline.store.housekeeping.leftovers import kept_back, leftovers, remove
+from pipeline.store.housekeeping.leftovers import Leftover, kept_back, leftovers, named, remove
 from pipeline.store.housekeeping.listing import size, table
 
 __all__ = [
     "Inventory",
+    "Leftover",
     "kept_back",
     "leftovers",
+    "named",
     "remove",
     "size",
     "table",

@@ -114,7 +114,7 @@ class Inventory:
         }
 
 
-def take_inventory(folder: Path) -> Inventory:
+def take_inventory(folder: Path, *, subfolders: bool = True) -> Inventory:
     """Everything in `folder` and its subfolders that belongs to a store.
 
     Raises `ConfigError` where there is no such folder.
@@ -124,10 +124,10 @@ def take_inventory(folder: Path) -> Inventory:
             f"stores.folder: expected a folder of stores, found none at {folder}. Name it with "
             "--set stores.folder=…"
         )
-    return Inventory(folder, tuple(_entry(*found) for found in _walk(folder)))
+    return Inventory(folder, tuple(_entry(*found) for found in _walk(folder, subfolders)))
 
 
-def _walk(folder: Path) -> Iterator[tuple[Path, Kind, Path]]:
+def _walk(folder: Path, subfolders: bool) -> Iterator[tuple[Path, Kind, Path]]:
     """What belongs to a store, at or below a folder; links to folders are not followed."""
     for path in sorted(folder.iterdir()):
         match = _NAME.fullmatch(path.name)
@@ -135,8 +135,8 @@ def _walk(folder: Path) -> Iterator[tuple[Path, Kind, Path]]:
             yield path, _SUFFIXES[match["suffix"] or ""], path.with_name(match["base"])
         elif path.name.endswith(".partial"):
             yield path, "unknown", path
-        elif path.is_dir() and not path.is_symlink():
-            yield from _walk(path)
+        elif subfolders and path.is_dir() and not path.is_symlink():
+            yield from _walk(path, subfolders)
 
 
 def _entry(path: Path, kind: Kind, base: Path) -> Entry:

@@ -1,17 +1,30 @@
 """What in a folder of stores nothing needs any more, and its removal.
 
 A finished store is never among it, nor anything that a living process is building, nor what lies
-behind a symbolic link.
+behind a symbolic link. An unfinished build that holds feature rows is work that the next run
+resumes or takes over: it goes only where it is named.
 """
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.errors import StoreLocked
-from pipeline.store.housekeeping.inventory import Entry, Inventory
+from pipeline.errors import ConfigError, StoreLocked
+from pipeline.store.housekeeping.inventory import Entry, Inventory, Kind
+from pipeline.store.housekeeping.listing import clause
 from pipeline.store.lock import build_lock
+from pipeline.store.mending import gc_command
+
+_REMOVABLE: tuple[Kind, ...] = (
+    "build",
+    "repair",
+    "set aside",
+    "replaced",
+    "ledger",
+    "lock",
+    "unknown",
+)
 
 
 @dataclass(frozen=True)
@@ -24,17 +37,39 @@ class Leftover:
     bytes: int
     """On the disk; what hard links elsewhere hold on to is not counted."""
     why: str
+    idle_lock: bool = False
+    """An empty lock file, of which there may be many."""
 
 
 def leftovers(inventory: Inventory) -> list[Leftover]:
-    """What may be removed, with the reason, by path."""
-    kinds = ("build", "repair", "set aside", "replaced", "ledger", "lock", "unknown")
+    """What nothing needs, with the reason, by path."""
     return [
-        Leftover(one.path, one.base, _freed(inventory, one), why)
-        for one in inventory.of_kind(*kinds)
-        if one.base not in inventory.holders and not one.path.is_symlink()
+        _leftover(inventory, one, why)
+        for one in inventory.of_kind(*_REMOVABLE)
+        if _untouched(inventory, one) and _work(one) is None
         if (why := _why(inventory, one)) is not None
     ]
+
+
+def named(inventory: Inventory, paths: Sequence[Path]) -> list[Leftover]:
+    """These very leftovers, unfinished builds with their rows among them.
+
+    Raises `ConfigError` for a path that is none, with the reason.
+    """
+    known = {one.path.absolute(): one for one in inventory.entries}
+    kept = [line for one in inventory.entries for line in _in_use(inventory, one)]
+    found: list[Leftover] = []
+    for path in paths:
+        entry = known.get(path.absolute())
+        why = entry and entry.kind in _REMOVABLE and (_work(entry) or _why(inventory, entry))
+        if entry is None or not why or not _untouched(inventory, entry):
+            said = next((line for line in kept if line.startswith(f"{path}: ")), None)
+            raise ConfigError(
+                f"stores.inputs: {said or f'{path}: no leftover of a build'}. Nothing was removed; "
+                "python -m stages.store gc lists what may be."
+            )
+        found.append(_leftover(inventory, entry, why))
+    return found
 
 
 def kept_back(inventory: Inventory) -> list[str]:
@@ -73,12 +108,11 @@ def _why(inventory: Inventory, entry: Entry) -> str | None:
     }
     match entry.kind:
         case "build":
-            return _why_build(entry)
+            return "a build that was stopped before any row was done; there is nothing to resume"
         case "repair":
             return "a repair that was stopped before it was a build; the next begins anew"
         case "set aside":
-            rows = f"{entry.contents.done} feature rows" if entry.contents else "rows"
-            return f"{rows} of an interrupted build, which the next stages.extract takes over"
+            return "an interrupted build of which no row was done"
         case "replaced":
             there = "store" in belongs or "archive" in belongs
             return f"{entry.base.name} has taken its place" if there else None
@@ -90,31 +124,53 @@ def _why(inventory: Inventory, entry: Entry) -> str | None:
             return "of a write that was killed"
 
 
-def _why_build(entry: Entry) -> str:
+def _untouched(inventory: Inventory, entry: Entry) -> bool:
+    """Whether no living process builds there and it is no symbolic link."""
+    return entry.base not in inventory.holders and not entry.path.is_symlink()
+
+
+def _work(entry: Entry) -> str | None:
+    """What would be lost with an unfinished build; None where it holds no row."""
+    if entry.kind not in ("build", "set aside"):
+        return None
     if entry.damage is not None:
-        return f"an unfinished build that cannot be resumed: {entry.damage}"
-    if entry.contents is None:
-        return "a build that was stopped before it was laid out; there is nothing to resume"
-    done, rows = entry.contents.done, entry.contents.rows
+        return f"unfinished build that cannot be read: {clause(entry.damage)}"
+    if entry.contents is None or not entry.contents.done:
+        return None
     merged = (entry.contents.plan or "").startswith("merge-")
-    resumes = "the same `stages.store merge`" if merged else "stages.extract"
-    return f"an unfinished build, {done} of {rows} rows done; {resumes} would resume it"
+    goes_on = "the same stages.store merge resumes" if merged else "stages.extract resumes"
+    if entry.kind == "set aside":
+        goes_on = "stages.extract takes rows from"
+    rows = f"{entry.contents.done} of {entry.contents.rows} rows done"
+    return f"unfinished build, {rows}; {goes_on} it"
 
 
 def _kept_back(inventory: Inventory) -> Iterator[str]:
     for one in inventory.entries:
         if one.kind in ("store", "archive", "lock"):
             continue
-        if one.path.is_symlink():
-            yield f"{one.path}: a symbolic link, left alone"
-        elif one.base in inventory.holders:
-            yield f"{one.path}: in use by {inventory.holders[one.base]}"
-        elif one.kind == "replaced" and _why(inventory, one) is None:
-            yield (
-                f"{one.path}: the only copy of {one.base.name}, set aside by a replacement that "
-                "was killed; the next stages.extract puts it back"
-            )
+        if (lines := list(_in_use(inventory, one))) or (work := _work(one)) is None:
+            yield from lines
+        else:
+            yield f"{one.path}: {work}, and {gc_command(one.path)} removes it"
 
 
-def _freed(inventory: Inventory, entry: Entry) -> int:
-    return entry.bytes - sum(inventory.siblings(entry).values())
+def _in_use(inventory: Inventory, entry: Entry) -> Iterator[str]:
+    """Why it may not go even where it is named."""
+    if entry.kind in ("store", "archive"):
+        yield f"{entry.path}: a finished {entry.kind}, which is never removed here"
+    elif entry.path.is_symlink():
+        yield f"{entry.path}: a symbolic link, left alone"
+    elif entry.base in inventory.holders:
+        yield f"{entry.path}: in use by {inventory.holders[entry.base]}"
+    elif entry.kind == "replaced" and _why(inventory, entry) is None:
+        yield (
+            f"{entry.path}: the only copy of {entry.base.name}, set aside by a replacement that "
+            "was killed; the next stages.extract puts it back"
+        )
+
+
+def _leftover(inventory: Inventory, entry: Entry, why: str) -> Leftover:
+    freed = entry.bytes - sum(inventory.siblings(entry).values())
+    idle_lock = entry.kind == "lock" and not entry.bytes
+    return Leftover(entry.path, entry.base, freed, why, idle_lock)

@@ -38,6 +38,11 @@ def size(count: int) -> str:
     return f"{count / 2**10:.0f} KiB"
 
 
+def clause(damage: str) -> str:
+    """What is wrong, without what to run about it."""
+    return damage.split(". ", 1)[0].splitlines()[0]
+
+
 def _row(inventory: Inventory, entry: Entry) -> tuple[str, ...]:
     name = entry.path.relative_to(inventory.folder).as_posix()
     what = "damaged" if entry.damage else entry.kind
@@ -59,7 +64,7 @@ def _aligned(row: Sequence[str], widths: Sequence[int]) -> str:
 
 def _details(inventory: Inventory, entry: Entry, dependents: Iterable[str]) -> Iterator[str]:
     if entry.damage:
-        yield f"damaged: {entry.damage}"
+        yield f"damaged: {clause(entry.damage)}"
     if entry.contents is not None and entry.kind == "store":
         yield _embodiment(entry.contents)
     if entry.path.is_symlink():

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.store.mending import mend, start_over
 from pipeline.store.replacement import Inode
 
 MOST_LINES = 20
@@ -55,6 +56,11 @@ class Places:
             return f"{said}, tick {tick})"
         return f"{said})"
 
+    def span(self, kind: str, first: int, last: int) -> str:
+        """`3 (episode 'x', tick 12) to 9 (episode 'y', tick 36)`; of one row, that row."""
+        begin = f"{first}{self.of(kind, first)}"
+        return begin if first == last else f"{begin} to {last}{self.of(kind, last)}"
+
 
 @dataclass(frozen=True)
 class Findings:
@@ -62,10 +68,12 @@ class Findings:
 
     store: Path
     rows: int
-    """Feature rows whose checksums were compared."""
+    """Feature rows that could be read and were checked."""
     bytes: int
-    """Read and checked."""
+    """Of the chunk files that were read, with the padding behind the last rows."""
     seconds: float
+    row_bytes: int = 0
+    """Of the rows of all arrays in these files."""
     inode: Inode | None = None
     """Of the store that was checked: another may have taken its place since."""
     damaged: tuple[Damage, ...] = ()
@@ -75,6 +83,10 @@ class Findings:
     faults: Mapping[str, NDArray[np.int64]] = field(default_factory=dict[str, NDArray[np.int64]])
     """The feature rows that cannot be used, ascending, by what is wrong with them."""
     places: Places = field(default_factory=lambda: Places({}, (), 1))
+    notes: tuple[str, ...] = ()
+    """What could not be checked."""
+    plan: bool = True
+    """Whether the metadata still say what the store was made of."""
 
     @property
     def sound(self) -> bool:
@@ -103,23 +115,34 @@ class Findings:
         ]
 
     def _named(self, rows: NDArray[np.int64], what: str) -> list[str]:
-        lines = [f"VL row {row}{self.places.of('vl', row)}: {what}" for row in rows[:MOST_LINES]]
-        more = len(rows) - len(lines)
+        runs = runs_of(rows)
+        lines = [
+            f"VL row{'s' if last > first else ''} {self.places.span('vl', first, last)}: {what}"
+            for first, last in runs[:MOST_LINES]
+        ]
+        more = sum(last - first + 1 for first, last in runs[MOST_LINES:])
         return [*lines, *([f"and {more} more VL rows: {what}"] if more else [])]
 
     def advice(self) -> str:
         """For people: what to run next."""
         if self.problems and not (self.damaged or self.faults):
             return "All that was stored is sound: look at these files and remove them."
-        return "Run python -m stages.verify --repair, then python -m stages.extract."
+        return mend(self.store) if self.plan else start_over(self.store)
 
     def summary(self) -> str:
         """For people: how much was checked, how fast."""
         rate = self.bytes / 1e9 / self.seconds if self.seconds else 0.0
         return (
-            f"{self.store}: checked {self.rows} feature rows and {self.bytes / 2**20:.1f} MiB in "
-            f"{self.seconds:.1f} s ({rate:.2f} GB/s)"
+            f"{self.store}: checked {self.rows} feature rows, {self.row_bytes / 2**20:.1f} MiB of "
+            f"rows in {self.bytes / 2**20:.1f} MiB of files, in {self.seconds:.1f} s "
+            f"({rate:.2f} GB/s)"
         )
+
+
+def runs_of(rows: NDArray[np.int64]) -> list[tuple[int, int]]:
+    """(first, last) of each run of consecutive rows, ascending."""
+    runs = np.split(rows, np.flatnonzero(np.diff(rows) != 1) + 1)
+    return [(int(run[0]), int(run[-1])) for run in runs if len(run)]
 
 
 def capped(lines: Sequence[str], kind: str) -> list[str]:

@@ -35,6 +35,8 @@ class ChunkReport:
     """What is wrong with the file as a file."""
     faults: Mapping[str, NDArray[np.int64]] = field(default_factory=dict[str, NDArray[np.int64]])
     """Rows by what is wrong with them."""
+    rows: int = 0
+    """That could be read, those of padding left out."""
 
 
 @dataclass(frozen=True)
@@ -71,11 +73,12 @@ class ChunkTask:
                 for what, bad in found.items():
                     if bad.any():
                         faults.setdefault(what, []).append(start + np.flatnonzero(bad))
-        unread = np.arange(min(rows.start + file.whole_rows, rows.stop), rows.stop)
+        read = min(file.whole_rows, len(rows))
+        unread = np.arange(rows.start + read, rows.stop)
         if len(unread):
             faults.setdefault(UNREADABLE, []).append(unread)
         found = {what: np.concatenate(each) for what, each in faults.items()}
-        return ChunkReport(self.array, self.chunk, file.bytes, file.damage, found)
+        return ChunkReport(self.array, self.chunk, file.bytes, file.damage, found, read)
 
     def _faults(
         self, start: int, values: NDArray[Any], beside: Mapping[str, ChunkFiles]

@@ -9,6 +9,7 @@ from typing import Any
 
 from pipeline.errors import StoreIncomplete
 from pipeline.store.integrity.findings import Damage
+from pipeline.store.metadata import metadata_damage
 from pipeline.store.schema import (
     ARRAY_NAMES,
     FEATURES,
@@ -22,7 +23,8 @@ from pipeline.store.schema import (
     read_spec,
 )
 
-_GROUPS = sorted({name.split("/")[0] for name in ARRAY_NAMES})
+GROUPS = sorted({name.split("/")[0] for name in ARRAY_NAMES})
+NO_DIGEST = "an earlier version wrote it without a metadata_digest: attributes cannot be checked"
 
 
 def read_arrays(root: Path) -> tuple[dict[str, ArraySpec], list[Damage]]:
@@ -71,9 +73,18 @@ def check_attributes(
     return [Damage("", None, root / "zarr.json", what) for what in wrong]
 
 
+def check_digest(root: Path) -> list[Damage]:
+    """What is wrong with the metadata that only their digest can tell."""
+    try:
+        what = metadata_damage(root)
+    except StoreIncomplete as error:
+        what = str(error)
+    return [Damage("", None, root / "zarr.json", what)] if what else []
+
+
 def strange_files(root: Path, specs: Mapping[str, ArraySpec]) -> list[str]:
     """Files that have no place in a store."""
-    expected = {root / "zarr.json", *(root / group / "zarr.json" for group in _GROUPS)}
+    expected = {root / "zarr.json", *(root / group / "zarr.json" for group in GROUPS)}
     expected |= {root / name / "zarr.json" for name in ARRAY_NAMES}
     expected |= {path for spec in specs.values() for path in chunk_paths(root, spec)}
     unjudged = tuple(str(root / name) + "/" for name in ARRAY_NAMES if name not in specs)

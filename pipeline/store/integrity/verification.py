@@ -17,10 +17,19 @@ from tqdm import tqdm
 
 from pipeline.errors import StoreIncomplete, StoreMismatch
 from pipeline.store.archive import is_archive
-from pipeline.store.integrity.findings import MOST_LINES, Damage, Findings, Places
+from pipeline.store.integrity.findings import MOST_LINES, Damage, Findings, Places, runs_of
 from pipeline.store.integrity.relations import EpisodeTable, RelationTask, relation_tasks
 from pipeline.store.integrity.scan import CHANGED, UNREADABLE, UNWRITTEN, ChunkReport, ChunkTask
-from pipeline.store.integrity.structure import check_attributes, read_arrays, strange_files
+from pipeline.store.integrity.structure import (
+    GROUPS,
+    NO_DIGEST,
+    check_attributes,
+    check_digest,
+    read_arrays,
+    strange_files,
+)
+from pipeline.store.mending import extract_command, restore_command
+from pipeline.store.metadata import has_digest
 from pipeline.store.replacement import inode_of, refuse_replaced
 from pipeline.store.schema import CHECKSUMS, FEATURES, ArraySpec, chunk_paths
 
@@ -40,6 +49,8 @@ def verify(path: Path, threads: int, workers: int | str = 0) -> Findings:
     specs, damaged = read_arrays(path)
     attrs, unreadable = _attributes(path)
     damaged += unreadable or check_attributes(path, attrs, specs)
+    damaged += [] if damaged else check_digest(path)
+    notes = () if damaged or has_digest(path) else (NO_DIGEST,)
     tasks = _chunk_tasks(path, specs)
     reports = list(run_tasks(tasks, threads, workers, "verify"))
     if workers:
@@ -59,13 +70,16 @@ def verify(path: Path, threads: int, workers: int | str = 0) -> Findings:
     return Findings(
         store=path,
         inode=inode,
-        rows=specs[FEATURES].shape[0] if FEATURES in specs else 0,
+        rows=sum(report.rows for report in reports if report.array == FEATURES),
+        row_bytes=sum(report.rows * specs[report.array].row_bytes for report in reports),
         bytes=sum(report.bytes for report in reports),
         seconds=time.monotonic() - begun,
         damaged=tuple(damaged + relations),
         problems=problems,
         faults=_row_faults(specs, reports),
         places=places,
+        notes=notes,
+        plan=isinstance(attrs.get("plan"), str),
     )
 
 
@@ -137,14 +151,19 @@ def _call(task: Task[Report]) -> Report:
 def _refuse_other_things(path: Path) -> None:
     part = path.with_name(path.name + ".part")
     if path.suffix == ".part" and path.exists():
-        raise StoreIncomplete(f"{path}: an unfinished build. Run stages.extract, then verify.")
+        command = extract_command(path.with_suffix(""))
+        raise StoreIncomplete(f"{path}: an unfinished build. Run {command}, then verify.")
     if not path.is_dir():
         found = f"only the unfinished build {part}" if part.exists() else "nothing there"
-        raise StoreIncomplete(f"{path}: no finished store ({found}). Run stages.extract.")
+        raise StoreIncomplete(f"{path}: no finished store ({found}). Run {extract_command(path)}.")
+    if not any((path / place / "zarr.json").exists() for place in ("", *GROUPS)):
+        raise StoreIncomplete(
+            f"{path}: no store (no zarr.json in it). Name one with --set verify.store=…"
+        )
     if is_archive(path):
         raise StoreMismatch(
             f"{path}: expected a store, found an archive of one, whose chunks carry checksums of "
-            f"their own. Restore it: python -m stages.archive --restore --set archive.output={path}"
+            f"their own. Restore it: {restore_command(path)}"
         )
 
 
@@ -190,9 +209,9 @@ def _file_damage(task: ChunkTask, report: ChunkReport, places: Places) -> Iterat
     rows = task.specs[task.array].chunk_rows_of(task.chunk)
     kind = task.array.split("/")[0]
     if report.damage:
-        first, last = places.of(kind, rows.start), places.of(kind, rows.stop - 1)
-        span = f"rows {rows.start}{first} to {rows.stop - 1}{last} of {task.array}"
-        yield Damage(task.array, task.chunk, task.path, f"{report.damage}; {span}")
+        span = places.span(kind, rows.start, rows.stop - 1)
+        what = f"{report.damage}; rows {span} of {task.array}"
+        yield Damage(task.array, task.chunk, task.path, what)
     if task.array == FEATURES:
         return
     for what, bad in report.faults.items():
@@ -215,6 +234,7 @@ def _relations(
 
 
 def _rows_said(rows: NDArray[np.int64], kind: str, places: Places) -> str:
-    named = ", ".join(f"{row}{places.of(kind, row)}" for row in rows[:MOST_LINES])
-    more = len(rows) - MOST_LINES
-    return f"row {named}" + (f" and {more} more" if more > 0 else "")
+    runs = runs_of(rows)
+    named = ", ".join(places.span(kind, first, last) for first, last in runs[:MOST_LINES])
+    more = sum(last - first + 1 for first, last in runs[MOST_LINES:])
+    return f"{'row' if len(rows) == 1 else 'rows'} {named}" + (f" and {more} more" if more else "")

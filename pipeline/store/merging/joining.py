@@ -130,6 +130,7 @@ def check_alike(stores: Sequence[FeatureStore]) -> None:
         for stream in _STREAMS:
             lines += _differing(stream, *_streams(stores, store, stream))
         if lines:
+            lines.sort(key=_rank)
             raise StoreMismatch(
                 f"{first.path} and {store.path} cannot become one store, which has one feature "
                 "spec and one embodiment; there they differ (first -> second):\n"
@@ -201,6 +202,12 @@ def _differing(place: str, a: Any, b: Any) -> list[str]:
     if isinstance(a, list) and isinstance(b, list) and len(a) != len(b):
         return [f"{place}: {len(a)} entries -> {len(b)} entries"]
     return [f"{place}: {_shown(a)} -> {_shown(b)}"]
+
+
+def _rank(line: str) -> int:
+    """Views and slots first: the example prompt differs where they do."""
+    place = line.split(":")[0]
+    return 2 if "example_prompt" in place else int("views" not in place and "slots" not in place)
 
 
 def _shown(value: Any) -> str:

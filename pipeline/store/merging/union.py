@@ -23,8 +23,10 @@ from pipeline.durable import free_bytes
 from pipeline.errors import ConfigError, DiskFull, StoreIncomplete, StoreMismatch
 from pipeline.store.integrity import verify
 from pipeline.store.lock import build_lock
+from pipeline.store.mending import gc_command
 from pipeline.store.merging.copying import axis_kind, copy_features, copy_stream
 from pipeline.store.merging.joining import Joined, join
+from pipeline.store.metadata import ATTRIBUTE, check_metadata
 from pipeline.store.reader import FeatureStore
 from pipeline.store.replacement import Inode, inode_of, recover, refuse_replaced
 from pipeline.store.schema import (
@@ -74,6 +76,7 @@ def merge(inputs: Sequence[Path], output: Path, say: Say = print) -> MergeReport
         part = read_plan(part_path(output))
         if read_plan(output) == plan and part != plan:  # else a repair of it has begun
             FeatureStore.open(output)  # refuses a store that files are missing from
+            check_metadata(output)
             say(f"{output}: up to date, nothing to do")
             return None
         _check_free(output, plan)
@@ -121,8 +124,8 @@ def _check_free(output: Path, plan: str) -> None:
     if read_plan(part) not in (None, plan):
         raise StoreMismatch(
             f"{part}: expected nothing there, or an interrupted merge of these stores; found an "
-            "unfinished build of something else. Choose another name with --into, or remove it "
-            "with `python -m stages.store gc --remove`."
+            "unfinished build of something else. Choose another name with --into, or remove it: "
+            f"{gc_command(part)}"
         )
 
 
@@ -132,8 +135,7 @@ def _check_sound(path: Path) -> None:
         raise StoreIncomplete(
             f"{path}: damaged, so nothing was merged:\n"
             + "\n".join(f"  {line}" for line in findings.lines())
-            + f"\nMend it: python -m stages.verify --repair --set verify.store={path}, then "
-            "stages.extract."
+            + f"\n{findings.advice()}"
         )
 
 
@@ -219,7 +221,8 @@ def _check_space(build: StoreBuild, first: Mapping[str, ArraySpec], ends: dict[s
 
 def _attributes(joined: Joined) -> dict[str, Any]:
     """Those of the first input, with the sources and streams of all."""
-    first = {name: value for name, value in joined.stores[0].attrs.items() if name != "plan"}
+    its_own = ("plan", ATTRIBUTE)
+    first = {name: one for name, one in joined.stores[0].attrs.items() if name not in its_own}
     return {
         **first,
         "sources": list(joined.sources),

@@ -1,0 +1,70 @@
+"""What to run about a store that is not as it was written, as full commands.
+
+Each names the store that was found damaged, which need not be that of params.yaml.
+"""
+
+import re
+import shlex
+from pathlib import Path
+
+_STORE = re.compile(r"(?P<base>.+?\.zarr)(?P<unfinished>(?:\.repair)?\.part|\.known-\d+)?")
+
+
+def extract_command(store: Path) -> str:
+    """Makes a store, or completes the build of it."""
+    return f"python -m stages.extract --set {_set('extract.store', store)}"
+
+
+def gc_command(path: Path) -> str:
+    """Removes an unfinished build."""
+    return f"python -m stages.store gc {shlex.quote(str(path))} --remove"
+
+
+def restore_command(archive: Path, store: Path | None = None) -> str:
+    """Makes a store from its archive; where none is named, one beside it."""
+    if store is None:
+        name = archive.stem.removesuffix(".archive")
+        store = archive.with_name(f"{name if name != archive.stem else name + '.restored'}.zarr")
+    places = f"--set {_set('archive.output', archive)} --set {_set('archive.store', store)}"
+    return f"python -m stages.archive --restore {places}"
+
+
+def mend(path: Path) -> str:
+    """What to do about a damaged store or build, of which `path` is the folder or a file in it."""
+    folder, store = _owner(path)
+    if folder != store:
+        return (
+            f"It lies in an unfinished build. Remove that with {gc_command(folder)}, then run "
+            f"{extract_command(store)}."
+        )
+    return (
+        f"Run python -m stages.verify --repair --set {_set('verify.store', store)}, which keeps "
+        f"what is sound, then {extract_command(store)}."
+    )
+
+
+def start_over(path: Path) -> str:
+    """What to do where the root's metadata no longer say what a store or build was made of."""
+    folder, store = _owner(path)
+    if folder != store:
+        return mend(path)
+    lost = (
+        "Without them its feature rows are of no use, and --repair cannot begin. Remove or rename "
+        f"{store}, then run {extract_command(store)}, which computes all of it"
+    )
+    archive = store.with_name(f"{store.stem}.archive.zarr")
+    if not (archive / "zarr.json").exists():
+        return f"{lost}."
+    return f"{lost}; or restore it from the archive beside it: {restore_command(archive, store)}."
+
+
+def _owner(path: Path) -> tuple[Path, Path]:
+    """The store or build that a path is or lies in, and the store that this is or will be."""
+    for folder in (path, *path.parents):
+        if found := _STORE.fullmatch(folder.name):
+            return folder, folder.with_name(found["base"])
+    return path, path
+
+
+def _set(key: str, path: Path) -> str:
+    return shlex.quote(f"{key}={path}")

@@ -1,0 +1,43 @@
+"""What is said to run about a damaged store acts on that very store."""
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.store.mending import mend, restore_command, start_over
+from pipeline.store.writer import read_plan
+
+
+@pytest.mark.parametrize("inside", ["", "zarr.json", "vl/features/c/0/0/0"])
+def test_a_store_is_repaired_and_extracted_by_name(inside: str) -> None:
+    said = mend(Path("some/my store.zarr") / inside)
+    assert "stages.verify --repair --set 'verify.store=some/my store.zarr'" in said
+    assert "stages.extract --set 'extract.store=some/my store.zarr'" in said
+    assert ".part" not in said
+
+
+@pytest.mark.parametrize("name", ["a.zarr.part", "a.zarr.repair.part", "a.zarr.known-3"])
+def test_a_build_is_removed_and_begun_anew(name: str) -> None:
+    said = mend(Path("some", name, "vl/key/c/0/0"))
+    assert f"python -m stages.store gc some/{name} --remove" in said
+    assert said.endswith("python -m stages.extract --set extract.store=some/a.zarr.")
+    assert "--repair" not in said
+
+
+def test_a_name_of_another_kind_is_taken_as_it_is() -> None:
+    assert "verify.store=copy," in mend(Path("copy"))
+
+
+def test_where_the_root_is_lost_all_say_the_same(tmp_path: Path) -> None:
+    for name in ("a.zarr", "a.zarr.part"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "zarr.json").write_text("{")
+        with pytest.raises(RuntimeError) as caught:
+            read_plan(tmp_path / name)
+        assert start_over(tmp_path / name) in str(caught.value)
+
+
+def test_an_archive_is_restored_to_a_store_beside_it() -> None:
+    for archive, store in (("x/a.archive.zarr", "x/a.zarr"), ("x/a.zarr", "x/a.restored.zarr")):
+        said = restore_command(Path(archive))
+        assert said.endswith(f"--set archive.output={archive} --set archive.store={store}")
