@@ -15,8 +15,8 @@ from pipeline.config import Params
 from pipeline.digests import ContentDigests
 from pipeline.errors import StoreMismatch
 from pipeline.extraction.encoder import Encoder
+from pipeline.extraction.places import ledger_path
 from pipeline.extraction.rows import ReadyRow, RowPreparation, in_background, spans_of
-from pipeline.extraction.run import ledger_path
 from pipeline.extraction.survey import Survey, survey
 from pipeline.recordings import Recording
 from pipeline.store import FEATURES, FeatureStore

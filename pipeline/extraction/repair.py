@@ -12,7 +12,8 @@ from pipeline.digests import ContentDigests
 from pipeline.durable import disk_full_named
 from pipeline.errors import StoreIncomplete, StoreMismatch
 from pipeline.extraction.layout import build_arrays, check_space, lay_out
-from pipeline.extraction.run import ledger_path, sound_episodes
+from pipeline.extraction.places import ledger_path
+from pipeline.extraction.run import sound_episodes
 from pipeline.extraction.survey import survey
 from pipeline.store import FEATURES, StoreBuild, build_lock, part_path, read_plan, recover
 from pipeline.store.integrity.findings import Damage, Findings
@@ -25,6 +26,7 @@ from pipeline.store.integrity.repair import (
 )
 from pipeline.store.integrity.structure import read_arrays
 from pipeline.store.mending import extract_command, gc_command, start_over
+from pipeline.store.writer import MERGED
 from pipeline.vlm.feature_spec import document_digest
 
 
@@ -109,7 +111,7 @@ def with_identity(findings: Findings) -> Findings:
 
 
 def _completed_by(store: Path, plan: str) -> str:
-    if plan.startswith("merge-"):
+    if plan.startswith(MERGED):
         return f"the same python -m stages.store merge --into {store} that made it"
     return extract_command(store)
 
@@ -133,8 +135,8 @@ def _lay_out_anew(store: Path, plan: str, params: Params) -> StoreBuild:
         raise StoreMismatch(
             f"{store}: metadata, streams, ticks or episodes are damaged, and the params describe "
             "another store than this one (recordings, data, vlm or dtypes changed), so that they "
-            "cannot be written again. Restore the recordings and params, or remove the store and "
-            f"run {extract_command(store)} for a new one."
+            "cannot be written again. Restore the recordings and params, or run "
+            f"{_completed_by(store, plan)}, which takes over every row whose frames it knows."
         )
     build = StoreBuild(repair_build(store), build_arrays(checked, surveyed, params), plan)
     check_space(build, checked, ())

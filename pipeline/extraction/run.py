@@ -1,8 +1,7 @@
 """Recordings x frozen model -> store."""
 
-import shutil
-from collections.abc import Callable, Generator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Sequence
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,17 @@ from pipeline.durable import free_bytes
 from pipeline.extraction.check import CheckedEpisode, check_episodes
 from pipeline.extraction.fill import ExtractionReport, fill, rate_name
 from pipeline.extraction.layout import build_arrays, check_space, lay_out
+from pipeline.extraction.places import (
+    Say,
+    donors_at,
+    known_places,
+    ledger_path,
+    make_room,
+    plans,
+    refuse_to_lose,
+    remove,
+    set_aside,
+)
 from pipeline.extraction.plan import ExtractionPlan, known_rows, reasons, store_bytes
 from pipeline.extraction.survey import Survey, survey
 from pipeline.store import (
@@ -27,9 +37,6 @@ from pipeline.store import (
 )
 from pipeline.store.metadata import check_metadata
 from pipeline.store.schema import read_specs
-from pipeline.vlm.feature_spec import differences
-
-Say = Callable[[str], None]
 
 
 def extract(params: Params, say: Say) -> ExtractionReport | None:
@@ -48,18 +55,13 @@ def extract(params: Params, say: Say) -> ExtractionReport | None:
         surveyed = survey(params, digests)
         if surveyed.bad and params.data.on_bad_episode == "stop":
             check_episodes(surveyed, params)  # lists them with whatever else is wrong
-        if surveyed.plan in _plans(target):
+        if surveyed.plan in plans(target):
             return _go_on(surveyed, params, digests, say)
         surveyed, checked = sound_episodes(surveyed, params, digests)
-        if surveyed.plan in _plans(target):
+        if surveyed.plan in plans(target):
             return _go_on(surveyed, params, digests, say)
         _say_survey(surveyed, params, say)
         return _begin(surveyed, checked, params, digests, say)
-
-
-def _plans(target: Path) -> tuple[str | None, str | None]:
-    """Of the unfinished build, and of the store."""
-    return read_plan(part_path(target)), read_plan(target)
 
 
 def _go_on(
@@ -103,7 +105,7 @@ def _resume(
     build = StoreBuild(target, read_specs(part_path(target)), surveyed.plan)
     repairs = read_plan(target) == surveyed.plan
     reason = "completing the repair" if repairs else "continuing the interrupted build"
-    with closing(build), _donors(_known_places(target), surveyed) as donors:
+    with closing(build), donors_at(known_places(target), surveyed) as donors:
         missing = build.missing()
         rows, episodes = (build.specs[name].shape[0] for name in ("vl/time", "episode/source"))
         plan = ExtractionPlan(
@@ -123,7 +125,7 @@ def _resume(
             return None
         report = fill(build, surveyed, donors, params, digests, missing)
         build.seal()
-    _remove(_set_aside(target))
+    remove(set_aside(target))
     return report
 
 
@@ -136,28 +138,29 @@ def _begin(
 ) -> ExtractionReport | None:
     """Begin a new build; what stood in its place is set aside only when nothing can refuse it."""
     target, part = params.extract.store, part_path(params.extract.store)
+    refuse_to_lose(target, surveyed)
     build = StoreBuild(target, build_arrays(checked, surveyed, params), surveyed.plan)
     if any(one.recording.has_poses for one in surveyed.episodes):
         say(f"actions: rotations as {surveyed.action_rotation}")
     with closing(build):
-        with _donors([part, *_known_places(target)], surveyed) as donors:
+        with donors_at([part, *known_places(target)], surveyed) as donors:
             plan = _new_plan(build, checked, surveyed, donors, params, digests)
             for line in plan.lines():
                 say(line)
             if params.extract.plan:
                 return None
             check_space(build, checked, donors)
-        if isinstance(params.extract.workers, str):
+        if isinstance(params.extract.workers, str) and plan.known < plan.rows:
             from pipeline.extraction.connection import check_scheduler  # dask: a second to import
 
             check_scheduler(params.extract)
-        _make_room(target, surveyed, say)
-        with _donors(_known_places(target), surveyed) as donors:
+        make_room(target, surveyed, say)
+        with donors_at(known_places(target), surveyed) as donors:
             lay_out(build, checked, surveyed, params, donors)
             everything = np.arange(plan.rows)
             report = fill(build, surveyed, donors, params, digests, everything)
             build.seal()
-    _remove(_set_aside(target))
+    remove(set_aside(target))
     return report
 
 
@@ -170,7 +173,7 @@ def _new_plan(
     digests: ContentDigests,
 ) -> ExtractionPlan:
     before = {digest for donor in donors for digest in donor.episode_digests}
-    before_it = build.target if build.target in _known_places(build.target) else build.part
+    before_it = build.target if build.target in known_places(build.target) else build.part
     store = Donor(before_it) if read_plan(before_it) is not None else None
     return ExtractionPlan(
         episodes=len(checked),
@@ -194,59 +197,3 @@ def _say_survey(surveyed: Survey, params: Params, say: Say) -> None:
         say(f"not there: {line}")
     for bad in surveyed.bad:
         say(f"skipped {bad.source}: {bad.reason}")
-
-
-@contextmanager
-def _donors(places: Sequence[Path], surveyed: Survey) -> Generator[list[Donor]]:
-    """Stores and laid-out builds of the same feature spec among these places."""
-    donors = [Donor(place) for place in places if read_plan(place) is not None]
-    try:
-        yield [donor for donor in donors if donor.spec_digest == surveyed.spec.digest]
-    finally:
-        for donor in donors:
-            donor.close()
-
-
-def _make_room(target: Path, surveyed: Survey, say: Say) -> None:
-    """Set an unfinished build of another plan aside; of another feature spec, it is of no use."""
-    part = part_path(target)
-    if read_plan(part) is None:
-        return
-    abandoned = Donor(part)
-    abandoned.close()
-    if abandoned.spec_digest == surveyed.spec.digest:
-        taken = len(_set_aside(target))
-        while (aside := _beside(target, f".known-{taken}")).exists():
-            taken += 1
-        part.rename(aside)
-        return
-    for line in differences(abandoned.attrs["feature_spec"], surveyed.spec.attrs()):
-        say(f"the unfinished build {part} is given up: {line}")
-
-
-def _known_places(target: Path) -> list[Path]:
-    """Builds that were set aside, and the store, unless a repair of it has begun.
-
-    A repair leaves out what is damaged: that must not come back from the store that it mends.
-    """
-    aside = _set_aside(target)
-    repairs = {read_plan(place) for place in [*aside, part_path(target)]} - {None}
-    return aside if read_plan(target) in repairs else [*aside, target]
-
-
-def _set_aside(target: Path) -> list[Path]:
-    return sorted(target.parent.glob(f"{target.name}.known-*"))
-
-
-def _remove(folders: Sequence[Path]) -> None:
-    for folder in folders:
-        shutil.rmtree(folder)
-
-
-def ledger_path(target: Path) -> Path:
-    """Where the digests of files are remembered."""
-    return _beside(target, ".files.sqlite")
-
-
-def _beside(target: Path, suffix: str) -> Path:
-    return target.with_name(target.name + suffix)

@@ -54,7 +54,7 @@ def recommend(study: Study) -> Recommendation | None:
             if all(better(score, other) for other in _without(study, one, reading))
         }
         if gains:
-            best, *others = sorted(gains, key=lambda one: scores[one].mean, reverse=True)
+            best, *others = sorted(gains, key=lambda one: gains[one], reverse=True)
             tied = tuple(
                 one
                 for one in others

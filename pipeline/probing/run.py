@@ -10,6 +10,7 @@ import torch
 from tqdm import tqdm
 
 from pipeline.config import ProbeParams
+from pipeline.errors import StoreMismatch
 from pipeline.probing.accumulation import Table
 from pipeline.probing.effort import foretold
 from pipeline.probing.folds import Folds, fold_by_recording
@@ -142,7 +143,12 @@ class _Work:
         """The mean action, and state + sensor alone."""
         parts = [self._table.moments(part, [Reader((), ())])[0] for part in self._parts]
         mean_action = self._known([part.last(self._table.targets) for part in parts])
-        assert mean_action is not None, "every fold has ticks"
+        if mean_action is None:
+            raise StoreMismatch(
+                "too few ticks to hold recordings out in turn: a fold, or what it would train on, "
+                "has none. Give a store with more or longer recordings, a larger probe.max_ticks "
+                "or a smaller probe.horizon."
+            )
         if self._table.beside:
             self._streams = self._known(parts)
         return mean_action, self._streams

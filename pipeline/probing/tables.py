@@ -141,7 +141,7 @@ def advice(study: Study) -> str:
             "one with the fewest slots is recommended."
         )
     elif len(study.groups) > 1:
-        lines.append("ahead of every other choice that gains, fold by fold")
+        lines.append("no other choice is level with it, fold by fold, or keeps half of its gain")
     else:
         lines.append("the only choice in this store: extract more layers or poolings to compare")
     name = found.chosen.name

@@ -3,6 +3,7 @@
 Each names the store that was found damaged, which need not be that of params.yaml.
 """
 
+import json
 import re
 import shlex
 from pathlib import Path
@@ -39,7 +40,7 @@ def mend(path: Path) -> str:
         )
     return (
         f"Run python -m stages.verify --repair --set {_set('verify.store', store)}, which keeps "
-        f"what is sound, then {extract_command(store)}."
+        "what is sound, then what it says."
     )
 
 
@@ -55,7 +56,8 @@ def start_over(path: Path) -> str:
     archive = store.with_name(f"{store.stem}.archive.zarr")
     if not (archive / "zarr.json").exists():
         return f"{lost}."
-    return f"{lost}; or restore it from the archive beside it: {restore_command(archive, store)}."
+    restore = restore_command(archive, store)
+    return f"{lost}; or, in place of that, restore it from the archive beside it: {restore}."
 
 
 def _owner(path: Path) -> tuple[Path, Path]:
@@ -67,4 +69,6 @@ def _owner(path: Path) -> tuple[Path, Path]:
 
 
 def _set(key: str, path: Path) -> str:
-    return shlex.quote(f"{key}={path}")
+    """A value is YAML: what is more than a plain word has to be quoted for it, too."""
+    plain = re.fullmatch(r"[\w./+-]+", str(path))
+    return shlex.quote(f"{key}={path if plain else json.dumps(str(path))}")

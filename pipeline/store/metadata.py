@@ -53,7 +53,7 @@ def _found_and_stored(root: Path) -> tuple[str, Any]:
     documents = {place: _document(root / place / "zarr.json") for place in _PLACES}
     attributes = documents[""].get("attributes")
     stored = attributes.pop(ATTRIBUTE, None) if isinstance(attributes, dict) else None
-    text = json.dumps(documents, sort_keys=True, ensure_ascii=False)
+    text = json.dumps(documents, sort_keys=True)
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest(), stored
 
 

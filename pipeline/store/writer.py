@@ -27,6 +27,9 @@ from pipeline.store.metadata import note_metadata
 from pipeline.store.replacement import put_in_place
 from pipeline.store.schema import CHECKSUMS, FEATURES, INCREMENTAL, KEYS, ArraySpec
 
+MERGED = "merge-"
+"""How the plan of a store begins that was not extracted but merged."""
+
 
 def part_path(target: Path) -> Path:
     """Where a store is built."""

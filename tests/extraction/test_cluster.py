@@ -27,7 +27,7 @@ from pipeline.extraction import extract
 from pipeline.extraction.connection import check_scheduler
 from pipeline.extraction.fill import rate_name
 from pipeline.extraction.job import Job
-from pipeline.extraction.run import ledger_path
+from pipeline.extraction.places import ledger_path
 from pipeline.extraction.survey import survey
 from pipeline.extraction.worker import check_place, device_of
 from pipeline.store import Donor, FeatureStore, StoreBuild, part_path, read_plan

@@ -2,6 +2,7 @@
 
 import pytest
 
+from pipeline.errors import StoreMismatch
 from pipeline.extraction import extract
 from pipeline.store import FeatureStore
 from pipeline.store.merging import merge
@@ -23,6 +24,11 @@ def test_a_merged_store_gives_every_row_to_an_extraction_of_all_sources(
     merge([tmp_path / "first.zarr", tmp_path / "second.zarr"], target)
     merged = FeatureStore.open(target)
     before = {one.id: merged.array("vl/features")[list(one.vl_rows)] for one in merged.episodes}
+
+    only_first = changed(data={"sources": sources[:1]}, extract={"store": str(target)})
+    with pytest.raises(StoreMismatch, match=r"merged of others and holds 1 episode\(s\) that"):
+        extract(only_first, print)
+    assert FeatureStore.open(target).attrs["plan"] == merged.attrs["plan"], "nothing was replaced"
 
     def refuse(*args, **kwargs):
         raise AssertionError("nothing needs the model")

@@ -15,6 +15,7 @@ from pipeline.store.housekeeping.inventory import Entry, Inventory, Kind
 from pipeline.store.housekeeping.listing import clause
 from pipeline.store.lock import build_lock
 from pipeline.store.mending import gc_command
+from pipeline.store.writer import MERGED
 
 _REMOVABLE: tuple[Kind, ...] = (
     "build",
@@ -114,7 +115,10 @@ def _why(inventory: Inventory, entry: Entry) -> str | None:
         case "set aside":
             return "an interrupted build of which no row was done"
         case "replaced":
-            there = "store" in belongs or "archive" in belongs
+            there = any(
+                one.base == entry.base and one.kind in ("store", "archive") and one.damage is None
+                for one in inventory.entries
+            )
             return f"{entry.base.name} has taken its place" if there else None
         case "ledger":
             return None if belongs else "content digests for a store that is not there"
@@ -137,7 +141,7 @@ def _work(entry: Entry) -> str | None:
         return f"unfinished build that cannot be read: {clause(entry.damage)}"
     if entry.contents is None or not entry.contents.done:
         return None
-    merged = (entry.contents.plan or "").startswith("merge-")
+    merged = (entry.contents.plan or "").startswith(MERGED)
     goes_on = "the same stages.store merge resumes" if merged else "stages.extract resumes"
     if entry.kind == "set aside":
         goes_on = "stages.extract takes rows from"

@@ -138,9 +138,12 @@ def _carry_marks(
 
 def _carry_environments(store: Path, build: StoreBuild) -> None:
     log = EnvironmentLog(build.part)
+    rows = build.specs[FEATURES].shape[0]
     attributes = json.loads((store / "zarr.json").read_text())["attributes"]
-    for noted in attributes["environment"]:
+    for noted in attributes.get("environment", []):
         start, stop = noted["rows"]
+        if not 0 <= start < stop <= rows:
+            continue  # of damaged metadata; what is not noted is only not known
         environment = {name: value for name, value in noted.items() if name != "rows"}
         log.note(start, stop - start, log.index(environment))
 

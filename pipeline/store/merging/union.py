@@ -37,7 +37,7 @@ from pipeline.store.schema import (
     arrays,
     read_specs,
 )
-from pipeline.store.writer import StoreBuild, part_path, read_plan
+from pipeline.store.writer import MERGED, StoreBuild, part_path, read_plan
 
 Say = Callable[[str], None]
 _THREADS = 4
@@ -148,7 +148,7 @@ def _plan(joined: Joined) -> str:
         "sources": joined.sources,
         "episodes": [(one.digest, one.source, one.id) for one in joined.episodes],
     }
-    return "merge-" + hashlib.blake2b(json.dumps(said).encode(), digest_size=16).hexdigest()
+    return MERGED + hashlib.blake2b(json.dumps(said).encode(), digest_size=16).hexdigest()
 
 
 def _arrays(joined: Joined) -> dict[str, ArraySpec]:
