@@ -13,7 +13,7 @@ from pathlib import Path
 
 from distributed import Client
 
-from pipeline.errors import ConfigError
+from pipeline.errors import ConfigError, PipelineError
 from pipeline.extraction.connection import connected
 from pipeline.extraction.handout import Handout, Task
 from pipeline.extraction.job import Job, Piece, WrittenRows
@@ -106,6 +106,11 @@ def _plugged(client: Client, job: Job) -> Generator[None]:
         raise ConfigError(
             f"extract.workers: a worker cannot import what it should run ({error}). Install the "
             f"same version of this package there as on {socket.gethostname()}."
+        ) from None
+    except OSError as error:
+        raise PipelineError(
+            f"extract.workers: a worker died as it began, or the scheduler with it ({error}). Run "
+            "the same command again, with fewer extract.workers where memory is short."
         ) from None
     try:
         yield

@@ -183,10 +183,8 @@ def in_background(
         made: deque[Future[list[Made]]] = deque()
         try:
             while True:
-                wanted = max(threads + 1, ahead())
-                made.extend(
-                    pool.submit(make, piece) for piece in islice(pieces, wanted - len(made))
-                )
+                lacking = max(threads + 1, ahead()) - len(made)  # below 0 once `ahead` has shrunk
+                made.extend(pool.submit(make, piece) for piece in islice(pieces, max(0, lacking)))
                 if not made:
                     return
                 yield from made.popleft().result()
