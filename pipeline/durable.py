@@ -62,7 +62,7 @@ def replace_folder(folder: Path, write: Callable[[Path], None]) -> None:
     where `recover_folder` brings it back. Raises `DiskFull` with the old in place.
     """
     recover_folder(folder)
-    temporary, old = _beside(folder, "new"), _beside(folder, "old")
+    temporary = _beside(folder, "new")
     with disk_full_named(folder):
         temporary.mkdir(parents=True)
         try:
@@ -73,24 +73,47 @@ def replace_folder(folder: Path, write: Callable[[Path], None]) -> None:
         except BaseException:
             shutil.rmtree(temporary)
             raise
-    if folder.exists():
-        folder.rename(old)
-    temporary.rename(folder)
-    sync(folder.parent)
-    if old.exists():
-        shutil.rmtree(old)
+    put_in_place(temporary, folder)
 
 
 def recover_folder(folder: Path) -> None:
     """Undo or complete a `replace_folder` that a kill stopped."""
-    temporary, old = _beside(folder, "new"), _beside(folder, "old")
-    if old.exists():
-        if folder.exists():
-            shutil.rmtree(old)
-        else:
-            old.rename(folder)
+    recover(folder)
+    temporary = _beside(folder, "new")
     if temporary.exists():
         shutil.rmtree(temporary)
+
+
+def put_in_place(complete: Path, target: Path) -> None:
+    """Rename a complete folder to `target`; what was there is removed.
+
+    A kill leaves the old one or the new, for one instant under the name `<target>.old`, from where
+    `recover` brings it back.
+    """
+    old = _beside(target, "old")
+    if target.exists():
+        _discard(old)
+        target.rename(old)
+    complete.rename(target)
+    sync(target.parent)
+    _discard(old)
+
+
+def recover(target: Path) -> None:
+    """Undo or complete a `put_in_place` that a kill stopped."""
+    old = _beside(target, "old")
+    if target.exists():
+        _discard(old)
+    elif old.exists():
+        old.rename(target)
+
+
+def _discard(old: Path) -> None:
+    """Remove a folder that was replaced; of one behind a symbolic link, the link alone."""
+    if old.is_symlink():
+        old.unlink()
+    elif old.exists():
+        shutil.rmtree(old)
 
 
 def sync(path: Path) -> None:

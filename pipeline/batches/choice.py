@@ -12,7 +12,7 @@ from pipeline.errors import ConfigError
 from pipeline.store import FeatureStore
 from pipeline.store.archive import is_archive
 from pipeline.store.gather import WIDE
-from pipeline.store.mapping import available_bytes
+from pipeline.store.mapping import available_bytes, fitting
 from pipeline.store.mending import restore_command
 
 FeedName = Literal["auto", "mapped", "device", "compressed"]
@@ -67,14 +67,9 @@ def choose_feed(
     if feed == "auto" and device.type != "cuda":
         return Choice("mapped", frozenset(), f"feed: mapped (auto: training runs on the {device})")
     free = _free_bytes(device) if free is None else free
-    sizes = {name: store.tensor(name).nbytes for name in WIDE}
-    sizes = {name: size for name, size in sizes.items() if size}
-    left, fields = int(free * _DEVICE_SHARE), list[str]()
-    for name in sorted(sizes, key=lambda name: sizes[name]):
-        left -= sizes[name]
-        if left >= 0:
-            fields.append(name)
-    whole, taken = sum(sizes.values()), sum(sizes[name] for name in fields)
+    wide = {name: store.tensor(name) for name in WIDE if store.tensor(name).nbytes}
+    fields = fitting(wide, free, _DEVICE_SHARE)
+    whole, taken = sum(one.nbytes for one in wide.values()), sum(wide[one].nbytes for one in fields)
     room = (
         f"{taken / 2**30:.2f} of {whole / 2**30:.2f} GiB fit in {_DEVICE_SHARE:.0%} of the "
         f"{free / 2**30:.1f} GiB free on {device}"

@@ -18,7 +18,7 @@ import os
 import weakref
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,9 +101,16 @@ def available_bytes() -> int:
     raise OSError("/proc/meminfo has no MemAvailable; Linux since 3.14 has")
 
 
-def fitting(arrays: Mapping[str, NDArray[Any]], available: int) -> list[str]:
-    """Which maps memory has room for: the smallest ones first, as many as fit together."""
-    left = int(available * _MEMORY_SHARE)
+class Sized(Protocol):
+    """An array or a tensor."""
+
+    @property
+    def nbytes(self) -> int: ...
+
+
+def fitting(arrays: Mapping[str, Sized], available: int, share: float = _MEMORY_SHARE) -> list[str]:
+    """Which arrays fit in a share of these bytes together: as many as can, the smallest first."""
+    left = int(available * share)
     names: list[str] = []
     for name in sorted(arrays, key=lambda name: arrays[name].nbytes):
         left -= arrays[name].nbytes

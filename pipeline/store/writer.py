@@ -18,13 +18,12 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from pipeline.durable import disk_full_named, sync
+from pipeline.durable import disk_full_named, put_in_place, sync
 from pipeline.errors import StoreIncomplete
 from pipeline.store.chunks import ChunkFiles, row_checksums
 from pipeline.store.environments import EnvironmentLog
 from pipeline.store.mending import start_over
 from pipeline.store.metadata import note_metadata
-from pipeline.store.replacement import put_in_place
 from pipeline.store.schema import CHECKSUMS, FEATURES, INCREMENTAL, KEYS, ArraySpec
 
 MERGED = "merge-"

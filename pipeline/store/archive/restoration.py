@@ -10,7 +10,7 @@ import zarr
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.durable import disk_full_named, sync
+from pipeline.durable import disk_full_named, recover, sync
 from pipeline.errors import StoreMismatch
 from pipeline.store.archive.layout import open_array, rows_of, shard_path, shards
 from pipeline.store.archive.manifest import (
@@ -25,7 +25,6 @@ from pipeline.store.archive.manifest import (
 from pipeline.store.archive.source import checked_rows, chunk_crcs
 from pipeline.store.lock import build_lock
 from pipeline.store.mending import extract_command, gc_command
-from pipeline.store.replacement import recover
 from pipeline.store.schema import ArraySpec, chunk_paths, read_specs
 from pipeline.store.writer import StoreBuild, part_path, read_plan
 

@@ -19,7 +19,7 @@ import numpy as np
 import zarr
 from tqdm import tqdm
 
-from pipeline.durable import free_bytes
+from pipeline.durable import free_bytes, recover
 from pipeline.errors import ConfigError, DiskFull, StoreIncomplete, StoreMismatch
 from pipeline.store.integrity import verify
 from pipeline.store.lock import build_lock
@@ -28,7 +28,7 @@ from pipeline.store.merging.copying import axis_kind, copy_features, copy_stream
 from pipeline.store.merging.joining import Joined, join
 from pipeline.store.metadata import ATTRIBUTE, check_metadata
 from pipeline.store.reader import FeatureStore
-from pipeline.store.replacement import Inode, inode_of, recover, refuse_replaced
+from pipeline.store.replacement import Inode, inode_of, refuse_replaced
 from pipeline.store.schema import (
     FEATURES,
     INCREMENTAL,
