@@ -20,10 +20,13 @@
 `extraction`   recordings x vlm -> store, here or on dask workers
 `evaluation`   predictions -> figures of merit
 `datasets`     recordings and store as torch data sets, under the names of the old code
+`machine`      what this computer can do, and what to install
 `training`     one loop for every expert
 `probing`      which slots carry the action, by ridge regression
+`inspection`   what a recording or a store holds, and what looks wrong
 `finetuning`   the same loop with the model in front of the policy learning too
 `plots`        arrays -> pictures
+`report`       pictures, tables and words -> one self-contained page
 
 Imports go only upwards in this list, and never within {recordings, vlm, store, normalization,
 models}, but for `models.unified`, the policy with a live model in front;

@@ -15,10 +15,11 @@ TIERS = (
     {"recordings", "vlm", "store", "normalization", "models"},
     {"timeline", "simulation", "sampling", "checkpoint"},
     {"batches", "extraction"},
-    {"evaluation", "datasets"},
-    {"training", "probing"},
+    {"evaluation", "datasets", "machine"},
+    {"training", "probing", "inspection"},
     {"finetuning"},
     {"plots"},
+    {"report"},
 )
 """Rooms import from tiers above theirs in this list, and from themselves."""
 
@@ -32,6 +33,7 @@ ONLY_IN = {
     "numcodecs": {"store"},
     "yaml": {"config"},
     "matplotlib": {"plots", "report"},
+    "plotly": {"plots", "report"},
     "jinja2": {"plots", "report"},
 }
 WITHOUT_TORCH = {"recordings", "timeline"}

@@ -4,10 +4,11 @@ Every section is a frozen model that forbids unknown keys, so that a misspelt ke
 not a default; all errors are reported at once. `stage_one` has the sections of the demo,
 the data and extraction, `stage_two` those of training and evaluation, `policy` those of the
 policy's parts, `finetune` that of tuning the model itself, `stores` those of what is done with
-stores; `load` reads the file, `keys` describes it.
+stores, `inspect` that of looking at both; `load` reads the file, `keys` describes it.
 """
 
 from pipeline.config.finetune import FinetuneParams, TuningParams
+from pipeline.config.inspect import InspectParams
 from pipeline.config.keys import described_keys
 from pipeline.config.load import load_params
 from pipeline.config.policy import (
@@ -59,6 +60,7 @@ __all__ = [
     "FinetuneParams",
     "FlowMatchingParams",
     "FusionStrategy",
+    "InspectParams",
     "ModelType",
     "Params",
     "Pooling",

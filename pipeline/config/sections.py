@@ -3,6 +3,7 @@
 from pydantic import model_validator
 
 from pipeline.config.finetune import FinetuneParams
+from pipeline.config.inspect import InspectParams
 from pipeline.config.section import Section
 from pipeline.config.stage_one import DataParams, DemoParams, ExtractParams, VLMParams
 from pipeline.config.stage_two import CompareParams, EvaluateParams, TrainHeadParams
@@ -24,6 +25,7 @@ class Params(Section):
     archive: ArchiveParams = ArchiveParams()
     probe: ProbeParams = ProbeParams()
     stores: StoresParams = StoresParams()
+    inspect: InspectParams = InspectParams()
 
     @model_validator(mode="after")
     def _mixture_names_sources(self) -> "Params":

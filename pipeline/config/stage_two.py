@@ -17,6 +17,7 @@ from pipeline.config.section import Fraction, Section, Seed
 
 ModelType = Literal["regression", "diffusion", "flow_matching"]
 FusionStrategy = Literal["concat", "cross_attention", "gated", "none"]
+Logger = Literal["report", "tensorboard", "wandb"]
 Weight = Annotated[float, Field(ge=0)]
 
 
@@ -121,6 +122,11 @@ class TrainHeadParams(Section):
     """Folder of the best and the last checkpoint."""
     logs: Path = Path("reports/train_head")
     """Folder of the curves."""
+    loggers: tuple[Logger, ...] = ("report",)
+    """Who shows the curves while it trains, beside the files that DVC plots: `report` a page in
+    `logs`, `tensorboard` event files in `<logs>.tensorboard`, `wandb` Weights & Biases."""
+    wandb_project: str = "vla-feature-cache"
+    """Where Weights & Biases puts the run; its own environment variables decide the rest."""
 
     @field_validator("output", "logs")
     @classmethod

@@ -1,0 +1,33 @@
+"""Section of looking: at recordings, and at a store."""
+
+from pathlib import Path
+
+from pydantic import Field
+
+from pipeline.config.section import Section, Seed
+from pipeline.config.stage_one import RecordingFormat
+
+
+class InspectParams(Section):
+    """What is looked at, and how much of it is shown."""
+
+    path: str | None = None
+    """A recording, a folder or glob of recordings, or a store; the recordings of `data.sources`
+    where null. Ticks, views and the feature spec follow the sections `data` and `vlm`."""
+    format: RecordingFormat = "auto"
+    """Of the recordings at `path`."""
+    episodes: int = Field(default=3, ge=1)
+    """Episodes drawn in detail, evenly spread and those with the worst findings first; every one is
+    checked."""
+    ticks: int = Field(default=5, ge=1)
+    """Instants of an episode at which its views are shown."""
+    samples: int = Field(default=5, ge=1)
+    """Training samples shown side by side."""
+    points: int = Field(default=4000, ge=100)
+    """VL rows of a store that pictures show at most, evenly spread."""
+    duplicate_similarity: float = Field(default=0.9999, gt=0, le=1)
+    """Cosine similarity, of features less their mean, from which VL rows are near-duplicates."""
+    seed: Seed = 0
+    """Of the choice of samples."""
+    output: Path = Path("reports/inspect")
+    """Folder of the page and its pictures."""

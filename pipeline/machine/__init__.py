@@ -1,0 +1,1 @@
+"""What this computer can do for the pipeline, and what to install where it cannot."""

@@ -1,0 +1,1 @@
+"""Pictures, tables and words -> one page that needs nothing beside itself."""

@@ -1,0 +1,111 @@
+"""What a page is made of, before it is HTML."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True)
+class Text:
+    """A paragraph of plain words; backticks make code."""
+
+    words: str
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of cells under column heads; numbers stand right, in as many digits as they deserve."""
+
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Any]]
+    caption: str = ""
+    strong: frozenset[int] = frozenset()
+    """Rows that stand out."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure: in the page as SVG that follows light and dark, beside it as `<name>.png`."""
+
+    name: str
+    """File stem, once in a report."""
+    caption: str
+    """What is seen and how to read it; also what a screen reader says."""
+    draw: Callable[[], Figure]
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A plotly figure that can be zoomed and hovered, and the same figure for paper."""
+
+    picture: Picture
+    """Writes the PNG, and stands in where scripts are off."""
+    figure: Any
+    """`plotly.graph_objects.Figure`."""
+
+
+@dataclass(frozen=True)
+class Notice:
+    """One thing that looks wrong: how bad, where (episode, stream, time), and what."""
+
+    severity: Literal["error", "warning"]
+    kind: str
+    where: str
+    message: str
+
+
+@dataclass(frozen=True)
+class Notices:
+    """What looks wrong, worst first; `none` is said where there is nothing."""
+
+    notices: Sequence[Notice]
+    none: str
+
+
+@dataclass(frozen=True)
+class Run:
+    """Consecutive tokens of one kind: `text` as the model has them, `note` such as "48 tokens"."""
+
+    text: str
+    kind: Literal["text", "special", "image"]
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Tokens:
+    """A prompt in reading order, special tokens and folded runs of image tokens marked."""
+
+    runs: Sequence[Run]
+
+
+@dataclass(frozen=True)
+class Document:
+    """A nested document (feature spec, params), folded, as indented YAML-like lines."""
+
+    title: str
+    content: Mapping[str, Any]
+
+
+Block = Text | Table | Picture | Chart | Notices | Tokens | Document
+
+
+@dataclass(frozen=True)
+class Section:
+    """A headed part of a page; `blocks` in reading order, `parts` one level below."""
+
+    title: str
+    blocks: Sequence[Block]
+    parts: Sequence["Section"] = ()
+
+
+@dataclass(frozen=True)
+class Report:
+    """A page: what it is of in one line, the figures that matter most, and its sections."""
+
+    title: str
+    summary: str
+    tiles: Sequence[tuple[str, str]] = ()
+    """(label, value), shown large at the top."""
+    sections: Sequence[Section] = field(default_factory=tuple)
