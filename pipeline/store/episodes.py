@@ -130,3 +130,8 @@ def episode_arrays(
         "episode/text": np.frombuffer(b"".join(one.text for one in episodes), np.uint8),
     }
     return arrays | {f"episode/{kind}_start": edge for kind, edge in edges.items()}
+
+
+def episode_of(arrays: Mapping[str, NDArray[Any]], ticks: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The index of the episode of each of these store-global ticks."""
+    return np.searchsorted(arrays["episode/tick_start"], ticks, side="right") - 1

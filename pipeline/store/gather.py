@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pipeline.store.batch import Batch
+from pipeline.store.episodes import episode_of
 from pipeline.store.mapping import available_bytes, fitting, read_at_random, will_need
 
 # OpenMP's threads do not survive a fork, and a forked process that waits for them waits for ever.
@@ -83,7 +84,7 @@ class Gatherer:
 
         See `FeatureStore.gather`.
         """
-        episode = np.searchsorted(self._arrays["episode/tick_start"], tick, side="right") - 1
+        episode = episode_of(self._arrays, tick)
         return Selection(
             {
                 "features": self._features(batch, tick, episode, feature_lag, variant),

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pipeline.errors import StoreIncomplete, StoreMismatch
 from pipeline.store.batch import Batch
-from pipeline.store.episodes import Episode, read_episodes
+from pipeline.store.episodes import Episode, episode_of, read_episodes
 from pipeline.store.gather import Gatherer, Selection
 from pipeline.store.mapping import map_flat, populate
 from pipeline.store.mending import extract_command, mend, restore_command, start_over
@@ -136,7 +136,7 @@ class FeatureStore:
 
     def episode_of(self, ticks: NDArray[np.int64]) -> NDArray[np.int64]:
         """The index of the episode of each of these store-global ticks."""
-        return np.searchsorted(self._arrays["episode/tick_start"], ticks, side="right") - 1
+        return episode_of(self._arrays, ticks)
 
     def gather(
         self,
