@@ -11,9 +11,9 @@ from pipeline.config.stage_one import RecordingFormat
 class InspectParams(Section):
     """What is looked at, and how much of it is shown."""
 
-    path: str | None = None
-    """A recording, a folder or glob of recordings, or a store; the recordings of `data.sources`
-    where null. Ticks, views and the feature spec follow the sections `data` and `vlm`."""
+    path: str | tuple[str, ...] | None = None
+    """Recordings, folders or globs of them, or a store; the recordings of `data.sources` where
+    null or none. Ticks, views and the feature spec follow the sections `data` and `vlm`."""
     format: RecordingFormat = "auto"
     """Of the recordings at `path`."""
     episodes: int = Field(default=3, ge=1)
@@ -30,4 +30,5 @@ class InspectParams(Section):
     seed: Seed = 0
     """Of the choice of samples."""
     output: Path = Path("reports/inspect")
-    """Folder of the page and its pictures."""
+    """Folder of the page and its pictures. Where it is not given, what `path` names has a folder of
+    its own in reports/inspect, so that one inspection leaves another's page alone."""

@@ -12,7 +12,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.recordings import CameraStream, RecordedAction, Recording, Stream
-from pipeline.timeline import Timeline
+from pipeline.timeline import ActionRotation, Timeline
+
+Severity = Literal["error", "warning"]
+
+
+KINDS = {
+    "unreadable": "a file is missing, damaged or contradicts itself",
+    "no ticks": "the streams leave no instant to train on",
+    "embodiment": "channels are not those of the other recordings",
+    "missing": "something is not there that should be",
+    "dead camera": "frames of one colour",
+    "duplicate frames": "a camera that stands still while the scene does not",
+    "flat channel": "a channel that never varies, beside others that do",
+    "frozen": "readings that repeat, all channels of them",
+    "saturated": "readings clipped at the end of their range",
+    "gap": "a clock with no entry for long",
+    "clock jump": "a step longer than the rest of the clock",
+    "repeated times": "entries stamped with one time",
+    "rate": "more or fewer entries a second than the recording says",
+    "frame count": "fewer frames than expected",
+    "lost ticks": "a stream that begins late or ends early",
+    "old frames": "a camera slower than the ticks need it",
+    "action outlier": "an action far beyond all others",
+}
+"""What can be found in a recording, and what each means."""
 
 
 @dataclass(frozen=True)
@@ -20,14 +44,13 @@ class Flaw:
     """Something that looks wrong, and where."""
 
     kind: str
-    """`unreadable`, `dead camera`, `flat channel`, `saturated`, `duplicate frames`, `gap`,
-    `clock jump`, …"""
-    severity: Literal["error", "warning"]
+    """Of a recording, one of `KINDS`."""
+    severity: Severity
     """An error keeps extraction from using the episode; a warning does not."""
     source: str
     episode: str
     stream: str
-    """`view View1`, `sensor`, `state`, …"""
+    """`view View1`, `sensor`, `state`, …; `episode` is all of it."""
     start_s: float | None
     """None where it is all of the stream."""
     stop_s: float | None
@@ -53,6 +76,47 @@ class EpisodeView:
     flaws: tuple[Flaw, ...]
     zero: float
     """The first instant of all clocks."""
+    instruction: str | None = None
+    """None where it could not be read; `recording.instruction` would raise."""
+    action_rotation: ActionRotation = "rotvec"
+    """How `timeline` derived actions from poses."""
+
+    @property
+    def streams(self) -> dict[str, Stream]:
+        """The streams that could be read, by name: sensor, state, poses, action."""
+        found = {
+            "sensor": self.sensor,
+            "state": self.state,
+            "poses": self.poses,
+            "action": self.action,
+        }
+        return {name: stream for name, stream in found.items() if stream is not None}
+
+    @property
+    def clocks(self) -> dict[str, NDArray[np.float64]]:
+        """The times of all that was recorded: `view View1`, …, `sensor`, `state`, …"""
+        cameras = {f"view {view}": camera.time for view, camera in self.cameras.items()}
+        return cameras | {name: stream.time for name, stream in self.streams.items()}
+
+    @property
+    def duration_s(self) -> float:
+        """From the first to the last instant of all clocks; 0 where nothing could be read."""
+        return (
+            max((float(time[-1]) for time in self.clocks.values()), default=self.zero) - self.zero
+        )
+
+    def flaw(
+        self,
+        kind: str,
+        stream: str,
+        message: str,
+        start_s: float | None = None,
+        stop_s: float | None = None,
+        severity: Severity = "warning",
+    ) -> Flaw:
+        """A flaw of this episode; the times are on its own clock."""
+        one = self.recording
+        return Flaw(kind, severity, one.source, one.id, stream, start_s, stop_s, message)
 
 
 @dataclass(frozen=True)
@@ -68,12 +132,13 @@ class Clock:
     """When a stream was sampled."""
 
     name: str
-    """`View1`, `sensor`, `state`, `poses`, `action`, `ticks`, `VL rows`."""
+    """`View1`, `sensor`, `state`, `poses`, `action`, `ticks`, `VL rows`; `poses` only where they
+    have a clock of their own."""
     kind: Literal["camera", "stream", "tick", "vl_row"]
     time: NDArray[np.float64]
     """(entry,) s."""
     rate_hz: float
-    """1 / the median step; NaN for fewer than two entries."""
+    """1 / the usual step (`clocks.usual_step`); NaN for fewer than two entries."""
     jitter_s: float
     """Standard deviation of the steps that are no gaps; NaN for fewer than three entries."""
     gaps: tuple[Gap, ...]

@@ -1,0 +1,97 @@
+"""When everything was sampled: rates, jitter, gaps.
+
+A step is a gap from `GAP_FACTOR` usual steps: one entry lost from a jittering clock (two steps and
+the jitter) is none, two lost in a row are.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.inspection.facts import Clock, EpisodeView, Gap
+
+GAP_FACTOR = 2.5
+"""Usual steps from which a step is a gap."""
+
+_BURSTS = 0.5
+"""Share of the mean step under which a median step means stamps in bursts."""
+_LONGEST = 0.02
+"""Share of the steps that may be gaps and are left out of the mean."""
+
+
+def clocks(view: EpisodeView) -> tuple[Clock, ...]:
+    """Every clock of the episode: cameras, streams, then ticks and VL rows.
+
+    Poses that stand at the state's times have no clock of their own and are left out.
+    """
+    found = [_clock(name, "camera", camera.time) for name, camera in view.cameras.items()]
+    for name, stream in view.streams.items():
+        same = view.state is not None and np.array_equal(view.state.time, stream.time)
+        if name != "poses" or not same:
+            found.append(_clock(name, "stream", stream.time))
+    if view.timeline is not None:
+        found.append(_clock("ticks", "tick", view.timeline.time))
+        found.append(_clock("VL rows", "vl_row", view.timeline.vl_time))
+    return tuple(found)
+
+
+def distinct_clocks(view: EpisodeView) -> Mapping[str, NDArray[np.float64]]:
+    """The recorded clocks, those that are equal once, under all their names.
+
+    So a gap in the rows of a LeRobot episode is one gap and not one of each view and stream.
+    """
+    groups: list[tuple[list[str], NDArray[np.float64]]] = []
+    for name, time in view.clocks.items():
+        for names, same in groups:
+            if np.array_equal(same, time):
+                names.append(name)
+                break
+        else:
+            groups.append(([name], time))
+    return {", ".join(names): time for names, time in groups}
+
+
+def usual_step(time: NDArray[np.float64]) -> float:
+    """The step of a clock in seconds, NaN for fewer than two entries.
+
+    The median; where entries are stamped in bursts, which have steps of nothing and long ones, the
+    mean of all steps but the longest 2 %, which may be gaps.
+    """
+    return _usual(time)[0]
+
+
+def gaps(time: NDArray[np.float64]) -> tuple[Gap, ...]:
+    """Where a clock skips; empty for fewer than three entries, which have no usual step.
+
+    Between bursts, from `GAP_FACTOR` times the steps that there are between bursts.
+    """
+    if len(time) < 3:
+        return ()
+    places = np.flatnonzero(np.diff(time) >= GAP_FACTOR * _usual(time)[1])
+    return tuple(Gap(float(time[place]), float(time[place + 1])) for place in places)
+
+
+def _usual(time: NDArray[np.float64]) -> tuple[float, float]:
+    """The usual step, and the longest that is usual."""
+    steps = np.sort(np.diff(time))
+    if not len(steps):
+        return float("nan"), float("nan")
+    median = float(np.median(steps))
+    kept = steps[: max(1, len(steps) - int(np.ceil(_LONGEST * len(steps))))]
+    mean = float(kept.mean())
+    return (mean, float(kept[-1])) if median < _BURSTS * mean else (median, median)
+
+
+def _clock(name: str, kind: str, time: NDArray[np.float64]) -> Clock:
+    step, longest = _usual(time)
+    steps = np.diff(time)
+    small = steps[steps < GAP_FACTOR * longest]
+    return Clock(
+        name=name,
+        kind=kind,  # pyright: ignore[reportArgumentType]
+        time=time,
+        rate_hz=1 / step if step > 0 else float("nan"),
+        jitter_s=float(small.std()) if len(small) > 1 else float("nan"),
+        gaps=gaps(time),
+    )

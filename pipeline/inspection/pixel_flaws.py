@@ -1,0 +1,200 @@
+"""What looks wrong in the pictures: frames that cannot be decoded, dead and frozen cameras.
+
+What is looked at, so that a long episode costs no more than a short one:
+- JPEG files: all of them for duplicates (two files are the same picture where their bytes are);
+  every frame that a VL row sees is checked at an eighth of its size, as extraction does; `RUNS`
+  pairs of neighbours, evenly spread, are decoded whole.
+- Videos and pictures in rows: all frames of an episode of up to `MOST_FRAMES`, else `RUNS` runs of
+  neighbours, evenly spread. The packets of a whole video are read in any case.
+
+Equal pictures prove a frozen camera only where its pictures have noise: where most pixels differ
+between neighbours, also between those just before and after equal ones. The pictures of a
+simulation, and of a video whose encoder skips what stands still, are equal whenever nothing moves;
+there a camera counts as frozen when every other one of the episode sees something move meanwhile,
+and a single such camera only when it never changes at all.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import RecordingError
+from pipeline.inspection.facts import EpisodeView, Flaw
+from pipeline.inspection.runs import runs
+from pipeline.recordings import CameraStream
+from pipeline.recordings.jpeg import JpegCamera
+
+MOST_FRAMES, RUNS = 120, 12
+ONE_COLOUR = 2.0
+"""Standard deviation of a frame's values, of 255, up to which it shows nothing."""
+DUPLICATES, DUPLICATE_SHARE = 3, 0.1
+"""Equal pairs in a row that are a freeze of a camera with noise, and the share of all pairs from
+which single ones are told."""
+STILL_PAIRS, MOVING_PAIRS = 5, 20
+"""Equal pairs in a row, and how many differing ones every other view has meanwhile, that are a
+freeze where pictures have no noise."""
+NOISY = 0.3
+"""Share of the pixels that differ between neighbours where pictures have noise, at least in nine
+of ten pairs."""
+
+
+@dataclass(frozen=True)
+class _Looked:
+    """What was seen of a camera."""
+
+    index: NDArray[np.int64]
+    """(frame,) numbers of the frames that were compared."""
+    equal: NDArray[np.bool_]
+    """(frame - 1,) whether a frame is that before."""
+    one_colour: dict[int, float]
+    """Mean value of each decoded frame that shows nothing."""
+    decoded: int
+    noisy: bool
+
+
+def pixel_flaws(view: EpisodeView) -> Iterator[Flaw]:
+    """Flaws of kind unreadable, dead camera and duplicate frames."""
+    looked: dict[str, _Looked] = {}
+    for name, camera in view.cameras.items():
+        try:
+            looked[name] = _look(view, name, camera)
+        except (RecordingError, OSError) as error:
+            yield view.flaw("unreadable", f"view {name}", str(error), severity="error")
+    for name, seen in looked.items():
+        yield from _dead(view, name, seen)
+        if len(seen.one_colour) < seen.decoded:
+            yield from _duplicates(view, name, looked)
+
+
+def _look(view: EpisodeView, name: str, camera: CameraStream) -> _Looked:
+    frames = len(camera.time)
+    if isinstance(camera, JpegCamera):
+        if view.timeline is not None:
+            camera.check(np.unique(view.timeline.frames[name]).tolist())
+        index = _neighbours(frames, 2 * RUNS)
+        compared, equal = np.arange(frames), _equal_files(camera)
+    else:
+        index = _neighbours(frames, MOST_FRAMES)
+        compared, equal = index, np.zeros(max(0, len(index) - 1), np.bool_)
+    one_colour: dict[int, float] = {}
+    differing: list[float] = []
+    before: NDArray[np.uint8] | None = None
+    for place, frame in enumerate(camera.read(index.tolist())):
+        if float(frame.std()) <= ONE_COLOUR:
+            one_colour[int(index[place])] = float(frame.mean())
+        if before is not None and before.shape == frame.shape:
+            differs = float((frame != before).any(axis=2).mean())
+            if compared is index:
+                equal[place - 1] = differs == 0
+            if differs and index[place] == index[place - 1] + 1:
+                differing.append(differs)
+        before = frame
+    noisy = bool(differing) and float(np.percentile(differing, 10)) > NOISY
+    if noisy and compared is not index:
+        noisy = min(_beside(camera, equal), default=1.0) > NOISY
+    return _Looked(compared, equal, one_colour, len(index), noisy)
+
+
+def _beside(camera: CameraStream, equal: NDArray[np.bool_]) -> Iterator[float]:
+    """Share of pixels that differ just before and just after the longest runs of equal pairs."""
+    longest = sorted(runs(equal), key=lambda run: run[0] - run[1])[:RUNS]
+    for first, last in longest:
+        for place in (first - 1, last):
+            if 0 <= place < len(equal):
+                before, after = camera.read([place, place + 1])
+                yield float((before != after).any(axis=2).mean())
+
+
+def _neighbours(frames: int, most: int) -> NDArray[np.int64]:
+    """All frames where they are few, else `RUNS` runs of neighbours, evenly spread."""
+    if frames <= most:
+        return np.arange(frames)
+    length = most // RUNS
+    starts = np.linspace(0, frames - length, RUNS).astype(np.int64)
+    return np.unique(starts[:, None] + np.arange(length))
+
+
+def _equal_files(camera: JpegCamera) -> NDArray[np.bool_]:
+    """(frame - 1,) whether files are the same; only those of equal size are read."""
+    sizes = np.array([path.stat().st_size for path in camera.paths])
+    equal = sizes[1:] == sizes[:-1]
+    for place in np.flatnonzero(equal):
+        first, second = camera.paths[place], camera.paths[place + 1]
+        equal[place] = first.read_bytes() == second.read_bytes()
+    return equal
+
+
+def _dead(view: EpisodeView, name: str, seen: _Looked) -> Iterator[Flaw]:
+    if not seen.one_colour:
+        return
+    time = view.cameras[name].time
+    dead = sorted(seen.one_colour)
+    whole = len(dead) == seen.decoded
+    start, stop = float(time[dead[0]]), float(time[dead[-1]])
+    level = float(np.mean(list(seen.one_colour.values())))
+    where = "all" if whole else f"{len(dead)} of the"
+    said = f"{where} {seen.decoded} frames looked at are of one colour (mean {level:.0f} of 255)"
+    if not whole:
+        said += f", the first at {start - view.zero:.2f} s, the last at {stop - view.zero:.2f} s"
+    span = (None, None) if whole else (start, stop)
+    yield view.flaw("dead camera", f"view {name}", f"{said}; expected a picture", *span)
+
+
+def _duplicates(view: EpisodeView, name: str, looked: Mapping[str, _Looked]) -> Iterator[Flaw]:
+    seen = looked[name]
+    time, pairs = view.cameras[name].time, len(seen.equal)
+    if pairs and seen.equal.all() and pairs >= STILL_PAIRS:
+        yield view.flaw(
+            "duplicate frames",
+            f"view {name}",
+            f"all {len(time)} frames are one picture; expected a camera that runs",
+        )
+        return
+    told = 0
+    for first, last in runs(seen.equal):
+        start, stop = (int(seen.index[place]) for place in (first, last))
+        frozen = (
+            last - first >= DUPLICATES
+            if seen.noisy
+            else last - first >= STILL_PAIRS
+            and _others_move(view, name, looked, float(time[start]), float(time[stop]))
+        )
+        if frozen:
+            told += last - first
+            yield view.flaw(
+                "duplicate frames",
+                f"view {name}",
+                f"frames {start} to {stop} are one picture, {time[stop] - time[start]:.2f} s from "
+                f"{time[start] - view.zero:.2f} s; "
+                + ("elsewhere no frame is that before" if seen.noisy else "other views move"),
+                float(time[start]),
+                float(time[stop]),
+            )
+    single = int(seen.equal.sum()) - told
+    if seen.noisy and single >= DUPLICATES and single > DUPLICATE_SHARE * pairs:
+        yield view.flaw(
+            "duplicate frames",
+            f"view {name}",
+            f"{single} of {pairs} frames compared are the picture before, here and there; "
+            "the camera is slower than its frames are stamped, or frames were stored twice",
+        )
+
+
+def _others_move(
+    view: EpisodeView, name: str, looked: Mapping[str, _Looked], start_s: float, stop_s: float
+) -> bool:
+    """Whether every other camera's pictures change between two instants, and there is another."""
+    others = [other for other in looked if other != name]
+    return bool(others) and all(
+        _differing(looked[other], view.cameras[other].time, start_s, stop_s) >= MOVING_PAIRS
+        for other in others
+    )
+
+
+def _differing(seen: _Looked, time: NDArray[np.float64], start_s: float, stop_s: float) -> int:
+    """How many neighbours among the frames compared differ within a span."""
+    compared = time[seen.index]
+    inside = (compared[:-1] >= start_s) & (compared[1:] <= stop_s)
+    return int(np.count_nonzero(inside & ~seen.equal))
