@@ -1,0 +1,111 @@
+"""Pictures of a store show what was found, for the smallest store and for one with flaws."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from pipeline.config import InspectParams
+from pipeline.inspection.store import StoreView, inspect_store
+from pipeline.plots import store as pictures
+from pipeline.plots import store_features as feature_pictures
+from pipeline.plots.style import RC, write
+from pipeline.store import FeatureStore
+
+ROWS = 10
+EVERY: dict[str, Callable[[StoreView], Figure]] = {
+    "coverage": pictures.coverage,
+    "ages": pictures.ages,
+    "sizes": pictures.sizes,
+    "norms": feature_pictures.norms,
+    "projection_episode": lambda view: feature_pictures.projection(view, "episode"),
+    "projection_progress": lambda view: feature_pictures.projection(view, "progress"),
+    "likeness": feature_pictures.likeness,
+}
+
+
+@pytest.fixture(scope="module")
+def flawed(tiny_store, tmp_path_factory) -> StoreView:
+    """Episode 4 shows what episode 1 shows, episode 0 has no view, and one feature is huge."""
+    path: Path = tiny_store(tmp_path_factory.mktemp("flawed"), sensor_channels=40, slots=24)
+    store = FeatureStore.open(path)
+
+    def file(name: str) -> np.ndarray:
+        like = store.array(name)
+        chunk = path / name / "c" / "/".join("0" * like.ndim)
+        return np.memmap(chunk, like.dtype, "r+", shape=like.shape)
+
+    features = file("vl/features")
+    features[4 * ROWS : 5 * ROWS] = features[ROWS : 2 * ROWS]
+    features[33, 2] *= 50
+    file("vl/frame_time")[:ROWS] = np.nan
+    return inspect_store(path, InspectParams())
+
+
+@pytest.fixture(scope="module")
+def smallest(tiny_store, tmp_path_factory) -> StoreView:
+    """One episode of one tick, no sensor and no state."""
+    folder = tmp_path_factory.mktemp("smallest")
+    sizes = {"slots": 1, "sensor_channels": 0, "state_dim": 0}
+    return inspect_store(tiny_store(folder, episodes=1, ticks=1, **sizes), InspectParams())
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_every_picture_is_drawn(flawed, tmp_path, name):
+    (path,) = write(tmp_path, {f"{name}.png": lambda: EVERY[name](flawed)})
+    assert path.stat().st_size > 5000
+
+
+@pytest.mark.parametrize("name", [name for name in EVERY if name != "likeness"])
+def test_the_smallest_store_can_be_drawn(smallest, tmp_path, name):
+    write(tmp_path, {f"{name}.png": lambda: EVERY[name](smallest)})
+
+
+def test_coverage_marks_what_is_absent(flawed):
+    with mpl.rc_context(RC):
+        above, below = pictures.coverage(flawed).axes
+    assert sum(len(one) for one in above.containers) == 6
+    shown = np.asarray(below.collections[0].get_array()).reshape(3, 6)
+    assert shown.tolist() == [[2] * 6, [2] * 6, [0, 2, 2, 2, 2, 2]]
+    assert [label.get_text() for label in below.get_yticklabels()] == ["sensor", "state", "View1"]
+
+
+def test_ages_are_shares_of_all_ticks(flawed):
+    with mpl.rc_context(RC):
+        (axis,) = pictures.ages(flawed).axes
+    assert sum(bar.get_height() for bar in axis.containers[0]) == pytest.approx(100)
+
+
+def test_sizes_are_of_the_whole_store(flawed):
+    with mpl.rc_context(RC):
+        (axis,) = pictures.sizes(flawed).axes
+    total = sum(bar.get_width() for bar in axis.containers[0])
+    assert total * 2**20 == pytest.approx(flawed.disk_bytes)
+
+
+def test_pairs_that_are_alike_are_framed(flawed):
+    with mpl.rc_context(RC):
+        axis = feature_pictures.likeness(flawed).axes[0]
+    framed = {
+        (int(line.get_xdata()[0]), int(line.get_ydata()[0]))
+        for line in axis.lines
+        if line.get_marker() == "s"
+    }
+    assert framed == {(1, 4), (4, 1)}
+
+
+def test_every_row_is_a_dot(flawed):
+    with mpl.rc_context(RC):
+        axis = feature_pictures.projection(flawed, "progress").axes[0]
+    assert len(axis.collections[0].get_offsets()) == 6 * ROWS
+
+
+def test_numbered_channels_are_drawn_together(flawed):
+    (run,) = pictures.numbered(flawed)
+    assert (run[0].name, run[-1].name, len(run)) == ("sensor_0", "sensor_39", 40)
+    with mpl.rc_context(RC):
+        (axis,) = pictures.wide_channels(flawed).axes
+    assert len(axis.lines[0].get_xdata()) == 40
