@@ -162,7 +162,7 @@ def _scale(
 
 
 def _map(axis: Axes, grid: np.ndarray, limits: tuple[float, float]) -> AxesImage:
-    colours = mpl.colormaps["viridis"].with_extremes(bad="#eeeeee")
+    colours = mpl.colormaps["viridis"].with_extremes(bad="none")
     axis.grid(visible=False)
     return axis.imshow(grid, cmap=colours, vmin=limits[0], vmax=limits[1], aspect="auto")
 

@@ -1,7 +1,8 @@
 """What every picture shares: colours, fonts, and how it becomes a file.
 
 The same numbers give the same bytes. Every way of acting keeps its colour, marker and line in all
-pictures (Okabe and Ito's palette, which colour-blind readers can tell apart).
+pictures (Okabe and Ito's palette, which colour-blind readers can tell apart). What is neutral is
+drawn in `INK` or `GRID` alone: a page exchanges them for its own colours, in light and in dark.
 """
 
 from collections.abc import Callable, Mapping
@@ -27,15 +28,29 @@ STYLES: dict[str, dict[str, Any]] = {
     "mean_action": {"color": "#009E73", "marker": "^", "linestyle": "-."},
     "repeat_last": {"color": "#CC79A7", "marker": "D", "linestyle": ":"},
 }
-RECORDED = "#333333"
+INK = "#333333"
+"""Text, axes, and whatever else is black on white paper."""
+GRID = "#dddddd"
+"""Grid lines, and areas behind data."""
+RECORDED = INK
+PALETTE = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
+"""Of what has no colour of its own; Okabe and Ito's, less what is lost on white or on black."""
 RC: dict[Any, Any] = {
     "figure.constrained_layout.use": True,
+    "text.color": INK,
+    "axes.edgecolor": INK,
+    "axes.labelcolor": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "hatch.color": INK,
+    # Else the ids inside an SVG are drawn by chance.
+    "svg.hashsalt": "pipeline",
     "font.size": 10,
     "axes.titlesize": 11,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
-    "grid.color": "#dddddd",
+    "grid.color": GRID,
     "axes.axisbelow": True,
     "legend.frameon": False,
 }

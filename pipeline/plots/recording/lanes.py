@@ -1,0 +1,222 @@
+"""The picture of all clocks of an episode: over its whole length, and a stretch from near."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch, Rectangle
+from numpy.typing import NDArray
+
+from pipeline.inspection.facts import Clock, EpisodeView
+from pipeline.plots.recording import reuse
+from pipeline.plots.recording.drawing import GAP, words
+from pipeline.plots.recording.thinning import usual_step, worst_steps
+from pipeline.plots.style import GRID, INK, PALETTE, canvas
+
+LANE_COLOURS = {"camera": PALETTE[0], "stream": PALETTE[4], "tick": INK, "vl_row": PALETTE[2]}
+"""By kind of clock."""
+_SINGLE, _SINGLE_NEAR = 400, 240
+"""Entries that are still shown one by one: over the whole episode, and from near."""
+_BINS = 500
+_GAP_LABELS = 8
+"""Gaps of a lane whose length is written, the longest ones."""
+_ROWS_ZOOMED = 5
+_LEAST_ZOOM_S = 0.5
+_OVERVIEW = (
+    "the whole episode (grey: the stretch below). A dense clock is a band as high as its usual "
+    "step over the longest one there"
+)
+_HALF = 0.36
+"""Of a lane: how far its marks reach up and down."""
+
+
+def clock_lanes(view: EpisodeView, clocks: Sequence[Clock]) -> Figure:
+    """A lane a clock: over the whole episode, and about five VL rows from near.
+
+    From near, lines lead from each frame to the VL row that took it, and brackets from the row to
+    the ticks that reuse it, numbered by how many ticks old it is for them. Streams that were
+    sampled by one clock share a lane.
+    """
+    shown = in_reading_order(clocks)
+    if not shown:
+        return words("The episode has no clock that could be read.")
+    near = zoom(view, shown)
+    heights = [0.34 * len(shown) + 0.3, 0.46 * len(shown) + 0.5]
+    figure = canvas(11.0, sum(heights) + 1.6)
+    whole, detail = figure.subplots(2, 1, gridspec_kw={"height_ratios": heights})
+    _overview(whole, shown, view.zero, near)
+    _detail(detail, view, shown, near)
+    _legend(figure, view)
+    return figure
+
+
+def same_clock_once(clocks: Sequence[Clock]) -> list[Clock]:
+    """The clocks, streams with the very same times as one whose name lists theirs."""
+    found: list[Clock] = []
+    for clock in clocks:
+        same = next(
+            (
+                index
+                for index, one in enumerate(found)
+                if one.kind == clock.kind == "stream" and np.array_equal(one.time, clock.time)
+            ),
+            None,
+        )
+        if same is None:
+            found.append(clock)
+        else:
+            found[same] = replace(found[same], name=f"{found[same].name}, {clock.name}")
+    return found
+
+
+def zoom(view: EpisodeView, clocks: Sequence[Clock]) -> tuple[float, float]:
+    """The stretch (start, stop) in s that is shown from near: five VL rows, around a gap if any.
+
+    The first gap of a camera comes before those of other streams; without one, the middle.
+    """
+    line = view.timeline
+    start = min(float(clock.time[0]) for clock in clocks)
+    stop = max(float(clock.time[-1]) for clock in clocks)
+    step = usual_step(line.vl_time) if line is not None else 0.0
+    width = max(_ROWS_ZOOMED * step, _LEAST_ZOOM_S) if step else 1.5
+    by_kind = sorted(clocks, key=lambda clock: clock.kind != "camera")
+    gaps = [gap for clock in by_kind for gap in clock.gaps]
+    middle = (start + stop) / 2
+    if gaps:
+        # Of a gap longer than the stretch, where it begins.
+        middle = min((gaps[0].start_s + gaps[0].stop_s) / 2, gaps[0].start_s + width / 4)
+    begin = min(max(middle - width / 2, start), max(stop - width, start))
+    if line is not None and len(line.vl_time):
+        # From just before a row, so that it is seen with all of its ticks.
+        row = max(int(np.searchsorted(line.vl_time, begin + width / 10, side="right")) - 1, 0)
+        begin = min(max(float(line.vl_time[row]) - width / 10, start), max(stop - width, start))
+    return begin, min(begin + width, max(stop, begin + 1e-3))
+
+
+def in_reading_order(clocks: Sequence[Clock]) -> list[Clock]:
+    """Those with an entry, once each: streams, cameras, VL rows, ticks.
+
+    What feeds a lane stands above it.
+    """
+    order = ("stream", "camera", "vl_row", "tick")
+    shown = [clock for clock in same_clock_once(clocks) if len(clock.time)]
+    return sorted(shown, key=lambda clock: order.index(clock.kind))
+
+
+def _overview(axis: Axes, clocks: Sequence[Clock], zero: float, near: tuple[float, float]) -> None:
+    start = min(float(clock.time[0]) for clock in clocks) - zero
+    stop = max(float(clock.time[-1]) for clock in clocks) - zero
+    room = 0.01 * max(stop - start, 1e-3)
+    axis.set_xlim(start - room, stop + room)
+    axis.axvspan(near[0] - zero, near[1] - zero, color=GRID, lw=0, zorder=0.3)
+    for lane, clock in enumerate(clocks):
+        if len(clock.time) <= _SINGLE:
+            marks(axis, clock.time - zero, lane, LANE_COLOURS[clock.kind])
+        else:
+            _evenness(axis, clock, lane, zero, (clock.time[0], clock.time[-1]))
+        _gaps(axis, clock, lane, zero)
+    axis.set_title(_OVERVIEW, loc="left", fontsize=10)
+    _lanes(axis, [clock.name for clock in clocks])
+    for lane, clock in enumerate(clocks):
+        axis.annotate(
+            _said(clock), (1.005, lane), xycoords=axis.get_yaxis_transform(), va="center", size=8
+        )
+
+
+def _detail(
+    axis: Axes, view: EpisodeView, clocks: Sequence[Clock], near: tuple[float, float]
+) -> None:
+    start, stop = near
+    axis.set_xlim(start - view.zero, stop - view.zero)
+    lanes = {clock.name: lane for lane, clock in enumerate(clocks)}
+    for lane, clock in enumerate(clocks):
+        inside = clock.time[(clock.time >= start) & (clock.time <= stop)]
+        if len(inside) <= _SINGLE_NEAR:
+            marks(axis, inside - view.zero, lane, LANE_COLOURS[clock.kind], 1.6)
+        else:
+            _evenness(axis, clock, lane, view.zero, near)
+        _gaps(axis, clock, lane, view.zero)
+    _lanes(axis, [clock.name for clock in clocks])
+    if view.timeline is not None and {"VL rows", "ticks"} <= set(lanes):
+        reuse.draw(axis, view, lanes, near)
+    axis.set_title(f"from near: {stop - start:.2f} s", loc="left", fontsize=10)
+    axis.set_xlabel("time since the recording began [s]")
+
+
+def marks(
+    axis: Axes, time: NDArray[np.float64], lane: int, colour: str, width: float = 1.2
+) -> None:
+    """A vertical stroke an entry."""
+    ends = np.empty((len(time), 2, 2))
+    ends[:, :, 0] = time[:, None]
+    ends[:, :, 1] = (lane - _HALF, lane + _HALF)
+    axis.add_collection(LineCollection(list(ends), colors=colour, linewidths=width))
+
+
+def _evenness(axis: Axes, clock: Clock, lane: int, zero: float, span: tuple[float, float]) -> None:
+    """A band as high as the usual step over the longest one there: full where no entry is lost."""
+    edges = np.linspace(*span, _BINS + 1)
+    longest = worst_steps(clock.time, edges)
+    usual = usual_step(clock.time)
+    height = 2 * _HALF * np.minimum(usual / np.maximum(longest, 1e-12), 1.0)
+    axis.fill_between(
+        np.repeat(edges - zero, 2)[1:-1],
+        lane + _HALF,
+        lane + _HALF - np.repeat(height, 2),
+        color=LANE_COLOURS[clock.kind],
+        lw=0,
+    )
+
+
+def _gaps(axis: Axes, clock: Clock, lane: int, zero: float) -> None:
+    longest = sorted(clock.gaps, key=lambda gap: gap.start_s - gap.stop_s)[:_GAP_LABELS]
+    low, high = axis.get_xlim()
+    for gap in clock.gaps:
+        start, stop = gap.start_s - zero, gap.stop_s - zero
+        if stop < low or start > high:
+            continue
+        box = Rectangle((start, lane - _HALF), stop - start, 2 * _HALF, zorder=3)
+        box.set(facecolor="none", edgecolor=GAP, hatchcolor=GAP, hatch="////", lw=1.4)
+        axis.add_patch(box)
+        if gap in longest:
+            middle = (max(start, low) + min(stop, high)) / 2
+            axis.text(
+                middle, lane - _HALF, f"{stop - start:.2g} s", color=GAP, size=8, ha="center",
+                va="bottom", clip_on=True,
+            )  # fmt: skip
+
+
+def _lanes(axis: Axes, names: Sequence[str]) -> None:
+    axis.set_yticks(range(len(names)), names)
+    axis.set_ylim(len(names) - 0.2, -0.7)
+    axis.grid(axis="y", visible=False)
+    axis.tick_params(axis="y", length=0)
+
+
+def _said(clock: Clock) -> str:
+    """Rate, jitter and count in one line."""
+    if not np.isfinite(clock.rate_hz):
+        return f"{len(clock.time)}"
+    known = np.isfinite(clock.jitter_s)
+    # Below a microsecond it is the float's own rounding.
+    jitter = f" ± {1000 * clock.jitter_s:.2g} ms" if known and clock.jitter_s > 1e-6 else ""
+    return f"{clock.rate_hz:.4g} Hz{jitter}, {len(clock.time)} entries"
+
+
+def _legend(figure: Figure, view: EpisodeView) -> None:
+    handles = [
+        Patch(color=colour, label=label)
+        for label, colour in (
+            ("reading", LANE_COLOURS["stream"]),
+            ("frame", LANE_COLOURS["camera"]),
+            ("VL row, age of its newest frame; lines: the frames it took", LANE_COLOURS["vl_row"]),
+            ("tick; number: ticks since its VL row", LANE_COLOURS["tick"]),
+        )
+    ]
+    if view.timeline is None:
+        handles = handles[:2]
+    gap = Patch(facecolor="none", edgecolor=GAP, hatchcolor=GAP, hatch="////", label="gap")
+    figure.legend(handles=[*handles, gap], loc="outside lower center", ncols=3, fontsize=8.5)

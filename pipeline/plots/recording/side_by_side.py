@@ -1,0 +1,210 @@
+"""The picture of training samples: all that a policy sees at a tick, and what it should do."""
+
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from pipeline.datasets import UnifiedBatch, UnifiedVLADataset
+from pipeline.plots.recording.channels import Group, groups
+from pipeline.plots.recording.drawing import absent, curves, legend_beside, names, words
+from pipeline.plots.style import canvas
+from pipeline.recordings import Channels
+
+_COLUMN_IN, _PANEL_IN = 2.5, 1.15
+_INSTRUCTION_WIDTH = 38
+
+
+@dataclass(frozen=True)
+class _Row:
+    """Panels of one group of channels, a sample each, or of one view."""
+
+    kind: str
+    """`view`, `sensor`, `state` or `action`."""
+    name: str
+    group: Group | None = None
+
+
+def samples(dataset: UnifiedVLADataset, batch: UnifiedBatch) -> Figure:
+    """The samples of a batch side by side, a column each: frames, windows, action chunk.
+
+    Windows end at their tick; hatched is what the episode had not recorded yet, or has not at all,
+    and the steps of a chunk that lie past its end and are masked. States are drawn as what they
+    changed since the first of the window. Features of a store have no frames to show.
+    """
+    rows = _rows(dataset, batch)
+    if not rows or not len(batch):
+        return words("The batch has no sample.")
+    heights = [_height(row, batch) for row in rows]
+    width = _COLUMN_IN * len(batch)
+    figure = canvas(width + 1.6, sum(heights) + 1.5)
+    axes = figure.subplots(
+        len(rows), len(batch), squeeze=False, gridspec_kw={"height_ratios": heights}
+    )
+    for place, (line, row) in enumerate(zip(axes, rows, strict=True)):
+        last = place + 1 == len(rows) or rows[place + 1].kind != row.kind
+        for index, axis in enumerate(line):
+            _panel(axis, row, batch, index)
+            _only_outer_labels(axis, row, index, last)
+        _together(line, row)
+    for index, axis in enumerate(axes[0]):
+        axis.set_title(_title(dataset, batch, index), fontsize=8.5)
+    return figure
+
+
+def _rows(dataset: UnifiedVLADataset, batch: UnifiedBatch) -> list[_Row]:
+    seen = [] if batch.images is None else sorted({view for one in batch.images for view in one})
+    rows = [_Row("view", view) for view in seen]
+    for kind in ("sensor", "state", "action"):
+        channels = _channels(dataset.store.streams[kind])
+        found = groups(channels, by_name=False)
+        found = sorted(found, key=lambda group: group.is_profile)
+        rows += [_Row(kind, group.label, group) for group in found]
+    return rows
+
+
+def _channels(named: dict[str, Any]) -> Channels:
+    return Channels(tuple(named["names"]), tuple(named["units"]))
+
+
+def _height(row: _Row, batch: UnifiedBatch) -> float:
+    if row.kind != "view":
+        return _PANEL_IN
+    frame = next(one[row.name] for one in batch.images or () if row.name in one)
+    return _COLUMN_IN * frame.shape[0] / frame.shape[1]
+
+
+def _panel(axis: Axes, row: _Row, batch: UnifiedBatch, index: int) -> None:
+    if row.group is None:
+        _frame(axis, batch, index, row.name)
+    elif row.kind == "action":
+        _chunk(axis, row.group, batch, index)
+    else:
+        _window(axis, row, batch, index)
+
+
+def _frame(axis: Axes, batch: UnifiedBatch, index: int, view: str) -> None:
+    axis.set(xticks=[], yticks=[])
+    axis.grid(visible=False)
+    frame = (batch.images or ())[index].get(view)
+    if frame is None:
+        axis.text(0.5, 0.5, "view missing", ha="center", va="center", transform=axis.transAxes)
+        absent(axis, 0, 1)
+    else:
+        axis.imshow(frame)
+        axis.spines[:].set_visible(False)
+
+
+def _window(axis: Axes, row: _Row, batch: UnifiedBatch, index: int) -> None:
+    assert row.group is not None
+    values = getattr(batch, row.kind)[index].float().numpy()[:, list(row.group.indices)]
+    valid = int(getattr(batch, f"{row.kind}_valid")[index])
+    length = len(values)
+    at = np.arange(length) - length + 1
+    axis.set_xlim(at[0] - 0.5, at[-1] + 0.5)
+    if valid < length:
+        absent(axis, at[0] - 0.5, at[-1] + 0.5 - valid)
+    if not valid:
+        axis.text(
+            0.5, 0.5, f"{row.kind} missing", ha="center", va="center", transform=axis.transAxes
+        )
+        return
+    real, at = values[length - valid :], at[length - valid :]
+    if row.group.is_profile:
+        _image(axis, real, at)
+    else:
+        # States lie far apart and move little within a window.
+        shown = real - real[0] if row.kind == "state" else real
+        curves(axis, at.astype(np.float64), shown, names(row.group))
+
+
+def _image(axis: Axes, real: NDArray[np.float32], at: NDArray[np.int64]) -> None:
+    axis.imshow(
+        real.T,
+        cmap=mpl.colormaps["viridis"],
+        aspect="auto",
+        extent=(at[0] - 0.5, at[-1] + 0.5, real.shape[1] - 0.5, -0.5),
+    )
+    axis.set_xlim(axis.get_xlim()[0], at[-1] + 0.5)
+    axis.grid(visible=False)
+
+
+def _chunk(axis: Axes, group: Group, batch: UnifiedBatch, index: int) -> None:
+    """Each action held for its step; those that are masked lie under a hatch."""
+    values = batch.action[index].numpy()[:, list(group.indices)]
+    valid = batch.action_valid[index].numpy()
+    edges = np.arange(len(values) + 1, dtype=np.float64)
+    curves(axis, edges, np.concatenate([values, values[-1:]]), names(group), steps=True)
+    for step in np.flatnonzero(~valid).tolist():
+        absent(axis, step, step + 1)
+    axis.set_xlim(0, len(values))
+
+
+def _only_outer_labels(axis: Axes, row: _Row, index: int, last: bool) -> None:
+    axis.tick_params(labelsize=8)
+    if index == 0:
+        said = row.name if row.kind == "view" else f"{row.kind}\n{_quantity(row)}"
+        axis.set_ylabel(said, fontsize=9)
+    else:
+        axis.tick_params(labelleft=False)
+    if row.kind == "view":
+        return
+    if last:
+        axis.set_xlabel(
+            "steps ahead" if row.kind == "action" else "readings before the tick", fontsize=8
+        )
+    else:
+        axis.tick_params(labelbottom=False)
+
+
+def _quantity(row: _Row) -> str:
+    if row.kind == "state":
+        return f"change {row.name}"
+    return f"{row.name}, depth" if row.group is not None and row.group.is_profile else row.name
+
+
+def _together(line: Sequence[Axes], row: _Row) -> None:
+    """One range of values, and of colours, for all samples of a row."""
+    images = [image for axis in line for image in axis.images]
+    if row.group is None:
+        return
+    if row.group.is_profile:
+        every = [np.asarray(image.get_array()).ravel() for image in images]
+        limits = np.percentile(np.concatenate(every), (1, 99.5)) if every else (0, 1)
+        for image in images:
+            image.set_clim(*limits)
+        for axis in line:
+            axis.set_ylim(len(row.group.indices) - 0.5, -0.5)
+        return
+    ranges = [axis.get_ylim() for axis in line if axis.lines]
+    for axis in line:
+        if ranges:
+            axis.set_ylim(min(low for low, _ in ranges), max(high for _, high in ranges))
+    labelled = [axis for axis in line if axis.lines]
+    if labelled and len(row.group.names) > 1:
+        legend_beside(line[-1], of=labelled[0], fontsize=7.5)
+
+
+def _title(dataset: UnifiedVLADataset, batch: UnifiedBatch, index: int) -> str:
+    store = dataset.store
+    episode = store.episodes[int(batch.episode[index])]
+    tick = int(batch.tick[index]) - episode.ticks.start
+    row = int(batch.vl_row[index]) - episode.vl_rows.start
+    since = float(batch.time[index]) - float(store.array("tick/time")[episode.ticks.start])
+    age = 1000 * float(batch.feature_age[index])
+    old = tick - row * store.vlm_reuse_count
+    frames = "" if batch.images is not None else "\nfeatures of a store, no frames"
+    said = textwrap.shorten(batch.instruction[index], _INSTRUCTION_WIDTH, placeholder=" …")
+    return (
+        f"{textwrap.shorten(episode.id.split('/')[-1], 36)}\n"
+        f"tick {tick} of {len(episode.ticks)}, {since:.2f} s\n"
+        f"“{said}”\n"
+        f"reuses VL row {row}, {old} {'tick' if old == 1 else 'ticks'} old\n"
+        f"newest frame {age:.0f} ms old{frames}"
+    )

@@ -1,0 +1,78 @@
+"""Pictures to zoom tell each mark's index and time, and stay small however long the recording."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.inspection.facts import Clock, EpisodeView
+from pipeline.inspection.store_projection import StoreProjection
+from pipeline.plots import interactive
+
+
+def test_hovering_tells_frames_rows_and_ticks(view: EpisodeView, clocks: tuple[Clock, ...]) -> None:
+    figure = interactive.clock_lanes(view, clocks)
+    lanes = {trace.name: trace for trace in figure.data}
+    assert view.timeline is not None
+    assert len(lanes["View1"].x) == len(view.cameras["View1"].time)
+    np.testing.assert_allclose(lanes["ticks"].x, view.timeline.time - view.zero)
+    assert lanes["ticks"].text[4] == "tick 4, reuses VL row 1, ticks since: 1"
+    row = view.timeline.frames["View2"][2]
+    assert f"View2: frame {row}, " in lanes["VL rows"].text[2]
+    took = lanes["frames of View2 that VL rows took"]
+    assert took.x[6] == pytest.approx(view.timeline.frame_time["View2"][2] - view.zero)
+    assert np.isnan(took.x[8])
+    gap = clocks[4].gaps[0]
+    assert lanes["gaps of state, poses"].x[0] == pytest.approx(gap.start_s - view.zero)
+
+
+def test_a_page_may_set_its_own_colours(view: EpisodeView, clocks: tuple[Clock, ...]) -> None:
+    layout = interactive.clock_lanes(view, clocks).layout
+    assert layout.paper_bgcolor == layout.plot_bgcolor == "rgba(0, 0, 0, 0)"
+    assert layout.font.color is None
+    assert layout.title.text is None
+
+
+def test_a_long_recording_stays_small_and_says_what_it_leaves_out(
+    view: EpisodeView, clocks: tuple[Clock, ...]
+) -> None:
+    hour = np.arange(3600 * 10) / 10
+    readings = np.arange(3600 * 650) / 650
+    long = (
+        replace(clocks[0], name="View1", time=hour, gaps=()),
+        replace(clocks[3], time=readings),
+    )
+    figure = interactive.clock_lanes(replace(view, timeline=None, zero=0.0), long)
+    assert len(figure.to_json()) < 1_000_000
+    assert "View1, 1 of 9" in figure.layout.yaxis.ticktext
+    assert max(len(trace.x) for trace in figure.data) <= interactive.SINGLE
+
+
+def test_the_same_clocks_are_the_same_figure(view: EpisodeView, clocks: tuple[Clock, ...]) -> None:
+    one, two = (interactive.clock_lanes(view, clocks).to_json() for _ in range(2))
+    assert one == two
+
+
+@pytest.mark.parametrize("by", ["episode", "progress"])
+def test_points_are_coloured_and_named(by: str) -> None:
+    found = StoreProjection(
+        points=np.array([[0.0, 1.0], [2.0, 3.0], [4.0, 5.0]]),
+        explained=(0.5, 0.25),
+        rows=np.array([0, 1, 7]),
+        episode=np.array([0, 0, 1]),
+        progress=np.array([0.0, 1.0, 0.5]),
+        time=np.array([0.1, 0.4, 9.0]),
+        source=np.zeros(3, np.int64),
+        episodes=("demo/a", "demo/b"),
+        sources=("demo",),
+        total=3,
+    )
+    figure = interactive.projection(found, by)  # type: ignore[arg-type]
+    (points,) = figure.data
+    assert list(points.text) == ["demo/a", "demo/a", "demo/b"]
+    assert points.customdata[2].tolist() == [7, 9, 0.5]
+    colours = list(points.marker.color)
+    assert (
+        (colours == [0, 1, 0.5]) if by == "progress" else (colours[0] == colours[1] != colours[2])
+    )
+    assert figure.layout.xaxis.title.text == "first principal component (50% of the variance)"
