@@ -1,8 +1,10 @@
 """A policy judged on recordings it has not seen, beside baselines that see nothing."""
 
 from pipeline.evaluation.cells import write_rows
+from pipeline.evaluation.curves import Curve, Curves, read_curves
 from pipeline.evaluation.experiments import (
     Experiment,
+    experiment_errors,
     experiment_rows,
     experiments_table,
     read_experiments,
@@ -14,10 +16,15 @@ from pipeline.evaluation.held_out import (
     held_out_ticks,
     judge,
 )
-from pipeline.evaluation.judged import JUDGED, judged_document
+from pipeline.evaluation.judged import JUDGED, Judgement, judged_document
 from pipeline.evaluation.modalities import ModalityStudy, Spoilt, judge_modalities
 from pipeline.evaluation.modality_tables import FOOTNOTE as MODALITY_FOOTNOTE
-from pipeline.evaluation.modality_tables import best_baseline, modality_table
+from pipeline.evaluation.modality_tables import (
+    best_baseline,
+    judged_on,
+    modality_errors,
+    modality_table,
+)
 from pipeline.evaluation.names import episode_name, place, with_unit
 from pipeline.evaluation.predictions import (
     BASELINES,
@@ -28,17 +35,22 @@ from pipeline.evaluation.predictions import (
     predict,
 )
 from pipeline.evaluation.scores import Comparison, Group, Scores, compare
-from pipeline.evaluation.tables import metrics, table, write_tables
+from pipeline.evaluation.tables import FOOTNOTE, HEADINGS, error_rows, metrics, table, write_tables
 
 __all__ = [
     "BASELINES",
+    "FOOTNOTE",
+    "HEADINGS",
     "JUDGED",
     "METHODS",
     "MODALITY_FOOTNOTE",
     "Comparison",
+    "Curve",
+    "Curves",
     "Experiment",
     "FeedMaker",
     "Group",
+    "Judgement",
     "ModalityStudy",
     "Predictions",
     "Scores",
@@ -48,6 +60,8 @@ __all__ = [
     "check_store",
     "compare",
     "episode_name",
+    "error_rows",
+    "experiment_errors",
     "experiment_rows",
     "experiments_table",
     "held_out_contents",
@@ -56,10 +70,13 @@ __all__ = [
     "judge",
     "judge_modalities",
     "judged_document",
+    "judged_on",
     "metrics",
+    "modality_errors",
     "modality_table",
     "place",
     "predict",
+    "read_curves",
     "read_experiments",
     "table",
     "with_unit",

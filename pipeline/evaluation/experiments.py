@@ -85,29 +85,42 @@ def read_experiments(reports: Path) -> tuple[Experiment, ...]:
     return tuple(sorted(found, key=_order))
 
 
-def experiments_table(experiments: Sequence[Experiment], markdown: bool = False) -> str:
-    """A line an experiment and one a baseline; errors are mean absolute errors.
+def experiment_errors(
+    experiments: Sequence[Experiment],
+) -> tuple[list[str], list[tuple[Any, ...]]]:
+    """Columns and rows of a table: an experiment a row, a baseline a row; mean absolute errors.
 
     `samples` are the chunks a tick whose mean was judged.
     """
     units = list(experiments[0].errors)
     names = ["overall [training std]" if unit == "overall" else unit for unit in units]
-    figures = ["policy / best", "samples", "parameters", "trained"]
-    lines = [["experiment", "expert", "fusion", *names, *figures]]
-    for one in experiments:
-        errors = [f"{one.errors[unit]['policy']:.4g}" for unit in units]
-        lines.append(
-            [
-                *(one.name, one.model_type, one.fusion_strategy, *errors),
-                ratio(one.errors["overall"].get("relative")),
-                str(one.samples),
-                f"{one.parameters:,}",
-                "-" if one.training_s is None else f"{one.training_s:.0f} s",
-            ]
+    columns = ["experiment", "expert", "fusion", *names, "policy / best", "samples", "parameters"]
+    rows: list[tuple[Any, ...]] = [
+        (
+            *(one.name, one.model_type, one.fusion_strategy),
+            *(one.errors[unit]["policy"] for unit in units),
+            *(one.errors["overall"].get("relative"), one.samples, one.parameters),
         )
+        for one in experiments
+    ]
     for method in BASELINES:
-        errors = [f"{experiments[0].errors[unit][method]:.4g}" for unit in units]
-        lines.append([f"baseline: {HEADINGS[method]}", "", "", *errors, "", "", "", ""])
+        errors = (experiments[0].errors[unit][method] for unit in units)
+        rows.append((f"baseline: {HEADINGS[method]}", "", "", *errors, None, None, None))
+    return columns, rows
+
+
+def experiments_table(experiments: Sequence[Experiment], markdown: bool = False) -> str:
+    """`experiment_errors` and the time that each training took, as lines."""
+    columns, rows = experiment_errors(experiments)
+    lines = [[*columns, "trained"]]
+    for place, (name, expert, fusion, *errors, relative, samples, parameters) in enumerate(rows):
+        cells = [name, expert, fusion, *(f"{error:.4g}" for error in errors)]
+        if place >= len(experiments):
+            lines.append([*cells, "", "", "", ""])
+            continue
+        trained = experiments[place].training_s
+        cells += [ratio(relative), str(samples), f"{parameters:,}"]
+        lines.append([*cells, "-" if trained is None else f"{trained:.0f} s"])
     if not markdown:
         return "\n".join(aligned(lines, left=3))
     ruler = ["---"] * 3 + ["---:"] * (len(lines[0]) - 3)

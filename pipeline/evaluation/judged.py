@@ -1,13 +1,38 @@
 """What an evaluation was made of, so that two of them can be told to be of the same things."""
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from pipeline.checkpoint import PolicyCheckpoint, source_of
+from pipeline.evaluation.curves import Curves
+from pipeline.evaluation.modalities import ModalityStudy
+from pipeline.evaluation.predictions import Predictions
+from pipeline.evaluation.scores import Comparison
 from pipeline.models import Trainable
 from pipeline.store import FeatureStore
 
 JUDGED = "judged.json"
 """Its name in the folder of an evaluation, beside metrics.json."""
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """A policy that was judged, and all that is known of it."""
+
+    name: str
+    """Of the checkpoint, as the user called it."""
+    checkpoint: PolicyCheckpoint
+    store: FeatureStore
+    comparison: Comparison
+    predictions: Predictions
+    study: ModalityStudy | None
+    judged: Mapping[str, Any]
+    """`judged_document`."""
+    curves: Curves
+    recordings: Path
+    """Below which a relative path of the store lies."""
 
 
 def judged_document(

@@ -7,7 +7,7 @@ from pipeline.evaluation.cells import aligned, cell, numbers, ratio
 from pipeline.evaluation.modalities import ModalityStudy
 from pipeline.evaluation.names import with_unit
 from pipeline.evaluation.predictions import BASELINES
-from pipeline.evaluation.scores import Comparison, Group
+from pipeline.evaluation.scores import Comparison
 
 FOOTNOTE = "zeroed: every value at its training mean, which the policy sees as zeros"
 
@@ -29,39 +29,48 @@ def modality_metrics(study: ModalityStudy) -> dict[str, Any]:
     return document
 
 
-def modality_table(study: ModalityStudy) -> str:
-    """A line for each way to spoil a stream, between the intact error and the best baseline's.
+def modality_errors(study: ModalityStudy) -> tuple[list[str], list[tuple[Any, ...]]]:
+    """Columns and rows of a table: each way to spoil a stream, between intact and best baseline.
 
-    Below them what `zeroed` means, and what could not be judged as asked.
+    Two words, the errors of each group and the overall one, and the latter's multiple of intact.
     """
-    groups = _told(study.intact)
+    groups = study.intact.varying_groups()
     names = [with_unit(group.name, group.unit) for group in groups]
-    lines = [["stream", "policy sees it", *names, "overall [training std]", "times intact"]]
-    lines.append(["all", "intact", *_errors(study.intact, groups), "1.00"])
-    lines += [
-        [
-            one.stream,
-            one.how,
-            *_errors(one.comparison, groups),
-            ratio(study.times_intact(one)),
-        ]
-        for one in study.spoilt
-    ]
+    columns = ["stream", "policy sees it", *names, "overall [training std]", "times intact"]
+
+    def errors(comparison: Comparison, method: str = "policy") -> tuple[float, ...]:
+        of_groups = (comparison.group_mae(method, group) for group in groups)
+        return *of_groups, comparison.overall(method)
+
     best = best_baseline(study.intact)
     intact, blind = study.intact.overall("policy"), study.intact.overall(best)
-    lines.append(
-        [
-            "none",
-            best.replace("_", " "),
-            *_errors(study.intact, groups, best),
-            ratio(blind / intact if intact > 0 else None),
-        ]
-    )
-    head = (
+    rows = [("all", "intact", *errors(study.intact), 1.0)]
+    rows += [
+        (one.stream, one.how, *errors(one.comparison), study.times_intact(one))
+        for one in study.spoilt
+    ]
+    times = blind / intact if intact > 0 else None
+    rows.append(("none", best.replace("_", " "), *errors(study.intact, best), times))
+    return columns, rows
+
+
+def modality_table(study: ModalityStudy) -> str:
+    """`modality_errors` as lines; below them what `zeroed` means, and what could not be judged."""
+    columns, rows = modality_errors(study)
+    lines = [columns]
+    lines += [
+        [stream, how, *(f"{error:.4g}" for error in errors), ratio(times)]
+        for stream, how, *errors, times in rows
+    ]
+    return "\n".join([f"{judged_on(study)}:", *aligned(lines, left=2), FOOTNOTE, *study.notes])
+
+
+def judged_on(study: ModalityStudy) -> str:
+    """What a table of this study says above it."""
+    return (
         f"mean absolute error on {study.intact.ticks} held-out ticks, {study.samples} chunk(s) a "
-        "tick, one stream spoilt each:"
+        "tick, one stream spoilt each"
     )
-    return "\n".join([head, *aligned(lines, left=2), FOOTNOTE, *study.notes])
 
 
 def modality_rows(study: ModalityStudy) -> Iterable[Sequence[object]]:
@@ -84,16 +93,15 @@ def modality_rows(study: ModalityStudy) -> Iterable[Sequence[object]]:
         yield [one.stream, one.how, "overall", "training std", *map(cell, overall)]
 
 
+def stream_rows(study: ModalityStudy) -> Iterable[Sequence[object]]:
+    """Lines of a CSV file: the overall error by way to spoil a stream, and what of the intact."""
+    yield ["spoilt", "times_intact", "overall_error"]
+    for one in study.spoilt:
+        times = study.times_intact(one)
+        error = one.comparison.overall("policy")
+        yield [f"{one.stream} {one.how}", "" if times is None else cell(times), cell(error)]
+
+
 def best_baseline(comparison: Comparison) -> str:
     """The baseline with the lowest overall error."""
     return min(BASELINES, key=comparison.overall)
-
-
-def _told(comparison: Comparison) -> list[Group]:
-    """The groups with something to predict."""
-    return [group for group in comparison.groups if comparison.relative(group) is not None]
-
-
-def _errors(comparison: Comparison, groups: Sequence[Group], method: str = "policy") -> list[str]:
-    errors = [comparison.group_mae(method, group) for group in groups]
-    return [f"{error:.4g}" for error in (*errors, comparison.overall(method))]

@@ -67,11 +67,44 @@ class Comparison:
         normally distributed actions, always acting the mean then costs 0.8. Where none varies, all
         count, undivided.
         """
-        return float(self._in_training_std(self.scores[method].mae))
+        return float(self.in_training_std(self.scores[method].mae).mean())
 
     def overall_by_episode(self, method: str) -> Errors:
         """`overall` of each episode, (episode,), in the order of `episodes`."""
-        return self._in_training_std(self.scores[method].mae_episode)
+        return self.in_training_std(self.scores[method].mae_episode).mean(axis=-1)
+
+    def ranked(self) -> list[int]:
+        """Places in `episodes`, from the one that the policy follows best to the one it does worst.
+
+        By `overall_by_episode`; of equals, the first comes first.
+        """
+        return np.argsort(self.overall_by_episode("policy"), kind="stable").tolist()
+
+    def extremes(self) -> list[tuple[str, int]]:
+        """The episodes of lowest and highest error: what to call each, and its store index.
+
+        Only one where only one was judged.
+        """
+        order = self.ranked()
+        best, worst = order[0], order[-1]
+        if best == worst:
+            return [("the held-out episode", self.episodes[best])]
+        return [("lowest error", self.episodes[best]), ("highest error", self.episodes[worst])]
+
+    def varying(self) -> list[int]:
+        """The dimensions that vary in training; all, where none does."""
+        dimensions = np.flatnonzero(self.scale > 0).tolist()
+        return dimensions or list(range(len(self.names)))
+
+    def varying_groups(self) -> list[Group]:
+        """The groups with something to predict."""
+        varying = set(self.varying())
+        return [group for group in self.groups if varying & set(group.dimensions)]
+
+    def in_training_std(self, errors: Errors) -> Errors:
+        """Errors (..., action_dim) of the `varying` dimensions, by their training deviations."""
+        dimensions = self.varying()
+        return errors[..., dimensions] / np.where(self.scale > 0, self.scale, 1)[dimensions]
 
     def group_mae(self, method: str, group: Group) -> float:
         """Mean absolute error of a group, in its unit."""
@@ -94,12 +127,6 @@ class Comparison:
         }
         best = min(errors[method] for method in BASELINES)
         return errors["policy"] / best if best > 0 else None
-
-    def _in_training_std(self, errors: Errors) -> Errors:
-        varies = self.scale > 0
-        if not varies.any():
-            return errors.mean(axis=-1)
-        return (errors[..., varies] / self.scale[varies]).mean(axis=-1)
 
 
 def compare(

@@ -8,7 +8,7 @@ from typing import Any
 from pipeline.durable import write_document
 from pipeline.evaluation.cells import aligned, cell, numbers, ratio, write_rows
 from pipeline.evaluation.modalities import ModalityStudy
-from pipeline.evaluation.modality_tables import modality_metrics, modality_rows
+from pipeline.evaluation.modality_tables import modality_metrics, modality_rows, stream_rows
 from pipeline.evaluation.names import with_unit
 from pipeline.evaluation.predictions import METHODS, Predictions
 from pipeline.evaluation.scores import Comparison
@@ -66,15 +66,30 @@ def metrics(comparison: Comparison) -> dict[str, Any]:
     return document
 
 
+def error_rows(comparison: Comparison) -> list[tuple[str, list[float], float | None]]:
+    """Mean absolute errors: what of, those of `METHODS`, and policy / best baseline.
+
+    One for each action group, and the overall one last.
+    """
+    rows = [
+        (
+            with_unit(group.name, group.unit),
+            [comparison.group_mae(method, group) for method in METHODS],
+            comparison.relative(group),
+        )
+        for group in comparison.groups
+    ]
+    overall = [comparison.overall(method) for method in METHODS]
+    return [*rows, ("overall [training std]", overall, comparison.relative())]
+
+
 def table(comparison: Comparison) -> str:
     """Mean absolute errors of policy and baselines, a line a group and a footnote."""
-    head = ["mean absolute error", *(HEADINGS[method] for method in METHODS), "policy / best"]
-    lines = [head]
-    for group in comparison.groups:
-        errors = [comparison.group_mae(method, group) for method in METHODS]
-        lines.append(_line(with_unit(group.name, group.unit), errors, comparison.relative(group)))
-    errors = [comparison.overall(method) for method in METHODS]
-    lines.append(_line("overall [training std]", errors, comparison.relative()))
+    lines = [["mean absolute error", *(HEADINGS[method] for method in METHODS), "policy / best"]]
+    lines += [
+        [name, *(f"{error:.4g}" for error in errors), ratio(relative)]
+        for name, errors, relative in error_rows(comparison)
+    ]
     return "\n".join([*aligned(lines), FOOTNOTE])
 
 
@@ -87,18 +102,21 @@ def write_tables(
 ) -> list[Path]:
     """Write metrics.json and, for plots, one CSV each by dimension, horizon, episode and tick.
 
-    And one by spoilt stream, and its figures among the metrics, where there is a `study`.
+    And by spoilt stream, with its figures among the metrics, where there is a `study`. steps.csv
+    and streams.csv have one line a point, as `dvc plots` takes them; the rest is for others.
     """
     document = metrics(comparison)
     files = {
         "dimensions.csv": _dimension_rows(comparison),
         "horizon.csv": _horizon_rows(comparison),
+        "steps.csv": _step_rows(comparison),
         "episodes.csv": _episode_rows(comparison, store),
         "predictions.csv": _prediction_rows(comparison, predictions, store),
     }
     if study is not None:
         document["modalities"] = modality_metrics(study)
         files["modalities.csv"] = modality_rows(study)
+        files["streams.csv"] = stream_rows(study)
     write_document(folder / METRICS, document)
     return [
         folder / METRICS,
@@ -131,6 +149,15 @@ def _horizon_rows(comparison: Comparison) -> Iterable[Sequence[object]]:
             ]
 
 
+def _step_rows(comparison: Comparison) -> Iterable[Sequence[object]]:
+    """The overall error [training std] by steps ahead."""
+    yield ["steps_ahead", *METHODS]
+    scores = [comparison.scores[method].mae_horizon for method in METHODS]
+    errors = [comparison.in_training_std(score).mean(axis=-1).tolist() for score in scores]
+    for step, values in enumerate(zip(*errors, strict=True)):
+        yield [step, *map(cell, values)]
+
+
 def _episode_rows(comparison: Comparison, store: FeatureStore) -> Iterable[Sequence[object]]:
     yield ["source", "episode", "group", "unit", *METHODS]
     for place, index in enumerate(comparison.episodes):
@@ -155,10 +182,6 @@ def _prediction_rows(
             f"{time_s[place]:.3f}",
             *(cell(value) for pair in pairs for value in pair),
         ]
-
-
-def _line(name: str, errors: Sequence[float], relative: float | None) -> list[str]:
-    return [name, *(f"{error:.4g}" for error in errors), ratio(relative)]
 
 
 def _steps(errors: Sequence[float]) -> dict[str, float]:

@@ -4,8 +4,6 @@ The survey's plan digest names everything that decides what a store holds. Where
 carries the same, there is nothing to do.
 """
 
-import hashlib
-import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,9 +12,9 @@ from pathlib import Path
 from tqdm import tqdm
 
 from pipeline.config import DataParams, Params
-from pipeline.digests import ContentDigests
+from pipeline.digests import ContentDigests, joint_digest
 from pipeline.errors import RecordingError
-from pipeline.recordings import BadEpisode, Recording, open_recordings
+from pipeline.recordings import BadEpisode, Recording, content_digest, open_recordings
 from pipeline.timeline import ActionRotation, choose_action_rotation
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 
@@ -60,7 +58,7 @@ def survey(params: Params, digests: ContentDigests) -> Survey:
     views: set[str] = set()
     for recording in tqdm(opened.recordings, "survey", unit="episode", disable=None, leave=False):
         try:
-            content = content_digest(recording, digests)
+            content = content_digest(recording, digests.of)
             digest = _digest(recording, content, data, rotation)
             if data.on_bad_episode == "skip" and (reason := digests.bad(digest)) is not None:
                 raise RecordingError(reason)
@@ -72,7 +70,7 @@ def survey(params: Params, digests: ContentDigests) -> Survey:
     if not episodes:
         refuse_bad(bad, of=len(bad))
     spec = feature_spec(params.vlm, params.extract.dtype, sorted(views), digests.of)
-    plan = _hash(
+    plan = joint_digest(
         spec.digest,
         params.extract.sensor_dtype,
         repr([(source.name, source.action_kind) for source in data.sources]),
@@ -102,17 +100,8 @@ def shown_path(path: Path, root: Path) -> str:
         return os.path.abspath(path)
 
 
-def content_digest(recording: Recording, digests: ContentDigests) -> str:
-    """Digest of a recording's files, wherever they lie; `RecordingError` where one is not read."""
-    # Frame times stand in file names, so a name is content too; where the folder lies is not.
-    named = (
-        (os.path.relpath(file, recording.path), digests.of(file)) for file in recording.files()
-    )
-    return _hash(recording.identity(), json.dumps(sorted(named)))
-
-
 def _digest(recording: Recording, content: str, data: DataParams, rotation: ActionRotation) -> str:
-    return _hash(
+    return joint_digest(
         content,
         recording.source,
         recording.id,
@@ -121,10 +110,3 @@ def _digest(recording: Recording, content: str, data: DataParams, rotation: Acti
         shown_path(recording.path, data.root),
         repr((data.action_hz, data.vlm_reuse_count, rotation)),
     )
-
-
-def _hash(*parts: str) -> str:
-    hasher = hashlib.blake2b(digest_size=16)
-    for part in parts:
-        hasher.update(f"{len(part)}:".encode() + part.encode())
-    return hasher.hexdigest()

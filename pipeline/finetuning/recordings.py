@@ -8,8 +8,7 @@ from tqdm import tqdm
 from pipeline.config import Params
 from pipeline.digests import ContentDigests
 from pipeline.errors import RecordingError, StoreMismatch
-from pipeline.extraction.survey import content_digest
-from pipeline.recordings import Opened, Recording, open_recordings
+from pipeline.recordings import Opened, Recording, content_digest, open_recordings
 from pipeline.store import Episode, FeatureStore
 from pipeline.vlm.feature_spec import FeatureSpec, differences, feature_spec
 
@@ -43,7 +42,7 @@ def check_recordings(
     pairs = list(zip(store.episodes, recordings, strict=True))
     for episode, recording in tqdm(pairs, "check", unit="episode", disable=None, leave=False):
         try:
-            if content_digest(recording, digests) != episode.content:
+            if content_digest(recording, digests.of) != episode.content:
                 changed.append((episode, f"the files in {recording.path} changed since extraction"))
             elif recording.instruction != episode.instruction:
                 said = f"{episode.instruction!r} at extraction, {recording.instruction!r} now"

@@ -14,6 +14,7 @@ from pathlib import Path
 from pipeline.config import Source
 from pipeline.errors import RecordingError
 from pipeline.recordings import lerobot, pickled, raw, windowed
+from pipeline.recordings.content import content_digest
 from pipeline.recordings.reader import FileRecording, absolute, natural_key
 from pipeline.recordings.recording import (
     ActionKind,
@@ -34,6 +35,8 @@ __all__ = [
     "Recording",
     "RecordingError",
     "Stream",
+    "content_digest",
+    "open_recording",
     "open_recordings",
 ]
 
@@ -121,6 +124,24 @@ def open_recordings(
     if views is not None:
         _check_views(recordings, views)
     return Opened(tuple(recordings), tuple(missing), tuple(bad))
+
+
+def open_recording(
+    path: Path, format: str, id: str, views: Sequence[str] | None = None
+) -> Recording:
+    """The episode that a store calls by these, alone; only the views in `views` are kept.
+
+    Raises `RecordingError` where it is not there, or not of that format any more.
+    """
+    reader, source = READERS[format], Source(name=format, path=str(path))
+    if not reader.marks(path, _listing(path)):
+        raise RecordingError(f"{path}: not of the format {format} (no {reader.marker})")
+    found, _ = reader.open(path, source, views)
+    # Parent folders stand before the ids that stood more than once in a source.
+    of_id = [one for one in found if format != "lerobot" or one.id == id.rpartition("/")[2]]
+    if not of_id:
+        raise RecordingError(f"{path}: has no episode {id}")
+    return of_id[0]
 
 
 def _folders(source: Source, root: Path) -> list[tuple[Path, _Reader]]:

@@ -21,7 +21,7 @@ from pipeline.evaluation import (
 )
 from pipeline.evaluation.corruption import donors_of, exchanged, missing, zeroed
 from pipeline.evaluation.modalities import delays
-from pipeline.evaluation.modality_tables import modality_metrics, modality_rows
+from pipeline.evaluation.modality_tables import modality_metrics, modality_rows, stream_rows
 from pipeline.models import Policy
 from pipeline.normalization import ChannelStatistics, Normalization
 from pipeline.sampling import split_by_episode
@@ -145,6 +145,13 @@ def test_the_figures_are_the_same_in_table_document_and_file(
     assert float(row["error"]) / float(row["intact_error"]) == pytest.approx(
         zeroed["times_intact"], rel=1e-4
     )
+    path = write_rows(tmp_path / "streams.csv", stream_rows(study))
+    (row,) = (
+        row
+        for row in csv.DictReader(path.read_text().splitlines())
+        if row["spoilt"] == "sensor zeroed"
+    )
+    assert float(row["times_intact"]) == pytest.approx(zeroed["times_intact"])
     lines = modality_table(study).splitlines()
     assert any(line.startswith("sensor    zeroed") for line in lines)
     assert lines[2].split()[:2] == ["all", "intact"]

@@ -90,6 +90,9 @@ def test_files_hold_every_dimension_step_episode_and_tick(
     assert float(rows["dimensions"][3]["policy_mae"]) == pytest.approx(0.5)
     assert float(rows["horizon"][6]["policy"]) == pytest.approx(0.2)
     assert rows["horizon"][6]["dimension"] == "dy"
+    steps = [float(row["policy"]) for row in rows["steps"]]
+    assert [row["steps_ahead"] for row in rows["steps"]] == ["0", "1", "2", "3"]
+    assert np.mean(steps) == pytest.approx(comparison.overall("policy"), rel=0.02)
     assert rows["episodes"][0]["episode"] == "episode_001"
     assert rows["episodes"][0]["source"] == "right"
     tick = rows["predictions"][31]

@@ -1,0 +1,101 @@
+"""The frames that a policy's features were computed from, from the recording itself.
+
+A store holds no frame. It says of each episode where its recording lay and what its files held, and
+of each VL row when its frames were captured: that finds them again, or says why not.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.batches import Ticks
+from pipeline.digests import file_digest
+from pipeline.errors import RecordingError
+from pipeline.recordings import CameraStream, Recording, content_digest, open_recording
+from pipeline.store import Episode, FeatureStore
+
+Frame = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Footage:
+    """Frames of one episode, or why there are none."""
+
+    frames: Mapping[str, Sequence[Frame]]
+    """By view, one for each VL row that was asked for: (height, width, 3), RGB."""
+    absence: str = ""
+    """One sentence where there are no frames, naming the path."""
+
+
+def shown_ticks(store: FeatureStore, ticks: Ticks, count: int) -> Ticks:
+    """At most `count` of these ticks of one episode, evenly spread.
+
+    Those at which a VL row begins, where there are such: no frame is newer than those it saw.
+    """
+    rows = store.array("tick/vl_row")[ticks]
+    before = store.array("tick/vl_row")[np.maximum(ticks - 1, 0)]
+    fresh = ticks[(rows != before) | (ticks == 0)]
+    among = fresh if len(fresh) else ticks
+    count = min(count, len(among))
+    return among[np.linspace(0, len(among) - 1, count).round().astype(np.int64)]
+
+
+def footage(store: FeatureStore, episode: Episode, vl_rows: Sequence[int], root: Path) -> Footage:
+    """The frames of these store-global VL rows of one episode, ascending.
+
+    A relative path of the store lies under `root`. No frame is handed out of a recording whose
+    files are not, by their digest, those that the store was made from.
+    """
+    path = root / episode.path
+    if not path.is_dir():
+        return Footage({}, f"No frames: there is no recording at {path} any more.")
+    try:
+        recording = _same(store, episode, path)
+        if recording is None:
+            return Footage(
+                {}, f"No frames: the recording at {path} changed since the store was made from it."
+            )
+        times = _frame_times(store, vl_rows)
+        cameras = recording.cameras()
+        return Footage({view: _read(cameras, view, at) for view, at in times.items()})
+    except (RecordingError, OSError) as error:
+        said = " ".join(str(error).split())
+        return Footage({}, f"No frames: the recording at {path} cannot be read ({said}).")
+
+
+def _same(store: FeatureStore, episode: Episode, path: Path) -> Recording | None:
+    """The episode's recording, with the views it was extracted with: all, or those of the store."""
+    digest_of = cache(file_digest)
+    for views in (None, store.spec["views"]):
+        recording = open_recording(path, episode.format, episode.id, views)
+        if content_digest(recording, digest_of) == episode.content:
+            return recording
+    return None
+
+
+def _frame_times(store: FeatureStore, vl_rows: Sequence[int]) -> dict[str, NDArray[np.float64]]:
+    """Capture times of the rows' frames, by view that the episode has."""
+    times = store.array("vl/frame_time")[np.asarray(vl_rows, np.int64)]
+    names = store.spec["views"]
+    return {
+        view: times[:, column]
+        for column, view in enumerate(names)
+        if np.isfinite(times[:, column]).all()
+    }
+
+
+def _read(
+    cameras: Mapping[str, CameraStream], view: str, times: NDArray[np.float64]
+) -> list[Frame]:
+    if view not in cameras:
+        raise RecordingError(f"it has no {view}")
+    clock = cameras[view].time
+    index = np.searchsorted(clock, times, side="right") - 1
+    # The store has the cameras' own times, so that any other is not of this frame.
+    if (index < 0).any() or not np.array_equal(clock[index], times):
+        raise RecordingError(f"{view} has no frames at the times that the store has")
+    return list(cameras[view].read(index.tolist()))
