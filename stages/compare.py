@@ -1,13 +1,15 @@
 """Put the evaluations of several experiments side by side, beside the baselines of all of them.
 
-Writes experiments.csv and experiments.png into `compare.output`; the table with the training times
-as Markdown beside that folder, for DVC tracks what is in it and a clock never says the same twice.
+Writes report.html, experiments.csv and experiments.png into `compare.output`; the table with the
+training times as Markdown beside that folder, for DVC tracks what is in it and a clock never says
+the same twice.
 """
 
 from pipeline.config import Params
 from pipeline.durable import disk_full_named, fresh
 from pipeline.evaluation import experiment_rows, experiments_table, read_experiments, write_rows
-from pipeline.plots import write_experiments_plot
+from pipeline.report import write_report
+from pipeline.report.comparison import comparison_report
 from stages.command import run
 
 
@@ -17,7 +19,7 @@ def main(params: Params) -> None:
     experiments = read_experiments(params.compare.reports)
     output.mkdir(parents=True, exist_ok=True)
     files = [write_rows(output / "experiments.csv", experiment_rows(experiments))]
-    files += write_experiments_plot(output, experiments)
+    files += write_report(output, comparison_report(experiments))
     markdown = output.with_name(f"{output.name}.md")
     with disk_full_named(markdown):
         fresh(markdown).write_text(experiments_table(experiments, markdown=True), encoding="utf-8")

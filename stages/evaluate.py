@@ -1,7 +1,9 @@
 """Judge a trained policy on the episodes it has not seen, beside three baselines.
 
-Writes metrics.json, tables (CSV) and pictures (PNG) into `evaluate.output`, and judged.json, which
-says what was judged on what. With `evaluate.modalities`, judges again with each stream spoilt.
+Writes metrics.json, tables (CSV) and a page with its pictures (report.html, PNG) into
+`evaluate.output`, and judged.json, which says what was judged on what. With `evaluate.modalities`,
+judges again with each stream spoilt. The page shows the frames of the best and the worst episode
+where their recordings still lie below `data.root`.
 An archive of a store serves as well: it is restored once, to `train_head.scratch`.
 """
 
@@ -12,16 +14,19 @@ from pipeline.device import resolve_device
 from pipeline.durable import write_document
 from pipeline.evaluation import (
     JUDGED,
+    Judgement,
     check_store,
     held_out_ticks,
     judge,
     judge_modalities,
     judged_document,
     modality_table,
+    read_curves,
     table,
     write_tables,
 )
-from pipeline.plots import write_modalities_plot, write_plots
+from pipeline.report import write_report
+from pipeline.report.evaluation import evaluation_report
 from pipeline.store import check_trailers
 from stages.command import run
 
@@ -64,10 +69,20 @@ def main(params: Params) -> None:
     wanted.output.mkdir(parents=True, exist_ok=True)
     files = write_tables(wanted.output, comparison, predictions, store, study)
     write_document(wanted.output / JUDGED, judged)
-    files += [wanted.output / JUDGED, *write_plots(wanted.output, comparison, predictions, store)]
+    found = Judgement(
+        name=str(wanted.checkpoint),
+        checkpoint=checkpoint,
+        store=store,
+        comparison=comparison,
+        predictions=predictions,
+        study=study,
+        judged=judged,
+        curves=read_curves(checkpoint.params.logs),
+        recordings=params.data.root,
+    )
+    files += [wanted.output / JUDGED, *write_report(wanted.output, evaluation_report(found))]
     print(table(comparison))
     if study is not None:
-        files += write_modalities_plot(wanted.output, study)
         print(f"\n{modality_table(study)}")
     elif wanted.modalities:
         print("streams were not spoilt: no held-out tick lies 200 ms into its episode")

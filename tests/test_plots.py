@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,8 @@ from matplotlib.figure import Figure
 from pipeline import plots
 from pipeline.evaluation import (
     Comparison,
+    Curve,
+    Curves,
     Experiment,
     Group,
     ModalityStudy,
@@ -21,6 +24,7 @@ from pipeline.evaluation import (
     compare,
 )
 from pipeline.plots import probe
+from pipeline.plots.style import write
 from pipeline.probing import Finding, Folds, Score, SlotName, Study
 
 Drawn = tuple[Comparison, Predictions, SimpleNamespace]
@@ -55,7 +59,10 @@ def evaluated(episodes: int, dimensions: int = 5, ticks: int = 12, constant: int
         streams={"action": {"kind": "delta"}},
         episodes=[
             SimpleNamespace(
-                source="demo", id=f"episode_{i}" * (1 + i), ticks=range(i * ticks, (i + 1) * ticks)
+                index=i,
+                source="demo",
+                id=f"episode_{i}" * (1 + i),
+                ticks=range(i * ticks, (i + 1) * ticks),
             )
             for i in range(episodes)
         ],
@@ -78,19 +85,34 @@ def evaluated(episodes: int, dimensions: int = 5, ticks: int = 12, constant: int
     return comparison, predictions, store
 
 
+def pictures(comparison: Comparison, predictions: Predictions, store: Any) -> dict[str, Any]:
+    """Each picture of an evaluation by its file's name; frames of two views for one episode."""
+    rng = np.random.default_rng(0)
+    frames = {name: rng.integers(0, 255, (2, 12, 16, 3), np.uint8) for name in ("A", "B")}
+    instants = predictions.ticks[predictions.episodes == comparison.episodes[0]][[0, 6]]
+
+    def chunks() -> Figure:
+        return plots.chunks(comparison, predictions, store, store.episodes[0], instants, frames)
+
+    return {
+        "timeline.png": lambda: plots.timeline(comparison, predictions, store),
+        "scatter.png": lambda: plots.scatter(comparison, predictions),
+        "horizon.png": lambda: plots.horizon(comparison, store.action_hz),
+        "episodes.png": lambda: plots.episodes(comparison, store),
+        "dimensions.png": lambda: plots.dimensions(comparison),
+        "dimension_horizon.png": lambda: plots.dimension_horizon(comparison),
+        "chunks.png": chunks,
+    }
+
+
 @pytest.mark.parametrize(
     ("episodes", "dimensions", "constant"), [(1, 5, 1), (2, 2, 0), (3, 14, 1), (2, 3, 3)]
 )
 def test_every_picture_is_written(
     tmp_path: Path, episodes: int, dimensions: int, constant: int
 ) -> None:
-    files = plots.write_plots(tmp_path, *evaluated(episodes, dimensions, constant=constant))  # type: ignore[arg-type]
-    assert {file.name for file in files} == {
-        "timeline.png",
-        "scatter.png",
-        "horizon.png",
-        "episodes.png",
-    }
+    files = write(tmp_path, pictures(*evaluated(episodes, dimensions, constant=constant)))
+    assert len(files) == 7
     for file in files:
         assert file.read_bytes().startswith(b"\x89PNG")
         assert file.stat().st_size > 5000
@@ -100,7 +122,7 @@ def test_the_same_numbers_are_the_same_bytes(tmp_path: Path) -> None:
     written = []
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
-        files = plots.write_plots(tmp_path / name, *evaluated(2))  # type: ignore[arg-type]
+        files = write(tmp_path / name, pictures(*evaluated(2)))
         written.append([file.read_bytes() for file in files])
     assert written[0] == written[1]
 
@@ -133,6 +155,70 @@ def test_axes_carry_units_and_titles_say_what_one_sees(
         assert part in texts(figure)
 
 
+def test_frames_stand_above_the_chunks_that_were_made_of_them() -> None:
+    comparison, predictions, store = evaluated(2)
+    figure = pictures(comparison, predictions, store)["chunks.png"]()
+    views, courses = figure.axes[:4], figure.axes[4:]
+    assert [axis.get_ylabel() for axis in views] == ["A", "", "B", ""]
+    assert [axis.get_title() for axis in views] == ["0.0 s", "0.6 s", "", ""]
+    assert all(len(axis.images) == 1 for axis in views)
+    assert [axis.get_ylabel() for axis in courses] == ["d0 [mm]", "d1 [mm]", "d2 [mm]", "d3 [mm]"]
+    said = courses[0].get_legend_handles_labels()[1]
+    assert said == ["recorded", "policy, next action", "policy, whole chunk at the dotted ticks"]
+    for axis, dimension in zip(courses, range(4), strict=True):
+        whole = [line for line in axis.lines if len(line.get_xdata()) == 3]
+        assert [line.get_xdata()[0] for line in whole] == pytest.approx([0.0, 0.6])
+        np.testing.assert_array_equal(whole[1].get_ydata(), predictions.predicted[6, :, dimension])
+
+
+def test_chunks_are_drawn_without_frames_and_end_with_their_episode() -> None:
+    comparison, predictions, store = evaluated(2)
+    last = np.array([23])
+    figure = plots.chunks(comparison, predictions, store, store.episodes[1], last, {})  # type: ignore[arg-type]
+    assert len(figure.axes) == 4
+    assert "overall error" in figure.get_suptitle()
+    (point,) = (line for line in figure.axes[0].lines if line.get_label().startswith("policy, wh"))
+    assert point.get_xdata() == pytest.approx([1.1])
+
+
+def test_errors_by_dimension_and_step_are_in_training_deviations() -> None:
+    comparison, *_ = evaluated(2)
+    comparison = replace(comparison, scale=np.array([0.5, 1, 1, 2, 0.0]))
+    (axis, _) = plots.dimension_horizon(comparison).axes
+    shown = np.asarray(axis.images[0].get_array())
+    errors = comparison.scores["policy"].mae_horizon
+    np.testing.assert_allclose(shown[0], errors[:, 0] / 0.5)
+    np.testing.assert_allclose(shown[3], errors[:, 3] / 2)
+    assert len(shown) == 4
+    assert [text.get_text() for text in axis.texts][:3] == [f"{e:.2f}" for e in shown[0]]
+    (axis,) = plots.dimensions(comparison).axes
+    policy = next(line for line in axis.lines if line.get_label() == "policy")
+    np.testing.assert_allclose(
+        policy.get_xdata(), comparison.scores["policy"].mae[:4] / [0.5, 1, 1, 2]
+    )
+
+
+def test_curves_mark_the_step_that_was_judged() -> None:
+    steps = np.array([10, 20, 30])
+    logged = {
+        name: Curve(steps, np.array(values))
+        for name, values in {
+            "train/loss": [1.0, 0.1, 0.01],
+            "lr": [0.0, 1e-3, 5e-4],
+            "train/other": [1.0, 1.0, 1.0],
+        }.items()
+    }
+    figure = plots.curves(Curves(logged), 20)
+    assert [axis.get_title() for axis in figure.axes] == ["training loss", "learning rate"]
+    assert [axis.get_yscale() for axis in figure.axes] == ["log", "linear"]
+    for axis in figure.axes:
+        assert axis.lines[0].get_xdata().tolist() == steps.tolist()
+        assert axis.lines[1].get_xdata()[0] == 20
+    assert "step 20" in figure.get_suptitle()
+    (axis,) = plots.curves(Curves({"train/other": logged["train/other"]}), 5).axes
+    assert axis.get_title() == "train/other"
+
+
 def test_what_never_varies_takes_no_panel() -> None:
     comparison, _, store = evaluated(2)
     assert len(plots.horizon(comparison, None).axes) == 1
@@ -157,7 +243,7 @@ def test_a_picture_never_writes_through_a_link(tmp_path: Path) -> None:
     report.mkdir()
     cache.write_bytes(b"cached")
     (report / "timeline.png").hardlink_to(cache)
-    plots.write_plots(report, *evaluated(1))  # type: ignore[arg-type]
+    write(report, pictures(*evaluated(1)))
     assert cache.read_bytes() == b"cached"
 
 
@@ -199,7 +285,7 @@ def test_what_each_stream_is_worth_stands_beside_intact_and_best_baseline(tmp_pa
     assert "mean training action" in figure.legends[0].get_texts()[1].get_text()
     assert "4 held-out ticks, 4 chunk(s) a tick" in figure.get_suptitle()
     assert "zeroed: every value at its training mean" in figure.legends[0].get_title().get_text()
-    (file,) = plots.write_modalities_plot(tmp_path, studied(0.5, 1.0, 0.75, 2.0))
+    (file,) = write(tmp_path, {"modalities.png": lambda: figure})
     assert file.read_bytes().startswith(b"\x89PNG")
 
 
@@ -222,12 +308,13 @@ def compared(errors: dict[str, float], rules: dict[str, float]) -> list[Experime
 def test_experiments_are_bars_and_baselines_lines(tmp_path: Path) -> None:
     rules = {"zero_action": 3.0, "mean_action": 2.0, "repeat_last": 1.0}
     experiments = compared({"regression": 0.3, "diffusion": 0.4}, rules)
-    (axis,) = plots.comparison_of_experiments(experiments).axes
+    figure = plots.comparison_of_experiments(experiments)
+    (axis,) = figure.axes
     assert [patch.get_width() for patch in axis.patches] == [0.3, 0.3, 0.4, 0.4]
     assert [line.get_xdata()[0] for line in axis.lines] == list(rules.values())
     assert [label.get_text() for label in axis.get_yticklabels()] == [e.name for e in experiments]
     assert [text.get_text() for text in axis.texts] == ["0.300", "0.300", "0.400", "0.400"]
-    (file,) = plots.write_experiments_plot(tmp_path, experiments)
+    (file,) = write(tmp_path, {"experiments.png": lambda: figure})
     assert file.read_bytes().startswith(b"\x89PNG")
 
 

@@ -1,30 +1,28 @@
 """Figures of merit -> pictures; the same numbers give the same bytes.
 
-The pictures of a probe are in `pipeline.plots.probe`, apart from these: they know another room.
+Those of a probe, of recordings and of stores are in modules apart from these: they know other
+rooms.
 """
 
-from pipeline.plots.experiments import comparison_of_experiments, write_experiments_plot
-from pipeline.plots.modalities import modalities, write_modalities_plot
-from pipeline.plots.predictions import (
-    EPISODE_LINES,
-    episodes,
-    horizon,
-    scatter,
-    timeline,
-    write_plots,
-)
+from pipeline.plots.chunks import chunks
+from pipeline.plots.curves import curves
+from pipeline.plots.errors import dimension_horizon, dimensions
+from pipeline.plots.experiments import comparison_of_experiments
+from pipeline.plots.modalities import modalities
+from pipeline.plots.predictions import EPISODE_LINES, episodes, horizon, scatter, timeline
 from pipeline.plots.style import LABELS
 
 __all__ = [
     "EPISODE_LINES",
     "LABELS",
+    "chunks",
     "comparison_of_experiments",
+    "curves",
+    "dimension_horizon",
+    "dimensions",
     "episodes",
     "horizon",
     "modalities",
     "scatter",
     "timeline",
-    "write_experiments_plot",
-    "write_modalities_plot",
-    "write_plots",
 ]

@@ -1,21 +1,15 @@
 """The picture of several experiments side by side."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from pipeline.evaluation import BASELINES, Experiment
-from pipeline.plots.style import LABELS, STYLES, canvas, write
+from pipeline.plots.style import LABELS, STYLES, canvas
 
 COLOURS = ("#0072B2", "#D55E00", "#56B4E9", "#F0E442", "#999999")
 """Of the experts, in the order in which they come."""
-
-
-def write_experiments_plot(folder: Path, experiments: Sequence[Experiment]) -> list[Path]:
-    """Write experiments.png into `folder` and return its path."""
-    return write(folder, {"experiments.png": lambda: comparison_of_experiments(experiments)})
 
 
 def comparison_of_experiments(experiments: Sequence[Experiment]) -> Figure:

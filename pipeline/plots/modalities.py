@@ -1,12 +1,10 @@
 """The picture that says which streams a policy uses."""
 
-from pathlib import Path
-
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pipeline.evaluation import MODALITY_FOOTNOTE, ModalityStudy, Spoilt, best_baseline
-from pipeline.plots.style import LABELS, STYLES, canvas, legend_below, write
+from pipeline.plots.style import GRID, INK, LABELS, STYLES, canvas, legend_below
 
 COLOURS = {
     "zeroed": "#0072B2",
@@ -14,11 +12,6 @@ COLOURS = {
     "shuffled": "#D55E00",
     "delayed": "#999999",
 }
-
-
-def write_modalities_plot(folder: Path, study: ModalityStudy) -> list[Path]:
-    """Write modalities.png into `folder` and return its path."""
-    return write(folder, {"modalities.png": lambda: modalities(study)})
 
 
 def modalities(study: ModalityStudy) -> Figure:
@@ -51,9 +44,9 @@ def _panel(axis: Axes, panel: list[Spoilt], study: ModalityStudy, unit: float) -
     heights = [one.comparison.overall("policy") / unit for one in panel]
     colours = [COLOURS[one.how.split()[0]] for one in panel]
     bars = axis.bar(range(len(panel)), heights, color=colours, width=0.7)
-    # On white, for a line may pass behind a number.
+    # On a ground of its own, for a line may pass behind a number.
     axis.bar_label(
-        bars, fmt="%.2f", padding=3, bbox={"facecolor": "white", "edgecolor": "none", "pad": 1}
+        bars, fmt="%.2f", padding=3, bbox={"facecolor": GRID, "edgecolor": "none", "pad": 1}
     )
     best = best_baseline(study.intact)
     axis.axhline(
@@ -64,7 +57,7 @@ def _panel(axis: Axes, panel: list[Spoilt], study: ModalityStudy, unit: float) -
     )
     axis.axhline(
         study.intact.overall(best) / unit,
-        color="#333333",
+        color=INK,
         lw=1.8,
         ls="--",
         label=f"best {LABELS[best]}, which sees nothing",

@@ -1,7 +1,6 @@
 """The pictures of an evaluation: what a policy did beside what was recorded."""
 
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,33 +16,16 @@ from pipeline.evaluation import (
     episode_name,
     with_unit,
 )
-from pipeline.plots.style import LABELS, RECORDED, STYLES, canvas, legend_below, write
+from pipeline.plots.style import LABELS, RECORDED, STYLES, canvas, legend_below
 from pipeline.store import Episode, FeatureStore
 
-TIMELINES = 2
-"""Episodes whose course is drawn: the one the policy follows best, and the one it follows worst."""
 SCATTER_POINTS = 4000
 EPISODE_LINES = 40
 
 
-def write_plots(
-    folder: Path, comparison: Comparison, predictions: Predictions, store: FeatureStore
-) -> list[Path]:
-    """Write the pictures of an evaluation into `folder` and return their paths."""
-    return write(
-        folder,
-        {
-            "timeline.png": lambda: timeline(comparison, predictions, store),
-            "scatter.png": lambda: scatter(comparison, predictions),
-            "horizon.png": lambda: horizon(comparison, store.action_hz),
-            "episodes.png": lambda: episodes(comparison, store),
-        },
-    )
-
-
 def timeline(comparison: Comparison, predictions: Predictions, store: FeatureStore) -> Figure:
     """Recorded and predicted action over time, a row a dimension, a column an episode."""
-    shown = _best_and_worst(comparison)
+    shown = comparison.extremes()
     rows = len(comparison.names)
     figure = canvas(max(5.8 * len(shown) + 0.4, 8.0), 1.15 * rows + 1.4)
     axes = figure.subplots(rows, len(shown), squeeze=False, sharex="col", sharey="row")
@@ -63,7 +45,7 @@ def timeline(comparison: Comparison, predictions: Predictions, store: FeatureSto
                 lw=1.6,
                 label="policy, next action",
             )
-        axes[0, column].set_title(f"{title}: {_short(episode)}")
+        axes[0, column].set_title(f"{title}: {short_name(episode)}")
         axes[-1, column].set_xlabel("time since the episode began [s]")
     for row, axis in enumerate(axes[:, 0]):
         axis.set_ylabel(with_unit(comparison.names[row], comparison.units[row]))
@@ -76,7 +58,7 @@ def timeline(comparison: Comparison, predictions: Predictions, store: FeatureSto
 
 def scatter(comparison: Comparison, predictions: Predictions) -> Figure:
     """Predicted against recorded next action, a panel a dimension; on the diagonal it is right."""
-    dimensions = _varying(comparison)
+    dimensions = comparison.varying()
     count = len(dimensions)
     columns = min(4, count)
     lines = math.ceil(count / columns)
@@ -104,13 +86,13 @@ def scatter(comparison: Comparison, predictions: Predictions) -> Figure:
 
 def horizon(comparison: Comparison, action_hz: float | None) -> Figure:
     """Mean absolute error by how far ahead an action lies, a panel an action group."""
-    groups = _varying_groups(comparison)
+    groups = comparison.varying_groups()
     figure = canvas(max(4.6 * len(groups), 8.5), 4.4)
     axes = figure.subplots(1, len(groups), squeeze=False)[0]
     for axis, group in zip(axes, groups, strict=True):
         for method in METHODS:
             errors = group.mean(comparison.scores[method].mae_horizon)
-            axis.plot(np.arange(len(errors)), errors, label=LABELS[method], **_marked(method))
+            axis.plot(np.arange(len(errors)), errors, label=LABELS[method], **marked(method))
         axis.set_title(_title(comparison, group))
         axis.set_xlabel(
             "steps ahead" if action_hz is None else f"steps ahead [{1000 / action_hz:.0f} ms each]"
@@ -125,21 +107,21 @@ def horizon(comparison: Comparison, action_hz: float | None) -> Figure:
 
 def episodes(comparison: Comparison, store: FeatureStore) -> Figure:
     """Mean absolute error of each held-out episode, a panel an action group, worst on top."""
-    order = np.argsort(comparison.overall_by_episode("policy"), kind="stable")
+    order = np.array(comparison.ranked())
     if len(order) > EPISODE_LINES:
         order = order[np.linspace(0, len(order) - 1, EPISODE_LINES).round().astype(int)]
-    groups = _varying_groups(comparison)
+    groups = comparison.varying_groups()
     figure = canvas(max(3.6 * len(groups) + 3, 9.0), 0.3 * len(order) + 2)
     axes = figure.subplots(1, len(groups), squeeze=False, sharey=True)[0]
     lines = np.arange(len(order))
     for axis, group in zip(axes, groups, strict=True):
         for method in METHODS:
             errors = group.mean(comparison.scores[method].mae_episode)[order]
-            axis.plot(errors, lines, label=LABELS[method], **_marked(method) | {"linestyle": ""})
+            axis.plot(errors, lines, label=LABELS[method], **marked(method) | {"linestyle": ""})
         axis.set_title(_title(comparison, group))
         axis.set_xlabel(with_unit("mean absolute error", group.unit))
         axis.set_xlim(left=0)
-    axes[0].set_yticks(lines, [_short(store.episodes[comparison.episodes[i]]) for i in order])
+    axes[0].set_yticks(lines, [short_name(store.episodes[comparison.episodes[i]]) for i in order])
     axes[0].set_ylim(-0.6, len(order) - 0.4)
     legend_below(figure, axes[0], len(METHODS))
     some = (
@@ -153,7 +135,14 @@ def episodes(comparison: Comparison, store: FeatureStore) -> Figure:
     return figure
 
 
-def _marked(method: str) -> dict[str, Any]:
+def short_name(episode: Episode) -> str:
+    """`episode_name`, its middle left out where it is too long for a title."""
+    name = episode_name(episode)
+    return name if len(name) <= 44 else f"{name[:14]}…{name[-28:]}"
+
+
+def marked(method: str) -> dict[str, Any]:
+    """How a way of acting is drawn where its points are marked."""
     wide = method == "policy"
     # An open, larger square stays visible where the mean action is next to no motion.
     size = {"policy": 6.5, "zero_action": 8.5}.get(method, 5)
@@ -164,28 +153,6 @@ def _title(comparison: Comparison, group: Group) -> str:
     names = ", ".join(comparison.names[index] for index in group.dimensions[:6])
     more = " …" if len(group.dimensions) > 6 else ""
     return f"{group.name} ({names}{more})"
-
-
-def _varying(comparison: Comparison) -> list[int]:
-    """The dimensions that vary in training; all, where none does."""
-    varying = np.flatnonzero(comparison.scale > 0).tolist()
-    return varying or list(range(len(comparison.names)))
-
-
-def _varying_groups(comparison: Comparison) -> list[Group]:
-    """The groups with something to predict: one that never varies would fill a panel with 0."""
-    varying = set(_varying(comparison))
-    return [group for group in comparison.groups if varying & set(group.dimensions)]
-
-
-def _best_and_worst(comparison: Comparison) -> list[tuple[str, int]]:
-    order = np.argsort(comparison.overall_by_episode("policy"), kind="stable")
-    if len(order) == 1:
-        return [("the held-out episode", comparison.episodes[0])]
-    return [
-        ("lowest error", comparison.episodes[order[0]]),
-        ("highest error", comparison.episodes[order[-1]]),
-    ][:TIMELINES]
 
 
 def _readable_range(axis: Axes, scale: float) -> None:
@@ -201,8 +168,3 @@ def _padded(values: NDArray[np.floating]) -> tuple[float, float]:
     low, high = float(values.min()), float(values.max())
     margin = max(0.05 * (high - low), 0.02 * max(abs(low), abs(high)), 1e-6)
     return low - margin, high + margin
-
-
-def _short(episode: Episode) -> str:
-    name = episode_name(episode)
-    return name if len(name) <= 44 else f"{name[:14]}…{name[-28:]}"

@@ -5,6 +5,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -24,6 +25,32 @@ def flip() -> Callable[[Path, str], Path]:
         return file
 
     return turn
+
+
+@pytest.fixture(scope="session")
+def quick_params(tiny_store: Callable[..., Path]) -> Callable[[Path], dict[str, Any]]:
+    """`quick_params(folder)`: params of a head that trains in a moment, its tiny store there."""
+
+    def document(folder: Path) -> dict[str, Any]:
+        return {
+            "data": {"sources": [{"name": "left", "path": "a"}, {"name": "right", "path": "b"}]},
+            "vlm": {"checkpoint": "unused"},
+            "extract": {"store": str(tiny_store(folder))},
+            "train_head": {
+                "sensor_encoder": {"channels": [8], "layers": 0, "heads": 1, "output_dim": 8},
+                "state_encoder": {"dim": 8, "layers": 0, "heads": 1, "output_dim": 8},
+                "expert": {"dim": 8, "layers": 1, "heads": 1},
+                "batch_size": 8,
+                "max_steps": 3,
+                "sensor_window": 6,
+                "state_window": 5,
+                "device": "cpu",
+                "output": str(folder / "head"),
+                "logs": str(folder / "logs"),
+            },
+        }
+
+    return document
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -18,23 +19,12 @@ NAMES = ["regression-concat", "regression-gated", "diffusion-concat", "flow_matc
 
 
 @pytest.fixture(scope="module")
-def experiments(tiny_store: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def experiments(
+    quick_params: Callable[[Path], dict[str, Any]], tmp_path_factory: pytest.TempPathFactory
+) -> Path:
     """A params.yaml and evaluated experiments."""
     folder = tmp_path_factory.mktemp("compare")
-    document = {
-        "data": {"sources": [{"name": "left", "path": "a"}, {"name": "right", "path": "b"}]},
-        "vlm": {"checkpoint": "unused"},
-        "extract": {"store": str(tiny_store(folder))},
-        "train_head": {
-            "sensor_encoder": {"channels": [8], "layers": 0, "heads": 1, "output_dim": 8},
-            "state_encoder": {"dim": 8, "layers": 0, "heads": 1, "output_dim": 8},
-            "expert": {"dim": 8, "layers": 1, "heads": 1},
-            "batch_size": 8,
-            "max_steps": 3,
-            "sensor_window": 6,
-            "state_window": 5,
-            "device": "cpu",
-        },
+    document = quick_params(folder) | {
         "evaluate": {"modalities": False, "samples": 2},
         "compare": {"reports": str(folder / "reports"), "output": str(folder / "comparison")},
     }
@@ -84,7 +74,8 @@ def test_a_table_a_file_and_a_picture(
         "baseline: repeat last",
     ]
     output = experiments.parent / "comparison"
-    assert sorted(path.name for path in output.iterdir()) == ["experiments.csv", "experiments.png"]
+    names = ["experiments.csv", "experiments.png", "report.html"]
+    assert sorted(path.name for path in output.iterdir()) == names
     assert (output / "experiments.png").read_bytes().startswith(b"\x89PNG")
     rows = list(csv.DictReader((output / "experiments.csv").read_text().splitlines()))
     for row in rows:
@@ -93,6 +84,8 @@ def test_a_table_a_file_and_a_picture(
         assert float(row["overall_policy"]) == overall["policy"]
         assert float(row["overall_mean_action"]) == overall["mean_action"]
         assert row["samples"] == ("1" if row["model_type"] == "regression" else "2")
+    page = (output / "report.html").read_text()
+    assert all(name in page for name in NAMES) and ">trained<" not in page
     markdown = (experiments.parent / "comparison.md").read_text().splitlines()
     assert markdown[1].startswith("| --- |")
     assert len({line.count("|") for line in markdown}) == 1

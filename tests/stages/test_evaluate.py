@@ -1,8 +1,10 @@
 """The command refuses a checkpoint and a store that do not belong together."""
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -11,29 +13,28 @@ from pipeline.store.archive import archive
 from stages import evaluate, train_head
 from stages.command import run
 
+PICTURES = (
+    "curves",
+    "dimension_horizon",
+    "dimensions",
+    "episode_best",
+    "episodes",
+    "horizon",
+    "modalities",
+    "scatter",
+    "timeline",
+)
+"""Of one held-out episode, which is the best and the worst; dvc.yaml lists them by name."""
+
 
 @pytest.fixture(scope="module")
-def trained(tiny_store: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def trained(
+    quick_params: Callable[[Path], dict[str, Any]], tmp_path_factory: pytest.TempPathFactory
+) -> Path:
     """A params.yaml whose head is trained."""
     folder = tmp_path_factory.mktemp("evaluate")
-    document = {
-        "data": {"sources": [{"name": "left", "path": "a"}, {"name": "right", "path": "b"}]},
-        "vlm": {"checkpoint": "unused"},
-        "extract": {"store": str(tiny_store(folder))},
-        "train_head": {
-            "sensor_encoder": {"channels": [8], "layers": 0, "heads": 1, "output_dim": 8},
-            "state_encoder": {"dim": 8, "layers": 0, "heads": 1, "output_dim": 8},
-            "expert": {"dim": 8, "layers": 1, "heads": 1},
-            "batch_size": 8,
-            "max_steps": 3,
-            "sensor_window": 6,
-            "state_window": 5,
-            "device": "cpu",
-            "output": str(folder / "head"),
-            "logs": str(folder / "logs"),
-        },
-        "evaluate": {"checkpoint": str(folder / "head"), "output": str(folder / "report")},
-    }
+    judged = {"checkpoint": str(folder / "head"), "output": str(folder / "report")}
+    document = quick_params(folder) | {"evaluate": judged}
     path = folder / "params.yaml"
     path.write_text(yaml.safe_dump(document))
     assert run("", train_head.main, ["--params", str(path)]) == 0
@@ -124,14 +125,45 @@ def test_the_report_says_what_was_judged_and_which_streams_are_used(
     said = capsys.readouterr().out
     assert "sensor    zeroed" in said
     assert "sensor shuffled: not judged" in said
-    assert (tmp_path / "report/modalities.png").read_bytes().startswith(b"\x89PNG")
+    for name in PICTURES:
+        assert (tmp_path / f"report/{name}.png").read_bytes().startswith(b"\x89PNG")
     metrics = json.loads((tmp_path / "report/metrics.json").read_text())
     assert metrics["modalities"]["sensor"]["delayed_50_ms"]["overall"] > 0
     judged = json.loads((tmp_path / "report/judged.json").read_text())
     assert judged["policy"]["model_type"] == "regression"
     assert judged["policy"]["samples"] == 1
     assert judged["drawn"] is None
-    assert next(iter(judged["on"]["held_out"].values()))["ticks"] == [0, 30]
+    ((name, held_out),) = judged["on"]["held_out"].items()
+    assert held_out["ticks"] == [0, 30]
+    page = (tmp_path / "report/report.html").read_text()
+    place = f"data/demo/recordings/{name.split('/')[1]}"
+    assert f"No frames: there is no recording at {place} any more." in page
+
+
+def test_the_same_judgement_is_the_same_bytes_wherever_it_is_written(
+    trained: Path, tmp_path: Path
+) -> None:
+    written = []
+    for output in (tmp_path / "one", tmp_path / "else/where"):
+        arguments = ["--params", str(trained), "--set", f"evaluate.output={output}"]
+        assert run("", evaluate.main, arguments) == 0
+        written.append({file.name: file.read_bytes() for file in output.iterdir()})
+    assert written[0] == written[1]
+    assert "report.html" in written[0]
+
+
+def test_a_report_says_that_the_logs_are_gone(trained: Path, tmp_path: Path) -> None:
+    logs = shutil.move(trained.parent / "logs", tmp_path / "logs")
+    arguments = ["--params", str(trained), "--set", f"evaluate.output={tmp_path / 'report'}"]
+    try:
+        assert run("", evaluate.main, arguments) == 0
+    finally:
+        shutil.move(logs, trained.parent / "logs")
+    assert (
+        f"there are none in {trained.parent / 'logs/plots/metrics'} any more"
+        in (tmp_path / "report/report.html").read_text()
+    )
+    assert not (tmp_path / "report/curves.png").exists()
 
 
 def test_streams_are_left_alone_where_nobody_asks(trained: Path, tmp_path: Path) -> None:

@@ -1,0 +1,126 @@
+"""What training and the frozen model get of one recording: samples, the batch, the prompt."""
+
+from collections.abc import Sequence
+from functools import lru_cache
+from itertools import groupby
+from pathlib import Path
+
+from tqdm import tqdm
+
+from pipeline.config import Params
+from pipeline.datasets import UnifiedBatch, UnifiedVLADataset
+from pipeline.digests import file_digest
+from pipeline.errors import PipelineError
+from pipeline.inspection.facts import EpisodeView, PromptToken, PromptView
+from pipeline.inspection.overview import RecordingsOverview
+from pipeline.inspection.prompt import view_prompt
+from pipeline.inspection.samples import samples
+from pipeline.plots import recording as plots
+from pipeline.report.blocks import Block, Document, Picture, Run, Section, Table, Text, Tokens
+from pipeline.report.recording_episode import Viewer
+from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
+
+
+def model_input(
+    index: int, view_of: Viewer, overview: RecordingsOverview, params: Params
+) -> Section:
+    """The section of the episode at `index`; what cannot be made is a sentence saying why."""
+    said = overview.summaries[index].episode
+    return Section(
+        "What the model and the policy get",
+        [Text(f"Of the episode `{said}`, under the params in force.")],
+        [
+            Section("Samples and batch", _samples(index, view_of, params)),
+            Section("Prompt", _prompt(view_of(index), overview, params)),
+        ],
+    )
+
+
+def _samples(index: int, view_of: Viewer, params: Params) -> list[Block]:
+    @lru_cache(maxsize=1)
+    def made() -> tuple[UnifiedVLADataset, UnifiedBatch]:
+        return samples(view_of(index), params, params.inspect.samples, params.inspect.seed)
+
+    try:
+        count = len(made()[1].tick)
+    except PipelineError as error:
+        return [Text(f"No sample can be made: {error}")]
+    head = params.train_head
+    return [
+        Picture(
+            "samples",
+            f"{count} training samples side by side: the frames, the sensor and state windows "
+            f"that end at the tick, and the chunk of {head.horizon} actions that begins at it. "
+            "The first is the episode's first tick, the last its last.",
+            lambda: plots.samples(*made()),
+        ),
+        Picture(
+            "batch",
+            "The same samples as one batch: windows are padded on the left before the episode's "
+            "start, chunks are masked past its end.",
+            lambda: plots.batch(made()[1]),
+        ),
+    ]
+
+
+def _prompt(view: EpisodeView, overview: RecordingsOverview, params: Params) -> list[Block]:
+    try:
+        spec = _spec(overview, params)
+    except PipelineError as error:
+        return [
+            Text(
+                f"Neither the prompt nor the feature spec can be shown: {error}. Name a checkpoint "
+                "that is here with `--set vlm.checkpoint=FOLDER`; the demo's is written by "
+                "`python -m stages.demo`."
+            )
+        ]
+    try:
+        blocks = _told(view_prompt(view, params.vlm, spec))
+    except PipelineError as error:
+        blocks = [Text(f"The prompt cannot be shown: {error}")]
+    return [*blocks, _document(spec)]
+
+
+def _spec(overview: RecordingsOverview, params: Params) -> FeatureSpec:
+    """Reads the whole checkpoint for its digest, which takes seconds a gigabyte."""
+    with tqdm(desc="digest of the checkpoint", unit="file", disable=None, leave=False) as bar:
+
+        def digest(path: Path) -> str:
+            bar.update()
+            return file_digest(path)
+
+        return feature_spec(params.vlm, params.extract.dtype, overview.views, digest)
+
+
+def _document(spec: FeatureSpec) -> Document:
+    return Document("Feature spec: what decides what a feature is", spec.attrs())
+
+
+def _told(prompt: PromptView) -> list[Block]:
+    height, width = prompt.pixels
+    images = sum(prompt.image_tokens.values())
+    text = len(prompt.tokens) - images
+    return [
+        Text(
+            f"{len(prompt.tokens):,} tokens: {images:,} of images, {text:,} others. Each image is "
+            f"{height} × {width} pixels for the model. Attention is causal: a token sees only what "
+            "stands before it."
+        ),
+        Tokens(runs(prompt.tokens)),
+        Table(["view", "image tokens"], list(prompt.image_tokens.items()), "Image tokens by view"),
+        Table(["token", "times"], list(prompt.special.items()), "Special tokens by name"),
+    ]
+
+
+def runs(tokens: Sequence[PromptToken]) -> list[Run]:
+    """Tokens of one kind and view as one run; those of an image folded to a count."""
+    found: list[Run] = []
+    for (kind, view), each in groupby(tokens, lambda one: (one.kind, one.view)):
+        group = list(each)
+        if kind == "image":
+            found.append(Run(group[0].text, kind, f"× {len(group):,}, {view}"))
+        elif kind == "special":
+            found += [Run(one.text, kind) for one in group]
+        else:
+            found.append(Run("".join(one.text for one in group), kind))
+    return found

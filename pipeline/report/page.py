@@ -1,0 +1,219 @@
+"""`Report` -> `report.html`, one file that needs nothing beside itself, and PNG files.
+
+The page makes no request: styles, scripts, pictures and plotly.js stand in it, and its content
+security policy forbids the rest. The same report gives the same bytes.
+"""
+
+import json
+import re
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+from matplotlib.figure import Figure
+from tqdm import tqdm
+
+from pipeline.durable import disk_full_named, sync
+from pipeline.plots.style import RC, write
+from pipeline.report.blocks import (
+    Block,
+    Chart,
+    Document,
+    Notices,
+    Picture,
+    Report,
+    Section,
+    Table,
+    Text,
+    Tokens,
+)
+from pipeline.report.cells import columns_of, prose
+from pipeline.report.charts import chart_json, plotly_script
+from pipeline.report.svg import inline_svg
+
+PAGE = "report.html"
+OPEN_NOTICES = 12
+"""Notices that show at once; the rest unfold."""
+_WRITTEN = re.compile(r'<meta name="pictures" content="([^"]*)">')
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
+
+
+def write_report(folder: Path, report: Report) -> list[Path]:
+    """Write `report.html` and `<name>.png` of every picture into `folder`; return their paths.
+
+    Pictures are drawn one at a time. Each file is put in place whole, the page last, so that a kill
+    leaves the old page. Pictures that the page of before had and this one has not are removed; of
+    other files in `folder` none is touched. Raises `DiskFull` with the old page in place, and
+    `ValueError` for a picture's name that is twice in the report or no plain file stem.
+    """
+    names = [picture.name for picture in _pictures(report.sections)]
+    _check_names(names)
+    folder.mkdir(parents=True, exist_ok=True)
+    temporary = folder / f".{PAGE}.new"
+    shutil.rmtree(temporary, ignore_errors=True)
+    with disk_full_named(folder):
+        temporary.mkdir()
+        try:
+            (temporary / PAGE).write_text(_Page(report, temporary, names).html(), encoding="utf-8")
+            return _put_in_place(temporary, folder, names)
+        finally:
+            shutil.rmtree(temporary)
+
+
+def _put_in_place(temporary: Path, folder: Path, names: Sequence[str]) -> list[Path]:
+    page = folder / PAGE
+    files = [*(f"{name}.png" for name in names), PAGE]
+    for file in files:
+        sync(temporary / file)
+    before = _pictures_of(page)
+    for file in files:
+        (temporary / file).replace(folder / file)
+    for name in before - set(names):
+        (folder / f"{name}.png").unlink(missing_ok=True)
+    sync(folder)
+    return [page, *(folder / file for file in files[:-1])]
+
+
+def _pictures_of(page: Path) -> set[str]:
+    """Names of the pictures that were written with a page; of no page, none."""
+    if not page.is_file():
+        return set()
+    with page.open(encoding="utf-8", errors="replace") as file:
+        found = _WRITTEN.search(file.read(2**16))
+    names = found[1].split() if found else []
+    return {name for name in names if _NAME.fullmatch(name)}
+
+
+def _pictures(sections: Sequence[Section]) -> Iterator[Picture]:
+    for section in sections:
+        for block in section.blocks:
+            if isinstance(block, Chart):
+                yield block.picture
+            elif isinstance(block, Picture):
+                yield block
+        yield from _pictures(section.parts)
+
+
+def _check_names(names: Sequence[str]) -> None:
+    for name in names:
+        if not _NAME.fullmatch(name):
+            raise ValueError(f"a picture's name is a plain file stem, found {name!r}")
+        if names.count(name) > 1:
+            raise ValueError(f"the picture {name!r} stands twice in the report")
+
+
+class _Page:
+    """One page in the making: its pictures' folder, the anchors taken, whether it has charts."""
+
+    def __init__(self, report: Report, pictures: Path, names: Sequence[str]) -> None:
+        templates = FileSystemLoader(Path(__file__).parent / "templates")
+        self._jinja = Environment(
+            loader=templates,
+            autoescape=True,
+            undefined=StrictUndefined,
+            trim_blocks=True,
+            lstrip_blocks=True,
+        )
+        self._jinja.filters["prose"] = prose
+        self._blocks: Any = self._jinja.get_template("blocks.html").module
+        self._templates = Path(__file__).parent / "templates"
+        self._report, self._pictures, self._names = report, pictures, names
+        self._anchors: set[str] = {"top"}
+        self._charts = 0
+
+    def html(self) -> str:
+        """The whole page."""
+        with tqdm(total=len(self._names), desc="pictures", unit="", disable=None) as self._bar:
+            sections = [self._section(section) for section in self._report.sections]
+        return self._jinja.get_template("page.html").render(
+            report=self._report,
+            sections=sections,
+            pictures=" ".join(self._names),
+            style=self._inlined("page.css"),
+            script=self._inlined("page.js"),
+            plotly=plotly_script() if self._charts else "",
+            chart_script=self._inlined("charts.js") if self._charts else "",
+        )
+
+    def _inlined(self, name: str) -> Markup:
+        return Markup((self._templates / name).read_text(encoding="utf-8"))
+
+    def _section(self, section: Section) -> dict[str, Any]:
+        return {
+            "title": section.title,
+            "anchor": self._anchor(section.title),
+            "blocks": [self._block(block) for block in section.blocks],
+            "parts": [self._section(part) for part in section.parts],
+        }
+
+    def _anchor(self, title: str) -> str:
+        stem = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-") or "section"
+        anchor, count = stem, 1
+        while anchor in self._anchors:
+            count += 1
+            anchor = f"{stem}-{count}"
+        self._anchors.add(anchor)
+        return anchor
+
+    def _block(self, block: Block) -> Markup:
+        match block:
+            case Text():
+                return self._blocks.text(block.words)
+            case Table():
+                columns = columns_of(block.columns, block.rows)
+                return self._blocks.table(block, columns)
+            case Picture():
+                return self._blocks.picture(block, self._draw(block))
+            case Chart():
+                return self._chart(block)
+            case Notices():
+                order = sorted(block.notices, key=lambda one: one.severity != "error")
+                return self._blocks.notices(order, OPEN_NOTICES, block.none)
+            case Tokens():
+                return self._blocks.tokens([asdict(run) for run in block.runs])
+            case Document():
+                return self._blocks.document(block.title, document_lines(block.content))
+
+    def _chart(self, chart: Chart) -> Markup:
+        self._charts += 1
+        height = chart.figure.layout.height or 480
+        svg = self._draw(chart.picture)
+        return self._blocks.chart(chart.picture, svg, chart_json(chart.figure), height)
+
+    def _draw(self, picture: Picture) -> Markup:
+        """The picture as SVG; its PNG is written on the way, from the same figure."""
+        drawn: list[Figure] = []
+
+        def draw() -> Figure:
+            drawn.append(picture.draw())
+            return drawn[0]
+
+        write(self._pictures, {f"{picture.name}.png": draw})
+        with mpl.rc_context(RC):
+            svg = inline_svg(drawn[0], picture.name, picture.caption)
+        self._bar.update()
+        return Markup(svg)
+
+
+def document_lines(content: Mapping[str, Any], depth: int = 0) -> list[tuple[int, str, str]]:
+    """A nested document as (depth, key, value) lines, in its own order."""
+    lines: list[tuple[int, str, str]] = []
+    for key, value in content.items():
+        lines += _entry(depth, str(key), value)
+    return lines
+
+
+def _entry(depth: int, key: str, value: Any) -> list[tuple[int, str, str]]:
+    if isinstance(value, Mapping) and value:
+        return [(depth, key, ""), *document_lines(value, depth + 1)]
+    if isinstance(value, list | tuple) and any(isinstance(one, Mapping | list) for one in value):
+        inside = [line for one in value for line in _entry(depth + 1, "-", one)]
+        return [(depth, key, ""), *inside]
+    if isinstance(value, str) and value.isprintable() and value == value.strip() != "":
+        return [(depth, key, value)]
+    return [(depth, key, json.dumps(value, ensure_ascii=False, default=str))]

@@ -1,0 +1,166 @@
+"""One recording -> its section: what each stream holds, and when."""
+
+import re
+from collections.abc import Callable, Sequence
+from functools import partial
+
+from matplotlib.figure import Figure
+
+from pipeline.config import InspectParams
+from pipeline.inspection.clocks import clocks
+from pipeline.inspection.contact import contacts
+from pipeline.inspection.facts import Clock, EpisodeView, Flaw
+from pipeline.inspection.frames import frames_at, spread_ticks
+from pipeline.inspection.overview import EpisodeSummary
+from pipeline.inspection.statistics import channel_statistics
+from pipeline.plots import interactive
+from pipeline.plots.recording import camera_views, clock_lanes, clock_steps, motion, sensor
+from pipeline.report.blocks import Block, Chart, Notices, Picture, Section, Table, Text
+from pipeline.report.flaws import notices
+from pipeline.report.statistics_table import statistics_table
+
+Viewer = Callable[[int], EpisodeView]
+"""Reads a recording by its place, or hands out the one that was read last."""
+
+
+def episode_section(
+    summary: EpisodeSummary,
+    place: int,
+    view_of: Callable[[], EpisodeView],
+    flaws: Sequence[Flaw],
+    wanted: InspectParams,
+    several: bool,
+) -> Section:
+    """Everything of one episode; `place` counts the sections and begins its pictures' names."""
+    view = view_of()
+    stem = f"episode{place}-{_plain(summary.episode)}"
+    draw = partial(_picture, stem, view_of)
+    title = f"{summary.source} / {summary.episode}" if several else summary.episode
+    zero = {(summary.source, summary.episode): summary.zero}
+    return Section(
+        title,
+        [
+            Text(f"`{summary.path}`, format {summary.format}: “{summary.instruction or '–'}”"),
+            Notices(notices(flaws, zero), "Nothing looks wrong in this episode."),
+        ],
+        [
+            Section("Camera views", _views(view, draw, wanted.ticks, flaws)),
+            Section("Sensor", _sensor(view, draw, flaws)),
+            Section("Motion and actions", _motion(view, draw)),
+            Section("Clocks", _clocks(view, draw)),
+            Section("Statistics by channel", _statistics(view)),
+        ],
+    )
+
+
+Draw = Callable[[str, str, Callable[[EpisodeView], Figure]], Picture]
+
+
+def _picture(
+    stem: str,
+    view_of: Callable[[], EpisodeView],
+    name: str,
+    caption: str,
+    draw: Callable[[EpisodeView], Figure],
+) -> Picture:
+    # The view is read again when the picture is drawn, so that a long page holds one in memory.
+    return Picture(f"{stem}-{name}", caption, lambda: draw(view_of()))
+
+
+def _views(view: EpisodeView, draw: Draw, count: int, flaws: Sequence[Flaw]) -> list[Block]:
+    if not view.cameras:
+        return [Text(_why(flaws, "cameras", "This episode has no camera views."))]
+    ticks = spread_ticks(view, count)
+    if not ticks:
+        return [Text(_why(flaws, "ticks", "No view is shown: the episode has no ticks."))]
+    shown = frames_at(view, ticks)
+    blocks: list[Block] = [
+        Text(f"{name} is not shown: a frame of it cannot be decoded; see what looks wrong above.")
+        for name in view.cameras
+        if name not in shown
+    ]
+    if shown:
+        caption = (
+            f"What each view shows at {len(ticks)} ticks, evenly from the first to the last: the "
+            "last frame at or before the tick."
+        )
+        drawing = draw(
+            "views", caption, lambda view: camera_views(view, ticks, frames_at(view, ticks))
+        )
+        blocks.append(drawing)
+    return blocks
+
+
+def _sensor(view: EpisodeView, draw: Draw, flaws: Sequence[Flaw]) -> list[Block]:
+    if view.sensor is None:
+        return [Text(_why(flaws, "sensor", "This episode has no sensor stream."))]
+    wide = len(view.sensor.channels.names)
+    touching = contacts(view)
+    spans = ", ".join(
+        f"{one.start_s - view.zero:.2f}–{one.stop_s - view.zero:.2f} s" for one in touching
+    )
+    said = f"Contact, by the force alone: {spans}." if spans else "No contact is seen in the force."
+    caption = f"The sensor's {wide:,} channels over time, contact shaded. {said}"
+    return [draw("sensor", caption, lambda view: sensor(view, contacts(view)))]
+
+
+def _motion(view: EpisodeView, draw: Draw) -> list[Block]:
+    if view.state is None and view.poses is None and view.action is None:
+        return [Text("Neither state nor poses nor actions of this episode can be read.")]
+    caption = "State of the robot as recorded, by unit, and the actions at the ticks."
+    return [draw("motion", caption, motion)]
+
+
+def _clocks(view: EpisodeView, draw: Draw) -> list[Block]:
+    found = clocks(view)
+    if not found:
+        return [Text("No stream of this episode has a clock that can be read.")]
+    lanes = draw(
+        "clocks",
+        "When each stream was sampled, and which VL row serves which ticks; zoom in to see single "
+        "entries. Gaps are marked.",
+        lambda view: clock_lanes(view, clocks(view)),
+    )
+    steps = draw(
+        "steps",
+        "How long a step from one entry to the next takes: a narrow peak is a steady clock.",
+        lambda view: clock_steps(clocks(view)),
+    )
+    return [Chart(lanes, interactive.clock_lanes(view, found)), _clock_table(view, found), steps]
+
+
+def _clock_table(view: EpisodeView, found: Sequence[Clock]) -> Table:
+    heads = ["clock", "entries", "first [ms]", "last [s]", "rate [Hz]", "jitter [µs]", "gaps"]
+    rows = [
+        (
+            one.name,
+            len(one.time),
+            1e3 * (one.time[0] - view.zero) if len(one.time) else None,
+            one.time[-1] - view.zero if len(one.time) else None,
+            one.rate_hz,
+            1e6 * one.jitter_s,
+            len(one.gaps),
+        )
+        for one in found
+    ]
+    return Table(heads, rows, "Jitter is the standard deviation of the steps that are no gaps.")
+
+
+def _statistics(view: EpisodeView) -> list[Block]:
+    found = channel_statistics(view)
+    if not found:
+        return [Text("No numeric stream of this episode can be read.")]
+    return [statistics_table(found)]
+
+
+def _why(flaws: Sequence[Flaw], stream: str, otherwise: str) -> str:
+    """What a flaw says of a stream that is not there, else that it was not recorded."""
+    for flaw in flaws:
+        if stream in flaw.stream.split(", ") and flaw.severity == "error":
+            return f"Not shown. {flaw.message}"
+    return otherwise
+
+
+def _plain(name: str) -> str:
+    """An episode's id as a part of a file's name."""
+    return re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")[-40:] or "episode"

@@ -1,0 +1,90 @@
+"""The parts of a store's page that show its features."""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Literal
+
+from pipeline.inspection.store import StoreView, Twins
+from pipeline.plots import interactive
+from pipeline.plots import store_features as pictures
+from pipeline.report.blocks import Block, Chart, Picture, Table, Text
+
+_TWINS = 20
+
+
+def features(view: StoreView) -> list[Block]:
+    """Norms and the projection."""
+    looked = f"{len(view.sampled.rows):,} of {view.sampled.total:,} VL rows"
+    rows = "all VL rows" if len(view.sampled.rows) == view.sampled.total else looked
+    variants = ", plain frames only" if view.variants > 1 else ""
+    planes: list[tuple[Literal["episode", "progress"], str]] = [
+        ("episode", "the rows of an episode are joined in order of time."),
+        ("progress", "coloured by how far its episode had come."),
+    ]
+    return [
+        Text(f"Of {rows}{variants}, evenly spread (`inspect.points`)."),
+        Picture(
+            "norms",
+            "Left: how long the features of each slot are. Right: their median length in each "
+            "episode beside that in all; a column that stands out is an episode unlike the others.",
+            partial(pictures.norms, view),
+        ),
+        Text(
+            "Below, the first two principal components of all slots side by side, each less its "
+            "mean, none scaled: near dots look alike to the model."
+        ),
+        *(
+            Chart(
+                Picture(
+                    f"projection_{by}",
+                    f"Features in a plane, by {by}: a dot is a VL row; {said}",
+                    partial(pictures.projection, view, by),
+                ),
+                interactive.projection(view.projection, by),
+            )
+            for by, said in planes
+        ),
+    ]
+
+
+def duplicates(view: StoreView) -> list[Block]:
+    """What the same features and the same inputs say twice."""
+    found = view.duplicates
+    looked = len(view.sampled.rows)
+    blocks: list[Block] = [
+        Text(
+            f"Near-duplicates are VL rows whose features, less their mean over the store, have a "
+            f"cosine similarity of at least {found.threshold:g} "
+            f"(`inspect.duplicate_similarity`): {found.within:,} of {looked:,} have one in their "
+            f"own episode, where the scene stands still for {found.still_count:,} stretches; "
+            f"{found.across:,} have one in another episode. By their keys, {found.equal_rows:,} of "
+            f"{view.sampled.total:,} have exactly the frames and prompt of another row; "
+            f"{found.equal_twins_count:,} pairs of episodes share such rows."
+        )
+    ]
+    if len(found.episodes) > 1:
+        said = "For each pair of episodes, how alike their two most alike VL rows are; the mark on "
+        said += "the scale is where near-duplicates begin, and pairs beyond it are framed."
+        blocks.append(Picture("likeness", said, partial(pictures.likeness, view)))
+    blocks += _twins(found.equal_twins, found.equal_twins_count, "Rows with equal keys")
+    blocks += _twins(found.twins, found.twins_count, "Near-duplicates by features")
+    if found.still:
+        rows = [(one.episode, one.start_s, one.stop_s, one.rows) for one in found.still[:_TWINS]]
+        said = f"Where the scene stands still: {_of(len(rows), found.still_count)}."
+        blocks.append(Table(("episode", "from [s]", "to [s]", "VL rows"), rows, said))
+    return blocks
+
+
+def _twins(pairs: Sequence[Twins], count: int, said: str) -> list[Block]:
+    if not pairs:
+        return []
+    heads = ("episode", "rows", "at [s]", "other episode", "rows ", "at [s] ", "similarity")
+    rows: list[tuple[object, ...]] = []
+    for one in pairs[:_TWINS]:
+        first, second = zip((one.first, one.second), one.rows, one.time_s, strict=True)
+        rows.append((*first, *second, f"{one.similarity:.6f}"))
+    return [Table(heads, rows, f"{said}, in different episodes: {_of(len(rows), count)}.")]
+
+
+def _of(shown: int, count: int) -> str:
+    return f"all {count:,}" if shown == count else f"the first {shown:,} of {count:,}"

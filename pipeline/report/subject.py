@@ -1,0 +1,133 @@
+"""What a path on the command line is: recordings, or a store."""
+
+import glob
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+
+from pipeline.config import InspectParams, Params, Source
+from pipeline.errors import ConfigError, RecordingError
+from pipeline.recordings import Opened, open_recordings
+
+ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".zst", ".rar")
+STORE = (".zarr", ".zarr.part")
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What is looked at."""
+
+    name: str
+    """As the user said it."""
+    folder: Path
+    """Where its page goes."""
+    store: Path | None
+    """None for recordings."""
+    sources: tuple[Source, ...]
+    """Of recordings."""
+    root: Path
+    """Where relative paths of the sources begin."""
+
+    def recordings(self, views: Sequence[str] | None) -> Opened:
+        """Its recordings; raises `RecordingError` where there is none that can be looked at."""
+        try:
+            opened = open_recordings(self.sources, self.root, views)
+        except RecordingError as error:
+            raise RecordingError(f"{error}{_stores_below(self.sources, self.root)}") from None
+        if not opened.recordings:
+            lines = [f"{self.name}: none of {len(opened.bad)} episode(s) can be looked at:"]
+            lines += [f"  {one.where}: {one.reason}" for one in opened.bad]
+            raise RecordingError("\n".join(lines))
+        return opened
+
+
+def subject_of(params: Params) -> Subject:
+    """What `inspect.path` names, else the recordings of `data.sources`.
+
+    A store is known by its content or its name. Raises `ConfigError` for a path that is not there
+    or is a file, and for a store beside something else.
+    """
+    wanted = params.inspect
+    places = (wanted.path,) if isinstance(wanted.path, str) else wanted.path or ()
+    if not places:
+        said = ", ".join(source.name for source in params.data.sources)
+        return Subject(said, wanted.output, None, params.data.sources, params.data.root)
+    for place in places:
+        _check(place)
+    name = " ".join(places)
+    found = [Path(match) for place in places for match in _matches(place)]
+    stores = [path for path in found if _is_store(path)]
+    if stores and len(found) > 1:
+        raise ConfigError(
+            f"inspect.path: expected recordings or one store, found {len(found)} paths, the store "
+            f"{stores[0]} among them. Look at it alone: python -m stages.inspect {stores[0]}"
+        )
+    store = stores[0] if stores else None
+    source = Source(name=_last(places), path=tuple(places), format=wanted.format)
+    return Subject(name, _folder(wanted, places), store, (source,), Path())
+
+
+def _check(place: str) -> None:
+    """Raise `ConfigError` for what is there and no folder, and for what is not there."""
+    path = Path(place)
+    if path.is_dir() or glob.has_magic(place):
+        return
+    if not path.exists():
+        raise ConfigError(f"inspect.path: {path} is not there.{_meant(path)}")
+    if path.suffix.lower() in ARCHIVES:
+        raise ConfigError(
+            f"inspect.path: expected a folder, found the packed file {path}. Unpack it, then look "
+            "at the folder that comes out."
+        )
+    raise ConfigError(
+        "inspect.path: expected a folder of recordings or a store, found the file "
+        f"{path}. Name the folder of the whole recording, such as {path.parent}"
+    )
+
+
+def _meant(path: Path) -> str:
+    """What is there instead."""
+    parent = next(folder for folder in path.absolute().parents if folder.is_dir())
+    below = path.absolute().relative_to(parent).parts[0]
+    names = sorted(name for name in os.listdir(parent) if not name.startswith("."))
+    meant = get_close_matches(below, names, n=3) or names[:8]
+    there = f"has {', '.join(meant)}" if meant else "is empty"
+    return f" {os.path.relpath(parent)} {there}{' …' if len(names) > len(meant) else ''}"
+
+
+def _matches(place: str) -> list[str]:
+    return sorted(glob.glob(place, recursive=True)) or [place]  # noqa: PTH207
+
+
+def _is_store(path: Path) -> bool:
+    return (path / "zarr.json").is_file() or (path.is_dir() and path.name.endswith(STORE))
+
+
+def _stores_below(sources: Sequence[Source], root: Path) -> str:
+    """What to say where a folder without recordings holds stores."""
+    folders = [root / place for source in sources for place in source.paths]
+    stores = [path for folder in folders if folder.is_dir() for path in sorted(folder.iterdir())]
+    stores = [path for path in stores if _is_store(path)]
+    return f". There is a store: python -m stages.inspect {stores[0]}" if stores else ""
+
+
+def _folder(wanted: InspectParams, places: Sequence[str]) -> Path:
+    """The output as it was given, else a folder in it named after the paths."""
+    if "output" in wanted.model_fields_set:
+        return wanted.output
+    first = os.path.relpath(places[0])
+    # A path elsewhere is named by its last parts: all of it would be no name.
+    parts = Path(first).parts if not first.startswith("..") else Path(places[0]).absolute().parts
+    words = "_".join(parts[-3:]).replace("*", "any")
+    name = re.sub(r"[^A-Za-z0-9.-]+", "_", words).strip("_.")
+    more = f"_and_{len(places) - 1}_more" if len(places) > 1 else ""
+    return wanted.output / f"{name or 'here'}{more}"
+
+
+def _last(places: Sequence[str]) -> str:
+    """The last part of the first path that is no pattern: the source's name on the page."""
+    parts = [part for part in Path(places[0]).absolute().parts if not glob.has_magic(part)]
+    return parts[-1].strip("/") or "recordings"

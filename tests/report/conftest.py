@@ -1,0 +1,228 @@
+"""A real browser that looks at pages, and a report with every kind of block."""
+
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go
+import pytest
+from matplotlib.figure import Figure
+from playwright.sync_api import Browser, Page, Route, sync_playwright
+
+from pipeline.plots.style import GRID, INK, canvas
+from pipeline.report import (
+    Chart,
+    Document,
+    Notice,
+    Notices,
+    Picture,
+    Report,
+    Run,
+    Section,
+    Table,
+    Text,
+    Tokens,
+)
+
+DESKTOP, PHONE = (1280, 900), (390, 844)
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+
+
+@dataclass
+class Visit:
+    """A loaded page and what it did that a page must not."""
+
+    page: Page
+    trouble: list[str] = field(default_factory=list)
+
+
+Visitor = Callable[..., Visit]
+
+
+# One a module, not one a session: while playwright runs, no other test can run an event loop.
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    """Headless Chromium; where CI has none that is a failure, so that a green CI has looked."""
+    found = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if found is None:
+        said = f"no browser to look at pages with: none of {', '.join(BROWSERS)} is installed"
+        if os.environ.get("CI"):
+            pytest.fail(said)
+        pytest.skip(said)
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=found, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def browser_page(browser: Browser) -> Iterator[Visitor]:
+    """`browser_page(path, size=…, scheme=…, **context)` loads a page from its file."""
+    contexts = []
+
+    def visit(
+        path: Path, size: tuple[int, int] = DESKTOP, scheme: str = "light", **options: Any
+    ) -> Visit:
+        viewport = {"width": size[0], "height": size[1]}
+        context = browser.new_context(viewport=viewport, color_scheme=scheme, **options)
+        contexts.append(context)
+        page = context.new_page()
+        visit = Visit(page)
+        address = path.resolve().as_uri()
+
+        def guard(route: Route) -> None:
+            url = route.request.url
+            if url.split("#")[0] == address or url.startswith(("data:", "blob:")):
+                route.continue_()
+            else:
+                visit.trouble.append(f"request for {url}")
+                route.abort()
+
+        context.route("**/*", guard)
+        page.on(
+            "console",
+            lambda said: visit.trouble.append(said.text) if said.type == "error" else None,
+        )
+        page.on("pageerror", lambda error: visit.trouble.append(f"script: {error}"))
+        page.goto(address)
+        return visit
+
+    yield visit
+    for context in contexts:
+        context.close()
+
+
+LOOK = """() => {
+  const box = (element) => element.getBoundingClientRect();
+  const seen = (element) => box(element).width > 40 && box(element).height > 20;
+  const named = (list) => [...list].map((one) => one.closest("figure").id);
+  const luminance = (colour) => {
+    const [r, g, b] = colour.match(/[0-9.]+/g).map((part) => {
+      const share = part / 255;
+      return share <= 0.04045 ? share / 12.92 : ((share + 0.055) / 1.055) ** 2.4;
+    });
+    return 0.2126 * r + 0.7152 * g + 0.0722 * b;
+  };
+  const ids = [...document.querySelectorAll("[id]")].map((one) => one.id);
+  const pictures = [...document.querySelectorAll("figure .wide > svg")];
+  const charts = [...document.querySelectorAll(".chart")];
+  return {
+    overflow: document.documentElement.scrollWidth - window.innerWidth,
+    pictures: pictures.length,
+    charts: charts.length,
+    unseen: named(pictures.filter((svg) => !seen(svg))),
+    unnamed: named(pictures.filter((svg) => !svg.querySelector(":scope > title")?.textContent)),
+    undrawn: named(charts.filter((one) => ![...one.querySelectorAll(".main-svg")].some(seen))),
+    dead: [...document.querySelectorAll('a[href^="#"]')]
+      .map((link) => link.getAttribute("href").slice(1))
+      .filter((id) => !document.getElementById(id)),
+    links: document.querySelectorAll("nav a").length,
+    twice: ids.filter((id, index) => ids.indexOf(id) !== index),
+    paper: luminance(getComputedStyle(document.body).backgroundColor),
+    inks: pictures.map((svg) => luminance(getComputedStyle(svg).fill)),
+    chart_inks: charts.map((one) => {
+      const text = one.querySelector(".main-svg text");
+      return luminance(getComputedStyle(text).fill);
+    }),
+  };
+}"""
+
+
+@pytest.fixture
+def assert_page_is_sound(browser_page: Visitor) -> Callable[[Path], None]:
+    """`assert_page_is_sound(path)`: at desktop and phone width, in light and in dark.
+
+    Nothing errs, no request leaves the page, nothing overflows, every picture and chart is there
+    in an ink that contrasts, every link of the contents leads somewhere, and no id is there twice.
+    """
+
+    def check(path: Path) -> None:
+        for size in (DESKTOP, PHONE):
+            for scheme in ("light", "dark"):
+                visit = browser_page(path, size, scheme)
+                here = f"{path.name} at {size}, {scheme}"
+                visit.page.wait_for_function("() => !document.querySelector('.chart > script')")
+                found = visit.page.evaluate(LOOK)
+                assert visit.trouble == [], here
+                assert found["overflow"] <= 0, here
+                assert found["links"] > 0, here
+                for wrong in ("unseen", "unnamed", "undrawn", "dead", "twice"):
+                    assert found[wrong] == [], f"{here}: {wrong}"
+                inks = found["inks"] + found["chart_inks"]
+                if scheme == "light":
+                    assert found["paper"] > 0.9 and all(ink < 0.1 for ink in inks), (here, found)
+                else:
+                    assert found["paper"] < 0.05 and all(ink > 0.5 for ink in inks), (here, found)
+
+    return check
+
+
+def drawn() -> Figure:
+    """A picture with a line, an image, a clip path and neutral colours."""
+    figure = canvas(12, 3)
+    left, right = figure.subplots(1, 2)
+    left.plot(np.sin(np.arange(50) / 9), color="#0072B2", label="a sine")
+    left.plot([0, 50], [0, 0], color=INK)
+    left.axvspan(3, 5, color=GRID)
+    left.set_xlabel("time [s]")
+    left.legend()
+    right.imshow(np.arange(80.0).reshape(8, 10))
+    return figure
+
+
+def plotted() -> go.Figure:
+    """A chart with neutral colours and a text that could end its script."""
+    figure = go.Figure(go.Scattergl(x=[0, 1, 2], y=[0, 2, 1], name="</script><b>", mode="markers"))
+    figure.add_scatter(x=[0, 2], y=[1, 1], line_color=INK)
+    return figure.update_layout(height=320, xaxis_title="time [s]")
+
+
+@pytest.fixture
+def every_block() -> Report:
+    """A report with every kind of block, and with texts that try to break out."""
+    long = "a/" + "x" * 200
+    notices = [Notice("warning", "flat channel", f"{long} · sensor", "n") for _ in range(14)]
+    notices.append(Notice("error", "unreadable", "b", "`x.jpg` is no picture <script>"))
+    return Report(
+        "A page <of> every block",
+        f"Of `{long}`.",
+        [("episodes", "12"), ("length", "1,204 s"), ("store", long)],
+        [
+            Section(
+                "Words",
+                [
+                    Text("With `code` & <script>alert(1)</script>."),
+                    Table(
+                        ["episode", "ticks", "mean [N]", "good"],
+                        [[long, 12000, 1.23456, True], ["b", 3, float("nan"), None]],
+                        "A table",
+                        frozenset({1}),
+                    ),
+                    Notices(notices, "fine"),
+                    Notices([], "Nothing looks wrong."),
+                ],
+            ),
+            Section(
+                "Pictures",
+                [Picture("one", "A sine & an image.", drawn), Picture("two", "Again.", drawn)],
+                [Section("Words", [Chart(Picture("lanes", "A chart.", drawn), plotted())])],
+            ),
+            Section(
+                "Prompt",
+                [
+                    Tokens(
+                        [
+                            Run("<|im_start|>", "special"),
+                            Run("user\ntouch <b>", "text"),
+                            Run("<|image_pad|>", "image", "48 tokens"),
+                        ]
+                    ),
+                    Document("Spec", {"weights": "w" * 300, "slots": [{"layer": -1}], "x": {}}),
+                ],
+            ),
+        ],
+    )

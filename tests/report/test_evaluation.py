@@ -1,0 +1,198 @@
+"""The page of an evaluation says what was judged, and a browser finds nothing wrong with it."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.batches import Windows
+from pipeline.checkpoint import PolicyCheckpoint, policy_shape, source_of
+from pipeline.config import TrainHeadParams
+from pipeline.evaluation import (
+    Curve,
+    Curves,
+    Experiment,
+    Judgement,
+    held_out_contents,
+    held_out_ranges,
+    judge,
+    judge_modalities,
+    judged_document,
+)
+from pipeline.evaluation.footage import Footage
+from pipeline.models import Policy
+from pipeline.normalization import ChannelStatistics, Normalization
+from pipeline.report import PAGE, Document, Picture, Report, Section, Table, write_report
+from pipeline.report import episodes as episode_sections
+from pipeline.report.comparison import comparison_report
+from pipeline.report.evaluation import evaluation_report
+from pipeline.store import FeatureStore
+
+Sound = Callable[[Path], None]
+PARAMS = TrainHeadParams.model_validate(
+    {
+        "sensor_encoder": {"channels": [8], "layers": 0, "heads": 1, "output_dim": 8},
+        "state_encoder": {"dim": 8, "layers": 0, "heads": 1, "output_dim": 8},
+        "expert": {"dim": 8, "layers": 1, "heads": 1},
+        "horizon": 4,
+        "sensor_window": 6,
+        "state_window": 5,
+    }
+)
+CURVES = Curves({"train/loss": Curve(np.array([10, 20]), np.array([1.0, 0.1]))})
+
+
+@pytest.fixture(scope="module")
+def judgement(
+    tiny_store: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory
+) -> Judgement:
+    """An untrained policy on three held-out episodes whose recordings are nowhere."""
+    store = FeatureStore.open(tiny_store(tmp_path_factory.mktemp("judged"), sensor_channels=40))
+
+    def statistics(name: str) -> ChannelStatistics:
+        values = store.array(name).astype(np.float64)
+        return ChannelStatistics(values.mean(0), values.std(0), len(values))
+
+    normalization = Normalization(
+        statistics("tick/action"),
+        statistics("vl/features"),
+        statistics("sensor/values"),
+        statistics("state/values"),
+    )
+    shape = policy_shape(store, normalization)
+    policy = Policy(PARAMS, shape, normalization).eval()
+    ticks = np.arange(90, 180)
+    ranges = held_out_ranges(store, ticks)
+    checkpoint = PolicyCheckpoint(
+        params=PARAMS,
+        shape=shape,
+        normalization=normalization,
+        source=source_of(store),
+        held_out_ticks=ranges,
+        held_out_content=held_out_contents(store, ranges),
+        step=20,
+        weights=policy.state_dict(),
+    )
+    windows = Windows.of(PARAMS)
+    comparison, predictions = judge(policy, store, ticks, windows, 64, normalization)
+    return Judgement(
+        name="models/head",
+        checkpoint=checkpoint,
+        store=store,
+        comparison=comparison,
+        predictions=predictions,
+        study=judge_modalities(checkpoint, policy, store, ticks, 64),
+        judged=judged_document(checkpoint, policy, store, 1, 64),
+        curves=CURVES,
+        recordings=Path("data/nowhere"),
+    )
+
+
+def blocks(report: Report, kind: type) -> list[Any]:
+    found: list[Any] = []
+
+    def gather(sections: Any) -> None:
+        for section in sections:
+            found.extend(block for block in section.blocks if isinstance(block, kind))
+            gather(section.parts)
+
+    gather(report.sections)
+    return found
+
+
+def section(report: Report, title: str) -> Section:
+    (found,) = (one for one in report.sections if one.title == title)
+    return found
+
+
+def test_tables_say_what_the_comparison_says(judgement: Judgement) -> None:
+    comparison = judgement.comparison
+    report = evaluation_report(judgement)
+    errors, dimensions, steps, episodes, streams = blocks(report, Table)
+    assert errors.rows[-1][1] == comparison.overall("policy")
+    assert errors.rows[-1][-1] == comparison.relative()
+    assert errors.strong == {len(errors.rows) - 1}
+    assert [row[0] for row in dimensions.rows] == list(comparison.names)
+    assert dimensions.rows[1][2] == comparison.scores["policy"].mae[1]
+    assert [row[:2] for row in steps.rows] == [(0, 0), (1, 100), (2, 200), (3, 300)]
+    group = comparison.groups[0]
+    assert [row[2] for row in steps.rows] == pytest.approx(
+        group.mean(comparison.scores["policy"].mae_horizon).tolist()
+    )
+    worst_first = [row[2] for row in episodes.rows]
+    assert worst_first == sorted(comparison.overall_by_episode("policy"), reverse=True)
+    assert [row[1] for row in episodes.rows] == [30, 30, 30]
+    assert streams.rows[0][:2] == ("all", "intact") and len(streams.rows) > 5
+    assert dict(report.tiles)["held-out episodes"] == "3"
+
+
+def test_params_spec_and_what_was_judged_are_there(judgement: Judgement) -> None:
+    trained, spec, source, judged = blocks(evaluation_report(judgement), Document)
+    assert trained.content["horizon"] == 4
+    assert spec.content["digest"] == "tiny-spec"
+    sensor = source.content["streams"]["sensor"]["names"]
+    assert sensor[-1] == "… 40 in all" and len(sensor) == 9
+    assert source.content["streams"]["action"]["names"] == ["dx", "dy", "dz", "da", "gripper"]
+    assert judged.content["on"]["horizon"] == 4
+
+
+def test_a_page_with_frames_and_without_is_sound(
+    judgement: Judgement,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    assert_page_is_sound: Sound,
+) -> None:
+    """Frames of the best episode; the worst one's recording is where no recording is."""
+    (_, best), (_, worst) = judgement.comparison.extremes()
+    look = episode_sections.footage
+
+    def half(store: FeatureStore, episode: Any, rows: list[int], root: Path) -> Footage:
+        if episode.index != best:
+            return look(store, episode, rows, root)
+        assert all(row in episode.vl_rows for row in rows) and len(rows) == 5
+        shades = np.linspace(0, 255, len(rows)).astype(np.uint8)
+        return Footage({"View1": [np.full((12, 16, 3), shade, np.uint8) for shade in shades]})
+
+    monkeypatch.setattr(episode_sections, "footage", half)
+    files = write_report(tmp_path, evaluation_report(judgement))
+    assert {file.stem for file in files} == {
+        *("report", "dimensions", "scatter", "horizon", "dimension_horizon", "episodes"),
+        *("timeline", "episode_best", "episode_worst", "modalities", "curves"),
+    }
+    page = (tmp_path / PAGE).read_text()
+    gone = judgement.store.episodes[worst].path
+    assert page.count("No frames:") == 1
+    assert f"No frames: there is no recording at data/nowhere/{gone} any more." in page
+    assert page.count("Above, the frames that the features") >= 1
+    assert_page_is_sound(tmp_path / PAGE)
+
+
+def test_what_is_missing_is_said(judgement: Judgement) -> None:
+    bare = replace(judgement, study=None, curves=Curves({}, "No training curves: gone."))
+    report = evaluation_report(bare)
+    assert {one.name for one in blocks(report, Picture)}.isdisjoint({"modalities", "curves"})
+    (training,) = section(report, "Training").blocks
+    assert training.words == "No training curves: gone."
+    (streams,) = section(report, "Which streams are used").blocks
+    assert streams.words.startswith("Not judged: `evaluate.modalities` is off")
+
+
+def test_experiments_are_one_page(tmp_path: Path, assert_page_is_sound: Sound) -> None:
+    rules = {"zero_action": 0.5, "mean_action": 0.4, "repeat_last": 0.45}
+    experiments = [
+        Experiment(
+            f"{expert}-concat", expert, "concat", 10, 1000, 1,
+            {"overall": {"policy": error, "relative": error / 0.4, **rules}}, 7.0,
+        )
+        for expert, error in (("regression", 0.3), ("diffusion", 0.2))
+    ]  # fmt: skip
+    report = comparison_report(experiments)
+    (table,) = blocks(report, Table)
+    assert table.strong == {1}
+    assert [row[3] for row in table.rows] == [0.3, 0.2, 0.5, 0.4, 0.45]
+    assert dict(report.tiles)["by"] == "diffusion-concat"
+    write_report(tmp_path, report)
+    assert_page_is_sound(tmp_path / PAGE)

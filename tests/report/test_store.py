@@ -1,0 +1,69 @@
+"""The page of a store says what was found, and loads without trouble."""
+
+import json
+
+import numpy as np
+import pytest
+
+from pipeline.config import InspectParams
+from pipeline.inspection.store import StoreView, inspect_store
+from pipeline.report import Document, Notices, Report, Table, write_report
+from pipeline.report.store import store_report
+from pipeline.store import FeatureStore
+
+ROWS = 10
+
+
+@pytest.fixture(scope="module")
+def view(tiny_store, tmp_path_factory) -> StoreView:
+    """A store in which an episode is there twice."""
+    path = tiny_store(tmp_path_factory.mktemp("store"), sensor_channels=40)
+    like = FeatureStore.open(path).array("vl/features")
+    features = np.memmap(path / "vl/features/c/0/0/0", like.dtype, "r+", shape=like.shape)
+    features[4 * ROWS : 5 * ROWS] = features[ROWS : 2 * ROWS]
+    return inspect_store(path, InspectParams())
+
+
+@pytest.fixture(scope="module")
+def report(view) -> Report:
+    return store_report(view)
+
+
+def blocks(report: Report, title: str) -> list:
+    return list(next(one for one in report.sections if one.title == title).blocks)
+
+
+def test_the_sum_of_the_sources_is_the_store(report, view):
+    table = blocks(report, "Coverage")[0]
+    *sources, total = table.rows
+    assert [row[0] for row in sources] == ["left", "right"]
+    for column in range(3, len(total)):
+        assert total[column] == pytest.approx(sum(row[column] for row in sources))
+    assert dict(report.tiles)["ticks"] == f"{view.ticks}"
+
+
+def test_what_looks_wrong_is_named_with_episode_and_time(report):
+    (notices,) = blocks(report, "What looks wrong")
+    assert isinstance(notices, Notices)
+    (notice,) = notices.notices
+    assert notice.kind == "near-duplicate episodes"
+    assert "episode_001" in notice.where and "left/episode_004" in notice.message
+    tables = [one for one in blocks(report, "Near-duplicates") if isinstance(one, Table)]
+    assert tables[0].rows[0][0] == "right/episode_001"
+
+
+def test_sizes_list_every_array(report, view):
+    table = next(one for one in blocks(report, "Size") if isinstance(one, Table))
+    assert [row[0] for row in table.rows] == [one.name for one in view.sizes]
+
+
+def test_the_spec_is_there_whole(report, view):
+    first = blocks(report, "What it was made of")[0]
+    assert isinstance(first, Document)
+    assert json.dumps(first.content) == json.dumps(view.spec)
+
+
+def test_the_page_loads(report, tmp_path, assert_page_is_sound):
+    page, *pictures = write_report(tmp_path / "page", report)
+    assert {one.stem for one in pictures} >= {"coverage", "ages", "norms", "likeness"}
+    assert_page_is_sound(page)

@@ -1,0 +1,96 @@
+"""What a path means, and what is said of one that means nothing."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from pipeline.config import Params, load_params
+from pipeline.errors import ConfigError, RecordingError
+from pipeline.report.subject import subject_of
+
+PARAMS = Path(__file__).resolve().parents[2] / "params.yaml"
+
+
+def looking_at(*paths: object, output: Path | None = None) -> Params:
+    said = ", ".join(f'"{path}"' for path in paths)
+    more = [] if output is None else [f"inspect.output={output}"]
+    return load_params(PARAMS, [f"inspect.path=[{said}]", *more])
+
+
+def refused(*paths: object) -> str:
+    with pytest.raises((ConfigError, RecordingError)) as caught:
+        subject_of(looking_at(*paths)).recordings(None)
+    return str(caught.value)
+
+
+def test_without_a_path_it_is_the_sources_of_the_params() -> None:
+    params = load_params(PARAMS)
+    subject = subject_of(params)
+    assert subject.sources == params.data.sources and subject.root == params.data.root
+    assert subject.folder == Path("reports/inspect")
+
+
+def test_a_path_that_is_not_there_names_what_is(tmp_path: Path) -> None:
+    (tmp_path / "monday").mkdir()
+    said = refused(tmp_path / "mondey" / "run")
+    assert f"{tmp_path / 'mondey/run'} is not there" in said
+    assert said.endswith("has monday")
+
+
+@pytest.mark.parametrize(
+    ("name", "said"), [("run.zip", "Unpack it"), ("meta.json", "Name the folder")]
+)
+def test_a_file_is_no_recording(tmp_path: Path, name: str, said: str) -> None:
+    (tmp_path / name).write_bytes(b"")
+    assert said in refused(tmp_path / name)
+    assert str(tmp_path / name) in refused(tmp_path / name)
+
+
+def test_a_folder_with_nothing_in_it_names_the_markers(tmp_path: Path) -> None:
+    said = refused(tmp_path)
+    assert str(tmp_path) in said
+    for marker in ("metadata.json", "meta/info.json"):
+        assert marker in said
+
+
+def test_a_glob_that_matches_nothing_says_so(tmp_path: Path) -> None:
+    assert "matches nothing" in refused(tmp_path / "day*")
+
+
+def test_stores_below_a_folder_are_named(tmp_path: Path, tiny_store: Callable[..., Path]) -> None:
+    store = tiny_store(tmp_path)
+    assert f"There is a store: python -m stages.inspect {store}" in refused(tmp_path)
+
+
+def test_a_store_is_known_by_its_content(tmp_path: Path, tiny_store: Callable[..., Path]) -> None:
+    store = tiny_store(tmp_path)
+    renamed = store.rename(tmp_path / "copy of a store")
+    assert subject_of(looking_at(renamed)).store == renamed
+
+
+def test_a_store_is_looked_at_alone(tmp_path: Path, tiny_store: Callable[..., Path]) -> None:
+    one, two = tiny_store(tmp_path, name="one"), tiny_store(tmp_path, name="two")
+    assert f"Look at it alone: python -m stages.inspect {one}" in refused(one, two)
+    assert f"python -m stages.inspect {one}" in refused(tmp_path / "*.zarr")
+
+
+def test_every_path_has_a_folder_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for place in ("lab/day 1/run", "lab/day2/run"):
+        (tmp_path / place).mkdir(parents=True)
+    folders = [
+        subject_of(looking_at(*paths)).folder.as_posix()
+        for paths in (["lab/day 1/run"], ["lab/day2/run"], ["lab/*"], ["."], ["lab", "lab/day2"])
+    ]
+    base = "reports/inspect"
+    assert folders == [
+        f"{base}/lab_day_1_run",
+        f"{base}/lab_day2_run",
+        f"{base}/lab_any",
+        f"{base}/here",
+        f"{base}/lab_and_1_more",
+    ]
+    assert subject_of(looking_at("lab", output=Path("mine"))).folder == Path("mine")

@@ -1,0 +1,111 @@
+"""`stages.inspect` as a user meets it: the page, the summary, exit codes."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from pipeline.report import Notice, Notices, Report, Section
+from pipeline.simulation.insertion_formats import write_raw
+from pipeline.simulation.recorder import simulate_episode
+from stages import inspect
+from stages.command import run
+
+PARAMS = Path(__file__).resolve().parents[2] / "params.yaml"
+EPOCH_S = 1.767e9 + 0.25
+
+
+@pytest.fixture
+def looked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, demo_checkpoint: Path
+) -> Callable[..., int]:
+    """`looked(*arguments)`: the exit code of the command, run in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    options = ["--params", str(PARAMS), "--set", f"vlm.checkpoint={demo_checkpoint}"]
+
+    def look(*arguments: object) -> int:
+        words = [*map(str, arguments), *options]
+        return run("", inspect.main, words, shorthands=[inspect.PATH])
+
+    return look
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with one raw recording in it."""
+    folder = tmp_path_factory.mktemp("lab") / "raw"
+    write_raw(folder, simulate_episode(4, EPOCH_S))
+    return folder
+
+
+def test_recordings_and_a_damaged_one_are_a_page(
+    looked: Callable[..., int],
+    recorded: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (episode,) = recorded.iterdir()
+    for name in ("sound", "broken"):
+        shutil.copytree(episode, tmp_path / "lab" / name)
+    next(tmp_path.glob("lab/broken/*sensor*")).write_bytes(b"no archive")
+    # As a shell hands out lab/*.
+    assert looked("lab/broken", "lab/sound", "--set", "inspect.episodes=1") == 0
+    page = Path("reports/inspect/lab_broken_and_1_more/report.html")
+    out = capsys.readouterr().out
+    assert "episodes 2 · " in out and "errors 1" in out
+    assert "error: unreadable: " in out and "broken" in out
+    assert out.splitlines()[-1].startswith(f"{page}: ")
+    assert page.is_file() and len(list(page.parent.glob("*.png"))) >= 4
+
+
+def test_a_store_is_a_page(
+    looked: Callable[..., int],
+    tiny_store: Callable[..., Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    store = tiny_store(tmp_path)
+    assert looked(store, "--set", "inspect.output=mine") == 0
+    assert "Store: tiny.zarr\nepisodes 6 · " in capsys.readouterr().out
+    assert (tmp_path / "mine/report.html").is_file()
+
+
+@pytest.mark.parametrize(
+    ("place", "said"),
+    [
+        ("nowhere", "nowhere is not there"),
+        ("empty", "none with an episode in it"),
+        ("tiny.zarr.part", "stages.extract"),
+        ("copy.zarr", "--restore"),
+    ],
+)
+def test_what_cannot_be_looked_at_is_refused(
+    looked: Callable[..., int],
+    tiny_store: Callable[..., Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    place: str,
+    said: str,
+) -> None:
+    from pipeline.store.archive import archive
+
+    (tmp_path / "empty").mkdir()
+    store = tiny_store(tmp_path)
+    archive(store, tmp_path / "copy.zarr", 1, 1)
+    store.rename(tmp_path / "tiny.zarr.part")
+    assert looked(place) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and said in error and "Traceback" not in error
+    assert not (tmp_path / "reports").exists()
+
+
+def test_the_summary_says_the_worst_first_and_how_much_more_there_is() -> None:
+    found = [Notice("warning", "gap", f"e{index} 1.00 s", "x") for index in range(9)]
+    found.append(Notice("error", "unreadable", "e9", "two\n  lines"))
+    report = Report("R", "", [("episodes", "9")], [Section("S", [Notices(found, "fine")])])
+    lines = list(inspect.summary(report))
+    assert lines[:4] == ["R", "episodes 9", "error: unreadable: e9", "    two lines"]
+    assert lines[4:6] == ["warning: gap: e0 1.00 s", "    x"]
+    assert lines[-1] == "… and 2 more on the page"
+    assert len(lines) == 2 + 2 * inspect.SAID + 1
