@@ -1,12 +1,26 @@
-"""Run the frozen VLM once per VL row and write the store.
+"""Run the frozen vision-language model over recordings once and keep what it says in a store.
 
-Reads the recordings of data.sources, computes pooled features with vlm.checkpoint and writes them,
-with the sensor, state and action streams, to extract.store. An interrupted run continues where it
-was; a finished store is left alone when nothing changed; added recordings compute only their rows.
+Reads recordings (camera frames, force, A-scan, robot state, actions) and a Qwen2.5-VL checkpoint.
+Writes one zarr store that training then needs alone: pooled features of the model for every
+vlm_reuse_count-th control tick, and the raw streams. As params.yaml stands, that is the demo.
 
-  python -m stages.extract                              what params.yaml says
-  python -m stages.extract --set extract.plan=true      only say what would be done, and why
-  python -m stages.extract --set extract.batch_size=4   smaller batches, the same store
+  python -m stages.doctor                              is this machine ready, does the store fit
+  python -m stages.extract --set extract.plan=true     how many rows, how large, how long, and why
+  python -m stages.extract                             do it
+
+For your own recordings set these in params.yaml, or with --set:
+  data.root         /recordings                         the folder that DVC watches
+  data.sources      [{name: lab, path: 2025-*}]         in it: episodes, folders of such, LeRobot
+  data.action_hz    10                                  control ticks a second; null: as recorded
+  vlm.checkpoint    Qwen/Qwen2.5-VL-3B-Instruct         or its folder; and with a real model
+                    vlm.dtype: bfloat16, vlm.image_resize_height: 360, vlm.image_resize_width: 640
+  extract.store     cache_store/lab.zarr
+
+All episodes are read and checked first; whatever is wrong is listed before anything is computed.
+Stop it whenever you like: the same command goes on. A finished store is left alone when nothing
+changed; added recordings compute only their rows; extract.batch_size and workers change no feature.
+
+Next: python -m stages.inspect STORE (look at it), stages.train_head (train). docs/ says the rest.
 """
 
 from pipeline.config import Params

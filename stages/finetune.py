@@ -1,13 +1,19 @@
 """Tune the vision-language model end to end from recordings, with the policy of train_head on top.
 
-Ticks, streams, split and normalisation come from the store, frames from the recordings of
-data.sources. Writes checkpoints with an adapter (or a whole checkpoint) into finetune.output, for
-extract to compute better features with. Works in `<finetune.output>.part` and renames it when
-finished; stopped or killed, the same command continues from the last checkpoint.
+Ticks, streams, split and normalisation come from the store that extract wrote, frames from the
+recordings of data.sources. Writes checkpoints with an adapter (or a whole checkpoint) to
+finetune.output, for extract to compute better features with, and curves to finetune.logs; while it
+runs, open report.html there (train_head.loggers adds TensorBoard and Weights & Biases).
 
   python -m stages.finetune                                        low-rank adapters
   python -m stages.finetune --set finetune.tuning.method=full      every weight
   torchrun --nproc_per_node 2 -m stages.finetune                   on two GPUs
+
+Where a GPU's memory does not do: finetune.grad_accumulation, a smaller finetune.batch_size, or
+finetune.tuning.gradient_checkpointing=true.
+
+Works in `<finetune.output>.part` and renames it when finished; stopped or killed, the same command
+goes on from the last checkpoint. At its end it prints what to run next.
 """
 
 from pipeline.config import Params

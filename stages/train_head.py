@@ -1,13 +1,22 @@
 """Train a policy head from the store alone: no image, no vision-language model.
 
-Works in `<train_head.output>.part` and renames it when finished. Stopped or killed, the same
-command continues from the last checkpoint; finished, it does nothing.
+Reads train_head.store (extract.store where null), or an archive of one, which is restored once, to
+train_head.scratch. Writes the best and the last checkpoint to train_head.output and curves to
+train_head.logs; while it runs, open report.html there. Some episodes are held out to judge it by.
 
-An archive of a store serves as well: it is restored once, to `train_head.scratch`. Batches are
-gathered from the mapped store or on the device, as `train_head.feed` says; no number depends on it.
+  python -m stages.train_head                                      what params.yaml says
+  python -m stages.train_head --set train_head.model_type=diffusion    or regression, flow_matching
+  python -m stages.train_head --set 'train_head.loggers=[report, tensorboard, wandb]'
+  torchrun --nproc_per_node 2 -m stages.train_head                 on two GPUs: the same curve
 
-On several GPUs or machines, each process takes its share of every batch:
-    torchrun --nproc_per_node 2 -m stages.train_head
+What is set first: train_head.max_steps, batch_size, lr, horizon (ticks an action chunk),
+fusion_strategy, mixture (weights of sources), device. train_head.feed says where batches are
+gathered; no number depends on it.
+
+Works in `<output>.part` and renames it when finished. Stopped or killed, the same command goes on
+from the last checkpoint; finished, it does nothing; with other params it begins another run.
+
+Next: python -m stages.evaluate
 """
 
 from pipeline.batches import open_store

@@ -1,1 +1,68 @@
-"""What this computer can do for the pipeline, and what to install where it cannot."""
+"""What this machine has, lacks and could have for the pipeline, and what to install or set.
+
+A group of checks is imported when its turn comes, so that a package that is broken or missing is a
+finding and not the end.
+"""
+
+from collections.abc import Callable, Generator
+from importlib import import_module
+from queue import Empty, SimpleQueue
+from threading import Thread
+
+from pipeline.config import Params
+from pipeline.errors import PipelineError
+from pipeline.machine.findings import Finding, described, missing, note
+
+__all__ = ["GROUPS", "Finding", "described", "examine"]
+
+PATIENCE_S = 10.0
+"""How long a group of checks may take; what hangs, such as a network disk, is named and left."""
+
+GROUPS = (
+    ("Python and packages", "packages", "check_packages"),
+    ("GPU", "gpu", "check_gpu"),
+    ("Attention", "attention", "check_attention"),
+    ("Video decoders", "decoders", "check_decoders"),
+    ("Vision-language model", "checkpoint", "check_checkpoint"),
+    ("Recordings", "data", "check_data"),
+    ("The store", "space", "check_space"),
+    ("DVC's cache", "links", "check_links"),
+    ("Machine", "limits", "check_limits_here"),
+)
+"""Title, module of this package and function from `Params` to findings."""
+
+
+def examine(params: Params) -> Generator[tuple[str, list[Finding]]]:
+    """Each group's title and findings, one after the other."""
+    for title, module, function in GROUPS:
+        try:
+            check = getattr(import_module(f"pipeline.machine.{module}"), function)
+        except (ImportError, OSError) as error:
+            said = f"cannot be looked at: {error}"
+            yield (
+                title,
+                [missing(module, said, "install what is missing above, and run this again")],
+            )
+            continue
+        answer: SimpleQueue[list[Finding]] = SimpleQueue()
+        Thread(target=_answer, args=(answer, module, check, params), daemon=True).start()
+        try:
+            yield title, answer.get(timeout=PATIENCE_S)
+        except Empty:
+            said = f"not known: no answer within {PATIENCE_S:g} s"
+            yield title, [note(module, said, "look at the disk or device it waits for")]
+
+
+def _answer(
+    answer: SimpleQueue[list[Finding]],
+    module: str,
+    check: Callable[[Params], list[Finding]],
+    params: Params,
+) -> None:
+    """Put what a check finds; what it cannot look at is a finding too."""
+    try:
+        answer.put(check(params))
+    except PipelineError as error:
+        answer.put([missing(module, str(error), "mend that, and run this again")])
+    except OSError as error:
+        answer.put([note(module, f"not known: {error}", "look at that path")])

@@ -21,6 +21,8 @@ FREE_PARAMS = {
     "scratch",
     "output",
     "logs",
+    "loggers",
+    "wandb_project",
     "checkpoint_every",
     "store",
     "grad_accumulation",

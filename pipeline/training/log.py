@@ -1,35 +1,25 @@
-"""What a run writes down while it goes: curves for DVC, speed beside them."""
+"""What a run writes down while it goes: its curves, to every logger, and speed beside them."""
 
 import csv
-from collections.abc import Iterable, Mapping
+from collections.abc import Generator, Iterable, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from dvclive import Live
-
+from pipeline.config import TrainHeadParams
 from pipeline.durable import disk_full_named, fresh
 from pipeline.evaluation.experiments import speed_file
+from pipeline.training.loggers import Logger, open_loggers
 from pipeline.training.speed import Pace
+from pipeline.training.world import World
 
 Row = tuple[int, Mapping[str, float]]
 """A step, counted from 1, and metrics by name."""
 
 
-class _Curves(Live):
-    """dvclive's files without its repository.
-
-    On start dvclive looks for git and DVC around the working directory: it fails in a repository
-    without a commit and runs `dvc init` in one that does not use DVC. All of that serves
-    experiments (`save_dvc_exp`), which DVC itself makes here, from the outputs in dvc.yaml.
-    """
-
-    def _init_dvc(self) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        self._dvc_file = "dvc.yaml"
-
-
 class TrainingLog:
-    """Curves in `<folder>/plots/metrics/*.tsv`, their newest values in `<folder>/metrics.json`.
+    """Hands the same rows to every logger, and keeps them.
 
     What came before a stop is given back as `earlier` and written again: DVC may have deleted the
     folder since, and a run that was killed has logged steps beyond its last checkpoint. Speed and
@@ -37,11 +27,12 @@ class TrainingLog:
     nothing of the clock. Raises `DiskFull`.
     """
 
-    def __init__(self, folder: Path, earlier: Iterable[Row] = ()) -> None:
+    def __init__(
+        self, folder: Path, loggers: Sequence[Logger], earlier: Iterable[Row] = ()
+    ) -> None:
         folder.mkdir(parents=True, exist_ok=True)
-        self._folder = folder
+        self._folder, self._loggers = folder, loggers
         self.rows: list[Row] = []
-        self._live = _Curves(str(folder), resume=False, dvcyaml=None, save_dvc_exp=False)
         self._speed = fresh(speed_file(folder)).open("w", encoding="utf-8", newline="")
         self._writer = csv.writer(self._speed, delimiter="\t")
         self._writer.writerow(
@@ -51,13 +42,11 @@ class TrainingLog:
             self.write(step, metrics)
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
-        """Add a point to each of these curves."""
+        """Add a point to each of these curves, everywhere."""
         self.rows.append((step, dict(metrics)))
         with disk_full_named(self._folder):
-            self._live.step = step
-            for name, value in metrics.items():
-                self._live.log_metric(name, value)
-            self._live.make_summary()
+            for logger in self._loggers:
+                logger.write(step, metrics)
 
     def write_speed(self, step: int, pace: Pace) -> None:
         """Add a line to `speed_file`."""
@@ -82,5 +71,29 @@ class TrainingLog:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._speed.close()
-        self._live.end()
+        with disk_full_named(self._folder), ExitStack() as closing:
+            # Whatever one logger does, the others are closed too.
+            for logger in reversed(self._loggers):
+                closing.callback(logger.close, kind is None)
+            closing.callback(self._speed.close)
+
+
+@contextmanager
+def open_log(
+    params: TrainHeadParams, resumed: bool, earlier: Iterable[Row], world: World
+) -> Generator[TrainingLog | None]:
+    """Rank 0's log, to the loggers of `params`, which says where to look; None on the others.
+
+    Where it cannot begin, no process waits for another. Raises `ConfigError` or `DiskFull`.
+    """
+    opened: list[TrainingLog] = []
+    with ExitStack() as stack:
+
+        def begin() -> None:
+            with disk_full_named(params.logs):
+                loggers = open_loggers(params, resumed)
+            opened.append(stack.enter_context(TrainingLog(params.logs, loggers, earlier)))
+            world.say(*(logger.note for logger in loggers if logger.note))
+
+        world.shared(begin)
+        yield opened[0] if opened else None

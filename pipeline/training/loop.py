@@ -1,7 +1,6 @@
 """The one training loop: every expert, cached or live, on one process or several."""
 
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
 from itertools import islice
 from typing import NoReturn
 
@@ -22,7 +21,8 @@ from pipeline.training.history import History
 from pipeline.training.interrupt import deferred_interrupt
 from pipeline.training.judging import Standing, held_out_error, judged_ticks
 from pipeline.training.learner import Learner
-from pipeline.training.log import Row, TrainingLog
+from pipeline.training.log import Row, TrainingLog, open_log
+from pipeline.training.loggers import check_loggers
 from pipeline.training.optimizer import schedule
 from pipeline.training.plan import Plan
 from pipeline.training.run import Run
@@ -53,6 +53,7 @@ class Trainer:
         run: Run,
         front: Front | None = None,
     ) -> None:
+        check_loggers(params)
         self.store, self.params, self.split, self.run = store, params, split, run
         self.world = World.current()
         self.device = process_device(params.device)
@@ -100,15 +101,15 @@ class Trainer:
         ticks. On Ctrl-C or SIGTERM, to whichever process, all end the step, the last checkpoint is
         written and `KeyboardInterrupt` raised.
         """
-        self.world.shared(self.run.begin)
         steps = range(self.step, self.params.max_steps)
-        windows = Windows.of(self.params)
+        windows, resumed = Windows.of(self.params), self.run.status == "resumed"
         with (
             deferred_interrupt() as interrupted,
-            self._open_log() as log,
+            open_log(self.params, resumed, self._earlier, self.world) as log,
             self.front.feed(self.plan.draws(steps), windows, self.device) as feed,
             self._open_bar() as bar,
         ):
+            self.world.shared(self.run.begin)
             batches, speed = iter(feed), Speed(feed, self.device, self.step, self._trained_s)
             while not self._over:
                 stopped = self._train_step(batches, interrupted)
@@ -135,12 +136,6 @@ class Trainer:
     @property
     def _over(self) -> bool:
         return self.step == self.params.max_steps or self.standing.exhausted
-
-    def _open_log(self) -> "TrainingLog | nullcontext[None]":
-        """Rank 0's; the others write nothing down."""
-        if not self.world.first:
-            return nullcontext()
-        return TrainingLog(self.params.logs, self._earlier)
 
     def _open_bar(self) -> "tqdm[NoReturn]":
         hidden = None if self.world.first else True

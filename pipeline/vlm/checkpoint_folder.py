@@ -28,7 +28,7 @@ def resolve_checkpoint(
             "JSON config and *.safetensors) or a hub id such as Qwen/Qwen2.5-VL-3B-Instruct. The "
             "demo's checkpoint is written by `python -m stages.demo`."
         )
-    return _cached(checkpoint, revision) or _downloaded(checkpoint, revision, setting)
+    return cached_checkpoint(checkpoint, revision) or _downloaded(checkpoint, revision, setting)
 
 
 def could_be_hub_id(checkpoint: str) -> bool:
@@ -37,7 +37,8 @@ def could_be_hub_id(checkpoint: str) -> bool:
     return len(parts) == 2 and all(parts) and parts[0][0] not in ".~"
 
 
-def _cached(checkpoint: str, revision: str | None) -> Path | None:
+def cached_checkpoint(checkpoint: str, revision: str | None) -> Path | None:
+    """The complete copy of a hub id in the hub's local cache, if there is one; no network."""
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import HFValidationError, LocalEntryNotFoundError
 

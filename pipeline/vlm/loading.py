@@ -94,7 +94,8 @@ def quiet_transformers() -> Generator[None]:
             transformers_logging.enable_progress_bar()
 
 
-def _attention(vlm: VLMParams, device: torch.device) -> str:
+def attention_backend(vlm: VLMParams, device: torch.device) -> str:
+    """What `vlm.attention` means on this device."""
     if vlm.attention != "auto":
         return vlm.attention
     half = vlm.dtype != "float32"
@@ -106,7 +107,7 @@ def load_checkpoint(vlm: VLMParams, device: torch.device, dtype: str | None = No
     """As `load_whole`, without the adapter."""
     folder = resolve_checkpoint(vlm.checkpoint, vlm.revision)
     weight_files(folder)
-    attention = _attention(vlm, device)
+    attention = attention_backend(vlm, device)
     if attention == "flash_attention_2" and (device.type != "cuda" or vlm.dtype == "float32"):
         raise VLMError(
             "vlm.attention flash_attention_2 needs CUDA and a half-precision vlm.dtype, found "

@@ -171,12 +171,14 @@ def test_two_processes_follow_the_curve_of_one_that_accumulates(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """With dropout, uneven parts and accumulation on each; both stop early at the same step."""
+    pytest.importorskip("tensorboard", reason="tensorboard is not installed")
     chosen = {
         "max_steps": 24,
         "eval_every": 2,
         "early_stopping": 1,
         "ema_decay": 0.0,
         "drop_sensor": 0.3,
+        "loggers": ["report", "tensorboard"],
     }
     together = write("together", grad_accumulation=2, **chosen)
     process = torchrun(script, 0, "", "--params", together)
@@ -194,6 +196,8 @@ def test_two_processes_follow_the_curve_of_one_that_accumulates(
     for name, values in expected.items():
         assert found[name] == pytest.approx(values, rel=1e-3, abs=1e-5), name
     assert same(tmp_path / "together/last", tmp_path / "alone/last")
+    assert len(list((tmp_path / "together_logs.tensorboard").iterdir())) == 1, "one process logs"
+    assert out.count("live: ") == 2
 
 
 def test_a_signal_to_torchrun_stops_all_after_one_step_and_one_process_can_go_on(

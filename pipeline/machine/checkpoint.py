@@ -1,0 +1,120 @@
+"""Whether the vision-language model is here and whole, and whether it fits."""
+
+import json
+import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pipeline.config import Params, VLMParams
+from pipeline.device import resolve_device
+from pipeline.errors import VLMError
+from pipeline.machine.findings import Finding, missing, note, ok, size
+from pipeline.machine.gpu import GPU, read_accelerator
+from pipeline.store.mapping import available_bytes
+from pipeline.vlm.checkpoint_folder import (
+    adapter_files,
+    cached_checkpoint,
+    could_be_hub_id,
+    tokenizer_files,
+    weight_files,
+)
+
+_BYTES = {"float32": 4, "float16": 2, "bfloat16": 2}
+_BESIDE = 2 * 2**30
+"""Roughly what else a GPU holds while the model works: CUDA itself and a batch's activations."""
+
+
+def check_checkpoint(params: Params) -> list[Finding]:
+    """`vlm.checkpoint` and `vlm.adapter`; nothing is downloaded, no weight is read."""
+    vlm = params.vlm
+    folder = local_folder(vlm.checkpoint, vlm.revision)
+    if folder is None:
+        return [absent_checkpoint(params)]
+    try:
+        files = weight_files(folder)
+        tokenizer_files(folder)
+    except VLMError as error:
+        return [missing("vlm.checkpoint", str(error), f"hf download {vlm.checkpoint}")]
+    count = parameter_count(files)
+    here = f"{vlm.checkpoint}, whole, {count:,} parameters"
+    if str(folder) != vlm.checkpoint:
+        here += " (in the hub's cache)"
+    findings = [ok("vlm.checkpoint", here)]
+    if vlm.adapter is not None:
+        findings.append(check_adapter(vlm.adapter))
+    gpus = read_accelerator().gpus if resolve_device(params.extract.device).type == "cuda" else ()
+    return [*findings, check_fit(count, vlm, gpus, available_bytes())]
+
+
+def local_folder(checkpoint: str, revision: str | None) -> Path | None:
+    """Where a checkpoint lies on this machine, in a folder or the hub's cache; None without."""
+    folder = Path(checkpoint).expanduser()
+    if folder.is_dir():
+        return folder
+    return cached_checkpoint(checkpoint, revision) if could_be_hub_id(checkpoint) else None
+
+
+def absent_checkpoint(params: Params) -> Finding:
+    """What is said of a checkpoint that is not on this machine."""
+    checkpoint = params.vlm.checkpoint
+    if Path(checkpoint) == params.demo.checkpoint:
+        said = f"{checkpoint}: the demo's checkpoint is not written yet"
+        return missing("vlm.checkpoint", said, "python -m stages.demo (or dvc repro)")
+    if not could_be_hub_id(checkpoint):
+        said = f"{checkpoint}: no such folder, and no hub id"
+        return missing("vlm.checkpoint", said, "set vlm.checkpoint to a folder or a hub id")
+    said = f"{checkpoint}: no such folder, and no complete copy in the hub's cache"
+    remedy = f"hf download {checkpoint}"
+    if os.environ.get("HF_HUB_OFFLINE", "0").lower() in ("1", "true", "yes", "on"):
+        said += "; HF_HUB_OFFLINE forbids to fetch it"
+        return missing("vlm.checkpoint", said, f"{remedy}, where there is network")
+    return note("vlm.checkpoint", f"{said}; the first extraction downloads it", remedy)
+
+
+def check_adapter(adapter: str) -> Finding:
+    """`vlm.adapter`."""
+    folder = local_folder(adapter, None)
+    if folder is None:
+        said = f"{adapter}: not on this machine"
+        return missing("vlm.adapter", said, "set vlm.adapter to its folder, or to null")
+    try:
+        adapter_files(folder)
+    except VLMError as error:
+        return missing("vlm.adapter", str(error), "copy it again, or set vlm.adapter to null")
+    return ok("vlm.adapter", adapter)
+
+
+def check_fit(count: int, vlm: VLMParams, gpus: Sequence[GPU], available: int) -> Finding:
+    """Whether the weights fit: on the smallest GPU, else into the memory that is free."""
+    weights = count * _BYTES[vlm.dtype]
+    where, room, needed = "memory", available, weights
+    if gpus:
+        smallest = min(gpus, key=lambda gpu: gpu.memory)
+        where, room, needed = smallest.name, smallest.memory, weights + _BESIDE
+    said = f"{size(weights)} in {vlm.dtype}, {where} has {size(room)}"
+    if needed <= room:
+        return ok("it fits", said)
+    half = "set vlm.dtype to bfloat16, or " if vlm.dtype == "float32" else ""
+    remedy = f"{half}take a smaller checkpoint, or a machine with more memory"
+    if gpus:
+        remedy += ", or set extract.device to cpu"
+    return note("it may not fit", said, remedy)
+
+
+def parameter_count(files: Sequence[Path]) -> int:
+    """How many numbers these safetensors files hold, by their headers."""
+    return sum(
+        math.prod(tensor["shape"])
+        for path in files
+        if path.suffix == ".safetensors"
+        for name, tensor in _header(path).items()
+        if name != "__metadata__"
+    )
+
+
+def _header(path: Path) -> dict[str, Any]:
+    with path.open("rb") as file:
+        length = int.from_bytes(file.read(8), "little")
+        return json.loads(file.read(length))

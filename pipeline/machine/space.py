@@ -1,0 +1,153 @@
+"""Whether the store that these params describe has room: on the disk, in memory, in maps."""
+
+import math
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from pipeline.config import Params
+from pipeline.durable import free_bytes
+from pipeline.extraction.check import CheckedEpisode
+from pipeline.extraction.layout import build_arrays
+from pipeline.extraction.plan import store_bytes
+from pipeline.extraction.survey import Survey, SurveyedEpisode
+from pipeline.machine.checkpoint import local_folder
+from pipeline.machine.findings import Finding, missing, note, ok, size
+from pipeline.machine.limits import memory_bytes
+from pipeline.machine.links import links_here
+from pipeline.recordings import Recording, open_recordings
+from pipeline.recordings.embodiment import Embodiment
+from pipeline.store import part_path
+from pipeline.timeline import ActionRotation, build_timeline, choose_action_rotation
+from pipeline.vlm.feature_spec import feature_spec
+
+BUDGET_S = 4.0
+"""How long episodes are read for the estimate; the rest is taken to be like them."""
+MOST_READ = 100
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What a store will take."""
+
+    bytes: int
+    maps: int
+    """Chunk files, each of which a process maps."""
+    episodes: int
+    read: int
+    """Episodes that were looked at; the others are taken to be as long."""
+
+    def __str__(self) -> str:
+        known = "" if self.read == self.episodes else f", judged by {self.read} of them"
+        return f"about {size(self.bytes)} for {self.episodes} episodes{known}"
+
+
+def check_space(params: Params) -> list[Finding]:
+    """The store of `params`, without loading the model or decoding a frame."""
+    target = params.extract.store
+    if local_folder(params.vlm.checkpoint, params.vlm.revision) is None:
+        return [note("size", "not known before vlm.checkpoint is here; see above")]
+    estimate = estimate_store(params)
+    links = links_here()
+    there = used_bytes(part_path(target))
+    limit = Path("/proc/sys/vm/max_map_count")
+    maps = int(limit.read_text(encoding="ascii")) if limit.exists() else None
+    return [
+        check_disk(estimate, target, free_bytes(target), there, finished=target.exists()),
+        *([check_cached_copy(estimate, free_bytes(target))] if links == "copy" else []),
+        check_page_cache(estimate, memory_bytes()),
+        *([] if maps is None else [check_maps(estimate, maps)]),
+    ]
+
+
+def check_disk(
+    estimate: Estimate, target: Path, free: int, begun: int, *, finished: bool
+) -> Finding:
+    """Room for the store, less what an unfinished build of it has already."""
+    said = f"{estimate}; {size(free)} free in {target.parent}"
+    if begun:
+        said += f", {size(begun)} of it written by an unfinished build"
+    if estimate.bytes - begun <= free:
+        return ok("disk", f"{said}; {target} is finished" if finished else said)
+    remedy = (
+        "make room, set extract.store to another disk, extract.dtype to float16, or fewer "
+        "vlm.pooling slots"
+    )
+    if finished:
+        return note("disk", f"{said}; {target} is there, but another has no room beside it", remedy)
+    return missing("disk", said, remedy)
+
+
+def check_cached_copy(estimate: Estimate, free: int) -> Finding:
+    """Room for the second store that DVC keeps where it can only copy."""
+    said = f"DVC can only copy into its cache: {size(2 * estimate.bytes)} with its copy"
+    remedy = "put .dvc/cache on the same disk (dvc cache dir), or call the stages without DVC"
+    return (note if 2 * estimate.bytes > free else ok)(
+        "DVC's copy", said, *([remedy] if 2 * estimate.bytes > free else [])
+    )
+
+
+def check_page_cache(estimate: Estimate, memory: int) -> Finding:
+    """Whether training reads the store at memory speed after its first epoch."""
+    if estimate.bytes <= 0.7 * memory:
+        return ok("page cache", f"the store fits into memory ({size(memory)})")
+    said = f"the store is larger than what {size(memory)} of memory keeps, so it is read from disk"
+    remedy = "keep it on a local NVMe disk, or set extract.dtype to float16"
+    return note("page cache", said, remedy)
+
+
+def check_maps(estimate: Estimate, limit: int) -> Finding:
+    """Room among the maps of a process."""
+    said = f"{estimate.maps} chunk files; vm.max_map_count is {limit}"
+    if estimate.maps < 0.8 * limit:
+        return ok("maps", said)
+    return missing("maps", said, f"sudo sysctl vm.max_map_count={4 * max(estimate.maps, limit)}")
+
+
+def estimate_store(params: Params) -> Estimate:
+    """What `extract.plan=true` computes, from a few episodes within `BUDGET_S`.
+
+    Raises what reading the recordings raises.
+    """
+    opened = open_recordings(params.data.sources, params.data.root, params.data.views)
+    rotation = choose_action_rotation(params.data.action_rotation, opened.recordings)
+    checked: list[CheckedEpisode] = []
+    until = time.monotonic() + BUDGET_S
+    for recording in _spread(opened.recordings)[:MOST_READ]:
+        if checked and time.monotonic() > until:
+            break
+        checked.append(_read(recording, params, rotation))
+    views = sorted({view for one in checked for view in one.surveyed.recording.view_names()})
+    # A digest decides nothing of a size, and reading every weight for it takes long.
+    spec = feature_spec(params.vlm, params.extract.dtype, views, lambda path: "")
+    survey = Survey(tuple(one.surveyed for one in checked), (), (), spec, rotation, "")
+    times = len(opened.recordings) / len(checked)
+    specs = {
+        name: replace(one, shape=(math.ceil(one.shape[0] * times), *one.shape[1:]))
+        for name, one in build_arrays(checked, survey, params).items()
+    }
+    maps = sum(one.chunk_count for one in specs.values())
+    return Estimate(store_bytes(specs), maps, len(opened.recordings), len(checked))
+
+
+def used_bytes(folder: Path) -> int:
+    """Bytes on the disk of the files below a folder; 0 where there is none."""
+    files = (Path(root, name) for root, _, names in os.walk(folder) for name in names)
+    return sum(file.lstat().st_blocks * 512 for file in files)
+
+
+def _spread(recordings: Sequence[Recording]) -> list[Recording]:
+    """All of them, in an order whose every beginning comes from all over: the golden ratio's."""
+    order = sorted(range(len(recordings)), key=lambda at: at * 0.6180339887498949 % 1)
+    return [recordings[at] for at in order]
+
+
+def _read(recording: Recording, params: Params, rotation: ActionRotation) -> CheckedEpisode:
+    state, sensor = recording.state(), recording.sensor()
+    hz, reuse = params.data.action_hz, params.data.vlm_reuse_count
+    line = build_timeline(recording, hz, reuse, rotation, state, sensor)
+    embodiment = Embodiment.of(line.action_channels, line.action_kind, sensor, state)
+    readings, states = (len(one.time) if one else 0 for one in (sensor, state))
+    return CheckedEpisode(SurveyedEpisode(recording, "", ""), line, embodiment, readings, states)

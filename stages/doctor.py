@@ -1,0 +1,36 @@
+"""Look at this machine: what is there, what is missing, and what to install or set.
+
+Checks Python and packages, the GPU and torch's build, attention backends, video decoders, the
+checkpoint, the recordings, the room for the store, DVC's cache and the kernel's limits, for the
+params given. Downloads nothing, loads no model, changes nothing; takes some seconds.
+
+  ok        as it should be
+  note      works, but could be better, or is needed for something else only
+  missing   the default pipeline does not run with these params; -> says what mends it
+
+Exit code 2 where something is missing. Next: python -m stages.extract --set extract.plan=true
+"""
+
+from pipeline.config import Params
+from pipeline.errors import PipelineError
+from pipeline.machine import Finding, described, examine
+from stages.command import run
+
+
+def main(params: Params) -> None:
+    """Print every group of findings; refuse where one is missing."""
+    lacking: list[Finding] = []
+    for title, findings in examine(params):
+        print("\n".join(described(title, findings)), flush=True)
+        lacking += [finding for finding in findings if finding.level == "missing"]
+    if lacking:
+        subjects = ", ".join(dict.fromkeys(finding.subject for finding in lacking))
+        raise PipelineError(
+            f"{len(lacking)} thing(s) are missing: {subjects}. Do what stands behind -> there, "
+            "then run python -m stages.doctor again."
+        )
+    print("nothing is missing: stage one and stage two can run with these params")
+
+
+if __name__ == "__main__":
+    raise SystemExit(run(__doc__ or "", main, sections=("data", "vlm", "extract", "train_head")))

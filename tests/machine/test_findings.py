@@ -1,0 +1,78 @@
+"""How findings read, and that a group that cannot be looked at is one."""
+
+import time
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from pipeline import machine
+from pipeline.config import Params
+from pipeline.errors import ConfigError
+from pipeline.machine.findings import WIDTH, described, missing, note, ok
+
+
+@pytest.fixture
+def params() -> Params:
+    return Params.model_validate(
+        {"data": {"sources": [{"name": "a", "path": "."}]}, "vlm": {"checkpoint": "x/y"}}
+    )
+
+
+@pytest.fixture
+def only(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], None]:
+    """`only(check)`: one group, whose check this is; an error stands for a failing import."""
+
+    def set_check(check: Any) -> None:
+        def load(name: str) -> Any:
+            if isinstance(check, Exception):
+                raise check
+            return SimpleNamespace(check=check)
+
+        monkeypatch.setattr(machine, "import_module", load)
+        monkeypatch.setattr(machine, "GROUPS", (("A group", "one", "check"),))
+
+    return set_check
+
+
+def test_lines_stay_within_the_width_and_words_whole() -> None:
+    command = "pip install --force-reinstall torch --index-url https://a.example/" + "x" * 20
+    lines = described(
+        "A group", [ok("subject", "word " * 40), note("other", "found", command), ok("s", "")]
+    )
+    assert lines[0] == "A group" and lines[-1] == ""
+    assert all(len(line) <= WIDTH for line in lines)
+    assert sum(line.startswith("  ok ") for line in lines) == 2
+    assert "https://a.example/" + "x" * 20 in "\n".join(lines)
+    starts = {line.index("word") for line in lines if "word" in line}
+    assert starts == {30}, "found stands in one column"
+
+
+@pytest.mark.parametrize(
+    ("check", "level", "said"),
+    [
+        (ImportError("No module named 'av'"), "missing", "No module named 'av'"),
+        (lambda params: _raise(ConfigError("device: cuda:7")), "missing", "device: cuda:7"),
+        (lambda params: _raise(OSError("stale handle")), "note", "stale handle"),
+        (lambda params: time.sleep(5), "note", "no answer within 0.1 s"),
+        (lambda params: [missing("it", "is not there", "get it")], "missing", "is not there"),
+    ],
+)
+def test_what_cannot_be_looked_at_is_a_finding(
+    params: Params,
+    only: Callable[[Any], None],
+    monkeypatch: pytest.MonkeyPatch,
+    check: Any,
+    level: str,
+    said: str,
+) -> None:
+    monkeypatch.setattr(machine, "PATIENCE_S", 0.1)
+    only(check)
+    ((title, (finding,)),) = machine.examine(params)
+    assert (title, finding.level) == ("A group", level)
+    assert said in finding.found
+
+
+def _raise(error: Exception) -> None:
+    raise error

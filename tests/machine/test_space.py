@@ -1,0 +1,158 @@
+"""Room for the store, for DVC's copy, in memory and among maps; links and limits."""
+
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import yaml
+
+from pipeline.config import Params
+from pipeline.machine.limits import Limits, check_limits, memory_bytes, read_limits
+from pipeline.machine.links import Cache, check_cache, read_cache
+from pipeline.machine.space import (
+    Estimate,
+    check_cached_copy,
+    check_disk,
+    check_maps,
+    check_page_cache,
+    check_space,
+    estimate_store,
+    used_bytes,
+)
+from stages import extract
+from stages.command import run
+
+GIB = 2**30
+TEN = Estimate(bytes=10 * GIB, maps=160, episodes=50, read=8)
+STORE = Path("cache_store/lab.zarr")
+ROOM = Limits(cores=8, memory=64 * GIB, open_files=4096, shared=8 * GIB)
+
+
+@pytest.mark.parametrize(
+    ("free", "begun", "finished", "level"),
+    [
+        (11, 0, False, "ok"),
+        (9, 0, False, "missing"),
+        (9, 2, False, "ok"),
+        (9, 0, True, "note"),
+        (11, 0, True, "ok"),
+    ],
+)
+def test_room_for_the_store(free: int, begun: int, finished: bool, level: str) -> None:
+    finding = check_disk(TEN, STORE, free * GIB, begun * GIB, finished=finished)
+    assert finding.level == level
+    assert "about 10.0 GiB for 50 episodes, judged by 8 of them" in finding.found
+    assert ("set extract.store to another disk" in finding.remedy) == (level != "ok")
+
+
+def test_room_for_the_copy_that_dvc_keeps() -> None:
+    assert check_cached_copy(TEN, 21 * GIB).level == "ok"
+    tight = check_cached_copy(TEN, 15 * GIB)
+    assert tight.level == "note" and "20.0 GiB with its copy" in tight.found
+
+
+def test_memory_and_maps() -> None:
+    assert check_page_cache(TEN, 16 * GIB).level == "ok"
+    assert check_page_cache(TEN, 12 * GIB).level == "note"
+    assert check_maps(TEN, 65530).level == "ok"
+    many = check_maps(replace(TEN, maps=70_000), 65530)
+    assert many.level == "missing"
+    assert many.remedy == "sudo sysctl vm.max_map_count=280000"
+
+
+def test_the_estimate_is_what_extraction_takes(
+    tmp_path: Path, demo_checkpoint: Path, recordings: Path
+) -> None:
+    document = {
+        "data": {
+            "root": str(recordings),
+            "sources": [{"name": "raw", "path": "raw"}, {"name": "new", "path": "new"}],
+        },
+        "vlm": {
+            "checkpoint": str(demo_checkpoint),
+            "dtype": "float32",
+            "image_resize_height": 28,
+            "image_resize_width": 28,
+        },
+        "extract": {"store": str(tmp_path / "made.zarr"), "device": "cpu"},
+    }
+    params = Params.model_validate(document)
+    before = estimate_store(params)
+    assert before.read == before.episodes == 4
+    assert [finding.level for finding in check_space(params)][:1] == ["ok"]
+    assert not list(tmp_path.glob("made*")), "a check writes nothing"
+    file = tmp_path / "params.yaml"
+    file.write_text(yaml.safe_dump(document))
+    assert run("", extract.main, ["--params", str(file)]) == 0
+    taken = used_bytes(tmp_path / "made.zarr")
+    # Chunk files are whole pages, and metadata takes some.
+    assert before.bytes < taken < 1.5 * before.bytes + 2**20
+    files = [path for path in (tmp_path / "made.zarr").rglob("*") if path.is_file()]
+    assert before.maps == sum(path.name != "zarr.json" for path in files)
+
+
+def test_without_a_checkpoint_the_size_is_not_known() -> None:
+    params = Params.model_validate(
+        {"data": {"sources": [{"name": "a", "path": "."}]}, "vlm": {"checkpoint": "/no/such"}}
+    )
+    (finding,) = check_space(params)
+    assert finding.level == "note" and "vlm.checkpoint" in finding.found
+
+
+def cache(**changed: object) -> Cache:
+    here = Cache(Path(".dvc/cache"), ("reflink", "hardlink", "copy"), ("hardlink", "copy"), True)
+    return replace(here, **changed)  # type: ignore[arg-type]
+
+
+def test_the_link_that_dvc_takes() -> None:
+    (finding,) = check_cache(cache())
+    assert finding.level == "ok" and "takes: hardlink" in finding.found
+    (default,) = check_cache(cache(types=("reflink", "copy")))
+    assert default.level == "note" and "on the disk twice" in default.found
+    assert default.remedy.startswith("dvc config cache.type")
+    (far,) = check_cache(cache(working=("copy",), same_disk=False))
+    assert far.level == "note" and "another disk" in far.found
+    assert far.remedy.startswith("dvc cache dir")
+    (none,) = check_cache(None)
+    assert none.level == "note" and none.remedy == "dvc init"
+
+
+def test_links_are_really_tried(tmp_path: Path) -> None:
+    assert read_cache(tmp_path) is None
+    subprocess.run(["git", "init", "-q", str(tmp_path)], check=True)
+    (tmp_path / ".dvc").mkdir()
+    (tmp_path / ".dvc" / "config").write_text('[cache]\n    type = "hardlink,copy"\n')
+    (tmp_path / "below").mkdir()
+    found = read_cache(tmp_path / "below")
+    assert found is not None
+    assert found.types == ("hardlink", "copy")
+    assert {"hardlink", "symlink", "copy"} <= set(found.working)
+    assert found.same_disk and found.link == "hardlink"
+    left = [path for path in (tmp_path / ".dvc").rglob("*") if path.is_file()]
+    assert [path.name for path in left] == ["config"], "what was tried is removed"
+
+
+def test_links_to_another_disk(tmp_path: Path, small_disk: Path) -> None:
+    (tmp_path / ".dvc").mkdir()
+    (tmp_path / ".dvc" / "config").write_text(f"[cache]\n    dir = {small_disk / 'cache'}\n")
+    found = read_cache(tmp_path)
+    assert found is not None
+    assert "hardlink" not in found.working
+    assert not found.same_disk and found.link == "copy"
+
+
+def test_limits() -> None:
+    assert {finding.level for finding in check_limits(ROOM)} == {"ok"}
+    small = check_limits(replace(ROOM, open_files=256, shared=64 * 2**20))
+    assert {finding.subject: finding.remedy for finding in small if finding.level == "note"} == {
+        "open files": "ulimit -n 4096",
+        "/dev/shm": "in a container, start it with --shm-size=8g",
+    }
+    assert len(check_limits(replace(ROOM, shared=None))) == 3
+
+
+def test_this_machines_limits_can_be_read() -> None:
+    here = read_limits()
+    assert here.cores > 0 and here.open_files > 0
+    assert 2**28 < here.memory == memory_bytes()

@@ -1,0 +1,89 @@
+"""The whole command, on this machine and on one where packages are missing."""
+
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from pipeline.machine import GROUPS
+from pipeline.simulation.demo_recordings import write_demo_recordings
+from stages import doctor
+from stages.command import run
+
+Start = Callable[..., "subprocess.Popen[str]"]
+WITHOUT = """
+import sys
+
+class Blocker:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in ("torch", "av", "dvc"):
+            raise ImportError(f"No module named {name!r}")
+
+sys.meta_path.insert(0, Blocker())
+from stages import doctor
+from stages.command import run
+
+sys.exit(run("", doctor.main, ["--params", sys.argv[1]]))
+"""
+
+
+@pytest.fixture(scope="module")
+def params(tmp_path_factory: pytest.TempPathFactory, demo_checkpoint: Path) -> Path:
+    tmp_path = tmp_path_factory.mktemp("doctor")
+    write_demo_recordings(tmp_path / "data", 2, 0)
+    document: dict[str, Any] = {
+        "data": {"root": str(tmp_path / "data"), "sources": [{"name": "new", "path": "new"}]},
+        "vlm": {"checkpoint": str(demo_checkpoint), "dtype": "float32"},
+        "extract": {"store": str(tmp_path / "made.zarr")},
+    }
+    path = tmp_path / "params.yaml"
+    path.write_text(yaml.safe_dump(document))
+    return path
+
+
+def test_where_nothing_is_missing(params: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = set(params.parent.rglob("*"))
+    assert run("", doctor.main, ["--params", str(params)]) == 0
+    said = capsys.readouterr()
+    assert said.err == ""
+    lines = said.out.splitlines()
+    assert [line for line in lines if line in {title for title, *_ in GROUPS}] == [
+        title for title, *_ in GROUPS
+    ]
+    assert max(map(len, lines)) <= 100 + len(str(params.parent)), "save for paths, 100 columns"
+    assert "\x1b" not in said.out
+    assert "AV1                decodes" in said.out
+    assert "2 episode(s), new" in said.out
+    assert "about " in said.out and " for 2 episodes; " in said.out
+    assert lines[-1].startswith("nothing is missing")
+    assert set(params.parent.rglob("*")) == before, "it changes nothing"
+
+
+def test_where_something_is(params: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = [
+        "--params",
+        str(params),
+        *("--set", "vlm.checkpoint=/no/such/model", "--set", "data.sources=[{name: x, path: y}]"),
+        *("--set", "extract.device=cuda:77"),
+    ]
+    assert run("", doctor.main, arguments) == 2
+    said = capsys.readouterr()
+    assert "missing  vlm.checkpoint" in said.out
+    assert "missing  x " in said.out
+    assert said.err.count("error: ") == 1
+    assert "vlm.checkpoint, x" in said.err
+    assert "Machine" in said.out, "it looks at the rest all the same"
+
+
+def test_where_packages_are_not_installed(started: Start, params: Path) -> None:
+    process = started(WITHOUT, params)
+    out, err = process.communicate(timeout=100)
+    assert process.returncode == 2, err
+    assert "Traceback" not in err
+    assert "cannot be looked at: No module named 'torch'" in out
+    assert "cannot be looked at: No module named 'av'" in out
+    assert "cannot be looked at: No module named 'dvc" in out
+    assert "Machine" in out

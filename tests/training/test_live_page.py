@@ -1,0 +1,154 @@
+"""The live page: what it shows, when it is drawn, and that it needs nothing."""
+
+import math
+import re
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import pytest
+
+from pipeline.training.live_page import REFRESH_S, LivePage
+from pipeline.training.live_svg import MOST_POINTS, Curve, chart, nice_ticks
+
+
+class Clock:
+    """A clock that stands still unless told, and on which drawing takes `drawing_s`."""
+
+    def __init__(self) -> None:
+        self.now, self.drawing_s, self._drawing = 100.0, 0.0, False
+
+    def monotonic(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr("pipeline.training.live_page.time", clock)
+    return clock
+
+
+def page(folder: Path) -> str:
+    return (folder / "report.html").read_text(encoding="utf-8")
+
+
+def test_it_draws_itself_again_until_the_run_ends(tmp_path: Path, clock: Clock) -> None:
+    live = LivePage(tmp_path, "models/<head>", 500)
+    live.write(10, {"train/loss": 0.5, "lr": 1e-4})
+    assert f'<meta http-equiv="refresh" content="{REFRESH_S}">' in page(tmp_path)
+    assert "step 10 of 500, training" in page(tmp_path)
+    live.write(20, {"train/loss": 0.25, "val/error": 0.3, "lr": 1e-4})
+    assert "step 10 of 500" in page(tmp_path), "not before it is due"
+    clock.now += REFRESH_S
+    live.write(30, {"train/loss": 0.2})
+    assert "step 30 of 500" in page(tmp_path)
+    live.close(finished=True)
+    said = page(tmp_path)
+    assert "step 30 of 500, finished" in said
+    assert "http-equiv" not in said
+    assert "models/&lt;head&gt;" in said
+    assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
+    headings = re.findall(r"<h2>(.*?)</h2>", said)
+    assert headings == ["Held-out ticks", "Training", "Schedule"]
+
+
+def test_it_asks_for_nothing_and_the_same_numbers_give_the_same_bytes(tmp_path: Path) -> None:
+    written: list[str] = []
+    for _ in range(2):
+        live = LivePage(tmp_path, "head", 40)
+        for step in range(10, 50, 10):
+            live.write(step, {"train/loss": 1 / step, "val/error": 2 / step})
+        live.close(finished=False)
+        written.append(page(tmp_path))
+    assert written[0] == written[1]
+    assert "stopped; the same command goes on" in written[0]
+    assert not re.search(r"https?://|<script|<link|src=", written[0])
+
+
+def test_drawing_takes_no_more_than_its_share_of_the_time(
+    tmp_path: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[float] = []
+
+    def slow(self: LivePage, *rest: object) -> None:
+        drawn.append(clock.now)
+        clock.now += 0.5
+
+    monkeypatch.setattr(LivePage, "_save", slow)
+    live = LivePage(tmp_path, "head", 10_000)
+    began = clock.now
+    for step in range(10, 10_000, 10):
+        live.write(step, {"train/loss": 1.0})
+        clock.now += 1
+    assert len(drawn) > 5
+    assert 0.5 * (len(drawn) - 1) / (clock.now - began) < 0.0051
+
+
+def shape(curve: Curve) -> tuple[ET.Element, list[tuple[float, float]]]:
+    """The figure, well-formed, and the points of its line in pixels."""
+    figure = ET.fromstring(chart(curve))
+    line = figure.find(".//polyline")
+    assert line is not None
+    return figure, [
+        (float(x), float(y)) for x, y in (p.split(",") for p in line.attrib["points"].split())
+    ]
+
+
+def test_a_curve_falls_where_its_values_fall() -> None:
+    curve = Curve("val/error")
+    for step, value in ((10, 0.4), (20, 0.2), (40, 0.3)):
+        curve.add(step, value)
+    figure, line = shape(curve)
+    (x0, y0), (x1, y1), (x2, y2) = line
+    assert (x1 - x0) * 2 == pytest.approx(x2 - x1, abs=0.2), "steps are an axis, not an order"
+    assert y0 < y2 < y1, "down is less"
+    mark = figure.find(".//circle")
+    assert mark is not None
+    assert (float(mark.attrib["cx"]), float(mark.attrib["cy"])) == (x1, y1)
+    assert "0.3 at step 40, lowest 0.2 at 20" in "".join(figure.itertext())
+
+
+def test_a_curve_over_decades_is_logarithmic() -> None:
+    curve = Curve("train/loss")
+    for step, value in enumerate((1.0, 0.1, 0.01)):
+        curve.add(step, value)
+    figure, line = shape(curve)
+    assert line[1][1] - line[0][1] == pytest.approx(line[2][1] - line[1][1], abs=0.2)
+    assert "logarithmic" in "".join(figure.itertext())
+
+
+def test_a_long_curve_is_thinned_to_means() -> None:
+    curve = Curve("train/loss")
+    for step in range(100_000):
+        curve.add(step, float(step % 2))
+    points = curve.points()
+    assert len(points) <= MOST_POINTS
+    assert all(value == pytest.approx(0.5, abs=0.01) for _, value in points)
+
+
+@pytest.mark.parametrize("values", [[0.0], [3.0, 3.0], [math.nan, 1.0], [-1.0, math.inf, 2.0]])
+def test_odd_curves_are_drawn(values: list[float]) -> None:
+    curve = Curve("train/loss")
+    for step, value in enumerate(values):
+        curve.add(step, value)
+    figure, line = shape(curve)
+    assert len(line) == sum(map(math.isfinite, values))
+    assert "nan" not in ET.tostring(figure, encoding="unicode")
+
+
+def test_a_curve_without_a_finite_value_says_so() -> None:
+    curve = Curve("train/loss")
+    curve.add(1, math.nan)
+    assert "no finite value yet" in chart(curve)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "expected"),
+    [
+        (0, 100, [0, 20, 40, 60, 80, 100]),
+        (0.12, 0.31, [0.15, 0.2, 0.25, 0.3]),
+        (-1, 1, [-1, -0.5, 0, 0.5, 1]),
+    ],
+)
+def test_ticks_are_round(low: float, high: float, expected: list[float]) -> None:
+    assert nice_ticks(low, high, 4) == pytest.approx(expected)
