@@ -1,0 +1,75 @@
+"""What the site is made of: figures as they are drawn, a page that describes every parameter."""
+
+import re
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from pipeline.config import described_keys
+
+ROOT = Path(__file__).resolve().parents[2]
+FIGURES = ROOT / "docs" / "figures"
+
+
+def test_the_figures_are_as_they_are_drawn(machinery):
+    drawn = machinery("draw").documents()
+    assert {path.name for path in FIGURES.glob("*.svg")} == set(drawn)
+    for name, text in drawn.items():
+        kept = (FIGURES / name).read_text(encoding="utf-8")
+        assert kept == text, f"{name} is stale: python docs/machinery/draw.py"
+
+
+@pytest.mark.parametrize("path", sorted(FIGURES.glob("*.svg")), ids=lambda path: path.stem)
+def test_a_figure_says_what_it_shows_and_names_its_colours(path):
+    text = path.read_text(encoding="utf-8")
+    root = ElementTree.fromstring(text)
+    assert root.findtext("{http://www.w3.org/2000/svg}title")
+    outside = re.sub(r"<style>.*?</style>", "", text, flags=re.DOTALL)
+    assert not re.search(r"#[0-9a-fA-F]{3,8}\b", outside), "a colour that does not follow the page"
+    used = set(re.findall(r"var\(--([a-z]+)\)", outside))
+    assert used <= set(re.findall(r"--([a-z]+):", text))
+
+
+def test_the_site_knows_every_colour_of_the_figures(machinery):
+    css = (ROOT / "docs" / "machinery" / "site.css").read_text(encoding="utf-8")
+    drawing = machinery("drawing")
+    for name, value in drawing.LIGHT.items():
+        assert f"--{name}: {value};" in css or name == "paper"
+    for name, value in drawing.DARK.items():
+        assert f"--{name}: {value};" in css or name == "paper"
+
+
+class TestParamsPage:
+    @pytest.fixture
+    def page(self, machinery) -> str:
+        return machinery("params_page").params_page()
+
+    def test_has_every_key_that_the_commands_list(self, page):
+        from pipeline.config import Params
+
+        listed = [
+            line.split(" = ")[0].strip()
+            for line in described_keys(tuple(Params.model_fields))
+            if re.match(r"  \w+\.[\w.]+ = ", line)
+        ]
+        assert len(listed) > 100
+        for key in listed:
+            assert f"`{key}`{{ #{key} }}" in page
+
+    def test_says_type_range_default_and_meaning(self, page):
+        (entry,) = re.findall(r"^`vlm\.layers`.*\n:   .*$", page, re.MULTILINE)
+        assert "list of (whole number), at least 1; default `[-1]`" in entry
+        assert "Decoder layers whose output is taken" in entry
+        assert "`train_head.val_fraction`{ #train_head.val_fraction } number, from 0 to 1;" in page
+        assert "`data.sources[].name`{ #data.sources.name } text, not empty; **has to" in page
+
+    def test_refuses_what_it_has_no_words_for(self, machinery):
+        with pytest.raises(KeyError):
+            machinery("params_page").words({"type": "unheard-of"}, {})
+
+
+def test_every_room_has_a_page_in_the_index(machinery):
+    index = (ROOT / "docs" / "reference" / "index.md").read_text(encoding="utf-8")
+    for room in machinery("reference_pages").rooms():
+        assert f"({room}.md)" in index, f"docs/reference/index.md does not name {room}"

@@ -1,0 +1,90 @@
+"""What the documentation names is there: commands, keys of params.yaml, files behind links.
+
+`<!-- no-check: why -->` before a paragraph or block excuses it.
+"""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from pipeline.config import Params
+from pipeline.config.section import Section
+
+ROOT = Path(__file__).resolve().parents[2]
+STAGES = {path.stem for path in (ROOT / "stages").glob("*.py")} - {"__init__", "command"}
+PAGES = [
+    *sorted((ROOT / "docs").rglob("*.md")),
+    *sorted(ROOT.glob("README*.md")),
+    ROOT / "CONTRIBUTING.md",
+    ROOT / "cache_store" / "README.md",
+]
+WRITTEN_AT_BUILD = re.compile(r"(^|/)docs/(params|reference/\w+)\.md$")
+EXCUSED = re.compile(
+    r"<!-- no-check: [^>]*-->\s*\n(?:```.*?^```$|.*?(?=\n\n|\Z))", re.DOTALL | re.MULTILINE
+)
+COMMAND = re.compile(r"\bstages\.([a-z_]+)")
+KEY = re.compile(
+    rf"(?<![\w./-])({'|'.join(Params.model_fields)})"
+    r"\.([a-z_]+(?:\.[a-z_]+)*)(?![\w(/])"
+)
+FILES = {"zarr", "pkl", "md", "py", "yaml", "json", "csv", "png", "html", "lock", "npz", "parquet"}
+LINK = re.compile(r"\]\(([^)\s]+)\)|(?:src|srcset|href)=\"([^\"]+)\"")
+
+each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+
+
+def text_of(page: Path) -> str:
+    return EXCUSED.sub("", page.read_text(encoding="utf-8"))
+
+
+def keys() -> set[str]:
+    """Every key and section of params.yaml by its full name."""
+    found: set[str] = set()
+
+    def collect(section: type[Section], place: str) -> None:
+        for name, one in section.model_fields.items():
+            found.add(f"{place}{name}")
+            if isinstance(one.annotation, type) and issubclass(one.annotation, Section):
+                collect(one.annotation, f"{place}{name}.")
+
+    collect(Params, "")
+    return found
+
+
+@each_page
+def test_every_command_is_there(page):
+    unknown = {name for name in COMMAND.findall(text_of(page)) if name not in STAGES}
+    assert not unknown - {"command"}
+
+
+@each_page
+def test_every_key_is_there(page):
+    known = keys()
+    code = re.findall(r"```.*?```|`[^`\n]+`", text_of(page), re.DOTALL)
+    named = {
+        f"{section}.{key}"
+        for piece in code
+        if not piece.startswith("```python")
+        for section, key in KEY.findall(piece)
+    }
+    # demo.zarr is a file of the demo, demo.episodes a key.
+    unknown = {name for name in named - known if name.rpartition(".")[2] not in FILES}
+    assert not unknown
+
+
+@each_page
+def test_every_link_within_the_project_resolves(page):
+    for target in (first or second for first, second in LINK.findall(text_of(page))):
+        if target.startswith(("https://", "http://", "#", "mailto:")):
+            continue
+        place = (page.parent / target.partition("#")[0]).resolve()
+        written = WRITTEN_AT_BUILD.search(place.as_posix())
+        assert place.exists() or written, f"{page.relative_to(ROOT)} -> {target}"
+
+
+def test_a_wrong_name_would_be_found():
+    assert "nonsense" not in STAGES
+    assert KEY.findall("`vlm.nonsense`") == [("vlm", "nonsense")]
+    assert {"vlm.layers", "train_head.diffusion.eta", "inspect.path"} <= keys()
+    assert not EXCUSED.sub("", "<!-- no-check: x -->\n```\nstages.nonsense\n```").strip()

@@ -1,0 +1,101 @@
+"""The built site in a real browser, from a folder: no errors, no other host."""
+
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+DESKTOP, PHONE = (1280, 900), (390, 844)
+PAGES = ("index", "concepts", "store", "params", "data/errors", "reference/store", "faq")
+
+
+class Links(HTMLParser):
+    """Where a page's links and resources lead, and which anchors it has."""
+
+    def __init__(self, page: Path) -> None:
+        super().__init__()
+        self.targets: list[str] = []
+        self.anchors: set[str] = set()
+        self.feed(page.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        named = dict(attrs)
+        self.anchors |= {value for name, value in attrs if name in ("id", "name") and value}
+        self.targets += [value for name in ("href", "src") if (value := named.get(name))]
+
+
+def test_every_link_and_anchor_is_there(site):
+    pages = {path: Links(path) for path in site.rglob("*.html") if path.name != "404.html"}
+    assert len(pages) > 40
+    lost = []
+    for page, links in pages.items():
+        for target in links.targets:
+            if re.match(r"[a-z]+:", target):
+                continue
+            name, _, anchor = target.partition("#")
+            place = (page.parent / name).resolve() if name else page
+            if not place.exists():
+                lost.append(f"{page.relative_to(site)} -> {target}")
+            elif anchor and place in pages and anchor not in pages[place].anchors:
+                # Its own code-line anchors aside, MkDocs makes every anchor when it builds.
+                lost.append(f"{page.relative_to(site)} -> {target} (no such anchor)")
+    assert not lost
+
+
+@pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_pages_load_alone_and_fit_the_screen(site, browser, size, scheme):
+    context = browser.new_context(
+        viewport={"width": size[0], "height": size[1]}, color_scheme=scheme
+    )
+    trouble: list[str] = []
+    page = context.new_page()
+    page.set_default_timeout(20_000)
+    page.on("console", lambda said: trouble.append(said.text) if said.type == "error" else None)
+    page.on("pageerror", lambda error: trouble.append(str(error)))
+
+    def only_files(route) -> None:
+        if route.request.url.startswith("file:"):
+            route.continue_()
+        else:
+            trouble.append(f"asked for {route.request.url}")
+            route.abort()
+
+    page.route("**/*", only_files)
+    for name in PAGES:
+        page.goto((site / f"{name}.html").as_uri())
+        page.wait_for_load_state("networkidle")
+        width = page.evaluate("document.documentElement.scrollWidth")
+        assert width <= size[0], f"{name} is {width} px wide"
+        shown = page.evaluate("document.body.getAttribute('data-md-color-scheme')")
+        assert shown == {"light": "default", "dark": "slate"}[scheme]
+        assert not trouble, f"{name}: {trouble}"
+    context.close()
+
+
+def test_figures_take_the_colours_of_the_page(site, browser):
+    colours = {}
+    for scheme in ("light", "dark"):
+        context = browser.new_context(color_scheme=scheme)
+        page = context.new_page()
+        page.goto((site / "concepts.html").as_uri())
+        text = page.locator("figure.drawing svg text").first
+        colours[scheme] = text.evaluate("node => getComputedStyle(node).fill")
+        assert page.locator("figure.drawing svg").count() >= 6
+        context.close()
+    assert colours["light"] == "rgb(31, 35, 40)"
+    assert colours["dark"] == "rgb(230, 233, 238)"
+
+
+def test_search_finds_a_parameter_without_a_server(site, browser):
+    page = browser.new_page(viewport={"width": 1280, "height": 900})
+    page.goto((site / "index.html").as_uri())
+    page.locator("input.md-search__input").click()
+    page.keyboard.type("feature_lag")
+    found = page.locator(".md-search-result__link").first
+    found.wait_for(timeout=20_000)
+    assert "concepts.html" in "".join(
+        link.get_attribute("href") or "" for link in page.locator(".md-search-result__link").all()
+    )
+    page.close()

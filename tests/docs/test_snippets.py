@@ -1,0 +1,85 @@
+"""Every Python snippet of the documentation runs, page by page, on a small demo.
+
+A comment before a block says what it needs: `<!-- needs: tensorstore -->` a module that may be
+missing, `<!-- no-run: why -->` something that no test has.
+"""
+
+import re
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = [
+    *sorted((ROOT / "docs").rglob("*.md")),
+    *sorted(ROOT.glob("README*.md")),
+    ROOT / "CONTRIBUTING.md",
+    ROOT / "cache_store" / "README.md",
+]
+BLOCK = re.compile(
+    r"^(?P<marks>(?:<!-- [^>]*-->\s*\n)*)```python\n(?P<code>.*?)^```$", re.DOTALL | re.MULTILINE
+)
+MARK = re.compile(r"<!-- (?P<kind>no-run|needs): (?P<said>[^>]+?) -->")
+
+
+@dataclass(frozen=True)
+class Snippet:
+    """A block of Python: its line in the page, its text, what stands before it."""
+
+    line: int
+    code: str
+    marks: dict[str, str]
+
+
+def snippets(page: Path) -> Iterator[Snippet]:
+    text = page.read_text(encoding="utf-8")
+    for match in BLOCK.finditer(text):
+        marks = {mark["kind"]: mark["said"] for mark in MARK.finditer(match["marks"])}
+        yield Snippet(text.count("\n", 0, match.start("code")) + 1, match["code"], marks)
+
+
+def with_snippets() -> list[Path]:
+    return [page for page in PAGES if any("no-run" not in one.marks for one in snippets(page))]
+
+
+@pytest.mark.filterwarnings("default")  # what a snippet's libraries warn of is not ours to mend
+@pytest.mark.parametrize("page", with_snippets(), ids=lambda page: str(page.relative_to(ROOT)))
+def test_the_snippets_of_a_page_run(page, demo, monkeypatch):
+    monkeypatch.chdir(demo)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    # Dataclasses and annotations look their module up.
+    module = ModuleType("documentation_snippet")
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    for snippet in snippets(page):
+        if "no-run" in snippet.marks:
+            continue
+        if "needs" in snippet.marks:
+            try:
+                __import__(snippet.marks["needs"])
+            except ImportError:
+                continue
+        # Blank lines before it, so that a traceback names the line of the page.
+        code = compile("\n" * (snippet.line - 1) + snippet.code, str(page), "exec")
+        exec(code, vars(module))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_snippet_is_at_least_python(page):
+    """Also those that cannot run: a part of a file still parses."""
+    for snippet in snippets(page):
+        code = snippet.code
+        if code.startswith("case "):
+            code = "match None:\n" + "".join(f"    {line}\n" for line in code.splitlines())
+        if re.search(r"^\s*return", code, re.MULTILINE):
+            code = "def part():\n" + "".join(f"    {line}\n" for line in code.splitlines())
+        compile(code, f"{page}:{snippet.line}", "exec")
+
+
+def test_the_store_page_has_a_snippet_of_each_library():
+    code = "\n".join(one.code for one in snippets(ROOT / "docs" / "store.md"))
+    for library in ("FeatureStore", "numpy", "zarr", "xarray", "dask", "torch", "tensorstore"):
+        assert re.search(rf"import {library}\b", code), library
