@@ -89,6 +89,7 @@ class AugmentationParams(Section):
     saturation: float = Field(default=0.2, ge=0, le=1)
     """Largest relative change, either way."""
     seed: Seed = 0
+    """Of what is drawn for each row."""
 
 
 class VLMParams(Section):
