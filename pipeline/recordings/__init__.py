@@ -151,9 +151,10 @@ def _folders(source: Source, root: Path) -> list[tuple[Path, _Reader]]:
         full = absolute(root / pattern)
         matches = _matches(full)
         if not matches:
+            lost = "" if root.is_dir() else f": {root} is no folder; see python -m stages.doctor"
             raise RecordingError(
                 f"source {source.name!r}: {pattern!r} matches nothing; looked for folders {full}. "
-                "Mend data.root or the source's path"
+                f"Mend data.root or the source's path{lost}"
             )
         episodes = [pair for match in matches for pair in _episodes(match, source)]
         if not episodes:

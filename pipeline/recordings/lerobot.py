@@ -108,7 +108,7 @@ class LeRobotRecording(FileRecording):
             return described
         spans = {view: self._entry.videos.get(key) for view, key in self._layout.views.items()}
         frames = [f"{v}@{span.first}" for v, span in sorted(spans.items()) if span]
-        return " ".join([described, f"{self.id}+{self._entry.length}", *frames])
+        return " ".join([described, f"{self._entry.id}+{self._entry.length}", *frames])
 
     def _read_features(self) -> list[str]:
         kept = [key for view, key in self._layout.views.items() if self._wants(view)]
@@ -191,7 +191,8 @@ class LeRobotRecording(FileRecording):
 
     @property
     def _sidecar(self) -> Path:
-        return self.path / "sensor" / f"{self.id}.npz"
+        # Not `self.id`, before which parent folders may stand.
+        return self.path / "sensor" / f"{self._entry.id}.npz"
 
 
 def action_kind(names: Sequence[str]) -> ActionKind:

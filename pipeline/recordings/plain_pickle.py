@@ -21,12 +21,16 @@ from pipeline.errors import RecordingError
 _DTYPE = re.compile(r"[<>=|]?(\?|[biuf][1248]|[SU]\d{1,6})")
 
 
+class _Refused(pickle.UnpicklingError):
+    """The pickle asks for something that is not admitted; other errors are damage."""
+
+
 class _Dtype:
     """Stands for `numpy.dtype`: only booleans, numbers and text."""
 
     def __init__(self, code: Any, align: Any = False, copy: Any = False) -> None:
         if not isinstance(code, str) or not _DTYPE.fullmatch(code):
-            raise pickle.UnpicklingError(f"an array of dtype {code!r}")
+            raise _Refused(f"an array of dtype {code!r}")
         self.dtype = np.dtype(code)
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
@@ -61,7 +65,7 @@ def _scalar(dtype: Any, data: Any) -> Any:
 def _latin1(text: Any, encoding: Any) -> bytes:
     """How protocol 2 writes bytes."""
     if encoding != "latin1":
-        raise pickle.UnpicklingError(f"encoding {encoding!r}")
+        raise _Refused(f"encoding {encoding!r}")
     return text.encode("latin1")
 
 
@@ -73,14 +77,14 @@ def _no_bytes() -> bytes:
 def _check_size(shape: Any, dtype: Any, data: Any) -> None:
     sized = all(isinstance(n, int) and n >= 0 for n in shape) and isinstance(dtype, _Dtype)
     if not sized or not isinstance(data, bytes | bytearray):
-        raise pickle.UnpicklingError("an array whose shape, dtype or data is not plain")
+        raise _Refused("an array whose shape, dtype or data is not plain")
     if prod(shape) * dtype.dtype.itemsize != len(data):
-        raise pickle.UnpicklingError(f"an array of shape {shape} in {len(data)} bytes")
+        raise _Refused(f"an array of shape {shape} in {len(data)} bytes")
 
 
 def _uncalled(*_: object) -> None:
     """`numpy.ndarray` itself is named in a pickle, never called."""
-    raise pickle.UnpicklingError("a call of numpy.ndarray")
+    raise _Refused("a call of numpy.ndarray")
 
 
 _STAND_INS: Mapping[tuple[str, str], Callable[..., Any]] = {
@@ -109,20 +113,24 @@ class _PlainUnpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         stand_in = _STAND_INS.get((module, name))
         if stand_in is None:
-            raise pickle.UnpicklingError(f"{module}.{name}")
+            raise _Refused(f"{module}.{name}")
         # A fresh partial, so that nothing a pickle sets on it outlives this load.
         return partial(stand_in)
+
+    def persistent_load(self, pid: Any) -> Any:
+        raise _Refused(f"an object of its program's own, {pid!r}")
 
 
 def load_plain(path: Path) -> Any:
     """What the pickle holds, if it is numpy arrays, scalars, dicts, lists, tuples, sets and text.
 
-    Raises `RecordingError` naming what else it asks for; nothing of it is executed.
+    Raises `RecordingError` naming what else it asks for, of which nothing is executed, or how it is
+    damaged.
     """
     try:
         with path.open("rb") as file:
             return _PlainUnpickler(file).load()
-    except pickle.UnpicklingError as error:
+    except _Refused as error:
         raise RecordingError(
             f"{path}: refused: it asks for {error}; only numpy arrays and plain containers are "
             "admitted, because a pickle can run code. Nothing was executed"

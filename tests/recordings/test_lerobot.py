@@ -9,8 +9,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from pipeline.config import Source
+from pipeline.digests import file_digest
 from pipeline.errors import RecordingError
-from pipeline.recordings import open_recordings
+from pipeline.recordings import content_digest, open_recording, open_recordings
 from pipeline.recordings.lerobot import action_kind
 
 VERSIONS = ["v2.0", "v2.1", "v3.0"]
@@ -277,6 +278,23 @@ def test_the_sidecar_is_the_sensor(root, truth):
     save(0, timestamps=time[:-1], values=truth.sensor[:30])
     with pytest.raises(RecordingError, match="30 rows but 29 timestamps"):
         opened(root).recordings[0].sensor()
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_a_set_says_the_same_beside_a_twin(tmp_path, write, truth, version):
+    """Whose episodes take their parents' names: neither sensor nor digest goes by them."""
+    alone, twin = (write.lerobot(tmp_path / "sets" / name, version) for name in ("a", "b"))
+    for root in (alone, twin):
+        (root / "sensor").mkdir()
+        path = root / "sensor/episode_000001.npz"
+        np.savez(path, timestamps=np.arange(30) / 50, values=truth.sensor[:30])
+    one = opened(alone).recordings[1]
+    two = opened(tmp_path / "sets").recordings[1]
+    assert (one.id, two.id) == ("episode_000001", "a/episode_000001")
+    np.testing.assert_array_equal(two.sensor().values, truth.sensor[:30])
+    assert content_digest(two, file_digest) == content_digest(one, file_digest)
+    again = open_recording(two.path, two.format, two.id)
+    assert content_digest(again, file_digest) == content_digest(one, file_digest)
 
 
 def test_episodes_whose_files_are_absent_are_listed(tmp_path, write):

@@ -100,6 +100,11 @@ def test_raw_beside_a_metadata_file_can_be_asked_for(root):
     assert [r.format for r in opened.recordings] == ["raw"]
 
 
+def test_a_root_that_is_not_there_is_named_itself(tmp_path):
+    with pytest.raises(RecordingError, match=r"path: \S+nowhere is no folder; .*stages\.doctor$"):
+        open_recordings([Source(name="raw", path="raw")], tmp_path / "nowhere")
+
+
 @pytest.mark.parametrize(
     ("path", "message"),
     [

@@ -168,11 +168,18 @@ def test_what_a_pickle_sets_on_an_admitted_name_does_not_outlive_it(tmp_path):
     np.testing.assert_array_equal(load_plain(kept), np.arange(3.0))
 
 
-@pytest.mark.parametrize("keep", [0, 1, 20, 200])
-def test_a_truncated_pickle_is_named(tmp_path, keep):
+@pytest.mark.parametrize("keep", [0, 1, 20, 200, 600])
+def test_a_truncated_pickle_is_damaged_and_accused_of_nothing(tmp_path, keep):
     path = save(tmp_path / "data.pkl", {"action": np.arange(100.0)})
     path.write_bytes(path.read_bytes()[:keep])
-    with pytest.raises(RecordingError, match=r"data\.pkl"):
+    with pytest.raises(RecordingError, match=r"data\.pkl: damaged pickle: .*copy it again$"):
+        load_plain(path)
+
+
+def test_a_pickle_that_leaves_a_part_to_its_program_is_refused(tmp_path):
+    path = tmp_path / "data.pkl"
+    path.write_bytes(b"\x80\x02U\x05mesh1Q.")
+    with pytest.raises(RecordingError, match=r"refused: .*own, 'mesh1'.*Nothing was executed"):
         load_plain(path)
 
 
