@@ -22,7 +22,8 @@ def resolve_device(name: str) -> torch.device:
     except (RuntimeError, AssertionError) as error:
         raise ConfigError(
             f"device: {name}: expected auto, cpu or a device of this machine "
-            f"(CUDA devices found: {torch.cuda.device_count()}): {str(error).splitlines()[0]}"
+            f"(CUDA devices found: {torch.cuda.device_count()}): {str(error).splitlines()[0]}. "
+            "python -m stages.doctor says what this machine has and what to install"
         ) from None
     return device
 

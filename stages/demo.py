@@ -1,7 +1,14 @@
 """Write the demo: simulated needle insertions in every format, and a small Qwen2.5-VL.
 
-The same seed gives the same bytes. Finished sets are kept, an interrupted run goes on with the
-others, and a folder that the demo did not write is refused.
+Writes demo.episodes episodes in each of four formats to demo.recordings, about 60 MB, and a model
+of random weights to demo.checkpoint. The same seed gives the same bytes.
+Finished sets are kept, an interrupted run goes on with the others, and a folder that the demo did
+not write is refused.
+
+  python -m stages.demo                            as params.yaml stands
+  python -m stages.demo --set demo.episodes=3      a quick look
+
+Next: python -m stages.inspect (look at them), stages.extract (the store)
 """
 
 from pathlib import Path

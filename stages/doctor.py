@@ -4,8 +4,11 @@ Checks Python and packages, the GPU and torch's build, attention backends, video
 checkpoint, the recordings, the room for the store, DVC's cache and the kernel's limits, for the
 params given. Downloads nothing, loads no model, changes nothing; takes some seconds.
 
+  python -m stages.doctor                                        as params.yaml stands
+  python -m stages.doctor --set vlm.checkpoint=Qwen/Qwen2.5-VL-3B-Instruct --set data.root=/lab
+
   ok        as it should be
-  note      works, but could be better, or is needed for something else only
+  note      works, but could be better, or is needed later
   missing   the default pipeline does not run with these params; -> says what mends it
 
 Exit code 2 where something is missing. Next: python -m stages.extract --set extract.plan=true

@@ -7,8 +7,10 @@ where their recordings still lie below `data.root`.
 An archive of a store serves as well: it is restored once, to `train_head.scratch`.
 """
 
+from pathlib import Path
+
 from pipeline.batches import Windows, open_store
-from pipeline.checkpoint import find_policy, load_policy
+from pipeline.checkpoint import PolicyCheckpoint, find_policy, load_policy
 from pipeline.config import Params
 from pipeline.device import resolve_device
 from pipeline.durable import write_document
@@ -27,26 +29,42 @@ from pipeline.evaluation import (
 )
 from pipeline.report import write_report
 from pipeline.report.evaluation import evaluation_report
-from pipeline.store import check_trailers
+from pipeline.store import FeatureStore, check_trailers
 from stages.command import run
 
 
 def main(params: Params) -> None:
     """Judge the checkpoint that `evaluate` names."""
-    wanted = params.evaluate
-    device = resolve_device(wanted.device)
-    folder = find_policy(wanted.checkpoint)
-    checkpoint = load_policy(folder)
-    path = wanted.store or params.train_head.store or params.extract.store
+    checkpoint = load_policy(find_policy(params.evaluate.checkpoint))
+    store = _store_for(checkpoint, params)
+    found = _judgement(checkpoint, store, params)
+    files = _write(params.evaluate.output, found)
+    print(table(found.comparison))
+    if found.study is not None:
+        print(f"\n{modality_table(found.study)}")
+    elif params.evaluate.modalities:
+        print("streams were not spoilt: no held-out tick lies 200 ms into its episode")
+    print(f"{params.evaluate.output}: {', '.join(file.name for file in files)}")
+
+
+def _store_for(checkpoint: PolicyCheckpoint, params: Params) -> FeatureStore:
+    """The store that is named, or else trained from, which this policy fits."""
+    path = params.evaluate.store or params.train_head.store or params.extract.store
     store = open_store(path, "auto", params.train_head.scratch, print)
     check_store(checkpoint, store)
     if params.train_head.check_store:
         check_trailers(store.path)
+    return store
+
+
+def _judgement(checkpoint: PolicyCheckpoint, store: FeatureStore, params: Params) -> Judgement:
+    wanted = params.evaluate
+    device = resolve_device(wanted.device)
     ticks = held_out_ticks(store, checkpoint.held_out_ticks, checkpoint.held_out_content)
     policy = checkpoint.policy(device)
     judged = judged_document(checkpoint, policy, store, wanted.samples, wanted.batch_size)
     print(
-        f"{folder} (step {checkpoint.step}) on {len(ticks)} held-out ticks of "
+        f"{wanted.checkpoint} (step {checkpoint.step}) on {len(ticks)} held-out ticks of "
         f"{len(checkpoint.held_out_ticks)} episode(s) in {store.path}, device {device}, "
         f"{judged['policy']['samples']} chunk(s) a tick",
         flush=True,
@@ -66,10 +84,7 @@ def main(params: Params) -> None:
         study = judge_modalities(
             checkpoint, policy, store, ticks, wanted.batch_size, wanted.samples, progress=True
         )
-    wanted.output.mkdir(parents=True, exist_ok=True)
-    files = write_tables(wanted.output, comparison, predictions, store, study)
-    write_document(wanted.output / JUDGED, judged)
-    found = Judgement(
+    return Judgement(
         name=str(wanted.checkpoint),
         checkpoint=checkpoint,
         store=store,
@@ -77,16 +92,17 @@ def main(params: Params) -> None:
         predictions=predictions,
         study=study,
         judged=judged,
-        curves=read_curves(checkpoint.params.logs),
+        curves=read_curves(checkpoint),
         recordings=params.data.root,
     )
-    files += [wanted.output / JUDGED, *write_report(wanted.output, evaluation_report(found))]
-    print(table(comparison))
-    if study is not None:
-        print(f"\n{modality_table(study)}")
-    elif wanted.modalities:
-        print("streams were not spoilt: no held-out tick lies 200 ms into its episode")
-    print(f"{wanted.output}: {', '.join(file.name for file in files)}")
+
+
+def _write(folder: Path, found: Judgement) -> list[Path]:
+    """The tables, the page with its pictures, and what was judged; returns their paths."""
+    folder.mkdir(parents=True, exist_ok=True)
+    files = write_tables(folder, found.comparison, found.predictions, found.store, found.study)
+    write_document(folder / JUDGED, found.judged)
+    return [*files, folder / JUDGED, *write_report(folder, evaluation_report(found))]
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from pipeline.finetuning import Live, head_params, next_steps, out_of_memory_nam
 from pipeline.finetuning.params import left_out
 from pipeline.sampling import split_by_episode
 from pipeline.store import FeatureStore, build_lock, check_trailers
-from pipeline.training import Trainer, open_run, process_group
+from pipeline.training import Trainer, check_loggers, open_run, process_group
 from pipeline.training.world import process_device
 from stages.command import run
 
@@ -30,6 +30,7 @@ def main(params: Params) -> None:
     """Tune the model that `vlm` and `finetune` describe."""
     with process_group(params.train_head.device) as world:
         head = head_params(params)
+        world.shared(lambda: check_loggers(head))
         store = FeatureStore.open(head.store or params.extract.store)
         with world.holding(build_lock(head.output)), out_of_memory_named():
             front = Live.open(store, params, process_device(head.device))

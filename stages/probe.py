@@ -1,15 +1,18 @@
 """Rank the slots of a store by how well a ridge regression reads the action chunk from them.
 
-Each slot by itself and each choice of layer, norm and pooling as a whole, alone and beside state +
+Reads probe.store (extract.store where null), its checksums first (train_head.check_store). Each
+slot by itself and each choice of layer, norm and pooling as a whole, alone and beside state +
 sensor, cross-validated by recording. Prints the ranking and the line for params.yaml that the
 evidence supports; writes metrics.json, slots.csv, groups.csv, targets.csv and pictures (PNG) into
-`probe.output`. Reads the store's checksums once before it begins (`train_head.check_store`).
+probe.output.
 
-What is most often changed, with --set:
-    probe.output=FOLDER    where the files go
-    probe.max_ticks=N      read that many ticks, evenly spread: a first look at a large store
-    probe.folds=N          groups of recordings, each predicted from the others
-    probe.horizon=N        ticks of the action chunk that is predicted
+  python -m stages.probe                             as params.yaml stands
+  python -m stages.probe --set probe.max_ticks=2000  that many ticks, evenly spread: a first look
+
+With --set, too: probe.output (where the files go), probe.folds (groups of recordings, each
+predicted from the others), probe.horizon (ticks of the action chunk that is predicted).
+
+Next: set vlm.pooling to that line, then python -m stages.extract
 """
 
 from functools import partial

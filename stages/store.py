@@ -1,13 +1,15 @@
 """Housekeeping among the stores of `stores.folder`: what is there, merge, tidy up.
 
-python -m stages.store list                             sizes, specs, who depends on what
-python -m stages.store merge A.zarr B.zarr --into C.zarr
+  python -m stages.store list                           sizes, specs, who depends on what
+  python -m stages.store merge A.zarr B.zarr --into C.zarr
                                                         one store of several, nothing computed
-python -m stages.store gc                               what nothing needs, and why
-python -m stages.store gc --remove                      remove it; never a finished store, nor
+  python -m stages.store gc                             what nothing needs, and why
+  python -m stages.store gc --remove                    remove it; never a finished store, nor
                                                         what a living process is building, nor an
                                                         unfinished build that holds rows
-python -m stages.store gc A.zarr.part --remove          remove that one, its rows too
+  python -m stages.store gc A.zarr.part --remove        remove that one, its rows too
+
+list and gc without --remove write nothing. Next after a merge: python -m stages.verify
 """
 
 import sys

@@ -6,7 +6,7 @@ train_head.logs; while it runs, open report.html there. Some episodes are held o
 
   python -m stages.train_head                                      what params.yaml says
   python -m stages.train_head --set train_head.model_type=diffusion    or regression, flow_matching
-  python -m stages.train_head --set 'train_head.loggers=[report, tensorboard, wandb]'
+  python -m stages.train_head --set 'train_head.loggers=[report, tensorboard]'   or wandb, dvclive
   torchrun --nproc_per_node 2 -m stages.train_head                 on two GPUs: the same curve
 
 What is set first: train_head.max_steps, batch_size, lr, horizon (ticks an action chunk),
@@ -23,7 +23,7 @@ from pipeline.batches import open_store
 from pipeline.config import Params
 from pipeline.sampling import split_by_episode
 from pipeline.store import build_lock, check_trailers
-from pipeline.training import Trainer, open_run, process_group
+from pipeline.training import Trainer, check_loggers, open_run, process_group
 from stages.command import run
 
 
@@ -31,6 +31,7 @@ def main(params: Params) -> None:
     """Train the head that `train_head` describes."""
     head = params.train_head
     with process_group(head.device) as world:
+        world.shared(lambda: check_loggers(head))
         path = head.store or params.extract.store
         store = open_store(path, head.feed, head.scratch, world.say)
         with world.holding(build_lock(head.output)):

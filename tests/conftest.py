@@ -3,13 +3,17 @@
 import json
 import subprocess
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
 from jaxtyping import install_import_hook
 
-from pipeline.store import SCHEMA, Sizes, StoreBuild, arrays
+from pipeline.store import SCHEMA, FeatureStore, Sizes, StoreBuild, arrays
+from pipeline.store.chunks import ChunkFiles, row_checksums
+from pipeline.store.metadata import note_metadata
+from pipeline.store.schema import read_specs
 from pipeline.vlm.demo_checkpoint import write_demo_checkpoint
 
 # Before anything imports them: every shape annotation of the models is checked in tests.
@@ -35,6 +39,23 @@ def tiny_store() -> Callable[..., Path]:
     and the newest state (fourth), so that a policy has something to learn from each.
     """
     return write_tiny_store
+
+
+@pytest.fixture(scope="session")
+def reseal() -> Callable[[Path], None]:
+    """`reseal(store)` gives what a test planted in a finished store its checksums."""
+
+    def seal(path: Path) -> None:
+        features = FeatureStore.open(path).array("vl/features")
+        sums = row_checksums(features)
+        file = path / "vl" / "checksum" / "c" / "0"
+        np.memmap(file, np.uint32, "r+", shape=sums.shape)[:] = sums
+        for spec in read_specs(path).values():
+            with closing(ChunkFiles(path, spec)) as files:
+                files.seal()
+        note_metadata(path)
+
+    return seal
 
 
 def write_tiny_store(

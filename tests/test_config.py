@@ -48,6 +48,11 @@ def test_overrides_are_yaml_and_reach_any_depth(minimal):
     assert params.vlm.prompt == "{images} {instruction}"
 
 
+def test_one_value_where_a_list_belongs_is_told_how_to_write_it(minimal):
+    with pytest.raises(ConfigError, match=r"pooling: expected a list, such as \[mean\]"):
+        load_params(minimal, ["vlm.pooling=mean"])
+
+
 def test_every_problem_is_said_with_its_place(minimal):
     with pytest.raises(ConfigError) as caught:
         load_params(minimal, ["train_head.lr=-1", "train_head.lrr=1", "data.vlm_reuse_count=0"])

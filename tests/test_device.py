@@ -1,9 +1,10 @@
-"""The precision that `amp` asks for, on each kind of device."""
+"""Devices by name, and the precision that `amp` asks for on each."""
 
 import pytest
 import torch
 
-from pipeline.device import use_bfloat16
+from pipeline.device import resolve_device, use_bfloat16
+from pipeline.errors import ConfigError
 
 CPU, CUDA = torch.device("cpu"), torch.device("cuda")
 
@@ -24,3 +25,8 @@ def test_when_the_forward_pass_runs_in_bfloat16(
 ) -> None:
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: supported)
     assert use_bfloat16(amp, device) is expected
+
+
+def test_a_device_that_is_not_there_is_an_error_that_says_who_knows_more() -> None:
+    with pytest.raises(ConfigError, match=r"device: cuda:77: .*python -m stages\.doctor says"):
+        resolve_device("cuda:77")

@@ -30,10 +30,11 @@ from pipeline.probing import Finding, Folds, Score, SlotName, Study
 Drawn = tuple[Comparison, Predictions, SimpleNamespace]
 
 
-def evaluated(episodes: int, dimensions: int = 5, ticks: int = 12, constant: int = 1) -> Drawn:
+def evaluated(
+    episodes: int, dimensions: int = 5, ticks: int = 12, constant: int = 1, horizon: int = 3
+) -> Drawn:
     """`constant` dimensions at the end never vary."""
     rng = np.random.default_rng(0)
-    horizon = 3
     action = rng.normal(size=(episodes * ticks, dimensions)).astype(np.float32)
     action[:, dimensions - constant :] = 1
     tick = np.arange(episodes * ticks)
@@ -106,12 +107,14 @@ def pictures(comparison: Comparison, predictions: Predictions, store: Any) -> di
 
 
 @pytest.mark.parametrize(
-    ("episodes", "dimensions", "constant"), [(1, 5, 1), (2, 2, 0), (3, 14, 1), (2, 3, 3)]
+    ("episodes", "dimensions", "constant", "horizon"),
+    [(1, 5, 1, 3), (2, 2, 0, 3), (3, 14, 1, 20), (2, 3, 3, 3), (1, 1, 0, 1)],
 )
 def test_every_picture_is_written(
-    tmp_path: Path, episodes: int, dimensions: int, constant: int
+    tmp_path: Path, episodes: int, dimensions: int, constant: int, horizon: int
 ) -> None:
-    files = write(tmp_path, pictures(*evaluated(episodes, dimensions, constant=constant)))
+    shown = evaluated(episodes, dimensions, constant=constant, horizon=horizon)
+    files = write(tmp_path, pictures(*shown))
     assert len(files) == 7
     for file in files:
         assert file.read_bytes().startswith(b"\x89PNG")

@@ -14,7 +14,6 @@ from drawing import DARK, LIGHT  # noqa: E402
 from figures import clocks, features, overview, samples, store  # noqa: E402
 
 DRAWINGS = {
-    "pipeline": overview.pipeline,
     "flow": overview.flow,
     "tick": clocks.tick,
     "reuse": clocks.reuse,
@@ -26,19 +25,17 @@ DRAWINGS = {
     "chunk": store.chunk,
     "icon": overview.icon,
 }
-IN_BOTH = ("pipeline",)
-"""Also as one file for light and one for dark: GitHub's theme is not the system's."""
 
 
 def documents() -> dict[str, str]:
-    """Every file's name and text."""
+    """Every file's name and text.
+
+    The README's figure is one file for light and one for dark: GitHub's theme is not the system's.
+    """
     files = {f"{name}.svg": draw().svg() for name, draw in DRAWINGS.items()}
-    for name in IN_BOTH:
-        drawing = DRAWINGS[name]()
-        files |= {
-            f"{name}-light.svg": drawing.svg(LIGHT),
-            f"{name}-dark.svg": drawing.svg(DARK),
-        }
+    readme = overview.pipeline()
+    files["pipeline-light.svg"] = readme.svg(LIGHT)
+    files["pipeline-dark.svg"] = readme.svg(DARK)
     return files
 
 

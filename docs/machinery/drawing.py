@@ -26,7 +26,7 @@ DARK = {
     "ink": "#e6e9ee",
     "mute": "#9aa4b0",
     "faint": "#454c57",
-    "paper": "#1e2129",
+    "paper": "#0d1117",
     "frame": "#4fb3f0",
     "vl": "#bd95f2",
     "sensor": "#f5925a",
@@ -71,11 +71,9 @@ class Drawing:
 
     def line(self, *points: Point, colour: str = "ink", width: float = 1.5, dash: str = "") -> None:
         """A line through points."""
-        self._stroke(_through(points), colour, width, dash, "")
+        self._stroke(_through(points), colour, width, dash)
 
-    def arrow(
-        self, *points: Point, colour: str = "mute", width: float = 1.5, dash: str = ""
-    ) -> None:
+    def arrow(self, *points: Point, colour: str = "mute", width: float = 1.5) -> None:
         """A line through points with a head at its end."""
         (x0, y0), (x1, y1) = points[-2:]
         length = max(1e-9, ((x1 - x0) ** 2 + (y1 - y0) ** 2) ** 0.5)
@@ -85,7 +83,7 @@ class Drawing:
         )
         size = 5 + 2 * width
         back = (x1 - size * along[0], y1 - size * along[1])
-        self._stroke(_through([*points[:-1], back]), colour, width, dash, "")
+        self._stroke(_through([*points[:-1], back]), colour, width)
         half = size * 0.42
         head = [
             (x1, y1),
@@ -94,9 +92,9 @@ class Drawing:
         ]
         self.parts.append(f'<path d="{_through(head)}Z" style="fill:var(--{colour})"/>')
 
-    def curve(self, path: str, colour: str = "ink", width: float = 1.5, dash: str = "") -> None:
+    def curve(self, path: str, colour: str = "ink", width: float = 1.5) -> None:
         """A stroke along a path in SVG's notation."""
-        self._stroke(path, colour, width, dash, "")
+        self._stroke(path, colour, width)
 
     def dot(
         self, x: float, y: float, radius: float, colour: str = "ink", *, fill: float = 1
@@ -145,7 +143,7 @@ class Drawing:
         while offset < width + height:
             begin = (x + max(0.0, offset - height), y + min(offset, height))
             end = (x + min(offset, width), y + max(0.0, offset - width))
-            self._stroke(_through([begin, end]), colour, 0.8, "", ";stroke-opacity:.6")
+            self._stroke(_through([begin, end]), colour, 0.8)
             offset += step
 
     def svg(self, colours: Mapping[str, str] | None = None) -> str:
@@ -164,11 +162,11 @@ class Drawing:
             f"<title>{escape(self.title)}</title>\n<style>{rules}</style>\n{body}\n</svg>\n"
         )
 
-    def _stroke(self, path: str, colour: str, width: float, dash: str, more: str) -> None:
+    def _stroke(self, path: str, colour: str, width: float, dash: str = "") -> None:
         dashes = f";stroke-dasharray:{dash}" if dash else ""
         self.parts.append(
             f'<path d="{path}" style="fill:none;stroke:var(--{colour});stroke-width:{width:g}'
-            f';stroke-linejoin:round;stroke-linecap:round{dashes}{more}"/>'
+            f';stroke-linejoin:round;stroke-linecap:round{dashes}"/>'
         )
 
 

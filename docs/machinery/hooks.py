@@ -1,8 +1,9 @@
 """What MkDocs does for this site beside its own work.
 
-`params.md` and the pages of the reference are written from the code when the site is built, so they
-cannot fall behind it. Figures stand in the pages as images, which every viewer of Markdown shows;
-the site lays their SVG into the page itself, where it takes the colours of the page, light or dark.
+The keys of `params.md` and the pages of the reference are written from the code when the site is
+built, so they cannot fall behind it. Figures stand in the pages as images, which every viewer of
+Markdown shows; the site lays their SVG into the page itself, where it takes the colours of the
+page, light or dark.
 """
 
 import html
@@ -41,13 +42,15 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the pages that are written from the code."""
-    for path, text in {"params.md": params_page(), **reference_pages()}.items():
+    for path, text in reference_pages().items():
         files.append(File.generated(config, path, content=text))
     return files
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Name files outside `docs/` instead of linking to them: the site does not hold them."""
+    """List the params; name files outside `docs/` and do not link to them: the site has none."""
+    if page.file.src_uri == "params.md":
+        markdown = params_page(markdown)
     folder = Path(config.docs_dir) / posixpath.dirname(page.file.src_uri)
 
     def name(match: re.Match[str]) -> str:

@@ -12,12 +12,8 @@ from pipeline.config import Params
 
 Schema = dict[str, Any]
 
-INTRODUCTION = """# Parameters
-
-Every key of `params.yaml`. This page is written from the models that check it (`pipeline.config`),
-and `python -m stages.NAME --keys` prints the same for one command. Lay a value over the file with
-`--set section.key=value` (YAML); an unknown key is an error, and all errors are reported at once.
-"""
+PLACE = "<!-- The site lists every key from here on. -->"
+"""In `docs/params.md`: what stands behind it is for those who read the file itself."""
 SIMPLE = {
     "string": "text",
     "integer": "whole number",
@@ -27,11 +23,13 @@ SIMPLE = {
 }
 
 
-def params_page() -> str:
-    """The whole page: a heading a section and a section within one, under it a key an entry."""
+def params_page(markdown: str) -> str:
+    """The page with its keys: a heading a section and a section within one, a key an entry."""
+    introduction, place, _ = markdown.partition(PLACE)
+    assert place, f"docs/params.md: no {PLACE}"
     schema = Params.model_json_schema()
     definitions: Schema = schema["$defs"]
-    parts = [INTRODUCTION]
+    parts = [introduction]
     for name, section in schema["properties"].items():
         parts += _section(definitions[_reference(section) or ""], name, "##", definitions)
     return "\n".join(parts)

@@ -16,6 +16,8 @@ IN_FULL = {
     "recordings": ("reader", "recording"),
     "models": ("expert", "policy"),
     "store": ("schema", "reader", "batch"),
+    "plots": ("interactive", "recording.lanes", "store", "store_features"),
+    "report": ("comparison", "evaluation", "recording", "store"),
 }
 """Modules of a package that are shown in full, beside what its `__all__` offers."""
 
@@ -43,7 +45,7 @@ def _room_page(room: str) -> str:
     if not package.exists():
         return f"{title}\n{_block(f'pipeline.{room}', nested=False)}"
     modules = _modules(package.parent)
-    offered = _offered(package)
+    offered = _offered(package.parent)
     in_full = IN_FULL.get(room, ()) if offered else tuple(_public(modules))
     blocks = [_block(f"pipeline.{room}", docstring_only=True)]
     for name in in_full:
@@ -72,24 +74,26 @@ def _commands_page() -> str:
 
 def _block(path: str, *, docstring_only: bool = False, nested: bool = True) -> str:
     """What mkdocstrings replaces by the documentation of an object."""
-    options = [f"heading_level: {2 if nested else 1}"]
+    options = ["heading_level: 2"]
     if docstring_only or not nested:
-        options.append("show_root_heading: false")
+        options += ["show_root_heading: false", "show_root_toc_entry: false"]
     if docstring_only:
         options.append("members: false")
-    if not nested:
-        options[0] = "heading_level: 2"
-        options.append("show_root_toc_entry: false")
     lines = "".join(f"        {option}\n" for option in options)
     return f"::: {path}\n    options:\n{lines}"
 
 
 def _modules(package: Path) -> dict[str, set[str]]:
-    """What each module of a package defines at its top level; '' is the package itself."""
+    """What each module defines at its top level, by its dotted name; the package's own is ''."""
     return {
-        "" if path.stem == "__init__" else path.stem: set(_defined(path))
-        for path in sorted(package.glob("*.py"))
+        _dotted(path.relative_to(package)): set(_defined(path))
+        for path in sorted(package.rglob("*.py"))
     }
+
+
+def _dotted(path: Path) -> str:
+    parts = path.parent.parts if path.stem == "__init__" else path.with_suffix("").parts
+    return ".".join(parts)
 
 
 def _public(modules: dict[str, set[str]]) -> Iterator[str]:
@@ -112,8 +116,11 @@ def _defined(path: Path) -> Iterator[str]:
 
 
 def _offered(package: Path) -> list[str]:
-    """The names in a package's `__all__`."""
-    for node in ast.parse(package.read_text(encoding="utf-8")).body:
-        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
-            return list(ast.literal_eval(node.value))
-    return []
+    """The names in `__all__` of a package, and of packages in it."""
+    return [
+        name
+        for path in sorted(package.rglob("__init__.py"))
+        for node in ast.parse(path.read_text(encoding="utf-8")).body
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__"
+        for name in ast.literal_eval(node.value)
+    ]

@@ -32,7 +32,8 @@ def load_params(path: Path, overrides: Sequence[str] = ()) -> Params:
     try:
         return Params.model_validate(document)
     except ValidationError as error:
-        raise ConfigError(_all_problems(error, path)) from None
+        where = f"{path} with what --set lays over it" if overrides else str(path)
+        raise ConfigError(_all_problems(error, where)) from None
 
 
 def _lay_over(document: dict[str, Any], override: str) -> None:
@@ -61,8 +62,8 @@ def _lay_over(document: dict[str, Any], override: str) -> None:
     node[keys[-1]] = value
 
 
-def _all_problems(error: ValidationError, path: Path) -> str:
-    lines = [f"{path}: {error.error_count()} problem(s)"]
+def _all_problems(error: ValidationError, where: str) -> str:
+    lines = [f"{where}: {error.error_count()} problem(s)"]
     for problem in error.errors():
         place = ".".join(str(part) for part in problem["loc"]) or "params"
         match problem["type"]:
@@ -70,6 +71,8 @@ def _all_problems(error: ValidationError, path: Path) -> str:
                 said = _unknown_key(problem["loc"])
             case "missing":
                 said = problem["msg"]
+            case "tuple_type":
+                said = f"expected a list, such as [{problem['input']}]"
             case _:
                 reason = problem["msg"].removeprefix("Value error, ")
                 said = f"{reason} (found {problem['input']!r:.200})"

@@ -17,7 +17,7 @@ from pipeline.config.section import Fraction, Section, Seed
 
 ModelType = Literal["regression", "diffusion", "flow_matching"]
 FusionStrategy = Literal["concat", "cross_attention", "gated", "none"]
-Logger = Literal["report", "tensorboard", "wandb"]
+Logger = Literal["report", "dvclive", "tensorboard", "wandb"]
 Weight = Annotated[float, Field(ge=0)]
 
 
@@ -124,7 +124,8 @@ class TrainHeadParams(Section):
     """Folder of the curves."""
     loggers: tuple[Logger, ...] = ("report",)
     """Who shows the curves while it trains, beside the files that DVC plots: `report` a page in
-    `logs`, `tensorboard` event files in `<logs>.tensorboard`, `wandb` Weights & Biases."""
+    `logs`, `dvclive` dvclive's own page `<logs>.dvclive.html`, which is blank without a network,
+    `tensorboard` event files in `<logs>.tensorboard`, `wandb` Weights & Biases."""
     wandb_project: str = "vla-feature-cache"
     """Where Weights & Biases puts the run; its own environment variables decide the rest."""
 

@@ -1,12 +1,15 @@
 """What a training wrote down of its course, read back."""
 
 import csv
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+
+from pipeline.checkpoint import PolicyCheckpoint
 
 
 @dataclass(frozen=True)
@@ -27,17 +30,31 @@ class Curves:
     """One sentence where there are none, naming the path."""
 
 
-def read_curves(logs: Path) -> Curves:
-    """The curves that a training with these `train_head.logs` left there."""
-    folder = logs / "plots" / "metrics"
+def read_curves(checkpoint: PolicyCheckpoint) -> Curves:
+    """The curves of the training that a checkpoint is of, where its logs still have them."""
+    folder = checkpoint.params.logs / "plots" / "metrics"
     files = sorted(folder.rglob("*.tsv"))
-    if not files:
-        return Curves({}, f"No training curves: there are none in {folder} any more.")
     try:
         found = {file.relative_to(folder).with_suffix("").as_posix(): _read(file) for file in files}
     except (ValueError, KeyError) as error:
         return Curves({}, f"No training curves: those in {folder} cannot be read ({error}).")
-    return Curves({name: curve for name, curve in found.items() if len(curve.step)})
+    curves = {name: curve for name, curve in found.items() if len(curve.step)}
+    if not curves:
+        return Curves({}, f"No training curves: there are none in {folder} any more.")
+    if _of_another(curves, checkpoint):
+        return Curves({}, f"No training curves: those in {folder} are of another training.")
+    return Curves(curves)
+
+
+def _of_another(curves: Mapping[str, Curve], checkpoint: PolicyCheckpoint) -> bool:
+    """Whether a later training wrote to the same logs: no step so late, or another error there."""
+    if max(int(curve.step[-1]) for curve in curves.values()) < checkpoint.step:
+        return True
+    error, curve = checkpoint.metrics.get("val/error"), curves.get("val/error")
+    if error is None or curve is None:
+        return False
+    there = curve.value[curve.step == checkpoint.step]
+    return not (len(there) and math.isclose(there[-1], error, rel_tol=1e-4))
 
 
 def _read(file: Path) -> Curve:

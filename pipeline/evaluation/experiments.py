@@ -14,8 +14,9 @@ from pipeline.config import FusionStrategy, ModelType
 from pipeline.errors import ConfigError
 from pipeline.evaluation.cells import aligned, cell, ratio
 from pipeline.evaluation.judged import JUDGED
-from pipeline.evaluation.predictions import BASELINES
-from pipeline.evaluation.tables import HEADINGS, METRICS
+from pipeline.evaluation.predictions import BASELINES, METHODS
+from pipeline.evaluation.scores import Group
+from pipeline.evaluation.tables import ERRORS, HEADINGS, OVERALL
 
 _SAME = 1e-4
 """Relative difference of two baselines that rounding on another machine explains."""
@@ -56,7 +57,13 @@ class Experiment:
     @property
     def error(self) -> float:
         """The policy's overall error."""
-        return self.errors["overall"]["policy"]
+        return self.errors[OVERALL]["policy"]
+
+    @property
+    def relative(self) -> float | None:
+        """It, divided by that of the best baseline."""
+        best = min(self.errors[OVERALL][method] for method in BASELINES)
+        return self.error / best if best > 0 else None
 
 
 def read_experiments(reports: Path) -> tuple[Experiment, ...]:
@@ -93,13 +100,13 @@ def experiment_errors(
     `samples` are the chunks a tick whose mean was judged.
     """
     units = list(experiments[0].errors)
-    names = ["overall [training std]" if unit == "overall" else unit for unit in units]
+    names = ["overall [training std]" if unit == OVERALL else unit for unit in units]
     columns = ["experiment", "expert", "fusion", *names, "policy / best", "samples", "parameters"]
     rows: list[tuple[Any, ...]] = [
         (
             *(one.name, one.model_type, one.fusion_strategy),
             *(one.errors[unit]["policy"] for unit in units),
-            *(one.errors["overall"].get("relative"), one.samples, one.parameters),
+            *(one.relative, one.samples, one.parameters),
         )
         for one in experiments
     ]
@@ -157,17 +164,30 @@ def training_seconds(logs: Path) -> float | None:
 
 
 def _experiment(folder: Path, policy: Mapping[str, Any]) -> Experiment:
-    document = _read(folder, METRICS, "overall")
-    groups = [name for name, errors in document.items() if "policy_rmse" in errors]
     try:
         return Experiment(
             name=folder.name,
-            errors={name: document[name] for name in ("overall", *groups)},
+            errors=_errors(folder),
             training_s=training_seconds(Path(policy["logs"])),
             **{key: value for key, value in policy.items() if key != "logs"},
         )
     except (KeyError, TypeError) as error:
         raise ConfigError(_no_evaluation(folder, f"it lacks {error}")) from None
+
+
+def _errors(folder: Path) -> dict[str, dict[str, float]]:
+    """Of `OVERALL`, which comes first, and each action group, by method."""
+    rows = list(csv.DictReader(_text(folder, ERRORS).splitlines()))
+    try:
+        errors = {
+            row["group"] if row["group"] == OVERALL else Group(row["group"], row["unit"], ()).key: {
+                method: float(row[method]) for method in METHODS
+            }
+            for row in rows
+        }
+    except ValueError as error:
+        raise ConfigError(_no_evaluation(folder, f"{ERRORS} cannot be read: {error}")) from None
+    return {OVERALL: errors.pop(OVERALL), **errors}
 
 
 def _check_same(
@@ -198,15 +218,20 @@ def _check_baselines(reports: Path, one: Experiment, other: Experiment) -> None:
 
 def _read(folder: Path, name: str, *keys: str) -> dict[str, Any]:
     try:
-        document = json.loads((folder / name).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ConfigError(_no_evaluation(folder, f"it has no {name}")) from None
+        document = json.loads(_text(folder, name))
     except ValueError as error:
         raise ConfigError(_no_evaluation(folder, f"{name} is no JSON: {error}")) from None
     lacking = [key for key in keys if key not in document]
     if lacking:
         raise ConfigError(_no_evaluation(folder, f"it lacks {lacking[0]!r} in {name}"))
     return document
+
+
+def _text(folder: Path, name: str) -> str:
+    try:
+        return (folder / name).read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ConfigError(_no_evaluation(folder, f"it has no {name}")) from None
 
 
 def _no_evaluation(folder: Path, why: str) -> str:

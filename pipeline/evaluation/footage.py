@@ -4,9 +4,8 @@ A store holds no frame. It says of each episode where its recording lay and what
 of each VL row when its frames were captured: that finds them again, or says why not.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -44,17 +43,24 @@ def shown_ticks(store: FeatureStore, ticks: Ticks, count: int) -> Ticks:
     return among[np.linspace(0, len(among) - 1, count).round().astype(np.int64)]
 
 
-def footage(store: FeatureStore, episode: Episode, vl_rows: Sequence[int], root: Path) -> Footage:
+def footage(
+    store: FeatureStore,
+    episode: Episode,
+    vl_rows: Sequence[int],
+    root: Path,
+    digest_of: Callable[[Path], str] = file_digest,
+) -> Footage:
     """The frames of these store-global VL rows of one episode, ascending.
 
     A relative path of the store lies under `root`. No frame is handed out of a recording whose
-    files are not, by their digest, those that the store was made from.
+    files are not, by their digest, those that the store was made from: each of them is read whole,
+    but where `digest_of` remembers it.
     """
     path = root / episode.path
     if not path.is_dir():
         return Footage({}, f"No frames: there is no recording at {path} any more.")
     try:
-        recording = _same(store, episode, path)
+        recording = _same(store, episode, path, digest_of)
         if recording is None:
             return Footage(
                 {}, f"No frames: the recording at {path} changed since the store was made from it."
@@ -67,9 +73,10 @@ def footage(store: FeatureStore, episode: Episode, vl_rows: Sequence[int], root:
         return Footage({}, f"No frames: the recording at {path} cannot be read ({said}).")
 
 
-def _same(store: FeatureStore, episode: Episode, path: Path) -> Recording | None:
+def _same(
+    store: FeatureStore, episode: Episode, path: Path, digest_of: Callable[[Path], str]
+) -> Recording | None:
     """The episode's recording, with the views it was extracted with: all, or those of the store."""
-    digest_of = cache(file_digest)
     for views in (None, store.spec["views"]):
         recording = open_recording(path, episode.format, episode.id, views)
         if content_digest(recording, digest_of) == episode.content:

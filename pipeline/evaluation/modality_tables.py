@@ -3,30 +3,13 @@
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from pipeline.evaluation.cells import aligned, cell, numbers, ratio
+from pipeline.evaluation.cells import aligned, cell, ratio
 from pipeline.evaluation.modalities import ModalityStudy
 from pipeline.evaluation.names import with_unit
 from pipeline.evaluation.predictions import BASELINES
 from pipeline.evaluation.scores import Comparison
 
 FOOTNOTE = "zeroed: every value at its training mean, which the policy sees as zeros"
-
-
-def modality_metrics(study: ModalityStudy) -> dict[str, Any]:
-    """The overall errors, in units of the training standard deviation, nested by stream."""
-    document: dict[str, Any] = {
-        "ticks": study.intact.ticks,
-        "samples": study.samples,
-        "intact": numbers({"overall": study.intact.overall("policy")}),
-    }
-    for one in study.spoilt:
-        document.setdefault(one.stream, {})[one.how.replace(" ", "_")] = numbers(
-            {
-                "overall": one.comparison.overall("policy"),
-                "times_intact": study.times_intact(one),
-            }
-        )
-    return document
 
 
 def modality_errors(study: ModalityStudy) -> tuple[list[str], list[tuple[Any, ...]]]:
@@ -73,9 +56,14 @@ def judged_on(study: ModalityStudy) -> str:
     )
 
 
-def modality_rows(study: ModalityStudy) -> Iterable[Sequence[object]]:
-    """Lines of a CSV file: error by stream, way to spoil it, and action group."""
+def modality_rows(study: ModalityStudy | None) -> Iterable[Sequence[object]]:
+    """Lines of a CSV file: error by stream, way to spoil it, and action group.
+
+    The headings alone where there is no study.
+    """
     yield ["stream", "how", "group", "unit", "error", "intact_error", "best_baseline_error"]
+    if study is None:
+        return
     best = best_baseline(study.intact)
     for one in study.spoilt:
         for group in study.intact.groups:
@@ -93,9 +81,14 @@ def modality_rows(study: ModalityStudy) -> Iterable[Sequence[object]]:
         yield [one.stream, one.how, "overall", "training std", *map(cell, overall)]
 
 
-def stream_rows(study: ModalityStudy) -> Iterable[Sequence[object]]:
-    """Lines of a CSV file: the overall error by way to spoil a stream, and what of the intact."""
+def stream_rows(study: ModalityStudy | None) -> Iterable[Sequence[object]]:
+    """Lines of a CSV file: the overall error by way to spoil a stream, and what of the intact.
+
+    The headings alone where there is no study.
+    """
     yield ["spoilt", "times_intact", "overall_error"]
+    if study is None:
+        return
     for one in study.spoilt:
         times = study.times_intact(one)
         error = one.comparison.overall("policy")

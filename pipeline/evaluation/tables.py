@@ -1,6 +1,5 @@
 """Scores -> what is printed, what DVC shows, what others plot."""
 
-import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -8,7 +7,7 @@ from typing import Any
 from pipeline.durable import write_document
 from pipeline.evaluation.cells import aligned, cell, numbers, ratio, write_rows
 from pipeline.evaluation.modalities import ModalityStudy
-from pipeline.evaluation.modality_tables import modality_metrics, modality_rows, stream_rows
+from pipeline.evaluation.modality_tables import modality_rows, stream_rows
 from pipeline.evaluation.names import with_unit
 from pipeline.evaluation.predictions import METHODS, Predictions
 from pipeline.evaluation.scores import Comparison
@@ -19,6 +18,9 @@ FOOTNOTE = (
     "actions are absolute, it takes the mean training action"
 )
 METRICS = "metrics.json"
+ERRORS = "errors.csv"
+"""The file with the errors of all methods, a line an action group and one `OVERALL`."""
+OVERALL = "overall"
 HEADINGS = {
     "policy": "policy",
     "zero_action": "zero",
@@ -28,41 +30,25 @@ HEADINGS = {
 
 
 def metrics(comparison: Comparison) -> dict[str, Any]:
-    """The essential numbers, nested, for `metrics.json`.
+    """The few numbers that tell two evaluations apart, for `metrics.json`; the rest is in tables.
 
-    `overall` is in units of the training standard deviation (`Comparison.overall`), a group in
-    its own; `relative` is the policy's error divided by the best baseline's. `horizon` is by step
-    of the chunk, of which step_1 is the action at the tick itself; a step that no held-out chunk
-    reaches is left out. Numbers have 6 significant digits: less would hide, more would be noise.
+    Mean absolute errors of the policy, `overall` in units of the training standard deviation
+    (`Comparison.overall`), a group's in its own; `relative` is the error divided by the best
+    baseline's. Numbers have 6 significant digits: less would hide, more would be noise.
     """
     document: dict[str, Any] = {
         "held_out": {"episodes": len(comparison.episodes), "ticks": comparison.ticks},
         "overall": numbers(
-            {method: comparison.overall(method) for method in METHODS}
-            | {"relative": comparison.relative()}
+            {"policy": comparison.overall("policy"), "relative": comparison.relative()}
         ),
     }
     for group in comparison.groups:
         document[group.key] = numbers(
-            {method: comparison.group_mae(method, group) for method in METHODS}
-            | {
+            {
+                "policy": comparison.group_mae("policy", group),
                 "relative": comparison.relative(group),
-                "policy_rmse": comparison.group_rmse("policy", group),
             }
         )
-    document["dimension"] = {
-        f"{name}_{unit}" if unit else name: numbers(
-            {method: float(comparison.scores[method].mae[index]) for method in METHODS}
-        )
-        for index, (name, unit) in enumerate(zip(comparison.names, comparison.units, strict=True))
-    }
-    document["horizon"] = {
-        group.key: {
-            method: _steps(group.mean(comparison.scores[method].mae_horizon).tolist())
-            for method in METHODS
-        }
-        for group in comparison.groups
-    }
     return document
 
 
@@ -100,28 +86,36 @@ def write_tables(
     store: FeatureStore,
     study: ModalityStudy | None = None,
 ) -> list[Path]:
-    """Write metrics.json and, for plots, one CSV each by dimension, horizon, episode and tick.
+    """Write metrics.json and one CSV each of all errors, by dimension, horizon, episode and tick.
 
-    And by spoilt stream, with its figures among the metrics, where there is a `study`. steps.csv
-    and streams.csv have one line a point, as `dvc plots` takes them; the rest is for others.
+    And two by spoilt stream, which have headings alone without a `study`: `dvc plots` would miss
+    the file, and one of an evaluation before would stay. steps.csv and streams.csv have one line a
+    point, as `dvc plots` takes them; the rest is for others.
     """
-    document = metrics(comparison)
     files = {
+        ERRORS: _error_rows(comparison),
         "dimensions.csv": _dimension_rows(comparison),
         "horizon.csv": _horizon_rows(comparison),
         "steps.csv": _step_rows(comparison),
         "episodes.csv": _episode_rows(comparison, store),
         "predictions.csv": _prediction_rows(comparison, predictions, store),
+        "modalities.csv": modality_rows(study),
+        "streams.csv": stream_rows(study),
     }
-    if study is not None:
-        document["modalities"] = modality_metrics(study)
-        files["modalities.csv"] = modality_rows(study)
-        files["streams.csv"] = stream_rows(study)
-    write_document(folder / METRICS, document)
+    write_document(folder / METRICS, metrics(comparison))
     return [
         folder / METRICS,
         *(write_rows(folder / name, rows) for name, rows in files.items()),
     ]
+
+
+def _error_rows(comparison: Comparison) -> Iterable[Sequence[object]]:
+    yield ["group", "unit", *METHODS, "policy_rmse"]
+    for group in comparison.groups:
+        errors = (comparison.group_mae(method, group) for method in METHODS)
+        rmse = comparison.group_rmse("policy", group)
+        yield [group.name, group.unit, *map(cell, errors), cell(rmse)]
+    yield [OVERALL, "training std", *(cell(comparison.overall(method)) for method in METHODS), ""]
 
 
 def _dimension_rows(comparison: Comparison) -> Iterable[Sequence[object]]:
@@ -182,9 +176,3 @@ def _prediction_rows(
             f"{time_s[place]:.3f}",
             *(cell(value) for pair in pairs for value in pair),
         ]
-
-
-def _steps(errors: Sequence[float]) -> dict[str, float]:
-    """Scores are NaN where no entry is valid."""
-    steps = {f"step_{step}": error for step, error in enumerate(errors, start=1)}
-    return numbers({name: error for name, error in steps.items() if not math.isnan(error)})

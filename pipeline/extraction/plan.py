@@ -73,8 +73,14 @@ def reasons(survey: Survey, store: Donor | None, specs: dict[str, ArraySpec]) ->
             f"{len(changed) - new} episode(s) have another instruction, name, place, action_hz or "
             "vlm_reuse_count"
         )
-    if before - now:
-        why.append(f"{len(before - now)} episode(s) of the store are gone or changed")
+    again = {one.content for one in changed}  # said above
+    gone = [
+        digest
+        for digest, content in zip(store.episode_digests, store.episode_contents, strict=True)
+        if digest not in now and content not in again
+    ]
+    if gone:
+        why.append(f"{len(gone)} episode(s) of the store are gone or changed")
     for name, spec in specs.items():
         if name != FEATURES and store.specs[name].dtype != spec.dtype:
             why.append(f"{name} was {store.specs[name].dtype}, is to be {spec.dtype}")

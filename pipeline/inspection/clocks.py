@@ -17,7 +17,7 @@ GAP_FACTOR = 2.5
 _BURSTS = 0.5
 """Share of the mean step under which a median step means stamps in bursts."""
 _LONGEST = 0.02
-"""Share of the steps that may be gaps and are left out of the mean."""
+"""Share of the rising steps that may be gaps and are left out of the mean."""
 
 
 def clocks(view: EpisodeView) -> tuple[Clock, ...]:
@@ -56,37 +56,44 @@ def usual_step(time: NDArray[np.float64]) -> float:
     """The step of a clock in seconds, NaN for fewer than two entries.
 
     The median; where entries are stamped in bursts, which have steps of nothing and long ones, the
-    mean of all steps but the longest 2 %, which may be gaps.
+    mean without the longest 2 % of the rising steps, which may be gaps; 0 where times only repeat.
     """
     return _usual(time)[0]
 
 
 def gaps(time: NDArray[np.float64]) -> tuple[Gap, ...]:
-    """Where a clock skips; empty for fewer than three entries, which have no usual step.
-
-    Between bursts, from `GAP_FACTOR` times the steps that there are between bursts.
-    """
-    if len(time) < 3:
-        return ()
-    places = np.flatnonzero(np.diff(time) >= GAP_FACTOR * _usual(time)[1])
+    """Where a clock skips: steps of `shortest_gap` or more."""
+    places = np.flatnonzero(np.diff(time) >= shortest_gap(time))
     return tuple(Gap(float(time[place]), float(time[place + 1])) for place in places)
+
+
+def shortest_gap(time: NDArray[np.float64]) -> float:
+    """Seconds from which a step of this clock is a gap: `GAP_FACTOR` usual steps.
+
+    Between bursts, `GAP_FACTOR` times the steps that there are between bursts. Infinite for fewer
+    than three entries, and where times only repeat: there no step is usual.
+    """
+    longest = _usual(time)[1]
+    return GAP_FACTOR * longest if len(time) > 2 and longest > 0 else float("inf")
 
 
 def _usual(time: NDArray[np.float64]) -> tuple[float, float]:
     """The usual step, and the longest that is usual."""
-    steps = np.sort(np.diff(time))
+    steps = np.diff(time)
     if not len(steps):
         return float("nan"), float("nan")
+    rising = np.sort(steps[steps > 0])
+    if not len(rising):
+        return 0.0, 0.0
     median = float(np.median(steps))
-    kept = steps[: max(1, len(steps) - int(np.ceil(_LONGEST * len(steps))))]
-    mean = float(kept.mean())
+    kept = rising[: max(1, len(rising) - int(np.ceil(_LONGEST * len(rising))))]
+    mean = float(kept.mean()) * len(rising) / len(steps)
     return (mean, float(kept[-1])) if median < _BURSTS * mean else (median, median)
 
 
 def _clock(name: str, kind: str, time: NDArray[np.float64]) -> Clock:
-    step, longest = _usual(time)
-    steps = np.diff(time)
-    small = steps[steps < GAP_FACTOR * longest]
+    step, steps = usual_step(time), np.diff(time)
+    small = steps[steps < shortest_gap(time)]
     return Clock(
         name=name,
         kind=kind,  # pyright: ignore[reportArgumentType]

@@ -4,11 +4,11 @@ The rule: at the start the needle is clear, so the median force of the first `_R
 noise is what the force does from reading to reading and within that time. The force, smoothed by a
 running median, is in contact from where it leaves rest by `_ENTER` times its noise until it is back
 within `_LEAVE` times: hysteresis, as for edges in J. Canny, "A computational approach to edge
-detection", IEEE TPAMI 8(6), 1986. A force in newtons has to leave rest by `_LEAST_N` at least,
-which a slow drift of the sensor does not reach.
+detection", IEEE TPAMI 8(6), 1986. A force in newtons has to leave rest by `_LEAST_N` at least.
 
-Its limits: a recording that begins in contact shows only what presses harder or less; a needle that
-glides out of tissue along a drifting sensor may seem to stay; a touch below the threshold is none.
+Its limits: a recording that begins in contact shows only what presses harder or less; a sensor that
+drifts by more than the threshold makes a contact seem to begin early, or to last when the needle
+has glided out of tissue; a touch below the threshold is none.
 """
 
 import numpy as np
@@ -43,7 +43,8 @@ def contacts(view: EpisodeView) -> tuple[Contact, ...]:
     time = view.sensor.time
     force = view.sensor.values[:, columns].astype(np.float64)
     resting = time <= time[0] + _REST_S
-    window = max(1, round(_SMOOTHED_S / usual_step(time))) | 1
+    # Where times only repeat there is no step, and nothing is smoothed.
+    window = max(1, round(_SMOOTHED_S / (usual_step(time) or _SMOOTHED_S))) | 1
     smooth = median_filter(force, size=(window, 1), mode="nearest")
     rest = np.median(smooth[resting], axis=0)
     noise = _noise(force, window) + _mad(smooth[resting] - rest)

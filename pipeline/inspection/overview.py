@@ -138,11 +138,11 @@ def _counted(summary: EpisodeSummary, flaws: Sequence[Flaw]) -> EpisodeSummary:
 def _lacking(
     summaries: Sequence[EpisodeSummary], held: Sequence[frozenset[str]]
 ) -> Iterator[tuple[int, list[str]]]:
-    """Places of episodes without what more than half of their source's episodes have."""
-    by_source: dict[str, list[int]] = defaultdict(list)
+    """Places of episodes without what most of their source's episodes of that format have."""
+    alike: dict[tuple[str, str], list[int]] = defaultdict(list)
     for place, one in enumerate(summaries):
-        by_source[one.source].append(place)
-    for places in by_source.values():
+        alike[one.source, one.format].append(place)
+    for places in alike.values():
         every = set().union(*(held[place] for place in places))
         usual = {
             name for name in every if 2 * sum(name in held[place] for place in places) > len(places)

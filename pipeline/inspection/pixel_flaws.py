@@ -145,11 +145,13 @@ def _dead(view: EpisodeView, name: str, seen: _Looked) -> Iterator[Flaw]:
 def _duplicates(view: EpisodeView, name: str, looked: Mapping[str, _Looked]) -> Iterator[Flaw]:
     seen = looked[name]
     time, pairs = view.cameras[name].time, len(seen.equal)
+    all_seen = len(seen.index) == len(time)
     if pairs and seen.equal.all() and pairs >= STILL_PAIRS:
         yield view.flaw(
             "duplicate frames",
             f"view {name}",
-            f"all {len(time)} frames are one picture; expected a camera that runs",
+            f"all {len(seen.index)} frames {'' if all_seen else 'looked at '}are one picture; "
+            "expected a camera that runs",
         )
         return
     told = 0
@@ -166,8 +168,9 @@ def _duplicates(view: EpisodeView, name: str, looked: Mapping[str, _Looked]) -> 
             yield view.flaw(
                 "duplicate frames",
                 f"view {name}",
-                f"frames {start} to {stop} are one picture, {time[stop] - time[start]:.2f} s from "
-                f"{time[start] - view.zero:.2f} s; "
+                f"frames {start} to {stop} are one picture"
+                f"{'' if all_seen else ' where they were looked at'}, "
+                f"{time[stop] - time[start]:.2f} s from {time[start] - view.zero:.2f} s; "
                 + ("elsewhere no frame is that before" if seen.noisy else "other views move"),
                 float(time[start]),
                 float(time[stop]),

@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 from pipeline.inspection.facts import ChannelStatistics, EpisodeView
 from pipeline.recordings import Channels
 
-_COLUMNS = 64
-"""Channels worked on at a time: percentiles copy what they look at."""
+_COLUMNS = 16
+"""Channels worked on at a time: sorting copies what it looks at."""
+_SHARES = np.array([0.0, 0.01, 0.5, 0.99, 1.0])
 
 
 def channel_statistics(view: EpisodeView) -> tuple[ChannelStatistics, ...]:
@@ -37,21 +38,36 @@ def _statistics(
     stream: str, channels: Channels, values: NDArray[np.float32]
 ) -> Iterator[ChannelStatistics]:
     for first in range(0, values.shape[1], _COLUMNS):
-        block = values[:, first : first + _COLUMNS].astype(np.float64)
-        points = np.percentile(block, [0, 1, 50, 99, 100], axis=0)
-        mean, std = block.mean(axis=0), block.std(axis=0)
-        for column in range(block.shape[1]):
-            minimum, low, median, high, maximum = map(float, points[:, column])
+        block = np.ascontiguousarray(values[:, first : first + _COLUMNS].T)
+        block.sort(axis=1)
+        points = _percentiles(block)
+        mean = block.mean(axis=1, dtype=np.float64).tolist()
+        std = block.std(axis=1, dtype=np.float64).tolist()
+        for column in range(len(block)):
+            minimum, low, median, high, maximum = points[column].tolist()
             yield ChannelStatistics(
                 stream=stream,
                 name=channels.names[first + column],
                 unit=channels.units[first + column],
-                count=len(block),
+                count=len(values),
                 minimum=minimum,
                 low=low,
                 median=median,
                 high=high,
                 maximum=maximum,
-                mean=float(mean[column]),
-                std=float(std[column]),
+                mean=mean[column],
+                std=std[column],
             )
+
+
+def _percentiles(ordered: NDArray[np.float32]) -> NDArray[np.float64]:
+    """(channel, share) linear between the neighbours in sorted values (channel, reading).
+
+    As `np.percentile`, which takes three times as long.
+    """
+    place = _SHARES * (ordered.shape[1] - 1)
+    below = np.floor(place).astype(np.int64)
+    low, high = (
+        ordered[:, at].astype(np.float64) for at in (below, np.ceil(place).astype(np.int64))
+    )
+    return low + (high - low) * (place - below)

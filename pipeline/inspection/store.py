@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.config import InspectParams
-from pipeline.errors import StoreIncomplete
 from pipeline.inspection.facts import Flaw
 from pipeline.inspection.store_coverage import Ages, EpisodeCoverage, ages, coverage
 from pipeline.inspection.store_duplicates import Duplicates, Still, Twins, find_duplicates
@@ -24,11 +23,10 @@ from pipeline.inspection.store_features import (
     sample_rows,
 )
 from pipeline.inspection.store_flaws import episode_flaws
+from pipeline.inspection.store_integrity import check_rows, open_checked
 from pipeline.inspection.store_projection import StoreProjection, project
 from pipeline.inspection.store_sizes import METADATA, ArraySize, array_sizes
 from pipeline.inspection.store_statistics import StreamStatistics, stream_statistics
-from pipeline.store import FeatureStore
-from pipeline.store.mending import extract_command
 
 __all__ = [
     "METADATA",
@@ -99,16 +97,19 @@ class StoreView:
 def inspect_store(path: str | Path, params: InspectParams) -> StoreView:
     """Everything that is said of a finished store; it is only read.
 
-    `params.points` VL rows are looked at at most, which takes 4 x points^2 bytes of memory, and
-    `params.duplicate_similarity` is what near-duplicates are from.
+    `params.points` VL rows are looked at at most, which takes some 16 x points^2 bytes of memory,
+    and `params.duplicate_similarity` is what near-duplicates are from. The checksums of these rows
+    are checked, and those of metadata and of every narrow array; the rest is for stages.verify.
 
     Raises `StoreIncomplete` where it is not there, unfinished, damaged or without an episode,
     `StoreMismatch` where it is an archive or follows another schema, each saying what to run, and
     `NumericsError` for a feature that is not finite.
     """
-    store = _open(Path(path))
+    store = open_checked(Path(path))
     episodes, age = coverage(store), ages(store)
-    found = look_at_features(store, sample_rows(store, params.points))
+    sampled = sample_rows(store, params.points)
+    check_rows(store, sampled.rows)
+    found = look_at_features(store, sampled)
     duplicates = find_duplicates(store, found, params.duplicate_similarity)
     statistics, far = stream_statistics(store), outliers(found)
     flaws = [
@@ -135,19 +136,3 @@ def inspect_store(path: str | Path, params: InspectParams) -> StoreView:
         statistics=statistics,
         flaws=tuple(sorted(flaws, key=lambda one: one.severity != "error")),
     )
-
-
-def _open(path: Path) -> FeatureStore:
-    """A finished store with something in it; a build looks like one until its files are read."""
-    if path.name.endswith(".part"):
-        finished = path.with_name(path.name.split(".zarr")[0] + ".zarr")
-        raise StoreIncomplete(
-            f"{path}: expected a finished store, found an unfinished build. Complete it with "
-            f"{extract_command(finished)}."
-        )
-    store = FeatureStore.open(path)
-    if not len(store.array("vl/time")):
-        raise StoreIncomplete(
-            f"{path}: expected VL rows to look at, found none. Run {extract_command(path)}."
-        )
-    return store

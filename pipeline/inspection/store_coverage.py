@@ -73,8 +73,9 @@ def ages(store: FeatureStore) -> Ages:
 
 def tick_step(store: FeatureStore) -> float:
     """The median time from a tick to the next of its episode, in s; NaN where there is none."""
-    starts = store.array("episode/tick_start")[1:-1]
-    steps = np.delete(np.diff(store.array("tick/time")), starts[(starts > 0)] - 1)
+    starts = store.array("episode/tick_start")
+    between = np.unique(starts[(starts > 0) & (starts < store.ticks)]) - 1
+    steps = np.delete(np.diff(store.array("tick/time")), between)
     return float(np.median(steps)) if len(steps) else float("nan")
 
 

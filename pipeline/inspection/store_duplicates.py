@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,13 +13,15 @@ from pipeline.store import KEY_BYTES, FeatureStore
 _BLOCK_ROWS = 512
 _LISTED = 50
 """Still stretches and pairs of episodes that are named; all are counted."""
+_ROUNDING = 1e-6
+"""Of a cosine in float32: rows that are equal may come out this much below 1."""
 _NO_DIRECTION = 1e-6
 """Of the root mean square norm: what lies nearer to the mean of all rows has no direction."""
 
 
 @dataclass(frozen=True)
 class Still:
-    """Consecutive VL rows of an episode, each a near-duplicate of the one before."""
+    """Sampled rows of an episode, one after the other, each a near-duplicate of the one before."""
 
     episode: str
     start_s: float
@@ -62,7 +63,7 @@ class Duplicates:
     equal_rows: int
     """Rows of the whole store whose key another row has: same prompt, same pixels, same model."""
     equal_twins: tuple[Twins, ...]
-    """Episodes that share keys; at most 50."""
+    """Episodes that share keys: the first that has one and each other; at most 50."""
     equal_twins_count: int
     episodes: NDArray[np.int64]
     """(episode,) indices of the episodes with sampled rows."""
@@ -81,13 +82,12 @@ def find_duplicates(store: FeatureStore, found: FeatureRows, threshold: float) -
     cosine = _Cosine(found.gram)
     episodes, starts = np.unique(sampled.episode, return_index=True)
     best = _best(cosine, starts)
-    near = best >= threshold
+    near = best >= threshold - _ROUNDING
     own = np.repeat(np.arange(len(episodes)), np.diff(starts, append=len(near)))
     in_own = near[np.arange(len(near)), own]
     near[np.arange(len(near)), own] = False
-    still = list(_still(sampled, cosine, names, threshold))
-    pairs = _pairs(near, starts)
-    twins = [_twins(sampled, cosine, names, starts, *pair) for pair in pairs[:_LISTED]]
+    still = sorted(_still(sampled, cosine, names, threshold), key=lambda one: -one.rows)
+    twins, twins_count = _twins(sampled, cosine, names, starts, near)
     equal, equal_twins = _equal(store, names)
     likeness = np.maximum.reduceat(best, starts, axis=0) if len(starts) else best
     np.fill_diagonal(likeness, np.nan)
@@ -95,10 +95,10 @@ def find_duplicates(store: FeatureStore, found: FeatureRows, threshold: float) -
         threshold=threshold,
         within=int(in_own.sum()),
         across=int(near.any(axis=1).sum()),
-        still=tuple(sorted(still, key=lambda one: -one.rows)[:_LISTED]),
+        still=tuple(still[:_LISTED]),
         still_count=len(still),
-        twins=tuple(twins),
-        twins_count=len(pairs),
+        twins=twins,
+        twins_count=twins_count,
         equal_rows=equal,
         equal_twins=tuple(equal_twins[:_LISTED]),
         equal_twins_count=len(equal_twins),
@@ -140,33 +140,13 @@ def _still(
     before, after = np.arange(len(sampled.rows) - 1), np.arange(1, len(sampled.rows))
     similar = cosine.gram[before, after] * cosine.scale[before] * cosine.scale[after]
     same = sampled.episode[before] == sampled.episode[after]
-    change = np.diff((same & (similar >= threshold)).astype(np.int8), prepend=0, append=0)
+    change = np.diff(
+        (same & (similar >= threshold - _ROUNDING)).astype(np.int8), prepend=0, append=0
+    )
     for first, last in zip(np.flatnonzero(change > 0), np.flatnonzero(change < 0), strict=True):
         episode = names[int(sampled.episode[first])]
         times = float(sampled.time[first]), float(sampled.time[last])
         yield Still(episode, *times, int(last - first) + 1)
-
-
-def _pairs(
-    near: NDArray[np.bool_], starts: NDArray[np.int64]
-) -> list[tuple[int, int, int, int, float]]:
-    """Episodes a < b that share rows: (a, b, rows of a, rows of b, share), the largest first."""
-    if not len(near):
-        return []
-    counts = np.add.reduceat(near, starts, axis=0, dtype=np.int64)
-    rows = np.diff(starts, append=len(near))
-    shares = counts / rows[:, None]
-    found = [
-        (
-            int(a),
-            int(b),
-            int(counts[a, b]),
-            int(counts[b, a]),
-            float(max(shares[a, b], shares[b, a])),
-        )
-        for a, b in np.argwhere(np.triu(counts + counts.T, 1))
-    ]
-    return sorted(found, key=lambda one: -one[4])
 
 
 def _twins(
@@ -174,55 +154,54 @@ def _twins(
     cosine: _Cosine,
     names: list[str],
     starts: NDArray[np.int64],
-    a: int,
-    b: int,
-    of_a: int,
-    of_b: int,
-    share: float,
-) -> Twins:
-    edges = [*starts.tolist(), len(sampled.rows)]
-    first, second = slice(edges[a], edges[a + 1]), slice(edges[b], edges[b + 1])
-    similar = cosine(first, second)
-    row, other = np.unravel_index(int(similar.argmax()), similar.shape)
-    at = first.start + int(row), second.start + int(other)
-    return Twins(
-        names[int(sampled.episode[at[0]])],
-        names[int(sampled.episode[at[1]])],
-        (of_a, of_b),
-        share,
-        (float(sampled.time[at[0]]), float(sampled.time[at[1]])),
-        min(1.0, float(similar[row, other])),
-    )
+    near: NDArray[np.bool_],
+) -> tuple[tuple[Twins, ...], int]:
+    """Episodes that share rows by features: those that share most of theirs, and how many."""
+    stops = np.append(starts[1:], len(near))
+    counts = np.add.reduceat(near, starts, axis=0, dtype=np.int32)
+    shares = (counts / (stops - starts)[:, None]).astype(np.float32)
+    shares = np.triu(np.maximum(shares, shares.T), 1)
+    found = int(np.count_nonzero(shares))
+    largest = np.argsort(-shares, axis=None, kind="stable")[: min(found, _LISTED)]
+    twins: list[Twins] = []
+    for a, b in zip(*np.unravel_index(largest, shares.shape), strict=True):
+        similar = cosine(slice(starts[a], stops[a]), slice(starts[b], stops[b]))
+        row, other = np.unravel_index(int(similar.argmax()), similar.shape)
+        at = [starts[a] + row, starts[b] + other]
+        first, second = sampled.episode[at].tolist()
+        of_a, of_b = int(counts[a, b]), int(counts[b, a])
+        begin, other_begin = sampled.time[at].tolist()
+        likeness = min(1.0, float(similar[row, other]))
+        twins.append(
+            Twins(
+                names[first],
+                names[second],
+                (of_a, of_b),
+                float(shares[a, b]),
+                (begin, other_begin),
+                likeness,
+            )
+        )
+    return tuple(twins), found
 
 
 def _equal(store: FeatureStore, names: list[str]) -> tuple[int, list[Twins]]:
     """Rows whose key another row of the store has, and the episodes that share keys."""
     keys = np.ascontiguousarray(store.array("vl/key")).view(f"V{KEY_BYTES}").ravel()
-    _, number, counts = np.unique(keys, return_inverse=True, return_counts=True)
-    shared = np.flatnonzero(counts[number] > 1)
-    edges = store.array("episode/vl_start")
-    episode = np.searchsorted(edges, shared, side="right") - 1
-    of_key: dict[int, dict[int, list[int]]] = {}
-    for row, key, owner in zip(
-        shared.tolist(), number[shared].tolist(), episode.tolist(), strict=True
-    ):
-        of_key.setdefault(key, {}).setdefault(owner, []).append(row)
-    rows: dict[tuple[int, int], list[list[int]]] = {}
-    for owners in of_key.values():
-        for a, b in combinations(owners, 2):
-            pair = rows.setdefault((a, b), [[], []])
-            pair[0] += owners[a]
-            pair[1] += owners[b]
-    lengths, time = np.diff(edges).tolist(), store.array("vl/time")
-    found = [
-        Twins(
-            names[a],
-            names[b],
-            (len(of_a), len(of_b)),
-            max(len(of_a) / lengths[a], len(of_b) / lengths[b]),
-            (float(time[of_a[0]] - time[edges[a]]), float(time[of_b[0]] - time[edges[b]])),
-            1.0,
-        )
-        for (a, b), (of_a, of_b) in rows.items()
-    ]
-    return len(shared), sorted(found, key=lambda one: -one.share)
+    edges, time = store.array("episode/vl_start"), store.array("vl/time")
+    _, key, counts = np.unique(keys, return_inverse=True, return_counts=True)
+    owner = np.repeat(np.arange(len(names)), np.diff(edges))
+    first = np.full(len(counts), len(names))
+    np.minimum.at(first, key, owner)
+    later = first[key] < owner
+    found: list[Twins] = []
+    for a, b in np.unique(np.column_stack([first[key], owner])[later], axis=0).tolist():
+        of_a, of_b = key[edges[a] : edges[a + 1]], key[edges[b] : edges[b + 1]]
+        shared = np.flatnonzero(np.isin(of_a, of_b)), np.flatnonzero(np.isin(of_b, of_a))
+        rows = len(shared[0]), len(shared[1])
+        share = max(rows[0] / len(of_a), rows[1] / len(of_b))
+        other = int((of_b == of_a[shared[0][0]]).argmax())
+        at = np.array([edges[a] + shared[0][0], edges[b] + other])
+        begin, other_begin = (time[at] - time[edges[[a, b]]]).tolist()
+        found.append(Twins(names[a], names[b], rows, share, (begin, other_begin), 1.0))
+    return int((counts[key] > 1).sum()), sorted(found, key=lambda one: -one.share)

@@ -1,7 +1,7 @@
 """The features of a store: how long they are, what does not vary, which rows lie near each other.
 
-One slot of at most `inspect.points` VL rows is in memory at a time, beside one matrix of all pairs
-of these rows (4 bytes x points^2). Of augmented variants, only the plain frames are looked at.
+One slot of at most `inspect.points` VL rows is in memory at a time, beside two matrices of all
+pairs of these rows (8 bytes x points^2). Of augmented variants, the plain frames are looked at.
 """
 
 from collections.abc import Iterator, Mapping
@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from pipeline.errors import NumericsError
 from pipeline.evaluation import place
+from pipeline.inspection.store_statistics import evenly
 from pipeline.store import FEATURES, FeatureStore
 
 _BLOCK_ROWS = 1024
@@ -23,7 +24,7 @@ _FAR, _FAR_SHARE = 10.0, 0.5
 
 @dataclass(frozen=True, eq=False)
 class SampledRows:
-    """The VL rows that are looked at: all, or as many as asked for, evenly spread."""
+    """The VL rows that are looked at: all, or every so many of each episode."""
 
     rows: NDArray[np.int64]
     """(row,) store-global, ascending."""
@@ -78,17 +79,22 @@ class Outlier:
 
 
 def sample_rows(store: FeatureStore, most: int) -> SampledRows:
-    """At most `most` VL rows, evenly spread over the store."""
-    edges = store.array("episode/vl_start")
-    total = int(edges[-1])
-    count = min(most, total)
-    rows = np.arange(count, dtype=np.int64) * total // max(1, count)
+    """At most `most` VL rows: all, or every so many of each episode from its first.
+
+    The same moments of all episodes, so that a recording that is there twice is seen twice. Of more
+    episodes than `most`, evenly spread ones.
+    """
+    edges, time = store.array("episode/vl_start"), store.array("vl/time")
+    lengths, total = np.diff(edges), int(edges[-1])
+    step = 1
+    while step < lengths.max() and (-(-lengths // step)).sum() > most:
+        step += 1
+    inside = np.arange(total) - np.repeat(edges[:-1], lengths)
+    rows = np.flatnonzero(inside % step == 0)
+    rows = rows[evenly(len(rows), most)]
     episode = np.searchsorted(edges, rows, side="right") - 1
-    last = np.maximum(1, np.diff(edges)[episode] - 1)
-    progress = (rows - edges[episode]) / last
-    time = store.array("vl/time")
-    begun = time[np.minimum(edges[episode], max(0, total - 1))]
-    return SampledRows(rows, episode, time[rows] - begun, progress, total)
+    progress = inside[rows] / np.maximum(1, lengths[episode] - 1)
+    return SampledRows(rows, episode, time[rows] - time[edges[episode]], progress, total)
 
 
 def look_at_features(store: FeatureStore, sampled: SampledRows) -> FeatureRows:
@@ -97,7 +103,7 @@ def look_at_features(store: FeatureStore, sampled: SampledRows) -> FeatureRows:
     Raises `NumericsError` for a feature that is not finite.
     """
     count, slots = len(sampled.rows), store.feature_shape[0]
-    names = tuple(slot_name(one) for one in store.attrs["slots"])
+    names = tuple(slot_name(one) for one in store.attrs["slots"][:slots])  # variants repeat them
     norm = np.full((count, slots), np.nan, np.float32)
     variation = np.full(slots, np.nan)
     within = np.full((len(store.episodes), slots), np.nan)

@@ -12,6 +12,8 @@ from pipeline.store import FeatureStore
 
 _SMALL = 16
 """Rows up to which all directions are computed, as the iteration needs room."""
+_TIE = 1e-3
+"""Share by which coordinates count as equally large, so that rounding decides no sign."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +46,7 @@ def project(store: FeatureStore, found: FeatureRows) -> StoreProjection:
 
     Every slot less its mean, none scaled, invalid ones at their mean; from the dot products of the
     rows, whose eigenvectors are the left singular vectors of the features. The sign of an axis is
-    such that its largest coordinate is positive.
+    such that the first of its largest coordinates is positive.
     """
     gram = found.gram.astype(np.float64)
     points, values = _main_axes(gram)
@@ -67,7 +69,9 @@ def project(store: FeatureStore, found: FeatureRows) -> StoreProjection:
 def _main_axes(gram: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(row, 2) scores and (2,) squared singular values, the larger first."""
     count = len(gram)
-    if count <= _SMALL or not gram.any():
+    if not gram.any():
+        return np.zeros((count, 2)), np.zeros(2)
+    if count <= _SMALL:
         values, vectors = np.linalg.eigh(gram)
     else:
         start = np.random.default_rng(0).normal(size=count)  # else it draws one from the clock
@@ -75,6 +79,8 @@ def _main_axes(gram: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
     order = np.argsort(values)[::-1][:2]
     values = np.maximum(values[order], 0)
     points = vectors[:, order] * np.sqrt(values)
-    points *= np.where(points[np.abs(points).argmax(axis=0), np.arange(points.shape[1])] < 0, -1, 1)
+    size = np.abs(points)
+    far = (size >= (1 - _TIE) * size.max(axis=0)).argmax(axis=0)
+    points *= np.where(points[far, np.arange(len(far))] < 0, -1, 1)
     pad = 2 - points.shape[1]
     return np.pad(points, ((0, 0), (0, pad))), np.pad(values, (0, pad))

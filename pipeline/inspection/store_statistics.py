@@ -40,16 +40,17 @@ def stream_statistics(
         values = store.array(name)
         if values.size:
             said = store.streams[stream]
-            rows = _evenly(len(values), max(2, sample_bytes // (4 * values.shape[1])))
+            rows = evenly(len(values), max(2, sample_bytes // (4 * values.shape[1])))
             sample = values[rows].astype(np.float32)
             channels = _channels(stream, sample, said["names"], said["units"])
             found.append(StreamStatistics(stream, len(values), len(rows), channels))
     return tuple(found)
 
 
-def _evenly(total: int, most: int) -> NDArray[np.int64]:
+def evenly(total: int, most: int) -> NDArray[np.int64]:
+    """At most `most` of `total` indices, ascending and evenly spread."""
     count = min(total, most)
-    return np.arange(count, dtype=np.int64) * total // count
+    return np.arange(count, dtype=np.int64) * total // max(1, count)
 
 
 def _channels(

@@ -44,25 +44,30 @@ def examine(params: Params) -> Generator[tuple[str, list[Finding]]]:
                 [missing(module, said, "install what is missing above, and run this again")],
             )
             continue
-        answer: SimpleQueue[list[Finding]] = SimpleQueue()
+        answer: SimpleQueue[list[Finding] | Exception] = SimpleQueue()
         Thread(target=_answer, args=(answer, module, check, params), daemon=True).start()
         try:
-            yield title, answer.get(timeout=PATIENCE_S)
+            found = answer.get(timeout=PATIENCE_S)
         except Empty:
             said = f"not known: no answer within {PATIENCE_S:g} s"
-            yield title, [note(module, said, "look at the disk or device it waits for")]
+            found = [note(module, said, "look at the disk or device it waits for")]
+        if isinstance(found, Exception):
+            raise found
+        yield title, found
 
 
 def _answer(
-    answer: SimpleQueue[list[Finding]],
+    answer: SimpleQueue[list[Finding] | Exception],
     module: str,
     check: Callable[[Params], list[Finding]],
     params: Params,
 ) -> None:
-    """Put what a check finds; what it cannot look at is a finding too."""
+    """Put what a check finds; what it cannot look at is a finding too, a bug is an error."""
     try:
         answer.put(check(params))
     except PipelineError as error:
         answer.put([missing(module, str(error), "mend that, and run this again")])
     except OSError as error:
         answer.put([note(module, f"not known: {error}", "look at that path")])
+    except Exception as error:
+        answer.put(error)

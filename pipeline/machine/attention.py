@@ -5,8 +5,8 @@ from importlib import import_module
 import torch
 
 from pipeline.config import Params
-from pipeline.device import resolve_device
 from pipeline.machine.findings import Finding, missing, note, ok
+from pipeline.machine.gpu import usable_device
 from pipeline.machine.packages import importable
 from pipeline.vlm.loading import attention_backend
 
@@ -21,7 +21,9 @@ _KERNELS = {
 
 def check_attention(params: Params) -> list[Finding]:
     """torch's own kernels, flash-attention, and what `vlm.attention` comes to."""
-    device = resolve_device(params.extract.device)
+    device = usable_device(params.extract.device)
+    if device is None:
+        return [note("attention", "not known before extract.device can be used, see GPU")]
     asked = params.vlm.attention
     flash = flash_trouble()
     findings = [ok("sdpa", _sdpa(device)), check_flash(flash, device.type, asked)]

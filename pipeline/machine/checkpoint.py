@@ -1,17 +1,16 @@
 """Whether the vision-language model is here and whole, and whether it fits."""
 
-import json
 import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+
+from safetensors import SafetensorError, safe_open
 
 from pipeline.config import Params, VLMParams
-from pipeline.device import resolve_device
 from pipeline.errors import VLMError
 from pipeline.machine.findings import Finding, missing, note, ok, size
-from pipeline.machine.gpu import GPU, read_accelerator
+from pipeline.machine.gpu import GPU, read_accelerator, usable_device
 from pipeline.store.mapping import available_bytes
 from pipeline.vlm.checkpoint_folder import (
     adapter_files,
@@ -22,6 +21,7 @@ from pipeline.vlm.checkpoint_folder import (
 )
 
 _BYTES = {"float32": 4, "float16": 2, "bfloat16": 2}
+_EXAMPLE = "set vlm.checkpoint to a folder or a hub id, such as Qwen/Qwen2.5-VL-3B-Instruct"
 _BESIDE = 2 * 2**30
 """Roughly what else a GPU holds while the model works: CUDA itself and a batch's activations."""
 
@@ -35,16 +35,19 @@ def check_checkpoint(params: Params) -> list[Finding]:
     try:
         files = weight_files(folder)
         tokenizer_files(folder)
+        count = parameter_count(files)
     except VLMError as error:
-        return [missing("vlm.checkpoint", str(error), f"hf download {vlm.checkpoint}")]
-    count = parameter_count(files)
+        own = Path(vlm.checkpoint).expanduser().is_dir()
+        remedy = "copy it again" if own else f"hf download --force-download {vlm.checkpoint}"
+        return [missing("vlm.checkpoint", str(error), remedy)]
     here = f"{vlm.checkpoint}, whole, {count:,} parameters"
     if str(folder) != vlm.checkpoint:
         here += " (in the hub's cache)"
     findings = [ok("vlm.checkpoint", here)]
     if vlm.adapter is not None:
         findings.append(check_adapter(vlm.adapter))
-    gpus = read_accelerator().gpus if resolve_device(params.extract.device).type == "cuda" else ()
+    device = usable_device(params.extract.device)
+    gpus = read_accelerator().gpus if device is not None and device.type == "cuda" else ()
     return [*findings, check_fit(count, vlm, gpus, available_bytes())]
 
 
@@ -64,7 +67,7 @@ def absent_checkpoint(params: Params) -> Finding:
         return missing("vlm.checkpoint", said, "python -m stages.demo (or dvc repro)")
     if not could_be_hub_id(checkpoint):
         said = f"{checkpoint}: no such folder, and no hub id"
-        return missing("vlm.checkpoint", said, "set vlm.checkpoint to a folder or a hub id")
+        return missing("vlm.checkpoint", said, _EXAMPLE)
     said = f"{checkpoint}: no such folder, and no complete copy in the hub's cache"
     remedy = f"hf download {checkpoint}"
     if os.environ.get("HF_HUB_OFFLINE", "0").lower() in ("1", "true", "yes", "on"):
@@ -104,17 +107,16 @@ def check_fit(count: int, vlm: VLMParams, gpus: Sequence[GPU], available: int) -
 
 
 def parameter_count(files: Sequence[Path]) -> int:
-    """How many numbers these safetensors files hold, by their headers."""
-    return sum(
-        math.prod(tensor["shape"])
-        for path in files
-        if path.suffix == ".safetensors"
-        for name, tensor in _header(path).items()
-        if name != "__metadata__"
-    )
+    """How many numbers these safetensors files hold, by their headers.
 
-
-def _header(path: Path) -> dict[str, Any]:
-    with path.open("rb") as file:
-        length = int.from_bytes(file.read(8), "little")
-        return json.loads(file.read(length))
+    Raises `VLMError` where one is cut off.
+    """
+    count = 0
+    for path in (path for path in files if path.suffix == ".safetensors"):
+        try:
+            with safe_open(path, "numpy") as file:
+                shapes = [file.get_slice(name).get_shape() for name in file.keys()]  # noqa: SIM118
+        except SafetensorError as error:
+            raise VLMError(f"{path}: cut off or damaged: {error}") from None
+        count += sum(map(math.prod, shapes))
+    return count

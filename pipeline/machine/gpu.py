@@ -3,16 +3,16 @@
 import os
 import shutil
 import subprocess
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
 from pipeline.config import Params
+from pipeline.device import resolve_device
+from pipeline.errors import ConfigError
 from pipeline.machine.findings import Finding, missing, note, ok, size
 
-_DEVICES = "extract.device, train_head.device, evaluate.device"
 _WHEELS = ((13.0, "cu130"), (12.8, "cu128"), (12.0, "cu126"))
 """The newest CUDA build of torch that a driver of at least this CUDA version runs."""
 
@@ -57,21 +57,31 @@ class Accelerator:
 
 def check_gpu(params: Params) -> list[Finding]:
     """The GPU of this machine under these params."""
-    devices = {params.extract.device, params.train_head.device, params.evaluate.device}
-    return check_accelerator(read_accelerator(), params.vlm.dtype, sorted(devices))
+    asked = {
+        "extract.device": params.extract.device,
+        "train_head.device": params.train_head.device,
+        "evaluate.device": params.evaluate.device,
+    }
+    absent = [
+        missing(key, f"{name}: torch cannot use it here, see GPU", f"mend that, or set {key}=auto")
+        for key, name in asked.items()
+        if usable_device(name) is None
+    ]
+    return [*check_accelerator(read_accelerator(), params.vlm.dtype), *absent]
 
 
-def check_accelerator(
-    here: Accelerator, dtype: str, devices: Sequence[str] = ("auto",)
-) -> list[Finding]:
+def usable_device(name: str) -> torch.device | None:
+    """The device of a param; None where torch cannot use it here, which `check_gpu` says."""
+    try:
+        return resolve_device(name)
+    except ConfigError:
+        return None
+
+
+def check_accelerator(here: Accelerator, dtype: str) -> list[Finding]:
     """Whether torch sees the GPU, why not, and what it can do."""
     if not here.gpus:
-        finding = _unseen(here)
-        asked = [name for name in devices if name.startswith("cuda")]
-        if not asked:
-            return [finding]
-        said = f"{finding.found}; but the params ask for {', '.join(asked)}"
-        return [missing("GPU", said, finding.remedy or "set these to auto: " + _DEVICES)]
+        return [_unseen(here)]
     findings = [ok("build", here.build)]
     for index, gpu in enumerate(here.gpus):
         said = f"{gpu.name}, {size(gpu.memory)}"

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dvc.config import Config
+from dvc.config import Config, ConfigError
 from dvc_objects.fs import LocalFileSystem
 from dvc_objects.fs.generic import test_links as try_links
 
 from pipeline.config import Params
-from pipeline.machine.findings import Finding, note, ok
+from pipeline.machine.findings import Finding, missing, note, ok
 
 LINKS = ("reflink", "hardlink", "symlink", "copy")
 WANTED = "dvc config cache.type reflink,hardlink,symlink,copy"
@@ -35,12 +35,18 @@ class Cache:
 
 def check_links(params: Params) -> list[Finding]:
     """DVC's cache for this working directory; params are not looked at."""
-    return check_cache(read_cache(Path.cwd()))
+    try:
+        return check_cache(read_cache(Path.cwd()))
+    except ConfigError as error:
+        return [missing("repository", f"DVC cannot read its {error}", "mend .dvc/config")]
 
 
 def links_here() -> str | None:
-    """What DVC takes in this working directory; None without DVC."""
-    cache = read_cache(Path.cwd())
+    """What DVC takes in this working directory; None without DVC, or one that it cannot read."""
+    try:
+        cache = read_cache(Path.cwd())
+    except ConfigError:
+        return None
     return None if cache is None else cache.link
 
 
@@ -51,6 +57,8 @@ def check_cache(cache: Cache | None) -> list[Finding]:
     works = ", ".join(cache.working) or "none"
     where = "same disk" if cache.same_disk else "another disk"
     said = f"{cache.folder} ({where}); works: {works}; takes: {cache.link or 'none'}"
+    if not cache.working:
+        return [note("links", f"{said}: nothing can be written there", "look at its permissions")]
     if cache.link == "copy" or cache.link is None:
         better = [name for name in LINKS[:3] if name in cache.working]
         remedy = WANTED if better else "dvc cache dir FOLDER, with a folder on this disk"

@@ -1,9 +1,8 @@
 """Which packages are installed, against the ranges that this project asks for."""
 
-import re
 import sys
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
@@ -14,15 +13,10 @@ from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
 from pipeline.config import Params
-from pipeline.machine.findings import Finding, missing, note, ok
+from pipeline.machine.findings import Finding, missing, ok
 
 PROJECT = "vla-feature-cache"
 _SHOWN = ("torch", "transformers", "peft", "zarr", "numpy", "av", "dvc")
-_OPTIONAL = {
-    "loggers": "train_head.loggers: [tensorboard, wandb]",
-    "bench": "the contenders in benchmarks/",
-    "test": "python -m pytest",
-}
 VersionOf = Callable[[str], str | None]
 
 
@@ -34,26 +28,26 @@ class Wanted:
     """Range of versions."""
     packages: Sequence[str]
     """Requirements, as in pyproject.toml."""
-    extras: Mapping[str, Sequence[str]]
+    loggers: Sequence[str]
+    """Those of the extra."""
 
 
 def check_packages(params: Params) -> list[Finding]:
-    """Python, the packages that are needed and the optional ones, as they are here."""
+    """Python, the packages that are needed and those of loggers, as they are here."""
     wanted = read_wanted(Path(__file__).parents[2] / "pyproject.toml")
     python = ".".join(map(str, sys.version_info[:3]))
     return [
         check_python(wanted.python, python),
         *check_required(wanted.packages, installed_version),
-        *check_optional(wanted.extras, params.train_head.loggers, installed_version),
+        check_loggers(wanted.loggers, params.train_head.loggers, installed_version),
     ]
 
 
 def read_wanted(pyproject: Path) -> Wanted:
     """What pyproject.toml of the checkout says: what was installed may be older than it."""
     project: dict[str, Any] = tomllib.loads(pyproject.read_text(encoding="utf-8"))["project"]
-    return Wanted(
-        project["requires-python"], project["dependencies"], project["optional-dependencies"]
-    )
+    loggers = project["optional-dependencies"]["loggers"]
+    return Wanted(project["requires-python"], project["dependencies"], loggers)
 
 
 def installed_version(name: str) -> str | None:
@@ -88,25 +82,22 @@ def check_required(packages: Sequence[str], version_of: VersionOf) -> list[Findi
     return findings
 
 
-def check_optional(
-    extras: Mapping[str, Sequence[str]], loggers: Sequence[str], version_of: VersionOf
-) -> list[Finding]:
-    """What the extras add; a logger that the params ask for is needed."""
-    findings: list[Finding] = []
-    for extra, use in _OPTIONAL.items():
-        lines = [line for line in extras.get(extra, ()) if not line.startswith(PROJECT)]
-        absent = [line for line in lines if not _fits(line, version_of(Requirement(line).name))]
-        names = [re.split(r"[<>=!~\[; ]", line)[0] for line in absent]
-        remedy = f"pip install '{PROJECT}[{extra}]', or in a checkout: pip install -e '.[{extra}]'"
-        if not absent:
-            findings.append(ok(f"[{extra}]", f"installed, for {use}"))
-        elif extra == "loggers" and (asked := sorted({*names} & {*loggers})):
-            said = f"train_head.loggers asks for {', '.join(asked)}, which is not installed"
-            findings.append(missing("[loggers]", said, remedy))
-        else:
-            said = f"optional, for {use}; not installed: {', '.join(names)}"
-            findings.append(note(f"[{extra}]", said, remedy))
-    return findings
+def check_loggers(extra: Sequence[str], loggers: Sequence[str], version_of: VersionOf) -> Finding:
+    """The packages of the extra `loggers`, of which those that the params name are needed."""
+    absent = {
+        Requirement(line).name
+        for line in extra
+        if not _fits(line, version_of(Requirement(line).name))
+    }
+    asked = sorted(absent & {*loggers})
+    remedy = f"pip install '{PROJECT}[loggers]', or in a checkout: pip install -e '.[loggers]'"
+    if asked:
+        said = f"train_head.loggers asks for {', '.join(asked)}, which is not installed"
+        return missing("loggers", said, remedy)
+    if absent:
+        said = f"{', '.join(sorted(absent))} not installed; not needed with these params"
+        return ok("loggers", said)
+    return ok("loggers", "tensorboard and wandb are there for train_head.loggers")
 
 
 def importable(name: str) -> bool:

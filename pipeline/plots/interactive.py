@@ -10,10 +10,11 @@ import numpy as np
 import plotly.graph_objects as go
 from numpy.typing import NDArray
 
+from pipeline.inspection.clocks import usual_step
 from pipeline.inspection.facts import Clock, EpisodeView
 from pipeline.inspection.store_projection import StoreProjection
 from pipeline.plots.recording.lanes import LANE_COLOURS, in_reading_order
-from pipeline.plots.recording.thinning import usual_step, worst_steps
+from pipeline.plots.recording.thinning import worst_steps
 from pipeline.plots.style import PALETTE
 
 SINGLE = 4000
@@ -92,11 +93,10 @@ def projection(found: StoreProjection, by: Literal["episode", "progress"]) -> go
             ),
         )
     )
-    for axis, share, said in zip(
-        (figure.update_xaxes, figure.update_yaxes), found.explained, ("first", "second"),
-        strict=True,
-    ):  # fmt: skip
-        axis(title=f"{said} principal component ({share:.0%} of the variance)")
+    for axis, share, number in zip(
+        (figure.update_xaxes, figure.update_yaxes), found.explained, (1, 2), strict=True
+    ):
+        axis(title=f"component {number} ({share:.0%} of the variance)")
     figure.update_layout(height=520)
     return figure
 

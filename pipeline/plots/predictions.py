@@ -87,7 +87,7 @@ def scatter(comparison: Comparison, predictions: Predictions) -> Figure:
 def horizon(comparison: Comparison, action_hz: float | None) -> Figure:
     """Mean absolute error by how far ahead an action lies, a panel an action group."""
     groups = comparison.varying_groups()
-    figure = canvas(max(4.6 * len(groups), 8.5), 4.4)
+    figure = canvas(max(4.6 * len(groups), 9.4), 4.4)
     axes = figure.subplots(1, len(groups), squeeze=False)[0]
     for axis, group in zip(axes, groups, strict=True):
         for method in METHODS:

@@ -22,12 +22,14 @@ _ABSENT, _PARTLY, _PRESENT = "#D55E00", "#E69F00", "#0072B2"
 _SIZES = 8
 _BINS = 48
 _NAMED_EPISODES = 16
+_NAME_ENDS = 6, 15
+"""Characters of a long name's begin and end that are shown."""
 
 
 def coverage(view: StoreView) -> Figure:
     """Length of each episode above, and below which streams and views its ticks see."""
     streams = list(view.episodes[0].covered)
-    figure = canvas(9.0, 3.4 + 0.3 * len(streams))
+    figure = canvas(9.0, 3.8 + 0.3 * len(streams))
     ratios = (2.2, 0.3 * len(streams) + 0.2)
     above, below = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": ratios})
     at = np.arange(len(view.episodes))
@@ -139,13 +141,21 @@ def mark_sources(axis: Axes, episodes: Sequence[EpisodeCoverage]) -> None:
     for start in starts[1:]:
         axis.axvline(start - 0.5, color=INK, lw=1.0)
     if len(episodes) <= _NAMED_EPISODES:
-        axis.set_xticks(range(len(episodes)), [one.id for one in episodes], rotation=60, ha="right")
+        one_source = len(starts) == 1
+        names = [_short(one.id if one_source else one.name) for one in episodes]
+        axis.set_xticks(range(len(episodes)), names, rotation=45, ha="right")
         return
     stops = [*starts[1:], len(episodes)]
     middle = [(start + stop - 1) / 2 for start, stop in zip(starts, stops, strict=True)]
     said = [f"{episodes[at].source}\n{stop - at}" for at, stop in zip(starts, stops, strict=True)]
     axis.set_xticks(middle, said)
     axis.set_xlabel("episodes, by source")
+
+
+def _short(name: str) -> str:
+    """Of a long name, both ends: where it belongs and what tells it from its neighbours."""
+    most = _NAME_ENDS[0] + _NAME_ENDS[1] + 1
+    return name if len(name) <= most else f"{name[: _NAME_ENDS[0]]}…{name[-_NAME_ENDS[1] :]}"
 
 
 def _begins(episodes: Sequence[EpisodeCoverage], index: int) -> bool:

@@ -26,7 +26,7 @@ _MOST_EPISODES = 200
 def norms(view: StoreView) -> Figure:
     """Length of the features: by slot on the left, by slot and episode on the right."""
     slots = len(view.norms.names)
-    figure = canvas(9.5, 2.4 + min(5.0, 0.3 * slots))
+    figure = canvas(9.5, 3.0 + min(5.0, 0.3 * slots))
     left, right = figure.subplots(1, 2, sharey=True, gridspec_kw={"width_ratios": (1, 1.7)})
     at = np.arange(slots)
     found = np.ma.masked_invalid(view.norms.norm)
@@ -101,7 +101,7 @@ def _by_episode(
     axis.grid(visible=False)
     axis.tick_params(left=False)
     mark_sources(axis, view.episodes)
-    figure.colorbar(image, ax=axis, label="median norm of the episode / of all", pad=0.02)
+    figure.colorbar(image, ax=axis, label="median / of all", pad=0.02)
 
 
 def _quantile(norm: np.ndarray, share: float) -> np.ndarray:

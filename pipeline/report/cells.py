@@ -65,6 +65,11 @@ def prose(words: str) -> Markup:
     )
 
 
+def breakable(words: str) -> Markup:
+    """Words, a path or an id, that may go on in a new line after a `/` or `_` inside it."""
+    return Markup(re.sub(r"(?<=\w)([/_])", r"\1<wbr>", str(escape(words))))
+
+
 def _column(head: str, values: Sequence[Any]) -> Column:
     numeric = any(_is_number(value) for value in values) and all(
         value is None or _is_number(value) for value in values

@@ -1,26 +1,28 @@
 """A plotly figure -> JSON for the page's script, which draws it in the page's own ink."""
 
+import base64
+import gzip
 import json
+import re
 from typing import Any
 
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
-from pipeline.plots.style import GRID, INK
-
-INK_NAME, GRID_NAME = "@ink", "@grid"
-"""What the script replaces with the page's colours whenever light and dark change."""
+from pipeline.report.svg import COLOURS
 
 
 def plotly_script() -> Markup:
-    """The whole of plotly.js, for a `<script>` element."""
-    return Markup(get_plotlyjs())
+    """The whole of plotly.js as base64 of gzip, which `charts.js` unpacks."""
+    # Without its time the same script is the same bytes.
+    return Markup(base64.b64encode(gzip.compress(get_plotlyjs().encode(), mtime=0)).decode())
 
 
 def chart_json(figure: Any) -> Markup:
     """Data and layout of a `plotly.graph_objects.Figure`, fit to stand in a `<script>` element.
 
-    The same figure gives the same bytes.
+    The same figure gives the same bytes. `"@ink"` and the like are the page's own colours, which
+    the script puts in whenever light and dark change.
     """
     document = json.loads(figure.to_json())
     kept = {
@@ -29,8 +31,7 @@ def chart_json(figure: Any) -> Markup:
         "layout": {key: value for key, value in document["layout"].items() if key != "template"},
     }
     text = json.dumps(kept, ensure_ascii=False, sort_keys=True, separators=(",", ":"))
-    for colour, name in ((INK, INK_NAME), ("#000000", INK_NAME), (GRID, GRID_NAME)):
-        for spelling in {colour.lower(), colour.upper()}:
-            text = text.replace(f'"{spelling}"', f'"{name}"')
+    for colour, name in COLOURS.items():
+        text = re.sub(f'"{colour}"', f'"@{name}"', text, flags=re.IGNORECASE)
     # Nothing in a <script> may look like its end or like a comment.
     return Markup(text.replace("<", "\\u003c"))

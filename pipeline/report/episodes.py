@@ -1,10 +1,11 @@
 """The held-out episodes on the page of an evaluation."""
 
 from collections.abc import Iterator
-from functools import partial
+from functools import cache, partial
 
 from pipeline import plots
 from pipeline.batches import Ticks
+from pipeline.digests import file_digest
 from pipeline.evaluation import HEADINGS, Judgement, Predictions, best_baseline, episode_name
 from pipeline.evaluation.footage import footage, shown_ticks
 from pipeline.report.blocks import Block, Picture, Section, Table, Text
@@ -51,15 +52,20 @@ def episodes(found: Judgement) -> list[Block]:
 
 
 def extremes(found: Judgement) -> Iterator[Section]:
-    """The best and the worst closely, with their frames where the recordings still lie there."""
+    """The best and the worst closely, with their frames where the recordings still lie there.
+
+    The picture of a single one is that of the worst, which dvc.yaml lists.
+    """
     comparison, predictions, store = found.comparison, found.predictions, found.store
     errors = dict(zip(comparison.episodes, comparison.overall_by_episode("policy"), strict=True))
-    names = ("episode_best", "episode_worst")
-    for name, (title, index) in zip(names, comparison.extremes(), strict=False):
+    digest_of = cache(file_digest)  # episodes of a LeRobot data set share files
+    *_, (_, worst) = comparison.extremes()
+    for title, index in comparison.extremes():
+        name = "episode_worst" if index == worst else "episode_best"
         episode = store.episodes[index]
         ticks = shown_ticks(store, _whole(predictions, index), _INSTANTS)
         rows = store.array("tick/vl_row")[ticks]
-        seen = footage(store, episode, rows.tolist(), found.recordings)
+        seen = footage(store, episode, rows.tolist(), found.recordings, digest_of)
         drawn = partial(plots.chunks, comparison, predictions, store, episode, ticks, seen.frames)
         told = f"Overall error {errors[index]:.3f} [training std]. {seen.absence}".strip()
         caption = (

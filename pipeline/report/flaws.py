@@ -39,11 +39,16 @@ def _notice(group: Sequence[Flaw], zeros: Mapping[tuple[str, str], float], sever
     if len(group) > PLACES:
         places += f"; and {len(group) - PLACES} more"
     stream = "" if first.stream == "episode" else first.stream
-    count = "" if len(group) == 1 else f"{len(group)} places in {episodes} episode(s)"
+    count = "" if len(group) == 1 else _count(len(group), episodes)
     where = " · ".join(part for part in (stream, count, places) if part)
     if len(group) == 1:
         return Notice(first.severity, first.kind, where, first.message)
     return Notice(first.severity, first.kind, where, f"The first: {first.message}")
+
+
+def _count(places: int, episodes: int) -> str:
+    among = "1 episode" if episodes == 1 else f"{episodes:,} episodes"
+    return among if places == episodes else f"{places:,} places in {among}"
 
 
 def _place(flaw: Flaw, zeros: Mapping[tuple[str, str], float], several: bool) -> str:

@@ -15,7 +15,6 @@ from typing import Any
 import matplotlib as mpl
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
-from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from pipeline.durable import disk_full_named, sync
@@ -32,7 +31,7 @@ from pipeline.report.blocks import (
     Text,
     Tokens,
 )
-from pipeline.report.cells import columns_of, prose
+from pipeline.report.cells import breakable, columns_of, prose
 from pipeline.report.charts import chart_json, plotly_script
 from pipeline.report.svg import inline_svg
 
@@ -59,7 +58,9 @@ def write_report(folder: Path, report: Report) -> list[Path]:
     with disk_full_named(folder):
         temporary.mkdir()
         try:
-            (temporary / PAGE).write_text(_Page(report, temporary, names).html(), encoding="utf-8")
+            page = _Page(report, temporary, names).html()
+            # A file's name need not be text: what is none is shown as \udcXX.
+            (temporary / PAGE).write_text(page, encoding="utf-8", errors="backslashreplace")
             return _put_in_place(temporary, folder, names)
         finally:
             shutil.rmtree(temporary)
@@ -119,7 +120,7 @@ class _Page:
             trim_blocks=True,
             lstrip_blocks=True,
         )
-        self._jinja.filters["prose"] = prose
+        self._jinja.filters |= {"prose": prose, "breakable": breakable}
         self._blocks: Any = self._jinja.get_template("blocks.html").module
         self._templates = Path(__file__).parent / "templates"
         self._report, self._pictures, self._names = report, pictures, names
@@ -187,15 +188,10 @@ class _Page:
 
     def _draw(self, picture: Picture) -> Markup:
         """The picture as SVG; its PNG is written on the way, from the same figure."""
-        drawn: list[Figure] = []
-
-        def draw() -> Figure:
-            drawn.append(picture.draw())
-            return drawn[0]
-
-        write(self._pictures, {f"{picture.name}.png": draw})
         with mpl.rc_context(RC):
-            svg = inline_svg(drawn[0], picture.name, picture.caption)
+            figure = picture.draw()
+            write(self._pictures, {f"{picture.name}.png": lambda: figure})
+            svg = inline_svg(figure, picture.name, picture.caption)
         self._bar.update()
         return Markup(svg)
 
@@ -208,12 +204,21 @@ def document_lines(content: Mapping[str, Any], depth: int = 0) -> list[tuple[int
     return lines
 
 
+def _item(depth: int, value: Any) -> list[tuple[int, str, str]]:
+    """An entry of a list: a flat mapping in one line."""
+    if not isinstance(value, Mapping):
+        return _entry(depth, "-", value)
+    lines = document_lines(value)
+    if any(inner for inner, _, _ in lines):
+        return _entry(depth, "-", value)
+    return [(depth, "-", ", ".join(f"{key}: {said}" for _, key, said in lines))]
+
+
 def _entry(depth: int, key: str, value: Any) -> list[tuple[int, str, str]]:
     if isinstance(value, Mapping) and value:
         return [(depth, key, ""), *document_lines(value, depth + 1)]
     if isinstance(value, list | tuple) and any(isinstance(one, Mapping | list) for one in value):
-        inside = [line for one in value for line in _entry(depth + 1, "-", one)]
-        return [(depth, key, ""), *inside]
+        return [(depth, key, ""), *(line for one in value for line in _item(depth + 1, one))]
     if isinstance(value, str) and value.isprintable() and value == value.strip() != "":
         return [(depth, key, value)]
     return [(depth, key, json.dumps(value, ensure_ascii=False, default=str))]

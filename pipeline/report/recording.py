@@ -1,6 +1,6 @@
 """Recordings -> their page: all in a table, what looks wrong, some of them in every detail."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache, partial
 
 from pipeline.config import Params
@@ -41,6 +41,7 @@ def recordings_report(opened: Opened, params: Params, name: str) -> Report:
                 overview.flaws_of(overview.summaries[index]),
                 params.inspect,
                 several,
+                len(overview.summaries) == 1,
             )
             for number_of_section, index in enumerate(chosen, start=1)
         ),
@@ -56,9 +57,10 @@ def zeros(overview: RecordingsOverview) -> dict[tuple[str, str], float]:
 
 def _notices(overview: RecordingsOverview) -> Notices:
     count = len(overview.summaries)
+    whole = "the episode was" if count == 1 else f"all {count:,} episodes were"
     return Notices(
         notices(overview.flaws, zeros(overview)),
-        f"Nothing looks wrong: all {count} episode(s) were read and every check passed.",
+        f"Nothing looks wrong: {whole} read and every check passed.",
     )
 
 
@@ -100,12 +102,12 @@ def _episodes(
     )
     shown = sorted({*chosen, *wanted[:ROWS]})
     heads = [
-        *(["source"] if several else []), "episode", "format", "length [s]", "ticks", "VL rows",
-        "frames", "sensor readings", "states", "errors", "warnings", "instruction",
+        *(["source"] if several else []), "episode", "errors", "warnings", "length [s]", "ticks",
+        "VL rows", "frames", "readings", "states", "format", "instruction",
     ]  # fmt: skip
     rows = [_line(summaries[index], several) for index in shown]
     strong = frozenset(row for row, index in enumerate(shown) if index in chosen)
-    said = "Those in bold are shown in detail below."
+    said = "Those in bold are shown in detail below. Readings are the sensor's."
     blocks: list[Block] = [Table(heads, rows, said, strong)]
     if len(shown) < len(summaries):
         blocks.append(
@@ -118,13 +120,19 @@ def _episodes(
 
 
 def _line(one: EpisodeSummary, several: bool) -> list[object]:
-    # Unbroken between a view and its count.
-    frames = ", ".join(f"{view}\u00a0{count:,}" for view, count in one.frames.items())
     return [
-        *([one.source] if several else []), one.episode, one.format, one.duration_s, one.ticks,
-        one.vl_rows, frames or "none", one.readings, one.states, one.errors, one.warnings,
+        *([one.source] if several else []), one.episode, one.errors, one.warnings, one.duration_s,
+        one.ticks, one.vl_rows, _frames(one.frames), one.readings, one.states, one.format,
         one.instruction,
     ]  # fmt: skip
+
+
+def _frames(counts: Mapping[str, int]) -> str:
+    """`3 × 76` where three views have as many, else the count of each."""
+    if len(set(counts.values())) == 1:
+        return f"{len(counts)} × {next(iter(counts.values())):,}"
+    # Unbroken between a view and its count.
+    return ", ".join(f"{view}\u00a0{count:,}" for view, count in counts.items()) or "none"
 
 
 def _clean_first(overview: RecordingsOverview, chosen: Sequence[int]) -> int:

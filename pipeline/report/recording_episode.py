@@ -19,6 +19,7 @@ from pipeline.report.blocks import Block, Chart, Notices, Picture, Section, Tabl
 from pipeline.report.flaws import notices
 from pipeline.report.statistics_table import statistics_table
 
+NOTHING_WRONG = "Nothing looks wrong in this episode."
 Viewer = Callable[[int], EpisodeView]
 """Reads a recording by its place, or hands out the one that was read last."""
 
@@ -30,8 +31,12 @@ def episode_section(
     flaws: Sequence[Flaw],
     wanted: InspectParams,
     several: bool,
+    alone: bool,
 ) -> Section:
-    """Everything of one episode; `place` counts the sections and begins its pictures' names."""
+    """Everything of one episode; `place` counts the sections and begins its pictures' names.
+
+    `several` sources name the episode's own; of an episode `alone` the page has said what is wrong.
+    """
     view = view_of()
     stem = f"episode{place}-{_plain(summary.episode)}"
     draw = partial(_picture, stem, view_of)
@@ -41,7 +46,7 @@ def episode_section(
         title,
         [
             Text(f"`{summary.path}`, format {summary.format}: “{summary.instruction or '–'}”"),
-            Notices(notices(flaws, zero), "Nothing looks wrong in this episode."),
+            *([] if alone else [Notices(notices(flaws, zero), NOTHING_WRONG)]),
         ],
         [
             Section("Camera views", _views(view, draw, wanted.ticks, flaws)),

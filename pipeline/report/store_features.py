@@ -7,6 +7,7 @@ from typing import Literal
 from pipeline.inspection.store import StoreView, Twins
 from pipeline.plots import interactive
 from pipeline.plots import store_features as pictures
+from pipeline.plots.style import PALETTE
 from pipeline.report.blocks import Block, Chart, Picture, Table, Text
 
 _TWINS = 20
@@ -14,30 +15,37 @@ _TWINS = 20
 
 def features(view: StoreView) -> list[Block]:
     """Norms and the projection."""
-    looked = f"{len(view.sampled.rows):,} of {view.sampled.total:,} VL rows"
+    looked = f"{len(view.sampled.rows):,} of {view.sampled.total:,} VL rows, the same moments of "
+    looked += "each episode (`inspect.points`)"
     rows = "all VL rows" if len(view.sampled.rows) == view.sampled.total else looked
     variants = ", plain frames only" if view.variants > 1 else ""
+    beside = " and has a second picture by source" if len(view.sources) > 1 else ""
     planes: list[tuple[Literal["episode", "progress"], str]] = [
-        ("episode", "the rows of an episode are joined in order of time."),
-        ("progress", "coloured by how far its episode had come."),
+        (
+            "episode",
+            f"its colour is its episode's, the same after every {len(PALETTE)}. The PNG joins the "
+            f"rows of each in order of time{beside}.",
+        ),
+        ("progress", "its colour is how far its episode had come."),
     ]
     return [
-        Text(f"Of {rows}{variants}, evenly spread (`inspect.points`)."),
+        Text(f"Of {rows}{variants}."),
         Picture(
             "norms",
             "Left: how long the features of each slot are. Right: their median length in each "
-            "episode beside that in all; a column that stands out is an episode unlike the others.",
+            "episode divided by that in all; a column that stands out is an episode unlike others.",
             partial(pictures.norms, view),
         ),
         Text(
             "Below, the first two principal components of all slots side by side, each less its "
-            "mean, none scaled: near dots look alike to the model."
+            "mean, none scaled. Dots that lie apart look different to the model; dots that lie "
+            "together may differ in the share of the variance that the axes do not hold."
         ),
         *(
             Chart(
                 Picture(
                     f"projection_{by}",
-                    f"Features in a plane, by {by}: a dot is a VL row; {said}",
+                    f"Features in a plane: a dot is a VL row, {said}",
                     partial(pictures.projection, view, by),
                 ),
                 interactive.projection(view.projection, by),
@@ -56,10 +64,10 @@ def duplicates(view: StoreView) -> list[Block]:
             f"Near-duplicates are VL rows whose features, less their mean over the store, have a "
             f"cosine similarity of at least {found.threshold:g} "
             f"(`inspect.duplicate_similarity`): {found.within:,} of {looked:,} have one in their "
-            f"own episode, where the scene stands still for {found.still_count:,} stretches; "
-            f"{found.across:,} have one in another episode. By their keys, {found.equal_rows:,} of "
-            f"{view.sampled.total:,} have exactly the frames and prompt of another row; "
-            f"{found.equal_twins_count:,} pairs of episodes share such rows."
+            f"own episode, {found.across:,} in another; the scene stands still for "
+            f"{found.still_count:,} stretches. By their keys, {found.equal_rows:,} of "
+            f"{view.sampled.total:,} have exactly the frames and prompt of another row; pairs of "
+            f"episodes with such rows: {found.equal_twins_count:,}."
         )
     ]
     if len(found.episodes) > 1:
@@ -71,7 +79,7 @@ def duplicates(view: StoreView) -> list[Block]:
     if found.still:
         rows = [(one.episode, one.start_s, one.stop_s, one.rows) for one in found.still[:_TWINS]]
         said = f"Where the scene stands still: {_of(len(rows), found.still_count)}."
-        blocks.append(Table(("episode", "from [s]", "to [s]", "VL rows"), rows, said))
+        blocks.append(Table(("episode", "from [s]", "to [s]", "rows looked at"), rows, said))
     return blocks
 
 

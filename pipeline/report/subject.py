@@ -48,15 +48,16 @@ def subject_of(params: Params) -> Subject:
     """What `inspect.path` names, else the recordings of `data.sources`.
 
     A store is known by its content or its name. Raises `ConfigError` for a path that is not there
-    or is a file, and for a store beside something else.
+    or is a file, for a store beside something else, and for an output that cannot be written to.
     """
     wanted = params.inspect
     places = (wanted.path,) if isinstance(wanted.path, str) else wanted.path or ()
+    _check_output(wanted.output)
     if not places:
         said = ", ".join(source.name for source in params.data.sources)
         return Subject(said, wanted.output, None, params.data.sources, params.data.root)
     for place in places:
-        _check(place)
+        _check(place, params.data.root)
     name = " ".join(places)
     found = [Path(match) for place in places for match in _matches(place)]
     stores = [path for path in found if _is_store(path)]
@@ -70,13 +71,13 @@ def subject_of(params: Params) -> Subject:
     return Subject(name, _folder(wanted, places), store, (source,), Path())
 
 
-def _check(place: str) -> None:
+def _check(place: str, root: Path) -> None:
     """Raise `ConfigError` for what is there and no folder, and for what is not there."""
     path = Path(place)
     if path.is_dir() or glob.has_magic(place):
         return
     if not path.exists():
-        raise ConfigError(f"inspect.path: {path} is not there.{_meant(path)}")
+        raise ConfigError(f"inspect.path: {path} is not there. {_meant(path, root)}")
     if path.suffix.lower() in ARCHIVES:
         raise ConfigError(
             f"inspect.path: expected a folder, found the packed file {path}. Unpack it, then look "
@@ -84,18 +85,38 @@ def _check(place: str) -> None:
         )
     raise ConfigError(
         "inspect.path: expected a folder of recordings or a store, found the file "
-        f"{path}. Name the folder of the whole recording, such as {path.parent}"
+        f"{path}. Name the folder of the whole recording: of LeRobot's, the one that holds meta/"
     )
 
 
-def _meant(path: Path) -> str:
-    """What is there instead."""
+def _check_output(folder: Path) -> None:
+    """Raise `ConfigError` now for what would stop the page once everything has been read."""
+    places = [folder.absolute(), *folder.absolute().parents]
+    there = next(place for place in places if place.exists())
+    store = next(filter(_is_store, places), None)
+    if not there.is_dir():
+        wrong = f"expected a folder, found the file {there}"
+    elif store is not None:
+        wrong = f"{folder} lies in the store {store}, where nothing else may be"
+    elif not os.access(there, os.W_OK | os.X_OK):
+        wrong = f"{there} cannot be written to"
+    else:
+        return
+    raise ConfigError(f"inspect.output: {wrong}. Name another: --set inspect.output=FOLDER")
+
+
+def _meant(path: Path, root: Path) -> str:
+    """What is there instead: below `data.root`, of nearly that name, or in the same folder."""
+    if (root / path).exists():
+        return f"It is under data.root: python -m stages.inspect '{root / path}'"
     parent = next(folder for folder in path.absolute().parents if folder.is_dir())
     below = path.absolute().relative_to(parent).parts[0]
     names = sorted(name for name in os.listdir(parent) if not name.startswith("."))
-    meant = get_close_matches(below, names, n=3) or names[:8]
-    there = f"has {', '.join(meant)}" if meant else "is empty"
-    return f" {os.path.relpath(parent)} {there}{' …' if len(names) > len(meant) else ''}"
+    close = get_close_matches(below, names, n=3)
+    if close:
+        return f"Did you mean {' or '.join(str(parent / name) for name in close)}?"
+    listed = ", ".join(names[:8]) + (" …" if len(names) > 8 else "")
+    return f"In {parent} there is {listed or 'nothing'}"
 
 
 def _matches(place: str) -> list[str]:
@@ -122,7 +143,7 @@ def _folder(wanted: InspectParams, places: Sequence[str]) -> Path:
     # A path elsewhere is named by its last parts: all of it would be no name.
     parts = Path(first).parts if not first.startswith("..") else Path(places[0]).absolute().parts
     words = "_".join(parts[-3:]).replace("*", "any")
-    name = re.sub(r"[^A-Za-z0-9.-]+", "_", words).strip("_.")
+    name = re.sub(r"[^\w.-]+", "_", words).strip("_.")
     more = f"_and_{len(places) - 1}_more" if len(places) > 1 else ""
     return wanted.output / f"{name or 'here'}{more}"
 

@@ -9,7 +9,7 @@ from markupsafe import escape
 from matplotlib.figure import Figure
 from PIL import Image
 
-from pipeline.plots.style import GRID, INK
+from pipeline.plots.style import GRID, INK, PALETTE
 
 RASTER_DPI = 144
 """Of what is drawn as points of an image inside the SVG."""
@@ -17,8 +17,8 @@ POINT_PX = 96 / 72
 PHOTO_BYTES, PHOTO_RATIO, PHOTO_QUALITY = 2**15, 3, 88
 """An image of at least so many bytes that JPEG makes so many times smaller is a photograph."""
 FONTS = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Noto Sans', sans-serif"
-COLOURS = {INK: "currentColor", "#000000": "currentColor", GRID: "var(--grid)"}
-"""Colours of a picture that follow the page's light or dark."""
+COLOURS = {INK: "ink", "#000000": "ink", GRID: "grid", PALETTE[0]: "blue"}
+"""Colours of a picture that follow the page's light or dark, by their names in its style."""
 
 
 def inline_svg(figure: Figure, name: str, label: str) -> str:
@@ -62,8 +62,8 @@ def _body(body: str, name: str) -> str:
     body = re.sub(r'(?<=href="#)', f"{name}-", body)
     body = re.sub(r"(?<=url\(#)", f"{name}-", body)
     body = re.sub(r"'DejaVu Sans'[^;\"]*", FONTS, body)
-    for colour, instead in COLOURS.items():
-        body = re.sub(rf"{colour}(?![0-9a-f])", instead, body, flags=re.IGNORECASE)
+    for colour, name in COLOURS.items():
+        body = re.sub(rf"{colour}(?![0-9a-f])", f"var(--{name})", body, flags=re.IGNORECASE)
     return re.sub(r"data:image/png;base64,([^\"]+)", _smaller, body)
 
 

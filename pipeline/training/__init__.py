@@ -4,6 +4,7 @@ Resumable at every checkpoint; on one process, or on several that torchrun start
 """
 
 from pipeline.training.front import Cached, Front
+from pipeline.training.loggers import check_loggers
 from pipeline.training.loop import Trainer
 from pipeline.training.run import Run, open_run
 from pipeline.training.statistics import fit_normalization
@@ -15,6 +16,7 @@ __all__ = [
     "Run",
     "Trainer",
     "World",
+    "check_loggers",
     "fit_normalization",
     "open_run",
     "process_group",

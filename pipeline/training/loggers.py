@@ -1,11 +1,11 @@
 """Who shows a run's curves while it goes: each is handed the same rows.
 
-TensorBoard's and Weights & Biases' files carry the clock, so they lie beside the logs, which DVC
-hashes, not in them.
+TensorBoard's and Weights & Biases' files carry the clock, and dvclive's report is never twice the
+same, so they lie beside the logs, which DVC hashes, not in them.
 """
 
 from collections.abc import Mapping
-from importlib.util import find_spec
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 from uuid import uuid4
@@ -14,10 +14,15 @@ from dvclive import Live
 
 from pipeline.config import TrainHeadParams
 from pipeline.errors import ConfigError
-from pipeline.training.live_page import LivePage
+from pipeline.training.live_page import LivePage, Turns
 
 FINISH_TIMEOUT_S = 120.0
 """How long a finished run waits for Weights & Biases to take what it has not sent yet."""
+
+
+_MODULES = {"tensorboard": "torch.utils.tensorboard", "wandb": "wandb.sdk"}
+"""What is imported of a logger's package: a folder `wandb`, as that leaves where it runs, has none
+of it."""
 
 
 class Logger(Protocol):
@@ -38,35 +43,57 @@ class Logger(Protocol):
 
 
 class DVCCurves:
-    """Curves in `<folder>/plots/metrics/*.tsv`, their newest values in `<folder>/metrics.json`."""
+    """Curves in `<folder>/plots/metrics/*.tsv`, their newest values in `<folder>/metrics.json`.
 
-    note = ""
+    With `report`, dvclive draws them there too, on a page that fetches its drawing library from the
+    network and never stops looking again.
+    """
 
-    def __init__(self, folder: Path) -> None:
-        self._live = _Live(str(folder), resume=False, dvcyaml=None, save_dvc_exp=False)
+    def __init__(self, folder: Path, report: Path | None = None) -> None:
+        self.note = "" if report is None else f"live: open {report} in a browser with a network"
+        self._live, self._turns = _Live(folder, report), Turns()
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
-        """Add a line to each file."""
+        """Add a line to each file; draw the report if it is due."""
         self._live.step = step
         for name, value in metrics.items():
             self._live.log_metric(name, value)
         self._live.make_summary()
+        self._turns.take(self._live.make_report)
 
     def close(self, finished: bool) -> None:
-        """Write the summary a last time."""
+        """Write the summary and the report a last time."""
         self._live.end()
 
 
 class _Live(Live):
-    """dvclive's files without its repository.
+    """dvclive's files without its repository, and its report where it is told.
 
     On start dvclive looks for git and DVC around the working directory: it fails in a repository
     without a commit and runs `dvc init` in one that does not use DVC. All of that serves
     experiments (`save_dvc_exp`), which DVC itself makes here, from the outputs in dvc.yaml.
     """
 
+    def __init__(self, folder: Path, report: Path | None) -> None:
+        self._report_path = report
+        super().__init__(
+            str(folder),
+            report=None if report is None else "html",
+            dvcyaml=None,
+            save_dvc_exp=False,
+        )
+
+    @property
+    def report_file(self) -> str | None:
+        """Outside of the folder: its curves stand in it in the order of the file system."""
+        return None if self._report_path is None else str(self._report_path)
+
     def _init_dvc(self) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         self._dvc_file = "dvc.yaml"
+
+    def _init_resume(self) -> None:
+        # DVCLIVE_RESUME=true asks for it, but the rows of before are written again.
+        self._init_cleanup()
 
 
 class TensorBoard:
@@ -148,13 +175,14 @@ class WandB:
 
 
 def check_loggers(params: TrainHeadParams) -> None:
-    """Raise `ConfigError` where a logger's package is not installed."""
-    missing = [name for name in params.loggers if name != "report" and not _installed(name)]
-    if missing:
+    """Raise `ConfigError` where a logger's package is not installed or does not load."""
+    troubles = [f"{name} ({why})" for name in params.loggers if (why := _trouble(name))]
+    if troubles:
         raise ConfigError(
-            f"train_head.loggers: expected the package of each logger, {', '.join(missing)} is not "
-            "installed. Run pip install 'vla-feature-cache[loggers]', or set "
-            "train_head.loggers=[report]."
+            "train_head.loggers: expected the package of each logger, cannot load "
+            f"{', '.join(troubles)}. "
+            "Run pip install 'vla-feature-cache[loggers]', in a checkout "
+            "pip install -e '.[loggers]', or set train_head.loggers=[report]."
         )
 
 
@@ -162,7 +190,8 @@ def open_loggers(params: TrainHeadParams, resumed: bool) -> list[Logger]:
     """The curves for DVC and the loggers of `params`. Raises `ConfigError`."""
     logs, chosen = params.logs, params.loggers
     logs.mkdir(parents=True, exist_ok=True)
-    found: list[Logger] = [DVCCurves(logs)]
+    report = beside(logs, "dvclive.html") if "dvclive" in chosen else None
+    found: list[Logger] = [DVCCurves(logs, report)]
     if "report" in chosen:
         title = f"{params.output}: {params.model_type}, {params.fusion_strategy}"
         found.append(LivePage(logs, title, params.max_steps))
@@ -178,10 +207,15 @@ def beside(logs: Path, name: str) -> Path:
     return logs.with_name(f"{logs.name}.{name}")
 
 
-def _installed(name: str) -> bool:
-    """Whether there is such a package; a folder `wandb`, as that leaves where it runs, is none."""
-    spec = find_spec(name)
-    return spec is not None and spec.origin is not None
+def _trouble(name: str) -> str:
+    """Why a logger's package cannot be used; "" where it can."""
+    if name not in _MODULES:
+        return ""
+    try:
+        import_module(_MODULES[name])
+    except ImportError as error:
+        return str(error)
+    return ""
 
 
 def _run_id(path: Path, resumed: bool) -> str:

@@ -22,7 +22,6 @@ from pipeline.training.interrupt import deferred_interrupt
 from pipeline.training.judging import Standing, held_out_error, judged_ticks
 from pipeline.training.learner import Learner
 from pipeline.training.log import Row, TrainingLog, open_log
-from pipeline.training.loggers import check_loggers
 from pipeline.training.optimizer import schedule
 from pipeline.training.plan import Plan
 from pipeline.training.run import Run
@@ -53,7 +52,6 @@ class Trainer:
         run: Run,
         front: Front | None = None,
     ) -> None:
-        check_loggers(params)
         self.store, self.params, self.split, self.run = store, params, split, run
         self.world = World.current()
         self.device = process_device(params.device)

@@ -43,7 +43,8 @@ def test_the_site_knows_every_colour_of_the_figures(machinery):
 class TestParamsPage:
     @pytest.fixture
     def page(self, machinery) -> str:
-        return machinery("params_page").params_page()
+        kept = (ROOT / "docs" / "params.md").read_text(encoding="utf-8")
+        return machinery("params_page").params_page(kept)
 
     def test_has_every_key_that_the_commands_list(self, page):
         from pipeline.config import Params
@@ -63,6 +64,10 @@ class TestParamsPage:
         assert "Decoder layers whose output is taken" in entry
         assert "`train_head.val_fraction`{ #train_head.val_fraction } number, from 0 to 1;" in page
         assert "`data.sources[].name`{ #data.sources.name } text, not empty; **has to" in page
+
+    def test_lists_them_in_place_of_what_the_file_says_instead(self, page):
+        assert page.startswith("# Parameters\n")
+        assert "mkdocs serve" not in page
 
     def test_refuses_what_it_has_no_words_for(self, machinery):
         with pytest.raises(KeyError):

@@ -19,7 +19,7 @@ PAGES = [
     ROOT / "CONTRIBUTING.md",
     ROOT / "cache_store" / "README.md",
 ]
-WRITTEN_AT_BUILD = re.compile(r"(^|/)docs/(params|reference/\w+)\.md$")
+WRITTEN_AT_BUILD = re.compile(r"(^|/)docs/reference/\w+\.md$")
 EXCUSED = re.compile(
     r"<!-- no-check: [^>]*-->\s*\n(?:```.*?^```$|.*?(?=\n\n|\Z))", re.DOTALL | re.MULTILINE
 )

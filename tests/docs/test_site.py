@@ -43,8 +43,9 @@ def test_every_link_and_anchor_is_there(site):
     assert not lost
 
 
-@pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
-@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize(
+    ("size", "scheme"), [(DESKTOP, "light"), (PHONE, "dark")], ids=["desktop", "phone"]
+)
 def test_pages_load_alone_and_fit_the_screen(site, browser, size, scheme):
     context = browser.new_context(
         viewport={"width": size[0], "height": size[1]}, color_scheme=scheme

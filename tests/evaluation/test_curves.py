@@ -1,10 +1,20 @@
 """What a training logged is read back; what is gone or torn is said."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from pipeline.evaluation import read_curves
+from pipeline.config import TrainHeadParams
+from pipeline.evaluation import Curves
+from pipeline.evaluation import read_curves as curves_of
+
+
+def read_curves(logs: Path, step: int = 20, **metrics: float) -> Curves:
+    """Of a checkpoint of that step, with this error where one is given."""
+    named = {name.replace("_", "/"): value for name, value in metrics.items()}
+    checkpoint = SimpleNamespace(params=TrainHeadParams(logs=logs), step=step, metrics=named)
+    return curves_of(checkpoint)  # type: ignore[arg-type]
 
 
 def written(logs: Path, name: str, text: str) -> None:
@@ -18,7 +28,7 @@ def test_every_curve_is_read_under_its_name(tmp_path: Path) -> None:
     written(tmp_path, "train/loss", "step\tloss\n10\t0.5\n20\t0.25\n")
     written(tmp_path, "val/error", "step\terror\n20\t9e-1\n")
     written(tmp_path, "lr", "step\tlr\n")
-    found = read_curves(tmp_path)
+    found = read_curves(tmp_path, val_error=0.9)
     assert found.absence == ""
     assert {name: curve.step.tolist() for name, curve in found.curves.items()} == {
         "train/loss": [10, 20],
@@ -32,6 +42,24 @@ def test_logs_that_are_gone_are_said(tmp_path: Path) -> None:
     found = read_curves(tmp_path / "logs")
     assert found.curves == {}
     assert str(tmp_path / "logs") in found.absence
+
+
+def test_logs_without_a_point_are_said(tmp_path: Path) -> None:
+    written(tmp_path, "lr", "step\tlr\n")
+    assert "there are none" in read_curves(tmp_path).absence
+
+
+def test_curves_of_another_training_are_not_shown(tmp_path: Path) -> None:
+    written(tmp_path, "val/error", "step\terror\n10\t0.5\n20\t0.25\n")
+    assert read_curves(tmp_path, 10, val_error=0.5).curves
+    assert read_curves(tmp_path, 10).curves, "a last checkpoint has no error of its own"
+    for other in (
+        read_curves(tmp_path, 30),
+        read_curves(tmp_path, 15, val_error=0.5),
+        read_curves(tmp_path, 20, val_error=0.5),
+    ):
+        assert other.curves == {}
+        assert "are of another training" in other.absence
 
 
 @pytest.mark.parametrize("content", ["step\tloss\n10\n", "step\tloss\n10\tmuch\n", "x\ty\n1\t2\n"])

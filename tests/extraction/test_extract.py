@@ -199,6 +199,14 @@ class TestWhatItTakesOver:
         report, said = run(params)
         assert report.computed == 0, "its frames did not change"
         assert any("1 episode(s) are new or their files changed" in line for line in said)
+        assert any("1 episode(s) of the store are gone or changed" in line for line in said)
+
+    def test_another_reuse_count_is_no_lost_episode(self, params):
+        run(params)
+        other = params.data.model_copy(update={"vlm_reuse_count": 2})
+        _, said = run(params.model_copy(update={"data": other}))
+        assert any("have another instruction" in line for line in said)
+        assert not any("gone or changed" in line for line in said)
 
     def test_a_lost_ledger_costs_nothing_but_reading(self, params, no_model_later):
         run(params)

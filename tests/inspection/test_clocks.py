@@ -46,6 +46,19 @@ def test_stamps_in_bursts_are_no_gaps() -> None:
     assert gap.start_s == late[499]
 
 
+def test_whole_packets_with_one_stamp_have_a_rate() -> None:
+    time = np.repeat(np.arange(100) / 10, 65)
+    assert usual_step(time) == pytest.approx(1 / 650, rel=0.02)
+    assert gaps(time) == ()
+    (gap,) = gaps(np.delete(time, np.s_[650:975]))
+    assert gap.stop_s - gap.start_s == pytest.approx(0.6)
+
+
+def test_a_clock_that_only_repeats_has_no_gap() -> None:
+    assert usual_step(np.zeros(50)) == 0
+    assert gaps(np.zeros(50)) == ()
+
+
 def test_short_clocks_have_no_rate() -> None:
     assert np.isnan(usual_step(np.array([3.0])))
     assert gaps(np.array([3.0, 9.0])) == ()

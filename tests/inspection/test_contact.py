@@ -97,3 +97,8 @@ def test_every_format_of_an_episode_has_the_same_contact(healthy: Path, look) ->
         ends.append(view.sensor.time[-1] - last.start_s)
         assert last.stop_s == view.sensor.time[-1]
     assert ends == pytest.approx([ends[0]] * 3, abs=0.05)
+
+
+def test_a_clock_that_only_repeats_has_no_contact_and_no_error(base: EpisodeView) -> None:
+    standing = view_of(base, np.full(100, 5.0), np.zeros(100))
+    assert contacts(standing) == ()

@@ -30,6 +30,12 @@ def many(healthy: Path, tmp_path: Path) -> Path:
     return tmp_path / "many"
 
 
+def test_formats_of_one_source_need_not_have_the_same_streams(healthy: Path) -> None:
+    paths = tuple(str(healthy / name) for name in ("raw", "new", "old", "lerobot"))
+    # Only the LeRobot episode has no poses beside its actions.
+    assert survey(Source(name="s", path=paths)).flaws == ()
+
+
 def test_healthy_recordings_of_every_format(healthy: Path) -> None:
     names = ("raw", "new", "old")
     found = survey(*(Source(name=name, path=str(healthy / name)) for name in names))

@@ -17,6 +17,7 @@ from pipeline.inspection.store_features import look_at_features, read_slot, samp
 from pipeline.inspection.store_flaws import KINDS
 from pipeline.inspection.store_statistics import stream_statistics
 from pipeline.store import FeatureStore
+from pipeline.store.metadata import note_metadata
 
 ROWS = 10
 """VL rows of each of the six episodes of a tiny store."""
@@ -27,8 +28,19 @@ def path(tiny_store, tmp_path) -> Path:
     return tiny_store(tmp_path)
 
 
-def plant(path: Path, name: str, change: Callable[[np.ndarray], Any]) -> None:
-    """Change an array of a finished store in its only chunk file."""
+@pytest.fixture
+def plant(reseal) -> Callable[..., None]:
+    """Change an array of a finished store in its only chunk file, as if it had been written so."""
+
+    def change(path: Path, name: str, how: Callable[[np.ndarray], Any]) -> None:
+        damage(path, name, how)
+        reseal(path)
+
+    return change
+
+
+def damage(path: Path, name: str, change: Callable[[np.ndarray], Any]) -> None:
+    """Change an array of a finished store in its only chunk file, behind its checksums' back."""
     like = FeatureStore.open(path).array(name)
     file = path / name / "c" / "/".join("0" * like.ndim)
     change(np.memmap(file, like.dtype, "r+", shape=like.shape))
@@ -38,6 +50,7 @@ def attributes(path: Path, change: Callable[[dict[str, Any]], Any]) -> None:
     document = json.loads((path / "zarr.json").read_text())
     change(document["attributes"])
     (path / "zarr.json").write_text(json.dumps(document))
+    note_metadata(path)
 
 
 def look(path: Path, **params: Any) -> StoreView:
@@ -52,7 +65,7 @@ class TestFacts:
     def test_a_sound_store_has_no_flaw(self, path):
         assert look(path).flaws == ()
 
-    def test_ages_are_those_that_gather_gives(self, path):
+    def test_ages_are_those_that_gather_gives(self, path, plant):
         plant(path, "vl/frame_time", lambda shown: shown.__setitem__(3, np.nan))
         store, found = FeatureStore.open(path), look(path).ages
         expected = store.gather(np.arange(store.ticks)).feature_age.numpy()
@@ -73,7 +86,7 @@ class TestFacts:
         features = next(one for one in view.sizes if one.name == "vl/features")
         assert features.data_bytes == FeatureStore.open(path).array("vl/features").nbytes
 
-    def test_coverage_is_counted_by_episode(self, path):
+    def test_coverage_is_counted_by_episode(self, path, plant):
         plant(path, "vl/frame_time", lambda shown: shown.__setitem__(slice(0, ROWS // 2), np.nan))
         first, second, *_ = look(path).episodes
         assert (first.name, first.source, first.ticks, first.vl_rows) == (
@@ -95,12 +108,12 @@ class TestFacts:
         expected = store.gather(ticks).features[:, 1].float().numpy()
         assert np.array_equal(read_slot(store, rows, 1), expected)
 
-    def test_of_variants_the_plain_frames_are_looked_at(self, tiny_store, tmp_path):
+    def test_of_variants_the_plain_frames_are_looked_at(self, tiny_store, tmp_path, plant):
         path = tiny_store(tmp_path, slots=4)
 
         def two_variants(attrs: dict[str, Any]) -> None:
             attrs["feature_spec"]["variants"] = 2
-            attrs["slots"] = attrs["slots"][:2]
+            attrs["slots"] = [one | {"variant": n // 2} for n, one in enumerate(attrs["slots"])]
 
         attributes(path, two_variants)
         plant(path, "vl/features", lambda rows: rows.__setitem__((slice(None), slice(2, 4)), 1e6))
@@ -163,9 +176,26 @@ class TestProjection:
 
     def test_rows_are_spread_evenly_over_the_store(self, tiny_store, tmp_path):
         view = look(tiny_store(tmp_path, episodes=30), points=100)
-        assert len(view.sampled.rows) == len(view.projection.points) == 100
+        assert len(view.sampled.rows) == len(view.projection.points) == 90
         assert view.sampled.total == 300
-        assert set(np.diff(view.sampled.rows)) == {3}
+        assert view.sampled.rows[:6].tolist() == [0, 4, 8, 10, 14, 18]
+
+    def test_of_more_episodes_than_rows_to_look_at_some_are_left_out(self, tiny_store, tmp_path):
+        store = FeatureStore.open(tiny_store(tmp_path, episodes=30))
+        found = sample_rows(store, 15)
+        assert found.rows.tolist() == list(range(0, 300, 2 * ROWS))
+        assert set(found.progress) == {0}
+
+    def test_the_sign_of_an_axis_does_not_hang_on_rounding(self, tiny_store, tmp_path):
+        view = look(tiny_store(tmp_path, episodes=1, ticks=6))
+        (first, second), _ = view.projection.points.T
+        assert first > 0 and first == pytest.approx(-second)
+
+    def test_features_that_are_all_the_same_lie_in_one_point(self, path, plant):
+        plant(path, "vl/features", lambda rows: rows.__setitem__(slice(None), 2.0))
+        view = look(path)
+        assert not view.projection.points.any() and view.projection.explained == (0, 0)
+        assert (view.duplicates.within, view.duplicates.across) == (0, 0)
 
 
 class TestDuplicates:
@@ -174,7 +204,7 @@ class TestDuplicates:
         assert (found.within, found.across, found.still, found.twins) == (0, 0, (), ())
         assert (found.equal_rows, found.equal_twins) == (0, ())
 
-    def test_a_recording_that_is_there_twice_is_found_and_nothing_else(self, path):
+    def test_a_recording_that_is_there_twice_is_found_and_nothing_else(self, path, plant):
         def twice(rows: np.ndarray) -> None:
             rows[4 * ROWS : 5 * ROWS] = rows[ROWS : 2 * ROWS] * (1 + 1e-5)
 
@@ -189,7 +219,16 @@ class TestDuplicates:
         assert alike == [[1, 4], [4, 1]]
         assert kinds(view) == [("near-duplicate episodes", "right", "episode_001")]
 
-    def test_a_still_scene_is_found_where_it_is(self, path):
+    def test_a_recording_that_is_there_twice_is_found_where_few_rows_are_looked_at(
+        self, tiny_store, tmp_path, plant
+    ):
+        path = tiny_store(tmp_path, episodes=13)
+        plant(path, "vl/features", lambda rows: rows.__setitem__(slice(80, 90), rows[10:20]))
+        (twins,) = look(path, points=100, duplicate_similarity=1).duplicates.twins
+        assert (twins.first, twins.second) == ("right/episode_001", "left/episode_008")
+        assert (twins.rows, twins.time_s[0]) == ((5, 5), twins.time_s[1])
+
+    def test_a_still_scene_is_found_where_it_is(self, path, plant):
         plant(path, "vl/features", lambda rows: rows.__setitem__(slice(23, 27), rows[23]))
         found = look(path).duplicates
         (still,) = found.still
@@ -197,7 +236,7 @@ class TestDuplicates:
         assert (still.start_s, still.stop_s) == pytest.approx((0.9, 1.8))
         assert (found.within, found.across, found.twins) == (4, 0, ())
 
-    def test_equal_keys_are_found_whatever_the_features(self, path):
+    def test_equal_keys_are_found_whatever_the_features(self, path, plant):
         def same(keys: np.ndarray) -> None:
             keys[5 * ROWS : 5 * ROWS + 6] = keys[2:8]
 
@@ -214,19 +253,47 @@ class TestDuplicates:
         assert view.duplicates.equal_rows == 12
         assert kinds(view) == [("same recording", "left", "episode_000")]
 
+    def test_of_a_key_that_all_have_the_pairs_are_as_many_as_the_episodes(self, path, plant):
+        plant(path, "vl/key", lambda keys: keys.__setitem__(slice(None), keys[0]))
+        found = look(path).duplicates
+        assert {one.first for one in found.equal_twins} == {"left/episode_000"}
+        assert (found.equal_twins_count, found.equal_rows) == (5, 6 * ROWS)
+        assert {one.rows for one in found.equal_twins} == {(ROWS, ROWS)}
+
+
+class TestIntegrity:
+    """What is looked at is what was written, or nothing is shown."""
+
+    def test_a_changed_feature_row(self, path):
+        damage(path, "vl/features", lambda rows: rows.__setitem__((34, 2, 1), 0.5))
+        with pytest.raises(StoreIncomplete, match=r"right/episode_003.*VL row 4.*stages\.verify"):
+            look(path)
+
+    @pytest.mark.parametrize("name", ["tick/vl_row", "vl/frame_time", "episode/vl_start"])
+    def test_a_changed_narrow_array(self, path, name):
+        damage(path, name, lambda values: values.__setitem__(0, values[-1]))
+        with pytest.raises(StoreIncomplete, match=rf"{name}.*trailer.*stages\.verify"):
+            look(path)
+
+    def test_changed_metadata(self, path):
+        file = path / "zarr.json"
+        file.write_text(file.read_text().replace('"action_hz": 10.0', '"action_hz": 20.0'))
+        with pytest.raises(StoreIncomplete, match=r"metadata were changed.*stages\.verify"):
+            look(path)
+
 
 class TestFlaws:
-    def test_a_dead_slot(self, path):
+    def test_a_dead_slot(self, path, plant):
         plant(path, "vl/features", lambda rows: rows.__setitem__((slice(None), 1), 3.0))
         view = look(path)
         assert kinds(view) == [("dead slot", "", "")]
         assert view.norms.variation[1] == 0 and view.norms.variation[[0, 2]].min() > 0.5
 
-    def test_features_that_stand_still_in_one_episode(self, path):
+    def test_features_that_stand_still_in_one_episode(self, path, plant):
         plant(path, "vl/features", lambda rows: rows.__setitem__(slice(30, 40), rows[30]))
         assert ("still features", "right", "episode_003") in kinds(look(path))
 
-    def test_a_feature_of_another_length(self, path):
+    def test_a_feature_of_another_length(self, path, plant):
         plant(path, "vl/features", lambda rows: rows.__setitem__((12, 0), rows[12, 0] * 100))
         (flaw,) = look(path).flaws
         assert (flaw.kind, flaw.episode, flaw.start_s) == (
@@ -235,7 +302,7 @@ class TestFlaws:
             pytest.approx(0.6),
         )
 
-    def test_a_missing_view(self, path):
+    def test_a_missing_view(self, path, plant):
         plant(path, "vl/frame_time", lambda shown: shown.__setitem__(slice(0, ROWS), np.nan))
         (flaw,) = look(path).flaws
         assert (flaw.kind, flaw.source, flaw.episode, flaw.stream) == (
@@ -245,7 +312,7 @@ class TestFlaws:
             "view View1",
         )
 
-    def test_old_frames_and_frames_from_the_future(self, path):
+    def test_old_frames_and_frames_from_the_future(self, path, plant):
         def shift(shown: np.ndarray) -> None:
             shown[:ROWS] -= 1
             shown[ROWS : 2 * ROWS] += 0.05
@@ -256,7 +323,7 @@ class TestFlaws:
             ("old frames", "left", "episode_000"),
         ]
 
-    def test_ticks_that_go_back_and_ticks_that_skip(self, path):
+    def test_ticks_that_go_back_and_ticks_that_skip(self, path, plant):
         def disturb(time: np.ndarray) -> None:
             time[5:30] += 10
             time[40] = time[39]
@@ -270,7 +337,7 @@ class TestFlaws:
             "episode_001",
         )
 
-    def test_an_episode_with_another_instruction_or_none(self, tiny_store, tmp_path):
+    def test_an_episode_with_another_instruction_or_none(self, tiny_store, tmp_path, plant):
         path = tiny_store(tmp_path, episodes=12)
 
         def say(text: np.ndarray, episode: int, words: bytes) -> None:
@@ -284,7 +351,7 @@ class TestFlaws:
             ("no instruction", "left", "episode_004"),
         ]
 
-    def test_a_flat_channel(self, path):
+    def test_a_flat_channel(self, path, plant):
         plant(path, "tick/action", lambda action: action.__setitem__((slice(None), 1), 0))
         (flaw,) = look(path).flaws
         assert (flaw.kind, flaw.stream, flaw.message[:2]) == ("flat channel", "action", "dy")
@@ -295,7 +362,7 @@ class TestFlaws:
             "short episode"
         ]
 
-    def test_every_kind_is_explained(self, path):
+    def test_every_kind_is_explained(self, path, plant):
         def all_wrong(rows: np.ndarray) -> None:
             rows[:, 1] = 3.0
             rows[12, 0] *= 100
@@ -305,7 +372,7 @@ class TestFlaws:
         view = look(path)
         assert view.flaws and {one.kind for one in view.flaws} <= KINDS.keys()
 
-    def test_a_feature_that_is_not_finite_is_an_error_that_names_the_row(self, path):
+    def test_a_feature_that_is_not_finite_is_an_error_that_names_the_row(self, path, plant):
         plant(path, "vl/features", lambda rows: rows.__setitem__((34, 2, 1), np.inf))
         with pytest.raises(NumericsError, match=r"right/episode_003.*VL row 4"):
             look(path)

@@ -4,12 +4,18 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.simulation.demo_recordings import write_demo_recordings
+from pipeline.simulation.insertion_formats import ABUTTING, write_new, write_raw
+from pipeline.simulation.lerobot_format import write_lerobot
+from pipeline.simulation.recorder import simulate_episode
 
 
 @pytest.fixture(scope="session")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two simulated episodes in each format."""
-    root = tmp_path_factory.mktemp("machine") / "demo"
-    write_demo_recordings(root, 2, 0)
+    """The same two simulated episodes in three formats."""
+    root = tmp_path_factory.mktemp("machine")
+    episodes = [simulate_episode(seed, 1.7e9 + 60 * seed) for seed in range(2)]
+    for episode in episodes:
+        write_raw(root / "raw", episode)
+        write_new(root / "new", episode, ABUTTING, robot_clock=False)
+    write_lerobot(root / "lerobot", episodes)
     return root

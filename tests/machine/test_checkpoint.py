@@ -46,6 +46,17 @@ def test_a_folder_with_a_hole(params: Make, demo_checkpoint: Path, tmp_path: Pat
     assert str(broken) in finding.found
 
 
+def test_a_file_that_is_cut_off(params: Make, demo_checkpoint: Path, tmp_path: Path) -> None:
+    broken = shutil.copytree(demo_checkpoint, tmp_path / "broken")
+    weights = next(broken.glob("*.safetensors"))
+    whole = weights.read_bytes()
+    for kept in (whole[:-1], whole[:5], b"\x08" + bytes(7) + b"garbage!"):
+        weights.write_bytes(kept)
+        (finding,) = check_checkpoint(params(broken))
+        assert (finding.level, finding.remedy) == ("missing", "copy it again")
+        assert f"{weights}: cut off or damaged: " in finding.found
+
+
 def test_what_is_not_here(params: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     (folder,) = check_checkpoint(params("/no/such/folder"))
     assert folder.level == "missing" and "no hub id" in folder.found

@@ -74,5 +74,13 @@ def test_what_cannot_be_looked_at_is_a_finding(
     assert said in finding.found
 
 
+def test_a_bug_in_a_check_is_an_error_and_no_silence(
+    params: Params, only: Callable[[Any], None]
+) -> None:
+    only(lambda params: _raise(KeyError("typo")))
+    with pytest.raises(KeyError, match="typo"):
+        list(machine.examine(params))
+
+
 def _raise(error: Exception) -> None:
     raise error

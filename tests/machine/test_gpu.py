@@ -4,10 +4,13 @@ from dataclasses import replace
 
 import pytest
 
+from pipeline.config import Params
+from pipeline.machine.attention import check_attention
 from pipeline.machine.gpu import (
     GPU,
     Accelerator,
     check_accelerator,
+    check_gpu,
     parse_nvidia_smi,
     read_accelerator,
 )
@@ -55,18 +58,24 @@ def test_a_gpu_that_torch_does_not_see(here: Accelerator, said: str, remedy: str
 
 
 def test_what_the_params_ask_for_by_name_is_needed() -> None:
-    (finding,) = check_accelerator(NVIDIA, "bfloat16", ["auto", "cuda:1"])
-    assert finding.level == "missing"
-    assert "the params ask for cuda:1" in finding.found
-    assert "cu128" in finding.remedy
-    (finding,) = check_accelerator(BARE, "bfloat16", ["cuda"])
-    assert "extract.device" in finding.remedy
+    document = {
+        "data": {"sources": [{"name": "a", "path": "."}]},
+        "vlm": {"checkpoint": "a/b"},
+        "extract": {"device": "cuda:77"},
+        "train_head": {"device": "cpu"},
+    }
+    params = Params.model_validate(document)
+    lacking = [finding for finding in check_gpu(params) if finding.level == "missing"]
+    assert [finding.subject for finding in lacking] == ["extract.device"]
+    assert "extract.device=auto" in lacking[0].remedy
+    (attention,) = check_attention(params)
+    assert attention.level == "note", "it is said once"
 
 
 def test_gpus_that_are_seen() -> None:
     old = GPU("Tesla T4", 15 * 2**30, False)
     here = replace(CUDA, gpus=(H100, old))
-    build, first, second = check_accelerator(here, "bfloat16", ["cuda"])
+    build, first, second = check_accelerator(here, "bfloat16")
     assert build.found == "torch 2.13.0+cu126, built for CUDA 12.6"
     assert (first.level, first.found) == ("ok", "NVIDIA H100, 80.0 GiB")
     assert second.level == "note"

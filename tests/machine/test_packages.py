@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.machine.packages import (
-    check_optional,
+    check_loggers,
     check_python,
     check_required,
     importable,
@@ -14,11 +14,7 @@ from pipeline.machine.packages import (
 )
 
 PYPROJECT = Path(__file__).resolve().parents[2] / "pyproject.toml"
-EXTRAS = {
-    "loggers": ["tensorboard>=2.18", "wandb>=0.19"],
-    "bench": ["h5py>=3.12"],
-    "test": ["pytest>=8"],
-}
+LOGGERS = ["tensorboard>=2.18", "wandb>=0.19"]
 
 
 def test_the_projects_own_ranges_hold_here() -> None:
@@ -29,7 +25,7 @@ def test_the_projects_own_ranges_hold_here() -> None:
     assert finding.level == "ok"
     assert f"{len(wanted.packages)} of {len(wanted.packages)}" in finding.found
     assert re.search(r"torch \d+\.\d+", finding.found)
-    assert {"loggers", "bench", "test"} <= wanted.extras.keys()
+    assert [re.split("[<>=]", line)[0] for line in wanted.loggers] == ["tensorboard", "wandb"]
 
 
 def test_a_missing_package_and_an_old_one_are_named_with_what_installs_them() -> None:
@@ -47,15 +43,15 @@ def test_any_build_of_torch_counts_by_its_number(found: str) -> None:
     assert finding.level == "ok"
 
 
-def test_an_optional_package_is_needed_only_where_the_params_ask_for_it() -> None:
-    versions = {"tensorboard": "2.19", "pytest": "8.4"}
-    loggers, bench, test = check_optional(EXTRAS, ("report", "tensorboard"), versions.get)
-    assert (loggers.level, bench.level, test.level) == ("note", "note", "ok")
-    assert "not installed: wandb" in loggers.found
-    assert "pip install 'vla-feature-cache[bench]'" in bench.remedy
-    loggers, *_ = check_optional(EXTRAS, ("wandb",), versions.get)
-    assert loggers.level == "missing"
-    assert "train_head.loggers asks for wandb" in loggers.found
+def test_a_logger_is_needed_only_where_the_params_ask_for_it() -> None:
+    versions = {"tensorboard": "2.19"}
+    unasked = check_loggers(LOGGERS, ("report", "tensorboard"), versions.get)
+    assert (unasked.level, unasked.found.split(";")[0]) == ("ok", "wandb not installed")
+    asked = check_loggers(LOGGERS, ("wandb",), versions.get)
+    assert asked.level == "missing"
+    assert "train_head.loggers asks for wandb" in asked.found
+    assert "pip install 'vla-feature-cache[loggers]'" in asked.remedy
+    assert check_loggers(LOGGERS, ("wandb",), lambda name: "2.20").level == "ok"
 
 
 def test_python() -> None:

@@ -9,7 +9,7 @@ import yaml
 
 from pipeline.config import Params
 from pipeline.machine.limits import Limits, check_limits, memory_bytes, read_limits
-from pipeline.machine.links import Cache, check_cache, read_cache
+from pipeline.machine.links import Cache, check_cache, check_links, links_here, read_cache
 from pipeline.machine.space import (
     Estimate,
     check_cached_copy,
@@ -100,6 +100,16 @@ def test_without_a_checkpoint_the_size_is_not_known() -> None:
     assert finding.level == "note" and "vlm.checkpoint" in finding.found
 
 
+def test_without_recordings_the_size_is_not_known(tmp_path: Path, demo_checkpoint: Path) -> None:
+    """The recordings' own group says why."""
+    document = {
+        "data": {"root": str(tmp_path), "sources": [{"name": "a", "path": "a"}]},
+        "vlm": {"checkpoint": str(demo_checkpoint)},
+    }
+    (finding,) = check_space(Params.model_validate(document))
+    assert finding.level == "note" and "before checkpoint and recordings" in finding.found
+
+
 def cache(**changed: object) -> Cache:
     here = Cache(Path(".dvc/cache"), ("reflink", "hardlink", "copy"), ("hardlink", "copy"), True)
     return replace(here, **changed)  # type: ignore[arg-type]
@@ -114,6 +124,8 @@ def test_the_link_that_dvc_takes() -> None:
     (far,) = check_cache(cache(working=("copy",), same_disk=False))
     assert far.level == "note" and "another disk" in far.found
     assert far.remedy.startswith("dvc cache dir")
+    (closed,) = check_cache(cache(working=()))
+    assert closed.level == "note" and "nothing can be written there" in closed.found
     (none,) = check_cache(None)
     assert none.level == "note" and none.remedy == "dvc init"
 
@@ -131,6 +143,18 @@ def test_links_are_really_tried(tmp_path: Path) -> None:
     assert found.same_disk and found.link == "hardlink"
     left = [path for path in (tmp_path / ".dvc").rglob("*") if path.is_file()]
     assert [path.name for path in left] == ["config"], "what was tried is removed"
+
+
+def test_a_config_that_dvc_cannot_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / ".dvc").mkdir()
+    (tmp_path / ".dvc" / "config").write_text("garbage [[\n")
+    monkeypatch.chdir(tmp_path)
+    params = Params.model_validate(
+        {"data": {"sources": [{"name": "a", "path": "."}]}, "vlm": {"checkpoint": "a/b"}}
+    )
+    (finding,) = check_links(params)
+    assert finding.level == "missing" and "garbage" in finding.found
+    assert links_here() is None
 
 
 def test_links_to_another_disk(tmp_path: Path, small_disk: Path) -> None:

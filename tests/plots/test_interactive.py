@@ -75,4 +75,4 @@ def test_points_are_coloured_and_named(by: str) -> None:
     assert (
         (colours == [0, 1, 0.5]) if by == "progress" else (colours[0] == colours[1] != colours[2])
     )
-    assert figure.layout.xaxis.title.text == "first principal component (50% of the variance)"
+    assert figure.layout.xaxis.title.text == "component 1 (50% of the variance)"

@@ -170,6 +170,16 @@ def test_sparse_readings_are_held_until_the_next() -> None:
     np.testing.assert_array_equal(image[0], 1 + np.floor(edges[:-1] + 1e-9))
 
 
+def test_columns_are_means_and_a_clock_in_packets_has_no_holes() -> None:
+    time = np.repeat(np.arange(100) / 10, 65)
+    values = np.arange(len(time), dtype=np.float32)[:, None]
+    shown = curve(time, values)
+    assert not np.isnan(shown.values).any()
+    _, image = columns(time, values, 500)
+    assert not np.isnan(image).any()
+    assert image[0, 0] == values[:65].mean()
+
+
 def test_a_lost_entry_is_the_longest_step_of_its_bins_alone() -> None:
     time = np.delete(np.arange(100) / 10, 50)
     steps = worst_steps(time, np.linspace(time[0], time[-1], 34))

@@ -28,7 +28,7 @@ EVERY: dict[str, Callable[[StoreView], Figure]] = {
 
 
 @pytest.fixture(scope="module")
-def flawed(tiny_store, tmp_path_factory) -> StoreView:
+def flawed(tiny_store, reseal, tmp_path_factory) -> StoreView:
     """Episode 4 shows what episode 1 shows, episode 0 has no view, and one feature is huge."""
     path: Path = tiny_store(tmp_path_factory.mktemp("flawed"), sensor_channels=40, slots=24)
     store = FeatureStore.open(path)
@@ -42,6 +42,7 @@ def flawed(tiny_store, tmp_path_factory) -> StoreView:
     features[4 * ROWS : 5 * ROWS] = features[ROWS : 2 * ROWS]
     features[33, 2] *= 50
     file("vl/frame_time")[:ROWS] = np.nan
+    reseal(path)
     return inspect_store(path, InspectParams())
 
 

@@ -107,14 +107,25 @@ LOOK = """() => {
     });
     return 0.2126 * r + 0.7152 * g + 0.0722 * b;
   };
+  const behind = (element) => {
+    const colour = getComputedStyle(element).backgroundColor;
+    return colour.endsWith(", 0)") ? behind(element.parentElement) : colour;
+  };
+  const contrast = (element) => {
+    const both = [getComputedStyle(element).color, behind(element)].map(luminance);
+    return (Math.max(...both) + 0.05) / (Math.min(...both) + 0.05);
+  };
+  const said = [...document.querySelectorAll("body *:not(svg *, script)")]
+    .filter((one) => [...one.childNodes].some((node) => node.nodeType === 3 && node.data.trim()));
   const ids = [...document.querySelectorAll("[id]")].map((one) => one.id);
-  const pictures = [...document.querySelectorAll("figure .wide > svg")];
+  const pictures = [...document.querySelectorAll("figure .wide:not(.paper) > svg")];
   const charts = [...document.querySelectorAll(".chart")];
   return {
     overflow: document.documentElement.scrollWidth - window.innerWidth,
     pictures: pictures.length,
     charts: charts.length,
     unseen: named(pictures.filter((svg) => !seen(svg))),
+    faint: said.filter((one) => contrast(one) < 4.5).map((one) => one.outerHTML.slice(0, 90)),
     unnamed: named(pictures.filter((svg) => !svg.querySelector(":scope > title")?.textContent)),
     undrawn: named(charts.filter((one) => ![...one.querySelectorAll(".main-svg")].some(seen))),
     dead: [...document.querySelectorAll('a[href^="#"]')]
@@ -137,7 +148,8 @@ def assert_page_is_sound(browser_page: Visitor) -> Callable[[Path], None]:
     """`assert_page_is_sound(path)`: at desktop and phone width, in light and in dark.
 
     Nothing errs, no request leaves the page, nothing overflows, every picture and chart is there
-    in an ink that contrasts, every link of the contents leads somewhere, and no id is there twice.
+    in an ink that contrasts, words contrast as WCAG's AA wants, every link of the contents leads
+    somewhere, and no id is there twice.
     """
 
     def check(path: Path) -> None:
@@ -150,7 +162,7 @@ def assert_page_is_sound(browser_page: Visitor) -> Callable[[Path], None]:
                 assert visit.trouble == [], here
                 assert found["overflow"] <= 0, here
                 assert found["links"] > 0, here
-                for wrong in ("unseen", "unnamed", "undrawn", "dead", "twice"):
+                for wrong in ("unseen", "unnamed", "undrawn", "faint", "dead", "twice"):
                     assert found[wrong] == [], f"{here}: {wrong}"
                 inks = found["inks"] + found["chart_inks"]
                 if scheme == "light":

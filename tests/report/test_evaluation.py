@@ -149,9 +149,9 @@ def test_a_page_with_frames_and_without_is_sound(
     (_, best), (_, worst) = judgement.comparison.extremes()
     look = episode_sections.footage
 
-    def half(store: FeatureStore, episode: Any, rows: list[int], root: Path) -> Footage:
+    def half(store: FeatureStore, episode: Any, rows: list[int], *rest: Any) -> Footage:
         if episode.index != best:
-            return look(store, episode, rows, root)
+            return look(store, episode, rows, *rest)
         assert all(row in episode.vl_rows for row in rows) and len(rows) == 5
         shades = np.linspace(0, 255, len(rows)).astype(np.uint8)
         return Footage({"View1": [np.full((12, 16, 3), shade, np.uint8) for shade in shades]})

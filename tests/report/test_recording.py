@@ -130,8 +130,7 @@ def test_a_flaw_of_many_episodes_is_one_notice() -> None:
     error, gap = notices(flaws, zeros)
     assert (error.severity, error.kind, error.where) == ("error", "unreadable", "e7")
     assert gap.where == (
-        "view View1 · 200 places in 200 episode(s) · e0 0.50–1.00 s; e1 0.50–1.00 s; "
-        "e2 0.50–1.00 s; and 197 more"
+        "view View1 · 200 episodes · e0 0.50–1.00 s; e1 0.50–1.00 s; e2 0.50–1.00 s; and 197 more"
     )
     assert gap.message == "The first: found 0"
 

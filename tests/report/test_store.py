@@ -1,6 +1,7 @@
 """The page of a store says what was found, and loads without trouble."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,12 +16,13 @@ ROWS = 10
 
 
 @pytest.fixture(scope="module")
-def view(tiny_store, tmp_path_factory) -> StoreView:
+def view(tiny_store, reseal, tmp_path_factory) -> StoreView:
     """A store in which an episode is there twice."""
     path = tiny_store(tmp_path_factory.mktemp("store"), sensor_channels=40)
     like = FeatureStore.open(path).array("vl/features")
     features = np.memmap(path / "vl/features/c/0/0/0", like.dtype, "r+", shape=like.shape)
     features[4 * ROWS : 5 * ROWS] = features[ROWS : 2 * ROWS]
+    reseal(path)
     return inspect_store(path, InspectParams())
 
 
@@ -43,8 +45,10 @@ def test_the_sum_of_the_sources_is_the_store(report, view):
 
 
 def test_what_looks_wrong_is_named_with_episode_and_time(report):
-    (notices,) = blocks(report, "What looks wrong")
+    notices, checked = blocks(report, "What looks wrong")
     assert isinstance(notices, Notices)
+    assert "all 60 VL rows give the checksums" in checked.words
+    assert "python -m stages.verify --set verify.store=" in checked.words
     (notice,) = notices.notices
     assert notice.kind == "near-duplicate episodes"
     assert "episode_001" in notice.where and "left/episode_004" in notice.message
@@ -67,3 +71,11 @@ def test_the_page_loads(report, tmp_path, assert_page_is_sound):
     page, *pictures = write_report(tmp_path / "page", report)
     assert {one.stem for one in pictures} >= {"coverage", "ages", "norms", "likeness"}
     assert_page_is_sound(page)
+
+
+def test_an_episode_says_what_its_ticks_do_not_see(view):
+    first, *others = view.episodes
+    covered = {**first.covered, "sensor": 0.0, "View1": 0.999}
+    odd = replace(view, episodes=(replace(first, covered=covered), *others))
+    table = blocks(store_report(odd), "Coverage")[-1]
+    assert [row[-1] for row in table.rows[:2]] == ["no sensor, 99% View1", "all"]

@@ -35,7 +35,18 @@ def test_a_path_that_is_not_there_names_what_is(tmp_path: Path) -> None:
     (tmp_path / "monday").mkdir()
     said = refused(tmp_path / "mondey" / "run")
     assert f"{tmp_path / 'mondey/run'} is not there" in said
-    assert said.endswith("has monday")
+    assert said.endswith(f"Did you mean {tmp_path / 'monday'}?")
+    assert f"In {tmp_path} there is monday" in refused(tmp_path / "tuesday")
+
+
+def test_a_path_below_the_data_root_is_found_there(tmp_path: Path) -> None:
+    (tmp_path / "monday").mkdir()
+    params = load_params(PARAMS, [f"data.root={tmp_path}", "inspect.path=monday"])
+    with pytest.raises(ConfigError) as caught:
+        subject_of(params)
+    assert f"It is under data.root: python -m stages.inspect '{tmp_path / 'monday'}'" in str(
+        caught.value
+    )
 
 
 @pytest.mark.parametrize(
@@ -94,3 +105,24 @@ def test_every_path_has_a_folder_of_its_own(
         f"{base}/lab_and_1_more",
     ]
     assert subject_of(looking_at("lab", output=Path("mine"))).folder == Path("mine")
+    for place in ("데이터", "실험"):
+        (tmp_path / place).mkdir()
+        assert subject_of(looking_at(place)).folder == Path("reports/inspect", place)
+
+
+def test_a_page_that_could_not_be_written_is_refused_first(
+    tmp_path: Path, tiny_store: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refusal(output: Path) -> str:
+        with pytest.raises(ConfigError, match=r"--set inspect\.output=FOLDER") as caught:
+            subject_of(looking_at(tmp_path, output=output))
+        return str(caught.value)
+
+    (tmp_path / "file").write_bytes(b"")
+    for output in (tmp_path / "file", tmp_path / "file" / "in it"):
+        assert f"found the file {tmp_path / 'file'}" in refusal(output)
+    store = tiny_store(tmp_path)
+    assert f"lies in the store {store}" in refusal(store / "page")
+    # Permissions do not bind root, whom tests may run as.
+    monkeypatch.setattr("os.access", lambda path, mode: path != tmp_path)
+    assert f"{tmp_path} cannot be written to" in refusal(tmp_path / "new")

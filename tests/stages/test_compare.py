@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import yaml
 
-from pipeline.evaluation import JUDGED, read_experiments
+from pipeline.evaluation import BASELINES, JUDGED, read_experiments
 from stages import compare, evaluate, train_head
 from stages.command import run
 
@@ -82,7 +82,8 @@ def test_a_table_a_file_and_a_picture(
         folder = experiments.parent / "reports" / row["experiment"]
         overall = json.loads((folder / "metrics.json").read_text())["overall"]
         assert float(row["overall_policy"]) == overall["policy"]
-        assert float(row["overall_mean_action"]) == overall["mean_action"]
+        best = min(float(row[f"overall_{method}"]) for method in BASELINES)
+        assert overall["policy"] / best == pytest.approx(overall["relative"], rel=1e-4)
         assert row["samples"] == ("1" if row["model_type"] == "regression" else "2")
     page = (output / "report.html").read_text()
     assert all(name in page for name in NAMES) and ">trained<" not in page
@@ -135,23 +136,32 @@ def test_policies_that_were_sampled_otherwise_are_refused(
 def test_other_baselines_are_refused(
     reports: Path, experiments: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = reports / "regression-gated" / "metrics.json"
-    document = json.loads(path.read_text())
-    document["translation_mm"]["mean_action"] *= 1.01
-    path.write_text(json.dumps(document))
+    path = reports / "regression-gated" / "errors.csv"
+    rows = list(csv.DictReader(path.read_text().splitlines()))
+    assert (rows[0]["group"], rows[0]["unit"]) == ("translation", "mm")
+    text = path.read_text().replace(rows[0]["mean_action"], "7.5")
+    path.write_text(text)
     error = refused(reports, experiments, capsys)
     assert "found mean_action (translation_mm)" in error
     assert "trained on other recordings" in error
 
 
-@pytest.mark.parametrize("name", [JUDGED, "metrics.json"])
+@pytest.mark.parametrize(
+    ("name", "torn", "said"),
+    [(JUDGED, "{", "is no JSON"), ("errors.csv", "group,unit,policy\na,b,x\n", "cannot be read")],
+)
 def test_a_folder_that_is_no_evaluation_is_named(
-    reports: Path, experiments: Path, capsys: pytest.CaptureFixture[str], name: str
+    reports: Path,
+    experiments: Path,
+    capsys: pytest.CaptureFixture[str],
+    name: str,
+    torn: str,
+    said: str,
 ) -> None:
     (reports / "regression-gated" / name).unlink()
     assert f"regression-gated, but it has no {name}" in refused(reports, experiments, capsys)
-    (reports / "regression-gated" / name).write_text("{")
-    assert "is no JSON" in refused(reports, experiments, capsys)
+    (reports / "regression-gated" / name).write_text(torn)
+    assert said in refused(reports, experiments, capsys)
     (reports / "regression-gated" / name).write_text("{}")
     assert "regression-gated, but it lacks" in refused(reports, experiments, capsys)
 

@@ -9,7 +9,8 @@ import pytest
 import yaml
 
 from pipeline.machine import GROUPS
-from pipeline.simulation.demo_recordings import write_demo_recordings
+from pipeline.simulation.insertion_formats import write_raw
+from pipeline.simulation.recorder import simulate_episode
 from stages import doctor
 from stages.command import run
 
@@ -33,9 +34,9 @@ sys.exit(run("", doctor.main, ["--params", sys.argv[1]]))
 @pytest.fixture(scope="module")
 def params(tmp_path_factory: pytest.TempPathFactory, demo_checkpoint: Path) -> Path:
     tmp_path = tmp_path_factory.mktemp("doctor")
-    write_demo_recordings(tmp_path / "data", 2, 0)
+    write_raw(tmp_path / "data" / "raw", simulate_episode(0, 1.7e9))
     document: dict[str, Any] = {
-        "data": {"root": str(tmp_path / "data"), "sources": [{"name": "new", "path": "new"}]},
+        "data": {"root": str(tmp_path / "data"), "sources": [{"name": "raw", "path": "raw"}]},
         "vlm": {"checkpoint": str(demo_checkpoint), "dtype": "float32"},
         "extract": {"store": str(tmp_path / "made.zarr")},
     }
@@ -56,8 +57,8 @@ def test_where_nothing_is_missing(params: Path, capsys: pytest.CaptureFixture[st
     assert max(map(len, lines)) <= 100 + len(str(params.parent)), "save for paths, 100 columns"
     assert "\x1b" not in said.out
     assert "AV1                decodes" in said.out
-    assert "2 episode(s), new" in said.out
-    assert "about " in said.out and " for 2 episodes; " in said.out
+    assert "1 episode(s), raw" in said.out
+    assert "about " in said.out and " for 1 episodes; " in said.out
     assert lines[-1].startswith("nothing is missing")
     assert set(params.parent.rglob("*")) == before, "it changes nothing"
 

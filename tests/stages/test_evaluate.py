@@ -1,6 +1,7 @@
 """The command refuses a checkpoint and a store that do not belong together."""
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -13,18 +14,19 @@ from pipeline.store.archive import archive
 from stages import evaluate, train_head
 from stages.command import run
 
+ROOT = Path(__file__).resolve().parents[2]
 PICTURES = (
     "curves",
     "dimension_horizon",
     "dimensions",
-    "episode_best",
+    "episode_worst",
     "episodes",
     "horizon",
     "modalities",
     "scatter",
     "timeline",
 )
-"""Of one held-out episode, which is the best and the worst; dvc.yaml lists them by name."""
+"""Of one held-out episode, which is the worst, and of which dvc.yaml lists some."""
 
 
 @pytest.fixture(scope="module")
@@ -127,8 +129,8 @@ def test_the_report_says_what_was_judged_and_which_streams_are_used(
     assert "sensor shuffled: not judged" in said
     for name in PICTURES:
         assert (tmp_path / f"report/{name}.png").read_bytes().startswith(b"\x89PNG")
-    metrics = json.loads((tmp_path / "report/metrics.json").read_text())
-    assert metrics["modalities"]["sensor"]["delayed_50_ms"]["overall"] > 0
+    streams = (tmp_path / "report/streams.csv").read_text()
+    assert "\nsensor delayed 50 ms," in streams
     judged = json.loads((tmp_path / "report/judged.json").read_text())
     assert judged["policy"]["model_type"] == "regression"
     assert judged["policy"]["samples"] == 1
@@ -166,12 +168,20 @@ def test_a_report_says_that_the_logs_are_gone(trained: Path, tmp_path: Path) -> 
     assert not (tmp_path / "report/curves.png").exists()
 
 
+def test_dvc_misses_no_file_of_a_single_episode(trained: Path, tmp_path: Path) -> None:
+    """Nor of one whose streams nobody asked for."""
+    listed = re.findall(r"evaluate\.output}/([\w.]+)", (ROOT / "dvc.yaml").read_text())
+    arguments = ["--set", f"evaluate.output={tmp_path}", "--set", "evaluate.modalities=false"]
+    assert run("", evaluate.main, ["--params", str(trained), *arguments]) == 0
+    assert len(listed) > 8 and set(listed) <= {file.name for file in tmp_path.iterdir()}
+
+
 def test_streams_are_left_alone_where_nobody_asks(trained: Path, tmp_path: Path) -> None:
     output = tmp_path / "report"
     arguments = ["--set", f"evaluate.output={output}", "--set", "evaluate.modalities=false"]
     assert run("", evaluate.main, ["--params", str(trained), *arguments]) == 0
-    assert not list(output.glob("modalities*"))
-    assert "modalities" not in json.loads((output / "metrics.json").read_text())
+    assert not (output / "modalities.png").exists()
+    assert (output / "streams.csv").read_text() == "spoilt,times_intact,overall_error\n"
 
 
 def test_a_sampling_policy_is_judged_on_the_mean_of_samples(trained: Path, tmp_path: Path) -> None:

@@ -89,6 +89,18 @@ def write_params(tiny_store: Callable[..., Path], tmp_path: Path) -> Callable[..
     return write
 
 
+def test_a_logger_that_is_not_installed_is_named_before_the_store_is_opened(
+    write_params: Callable[..., Path],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr("pipeline.training.loggers._MODULES", {"wandb": "no_such_module"})
+    path = write_params(loggers=["report", "wandb"])
+    arguments = ["--params", str(path), "--set", "extract.store=/no/such.zarr"]
+    assert run("", train_head.main, arguments) == 2
+    assert "cannot load wandb (No module named 'no_such_module')" in capsys.readouterr().err
+
+
 def test_it_trains_evaluates_and_then_has_nothing_to_do(
     write_params: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

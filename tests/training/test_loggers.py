@@ -15,7 +15,7 @@ from pipeline.config import TrainHeadParams
 from pipeline.durable import read_document
 from pipeline.errors import ConfigError, DiskFull
 from pipeline.store import FeatureStore
-from pipeline.training import Trainer, loggers, open_run
+from pipeline.training import Trainer, check_loggers, loggers, open_run
 from pipeline.training.log import TrainingLog
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -28,11 +28,12 @@ from pipeline.training.loggers import WandB
 
 place = Path(sys.argv[1])
 params = TrainHeadParams(output=place / "head", wandb_project="needles")
-run = WandB(place / "logs.wandb", params, resumed=sys.argv[2] == "resumed")
-print(run.note)
-run.write(10, {"train/loss": 0.125})
-run.write(10, {"val/error": 0.375})
-run.close(finished=True)
+for resumed in (False, True):
+    run = WandB(place / "logs.wandb", params, resumed)
+    print(run.note, (place / "logs.wandb/id").read_text())
+    run.write(10, {"train/loss": 0.125})
+    run.write(10, {"val/error": 0.375})
+    run.close(finished=True)
 """
 
 
@@ -113,7 +114,7 @@ def test_every_logger_has_the_curves_of_dvc_after_a_stop_too(
     chosen = params(loggers=["report", "tensorboard"])
     events = chosen.logs.with_name("logs.tensorboard")
     stop_at(trainer(store, chosen), 17)
-    assert "stopped; the same command goes on" in (chosen.logs / "report.html").read_text()
+    assert "stopped before its end" in (chosen.logs / "report.html").read_text()
     assert f"live: tensorboard --logdir {events}" in capsys.readouterr().out
     assert scalars(events)["train/loss"][-1][0] == 17
     resumed = trainer(store, chosen)
@@ -176,23 +177,41 @@ def test_a_run_of_before_there_were_loggers_goes_on(
     assert (resumed.run.status, resumed.step) == ("resumed", 10)
 
 
-def test_a_missing_package_is_named_before_anything_is_done(
-    store: FeatureStore, params: Make, trainer: Make, monkeypatch: pytest.MonkeyPatch
+def test_a_missing_package_and_one_that_does_not_load_are_named(
+    tmp_path: Path, params: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(loggers, "find_spec", lambda name: None)
-    with pytest.raises(ConfigError, match=r"tensorboard, wandb.*vla-feature-cache\[loggers\]"):
-        trainer(store, params(loggers=["report", "tensorboard", "wandb"]))
-    assert not params().output.with_name("head.part").exists()
-    assert trainer(store, params()).step == 0, "the report needs no package"
+    """What is left of wandb is the folder it makes where it runs; tensorboard is half installed."""
+    for name in [
+        name for name in sys.modules if name.partition(".")[0] in ("wandb", "tensorboard")
+    ]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.delitem(sys.modules, "torch.utils.tensorboard", raising=False)
+    (tmp_path / "wandb").mkdir()
+    (tmp_path / "tensorboard").mkdir()
+    (tmp_path / "tensorboard" / "__init__.py").write_text("raise ImportError('no protobuf')")
+    monkeypatch.setattr("sys.path", [str(tmp_path)])
+    chosen = params(loggers=["report", "dvclive", "tensorboard", "wandb"])
+    with pytest.raises(ConfigError, match=r"tensorboard \(no protobuf\), wandb \(No module named"):
+        check_loggers(chosen)
+    check_loggers(params(loggers=["report", "dvclive"]))
 
 
-def test_a_folder_of_that_name_is_no_package(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_dvclives_own_report_lies_beside_the_logs(
+    tmp_path: Path, params: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "tensorbored").mkdir()
-    monkeypatch.syspath_prepend(str(tmp_path))
-    assert not loggers._installed("tensorbored")
-    assert loggers._installed("torch")
+    monkeypatch.setenv("DVCLIVE_RESUME", "true")
+    chosen = params(loggers=["report", "dvclive"], max_steps=20)
+    for last in (30, 20):
+        opened = loggers.open_loggers(chosen, resumed=False)
+        with TrainingLog(chosen.logs, opened) as log:
+            for step in range(10, last + 10, 10):
+                log.write(step, {"train/loss": 1 / step})
+    assert "live: open" in opened[0].note and "with a network" in opened[0].note
+    said = (tmp_path / "logs.dvclive.html").read_text()
+    assert "vega" in said and "train/loss" in said and "0.05" in said
+    assert [step for step, _ in curves(chosen.logs)["train/loss"]] == [10, 20], "none stands twice"
+    assert (chosen.logs / "report.html").exists()
+    assert {path.name for path in chosen.logs.iterdir()} == {"plots", "metrics.json", "report.html"}
 
 
 def test_a_full_disk_is_named_and_every_logger_is_closed(
@@ -218,34 +237,28 @@ def test_a_page_that_finds_no_room_is_a_full_disk(small_disk: Path) -> None:
         log.write(10, {f"train/{name}": 1.0 for name in range(100)})
 
 
-def start_wandb(place: Path, how: str) -> str:
+def test_weights_and_biases_keeps_a_run_offline_and_goes_on_under_its_id(tmp_path: Path) -> None:
     pytest.importorskip(
         "wandb", reason="wandb is not installed: pip install 'vla-feature-cache[loggers]'"
     )
-    private = {f"WANDB_{name}_DIR": str(place / name) for name in ("CONFIG", "CACHE", "DATA")}
+    private = {f"WANDB_{name}_DIR": str(tmp_path / name) for name in ("CONFIG", "CACHE", "DATA")}
     ran = subprocess.run(
-        [sys.executable, "-c", WANDB, str(place), how],
+        [sys.executable, "-c", WANDB, str(tmp_path)],
         capture_output=True,
         text=True,
         timeout=100,
         env=os.environ | private | {"WANDB_MODE": "offline", "PYTHONPATH": str(ROOT)},
     )
-    assert ran.returncode == 0, ran.stderr
-    assert ran.stderr == ""
-    return ran.stdout
-
-
-def test_weights_and_biases_keeps_a_run_offline_and_goes_on_under_its_id(tmp_path: Path) -> None:
-    said = start_wandb(tmp_path, "new")
-    assert said.startswith(f"wandb is offline; wandb sync {tmp_path}/logs.wandb/")
+    assert (ran.returncode, ran.stderr) == (0, "")
+    first, again = ran.stdout.splitlines()
+    assert first.startswith(f"wandb is offline; wandb sync {tmp_path}/logs.wandb/")
     identifier = (tmp_path / "logs.wandb/id").read_text()
-    (kept,) = (tmp_path / "logs.wandb").rglob("*.wandb")
-    assert identifier in kept.name
-    content = kept.read_bytes()
-    for text in (b"needles", b"train/loss", b"0.125", b"val/error", b"0.375", b"max_steps"):
-        assert text in content, text
-    start_wandb(tmp_path, "resumed")
-    assert (tmp_path / "logs.wandb/id").read_text() == identifier
+    assert first.split()[-1] == again.split()[-1] == identifier
+    for kept in (tmp_path / "logs.wandb").rglob("*.wandb"):
+        assert identifier in kept.name
+        content = kept.read_bytes()
+        for text in (b"needles", b"train/loss", b"0.125", b"val/error", b"0.375", b"max_steps"):
+            assert text in content, text
 
 
 def test_another_run_of_the_same_folder_has_another_id(tmp_path: Path) -> None:
@@ -300,7 +313,6 @@ def test_rows_that_the_service_has_are_not_sent_again_and_its_loss_stops_nothing
 def test_a_service_that_takes_no_run_is_said_before_anything_is_done(
     store: FeatureStore, params: Make, trainer: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(loggers, "_installed", lambda name: True)
     monkeypatch.setitem(sys.modules, "wandb", Service(refuses="no API key."))
     with pytest.raises(ConfigError, match=r"no API key\. Log in with `wandb login`"):
         trainer(store, params(loggers=["wandb"])).fit()

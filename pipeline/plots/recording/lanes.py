@@ -10,10 +10,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 from numpy.typing import NDArray
 
+from pipeline.inspection.clocks import usual_step
 from pipeline.inspection.facts import Clock, EpisodeView
 from pipeline.plots.recording import reuse
 from pipeline.plots.recording.drawing import GAP, words
-from pipeline.plots.recording.thinning import usual_step, worst_steps
+from pipeline.plots.recording.thinning import worst_steps
 from pipeline.plots.style import GRID, INK, PALETTE, canvas
 
 LANE_COLOURS = {"camera": PALETTE[0], "stream": PALETTE[4], "tick": INK, "vl_row": PALETTE[2]}
@@ -24,7 +25,8 @@ _BINS = 500
 _GAP_LABELS = 8
 """Gaps of a lane whose length is written, the longest ones."""
 _ROWS_ZOOMED = 5
-_LEAST_ZOOM_S = 0.5
+_ZOOM_S, _LEAST_ZOOM_S = 1.5, 0.5
+"""Of what is shown from near: without VL rows, and with rows that follow fast."""
 _OVERVIEW = (
     "the whole episode (grey: the stretch below). A dense clock is a band as high as its usual "
     "step over the longest one there"
@@ -80,8 +82,8 @@ def zoom(view: EpisodeView, clocks: Sequence[Clock]) -> tuple[float, float]:
     line = view.timeline
     start = min(float(clock.time[0]) for clock in clocks)
     stop = max(float(clock.time[-1]) for clock in clocks)
-    step = usual_step(line.vl_time) if line is not None else 0.0
-    width = max(_ROWS_ZOOMED * step, _LEAST_ZOOM_S) if step else 1.5
+    step = usual_step(line.vl_time) if line is not None else float("nan")
+    width = max(_ROWS_ZOOMED * step, _LEAST_ZOOM_S) if step > 0 else _ZOOM_S
     by_kind = sorted(clocks, key=lambda clock: clock.kind != "camera")
     gaps = [gap for clock in by_kind for gap in clock.gaps]
     middle = (start + stop) / 2
@@ -199,11 +201,11 @@ def _lanes(axis: Axes, names: Sequence[str]) -> None:
 def _said(clock: Clock) -> str:
     """Rate, jitter and count in one line."""
     if not np.isfinite(clock.rate_hz):
-        return f"{len(clock.time)}"
+        return f"{len(clock.time):,}"
     known = np.isfinite(clock.jitter_s)
     # Below a microsecond it is the float's own rounding.
     jitter = f" ± {1000 * clock.jitter_s:.2g} ms" if known and clock.jitter_s > 1e-6 else ""
-    return f"{clock.rate_hz:.4g} Hz{jitter}, {len(clock.time)} entries"
+    return f"{clock.rate_hz:.4g} Hz{jitter}, {len(clock.time):,} entries"
 
 
 def _legend(figure: Figure, view: EpisodeView) -> None:

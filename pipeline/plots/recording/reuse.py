@@ -30,7 +30,7 @@ def draw(
     _from_frames(axis, view, lanes, rows)
     for row in rows:
         _bracket(axis, line.time[served[row]] - view.zero, lanes["VL rows"], lanes["ticks"])
-        inside = line.vl_time[row] >= near[0]
+        inside = line.vl_time[row] >= near[0] and line.time[served[row][-1]] <= near[1]
         if len(rows) <= _ROW_LABELS and inside:
             axis.text(
                 line.vl_time[row] - view.zero, lanes["VL rows"], f" row {row}{_age(line, row)}",

@@ -188,7 +188,8 @@ def _together(line: Sequence[Axes], row: _Row) -> None:
             axis.set_ylim(min(low for low, _ in ranges), max(high for _, high in ranges))
     labelled = [axis for axis in line if axis.lines]
     if labelled and len(row.group.names) > 1:
-        legend_beside(line[-1], of=labelled[0], fontsize=7.5)
+        # The last sample's window is the fullest: a single reading has a marker in place of a line.
+        legend_beside(line[-1], of=labelled[-1], fontsize=7.5)
 
 
 def _title(dataset: UnifiedVLADataset, batch: UnifiedBatch, index: int) -> str:

@@ -24,7 +24,8 @@
   changed();
 
   // On a phone the contents begin folded, and fold again once one is chosen.
-  const contents = document.querySelector("nav details");
+  const nav = document.querySelector("nav");
+  const contents = nav.querySelector("details");
   const narrow = matchMedia("(max-width: 60rem)");
   const fold = () => { contents.open = !narrow.matches; };
   narrow.addEventListener("change", fold);
@@ -44,8 +45,14 @@
     large.showModal();
   };
   for (const box of document.querySelectorAll(".enlarge")) {
-    box.addEventListener("click", () => { if (box.querySelector("svg")) enlarge(box); });
-    box.addEventListener("keydown", (event) => { if (event.key === "Enter") enlarge(box); });
+    box.setAttribute("role", "button");
+    box.setAttribute("aria-label", "Enlarge: " + box.querySelector("title").textContent);
+    box.addEventListener("click", () => enlarge(box));
+    box.addEventListener("keydown", (event) => {
+      if (event.key !== "Enter" && event.key !== " ") return;
+      event.preventDefault();
+      enlarge(box);
+    });
   }
   place.addEventListener("click", (event) => { if (event.target === place) large.close(); });
   large.addEventListener("close", () => {
@@ -64,7 +71,10 @@
     // The last of those in sight in the order of the page is the innermost.
     const here = [...links.keys()].filter((id) => above.get(id)).pop();
     for (const link of links.values()) link.removeAttribute("aria-current");
-    links.get(here)?.setAttribute("aria-current", "true");
+    const link = links.get(here);
+    link?.setAttribute("aria-current", "true");
+    // Long contents scroll along in their own box.
+    if (link && !narrow.matches) nav.scrollTop = link.offsetTop - nav.clientHeight / 2;
   };
   // In sight is what crosses a line a fifth down the window.
   const observer = new IntersectionObserver(mark, { rootMargin: "-20% 0px -80% 0px" });
