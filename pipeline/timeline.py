@@ -21,8 +21,13 @@ ActionRotation = Literal["rotvec", "euler_delta"]
 RATE_TOLERANCE = 0.1
 """Recorded rows are the ticks when `action_hz` differs from their rate by no more than this."""
 
+_MOST_TICKS = 1_000_000  # of an episode: 28 hours at 10 Hz
+_SLOWEST_HZ = 0.66  # of an episode's fastest stream: 650 Hz in milliseconds looks like 0.65
+
 _TRANSLATION = ("dx", "dy", "dz")
 _ROTATION = {"rotvec": ("rx", "ry", "rz"), "euler_delta": ("da", "db", "dr")}
+
+_Clocks = Mapping[str, NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
@@ -35,6 +40,10 @@ class Timeline:
     """(tick, action_dim) in physical units."""
     action_channels: Channels
     action_kind: str
+    recorded_hz: float | None
+    """Rate of the recorded actions; None where they are derived from poses."""
+    fastest_hz: float
+    """Rate of the episode's fastest stream."""
     vl_row: NDArray[np.int64]
     """(tick,) the VL row that serves it."""
     vl_time: NDArray[np.float64]
@@ -66,38 +75,42 @@ def build_timeline(
     """The ticks of one episode.
 
     `state` and `sensor` are the recording's own streams, passed in because they are read once.
-    Raises `RecordingError` when there are no actions, when no instant is covered by every stream or
-    when a delta action would have to be resampled, and `ConfigError` when pose-derived actions are
-    asked for without a rate.
+    Raises `RecordingError` when there are no actions, when no instant is covered by every stream,
+    when clocks are not in seconds or when a delta action would have to be resampled, and
+    `ConfigError` when pose-derived actions are asked for without a rate.
     """
-    clocks = {f"view {view}": camera.time for view, camera in recording.cameras().items()}
-    clocks |= {
-        name: stream.time for name, stream in (("sensor", sensor), ("state", state)) if stream
-    }
+    cameras = recording.cameras()
+    clocks = {f"view {view}": camera.time for view, camera in cameras.items()}
+    streams = {"sensor": sensor, "state": state}
+    clocks |= {name: stream.time for name, stream in streams.items() if stream}
     recorded = recording.action()
     poses = recording.poses()
+    rate: float | None = None
     if recorded is not None and not _redo_rotation(recorded, poses, action_rotation):
-        time, action = _recorded_ticks(recording, recorded, clocks, action_hz)
+        clocks["action"] = recorded.time
+        rate = recorded.rate_hz or _hz(recorded.time) or 1.0
+        time, action = _recorded_ticks(recording, recorded, rate, clocks, action_hz)
         channels, kind = recorded.channels, recorded.kind
     elif poses is not None:
+        clocks["pose"] = poses.time
         time, action = _pose_ticks(recording, poses, clocks, action_hz, action_rotation)
         channels, kind = _pose_channels(action_rotation), "delta"
     else:
         raise RecordingError(f"{recording.path}: neither actions nor poses to derive them from")
     vl_time = time[::vlm_reuse_count]
-    frames = {view: last_at(camera.time, vl_time) for view, camera in recording.cameras().items()}
+    frames = {view: last_at(camera.time, vl_time) for view, camera in cameras.items()}
     none = np.zeros(len(time), np.int64)
     return Timeline(
         time=time,
         action=action,
         action_channels=channels,
         action_kind=kind,
+        recorded_hz=rate,
+        fastest_hz=max(map(_hz, clocks.values())),
         vl_row=np.arange(len(time)) // vlm_reuse_count,
         vl_time=vl_time,
         frames=frames,
-        frame_time={
-            view: camera.time[frames[view]] for view, camera in recording.cameras().items()
-        },
+        frame_time={view: cameras[view].time[rows] for view, rows in frames.items()},
         sensor_end=none if sensor is None else last_at(sensor.time, time) + 1,
         state_end=none if state is None else last_at(state.time, time) + 1,
     )
@@ -141,11 +154,11 @@ def _pose_channels(action_rotation: ActionRotation) -> Channels:
 def _recorded_ticks(
     recording: Recording,
     recorded: RecordedAction,
-    clocks: Mapping[str, NDArray[np.float64]],
+    rate: float,
+    clocks: _Clocks,
     action_hz: float | None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    start, stop = _covered(recording, {"action": recorded.time, **clocks})
-    rate = recorded.rate_hz or _rate(recorded.time)
+    start, stop = _covered(recording, clocks)
     if action_hz is None or abs(action_hz - rate) <= RATE_TOLERANCE * rate:
         kept = (recorded.time >= start) & (recorded.time <= stop)
         return _some(recording, recorded.time[kept]), recorded.values[kept]
@@ -154,14 +167,14 @@ def _recorded_ticks(
             f"{recording.path}: its actions are differences recorded at {rate:g} Hz and cannot be "
             f"held at data.action_hz={action_hz:g}. Set data.action_hz to {rate:g} or null."
         )
-    time = _some(recording, _grid(start, stop, action_hz))
+    time = _some(recording, _grid(recording, clocks, start, stop, action_hz))
     return time, recorded.values[last_at(recorded.time, time)]
 
 
 def _pose_ticks(
     recording: Recording,
     poses: Stream,
-    clocks: Mapping[str, NDArray[np.float64]],
+    clocks: _Clocks,
     action_hz: float | None,
     action_rotation: ActionRotation,
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
@@ -170,9 +183,14 @@ def _pose_ticks(
             f"data.action_hz is null, but the actions of {recording.path} are derived from poses "
             "and need a rate; set data.action_hz, for example to 10"
         )
-    start, stop = _covered(recording, {"pose": poses.time, **clocks})
+    if len(np.unique(poses.time)) < 2:
+        raise RecordingError(
+            f"{recording.path}: its {len(poses.time)} pose(s) stand at one instant, so no action "
+            "can be derived from them. Mend the recording's times or leave it out"
+        )
+    start, stop = _covered(recording, clocks)
     last = min(stop, float(poses.time[-1]) - 1 / action_hz)
-    time = _some(recording, _grid(start, last, action_hz))
+    time = _some(recording, _grid(recording, clocks, start, last, action_hz))
     edges = np.append(time, start + len(time) / action_hz)
     edges = np.minimum(edges, poses.time[-1])
     return time, _pose_actions(poses, edges, action_rotation)
@@ -186,7 +204,8 @@ def _pose_actions(
     pose = poses.values[first].astype(np.float64)
     place = np.stack([np.interp(edges, clock, pose[:, axis]) for axis in range(3)], axis=1)
     if action_rotation == "rotvec":
-        turned = Slerp(clock, _rotations(pose[:, 3:]))(edges)
+        # R = Rx(a)·Ry(b)·Rz(r), the arm's mobile XYZ convention.
+        turned = Slerp(clock, Rotation.from_euler("XYZ", pose[:, 3:], degrees=True))(edges)
         # In the base frame: R(k+1)·R(k)ᵀ.
         rotation = (turned[1:] * turned[:-1].inv()).as_rotvec(degrees=True)
     else:
@@ -198,14 +217,7 @@ def _pose_actions(
     return np.concatenate([np.diff(place, axis=0), rotation, gripper], axis=1).astype(np.float32)
 
 
-def _rotations(angles: NDArray[np.float64]) -> Rotation:
-    """R = Rx(a)·Ry(b)·Rz(r), the arm's mobile XYZ convention; angles (n, 3) in degrees."""
-    return Rotation.from_euler("XYZ", angles, degrees=True)
-
-
-def _covered(
-    recording: Recording, clocks: Mapping[str, NDArray[np.float64]]
-) -> tuple[float, float]:
+def _covered(recording: Recording, clocks: _Clocks) -> tuple[float, float]:
     """The first and last instant at which every stream has begun and none has ended."""
     late = max(clocks, key=lambda name: float(clocks[name][0]))
     early = min(clocks, key=lambda name: float(clocks[name][-1]))
@@ -218,9 +230,18 @@ def _covered(
     return start, stop
 
 
-def _grid(start: float, stop: float, rate_hz: float) -> NDArray[np.float64]:
+def _grid(
+    recording: Recording, clocks: _Clocks, start: float, stop: float, rate_hz: float
+) -> NDArray[np.float64]:
     """start, start + 1/rate, … up to `stop`; a microsecond of slack for rounding."""
     count = int(np.floor((stop - start) * rate_hz + 1e-6 * rate_hz)) + 1
+    fastest = max(map(_hz, clocks.values()))
+    if count > _MOST_TICKS or 0 < fastest < _SLOWEST_HZ:
+        raise RecordingError(
+            f"{recording.path}: are the clocks in seconds? {stop - start:g} s would be {count:,} "
+            f"ticks at {rate_hz:g} Hz, and its fastest stream has {fastest:.2g} entries a second. "
+            "Divide the recording's times by 1e3 or 1e9, or lower data.action_hz"
+        )
     return start + np.arange(max(0, count)) / rate_hz
 
 
@@ -232,5 +253,8 @@ def _some(recording: Recording, time: NDArray[np.float64]) -> NDArray[np.float64
     return time
 
 
-def _rate(time: NDArray[np.float64]) -> float:
-    return 1.0 / float(np.median(np.diff(time))) if len(time) > 1 else 1.0
+def _hz(clock: NDArray[np.float64]) -> float:
+    """Entries a second; 0 of a clock without two instants."""
+    steps = np.diff(clock)
+    steps = steps[steps > 0]
+    return 1.0 / float(np.median(steps)) if len(steps) else 0.0

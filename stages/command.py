@@ -6,6 +6,7 @@ import signal
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -82,7 +83,10 @@ def run(
     )
     for shorthand in shorthands:
         shorthand.add_to(parser)
-    options = parser.parse_args(arguments)
+    options, unknown = parser.parse_known_args(arguments)
+    if unknown:
+        known = ["--params", "--set", "--keys", *(one.name for one in shorthands)]
+        parser.error(f"unrecognized arguments: {' '.join(unknown)}{_meant(unknown, known)}")
     if options.keys:
         print("\n".join(described_keys(sections or tuple(Params.model_fields))))
         return 0
@@ -105,6 +109,20 @@ def run(
         print("stopped; run the same command again", file=sys.stderr)
         return 1
     return 0
+
+
+def _meant(unknown: Sequence[str], known: Sequence[str]) -> str:
+    """A question about the first of some unknown arguments, where it looks like a known one."""
+    first, *values = unknown
+    name, equals, value = first.partition("=")
+    if first.startswith("-"):
+        near = get_close_matches(name, [one for one in known if one.startswith("-")], 1)
+        meant = " ".join([near[0] + equals + value, *values]) if near else ""
+    elif first.endswith((".yaml", ".yml")):
+        meant = f"--params {first}"
+    else:
+        meant = f"--set {first}" if equals else ""
+    return f"; did you mean {meant}?" if meant else ""
 
 
 def _terminate(signum: int, frame: FrameType | None) -> None:

@@ -13,17 +13,19 @@ is written, whatever it finds, and 2 where nothing could be looked at.
 
 The page of PATH goes into a folder of its own in reports/inspect, named after PATH; without PATH it
 goes into reports/inspect itself, and with --set inspect.output=FOLDER always into that one. Looking
-again replaces the page and its pictures there, and touches no other file.
+again replaces the page, its pictures and findings.csv there, and touches no other file. Digests of
+the checkpoint are remembered in reports/inspect/.files.sqlite, or where stages.extract does it.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 from pipeline.config import Params
 from pipeline.inspection.store import inspect_store
-from pipeline.report import Notice, Notices, Report, Section, write_report
+from pipeline.inspection.subject import Subject, subject_of
+from pipeline.report import Notice, Notices, Report, write_report
+from pipeline.report.findings import FINDINGS
 from pipeline.report.recording import recordings_report
 from pipeline.report.store import store_report
-from pipeline.report.subject import Subject, subject_of
 from stages.command import Shorthand, run
 
 PATH = Shorthand(
@@ -37,41 +39,35 @@ def main(params: Params) -> None:
     """Write the page of what `inspect.path` names."""
     subject = subject_of(params)
     report = _report(subject, params)
-    page, *pictures = write_report(subject.folder, report)
+    page, *beside = write_report(subject.folder, report)
     print("\n".join(summary(report)))
-    print(f"{page}: the page, with {len(pictures)} pictures beside it")
+    pictures = sum(file.suffix == ".png" for file in beside)
+    print(f"{page}: the page, with {pictures} pictures and {FINDINGS} beside it")
 
 
 def summary(report: Report) -> Iterator[str]:
     """What the page says first, for a terminal."""
     yield report.title
     yield " · ".join(f"{label} {value}" for label, value in report.tiles)
-    found = _first_notices(report.sections)
+    # The first are those of all: those of single parts come later.
+    found = next(report.blocks(Notices), None)
     if found is None:
         return
     if not found.notices:
         yield found.none
     worst_first = sorted(found.notices, key=lambda one: one.severity != "error")
     for one in worst_first[:SAID]:
-        yield f"{one.severity}: {one.kind}: {one.where}"
+        first = f", the first {one.places[0]}" if len(one.places) > 1 else ""
+        yield f"{one.severity}: {one.kind}: {one.where}{first}"
         yield f"    {_line(one)}"
     if len(found.notices) > SAID:
-        yield f"… and {len(found.notices) - SAID} more on the page"
+        yield f"… and {len(found.notices) - SAID} more on the page and in {FINDINGS}"
 
 
 def _report(subject: Subject, params: Params) -> Report:
     if subject.store is not None:
         return store_report(inspect_store(subject.store, params.inspect))
     return recordings_report(subject.recordings(params.data.views), params, subject.name)
-
-
-def _first_notices(sections: Sequence[Section]) -> Notices | None:
-    """The notices of all: those of single parts come later."""
-    for section in sections:
-        for block in section.blocks:
-            if isinstance(block, Notices):
-                return block
-    return None
 
 
 def _line(notice: Notice) -> str:

@@ -15,6 +15,7 @@ list and gc without --remove write nothing. Next after a merge: python -m stages
 import sys
 from pathlib import Path
 
+from pipeline.amounts import size
 from pipeline.config import Params, StoresParams
 from pipeline.errors import ConfigError, PipelineError, StoreLocked
 from pipeline.store import FeatureStore
@@ -25,7 +26,6 @@ from pipeline.store.housekeeping import (
     leftovers,
     named,
     remove,
-    size,
     table,
     take_inventory,
 )

@@ -1,15 +1,20 @@
 """What tests of every room share: the real recordings, where present, and a small store."""
 
 import json
+import os
+import shutil
 import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from jaxtyping import install_import_hook
 
+from pipeline.simulation.insertion_formats import write_raw
+from pipeline.simulation.recorder import simulate_episode
 from pipeline.store import SCHEMA, FeatureStore, Sizes, StoreBuild, arrays
 from pipeline.store.chunks import ChunkFiles, row_checksums
 from pipeline.store.metadata import note_metadata
@@ -20,6 +25,7 @@ from pipeline.vlm.demo_checkpoint import write_demo_checkpoint
 install_import_hook("pipeline.models", "beartype.beartype")
 
 ROOT = Path(__file__).resolve().parents[1]
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
 @pytest.fixture(scope="session")
@@ -219,3 +225,37 @@ def demo_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("checkpoint") / "demo_vlm"
     write_demo_checkpoint(folder)
     return folder
+
+
+@pytest.fixture(scope="session")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with one raw recording in it, not to be written to."""
+    folder = tmp_path_factory.mktemp("lab") / "raw"
+    write_raw(folder, simulate_episode(4, 1.767e9 + 0.25))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def missing() -> Callable[[str], None]:
+    """`missing(said)` skips; where CI runs, it fails: a green CI has looked."""
+
+    def stop(said: str) -> None:
+        if os.environ.get("CI"):
+            pytest.fail(said)
+        pytest.skip(said)
+
+    return stop
+
+
+# One a module, not one a session: while playwright runs, no other test can run an event loop.
+@pytest.fixture(scope="module")
+def browser(missing: Callable[[str], None]) -> Iterator[Any]:
+    """Headless Chromium."""
+    sync_api = pytest.importorskip("playwright.sync_api")
+    found = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if found is None:
+        missing(f"no browser to look at pages with: none of {', '.join(BROWSERS)} is installed")
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=found, args=["--no-sandbox"])
+        yield browser
+        browser.close()

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -220,6 +221,43 @@ def test_curves_mark_the_step_that_was_judged() -> None:
     assert "step 20" in figure.get_suptitle()
     (axis,) = plots.curves(Curves({"train/other": logged["train/other"]}), 5).axes
     assert axis.get_title() == "train/other"
+
+
+def test_titles_of_groups_of_many_stay_within_their_panels() -> None:
+    comparison, _, store = evaluated(2, 13)
+    names = [f"joint_{index}_velocity" for index in range(13)]
+    groups = (
+        Group("other", "rad/s", tuple(range(6))),
+        Group("translation", "rad/s", tuple(range(6, 12))),
+    )
+    comparison = replace(comparison, names=names, groups=groups)
+    for figure in (plots.horizon(comparison, 10.0), plots.episodes(comparison, store)):  # type: ignore[arg-type]
+        figure.draw_without_rendering()
+        left, right = (axis.title.get_window_extent() for axis in figure.axes)
+        assert figure.axes[0].get_title().startswith("other, 6 dimensions\n")
+        assert 0 < left.x0 < left.x1 < right.x0 < right.x1 < figure.bbox.x1
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1e-3, 1.0, 1e5])
+def test_labels_of_a_scatter_lie_apart_whatever_the_range(scale: float) -> None:
+    comparison, predictions, _ = evaluated(2)
+    small = np.float32(scale)
+    predictions = replace(
+        predictions,
+        recorded=predictions.recorded * small,
+        predicted=predictions.predicted * small,
+    )
+    figure = plots.scatter(comparison, predictions)
+    figure.draw_without_rendering()
+    for axis in figure.axes[:4]:
+        low, high = axis.get_xlim()
+        shown = [
+            label.get_window_extent()
+            for place, label in zip(axis.get_xticks(), axis.get_xticklabels(), strict=True)
+            if low <= place <= high
+        ]
+        assert len(shown) >= 2
+        assert all(right.x0 - left.x1 > 3 for left, right in pairwise(shown))
 
 
 def test_what_never_varies_takes_no_panel() -> None:

@@ -107,6 +107,25 @@ class TestRecordedTicks:
         assert np.allclose(np.diff(line.time), 0.04)
         assert np.array_equal(line.action[:, 0], 2 * np.floor(line.time * 10 + 1e-9))
 
+    def test_know_the_rate_they_were_recorded_at_and_that_of_the_fastest_stream(self):
+        cameras = {"View1": np.arange(100) / 50}
+        made = Made(camera_times=cameras, recorded=recorded_at(np.arange(20) / 10, "absolute"))
+        line = build_timeline(made, 25.0, 3, "euler_delta")
+        assert (line.recorded_hz, line.fastest_hz) == (10.0, pytest.approx(50))
+
+    @pytest.mark.parametrize("unit", [1e3, 1e6, 1e9])
+    def test_refuse_clocks_that_are_not_in_seconds(self, unit):
+        time = (1.7e9 + np.arange(20) / 10) * unit
+        with pytest.raises(RecordingError, match="made: are the clocks in seconds"):
+            build_timeline(
+                Made(recorded=recorded_at(time, "absolute", None)), 10.0, 3, "euler_delta"
+            )
+
+    def test_refuse_more_than_an_episode_can_have(self):
+        recorded = recorded_at(np.append(np.arange(20) / 10, 1e12), "absolute")
+        with pytest.raises(RecordingError, match="made: are the clocks in seconds"):
+            build_timeline(Made(recorded=recorded), 25.0, 3, "euler_delta")
+
     def test_refuse_to_hold_differences(self):
         with pytest.raises(RecordingError, match=r"made.*10 Hz.*action_hz=25"):
             build_timeline(Made(recorded=recorded_at(np.arange(20) / 10)), 25.0, 3, "euler_delta")
@@ -207,6 +226,18 @@ class TestPoseActions:
     def test_needs_a_rate(self):
         with pytest.raises(ConfigError, match="action_hz"):
             build_timeline(Made(pose=self.poses(np.zeros((50, 6)))), None, 3, "rotvec")
+
+    @pytest.mark.parametrize("unit", [1e3, 1e9])
+    def test_refuses_clocks_that_are_not_in_seconds(self, unit):
+        pose = Stream(POSE, np.arange(50) * unit / 100, np.zeros((50, 6), np.float32))
+        with pytest.raises(RecordingError, match="made: are the clocks in seconds"):
+            build_timeline(Made(pose=pose), 10.0, 3, "rotvec")
+
+    def test_refuses_poses_of_one_instant(self):
+        # A tenth of a second is lost in a float64 of nanoseconds.
+        pose = Stream(POSE, np.full(50, 1.7e18), np.zeros((50, 6), np.float32))
+        with pytest.raises(RecordingError, match=r"made: its 50 pose\(s\) stand at one instant"):
+            build_timeline(Made(pose=pose), 10.0, 3, "rotvec")
 
     def test_too_short_for_a_following_pose(self):
         with pytest.raises(RecordingError, match="too short"):

@@ -7,6 +7,7 @@ from typing import Literal
 
 import torch
 
+from pipeline.amounts import size
 from pipeline.batches.scratch import restored
 from pipeline.errors import ConfigError
 from pipeline.store import FeatureStore
@@ -71,8 +72,8 @@ def choose_feed(
     fields = fitting(wide, free, _DEVICE_SHARE)
     whole, taken = sum(one.nbytes for one in wide.values()), sum(wide[one].nbytes for one in fields)
     room = (
-        f"{taken / 2**30:.2f} of {whole / 2**30:.2f} GiB fit in {_DEVICE_SHARE:.0%} of the "
-        f"{free / 2**30:.1f} GiB free on {device}"
+        f"{size(taken)} of {size(whole)} fit in {_DEVICE_SHARE:.0%} of the "
+        f"{size(free)} free on {device}"
     )
     if feed == "auto" and taken < whole:
         return Choice("mapped", frozenset(), f"feed: mapped (auto: {room})")

@@ -9,6 +9,7 @@ from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
 
+from pipeline.amounts import size
 from pipeline.durable import free_bytes
 from pipeline.errors import DiskFull
 from pipeline.store.archive import restore
@@ -34,12 +35,12 @@ def restored(archive: Path, scratch: Path | None, say: Callable[[str], None]) ->
         if target.exists():
             say(f"feed: compressed: {archive} is an archive; its store is still in {target}")
             return target
-        size = sum(array.raw_bytes for array in manifest.arrays.values()) + _MARGIN_BYTES
+        needed = sum(array.raw_bytes for array in manifest.arrays.values()) + _MARGIN_BYTES
         free = free_bytes(folder)
-        if free < size:
+        if free < needed:
             raise DiskFull(
-                f"{folder}: expected {size / 2**30:.2f} GiB for the store of {archive}, found "
-                f"{free / 2**30:.2f} GiB free. Make room (stores restored earlier lie there too), "
+                f"{folder}: expected {size(needed)} for the store of {archive}, found "
+                f"{size(free)} free. Make room (stores restored earlier lie there too), "
                 "or set train_head.scratch to a folder on a larger disk."
             )
         say(f"feed: compressed: {archive} is an archive; restoring its store to {target}")

@@ -39,7 +39,8 @@ class UnifiedVLADataset(Dataset[Sample]):
     frames; `stages.train_head` draws others too.
 
     `horizon` is in ticks, the windows in readings, `action_hz` None takes recorded rows as ticks.
-    `instruction` replaces what the recordings say. Old and new recordings in one data set have
+    `recordings`, open already, may stand in the place of `data`; what they are read with stays.
+    `instruction` replaces what those of `data` say. Old and new recordings in one data set have
     actions of one kind, `action_rotation`; `auto` is rotvec where every recording has poses.
 
     Works in DataLoader workers however they are started: a pickle opens the data again. Use
@@ -69,6 +70,7 @@ class UnifiedVLADataset(Dataset[Sample]):
         views: Sequence[str] | None = None,
         action_rotation: Rotation = "auto",
         store: FeatureStore | str | Path | None = None,
+        recordings: Sequence[Recording] | None = None,
     ) -> None:
         _check_one_of("format", format, get_args(Format))
         _check_one_of("action_rotation", action_rotation, get_args(Rotation))
@@ -76,12 +78,17 @@ class UnifiedVLADataset(Dataset[Sample]):
         self.vlm_reuse_count, self.action_hz = vlm_reuse_count, action_hz
         self.action_rotation: Rotation = action_rotation
         self._sources = _sources(data, format, instruction)
-        self._format, self._views = format, views
+        self._format, self._views, self._given = format, views, recordings
         self._cached = FeatureStore.open(store) if isinstance(store, str | Path) else store
         if min(astuple(self.windows)) < 1 or vlm_reuse_count < 1:
             raise ConfigError(
                 "horizon, windows and vlm_reuse_count count from 1, found "
                 f"{self.windows} and vlm_reuse_count={vlm_reuse_count}"
+            )
+        if recordings is not None and not (data is None and instruction is None and views is None):
+            raise ConfigError(
+                "recordings are open already, but data, instruction and views are about opening "
+                "some. Leave these out, or recordings"
             )
         if self._cached is not None and (instruction is not None or views is not None):
             raise ConfigError(
@@ -151,7 +158,7 @@ class UnifiedVLADataset(Dataset[Sample]):
             check_store(self.store, self.vlm_reuse_count, self.action_hz, self.action_rotation)
             self.episodes = tuple(
                 episodes_of_recordings(self.store, self._recordings())
-                if self._sources
+                if self._sources or self._given is not None
                 else episodes_of_format(self.store, self._format)
             )
         ranges = [np.arange(one.ticks.start, one.ticks.stop) for one in self.episodes]
@@ -164,7 +171,9 @@ class UnifiedVLADataset(Dataset[Sample]):
         self.episodes = self.store.episodes
         self._frames = Frames(read, self.store.array("episode/vl_start"))
 
-    def _recordings(self) -> tuple[Recording, ...]:
+    def _recordings(self) -> Sequence[Recording]:
+        if self._given:
+            return self._given
         if not self._sources:
             raise ConfigError(
                 "a data set needs recordings or a store, found neither. Name a folder of "

@@ -25,7 +25,7 @@ from pipeline.evaluation.modality_tables import (
     modality_errors,
     modality_table,
 )
-from pipeline.evaluation.names import episode_name, place, with_unit
+from pipeline.evaluation.names import with_unit
 from pipeline.evaluation.predictions import (
     BASELINES,
     METHODS,
@@ -59,7 +59,6 @@ __all__ = [
     "best_baseline",
     "check_store",
     "compare",
-    "episode_name",
     "error_rows",
     "experiment_errors",
     "experiment_rows",
@@ -74,7 +73,6 @@ __all__ = [
     "metrics",
     "modality_errors",
     "modality_table",
-    "place",
     "predict",
     "read_curves",
     "read_experiments",

@@ -7,12 +7,11 @@ import numpy as np
 from pipeline.batches import Ticks, Windows
 from pipeline.checkpoint import PolicyCheckpoint, describe, source_differences, source_of
 from pipeline.errors import CheckpointMismatch
-from pipeline.evaluation.names import episode_name
 from pipeline.evaluation.predictions import FeedMaker, Predictions, baselines, predict
 from pipeline.evaluation.scores import Comparison, Group, compare
 from pipeline.models import Trainable, action_groups
 from pipeline.normalization import Normalization
-from pipeline.store import FeatureStore
+from pipeline.store import FeatureStore, episode_name
 
 
 def held_out_ranges(store: FeatureStore, ticks: Ticks) -> dict[str, tuple[int, int]]:

@@ -21,11 +21,10 @@ from pipeline.evaluation.corruption import (
     zeroed,
 )
 from pipeline.evaluation.held_out import judge
-from pipeline.evaluation.names import episode_name
 from pipeline.evaluation.predictions import FeedMaker
 from pipeline.evaluation.scores import Comparison
 from pipeline.models import Policy
-from pipeline.store import FeatureStore
+from pipeline.store import FeatureStore, episode_name
 
 DELAYS_MS = (50, 100, 200)
 MOST_TICKS = 1000

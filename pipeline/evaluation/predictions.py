@@ -11,9 +11,8 @@ from tqdm import tqdm
 
 from pipeline.batches import Draw, Feed, Prefetch, Ticks, Windows, draws
 from pipeline.errors import NumericsError
-from pipeline.evaluation.names import place
 from pipeline.models import Observation, Trainable
-from pipeline.store import FeatureStore
+from pipeline.store import FeatureStore, place
 
 Actions = NDArray[np.float32]
 METHODS = ("policy", "zero_action", "mean_action", "repeat_last")

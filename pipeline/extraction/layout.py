@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from pipeline.amounts import size
 from pipeline.config import Params
 from pipeline.durable import free_bytes
 from pipeline.errors import DiskFull, NumericsError
@@ -32,8 +33,8 @@ def check_space(
     free = free_bytes(build.part)
     if needed > free:
         raise DiskFull(
-            f"{build.target}: the store needs {needed / 2**30:.2f} GiB, {build.part.parent} has "
-            f"{free / 2**30:.2f} GiB free. Make room, or set extract.store to another disk, "
+            f"{build.target}: the store needs {size(needed)}, {build.part.parent} has "
+            f"{size(free)} free. Make room, or set extract.store to another disk, "
             "extract.dtype or extract.sensor_dtype to float16, or fewer vlm.pooling slots or "
             "vlm.variants."
         )

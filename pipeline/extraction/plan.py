@@ -3,10 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from pipeline.amounts import duration, size
 from pipeline.extraction.check import CheckedEpisode
 from pipeline.extraction.survey import Survey
 from pipeline.store import FEATURES, Donor
 from pipeline.store.schema import ArraySpec
+from pipeline.timeline import RATE_TOLERANCE
 from pipeline.vlm.feature_spec import differences
 
 
@@ -37,14 +39,14 @@ class ExtractionPlan:
             time = "not known before a first session of this store with this model and device"
         else:
             seconds = left / self.rows_per_s
-            time = f"about {_duration(seconds)} at {self.rows_per_s:.1f} rows/s, as last measured"
+            time = f"about {duration(seconds)} at {self.rows_per_s:.1f} rows/s, as last measured"
         return [
             *(f"why: {reason}" for reason in self.reasons),
             f"episodes: {self.episodes}, {self.unchanged} of them unchanged",
             f"rows: {self.rows}, {self.known} known, {left} to compute"
             + (f" in {self.variants} variants each" if left and self.variants > 1 else "")
             + (" (fewer where a key turns out to be known)" if left and self.known else ""),
-            f"disk: {_size(self.bytes)} for the whole store, {_size(self.free)} free",
+            f"disk: {size(self.bytes)} for the whole store, {size(self.free)} free",
             f"time: {time}",
         ]
 
@@ -87,6 +89,37 @@ def reasons(survey: Survey, store: Donor | None, specs: dict[str, ArraySpec]) ->
     return tuple(why) or ("the order of episodes, or how actions are derived, changed",)
 
 
+def rate_notes(checked: Sequence[CheckedEpisode], action_hz: float | None) -> list[str]:
+    """A line a source whose ticks come at another rate than what was recorded."""
+    if action_hz is None:
+        return []
+    fastest: dict[str, float] = {}
+    recorded: dict[str, set[float]] = {}
+    for one in checked:
+        source, line = one.surveyed.recording.source, one.timeline
+        fastest[source] = max(fastest.get(source, 0.0), line.fastest_hz)
+        rates = recorded.setdefault(source, set())
+        if line.recorded_hz is not None:
+            rates.add(line.recorded_hz)
+    notes = {
+        source: _rate_note(action_hz, sorted(recorded[source]), rate)
+        for source, rate in fastest.items()
+    }
+    return [f"source {source!r}: {note}" for source, note in notes.items() if note]
+
+
+def _rate_note(action_hz: float, recorded: Sequence[float], fastest: float) -> str | None:
+    said: list[str] = []
+    others = [rate for rate in recorded if abs(action_hz - rate) > RATE_TOLERANCE * rate]
+    if others:
+        rates = f"{others[0]:.3g}" + (f" to {others[-1]:.3g}" if len(others) > 1 else "")
+        fate = "held" if action_hz > others[0] else "left out between ticks"
+        said.append(f"recorded at {rates} Hz: actions are {fate}")
+    if action_hz > (1 + RATE_TOLERANCE) * fastest:
+        said.append(f"no stream is faster than {fastest:.3g} Hz: check data.action_hz")
+    return f"ticks at {action_hz:g} Hz, {', '.join(said)}" if said else None
+
+
 def known_rows(
     checked: Sequence[CheckedEpisode], views: Sequence[str], donors: Sequence[Donor]
 ) -> int:
@@ -98,14 +131,3 @@ def known_rows(
         rows = one.timeline.frame_times(views)
         count += sum(row.tobytes() in known for row in rows)
     return count
-
-
-def _duration(seconds: float) -> str:
-    minutes, hours = seconds / 60, seconds / 3600
-    if hours >= 1.5:
-        return f"{hours:.1f} h"
-    return f"{minutes:.0f} min" if minutes >= 1.5 else f"{seconds:.0f} s"
-
-
-def _size(count: int) -> str:
-    return f"{count / 2**30:.1f} GiB" if count >= 2**30 else f"{count / 2**20:.1f} MiB"

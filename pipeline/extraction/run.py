@@ -24,7 +24,13 @@ from pipeline.extraction.places import (
     remove,
     set_aside,
 )
-from pipeline.extraction.plan import ExtractionPlan, known_rows, reasons, store_bytes
+from pipeline.extraction.plan import (
+    ExtractionPlan,
+    known_rows,
+    rate_notes,
+    reasons,
+    store_bytes,
+)
 from pipeline.extraction.survey import Survey, survey
 from pipeline.store import (
     Donor,
@@ -142,6 +148,8 @@ def _begin(
     build = StoreBuild(target, build_arrays(checked, surveyed, params), surveyed.plan)
     if any(one.recording.has_poses for one in surveyed.episodes):
         say(f"actions: rotations as {surveyed.action_rotation}")
+    for line in rate_notes(checked, params.data.action_hz):
+        say(line)
     with closing(build):
         with donors_at([part, *known_places(target)], surveyed) as donors:
             plan = _new_plan(build, checked, surveyed, donors, params, digests)

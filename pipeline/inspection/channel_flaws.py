@@ -1,5 +1,8 @@
-"""What looks wrong in the values: flat, frozen and clipped channels, actions far beyond others."""
+"""What looks wrong in the values: flat, still, frozen and clipped channels, actions far beyond
+others."""
 
+import re
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -12,6 +15,8 @@ from pipeline.inspection.facts import EpisodeView, Flaw
 from pipeline.inspection.runs import runs
 from pipeline.recordings import Stream
 
+STILL = 0.01
+"""Times the median standard deviation of the channels of its kind, below which one hardly moves."""
 FROZEN_S = 0.5
 """A sensor whose channels all repeat for as long stands still."""
 CLIPPED_SHARE, CLIPPED_RUN = 0.01, 5
@@ -28,15 +33,19 @@ _FEWEST = 20
 """Entries below which nothing is said of a stream's values."""
 _WIDE = 8
 """Channels of one unit, from which their common largest value is taken for the end of the range."""
+_ALIKE = 3
+"""Moving channels of one kind, from which what is usual for them is known."""
 _NEIGHBOURS = 5
 _SHOWN = 4
 
 
 def channel_flaws(view: EpisodeView) -> Iterator[Flaw]:
-    """Flaws of kind flat channel, frozen, saturated and action outlier."""
+    """Flaws of kind flat channel, still channel, frozen, saturated and action outlier."""
     for name, stream in view.streams.items():
         if name != "poses" and len(stream.time) >= _FEWEST:
             yield from _flat(view, name, stream)
+            if name != "sensor":  # the depths of a scan are not all equally bright
+                yield from _still(view, name, stream)
     if view.sensor is not None and len(view.sensor.time) >= _FEWEST:
         yield from _frozen(view, view.sensor)
         yield from _saturated(view, view.sensor)
@@ -66,6 +75,33 @@ def _flat(view: EpisodeView, name: str, stream: Stream) -> Iterator[Flaw]:
         said = f"{len(columns)} of {len(names)} channels never change: {named(names, columns)}"
     others = "no channel varies" if flat.all() else "the others vary"
     yield view.flaw("flat channel", name, f"{said}; {others}")
+
+
+def _still(view: EpisodeView, name: str, stream: Stream) -> Iterator[Flaw]:
+    """Channels that hardly move beside others of their kind, such as joints, and their unit."""
+    names, units = stream.channels.names, stream.channels.units
+    std = stream.values.std(axis=0, dtype=np.float64)
+    kinds: dict[tuple[str, str], list[int]] = defaultdict(list)
+    for column in np.flatnonzero(np.ptp(stream.values, axis=0) > 0).tolist():
+        kinds[re.sub(r"\d+", "#", names[column]), units[column]].append(column)
+    usual = {
+        column: float(np.median(std[columns]))
+        for columns in kinds.values()
+        if len(columns) >= _ALIKE
+        for column in columns
+    }
+    columns = sorted(column for column, each in usual.items() if std[column] < STILL * each)
+    if not columns:
+        return
+    largest = max(columns, key=lambda column: std[column] / usual[column])
+    what = "hardly moves" if len(columns) == 1 else "hardly move"
+    yield view.flaw(
+        "still channel",
+        name,
+        f"{named(names, columns)} {what}: a standard deviation of {std[largest]:.2g} at most, "
+        f"where {usual[largest]:.2g} is usual for such channels; training scales every channel to "
+        "unit spread, so that their noise would count like a motion",
+    )
 
 
 def _frozen(view: EpisodeView, sensor: Stream) -> Iterator[Flaw]:

@@ -1,21 +1,21 @@
-"""What looks wrong in the clocks: gaps, jumps, rates, counts, ticks lost, frames too old."""
+"""What looks wrong in the clocks: gaps, jumps, rates, frames lost, ticks lost, frames too old."""
 
 from collections.abc import Iterator, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.inspection.clocks import distinct_clocks, gaps, usual_step
+from pipeline.inspection.clocks import distinct_clocks, gaps, shortest_gap, usual_step
 from pipeline.inspection.facts import EpisodeView, Flaw, Gap
-from pipeline.inspection.nominal import said_by
-from pipeline.recordings.reader import FileRecording
+from pipeline.recordings.recording import Nominal
 
 RATE_TOLERANCE = 0.1
 """Share by which entries a second may differ from what the recording says."""
-COUNT_TOLERANCE = 0.1
-"""Share of its frames that a view may lack; two frames are never too few."""
-OTHER_RATE = 1.8
-"""Times as fast a camera is one of another kind, whose frames are not compared in number."""
+DROPPED_STEP = 1.5
+"""Usual steps from which a camera's step has lost a frame."""
+DROPPED, DROPPED_SHARE = 5, 0.05
+"""How many such steps there are at least, and what share of the steps they have to exceed, as have
+the frames that there was time for: jitter alone leaves no time, as steps get shorter too."""
 LOST_S = 0.5
 """Seconds by which a stream may begin after the others, or end before them."""
 REPEATED = 0.05
@@ -25,21 +25,23 @@ OLD = 2.0
 
 _TICK_S = 0.1
 """Of an episode without ticks."""
+_FEWEST = 20
+"""Steps below which nothing is said of how a clock runs."""
 _LISTED = 5
 """Gaps of one clock that are told one by one; of more, the longest and their number."""
 
 
-def clock_flaws(view: EpisodeView) -> Iterator[Flaw]:
-    """Flaws of kind gap, clock jump, repeated times, rate, frame count, missing, lost ticks and
-    old frames.
+def clock_flaws(view: EpisodeView, said: Nominal) -> Iterator[Flaw]:
+    """Flaws of kind gap, clock jump, repeated times, rate, dropped frames, lost ticks and old
+    frames; `said` is what the recording says of itself.
 
     A gap shorter than the ticks are apart is none: no tick sees less by it.
     """
     for names, time in distinct_clocks(view).items():
         yield from _gaps(view, names, time)
         yield from _repeated(view, names, time)
-    yield from _rates(view)
-    yield from _counts(view)
+        yield from _dropped(view, names, time, said)
+    yield from _rates(view, said)
     yield from _lost_ticks(view)
     yield from _old_frames(view)
 
@@ -92,11 +94,39 @@ def _repeated(view: EpisodeView, names: str, time: NDArray[np.float64]) -> Itera
         )
 
 
-def _rates(view: EpisodeView) -> Iterator[Flaw]:
+def _dropped(
+    view: EpisodeView, names: str, time: NDArray[np.float64], said: Nominal
+) -> Iterator[Flaw]:
+    """A camera that loses frames one by one, all over the episode; gaps are told apart."""
+    steps = np.diff(time)
+    usual = usual_step(time)
+    steps = steps[steps < shortest_gap(time)]
+    # Stamps in bursts have long steps between them and lack nothing.
+    if not names.startswith("view ") or len(steps) < _FEWEST or usual > float(np.median(steps)):
+        return
+    long = int(np.count_nonzero(steps >= DROPPED_STEP * usual))
+    lost = float(steps.sum()) / usual - len(steps)
+    if long < DROPPED or min(long, lost) <= DROPPED_SHARE * len(steps):
+        return
+    expected = _expected_rate(names, said)
+    nominal = "" if expected is None else f", {expected:.3g} Hz by {said.where}"
+    yield view.flaw(
+        "dropped frames",
+        names,
+        f"{long} of {len(steps)} steps take at least {DROPPED_STEP:g} times the usual "
+        f"{1e3 * usual:.0f} ms (up to {1e3 * steps.max():.0f} ms): there is time for {lost:.0f} "
+        f"more frames; {len(steps) / steps.sum():.1f} Hz on average{nominal}",
+    )
+
+
+def _expected_rate(names: str, said: Nominal) -> float | None:
+    return next((said.rates_hz[name] for name in names.split(", ") if name in said.rates_hz), None)
+
+
+def _rates(view: EpisodeView, said: Nominal) -> Iterator[Flaw]:
     """The mean rate, without gaps that are told anyway: also entries lost one by one show in it."""
-    said = said_by(view)
     for names, time in distinct_clocks(view).items():
-        expected = next((said.rates_hz[n] for n in names.split(", ") if n in said.rates_hz), None)
+        expected = _expected_rate(names, said)
         if expected is None or len(time) < 3:
             continue
         lost = sum(gap.stop_s - gap.start_s for gap in gaps(time))
@@ -108,45 +138,6 @@ def _rates(view: EpisodeView) -> Iterator[Flaw]:
                 names,
                 f"found {found:.4g} entries a second, expected {expected:.4g} by {said.where}",
             )
-
-
-def _counts(view: EpisodeView) -> Iterator[Flaw]:
-    said = said_by(view)
-    frames = {name: len(camera.time) for name, camera in view.cameras.items()}
-    recorded = _recorded_views(view)
-    for name in said.views:
-        if recorded is not None and not any(
-            n == name or n.startswith(f"{name}_") for n in recorded
-        ):
-            message = f"no frame; {said.where} lists {', '.join(said.views)}"
-            yield view.flaw("missing", f"view {name}", message)
-    most = max(frames.values(), default=0)
-    if said.frames is not None and _too_few(most, said.frames):
-        message = f"{most} frames in the view that has most, {said.where} says {said.frames}"
-        yield view.flaw("frame count", "cameras", message)
-    for name, found in frames.items():
-        expected = max(frames[other] for other in frames if _same_rate(view, name, other))
-        if _too_few(found, expected):
-            message = f"{found} frames, another view of its rate has {expected}"
-            yield view.flaw("frame count", f"view {name}", message)
-
-
-def _too_few(found: int, expected: int) -> bool:
-    return expected - found > max(2, COUNT_TOLERANCE * expected)
-
-
-def _same_rate(view: EpisodeView, one: str, other: str) -> bool:
-    """Whether two cameras may be meant to run alike: a rig can have a slow and a fast one."""
-    step, beside = (usual_step(view.cameras[name].time) for name in (one, other))
-    return one == other or max(step, beside) < OTHER_RATE * min(step, beside)
-
-
-def _recorded_views(view: EpisodeView) -> tuple[str, ...] | None:
-    """All views of the recording, those that `data.views` leaves out too; None if not readable."""
-    one = view.recording
-    if not isinstance(one, FileRecording) or any("cameras" in flaw.stream for flaw in view.flaws):
-        return None
-    return tuple(one.all_views())
 
 
 def _lost_ticks(view: EpisodeView) -> Iterator[Flaw]:

@@ -4,7 +4,7 @@ A step is a gap from `GAP_FACTOR` usual steps: one entry lost from a jittering c
 the jitter) is none, two lost in a row are.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,15 +41,20 @@ def distinct_clocks(view: EpisodeView) -> Mapping[str, NDArray[np.float64]]:
 
     So a gap in the rows of a LeRobot episode is one gap and not one of each view and stream.
     """
-    groups: list[tuple[list[str], NDArray[np.float64]]] = []
-    for name, time in view.clocks.items():
-        for names, same in groups:
-            if np.array_equal(same, time):
-                names.append(name)
-                break
+    names, times = list(view.clocks), list(view.clocks.values())
+    return {", ".join(names[at] for at in same): times[same[0]] for same in equal_clocks(times)}
+
+
+def equal_clocks(times: Sequence[NDArray[np.float64]]) -> list[list[int]]:
+    """The places of clocks, those with the very same times together, in order of the first."""
+    found: list[list[int]] = []
+    for place, time in enumerate(times):
+        same = next((one for one in found if np.array_equal(times[one[0]], time)), None)
+        if same is None:
+            found.append([place])
         else:
-            groups.append(([name], time))
-    return {", ".join(names): time for names, time in groups}
+            same.append(place)
+    return found
 
 
 def usual_step(time: NDArray[np.float64]) -> float:

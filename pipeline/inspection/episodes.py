@@ -16,7 +16,7 @@ from pipeline.timeline import ActionRotation, Timeline, build_timeline
 
 Part = TypeVar("Part")
 
-_BROKEN = (RecordingError, OSError)
+BROKEN = (RecordingError, OSError)
 """What a damaged recording raises: a reader's word, or a disk's."""
 
 
@@ -32,7 +32,7 @@ def view_episode(recording: Recording, data: DataParams, rotation: ActionRotatio
     def attempt(stream: str, read: Callable[[], Part]) -> Part | None:
         try:
             return read()
-        except _BROKEN as error:
+        except BROKEN as error:
             flaws.append(_flaw(recording, "unreadable", stream, error))
             return None
 

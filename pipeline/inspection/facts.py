@@ -22,15 +22,19 @@ KINDS = {
     "no ticks": "the streams leave no instant to train on",
     "embodiment": "channels are not those of the other recordings",
     "missing": "something is not there that should be",
+    "frame size": "frames of one view in several sizes",
+    "duplicate recording": "an episode that is there twice",
     "dead camera": "frames of one colour",
     "duplicate frames": "a camera that stands still while the scene does not",
     "flat channel": "a channel that never varies, beside others that do",
+    "still channel": "a channel that hardly moves, beside others of its kind that do",
     "frozen": "readings that repeat, all channels of them",
     "saturated": "readings clipped at the end of their range",
     "gap": "a clock with no entry for long",
     "clock jump": "a step longer than the rest of the clock",
     "repeated times": "entries stamped with one time",
     "rate": "more or fewer entries a second than the recording says",
+    "dropped frames": "a camera that loses frames all over the episode",
     "frame count": "fewer frames than expected",
     "lost ticks": "a stream that begins late or ends early",
     "old frames": "a camera slower than the ticks need it",
@@ -142,6 +146,12 @@ class Clock:
     jitter_s: float
     """Standard deviation of the steps that are no gaps; NaN for fewer than three entries."""
     gaps: tuple[Gap, ...]
+
+    @property
+    def mean_rate_hz(self) -> float:
+        """Steps a second from the first entry to the last, gaps and all; NaN where none rises."""
+        span = float(self.time[-1] - self.time[0]) if len(self.time) else 0.0
+        return (len(self.time) - 1) / span if span > 0 else float("nan")
 
 
 @dataclass(frozen=True)

@@ -1,20 +1,36 @@
 """Everything that looks wrong in one episode."""
 
+from collections.abc import Iterator
+
+from pipeline.errors import RecordingError
 from pipeline.inspection.channel_flaws import channel_flaws
 from pipeline.inspection.clock_flaws import clock_flaws
+from pipeline.inspection.count_flaws import count_flaws
 from pipeline.inspection.facts import EpisodeView, Flaw
 from pipeline.inspection.pixel_flaws import pixel_flaws
+from pipeline.recordings.recording import Nominal
 
 
 def find_flaws(view: EpisodeView) -> tuple[Flaw, ...]:
     """The flaws of this episode, those of reading it included: errors first, then by time.
 
-    Each kind's rule and thresholds stand in `clock_flaws`, `channel_flaws` and `pixel_flaws`; which
-    frames are decoded, in the last. Most rules look for what is unlike the rest of the same
-    episode, so that no expectation about the robot is needed.
+    Each kind's rule and thresholds stand in `clock_flaws`, `count_flaws`, `channel_flaws` and
+    `pixel_flaws`; which frames are decoded, in the last. Most rules look for what is unlike the
+    rest of the same episode, so that no expectation about the robot is needed.
     """
-    found = [*view.flaws, *clock_flaws(view), *channel_flaws(view), *pixel_flaws(view)]
+    found = [*view.flaws, *_said(view), *channel_flaws(view), *pixel_flaws(view)]
     return tuple(sorted(found, key=_order))
+
+
+def _said(view: EpisodeView) -> Iterator[Flaw]:
+    """What is unlike what the recording says of itself, and what clocks show without that."""
+    try:
+        said = view.recording.nominal()
+    except RecordingError as error:
+        said = Nominal()
+        yield view.flaw("unreadable", "metadata", str(error))
+    yield from clock_flaws(view, said)
+    yield from count_flaws(view, said)
 
 
 def _order(flaw: Flaw) -> tuple[bool, float]:

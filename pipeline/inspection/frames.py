@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import RecordingError
-from pipeline.inspection.facts import EpisodeView
+from pipeline.inspection.episodes import BROKEN
+from pipeline.inspection.facts import EpisodeView, Flaw
 from pipeline.timeline import last_at
 
 
@@ -22,16 +22,27 @@ def spread_ticks(view: EpisodeView, count: int) -> list[int]:
 def frames_at(view: EpisodeView, ticks: Sequence[int]) -> dict[str, list[NDArray[np.uint8]]]:
     """By view, the last frame (height, width, 3) RGB at or before each of these ticks.
 
-    Ticks never decrease. A view of which a frame cannot be decoded is left out (`find_flaws` says
+    Ticks never decrease. A view of which a frame cannot be read is left out (`read_frames` says
     why), and so is every view of an episode without ticks.
     """
+    return read_frames(view, ticks)[0]
+
+
+def read_frames(
+    view: EpisodeView, ticks: Sequence[int]
+) -> tuple[dict[str, list[NDArray[np.uint8]]], tuple[Flaw, ...]]:
+    """`frames_at`, and a flaw `unreadable` for each view that is left out of it.
+
+    Also one that `find_flaws` did not find: a file may vanish after it was looked at.
+    """
     if view.timeline is None:
-        return {}
+        return {}, ()
     times = view.timeline.time[np.asarray(ticks, np.int64)]
     found: dict[str, list[NDArray[np.uint8]]] = {}
+    broken: list[Flaw] = []
     for name, camera in view.cameras.items():
         try:
             found[name] = list(camera.read(last_at(camera.time, times).tolist()))
-        except RecordingError:
-            continue
-    return found
+        except BROKEN as error:
+            broken.append(view.flaw("unreadable", f"view {name}", str(error), severity="error"))
+    return found, tuple(broken)

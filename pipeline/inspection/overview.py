@@ -3,6 +3,7 @@
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from hashlib import blake2b
 from pathlib import Path
 
 import numpy as np
@@ -86,17 +87,21 @@ def survey_recordings(opened: Opened, params: Params) -> RecordingsOverview:
     flaws: list[tuple[Flaw, ...]] = []
     embodiments: list[tuple[Recording, Embodiment]] = []
     held: list[frozenset[str]] = []
+    digests: list[str | None] = []
     for recording in tqdm(opened.recordings, "inspecting", unit="episode", disable=None):
         view = view_episode(recording, params.data, rotation)
         flaws.append(find_flaws(view))
         summaries.append(_summary(view))
         held.append(frozenset(view.clocks))
+        digests.append(_motion_digest(view))
         if view.timeline is not None:
             line = view.timeline
             found = Embodiment.of(line.action_channels, line.action_kind, view.sensor, view.state)
             embodiments.append((recording, found))
     for place, lacking in _lacking(summaries, held):
         flaws[place] = (*flaws[place], *_missing(summaries[place], lacking, flaws[place]))
+    for place, flaw in _duplicates(summaries, digests):
+        flaws[place] = (*flaws[place], flaw)
     counted = [_counted(one, found) for one, found in zip(summaries, flaws, strict=True)]
     return RecordingsOverview(
         summaries=tuple(counted),
@@ -172,6 +177,51 @@ def _missing(
             None,
             "not there; most episodes of this source have it",
         )
+
+
+def _motion_digest(view: EpisodeView) -> str | None:
+    """What the clocks and values of state and action come to, those of the sensor without either.
+
+    None where nothing moves or nothing is there: such episodes can be equal by chance.
+    """
+    motion = [stream for name in ("state", "action") if (stream := view.streams.get(name))]
+    streams = motion or ([view.sensor] if view.sensor is not None else [])
+    if not any(np.ptp(stream.values, axis=0).any() for stream in streams):
+        return None
+    digest = blake2b(digest_size=16)
+    for stream in streams:
+        digest.update(repr((stream.channels.names, stream.values.shape)).encode())
+        digest.update(stream.time.tobytes())
+        digest.update(stream.values.tobytes())
+    return digest.hexdigest()
+
+
+def _duplicates(
+    summaries: Sequence[EpisodeSummary], digests: Sequence[str | None]
+) -> Iterator[tuple[int, Flaw]]:
+    """Places of episodes that were there before, with a flaw that names the first."""
+    first: dict[str, EpisodeSummary] = {}
+    for place, (one, digest) in enumerate(zip(summaries, digests, strict=True)):
+        if digest is None:
+            continue
+        other = first.setdefault(digest, one)
+        if other is not one:
+            source = "" if other.source == one.source else f"{other.source}/"
+            message = (
+                f"the same recording as {source}{other.episode} ({other.path}): equal clocks and "
+                "equal values; it would count twice. Leave one of them out of data.sources"
+            )
+            flaw = Flaw(
+                "duplicate recording",
+                "warning",
+                one.source,
+                one.episode,
+                "episode",
+                None,
+                None,
+                message,
+            )
+            yield place, flaw
 
 
 def _not_opened(opened: Opened) -> Iterator[Flaw]:

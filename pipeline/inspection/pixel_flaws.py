@@ -1,9 +1,10 @@
-"""What looks wrong in the pictures: frames that cannot be decoded, dead and frozen cameras.
+"""What looks wrong in the pictures: frames that cannot be decoded or change in size, dead and
+frozen cameras.
 
 What is looked at, so that a long episode costs no more than a short one:
 - JPEG files: all of them for duplicates (two files are the same picture where their bytes are);
-  every frame that a VL row sees is checked at an eighth of its size, as extraction does; `RUNS`
-  pairs of neighbours, evenly spread, are decoded whole.
+  every frame that a VL row sees is checked at an eighth of its size, as extraction does, and asked
+  for its size; `RUNS` pairs of neighbours, evenly spread, are decoded whole.
 - Videos and pictures in rows: all frames of an episode of up to `MOST_FRAMES`, else `RUNS` runs of
   neighbours, evenly spread. The packets of a whole video are read in any case.
 
@@ -14,17 +15,17 @@ there a camera counts as frozen when every other one of the episode sees somethi
 and a single such camera only when it never changes at all.
 """
 
+import itertools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import RecordingError
+from pipeline.inspection.episodes import BROKEN
 from pipeline.inspection.facts import EpisodeView, Flaw
 from pipeline.inspection.runs import runs
 from pipeline.recordings import CameraStream
-from pipeline.recordings.jpeg import JpegCamera
 
 MOST_FRAMES, RUNS = 120, 12
 ONE_COLOUR = 2.0
@@ -52,17 +53,20 @@ class _Looked:
     """Mean value of each decoded frame that shows nothing."""
     decoded: int
     noisy: bool
+    sizes: dict[int, tuple[int, ...]]
+    """(height, width) by frame, of those that were decoded or that a VL row sees."""
 
 
 def pixel_flaws(view: EpisodeView) -> Iterator[Flaw]:
-    """Flaws of kind unreadable, dead camera and duplicate frames."""
+    """Flaws of kind unreadable, frame size, dead camera and duplicate frames."""
     looked: dict[str, _Looked] = {}
     for name, camera in view.cameras.items():
         try:
             looked[name] = _look(view, name, camera)
-        except (RecordingError, OSError) as error:
+        except BROKEN as error:
             yield view.flaw("unreadable", f"view {name}", str(error), severity="error")
     for name, seen in looked.items():
+        yield from _resized(view, name, seen)
         yield from _dead(view, name, seen)
         if len(seen.one_colour) < seen.decoded:
             yield from _duplicates(view, name, looked)
@@ -70,11 +74,16 @@ def pixel_flaws(view: EpisodeView) -> Iterator[Flaw]:
 
 def _look(view: EpisodeView, name: str, camera: CameraStream) -> _Looked:
     frames = len(camera.time)
-    if isinstance(camera, JpegCamera):
+    sizes: dict[int, tuple[int, ...]] = {}
+    repeats = camera.repeats()
+    if repeats is not None:
         if view.timeline is not None:
-            camera.check(np.unique(view.timeline.frames[name]).tolist())
+            served = np.unique(view.timeline.frames[name]).tolist()
+            camera.check(served)
+            if (told := camera.sizes(served)) is not None:
+                sizes |= zip(served, map(tuple, told.tolist()), strict=True)
         index = _neighbours(frames, 2 * RUNS)
-        compared, equal = np.arange(frames), _equal_files(camera)
+        compared, equal = np.arange(frames), repeats
     else:
         index = _neighbours(frames, MOST_FRAMES)
         compared, equal = index, np.zeros(max(0, len(index) - 1), np.bool_)
@@ -82,6 +91,7 @@ def _look(view: EpisodeView, name: str, camera: CameraStream) -> _Looked:
     differing: list[float] = []
     before: NDArray[np.uint8] | None = None
     for place, frame in enumerate(camera.read(index.tolist())):
+        sizes[int(index[place])] = frame.shape[:2]
         if float(frame.std()) <= ONE_COLOUR:
             one_colour[int(index[place])] = float(frame.mean())
         if before is not None and before.shape == frame.shape:
@@ -94,7 +104,7 @@ def _look(view: EpisodeView, name: str, camera: CameraStream) -> _Looked:
     noisy = bool(differing) and float(np.percentile(differing, 10)) > NOISY
     if noisy and compared is not index:
         noisy = min(_beside(camera, equal), default=1.0) > NOISY
-    return _Looked(compared, equal, one_colour, len(index), noisy)
+    return _Looked(compared, equal, one_colour, len(index), noisy, dict(sorted(sizes.items())))
 
 
 def _beside(camera: CameraStream, equal: NDArray[np.bool_]) -> Iterator[float]:
@@ -104,7 +114,8 @@ def _beside(camera: CameraStream, equal: NDArray[np.bool_]) -> Iterator[float]:
         for place in (first - 1, last):
             if 0 <= place < len(equal):
                 before, after = camera.read([place, place + 1])
-                yield float((before != after).any(axis=2).mean())
+                alike = before.shape == after.shape
+                yield float((before != after).any(axis=2).mean()) if alike else 1.0
 
 
 def _neighbours(frames: int, most: int) -> NDArray[np.int64]:
@@ -116,14 +127,27 @@ def _neighbours(frames: int, most: int) -> NDArray[np.int64]:
     return np.unique(starts[:, None] + np.arange(length))
 
 
-def _equal_files(camera: JpegCamera) -> NDArray[np.bool_]:
-    """(frame - 1,) whether files are the same; only those of equal size are read."""
-    sizes = np.array([path.stat().st_size for path in camera.paths])
-    equal = sizes[1:] == sizes[:-1]
-    for place in np.flatnonzero(equal):
-        first, second = camera.paths[place], camera.paths[place + 1]
-        equal[place] = first.read_bytes() == second.read_bytes()
-    return equal
+def _resized(view: EpisodeView, name: str, seen: _Looked) -> Iterator[Flaw]:
+    """Where a view's frames change in size, in one line."""
+    time, frames = view.cameras[name].time, list(seen.sizes)
+    changes = [
+        (before, frame)
+        for before, frame in itertools.pairwise(frames)
+        if seen.sizes[before] != seen.sizes[frame]
+    ]
+    if not changes:
+        return
+    before, frame = changes[0]
+    (old_height, old_width), (height, width) = seen.sizes[before], seen.sizes[frame]
+    more = f"; {len(changes)} changes in all" if len(changes) > 1 else ""
+    yield view.flaw(
+        "frame size",
+        f"view {name}",
+        f"frames change from {old_width} x {old_height} (frame {before}) to {width} x {height} "
+        f"(frame {frame}) at {time[frame] - view.zero:.2f} s{more}; expected one size",
+        float(time[frame]),
+        float(time[changes[-1][1]]),
+    )
 
 
 def _dead(view: EpisodeView, name: str, seen: _Looked) -> Iterator[Flaw]:

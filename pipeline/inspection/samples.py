@@ -5,26 +5,6 @@ import numpy as np
 from pipeline.config import Params
 from pipeline.datasets import UnifiedBatch, UnifiedVLADataset, unified_collate_fn
 from pipeline.inspection.facts import EpisodeView
-from pipeline.recordings import Recording
-
-
-class _OneRecording(UnifiedVLADataset):
-    """The data set of a recording that is open already, and of no other."""
-
-    def __init__(self, recording: Recording, params: Params, view: EpisodeView) -> None:
-        self._one = recording
-        data, head = params.data, params.train_head
-        super().__init__(
-            horizon=head.horizon,
-            vlm_reuse_count=data.vlm_reuse_count,
-            sensor_window_size=head.sensor_window,
-            state_window_size=head.state_window,
-            action_hz=data.action_hz,
-            action_rotation=view.action_rotation,
-        )
-
-    def _recordings(self) -> tuple[Recording, ...]:
-        return (self._one,)
 
 
 def samples(
@@ -37,7 +17,16 @@ def samples(
     and horizon are those of `train_head`. Raises `RecordingError` where the recording cannot be
     read.
     """
-    dataset = _OneRecording(view.recording, params, view)
+    data, head = params.data, params.train_head
+    dataset = UnifiedVLADataset(
+        recordings=[view.recording],
+        horizon=head.horizon,
+        vlm_reuse_count=data.vlm_reuse_count,
+        sensor_window_size=head.sensor_window,
+        state_window_size=head.state_window,
+        action_hz=data.action_hz,
+        action_rotation=view.action_rotation,
+    )
     ticks = len(dataset)
     ends = np.unique([0, ticks - 1])[:count]
     inner = np.random.default_rng(seed).permutation(np.arange(1, ticks - 1))

@@ -9,11 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pipeline.config import InspectParams
 from pipeline.inspection.facts import Flaw
 from pipeline.inspection.store_coverage import Ages, EpisodeCoverage, ages, coverage
 from pipeline.inspection.store_duplicates import Duplicates, Still, Twins, find_duplicates
-from pipeline.inspection.store_feature_flaws import feature_flaws
+from pipeline.inspection.store_feature_flaws import broken_rows, feature_flaws
 from pipeline.inspection.store_features import (
     Outlier,
     SampledRows,
@@ -21,6 +23,7 @@ from pipeline.inspection.store_features import (
     look_at_features,
     outliers,
     sample_rows,
+    slot_names,
 )
 from pipeline.inspection.store_flaws import episode_flaws
 from pipeline.inspection.store_integrity import check_rows, open_checked
@@ -102,17 +105,17 @@ def inspect_store(path: str | Path, params: InspectParams) -> StoreView:
     are checked, and those of metadata and of every narrow array; the rest is for stages.verify.
 
     Raises `StoreIncomplete` where it is not there, unfinished, damaged or without an episode,
-    `StoreMismatch` where it is an archive or follows another schema, each saying what to run, and
-    `NumericsError` for a feature that is not finite.
+    `StoreMismatch` where it is an archive or follows another schema, each saying what to run.
     """
     store = open_checked(Path(path))
     episodes, age = coverage(store), ages(store)
-    sampled = sample_rows(store, params.points)
-    check_rows(store, sampled.rows)
-    found = look_at_features(store, sampled)
+    looked_at = sample_rows(store, params.points)
+    broken = check_rows(store, looked_at.rows)
+    found = look_at_features(store, looked_at.but(np.asarray(broken.any(axis=1))))
     duplicates = find_duplicates(store, found, params.duplicate_similarity)
     statistics, far = stream_statistics(store), outliers(found)
     flaws = [
+        *broken_rows(episodes, looked_at, broken, slot_names(store)),
         *episode_flaws(store, episodes, age, statistics),
         *feature_flaws(episodes, found, far, duplicates),
     ]

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.evaluation import episode_name
-from pipeline.store import Episode, FeatureStore
+from pipeline.store import Episode, FeatureStore, episode_name
 from pipeline.store.gather import WIDE
 
 _BLOCK_TICKS = 65536
@@ -28,8 +27,6 @@ class EpisodeCoverage:
     vl_rows: int
     seconds: float
     """From the first tick to the last."""
-    start_s: float
-    """Time of its first tick on its own clock; NaN without ticks."""
     readings: Mapping[str, int]
     """`sensor` and `state` -> readings."""
     covered: Mapping[str, float]
@@ -100,7 +97,6 @@ def _covered(store: FeatureStore, episode: Episode) -> EpisodeCoverage:
         ticks=len(episode.ticks),
         vl_rows=len(episode.vl_rows),
         seconds=float(time[-1] - time[0]) if len(time) else 0.0,
-        start_s=float(time[0]) if len(time) else float("nan"),
         readings={name: len(rows) for name, rows in streams.items()},
         covered=covered,
     )

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.evaluation import episode_name
+from pipeline.inspection.runs import runs
 from pipeline.inspection.store_features import FeatureRows, SampledRows
-from pipeline.store import KEY_BYTES, FeatureStore
+from pipeline.store import KEY_BYTES, FeatureStore, episode_name
 
 _BLOCK_ROWS = 512
 _LISTED = 50
@@ -140,13 +140,10 @@ def _still(
     before, after = np.arange(len(sampled.rows) - 1), np.arange(1, len(sampled.rows))
     similar = cosine.gram[before, after] * cosine.scale[before] * cosine.scale[after]
     same = sampled.episode[before] == sampled.episode[after]
-    change = np.diff(
-        (same & (similar >= threshold - _ROUNDING)).astype(np.int8), prepend=0, append=0
-    )
-    for first, last in zip(np.flatnonzero(change > 0), np.flatnonzero(change < 0), strict=True):
+    for first, last in runs(same & (similar >= threshold - _ROUNDING)):
         episode = names[int(sampled.episode[first])]
         times = float(sampled.time[first]), float(sampled.time[last])
-        yield Still(episode, *times, int(last - first) + 1)
+        yield Still(episode, *times, last - first + 1)
 
 
 def _twins(

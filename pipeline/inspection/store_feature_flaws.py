@@ -4,11 +4,12 @@ from collections.abc import Iterator, Sequence
 from itertools import groupby
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.inspection.facts import Flaw
 from pipeline.inspection.store_coverage import EpisodeCoverage
 from pipeline.inspection.store_duplicates import Duplicates
-from pipeline.inspection.store_features import FeatureRows, Outlier
+from pipeline.inspection.store_features import FeatureRows, Outlier, SampledRows
 from pipeline.inspection.store_flaws import flaw_of, listed
 
 DEAD = 1e-3
@@ -28,6 +29,25 @@ def feature_flaws(
     yield from _still_episodes(episodes, found)
     yield from _outliers(episodes, outliers)
     yield from _twins(episodes, duplicates)
+
+
+def broken_rows(
+    episodes: Sequence[EpisodeCoverage],
+    sampled: SampledRows,
+    broken: NDArray[np.bool_],
+    slots: Sequence[str],
+) -> Iterator[Flaw]:
+    """The episodes of the rows (row, slot) with features that are no numbers."""
+    places = zip(*(each.tolist() for each in np.nonzero(broken)), strict=True)
+    for index, group in groupby(places, key=lambda one: int(sampled.episode[one[0]])):
+        these = list(group)
+        rows = sorted({row for row, _ in these})
+        first, slot = these[0]
+        said = f"{len(rows)} VL row(s) with features that are NaN or infinite, the first in slot "
+        said += f"{slots[slot]} at {sampled.time[first]:.2f} s; left out of all that is shown of "
+        said += "features. Training refuses them: extract these rows anew"
+        span = (float(sampled.time[first]), float(sampled.time[rows[-1]]))
+        yield flaw_of(episodes[index], "not finite", "vl/features", said, span, error=True)
 
 
 def _dead_slots(found: FeatureRows) -> Iterator[Flaw]:

@@ -5,21 +5,21 @@ pairs of these rows (8 bytes x points^2). Of augmented variants, the plain frame
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.errors import NumericsError
-from pipeline.evaluation import place
 from pipeline.inspection.store_statistics import evenly
 from pipeline.store import FEATURES, FeatureStore
 
 _BLOCK_ROWS = 1024
 _TINY = 1e-30
 _FAR, _FAR_SHARE = 10.0, 0.5
+_FEWEST = 20
+"""Rows below which nothing is far from the rest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +36,24 @@ class SampledRows:
     """(row,) 0 at the episode's first VL row, 1 at its last."""
     total: int
     """VL rows of the store."""
+    left_out: int = 0
+    """VL rows that were looked at and are not among `rows`, as they hold what is no number."""
+
+    @property
+    def looked_at(self) -> int:
+        """VL rows, those that were left out among them."""
+        return len(self.rows) + self.left_out
+
+    def but(self, broken: NDArray[np.bool_]) -> "SampledRows":
+        """All rows but these (row,), which are counted as left out."""
+        return replace(
+            self,
+            rows=self.rows[~broken],
+            episode=self.episode[~broken],
+            time=self.time[~broken],
+            progress=self.progress[~broken],
+            left_out=self.left_out + int(broken.sum()),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,12 +116,9 @@ def sample_rows(store: FeatureStore, most: int) -> SampledRows:
 
 
 def look_at_features(store: FeatureStore, sampled: SampledRows) -> FeatureRows:
-    """Norms, variation and dot products of the sampled rows, in one pass, slot after slot.
-
-    Raises `NumericsError` for a feature that is not finite.
-    """
+    """Norms, variation and dot products of these finite rows, in one pass, slot after slot."""
     count, slots = len(sampled.rows), store.feature_shape[0]
-    names = tuple(slot_name(one) for one in store.attrs["slots"][:slots])  # variants repeat them
+    names = slot_names(store)[:slots]  # variants repeat them
     norm = np.full((count, slots), np.nan, np.float32)
     variation = np.full(slots, np.nan)
     within = np.full((len(store.episodes), slots), np.nan)
@@ -111,12 +126,6 @@ def look_at_features(store: FeatureStore, sampled: SampledRows) -> FeatureRows:
     for slot in tqdm(range(slots), desc="look at features", unit="slot", disable=None):
         valid = store.array("vl/slot_valid")[sampled.rows, slot] != 0
         values = read_slot(store, sampled.rows, slot)
-        if not np.isfinite(values[valid]).all():
-            bad = int(np.flatnonzero(valid & ~np.isfinite(values).all(axis=1))[0])
-            raise NumericsError(
-                f"{store.path}: slot {names[slot]} of {place(store, 'vl', int(sampled.rows[bad]))} "
-                "is not finite. Run python -m stages.verify to see what else is wrong."
-            )
         norm[valid, slot] = np.linalg.norm(values[valid], axis=1)
         variation[slot] = _variation(values[valid])
         for episode, rows in _episodes(sampled.episode, valid):
@@ -133,6 +142,8 @@ def outliers(found: FeatureRows) -> tuple[Outlier, ...]:
     In order of episodes; Iglewicz and Hoaglin's score, with a wider bound as norms are many.
     """
     norm, names = found.norms.norm, found.norms.names
+    if len(norm) < _FEWEST:
+        return ()
     with np.errstate(invalid="ignore"):
         filled = np.ma.masked_invalid(norm)
         median = np.ma.median(filled, axis=0).filled(np.nan)
@@ -166,7 +177,12 @@ def read_slot(store: FeatureStore, rows: NDArray[np.int64], slot: int) -> NDArra
     return out
 
 
-def slot_name(document: Mapping[str, Any]) -> str:
+def slot_names(store: FeatureStore) -> tuple[str, ...]:
+    """(slot,) of all variants."""
+    return tuple(_slot_name(one) for one in store.attrs["slots"])
+
+
+def _slot_name(document: Mapping[str, Any]) -> str:
     """What a slot is, in a few words, by its entry in the store's attributes."""
     said = f"layer {document['layer']}{'' if document['norm'] else ' no norm'}"
     said += f" {document['pooling']}"

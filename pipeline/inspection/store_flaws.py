@@ -6,29 +6,10 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.inspection.facts import Flaw
+from pipeline.inspection.facts import ChannelStatistics, Flaw
 from pipeline.inspection.store_coverage import Ages, EpisodeCoverage
 from pipeline.inspection.store_statistics import StreamStatistics
 from pipeline.store import FeatureStore
-
-KINDS = {
-    "clock jump": "ticks that do not ascend",
-    "gap": "a time without a tick, much longer than a step",
-    "frames from the future": "features of a frame taken after the tick that uses them",
-    "old frames": "features of frames taken long before the tick",
-    "missing": "a stream that other episodes have",
-    "partly missing": "a stream that some ticks of the episode do not see",
-    "short episode": "hardly any ticks",
-    "no instruction": "a prompt without a task",
-    "other instruction": "one episode told something else than the rest of its source",
-    "flat channel": "a channel that never varies",
-    "dead slot": "features that are the same in every VL row",
-    "still features": "features that are the same in every VL row of an episode",
-    "feature norm": "features much longer or shorter than their slot's others",
-    "same recording": "two episodes with the same frames and prompts",
-    "near-duplicate episodes": "two episodes that look alike to the model",
-}
-"""What can be found in a store, and what each means."""
 
 FEW_TICKS = 10
 _STALE_PERIODS = 2
@@ -36,6 +17,10 @@ _GAP_STEPS = 5
 _RARE, _USUAL = 0.05, 0.8
 _FUTURE_S = 1e-6
 _NAMED = 4
+_NOISE = 0.01
+"""Of the median standard deviation of the channels of a unit: what varies less is noise."""
+_COMPARED = 3
+"""Channels of one unit at least, for their median to say what is usual."""
 
 
 def episode_flaws(
@@ -55,6 +40,8 @@ def episode_flaws(
     yield from _missing(episodes)
     yield from _instructions(episodes)
     yield from _constant(statistics)
+    yield from _not_finite(statistics)
+    yield from _noise(statistics)
 
 
 def flaw_of(
@@ -170,3 +157,30 @@ def _constant(statistics: Sequence[StreamStatistics]) -> Iterator[Flaw]:
         if still:
             found = f"{listed(still)}: one value in all {stream.looked_at} rows looked at"
             yield Flaw("flat channel", "warning", "", "", stream.stream, None, None, found)
+
+
+def _not_finite(statistics: Sequence[StreamStatistics]) -> Iterator[Flaw]:
+    for stream in statistics:
+        bad = [one.name for one in stream.channels if not np.isfinite(one.mean)]
+        if bad:
+            found = f"{listed(bad)}: NaN or infinite in the {stream.looked_at} rows looked at"
+            yield Flaw("not finite", "error", "", "", stream.stream, None, None, found)
+
+
+def _noise(statistics: Sequence[StreamStatistics]) -> Iterator[Flaw]:
+    """Channels that vary far less than the others of their unit, which normalising hides."""
+    for stream in statistics:
+        by_unit: dict[str, list[ChannelStatistics]] = defaultdict(list)
+        for one in stream.channels:
+            if one.unit and one.std > 0:
+                by_unit[one.unit].append(one)
+        for unit, ones in by_unit.items():
+            usual = float(np.median([one.std for one in ones]))
+            quiet = [one for one in ones if one.std < _NOISE * usual]
+            if quiet and len(ones) >= _COMPARED:
+                most = max(one.std for one in quiet)
+                found = f"{listed([one.name for one in quiet])}: standard deviation up to "
+                found += f"{most:.2g} {unit}, under {_NOISE:.0%} of the median of this unit's "
+                found += f"channels, {usual:.2g} {unit}; normalised, this noise weighs as much as "
+                found += "their signal"
+                yield Flaw("noise", "warning", "", "", stream.stream, None, None, found)

@@ -2,13 +2,13 @@
 
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import StoreIncomplete
-from pipeline.evaluation import place
-from pipeline.store import FEATURES, FeatureStore
+from pipeline.store import FEATURES, FeatureStore, place
 from pipeline.store.chunks import ChunkFiles, row_checksums
 from pipeline.store.gather import WIDE
 from pipeline.store.mending import extract_command, mend
@@ -16,6 +16,8 @@ from pipeline.store.metadata import check_metadata
 from pipeline.store.schema import read_specs
 
 _BLOCK_BYTES = 2**24
+_BFLOAT16_EXPONENT = 0x7F80
+"""All of its bits are set in what is infinite or not a number."""
 
 
 def open_checked(path: Path) -> FeatureStore:
@@ -24,12 +26,6 @@ def open_checked(path: Path) -> FeatureStore:
     Metadata and every array of a few bytes a tick or row are read whole, as all that is said of a
     store rests on them. Raises `StoreIncomplete` where one is damaged.
     """
-    if path.name.endswith(".part"):  # which looks like a store until its files are read
-        finished = path.with_name(path.name.split(".zarr")[0] + ".zarr")
-        raise StoreIncomplete(
-            f"{path}: expected a finished store, found an unfinished build. Complete it with "
-            f"{extract_command(finished)}."
-        )
     store = FeatureStore.open(path)
     check_metadata(path)
     for name, spec in read_specs(path).items():
@@ -43,16 +39,31 @@ def open_checked(path: Path) -> FeatureStore:
     return store
 
 
-def check_rows(store: FeatureStore, rows: NDArray[np.int64]) -> None:
-    """Raise `StoreIncomplete` where one of these feature rows does not give its checksum."""
+def check_rows(store: FeatureStore, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """(row, slot) whether the features of these VL rows are no numbers where the slot is valid.
+
+    Slots of all variants. Raises `StoreIncomplete` where a row does not give its checksum.
+    """
     features, wanted = store.array(FEATURES), store.array("vl/checksum")
+    valid = store.array("vl/slot_valid")
+    broken = np.zeros((len(rows), features.shape[1]), np.bool_)
     step = max(1, _BLOCK_BYTES // features[:1].nbytes)
     for start in range(0, len(rows), step):
         block = rows[start : start + step]
-        bad = block[row_checksums(features[block]) != wanted[block]]
+        values = features[block]
+        broken[start : start + step] = ~_finite(values).all(axis=2) & (valid[block] != 0)
+        bad = block[row_checksums(values) != wanted[block]]
         if len(bad):
             raise StoreIncomplete(
                 f"{store.path}: expected features that give their checksum, found {len(bad)} VL "
                 f"row(s) that do not, the first {place(store, 'vl', int(bad[0]))}: the store is "
                 f"damaged. {mend(store.path)}"
             )
+    return broken
+
+
+def _finite(values: NDArray[Any]) -> NDArray[np.bool_]:
+    """As `np.isfinite`, also of bfloat16, which a store holds as bits."""
+    if values.dtype == np.uint16:
+        return (values & _BFLOAT16_EXPONENT) != _BFLOAT16_EXPONENT
+    return np.isfinite(values)

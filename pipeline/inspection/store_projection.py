@@ -6,9 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.linalg import eigsh
 
-from pipeline.evaluation import episode_name
 from pipeline.inspection.store_features import FeatureRows
-from pipeline.store import FeatureStore
+from pipeline.store import FeatureStore, episode_name
 
 _SMALL = 16
 """Rows up to which all directions are computed, as the iteration needs room."""

@@ -19,8 +19,6 @@ class ArraySize:
     dtype: str
     chunks: int
     """Chunk files."""
-    data_bytes: int
-    """Of its values alone: shape x item size."""
     disk_bytes: int
     """Blocks that its files take: values, padding of the last chunk, and trailers."""
 
@@ -38,12 +36,11 @@ def array_sizes(path: Path) -> tuple[ArraySize, ...]:
             spec.shape,
             spec.attributes.get("dtype", spec.dtype.name),
             spec.chunk_count,
-            spec.data_bytes,
             disk[name],
         )
         for name, spec in specs.items()
     ]
-    found.append(ArraySize(METADATA, (), "", 0, 0, disk[METADATA]))
+    found.append(ArraySize(METADATA, (), "", 0, disk[METADATA]))
     return tuple(sorted(found, key=lambda one: one.disk_bytes, reverse=True))
 
 

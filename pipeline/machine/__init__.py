@@ -33,7 +33,12 @@ GROUPS = (
 
 
 def examine(params: Params) -> Generator[tuple[str, list[Finding]]]:
-    """Each group's title and findings, one after the other."""
+    """Each group's title and findings, one after the other.
+
+    A check that fails by a bug of its own costs its group alone: raises `ExceptionGroup` of all
+    those, at the end.
+    """
+    bugs: list[Exception] = []
     for title, module, function in GROUPS:
         try:
             check = getattr(import_module(f"pipeline.machine.{module}"), function)
@@ -44,6 +49,10 @@ def examine(params: Params) -> Generator[tuple[str, list[Finding]]]:
                 [missing(module, said, "install what is missing above, and run this again")],
             )
             continue
+        except Exception as error:
+            bugs.append(error)
+            yield title, [_failed(module, function, error)]
+            continue
         answer: SimpleQueue[list[Finding] | Exception] = SimpleQueue()
         Thread(target=_answer, args=(answer, module, check, params), daemon=True).start()
         try:
@@ -52,8 +61,16 @@ def examine(params: Params) -> Generator[tuple[str, list[Finding]]]:
             said = f"not known: no answer within {PATIENCE_S:g} s"
             found = [note(module, said, "look at the disk or device it waits for")]
         if isinstance(found, Exception):
-            raise found
+            bugs.append(found)
+            found = [_failed(module, function, found)]
         yield title, found
+    if bugs:
+        raise ExceptionGroup("checks that failed; the others stand above", bugs)
+
+
+def _failed(module: str, function: str, error: Exception) -> Finding:
+    said = f"{function} failed with {type(error).__name__}: {error}"
+    return note(module, said, "its traceback stands at the end; report it")
 
 
 def _answer(

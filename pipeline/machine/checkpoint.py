@@ -7,9 +7,10 @@ from pathlib import Path
 
 from safetensors import SafetensorError, safe_open
 
+from pipeline.amounts import size
 from pipeline.config import Params, VLMParams
 from pipeline.errors import VLMError
-from pipeline.machine.findings import Finding, missing, note, ok, size
+from pipeline.machine.findings import Finding, missing, note, ok
 from pipeline.machine.gpu import GPU, read_accelerator, usable_device
 from pipeline.store.mapping import available_bytes
 from pipeline.vlm.checkpoint_folder import (

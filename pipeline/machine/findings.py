@@ -48,11 +48,6 @@ def described(title: str, findings: Sequence[Finding]) -> list[str]:
     return [*lines, ""]
 
 
-def size(count: float) -> str:
-    """Bytes for people."""
-    return f"{count / 2**30:.1f} GiB" if count >= 2**30 else f"{count / 2**20:.0f} MiB"
-
-
 def _wrapped(text: str, head: str) -> list[str]:
     # A path or an option is copied, so it is never broken.
     wrapped = textwrap.wrap(text, WIDTH - len(head), break_long_words=False, break_on_hyphens=False)

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import torch
 
+from pipeline.amounts import size
 from pipeline.config import Params
 from pipeline.device import resolve_device
 from pipeline.errors import ConfigError
-from pipeline.machine.findings import Finding, missing, note, ok, size
+from pipeline.machine.findings import Finding, missing, note, ok
 
 _WHEELS = ((13.0, "cu130"), (12.8, "cu128"), (12.0, "cu126"))
 """The newest CUDA build of torch that a driver of at least this CUDA version runs."""

@@ -6,8 +6,9 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipeline.amounts import size
 from pipeline.config import Params
-from pipeline.machine.findings import Finding, note, ok, size
+from pipeline.machine.findings import Finding, note, ok
 
 _CGROUP = Path("/sys/fs/cgroup")
 _LEAST_FILES = 1024

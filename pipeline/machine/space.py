@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from pipeline.amounts import size
 from pipeline.config import Params
 from pipeline.durable import free_bytes
 from pipeline.errors import PipelineError
@@ -15,7 +16,7 @@ from pipeline.extraction.layout import build_arrays
 from pipeline.extraction.plan import store_bytes
 from pipeline.extraction.survey import Survey, SurveyedEpisode
 from pipeline.machine.checkpoint import local_folder
-from pipeline.machine.findings import Finding, missing, note, ok, size
+from pipeline.machine.findings import Finding, missing, note, ok
 from pipeline.machine.limits import memory_bytes
 from pipeline.machine.links import links_here
 from pipeline.recordings import Recording, open_recordings
@@ -54,6 +55,8 @@ def check_space(params: Params) -> list[Finding]:
         estimate = estimate_store(params)
     except PipelineError:
         return [note("size", "not known before checkpoint and recordings can be read; see above")]
+    if estimate is None:
+        return [note("size", "not known: no episode could be read; see above")]
     links = links_here()
     there = used_bytes(part_path(target))
     limit = Path("/proc/sys/vm/max_map_count")
@@ -110,12 +113,14 @@ def check_maps(estimate: Estimate, limit: int) -> Finding:
     return missing("maps", said, f"sudo sysctl vm.max_map_count={4 * max(estimate.maps, limit)}")
 
 
-def estimate_store(params: Params) -> Estimate:
+def estimate_store(params: Params) -> Estimate | None:
     """What `extract.plan=true` computes, from a few episodes within `BUDGET_S`.
 
-    Raises what reading the recordings raises.
+    None where every episode is bad. Raises what reading the recordings raises.
     """
     opened = open_recordings(params.data.sources, params.data.root, params.data.views)
+    if not opened.recordings:
+        return None
     rotation = choose_action_rotation(params.data.action_rotation, opened.recordings)
     checked: list[CheckedEpisode] = []
     until = time.monotonic() + BUDGET_S

@@ -1,10 +1,10 @@
-"""Pictures that can be zoomed and hovered: the clocks of an episode, the features of a store.
+"""The clocks of an episode in a picture that can be zoomed and hovered.
 
-They have no title and no colour of text: the page around them has both.
+It has no title and no colour of text: the page around it has both.
 """
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from pipeline.inspection.clocks import usual_step
 from pipeline.inspection.facts import Clock, EpisodeView
-from pipeline.inspection.store_projection import StoreProjection
-from pipeline.plots.recording.lanes import LANE_COLOURS, in_reading_order
-from pipeline.plots.recording.thinning import worst_steps
+from pipeline.plots.recording.lanes import BAND, LANE_COLOURS, in_reading_order
+from pipeline.plots.recording.thinning import evenness, worst_steps
 from pipeline.plots.style import PALETTE
 
 SINGLE = 4000
@@ -24,6 +23,7 @@ BINS = 1500
 _AXIS = "#888888"
 """Of axes and grid: seen on white and on black."""
 _TICK = "#888888"
+_SMALL = '<span style="font-size:12px">{}</span>'
 _GAP = PALETTE[5]
 _COLOURS = LANE_COLOURS | {"tick": _TICK}
 
@@ -35,7 +35,7 @@ def clock_lanes(view: EpisodeView, clocks: Sequence[Clock]) -> go.Figure:
     that was, of a tick the VL row that it reuses. Lines lead from frames to VL rows.
     """
     shown = in_reading_order(clocks)
-    figure = go.Figure(layout=_layout())
+    figure = go.Figure(layout=layout())
     lanes = {clock.name: len(shown) - 1 - index for index, clock in enumerate(shown)}
     _served(figure, view, lanes)
     labels: dict[int, str] = {}
@@ -56,52 +56,13 @@ def clock_lanes(view: EpisodeView, clocks: Sequence[Clock]) -> go.Figure:
         fixedrange=True,
         showgrid=False,
     )
-    figure.update_xaxes(title="time since the recording began [s]")
-    figure.update_layout(height=90 + 46 * max(len(shown), 2), showlegend=False)
+    figure.update_xaxes(title=f"time since the recording began [s]<br>{_SMALL.format(BAND)}")
+    figure.update_layout(height=110 + 46 * max(len(shown), 2), showlegend=False)
     return figure
 
 
-def projection(found: StoreProjection, by: Literal["episode", "progress"]) -> go.Figure:
-    """VL rows on the first two principal components of their features, coloured by one trait.
-
-    Colours repeat after six episodes; hovering names the episode, the VL row and its time.
-    """
-    marker: dict[str, Any] = {"size": 5, "opacity": 0.8}
-    if by == "progress":
-        marker |= {
-            "color": found.progress,
-            "colorscale": "Viridis",
-            "cmin": 0.0,
-            "cmax": 1.0,
-            "colorbar": {"title": {"text": "progress"}, "thickness": 12, "outlinewidth": 0},
-        }
-    else:
-        marker["color"] = [PALETTE[one % len(PALETTE)] for one in found.episode.tolist()]
-    names = np.array(found.episodes, dtype=object)[found.episode].tolist()
-    figure = go.Figure(layout=_layout())
-    figure.add_trace(
-        go.Scattergl(
-            x=found.points[:, 0],
-            y=found.points[:, 1],
-            mode="markers",
-            marker=marker,
-            text=names,
-            customdata=np.column_stack([found.rows, found.time, found.progress]),
-            hovertemplate=(
-                "%{text}<br>VL row %{customdata[0]:d}, %{customdata[1]:.2f} s"
-                "<br>progress %{customdata[2]:.2f}<extra></extra>"
-            ),
-        )
-    )
-    for axis, share, number in zip(
-        (figure.update_xaxes, figure.update_yaxes), found.explained, (1, 2), strict=True
-    ):
-        axis(title=f"component {number} ({share:.0%} of the variance)")
-    figure.update_layout(height=520)
-    return figure
-
-
-def _layout() -> dict[str, Any]:
+def layout() -> dict[str, Any]:
+    """Of every chart: axes that are seen on white and on black, and no background."""
     axis = {
         "gridcolor": "rgba(136, 136, 136, 0.3)",
         "linecolor": _AXIS,
@@ -199,7 +160,7 @@ def _evenness(figure: go.Figure, clock: Clock, lane: int, zero: float) -> None:
     longest = worst_steps(clock.time, edges)
     longest[~np.isfinite(longest)] = 0.0
     usual = usual_step(clock.time)
-    heights = 0.7 * np.minimum(usual / np.maximum(longest, 1e-12), 1.0)
+    heights = 0.7 * evenness(clock.time, edges)
     figure.add_trace(
         go.Bar(
             x=(edges[:-1] + edges[1:]) / 2 - zero,

@@ -1,6 +1,7 @@
 """The pictures of an evaluation: what a policy did beside what was recorded."""
 
 import math
+import textwrap
 from typing import Any
 
 import numpy as np
@@ -13,14 +14,15 @@ from pipeline.evaluation import (
     Comparison,
     Group,
     Predictions,
-    episode_name,
     with_unit,
 )
 from pipeline.plots.style import LABELS, RECORDED, STYLES, canvas, legend_below
-from pipeline.store import Episode, FeatureStore
+from pipeline.store import Episode, FeatureStore, episode_name
 
 SCATTER_POINTS = 4000
 EPISODE_LINES = 40
+_TITLE_WIDTH = 34
+"""Characters for which a panel of an action group has room."""
 
 
 def timeline(comparison: Comparison, predictions: Predictions, store: FeatureStore) -> Figure:
@@ -76,6 +78,8 @@ def scatter(comparison: Comparison, predictions: Predictions) -> Figure:
             recorded, predicted, s=9, alpha=0.35, linewidths=0, color=STYLES["policy"]["color"]
         )
         axis.set(xlim=(low, high), ylim=(low, high), aspect="equal")
+        axis.locator_params(nbins=4)
+        axis.ticklabel_format(scilimits=(-2, 4), useOffset=False)
         unit = comparison.units[index]
         axis.set_title(with_unit(comparison.names[index], unit))
         axis.set_xlabel(with_unit("recorded", unit))
@@ -150,9 +154,13 @@ def marked(method: str) -> dict[str, Any]:
 
 
 def _title(comparison: Comparison, group: Group) -> str:
-    names = ", ".join(comparison.names[index] for index in group.dimensions[:6])
-    more = " …" if len(group.dimensions) > 6 else ""
-    return f"{group.name} ({names}{more})"
+    """The group and its dimensions, as the width of a panel allows."""
+    names = [comparison.names[index] for index in group.dimensions]
+    title = f"{group.name} ({', '.join(names)})"
+    if len(title) <= _TITLE_WIDTH:
+        return title
+    ends = textwrap.fill(f"{names[0]} … {names[-1]}", _TITLE_WIDTH)
+    return f"{group.name}, {len(names)} dimensions\n{ends}"
 
 
 def _readable_range(axis: Axes, scale: float) -> None:

@@ -1,6 +1,5 @@
 """Pictures of a store: which episodes have what, how old features are, what takes the space."""
 
-import re
 from collections.abc import Iterator, Sequence
 from itertools import groupby
 from typing import Any
@@ -11,13 +10,12 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
+from pipeline.amounts import size
+from pipeline.inspection.channels import PROFILE_CHANNELS, unnumbered
 from pipeline.inspection.facts import ChannelStatistics
 from pipeline.inspection.store import Ages, ArraySize, EpisodeCoverage, StoreView
 from pipeline.plots.style import GRID, INK, PALETTE, canvas
-from pipeline.store.housekeeping import size
 
-WIDE_CHANNELS = 24
-"""Channels of one name and a number from which they are drawn side by side."""
 _ABSENT, _PARTLY, _PRESENT = "#D55E00", "#E69F00", "#0072B2"
 _SIZES = 8
 _BINS = 48
@@ -127,11 +125,11 @@ def wide_channels(view: StoreView) -> Figure:
 
 
 def numbered(view: StoreView) -> Iterator[tuple[ChannelStatistics, ...]]:
-    """Runs of at least `WIDE_CHANNELS` channels of one name and a number."""
+    """Runs of channels that make a profile."""
     for stream in view.statistics:
-        for _, run in groupby(stream.channels, key=lambda one: _stem(one.name)):
+        for _, run in groupby(stream.channels, key=lambda one: (unnumbered(one.name), one.unit)):
             channels = tuple(run)
-            if len(channels) >= WIDE_CHANNELS:
+            if len(channels) >= PROFILE_CHANNELS:
                 yield channels
 
 
@@ -190,7 +188,3 @@ def _band(axis: Axes, channels: Sequence[ChannelStatistics]) -> None:
     axis.set_ylabel(f"{channels[0].stream}{unit}")
     axis.set_xlabel(f"channel: {channels[0].name} to {channels[-1].name}")
     axis.margins(x=0)
-
-
-def _stem(name: str) -> str:
-    return re.sub(r"\d+$", "", name)

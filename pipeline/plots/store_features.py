@@ -18,6 +18,8 @@ from pipeline.plots.style import GRID, INK, PALETTE, canvas
 PROGRESS = LinearSegmentedColormap.from_list("progress", ("#0072B2", "#CC79A7", "#E69F00"))
 """From an episode's begin to its end, in colours that read on white and on black."""
 _AROUND = LinearSegmentedColormap.from_list("around", ("#0072B2", "#f0f0f0", "#D55E00"))
+FRAMED_EPISODES = 60
+"""Up to which alike pairs are framed; among more, the frames would hide the matrix."""
 _NAMED_SLOTS = 20
 _MOST_EPISODES = 200
 """Of which the paths are drawn; more are a blot."""
@@ -79,9 +81,9 @@ def likeness(view: StoreView) -> Figure:
     label = "highest cosine similarity of two VL rows"
     bar = figure.colorbar(image, ax=axis, label=label, fraction=0.046, pad=0.03)
     bar.ax.axhline(found.threshold, color=PALETTE[5], lw=2)
-    for place in np.argwhere(np.triu(shown >= found.threshold, 1)):
-        for column, row in (place, place[::-1]):
-            axis.plot(column, row, "s", mfc="none", mec=PALETTE[5], mew=1.5, ms=8)
+    if len(episodes) <= FRAMED_EPISODES:
+        row, column = np.nonzero(shown >= found.threshold)
+        axis.scatter(column, row, 64, marker="s", fc="none", ec=PALETTE[5], lw=1.5)
     return figure
 
 

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pipeline.errors import NumericsError
-from pipeline.evaluation import place
 from pipeline.probing.projection import Projection
-from pipeline.store import FeatureStore
+from pipeline.store import FeatureStore, place
 
 GROUP_WIDTH = 1024
 """Inputs at most that several slots together make."""

@@ -12,9 +12,8 @@ from tqdm import tqdm
 
 from pipeline.batches import Prefetch, Windows, draws
 from pipeline.errors import NumericsError
-from pipeline.evaluation import place
 from pipeline.probing.projection import GroupedProjection
-from pipeline.store import Batch, FeatureStore
+from pipeline.store import Batch, FeatureStore, place
 
 GROUP_WIDTH = 64
 """Directions at most of each summary of channels that share a unit."""

@@ -4,17 +4,15 @@
 frames are read when asked for.
 """
 
-import glob
-import os
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.config import Source
 from pipeline.errors import RecordingError
-from pipeline.recordings import lerobot, pickled, raw, windowed
 from pipeline.recordings.content import content_digest
+from pipeline.recordings.finding import READERS, episode_folders, listing
 from pipeline.recordings.reader import FileRecording, absolute, natural_key
 from pipeline.recordings.recording import (
     ActionKind,
@@ -60,34 +58,6 @@ class Opened:
     bad: tuple[BadEpisode, ...]
 
 
-Found = tuple[Sequence[FileRecording], Sequence[str]]
-"""Episodes, and lines about those that are not there."""
-
-
-@dataclass(frozen=True)
-class _Reader:
-    """A format: what marks its folders, and how one is opened."""
-
-    marker: str
-    marks: Callable[[Path, Collection[str]], bool]
-    open: Callable[[Path, Source, Sequence[str] | None], Found]
-
-
-def _one(
-    episode: Callable[[Path, Source, Sequence[str] | None], FileRecording],
-) -> Callable[[Path, Source, Sequence[str] | None], Found]:
-    return lambda path, source, views: ([episode(path, source, views)], [])
-
-
-READERS = {
-    "new": _Reader(windowed.MARKER, windowed.is_episode, _one(windowed.WindowedRecording)),
-    "old": _Reader(pickled.MARKER, pickled.is_episode, _one(pickled.PickledRecording)),
-    "raw": _Reader(raw.MARKER, raw.is_episode, _one(raw.RawRecording)),
-    "lerobot": _Reader(lerobot.MARKER, lerobot.is_root, lerobot.open_data_set),
-}
-"""In the order of detection."""
-
-
 def open_recordings(
     sources: Sequence[Source], root: Path = Path(), views: Sequence[str] | None = None
 ) -> Opened:
@@ -103,7 +73,7 @@ def open_recordings(
     bad: list[BadEpisode] = []
     for source in sources:
         of_source: list[FileRecording] = []
-        for folder, reader in _folders(source, root):
+        for folder, reader in episode_folders(source, root):
             try:
                 found, absent = reader.open(folder, source, views)
             except RecordingError as error:
@@ -134,7 +104,7 @@ def open_recording(
     Raises `RecordingError` where it is not there, or not of that format any more.
     """
     reader, source = READERS[format], Source(name=format, path=str(path))
-    if not reader.marks(path, _listing(path)):
+    if not reader.marks(path, listing(path)):
         raise RecordingError(f"{path}: not of the format {format} (no {reader.marker})")
     found, _ = reader.open(path, source, views)
     # Parent folders stand before the ids that stood more than once in a source.
@@ -142,85 +112,6 @@ def open_recording(
     if not of_id:
         raise RecordingError(f"{path}: has no episode {id}")
     return of_id[0]
-
-
-def _folders(source: Source, root: Path) -> list[tuple[Path, _Reader]]:
-    """The source's episode folders and LeRobot roots, each once, in natural order."""
-    found: dict[Path, tuple[Path, _Reader]] = {}
-    for pattern in source.paths:
-        full = absolute(root / pattern)
-        matches = _matches(full)
-        if not matches:
-            lost = "" if root.is_dir() else f": {root} is no folder; see python -m stages.doctor"
-            raise RecordingError(
-                f"source {source.name!r}: {pattern!r} matches nothing; looked for folders {full}. "
-                f"Mend data.root or the source's path{lost}"
-            )
-        episodes = [pair for match in matches for pair in _episodes(match, source)]
-        if not episodes:
-            raise RecordingError(
-                f"source {source.name!r}: {pattern!r} matches {len(matches)} folder(s), none with "
-                f"an episode in it; looked under {full} for folders with "
-                f"{_wanted_markers(source)}. Mend the source's path or format"
-            )
-        for folder, reader in episodes:
-            found.setdefault(folder.resolve(), (folder, reader))
-    return sorted(found.values(), key=lambda pair: natural_key(pair[0]))
-
-
-def _matches(full: Path) -> list[Path]:
-    """The folders that a path or glob means; a glob's end `/**` is the search that follows."""
-    if full.is_dir():
-        return [full]
-    while full.name == "**":
-        full = full.parent
-    # glob follows symbolic links, as data folders often are; pathlib's ** does not.
-    found = [Path(match) for match in glob.glob(str(full), recursive=True)]  # noqa: PTH207
-    return sorted((path for path in found if path.is_dir()), key=natural_key)
-
-
-def _episodes(
-    folder: Path, source: Source, seen: frozenset[Path] = frozenset()
-) -> Iterator[tuple[Path, _Reader]]:
-    """Episode folders at or below a folder; nothing is looked for inside an episode."""
-    names = _listing(folder)
-    format = _detect(folder, names, source)
-    if format is not None:
-        yield folder, READERS[format]
-        return
-    seen |= {folder.resolve()}
-    for name in sorted(names, key=natural_key):
-        below = folder / name
-        if not name.startswith(".") and below.is_dir() and below.resolve() not in seen:
-            yield from _episodes(below, source, seen)
-
-
-def _detect(folder: Path, names: Collection[str], source: Source) -> str | None:
-    if source.format != "auto" and READERS[source.format].marks(folder, names):
-        return source.format
-    for format, reader in READERS.items():
-        if reader.marks(folder, names):
-            if source.format != "auto":
-                raise RecordingError(
-                    f"source {source.name!r}: {folder} is not of the format {source.format!r} "
-                    f"that params ask for (no {READERS[source.format].marker}), it looks like "
-                    f"{format!r} ({reader.marker}). Set the source's format to auto or {format}"
-                )
-            return format
-    return None
-
-
-def _listing(folder: Path) -> list[str]:
-    try:
-        return os.listdir(folder)
-    except OSError as error:
-        raise RecordingError(f"{folder}: cannot be listed: {error}") from None
-
-
-def _wanted_markers(source: Source) -> str:
-    if source.format != "auto":
-        return READERS[source.format].marker
-    return ", or ".join(reader.marker for reader in READERS.values())
 
 
 def _name_apart(recordings: Sequence[FileRecording]) -> None:

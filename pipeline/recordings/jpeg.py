@@ -42,6 +42,18 @@ class JpegCamera(CameraStream):
                 last, frame = index, read_image(self.paths[index], str(self.paths[index]))
             yield frame
 
+    def repeats(self) -> NDArray[np.bool_]:
+        """Whether files are the same byte by byte; only those of equal length are read."""
+        lengths = np.array([path.stat().st_size for path in self.paths])
+        same = lengths[1:] == lengths[:-1]
+        for place in np.flatnonzero(same):
+            same[place] = self.paths[place].read_bytes() == self.paths[place + 1].read_bytes()
+        return same
+
+    def sizes(self, indices: Sequence[int]) -> NDArray[np.int64]:
+        found = [image_size(self.paths[index], str(self.paths[index])) for index in indices]
+        return np.array(found, np.int64).reshape(-1, 2)
+
 
 def frame_time(path: PurePath) -> float:
     """Seconds in the last `_`-separated part of the stem, as in `zed_left_1761551500.174.jpg`."""
@@ -65,18 +77,18 @@ def list_views(folder: Path, prefix: str = "") -> dict[str, list[Path]]:
     or the part before the time in a file's name.
     """
     found: dict[tuple[str, str], list[Path]] = {}
-    for view in sorted(_entries(folder), key=lambda entry: natural_key(entry.name)):
-        if not view.name.startswith(prefix) or not view.is_dir():
-            continue
-        base, eye = split_eye(view.name)
-        for entry in _entries(Path(view.path)):
-            if entry.name in _EYES and entry.is_dir():
-                inside = [Path(e.path) for e in _entries(Path(entry.path)) if _is_jpeg(e.name)]
-                found.setdefault((base, entry.name), []).extend(inside)
-            elif _is_jpeg(entry.name):
-                side = eye or _eye_of_file(entry.name)
-                found.setdefault((base, side), []).append(Path(entry.path))
-    return name_views({key: paths for key, paths in found.items() if paths})
+    for view in _view_folders(folder, prefix):
+        base, _ = split_eye(view.name)
+        for eye, path in _frames(view):
+            found.setdefault((base, eye), []).append(path)
+    return name_views(found)
+
+
+def list_empty_views(folder: Path, prefix: str = "") -> list[str]:
+    """The folders `<prefix>…` in `folder` without a JPEG in them or in their eyes' subfolders."""
+    return [
+        view.name for view in _view_folders(folder, prefix) if next(_frames(view), None) is None
+    ]
 
 
 def name_views(found: Mapping[tuple[str, str], list[Frame]]) -> dict[str, list[Frame]]:
@@ -105,6 +117,15 @@ def read_image(file: Path | bytes, where: str) -> NDArray[np.uint8]:
         raise RecordingError(f"{where}: cannot be decoded as an image: {error}") from None
 
 
+def image_size(file: Path, where: str) -> tuple[int, int]:
+    """Height and width as the file's header says."""
+    try:
+        with Image.open(file) as image:
+            return image.height, image.width
+    except _UNREADABLE as error:
+        raise RecordingError(f"{where}: cannot be decoded as an image: {error}") from None
+
+
 def check_image(file: Path | bytes, where: str) -> None:
     """Raise `RecordingError` on an unreadable image.
 
@@ -123,6 +144,22 @@ def check_image(file: Path | bytes, where: str) -> None:
 
 def _readable(file: Path | bytes) -> Path | BytesIO:
     return BytesIO(file) if isinstance(file, bytes) else file
+
+
+def _view_folders(folder: Path, prefix: str) -> list[Path]:
+    found = [Path(e.path) for e in _entries(folder) if e.name.startswith(prefix) and e.is_dir()]
+    return sorted(found, key=lambda view: natural_key(view.name))
+
+
+def _frames(view: Path) -> Iterator[tuple[str, Path]]:
+    """(eye, file) of every JPEG of a view's folder."""
+    _, eye = split_eye(view.name)
+    for entry in _entries(view):
+        if entry.name in _EYES and entry.is_dir():
+            inside = _entries(Path(entry.path))
+            yield from ((entry.name, Path(file.path)) for file in inside if _is_jpeg(file.name))
+        elif _is_jpeg(entry.name):
+            yield eye or _eye_of_file(entry.name), Path(entry.path)
 
 
 def _entries(folder: Path) -> Iterable[os.DirEntry[str]]:

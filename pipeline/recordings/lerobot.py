@@ -25,6 +25,7 @@ from pipeline.recordings.recording import (
     ActionKind,
     CameraStream,
     Channels,
+    Nominal,
     RecordedAction,
     Stream,
     check_rising_clock,
@@ -139,6 +140,10 @@ class LeRobotRecording(FileRecording):
         channels = _sidecar_channels(members, values.shape[1], path)
         return checked_stream(channels, member(members, ("timestamps",), path), values, str(path))
 
+    def nominal(self) -> Nominal:
+        clocks = ["state", "action", *(f"view {view}" for view in self.all_views())]
+        return Nominal(dict.fromkeys(clocks, self._layout.fps), where=MARKER)
+
     def all_views(self) -> Sequence[str]:
         return sorted(self._layout.views)
 
@@ -235,10 +240,8 @@ def _flat_names(names: list[Any] | dict[str, Any] | None) -> list[str] | None:
     if isinstance(names, dict):
         named_lists = all(isinstance(value, list) for value in names.values())
         names = list(names.values()) if named_lists else list(names)
-    flat: list[str] = []
-    for name in names:
-        flat.extend(map(str, name) if isinstance(name, list) else [str(name)])
-    return flat
+    lists = [name if isinstance(name, list) else [name] for name in names]
+    return [str(name) for each in lists for name in each]
 
 
 def _sidecar_channels(members: Mapping[str, NDArray[Any]], width: int, path: Path) -> Channels:

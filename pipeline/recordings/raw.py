@@ -16,7 +16,7 @@ from pipeline.recordings.insertion import (
     read_state_csv,
     sensor_rows,
 )
-from pipeline.recordings.jpeg import list_views
+from pipeline.recordings.jpeg import list_empty_views, list_views
 from pipeline.recordings.recording import Stream, checked_stream
 
 _STATE_FILES = "robot_state_*.csv"
@@ -64,6 +64,9 @@ class RawRecording(InsertionRecording):
             str(path),
         )
         return checked_stream(SENSOR, member(members, ("timestamps",), path), values, str(path))
+
+    def empty_views(self) -> Sequence[str]:
+        return [view for view in list_empty_views(self.path, prefix="View") if self._wants(view)]
 
     def _only(self, pattern: str) -> Path | None:
         found = sorted(self.path.glob(pattern))

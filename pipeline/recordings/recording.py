@@ -10,7 +10,7 @@ Times are float64 seconds on the recording's own clock, never decreasing. Anythi
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -51,6 +51,19 @@ class RecordedAction(Stream):
     rate_hz: float | None
 
 
+@dataclass(frozen=True)
+class Nominal:
+    """What a recording says of itself beside its data; empty where it says nothing."""
+
+    rates_hz: Mapping[str, float] = field(default_factory=dict[str, float])
+    """By clock: `sensor`, `state`, `action`, `view View1`, …"""
+    views: tuple[str, ...] = ()
+    frames: int | None = None
+    """Of the view that has most."""
+    where: str = ""
+    """The file that says so."""
+
+
 class CameraStream(ABC):
     """One view of one episode: `time` (frame,) float64 s is when each frame was captured."""
 
@@ -70,6 +83,14 @@ class CameraStream(ABC):
 
         Holds one decoded frame at a time and never seeks backwards.
         """
+
+    def repeats(self) -> NDArray[np.bool_] | None:
+        """(frame - 1,) whether a frame is the one before; None where only decoding tells."""
+        return None
+
+    def sizes(self, indices: Sequence[int]) -> NDArray[np.int64] | None:
+        """(index, 2) height and width of these frames; None where only decoding tells."""
+        return None
 
 
 class Recording(ABC):
@@ -97,6 +118,14 @@ class Recording(ABC):
     def view_names(self) -> Sequence[str]:
         """Names of `cameras()`, where the format allows it without reading a numeric stream."""
         return list(self.cameras())
+
+    def empty_views(self) -> Sequence[str]:
+        """Views that have a place in the recording and no frame there."""
+        return []
+
+    def nominal(self) -> Nominal:
+        """What the recording says of its rates and counts."""
+        return Nominal()
 
     def state(self) -> Stream | None:
         """The robot state, or None where the episode has none."""

@@ -15,8 +15,8 @@ from pipeline.recordings.insertion import (
     read_robot_states,
     robot_state_file,
 )
-from pipeline.recordings.jpeg import list_views
-from pipeline.recordings.recording import Stream, check_clock, checked_stream
+from pipeline.recordings.jpeg import list_empty_views, list_views
+from pipeline.recordings.recording import Nominal, Stream, check_clock, checked_stream
 from pipeline.recordings.windows import rebuild
 
 MARKER = "metadata.json"
@@ -73,6 +73,21 @@ class WindowedRecording(InsertionRecording):
         check_clock(ends, f"{path}, member 'timestamps'")
         time, values = rebuild(ends, windows, self._sensor_hz, str(path))
         return checked_stream(SENSOR, time, values, str(path))
+
+    def empty_views(self) -> Sequence[str]:
+        return [view for view in list_empty_views(self.path / "images") if self._wants(view)]
+
+    def nominal(self) -> Nominal:
+        """Raises `RecordingError` where `metadata.json` counts frames in anything but a number."""
+        told = {"sensor": self._sensor_hz, "state": self._robot_hz}
+        frames = self._number("camera_frames_count")
+        listed = self._metadata.get("camera_views")
+        return Nominal(
+            {name: rate for name, rate in told.items() if rate is not None},
+            tuple(map(str, listed)) if isinstance(listed, list) else (),
+            None if frames is None else int(frames),
+            MARKER,
+        )
 
     def _recorded_instruction(self) -> str:
         told = self._metadata.get("instruction")

@@ -1,8 +1,8 @@
 """What a page is made of, before it is HTML."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from matplotlib.figure import Figure
 
@@ -47,6 +47,26 @@ class Chart:
 
 
 @dataclass(frozen=True)
+class Place:
+    """One place of a notice: `str` says the episode and the time."""
+
+    episode: str
+    stream: str
+    start_s: float | None
+    """Since the instant from which the page counts; None where it is all of the stream."""
+    stop_s: float | None
+    message: str
+    """What was found there."""
+
+    def __str__(self) -> str:
+        if self.start_s is None:
+            return self.episode
+        start = f"{self.start_s:.2f}"
+        stop = start if self.stop_s is None else f"{self.stop_s:.2f}"
+        return f"{self.episode} {start if stop == start else f'{start}–{stop}'} s".lstrip()
+
+
+@dataclass(frozen=True)
 class Notice:
     """One thing that looks wrong: how bad, where (episode, stream, time), and what."""
 
@@ -54,6 +74,9 @@ class Notice:
     kind: str
     where: str
     message: str
+    """Of several places, what was found at the first."""
+    places: Sequence[Place] = ()
+    """All of them; where they are several, `where` says how many and names none."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +123,9 @@ class Section:
     parts: Sequence["Section"] = ()
 
 
+_Kind = TypeVar("_Kind")
+
+
 @dataclass(frozen=True)
 class Report:
     """A page: what it is of in one line, the figures that matter most, and its sections."""
@@ -109,3 +135,15 @@ class Report:
     tiles: Sequence[tuple[str, str]] = ()
     """(label, value), shown large at the top."""
     sections: Sequence[Section] = field(default_factory=tuple)
+
+    def blocks(self, *kinds: type[_Kind]) -> Iterator[_Kind]:
+        """Its blocks of these kinds, in reading order."""
+        return _blocks(self.sections, kinds)
+
+
+def _blocks(sections: Sequence[Section], kinds: tuple[type[_Kind], ...]) -> Iterator[_Kind]:
+    for section in sections:
+        for block in section.blocks:
+            if isinstance(block, kinds):
+                yield block
+        yield from _blocks(section.parts, kinds)

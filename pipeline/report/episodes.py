@@ -6,9 +6,10 @@ from functools import cache, partial
 from pipeline import plots
 from pipeline.batches import Ticks
 from pipeline.digests import file_digest
-from pipeline.evaluation import HEADINGS, Judgement, Predictions, best_baseline, episode_name
+from pipeline.evaluation import HEADINGS, Judgement, Predictions, best_baseline
 from pipeline.evaluation.footage import footage, shown_ticks
 from pipeline.report.blocks import Block, Picture, Section, Table, Text
+from pipeline.store import episode_name
 
 _INSTANTS = 5
 """Ticks of an episode at which its frames are shown."""

@@ -40,6 +40,7 @@ def evaluation_report(found: Judgement) -> Report:
             f"{policy['step']}, {policy['parameters']:,} parameters, judged on "
             f"{comparison.ticks:,} held-out ticks of {len(comparison.episodes)} episode(s) of "
             f"{found.store.path.name}, {policy['samples']} chunk(s) a tick."
+            f"{_beaten(comparison)}"
         ),
         tiles=_tiles(comparison),
         sections=(
@@ -51,6 +52,16 @@ def evaluation_report(found: Judgement) -> Report:
             Section("What was judged", _documents(found)),
         ),
     )
+
+
+def _beaten(comparison: Comparison) -> str:
+    """A sentence on the groups in which a baseline is better, which the overall error hides."""
+    worse = [
+        f"{group.name} ({relative:.2f} times the best baseline's error)"
+        for group in comparison.varying_groups()
+        if (relative := comparison.relative(group)) is not None and relative > 1
+    ]
+    return f" A baseline is better in {', '.join(worse)}." if worse else ""
 
 
 def _tiles(comparison: Comparison) -> list[tuple[str, str]]:

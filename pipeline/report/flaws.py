@@ -1,13 +1,10 @@
-"""Flaws -> notices: the same flaw in many episodes is one, with a count and the first places."""
+"""Flaws -> notices: the same flaw in many episodes is one, with a count and all its places."""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 
 from pipeline.inspection.facts import Flaw
-from pipeline.report.blocks import Notice
-
-PLACES = 3
-"""Of a flaw that stands in many, the first that are named."""
+from pipeline.report.blocks import Notice, Place
 
 
 def notices(flaws: Sequence[Flaw], zeros: Mapping[tuple[str, str], float]) -> list[Notice]:
@@ -23,27 +20,14 @@ def notices(flaws: Sequence[Flaw], zeros: Mapping[tuple[str, str], float]) -> li
     return [_notice(group, zeros, several) for group in groups]
 
 
-def when(flaw: Flaw, zero: float) -> str:
-    """`3.20–4.10 s` since the first instant; nothing where it is all of the stream."""
-    if flaw.start_s is None:
-        return ""
-    start = f"{flaw.start_s - zero:.2f}"
-    stop = start if flaw.stop_s is None else f"{flaw.stop_s - zero:.2f}"
-    return f"{start} s" if stop == start else f"{start}–{stop} s"
-
-
 def _notice(group: Sequence[Flaw], zeros: Mapping[tuple[str, str], float], several: bool) -> Notice:
     first = group[0]
     episodes = len({(flaw.source, flaw.episode) for flaw in group})
-    places = "; ".join(_place(flaw, zeros, several) for flaw in group[:PLACES])
-    if len(group) > PLACES:
-        places += f"; and {len(group) - PLACES} more"
+    places = tuple(_place(flaw, zeros, several) for flaw in group)
     stream = "" if first.stream == "episode" else first.stream
-    count = "" if len(group) == 1 else _count(len(group), episodes)
-    where = " · ".join(part for part in (stream, count, places) if part)
-    if len(group) == 1:
-        return Notice(first.severity, first.kind, where, first.message)
-    return Notice(first.severity, first.kind, where, f"The first: {first.message}")
+    count = str(places[0]) if len(group) == 1 else _count(len(group), episodes)
+    where = " · ".join(part for part in (stream, count) if part)
+    return Notice(first.severity, first.kind, where, first.message, places)
 
 
 def _count(places: int, episodes: int) -> str:
@@ -51,7 +35,8 @@ def _count(places: int, episodes: int) -> str:
     return among if places == episodes else f"{places:,} places in {among}"
 
 
-def _place(flaw: Flaw, zeros: Mapping[tuple[str, str], float], several: bool) -> str:
+def _place(flaw: Flaw, zeros: Mapping[tuple[str, str], float], several: bool) -> Place:
     episode = f"{flaw.source}/{flaw.episode}" if several and flaw.episode else flaw.episode
-    time = when(flaw, zeros.get((flaw.source, flaw.episode), 0.0))
-    return " ".join(part for part in (episode or flaw.source, time) if part)
+    zero = zeros.get((flaw.source, flaw.episode), 0.0)
+    start, stop = (None if at is None else at - zero for at in (flaw.start_s, flaw.stop_s))
+    return Place(episode or flaw.source, flaw.stream, start, stop, flaw.message)

@@ -3,22 +3,19 @@
 from collections.abc import Sequence
 from functools import lru_cache
 from itertools import groupby
-from pathlib import Path
-
-from tqdm import tqdm
 
 from pipeline.config import Params
 from pipeline.datasets import UnifiedBatch, UnifiedVLADataset
-from pipeline.digests import file_digest
 from pipeline.errors import PipelineError
 from pipeline.inspection.facts import EpisodeView, PromptToken, PromptView
 from pipeline.inspection.overview import RecordingsOverview
 from pipeline.inspection.prompt import view_prompt
 from pipeline.inspection.samples import samples
+from pipeline.inspection.spec import remembered_spec
 from pipeline.plots import recording as plots
 from pipeline.report.blocks import Block, Document, Picture, Run, Section, Table, Text, Tokens
 from pipeline.report.recording_episode import Viewer
-from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
+from pipeline.vlm.feature_spec import FeatureSpec
 
 
 def model_input(
@@ -65,7 +62,7 @@ def _samples(index: int, view_of: Viewer, params: Params) -> list[Block]:
 
 def _prompt(view: EpisodeView, overview: RecordingsOverview, params: Params) -> list[Block]:
     try:
-        spec = _spec(overview, params)
+        spec = remembered_spec(params, overview.views)
     except PipelineError as error:
         return [
             Text(
@@ -79,17 +76,6 @@ def _prompt(view: EpisodeView, overview: RecordingsOverview, params: Params) -> 
     except PipelineError as error:
         blocks = [Text(f"The prompt cannot be shown: {error}")]
     return [*blocks, _document(spec)]
-
-
-def _spec(overview: RecordingsOverview, params: Params) -> FeatureSpec:
-    """Reads the whole checkpoint for its digest, which takes seconds a gigabyte."""
-    with tqdm(desc="digest of the checkpoint", unit="file", disable=None, leave=False) as bar:
-
-        def digest(path: Path) -> str:
-            bar.update()
-            return file_digest(path)
-
-        return feature_spec(params.vlm, params.extract.dtype, overview.views, digest)
 
 
 def _document(spec: FeatureSpec) -> Document:

@@ -7,7 +7,7 @@ security policy forbids the rest. The same report gives the same bytes.
 import json
 import re
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -33,11 +33,16 @@ from pipeline.report.blocks import (
 )
 from pipeline.report.cells import breakable, columns_of, prose
 from pipeline.report.charts import chart_json, plotly_script
+from pipeline.report.findings import FINDINGS, findings_csv
 from pipeline.report.svg import inline_svg
 
 PAGE = "report.html"
 OPEN_NOTICES = 12
 """Notices that show at once; the rest unfold."""
+NAMED_PLACES = 3
+"""Of a notice, those that show at once; all of them unfold."""
+MOST_PLACES = 300
+"""Of a notice, those that the page lists; more stand in `findings.csv` only."""
 _WRITTEN = re.compile(r'<meta name="pictures" content="([^"]*)">')
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 
@@ -45,12 +50,13 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 def write_report(folder: Path, report: Report) -> list[Path]:
     """Write `report.html` and `<name>.png` of every picture into `folder`; return their paths.
 
-    Pictures are drawn one at a time. Each file is put in place whole, the page last, so that a kill
-    leaves the old page. Pictures that the page of before had and this one has not are removed; of
-    other files in `folder` none is touched. Raises `DiskFull` with the old page in place, and
-    `ValueError` for a picture's name that is twice in the report or no plain file stem.
+    A page that says what looks wrong has all of it in `findings.csv` beside it. Pictures are drawn
+    one at a time. Each file is put in place whole, the page last, so that a kill leaves the old
+    page. Pictures that the page of before had and this one has not are removed; of other files in
+    `folder` none is touched. Raises `DiskFull` with the old page in place, and `ValueError` for a
+    picture's name that is twice in the report or no plain file stem.
     """
-    names = [picture.name for picture in _pictures(report.sections)]
+    names = [picture.name for picture in _pictures(report)]
     _check_names(names)
     folder.mkdir(parents=True, exist_ok=True)
     temporary = folder / f".{PAGE}.new"
@@ -60,15 +66,19 @@ def write_report(folder: Path, report: Report) -> list[Path]:
         try:
             page = _Page(report, temporary, names).html()
             # A file's name need not be text: what is none is shown as \udcXX.
-            (temporary / PAGE).write_text(page, encoding="utf-8", errors="backslashreplace")
-            return _put_in_place(temporary, folder, names)
+            texts = {**_findings(report), PAGE: page}
+            for name, text in texts.items():
+                (temporary / name).write_text(text, encoding="utf-8", errors="backslashreplace")
+            return _put_in_place(temporary, folder, names, texts)
         finally:
             shutil.rmtree(temporary)
 
 
-def _put_in_place(temporary: Path, folder: Path, names: Sequence[str]) -> list[Path]:
+def _put_in_place(
+    temporary: Path, folder: Path, names: Sequence[str], texts: Iterable[str]
+) -> list[Path]:
     page = folder / PAGE
-    files = [*(f"{name}.png" for name in names), PAGE]
+    files = [*(f"{name}.png" for name in names), *texts]
     for file in files:
         sync(temporary / file)
     before = _pictures_of(page)
@@ -78,6 +88,12 @@ def _put_in_place(temporary: Path, folder: Path, names: Sequence[str]) -> list[P
         (folder / f"{name}.png").unlink(missing_ok=True)
     sync(folder)
     return [page, *(folder / file for file in files[:-1])]
+
+
+def _findings(report: Report) -> dict[str, str]:
+    """The first notices are those of all; those of single parts come later."""
+    found = next(report.blocks(Notices), None)
+    return {} if found is None else {FINDINGS: findings_csv(found)}
 
 
 def _pictures_of(page: Path) -> set[str]:
@@ -90,14 +106,9 @@ def _pictures_of(page: Path) -> set[str]:
     return {name for name in names if _NAME.fullmatch(name)}
 
 
-def _pictures(sections: Sequence[Section]) -> Iterator[Picture]:
-    for section in sections:
-        for block in section.blocks:
-            if isinstance(block, Chart):
-                yield block.picture
-            elif isinstance(block, Picture):
-                yield block
-        yield from _pictures(section.parts)
+def _pictures(report: Report) -> Iterator[Picture]:
+    for block in report.blocks(Picture, Chart):
+        yield block.picture if isinstance(block, Chart) else block
 
 
 def _check_names(names: Sequence[str]) -> None:
@@ -121,7 +132,8 @@ class _Page:
             lstrip_blocks=True,
         )
         self._jinja.filters |= {"prose": prose, "breakable": breakable}
-        self._blocks: Any = self._jinja.get_template("blocks.html").module
+        limits = {"named": NAMED_PLACES, "listed": MOST_PLACES, "findings": FINDINGS}
+        self._blocks: Any = self._jinja.get_template("blocks.html", globals=limits).module
         self._templates = Path(__file__).parent / "templates"
         self._report, self._pictures, self._names = report, pictures, names
         self._anchors: set[str] = {"top"}

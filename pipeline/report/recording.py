@@ -3,12 +3,12 @@
 from collections.abc import Mapping, Sequence
 from functools import lru_cache, partial
 
+from pipeline.amounts import duration
 from pipeline.config import Params
 from pipeline.inspection.episodes import view_episode
 from pipeline.inspection.overview import EpisodeSummary, RecordingsOverview, survey_recordings
 from pipeline.recordings import Opened
 from pipeline.report.blocks import Block, Notices, Report, Section, Table, Text
-from pipeline.report.cells import number
 from pipeline.report.flaws import notices
 from pipeline.report.model_input import model_input
 from pipeline.report.recording_episode import Viewer, episode_section
@@ -78,20 +78,13 @@ def _tiles(overview: RecordingsOverview) -> list[tuple[str, str]]:
     errors = sum(flaw.severity == "error" for flaw in overview.flaws)
     return [
         ("episodes", f"{len(all_of):,}"),
-        ("recorded", _duration(sum(one.duration_s for one in all_of))),
+        ("recorded", duration(sum(one.duration_s for one in all_of))),
         ("ticks", f"{sum(one.ticks for one in all_of):,}"),
         ("VL rows", f"{sum(one.vl_rows for one in all_of):,}"),
         ("cameras", f"{len(overview.views)}"),
         ("errors", f"{errors:,}"),
         ("warnings", f"{len(overview.flaws) - errors:,}"),
     ]
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 120:
-        return f"{number(seconds)} s"
-    minutes = seconds / 60
-    return f"{minutes:.1f} min" if minutes < 120 else f"{minutes / 60:.1f} h"
 
 
 def _episodes(

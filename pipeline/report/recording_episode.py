@@ -1,5 +1,6 @@
 """One recording -> its section: what each stream holds, and when."""
 
+import math
 import re
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -10,7 +11,7 @@ from pipeline.config import InspectParams
 from pipeline.inspection.clocks import clocks
 from pipeline.inspection.contact import contacts
 from pipeline.inspection.facts import Clock, EpisodeView, Flaw
-from pipeline.inspection.frames import frames_at, spread_ticks
+from pipeline.inspection.frames import frames_at, read_frames, spread_ticks
 from pipeline.inspection.overview import EpisodeSummary
 from pipeline.inspection.statistics import channel_statistics
 from pipeline.plots import interactive
@@ -78,12 +79,8 @@ def _views(view: EpisodeView, draw: Draw, count: int, flaws: Sequence[Flaw]) -> 
     ticks = spread_ticks(view, count)
     if not ticks:
         return [Text(_why(flaws, "ticks", "No view is shown: the episode has no ticks."))]
-    shown = frames_at(view, ticks)
-    blocks: list[Block] = [
-        Text(f"{name} is not shown: a frame of it cannot be decoded; see what looks wrong above.")
-        for name in view.cameras
-        if name not in shown
-    ]
+    shown, broken = read_frames(view, ticks)
+    blocks: list[Block] = [Text(f"{one.stream} is not shown: {one.message}") for one in broken]
     if shown:
         caption = (
             f"What each view shows at {len(ticks)} ticks, evenly from the first to the last: the "
@@ -135,20 +132,23 @@ def _clocks(view: EpisodeView, draw: Draw) -> list[Block]:
 
 
 def _clock_table(view: EpisodeView, found: Sequence[Clock]) -> Table:
-    heads = ["clock", "entries", "first [ms]", "last [s]", "rate [Hz]", "jitter [µs]", "gaps"]
+    first = [one.time[0] - view.zero if len(one.time) else None for one in found]
+    last = [one.time[-1] - view.zero if len(one.time) else None for one in found]
+    jitters = [one.jitter_s for one in found]
+    unit, size = jitter_unit(jitters)
+    heads = ["clock", "entries", "first [s]", "last [s]", "rate [Hz]", f"jitter [{unit}]", "gaps"]
     rows = [
-        (
-            one.name,
-            len(one.time),
-            1e3 * (one.time[0] - view.zero) if len(one.time) else None,
-            one.time[-1] - view.zero if len(one.time) else None,
-            one.rate_hz,
-            1e6 * one.jitter_s,
-            len(one.gaps),
-        )
-        for one in found
+        (one.name, len(one.time), begin, end, one.rate_hz, jitter / size, len(one.gaps))
+        for one, begin, end, jitter in zip(found, first, last, jitters, strict=True)
     ]
     return Table(heads, rows, "Jitter is the standard deviation of the steps that are no gaps.")
+
+
+def jitter_unit(jitters_s: Sequence[float]) -> tuple[str, float]:
+    """The largest of s, ms and µs, with its seconds, in which the largest jitter is at least 1."""
+    largest = max((one for one in jitters_s if not math.isnan(one)), default=0.0)
+    units = {"s": 1.0, "ms": 1e-3, "µs": 1e-6}
+    return next((one for one in units.items() if largest >= one[1]), ("µs", 1e-6))
 
 
 def _statistics(view: EpisodeView) -> list[Block]:

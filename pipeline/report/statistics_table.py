@@ -1,28 +1,26 @@
 """Per-channel statistics -> a table in which a thousand like channels are one row."""
 
-import re
 from collections.abc import Sequence
 from itertools import groupby
 
 import numpy as np
 
+from pipeline.inspection.channels import PROFILE_CHANNELS, unnumbered
 from pipeline.inspection.facts import ChannelStatistics
 from pipeline.report.blocks import Table
 
-MANY = 16
-"""Like-named channels of one unit from which they are one row."""
 HEADS = (
     "stream", "channel", "unit", "count", "min", "1 %", "median", "99 %", "max", "mean", "std",
 )  # fmt: skip
 
 
 def statistics_table(statistics: Sequence[ChannelStatistics]) -> Table:
-    """A row a channel; channels that differ by a number in their names are one from 16 on."""
+    """A row a channel; channels that differ by a number in their names are one from 24 on."""
     rows: list[tuple[object, ...]] = []
     many = False
-    for _, like in groupby(statistics, lambda one: (one.stream, _stem(one.name), one.unit)):
+    for _, like in groupby(statistics, lambda one: (one.stream, unnumbered(one.name), one.unit)):
         group = list(like)
-        if len(group) < MANY:
+        if len(group) < PROFILE_CHANNELS:
             rows += [_row(one) for one in group]
         else:
             rows.append(_joint_row(group))
@@ -34,10 +32,6 @@ def statistics_table(statistics: Sequence[ChannelStatistics]) -> Table:
             " the median over the channels."
         )
     return Table(HEADS, rows, said)
-
-
-def _stem(name: str) -> str:
-    return re.sub(r"\d+", "#", name)
 
 
 def _row(one: ChannelStatistics) -> tuple[object, ...]:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.amounts import duration, size
 from pipeline.inspection.facts import ChannelStatistics
 from pipeline.inspection.store import EpisodeCoverage, StoreView
 from pipeline.plots import store as pictures
@@ -24,7 +25,6 @@ from pipeline.report.blocks import (
 from pipeline.report.flaws import notices
 from pipeline.report.statistics_table import statistics_table
 from pipeline.report.store_features import duplicates, features
-from pipeline.store.housekeeping import size
 
 ROWS = 100
 """Episodes in the table of all; of more, the first."""
@@ -58,7 +58,7 @@ def store_report(view: StoreView) -> Report:
 def _tiles(view: StoreView) -> list[tuple[str, str]]:
     return [
         ("episodes", f"{len(view.episodes):,}"),
-        ("length", f"{view.seconds / 60:,.1f} min"),
+        ("length", duration(view.seconds)),
         ("ticks", f"{view.ticks:,}"),
         ("VL rows", f"{view.sampled.total:,}"),
         ("on the disk", size(view.disk_bytes)),
@@ -75,7 +75,7 @@ def _notices(view: StoreView) -> Notices:
 
 
 def _checked(view: StoreView) -> Text:
-    looked, total = len(view.sampled.rows), view.sampled.total
+    looked, total = view.sampled.looked_at, view.sampled.total
     rows = f"all {total:,}" if looked == total else f"{looked:,} of {total:,}"
     command = f"python -m stages.verify --set verify.store={view.path}"
     return Text(
@@ -183,14 +183,14 @@ def _sizes(view: StoreView) -> list[Block]:
             " × ".join(f"{count:,}" for count in one.shape),
             one.dtype,
             one.chunks,
-            size(one.disk_bytes),
-            f"{one.disk_bytes / max(1, view.disk_bytes):.1%}",
+            one.disk_bytes / 2**20,
+            100 * one.disk_bytes / max(1, view.disk_bytes),
         )
         for one in view.sizes
     ]
     return [
         Picture("sizes", "Bytes on the disk by array.", partial(pictures.sizes, view)),
-        Table(("array", "shape", "dtype", "chunks", "on the disk", "share"), rows),
+        Table(("array", "shape", "dtype", "chunks", "on the disk [MiB]", "share [%]"), rows),
     ]
 
 

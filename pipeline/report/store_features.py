@@ -5,8 +5,8 @@ from functools import partial
 from typing import Literal
 
 from pipeline.inspection.store import StoreView, Twins
-from pipeline.plots import interactive
 from pipeline.plots import store_features as pictures
+from pipeline.plots import store_interactive as interactive
 from pipeline.plots.style import PALETTE
 from pipeline.report.blocks import Block, Chart, Picture, Table, Text
 
@@ -15,21 +15,19 @@ _TWINS = 20
 
 def features(view: StoreView) -> list[Block]:
     """Norms and the projection."""
-    looked = f"{len(view.sampled.rows):,} of {view.sampled.total:,} VL rows, the same moments of "
-    looked += "each episode (`inspect.points`)"
-    rows = "all VL rows" if len(view.sampled.rows) == view.sampled.total else looked
-    variants = ", plain frames only" if view.variants > 1 else ""
+    if not len(view.sampled.rows):
+        return [Text("Every VL row looked at holds features that are no numbers.")]
     beside = " and has a second picture by source" if len(view.sources) > 1 else ""
     planes: list[tuple[Literal["episode", "progress"], str]] = [
         (
             "episode",
-            f"its colour is its episode's, the same after every {len(PALETTE)}. The PNG joins the "
-            f"rows of each in order of time{beside}.",
+            f"{_colours(view)} Hovering names the episode. The PNG joins the rows of each episode "
+            f"in order of time, in colours that repeat after {len(PALETTE)}{beside}.",
         ),
-        ("progress", "its colour is how far its episode had come."),
+        ("progress", "its colour is how far its episode had come. Hovering names the episode."),
     ]
     return [
-        Text(f"Of {rows}{variants}."),
+        Text(_looked_at(view)),
         Picture(
             "norms",
             "Left: how long the features of each slot are. Right: their median length in each "
@@ -48,11 +46,32 @@ def features(view: StoreView) -> list[Block]:
                     f"Features in a plane: a dot is a VL row, {said}",
                     partial(pictures.projection, view, by),
                 ),
-                interactive.projection(view.projection, by),
+                interactive.projection(view, by),
             )
             for by, said in planes
         ),
     ]
+
+
+def _colours(view: StoreView) -> str:
+    kind = interactive.trait(view)
+    if kind is None:
+        return f"its colour is its episode's, the same after every {len(PALETTE)}."
+    return f"its colour is its {kind}'s, which the legend names."
+
+
+def _looked_at(view: StoreView) -> str:
+    sampled = view.sampled
+    said = "Of all VL rows"
+    if sampled.looked_at < sampled.total:
+        said = f"Of {sampled.looked_at:,} of {sampled.total:,} VL rows, the same moments of each "
+        said += "episode (`inspect.points`)"
+    said += ", plain frames only" if view.variants > 1 else ""
+    return (
+        f"{said}, but {sampled.left_out:,} with what is not finite."
+        if sampled.left_out
+        else f"{said}."
+    )
 
 
 def duplicates(view: StoreView) -> list[Block]:
@@ -72,7 +91,9 @@ def duplicates(view: StoreView) -> list[Block]:
     ]
     if len(found.episodes) > 1:
         said = "For each pair of episodes, how alike their two most alike VL rows are; the mark on "
-        said += "the scale is where near-duplicates begin, and pairs beyond it are framed."
+        framed = len(found.episodes) <= pictures.FRAMED_EPISODES
+        said += "the scale is where near-duplicates begin"
+        said += ", and pairs beyond it are framed." if framed else "."
         blocks.append(Picture("likeness", said, partial(pictures.likeness, view)))
     blocks += _twins(found.equal_twins, found.equal_twins_count, "Rows with equal keys")
     blocks += _twins(found.twins, found.twins_count, "Near-duplicates by features")

@@ -9,6 +9,7 @@ from pipeline.store.batch import Batch
 from pipeline.store.chunks import check_trailers
 from pipeline.store.donor import Donor
 from pipeline.store.lock import build_lock
+from pipeline.store.names import episode_name, place
 from pipeline.store.reader import Episode, FeatureStore
 from pipeline.store.schema import FEATURES, KEY_BYTES, SCHEMA, Sizes, arrays
 from pipeline.store.writer import StoreBuild, part_path, read_plan
@@ -26,7 +27,9 @@ __all__ = [
     "arrays",
     "build_lock",
     "check_trailers",
+    "episode_name",
     "part_path",
+    "place",
     "read_plan",
     "recover",
 ]

@@ -40,12 +40,13 @@ class FeatureStore:
         it follows another schema.
         """
         root = Path(path)
-        if not (root / "zarr.json").exists():
-            part = root.with_name(root.name + ".part")
+        build = root.name.endswith(".part")  # which looks like a store until its files are read
+        if build or not (root / "zarr.json").exists():
+            part = root if build else root.with_name(root.name + ".part")
             found = f"only the unfinished build {part}" if part.exists() else "nothing there"
-            raise StoreIncomplete(
-                f"{root}: no finished store ({found}). Run {extract_command(root)}."
-            )
+            base = root.name.removesuffix(".part").removesuffix(".repair")
+            run = extract_command(root.with_name(base))
+            raise StoreIncomplete(f"{root}: no finished store ({found}). Run {run}.")
         try:
             attrs = zarr.open_group(root, mode="r").attrs.asdict()
         except (ValueError, KeyError) as error:

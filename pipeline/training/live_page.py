@@ -24,16 +24,35 @@ LOG_FROM = 20
 WIDTH, HEIGHT = 340, 180
 LEFT, RIGHT, TOP, BOTTOM = 60, 10, 8, 22
 
-_SECTIONS = (("val/", "Held-out ticks"), ("train/", "Training"), ("", "Schedule"))
+_SECTIONS = (
+    (
+        "val/",
+        "Held-out ticks",
+        "Mean absolute errors: val/error over the action dimensions that vary, each in its "
+        "training std; the others of a group of dimensions, in its own unit. Of these, other holds "
+        "what is neither translation, rotation nor gripper, such as velocities.",
+    ),
+    (
+        "train/",
+        "Training",
+        "Each point is the mean over the steps since the point before it; the terminal says the "
+        "loss of one step.",
+    ),
+    ("", "Schedule", ""),
+)
+"""Prefix of the curves, heading, and what a reader has to know of them."""
 _FIRST = ("val/error", "train/loss")
+_UNITS = {"val/error": "training std"}
+"""Of curves whose name has none."""
 _STYLE = """
-:root{color-scheme:light dark;--ink:#1f2328;--soft:#5f6b76;--grid:#e3e6ea;--line:#0072b2;
---card:#fff;--back:#f6f7f9}
-@media (prefers-color-scheme:dark){:root{--ink:#e6e9ec;--soft:#9aa6b2;--grid:#353b42;
---line:#56b4e9;--card:#1b1f24;--back:#121518}}
+:root{color-scheme:light dark;--ink:#24272b;--soft:#62676e;--grid:#dcdcd8;--line:#0072b2;
+--card:#f4f4f1;--back:#fdfdfc}
+@media (prefers-color-scheme:dark){:root{--ink:#dfe1e4;--soft:#9aa1a9;--grid:#353a40;
+--line:#2a8fd4;--card:#1f2226;--back:#16181b}}
 body{margin:0 auto;max-width:76rem;padding:1rem;background:var(--back);color:var(--ink);
 font:15px/1.45 system-ui,sans-serif}
 h1{font-size:1.25rem;margin:.2rem 0;overflow-wrap:anywhere}h2{font-size:1rem;margin:1.2rem 0 .5rem}
+h2+p{font-size:.85rem;max-width:72ch;padding-bottom:.4rem}
 p{margin:.2rem 0;color:var(--soft)}progress{width:100%;height:.6rem;accent-color:var(--line)}
 main{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(100%,21rem),1fr));gap:.8rem}
 figure{margin:0;padding:.6rem .7rem;background:var(--card);border:1px solid var(--grid);
@@ -113,12 +132,13 @@ class LivePage:
     def _html(self, state: str, refresh: str) -> str:
         parts: list[str] = []
         left = sorted(self._curves, key=lambda name: (name not in _FIRST, name))
-        for prefix, heading in _SECTIONS:
+        for prefix, heading, words in _SECTIONS:
             here = [name for name in left if name.startswith(prefix)]
             left = [name for name in left if name not in here]
+            told = f"<p>{words}</p>\n" if words else ""
             if here:
                 charts = "\n".join(chart(name, self._curves[name]) for name in here)
-                parts.append(f"<h2>{heading}</h2>\n<main>\n{charts}\n</main>")
+                parts.append(f"<h2>{heading}</h2>\n{told}<main>\n{charts}\n</main>")
         title, body = escape(self._title), "\n".join(parts)
         return (
             '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">\n'
@@ -132,9 +152,9 @@ class LivePage:
 
 def chart(name: str, points: Sequence[Point]) -> str:
     """A curve as an HTML figure, with its newest and, of an error, its lowest value in words."""
-    name = escape(name)
+    title = escape(f"{name} [{_UNITS[name]}]" if name in _UNITS else name)
     if not points:
-        return f"<figure><figcaption><b>{name}</b> no finite value yet</figcaption></figure>"
+        return f"<figure><figcaption><b>{title}</b> no finite value yet</figcaption></figure>"
     judged = name.startswith("val/")
     step, value = points[-1]
     said = f"{value:.4g} at step {step:,}"
@@ -145,8 +165,8 @@ def chart(name: str, points: Sequence[Point]) -> str:
     values = [value for _, value in line]
     log = 0 < LOG_FROM * min(values) < max(values)
     return (
-        f"<figure><figcaption><b>{name}</b> {said}{', logarithmic' if log else ''}</figcaption>\n"
-        f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{name}: {said}">'
+        f"<figure><figcaption><b>{title}</b> {said}{', logarithmic' if log else ''}</figcaption>\n"
+        f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{title}: {said}">'
         f"{_drawn(line, log, marked=judged or len(line) == 1)}</svg></figure>"
     )
 

@@ -10,9 +10,8 @@ from tqdm import tqdm
 
 from pipeline.batches import Ticks
 from pipeline.errors import NumericsError
-from pipeline.evaluation import place
 from pipeline.normalization import Block, ChannelStatistics, Normalization, fit_channels
-from pipeline.store import FeatureStore
+from pipeline.store import FeatureStore, place
 
 CHUNK_BYTES = 64 * 2**20
 THREAD_BYTES = 2**20

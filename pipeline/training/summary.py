@@ -2,6 +2,7 @@
 
 import torch
 
+from pipeline.amounts import duration, size
 from pipeline.config import TrainHeadParams
 from pipeline.models import Policy, PolicyShape
 from pipeline.models.cost import describe_cost
@@ -70,6 +71,7 @@ def closing(step: int, standing: Standing, trained_s: float, device: torch.devic
     early = f"stopped early at step {step}: {standing.stalled} evaluations without a better one"
     return [
         *([early] if standing.exhausted else []),
-        f"trained {step} steps in {trained_s:.1f} s ({step / max(trained_s, 1e-9):.1f} steps/s), "
-        f"peak memory {peak_memory_bytes(device) / 2**30:.2f} GiB",
+        f"trained {step} steps in {duration(trained_s)} "
+        f"({step / max(trained_s, 1e-9):.1f} steps/s), "
+        f"peak memory {size(peak_memory_bytes(device))}",
     ]

@@ -67,17 +67,20 @@ def _is_complete(folder: Path) -> bool:
 
 def _downloaded(checkpoint: str, revision: str | None, setting: str) -> Path:
     from huggingface_hub import snapshot_download
-    from huggingface_hub.errors import HFValidationError
+    from huggingface_hub.errors import HFValidationError, LocalEntryNotFoundError
 
     try:
         return Path(snapshot_download(checkpoint, revision=revision, allow_patterns=_WANTED))
+    except LocalEntryNotFoundError as error:
+        cause, why = error, "it is neither whole in the local cache nor reachable"
     except (HFValidationError, OSError) as error:
-        raise VLMError(
-            f"{setting} {checkpoint}: no folder of this name, no complete copy in the hub's "
-            f"cache, and it cannot be downloaded ({type(error).__name__}: {_first_line(error)}). "
-            "If it is the demo's folder, run `python -m stages.demo`; if it is a hub id, run "
-            f"`hf download {checkpoint}` where there is network and set {setting} to the folder."
-        ) from error
+        cause, why = error, f"it cannot be downloaded: {_first_line(error)}"
+    raise VLMError(
+        f"{setting} {checkpoint}: there is no folder of that name here; and as a hub id, {why}. "
+        "If it is the demo's folder, run `python -m stages.demo`; if it is a hub id, run "
+        f"`hf download {checkpoint}` where there is network and set {setting} to the folder. "
+        "`python -m stages.doctor` looks at the rest."
+    ) from cause
 
 
 def _first_line(error: Exception) -> str:

@@ -13,7 +13,7 @@ from pipeline.vlm.augmentation import Augmentation
 from pipeline.vlm.checkpoint_folder import resolve_checkpoint
 from pipeline.vlm.feature_spec import FeatureSpec
 from pipeline.vlm.pixels import PixelSettings, stretch
-from pipeline.vlm.prompt import PromptRenderer
+from pipeline.vlm.prompt import PromptRenderer, TokenKind
 
 
 @dataclass(frozen=True)
@@ -74,6 +74,10 @@ class Preparer:
         Raises `VLMError` where the instruction holds a control token, or a view is not the spec's.
         """
         return self._rendered(instruction, len(self._ordered(views_present)))
+
+    def describe(self, token: int) -> tuple[str, TokenKind]:
+        """The text of a token of a row and its kind."""
+        return self._renderer.describe(token)
 
     def prepare(self, instruction: str, frames: Mapping[str, NDArray[np.uint8]]) -> PreparedRow:
         """The row of an instruction and its frames (height, width, 3) RGB by view.

@@ -1,7 +1,7 @@
 """An instruction and its views -> the text and the tokens that the model reads."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from transformers import AutoTokenizer
 
@@ -10,6 +10,11 @@ from pipeline.vlm.checkpoint_folder import read_config, read_json, tokenizer_fil
 
 _QWEN_IMAGE_TOKEN_ID = 151655
 """What a Qwen2.5-VL config means when it does not say."""
+
+_PART_OF_A_CHARACTER = "\ufffd"
+
+TokenKind = Literal["text", "special", "image"]
+"""What the model reads a token as: words, control, or a part of a picture."""
 
 
 class PromptRenderer:
@@ -70,6 +75,15 @@ class PromptRenderer:
         # The Rust tokenizer itself: the Python wrapper around it is not safe among threads.
         encoding = self._tokenizer.backend_tokenizer.encode(text, add_special_tokens=False)
         return encoding.ids
+
+    def describe(self, token: int) -> tuple[str, TokenKind]:
+        """The text of a token and its kind; a part of a character as the vocabulary spells it."""
+        text: str = self._tokenizer.decode([token], clean_up_tokenization_spaces=False)
+        if _PART_OF_A_CHARACTER in text:
+            text = self._tokenizer.convert_ids_to_tokens(token)
+        if token == self.image_token_id:
+            return text, "image"
+        return text, "special" if text in self._specials else "text"
 
     def _text_part(self, part: str, instruction: str) -> list[dict[str, str]]:
         text = part.replace("{instruction}", instruction)

@@ -247,6 +247,12 @@ class TestErrors:
             UnifiedVLADataset()
         with pytest.raises(ConfigError, match="views"):
             UnifiedVLADataset(store=extracted, views=["View1"])
+        with pytest.raises(ConfigError, match="recordings or a store"):
+            UnifiedVLADataset(recordings=[], store=extracted)
+        opened = open_recordings(sources(recordings)).recordings
+        for doubled in ({"data": recordings}, {"instruction": "go"}, {"views": ["View1"]}):
+            with pytest.raises(ConfigError, match="open already"):
+                UnifiedVLADataset(recordings=opened, **doubled)
         with pytest.raises(ConfigError, match="horizon=0"):
             UnifiedVLADataset(recordings / "new", horizon=0)
         wrong: Any = "newest"
@@ -351,6 +357,19 @@ class TestWorkers:
         )
         for batch, items in zip(loader, loader.batch_sampler, strict=True):
             assert equal(batch, data.__getitems__(items))
+
+    def test_recordings_that_are_open_already_are_the_same_data(
+        self, recordings: Path, extracted: FeatureStore, live, cached
+    ) -> None:
+        opened = open_recordings(sources(recordings)).recordings
+        for ours, theirs in (
+            (UnifiedVLADataset(recordings=opened), live),
+            (UnifiedVLADataset(recordings=opened, store=extracted), cached),
+        ):
+            assert len(ours) == len(theirs) and equal(ours[3], theirs[3])
+            assert equal(pickle.loads(pickle.dumps(ours))[3], theirs[3])
+        one = UnifiedVLADataset(recordings=opened[1:2])
+        assert [each.id for each in one.episodes] == [opened[1].id]
 
     def test_a_pickle_opens_the_data_again(
         self, live: UnifiedVLADataset, cached: UnifiedVLADataset

@@ -1,4 +1,4 @@
-"""The site as a reader gets it, a browser that looks at it, and a small demo to try snippets on."""
+"""The site as a reader gets it, and a small demo to try snippets on."""
 
 import os
 import shutil
@@ -7,25 +7,16 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 import pytest
 import yaml
 
 ROOT = Path(__file__).resolve().parents[2]
 MACHINERY = ROOT / "docs" / "machinery"
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
-
-
-def missing(said: str) -> None:
-    """Skip; where CI runs, fail: a green CI has looked."""
-    if os.environ.get("CI"):
-        pytest.fail(said)
-    pytest.skip(said)
 
 
 @pytest.fixture(scope="session")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def site(tmp_path_factory: pytest.TempPathFactory, missing: Callable[[str], None]) -> Path:
     """The folder of the built site; a warning fails the build."""
     if shutil.which("mkdocs", path=Path(sys.executable).parent) is None:
         missing("mkdocs is not installed: pip install -e '.[docs]'")
@@ -39,20 +30,6 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return folder
-
-
-# One a module, not one a session: while playwright runs, no other test can run an event loop.
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    """Headless Chromium."""
-    sync_api = pytest.importorskip("playwright.sync_api")
-    found = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if found is None:
-        missing(f"no browser to look at pages with: none of {', '.join(BROWSERS)} is installed")
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=found, args=["--no-sandbox"])
-        yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="session")

@@ -1,6 +1,7 @@
 """The built site in a real browser, from a folder: no errors, no other host."""
 
 import re
+from collections.abc import Callable, Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -43,27 +44,52 @@ def test_every_link_and_anchor_is_there(site):
     assert not lost
 
 
-@pytest.mark.parametrize(
-    ("size", "scheme"), [(DESKTOP, "light"), (PHONE, "dark")], ids=["desktop", "phone"]
-)
-def test_pages_load_alone_and_fit_the_screen(site, browser, size, scheme):
-    context = browser.new_context(
-        viewport={"width": size[0], "height": size[1]}, color_scheme=scheme
-    )
-    trouble: list[str] = []
-    page = context.new_page()
-    page.set_default_timeout(20_000)
-    page.on("console", lambda said: trouble.append(said.text) if said.type == "error" else None)
-    page.on("pageerror", lambda error: trouble.append(str(error)))
+class Reader:
+    """A page in the browser, and what it did that it must not: errors, requests to another host."""
 
-    def only_files(route) -> None:
+    def __init__(self, browser, **options) -> None:
+        self.trouble: list[str] = []
+        self.context = browser.new_context(**options)
+        self.page = self.context.new_page()
+        self.page.set_default_timeout(20_000)
+        self.page.on("console", self._heard)
+        self.page.on("pageerror", lambda error: self.trouble.append(str(error)))
+        self.context.route("**/*", self._only_files)
+
+    def _heard(self, said) -> None:
+        if said.type == "error":
+            self.trouble.append(said.text)
+
+    def _only_files(self, route) -> None:
         if route.request.url.startswith("file:"):
             route.continue_()
         else:
-            trouble.append(f"asked for {route.request.url}")
+            self.trouble.append(f"asked for {route.request.url}")
             route.abort()
 
-    page.route("**/*", only_files)
+
+@pytest.fixture
+def reader(browser) -> Iterator[Callable[..., Reader]]:
+    """`reader(**context)`: a reader, of whom nothing but files may have been asked in the end."""
+    readers: list[Reader] = []
+
+    def come(**options) -> Reader:
+        readers.append(Reader(browser, **options))
+        return readers[-1]
+
+    yield come
+    for one in readers:
+        one.context.close()
+    assert [trouble for one in readers for trouble in one.trouble] == []
+
+
+@pytest.mark.parametrize(
+    ("size", "scheme"), [(DESKTOP, "light"), (PHONE, "dark")], ids=["desktop", "phone"]
+)
+def test_pages_load_alone_and_fit_the_screen(site, reader, size, scheme):
+    viewport = {"width": size[0], "height": size[1]}
+    visitor = reader(viewport=viewport, color_scheme=scheme)
+    page = visitor.page
     for name in PAGES:
         page.goto((site / f"{name}.html").as_uri())
         page.wait_for_load_state("networkidle")
@@ -71,26 +97,23 @@ def test_pages_load_alone_and_fit_the_screen(site, browser, size, scheme):
         assert width <= size[0], f"{name} is {width} px wide"
         shown = page.evaluate("document.body.getAttribute('data-md-color-scheme')")
         assert shown == {"light": "default", "dark": "slate"}[scheme]
-        assert not trouble, f"{name}: {trouble}"
-    context.close()
+        assert not visitor.trouble, f"{name}: {visitor.trouble}"
 
 
-def test_figures_take_the_colours_of_the_page(site, browser):
+def test_figures_take_the_colours_of_the_page(site, reader):
     colours = {}
     for scheme in ("light", "dark"):
-        context = browser.new_context(color_scheme=scheme)
-        page = context.new_page()
+        page = reader(color_scheme=scheme).page
         page.goto((site / "concepts.html").as_uri())
         text = page.locator("figure.drawing svg text").first
         colours[scheme] = text.evaluate("node => getComputedStyle(node).fill")
         assert page.locator("figure.drawing svg").count() >= 6
-        context.close()
     assert colours["light"] == "rgb(31, 35, 40)"
     assert colours["dark"] == "rgb(230, 233, 238)"
 
 
-def test_search_finds_a_parameter_without_a_server(site, browser):
-    page = browser.new_page(viewport={"width": 1280, "height": 900})
+def test_search_finds_a_parameter_without_a_server(site, reader):
+    page = reader(viewport={"width": 1280, "height": 900}).page
     page.goto((site / "index.html").as_uri())
     page.locator("input.md-search__input").click()
     page.keyboard.type("feature_lag")
@@ -99,4 +122,3 @@ def test_search_finds_a_parameter_without_a_server(site, browser):
     assert "concepts.html" in "".join(
         link.get_attribute("href") or "" for link in page.locator(".md-search-result__link").all()
     )
-    page.close()

@@ -54,6 +54,7 @@ def test_the_snippets_of_a_page_run(page, demo, monkeypatch):
     # Dataclasses and annotations look their module up.
     module = ModuleType("documentation_snippet")
     monkeypatch.setitem(sys.modules, module.__name__, module)
+    untried = []
     for snippet in snippets(page):
         if "no-run" in snippet.marks:
             continue
@@ -61,10 +62,13 @@ def test_the_snippets_of_a_page_run(page, demo, monkeypatch):
             try:
                 __import__(snippet.marks["needs"])
             except ImportError:
+                untried.append(f"line {snippet.line}: {snippet.marks['needs']} is not installed")
                 continue
         # Blank lines before it, so that a traceback names the line of the page.
         code = compile("\n" * (snippet.line - 1) + snippet.code, str(page), "exec")
         exec(code, vars(module))
+    if untried:
+        pytest.skip(f"all other snippets ran; {'; '.join(untried)}")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))

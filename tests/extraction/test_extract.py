@@ -10,7 +10,7 @@ from PIL import Image
 
 from pipeline.errors import DiskFull, NumericsError, RecordingError, StoreLocked, StoreMismatch
 from pipeline.extraction import extract
-from pipeline.recordings import Channels, Stream, open_recordings
+from pipeline.recordings import Channels, RecordedAction, Stream, open_recordings
 from pipeline.recordings.windowed import WindowedRecording
 from pipeline.store import FeatureStore, StoreBuild, build_lock
 from pipeline.timeline import build_timeline
@@ -329,6 +329,30 @@ class TestPlan:
             "made.zarr.files.sqlite"
         ]
 
+    @pytest.mark.parametrize(
+        ("action_hz", "said"),
+        [
+            (10, None),
+            (5, "ticks at 5 Hz, recorded at 10 Hz: actions are left out between ticks"),
+            (20, "ticks at 20 Hz, recorded at 10 Hz: actions are held"),
+            (
+                1000,
+                "ticks at 1000 Hz, recorded at 10 Hz: actions are held, "
+                "no stream is faster than 130 Hz: check data.action_hz",
+            ),
+        ],
+    )
+    def test_says_when_ticks_are_not_the_recorded_rows(self, changed, monkeypatch, action_hz, said):
+        def joints(recording):
+            time = np.arange(21) / 10 + recording.state().time[0]
+            channels = Channels(("a", "b"), ("", ""))
+            return RecordedAction(channels, time, np.zeros((21, 2), np.float32), "absolute", 10.0)
+
+        monkeypatch.setattr(WindowedRecording, "action", joints)
+        _, lines = run(changed(extract={"plan": True}, data={"action_hz": action_hz}))
+        notes = [line for line in lines if "ticks at" in line]
+        assert notes == ([] if said is None else [f"source 'made': {said}"])
+
     def test_names_a_time_once_a_speed_is_known(self, params, changed):
         run(params)
         _, said = run(changed(extract={"plan": True}, data={"vlm_reuse_count": 2}))
@@ -339,7 +363,7 @@ class TestRefusals:
     def test_too_little_disk_is_refused_before_the_model(self, params, monkeypatch, no_model_later):
         monkeypatch.setattr("pipeline.extraction.layout.free_bytes", lambda path: 1000)
         no_model_later(images=False)
-        with pytest.raises(DiskFull, match=r"needs .* GiB.*free"):
+        with pytest.raises(DiskFull, match=r"needs \d.*B, .* has \d.*B free"):
             run(params)
         assert not params.extract.store.exists()
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.amounts import size
 from pipeline.config import Params
 from pipeline.errors import DiskFull
 from pipeline.extraction import extract
@@ -166,7 +167,7 @@ def test_the_plan_and_the_disk_check_count_every_variant(extracted, varied, monk
     )
     assert needed[K] - needed[1] == (K - 1) * (features + valid)
     _, said = run(varied(extract={"plan": True}))
-    assert f"disk: {needed[K] / 2**20:.1f} MiB for the whole store" in "\n".join(said)
+    assert f"disk: {size(needed[K])} for the whole store" in "\n".join(said)
     monkeypatch.setattr("pipeline.extraction.layout.free_bytes", lambda path: needed[K] - 1)
     with pytest.raises(DiskFull, match=r"fewer vlm\.pooling slots or vlm\.variants"):
         run(varied())

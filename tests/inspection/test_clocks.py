@@ -22,6 +22,8 @@ def test_every_clock_of_a_recording(healthy: Path, look: Callable[..., EpisodeVi
     assert found["View1"].kind == "camera" and found["sensor"].kind == "stream"
     assert found["ticks"].rate_hz == pytest.approx(10)
     assert found["VL rows"].rate_hz == pytest.approx(10 / 3)
+    assert found["ticks"].mean_rate_hz == pytest.approx(10)
+    assert found["View2"].mean_rate_hz <= found["View2"].rate_hz * 1.01
     assert found["sensor"].rate_hz == pytest.approx(10 if format == "old" else 650, rel=0.01)
     # The simulated raw recorder loses five rows of the robot's in every episode.
     assert len(found["state"].gaps) == (format == "raw")

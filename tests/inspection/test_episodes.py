@@ -1,6 +1,6 @@
 """What cannot be read is a flaw; everything else is there all the same."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +10,7 @@ from pipeline.errors import RecordingError
 from pipeline.inspection.clocks import clocks
 from pipeline.inspection.facts import EpisodeView
 from pipeline.inspection.flaws import find_flaws
-from pipeline.inspection.frames import frames_at, spread_ticks
+from pipeline.inspection.frames import frames_at, read_frames, spread_ticks
 from pipeline.inspection.statistics import channel_statistics
 
 Look = Callable[..., EpisodeView]
@@ -119,3 +119,19 @@ def test_a_view_that_cannot_be_decoded_is_left_out(copied, look: Look) -> None:
     (flaw,) = find_flaws(view)
     assert (flaw.kind, flaw.severity, flaw.stream) == ("unreadable", "error", "view View2")
     assert "cannot be decoded" in flaw.message
+
+
+def test_a_disk_that_fails_while_frames_are_read(
+    copied: Callable[[str], Path], look: Look, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    view = look(copied("raw"))
+    failing = view.cameras["View2"]
+
+    def read(indices: Sequence[int]) -> Iterator[np.ndarray]:
+        raise OSError("the disk is gone")
+
+    monkeypatch.setattr(failing, "read", read)
+    shown, (flaw,) = read_frames(view, spread_ticks(view, 3))
+    assert set(shown) == {"View1", "View5"} == set(frames_at(view, [0]))
+    assert (flaw.kind, flaw.severity, flaw.stream) == ("unreadable", "error", "view View2")
+    assert flaw.message == "the disk is gone"

@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,8 +10,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from pipeline.config import DataParams, Source
 from pipeline.inspection.channel_flaws import named
+from pipeline.inspection.episodes import view_episode
 from pipeline.inspection.facts import EpisodeView, Flaw
+from pipeline.inspection.flaws import find_flaws
+from pipeline.recordings import open_recordings
 
 Find = Callable[..., tuple[Flaw, ...]]
 Copied = Callable[[str], Path]
@@ -29,17 +34,38 @@ def time_of(path: Path) -> float:
     return float(path.stem.rsplit("_", 1)[-1])
 
 
+def test_a_real_camera_that_loses_frames(shared_data: Path) -> None:
+    path = shared_data / "lerobot/cr5_banana_v21"
+    data = DataParams(sources=(Source(name="s", path=str(path)),))
+    recordings = open_recordings(data.sources).recordings
+    found = {
+        one.id: flaw.message
+        for one in recordings
+        for flaw in find_flaws(view_episode(one, data, "rotvec"))
+        if flaw.kind == "dropped frames"
+    }
+    assert found == {
+        "episode_000000": "13 of 175 steps take at least 1.5 times the usual 99 ms (up to 233 ms): "
+        "there is time for 18 more frames; 9.2 Hz on average, 10 Hz by meta/info.json"
+    }
+
+
 @pytest.mark.parametrize("format", ["raw", "new", "old", "lerobot"])
 def test_nothing_is_found_in_a_healthy_recording(healthy: Path, flaws_of: Find, format: str):
     assert flaws_of(healthy / format) == ()
 
 
 def test_little_is_found_in_real_recordings(shared_data: Path, flaws_of: Find) -> None:
-    for format in ("raw", "new", "old"):
+    # Composites: half of these views' frames were shown twice, and the tip never moved in z.
+    twice = [("duplicate frames", "view View3"), ("duplicate frames", "view View5")]
+    expected = {
+        "raw": [("flat channel", "state"), *twice],
+        "new": [("flat channel", "state"), *twice],
+        "old": [("flat channel", "action")],
+    }
+    for format, flaws in expected.items():
         found = flaws_of(shared_data / "insertion" / format)
-        # Composites: half of these views' frames were shown twice, and the tip never moved in z.
-        assert {flaw.kind for flaw in found} <= {"duplicate frames", "flat channel"}
-        assert {flaw.stream for flaw in found} <= {"view View3", "view View5", "state", "action"}
+        assert [(flaw.kind, flaw.stream) for flaw in found] == flaws
 
 
 class TestCameras:
@@ -98,6 +124,18 @@ class TestCameras:
         assert flaw.kind == "duplicate frames"
         assert f"{len(paths) // 2} of {len(paths) - 1} frames" in flaw.message
 
+    def test_frames_that_change_in_size(self, copied: Copied, flaws_of: Find) -> None:
+        folder = copied("raw")
+        noisy(folder, "View1")
+        paths = frames(folder, "View1")
+        for path in paths[40:]:
+            Image.open(path).resize((160, 90)).save(path)
+        paths[39].write_bytes(paths[38].read_bytes())  # an equal pair just before the change
+        (flaw,) = flaws_of(folder, views=["View1"], vlm_reuse_count=1)
+        assert (flaw.kind, flaw.stream, flaw.severity) == ("frame size", "view View1", "warning")
+        assert flaw.start_s == flaw.stop_s == time_of(paths[40])
+        assert "from 224 x 126 (frame 39) to 160 x 90 (frame 40)" in flaw.message
+
     def test_one_picture_throughout(self, copied: Copied, flaws_of: Find) -> None:
         folder = copied("raw")
         paths = frames(folder, "View5")
@@ -151,6 +189,51 @@ class TestCameras:
         # A view that the params leave out is not missing.
         metadata(folder, camera_views=["View1", "View2", "View5"])
         assert flaws_of(folder, views=["View1"]) == ()
+
+    def test_no_camera_at_all(self, copied: Copied, flaws_of: Find) -> None:
+        folder = copied("raw")
+        assert any(flaw.kind == "missing" for flaw in flaws_of(folder, views=[]))
+        for view in ("View1", "View2", "View5"):
+            shutil.rmtree(folder / view)
+        (flaw,) = flaws_of(folder)
+        assert (flaw.kind, flaw.stream) == ("missing", "cameras")
+        assert flaw.message == "no camera has a frame: the VLM would see no picture"
+
+    @pytest.mark.parametrize(("format", "place"), [("raw", ""), ("new", "images")])
+    def test_a_folder_without_a_frame(
+        self, copied: Copied, flaws_of: Find, format: str, place: str
+    ) -> None:
+        folder = copied(format)
+        (folder / place / "View3" / "left").mkdir(parents=True)
+        (flaw,) = flaws_of(folder)
+        assert (flaw.kind, flaw.stream) == ("missing", "view View3")
+        assert flaws_of(folder, views=["View1"]) == ()
+
+    def test_frames_counted_in_words(self, copied: Copied, flaws_of: Find) -> None:
+        folder = copied("new")
+        metadata(folder, camera_frames_count="many")
+        (flaw,) = flaws_of(folder)
+        assert (flaw.kind, flaw.stream) == ("unreadable", "metadata")
+        assert "camera_frames_count" in flaw.message
+
+    def test_frames_lost_one_by_one(self, copied: Copied, flaws_of: Find) -> None:
+        folder = copied("raw")
+        paths = frames(folder, "View2")
+        lost = paths[5:-5:9]
+        for path in lost:
+            path.unlink()
+        (flaw,) = [flaw for flaw in flaws_of(folder) if flaw.kind == "dropped frames"]
+        assert (flaw.stream, flaw.severity) == ("view View2", "warning")
+        assert f"time for {len(lost)} more frames" in flaw.message
+        assert " Hz on average" in flaw.message
+
+    def test_jitter_loses_no_frame(self, copied: Copied, flaws_of: Find) -> None:
+        folder = copied("raw")
+        rng = np.random.default_rng(0)
+        for place, path in enumerate(frames(folder, "View2")):
+            time = time_of(path) + (0.07 * rng.random() if place % 3 == 1 else 0)
+            path.rename(path.with_name(f"{path.stem.rsplit('_', 1)[0]}_{time:.3f}.jpg"))
+        assert flaws_of(folder) == ()
 
     def test_slower_than_the_rows_that_need_it(self, copied: Copied, flaws_of: Find) -> None:
         folder = copied("raw")
@@ -273,6 +356,26 @@ class TestChannels:
         change_csv(only(folder, "robot_state_*.csv"), hold)
         (flaw,) = flaws_of(folder)
         assert flaw.message == "joint_3 is 12.5 throughout; the others vary"
+
+    def test_a_joint_that_hardly_moves(self, copied: Copied, flaws_of: Find, change_csv) -> None:
+        folder = copied("raw")
+        rng = np.random.default_rng(0)
+
+        def hold(noise: float) -> Callable[[np.ndarray], np.ndarray]:
+            def change(table: np.ndarray) -> np.ndarray:
+                table[:, 6] = 12.5 + noise * rng.normal(size=len(table))
+                return table
+
+            return change
+
+        path = only(folder, "robot_state_*.csv")
+        usual = np.median(np.loadtxt(path, delimiter=",", skiprows=1)[:, 4:10].std(axis=0))
+        change_csv(path, hold(0.1 * usual))
+        assert flaws_of(folder) == ()
+        change_csv(path, hold(0.002 * usual))
+        (flaw,) = flaws_of(folder)
+        assert (flaw.kind, flaw.stream, flaw.severity) == ("still channel", "state", "warning")
+        assert flaw.message.startswith("joint_3 hardly moves: a standard deviation of ")
 
     def test_a_clipped_force(self, copied: Copied, flaws_of: Find, change_npz) -> None:
         folder = copied("raw")

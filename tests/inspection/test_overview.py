@@ -1,5 +1,6 @@
 """All recordings in one go: their lines, what is wrong, and which to look at."""
 
+import pickle
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -23,10 +24,13 @@ def survey(*sources: Source) -> RecordingsOverview:
 
 @pytest.fixture
 def many(healthy: Path, tmp_path: Path) -> Path:
-    """Three old episodes."""
+    """Three old episodes that differ."""
     (episode,) = (healthy / "old" / "Red_point").iterdir()
     for name in "abc":
-        shutil.copytree(episode, tmp_path / "many" / name)
+        folder = Path(shutil.copytree(episode, tmp_path / "many" / name))
+        document = pickle.loads((folder / "data.pkl").read_bytes())
+        document["action"][1, 0] += 0.01 * ord(name)
+        (folder / "data.pkl").write_bytes(pickle.dumps(document))
     return tmp_path / "many"
 
 
@@ -71,6 +75,26 @@ def test_what_most_episodes_of_a_source_have(many: Path) -> None:
     (flaw,) = [flaw for flaw in found.flaws if flaw.kind == "missing"]
     assert (flaw.episode, flaw.stream) == ("c", "poses, state")
     assert found.summaries[2].warnings == 1
+
+
+def test_the_same_recording_twice(many: Path) -> None:
+    shutil.copytree(many / "a", many / "d")
+    found = survey(Source(name="s", path=str(many)), Source(name="t", path=str(many / "b")))
+    first, second = found.flaws
+    assert {flaw.kind for flaw in found.flaws} == {"duplicate recording"}
+    assert (first.source, first.episode, second.source, second.episode) == ("s", "d", "t", "b")
+    assert first.message.startswith(f"the same recording as a ({many / 'a'}): ")
+    assert second.message.startswith(f"the same recording as s/b ({many / 'b'}): ")
+    assert [one.warnings for one in found.summaries] == [0, 0, 0, 1, 1]
+
+
+def test_real_recordings_in_two_versions(shared_data: Path) -> None:
+    found = survey(Source(name="s", path=str(shared_data / "lerobot")))
+    twice = [flaw for flaw in found.flaws if flaw.kind == "duplicate recording"]
+    assert [flaw.episode for flaw in twice] == [
+        f"cr5_banana_v30_split/episode_{index:06d}" for index in range(5)
+    ]
+    assert "the same recording as cr5_banana_v21/episode_000000" in twice[0].message
 
 
 def test_episodes_that_cannot_be_opened(healthy: Path, tmp_path: Path) -> None:

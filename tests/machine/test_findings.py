@@ -74,12 +74,32 @@ def test_what_cannot_be_looked_at_is_a_finding(
     assert said in finding.found
 
 
-def test_a_bug_in_a_check_is_an_error_and_no_silence(
-    params: Params, only: Callable[[Any], None]
+def test_a_bug_in_a_check_costs_its_group_alone_and_is_raised_at_the_end(
+    params: Params, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    only(lambda params: _raise(KeyError("typo")))
-    with pytest.raises(KeyError, match="typo"):
-        list(machine.examine(params))
+    checks = SimpleNamespace(
+        broken=lambda params: _raise(KeyError("typo")), sound=lambda params: [ok("it", "is there")]
+    )
+
+    def load(name: str) -> Any:
+        return checks if name != "pipeline.machine.zero" else _raise(NameError("no such name"))
+
+    monkeypatch.setattr(machine, "import_module", load)
+    groups = (
+        ("Zeroth", "zero", "sound"),
+        ("First", "one", "broken"),
+        ("Second", "two", "sound"),
+    )
+    monkeypatch.setattr(machine, "GROUPS", groups)
+    seen: list[tuple[str, str]] = []
+    with pytest.raises(ExceptionGroup) as caught:
+        seen.extend((title, one.found) for title, (one,) in machine.examine(params))
+    assert [type(error) for error in caught.value.exceptions] == [NameError, KeyError]
+    assert seen == [
+        ("Zeroth", "sound failed with NameError: no such name"),
+        ("First", "broken failed with KeyError: 'typo'"),
+        ("Second", "is there"),
+    ]
 
 
 def _raise(error: Exception) -> None:

@@ -1,5 +1,6 @@
 """Room for the store, for DVC's copy, in memory and among maps; links and limits."""
 
+import shutil
 import subprocess
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +21,7 @@ from pipeline.machine.space import (
     estimate_store,
     used_bytes,
 )
+from pipeline.recordings import open_recordings
 from stages import extract
 from stages.command import run
 
@@ -79,7 +81,7 @@ def test_the_estimate_is_what_extraction_takes(
     }
     params = Params.model_validate(document)
     before = estimate_store(params)
-    assert before.read == before.episodes == 4
+    assert before is not None and before.read == before.episodes == 4
     assert [finding.level for finding in check_space(params)][:1] == ["ok"]
     assert not list(tmp_path.glob("made*")), "a check writes nothing"
     file = tmp_path / "params.yaml"
@@ -108,6 +110,28 @@ def test_without_recordings_the_size_is_not_known(tmp_path: Path, demo_checkpoin
     }
     (finding,) = check_space(Params.model_validate(document))
     assert finding.level == "note" and "before checkpoint and recordings" in finding.found
+
+
+def test_where_every_episode_is_bad_the_size_is_not_known(
+    tmp_path: Path, recordings: Path, demo_checkpoint: Path
+) -> None:
+    shutil.copytree(recordings / "raw", tmp_path / "raw")
+    for stream in tmp_path.glob("raw/**/robot_state_*.csv"):
+        stream.unlink()
+    document = {
+        "data": {
+            "root": str(tmp_path),
+            "sources": [{"name": "a", "path": "raw"}],
+            "on_bad_episode": "skip",
+        },
+        "vlm": {"checkpoint": str(demo_checkpoint)},
+    }
+    params = Params.model_validate(document)
+    opened = open_recordings(params.data.sources, params.data.root)
+    assert opened.bad and not opened.recordings
+    (finding,) = check_space(params)
+    assert finding.level == "note"
+    assert finding.found == "not known: no episode could be read; see above"
 
 
 def cache(**changed: object) -> Cache:

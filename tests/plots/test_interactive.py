@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from pipeline.inspection.facts import Clock, EpisodeView
-from pipeline.inspection.store_projection import StoreProjection
 from pipeline.plots import interactive
 
 
@@ -51,28 +50,3 @@ def test_a_long_recording_stays_small_and_says_what_it_leaves_out(
 def test_the_same_clocks_are_the_same_figure(view: EpisodeView, clocks: tuple[Clock, ...]) -> None:
     one, two = (interactive.clock_lanes(view, clocks).to_json() for _ in range(2))
     assert one == two
-
-
-@pytest.mark.parametrize("by", ["episode", "progress"])
-def test_points_are_coloured_and_named(by: str) -> None:
-    found = StoreProjection(
-        points=np.array([[0.0, 1.0], [2.0, 3.0], [4.0, 5.0]]),
-        explained=(0.5, 0.25),
-        rows=np.array([0, 1, 7]),
-        episode=np.array([0, 0, 1]),
-        progress=np.array([0.0, 1.0, 0.5]),
-        time=np.array([0.1, 0.4, 9.0]),
-        source=np.zeros(3, np.int64),
-        episodes=("demo/a", "demo/b"),
-        sources=("demo",),
-        total=3,
-    )
-    figure = interactive.projection(found, by)  # type: ignore[arg-type]
-    (points,) = figure.data
-    assert list(points.text) == ["demo/a", "demo/a", "demo/b"]
-    assert points.customdata[2].tolist() == [7, 9, 0.5]
-    colours = list(points.marker.color)
-    assert (
-        (colours == [0, 1, 0.5]) if by == "progress" else (colours[0] == colours[1] != colours[2])
-    )
-    assert figure.layout.xaxis.title.text == "component 1 (50% of the variance)"

@@ -1,7 +1,7 @@
 """What pictures of a recording show lies where and when it was recorded."""
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,9 +10,11 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from pipeline.inspection.channels import unnumbered
 from pipeline.inspection.facts import Clock, Contact, EpisodeView, Flaw
-from pipeline.plots import recording
+from pipeline.plots import interactive, recording
 from pipeline.plots.recording.channels import groups
+from pipeline.plots.recording.lanes import BAND
 from pipeline.plots.recording.thinning import columns, curve, worst_steps
 from pipeline.recordings import Channels
 
@@ -67,6 +69,70 @@ def test_another_sensor_is_curves_by_unit(felt: Felt) -> None:
     assert [len(axis.lines) for axis in figure.axes] == [3, 3]
     one = recording.sensor(felt(("pressure",), ("",), time[:1], np.ones((1, 1))), ())
     assert one.axes[0].get_ylabel() == "pressure"
+
+
+def test_one_reading_of_a_profile_is_drawn_at_a_time_of_day(felt: Felt) -> None:
+    names = ("force", *(f"aline_{at}" for at in range(40)))
+    one = replace(felt(names, ("N", *[""] * 40), np.array([1.767e9]), np.ones((1, 41))), zero=0.0)
+    figure = recording.sensor(one, ())
+    figure.draw_without_rendering()
+    left, right, _, _ = figure.axes[1].images[0].get_extent()
+    assert right - left == pytest.approx(1e-3, rel=0.01)
+
+
+def test_a_sensor_stamped_in_bursts_has_no_blank_stripes_and_lanes_of_full_height(
+    felt: Felt,
+) -> None:
+    time = np.repeat(np.arange(10), 130) + 1.767e9
+    names = ("force", *(f"aline_{at}" for at in range(40)))
+    view = felt(names, ("N", *[""] * 40), time, np.ones((len(time), 41)))
+    view = replace(view, zero=1.767e9, timeline=None)
+    _, scan = recording.sensor(view, ()).axes[:2]
+    assert np.isfinite(np.asarray(scan.images[0].get_array(), float)).all()
+    shown = (Clock("sensor", "stream", time, 130.0, 0.0, ()),)
+    whole, _ = recording.clock_lanes(view, shown).axes
+    (band,) = [one for one in whole.collections if one.get_label() == BAND]
+    corners = band.get_paths()[0].vertices
+    assert np.ptp(corners[:, 1]) == pytest.approx(0.72)
+    assert np.unique(corners[:, 1].round(6)).tolist() == [-0.36, 0.36]
+    bars = interactive.clock_lanes(view, shown).data[0]
+    assert set(np.round(bars.y, 6)) == {0.7}
+
+
+def test_what_the_height_of_a_band_means_is_said_where_there_is_one(
+    view: EpisodeView, clocks: tuple[Clock, ...]
+) -> None:
+    def said(shown: Sequence[Clock]) -> str:
+        figure = recording.clock_lanes(replace(view, timeline=None), shown)
+        return figure.legends[0].get_title().get_text()
+
+    assert said(clocks[:4]) == BAND
+    assert said(clocks[:3]) == ""
+    assert BAND in interactive.clock_lanes(view, clocks).layout.xaxis.title.text
+
+
+def test_an_episode_without_a_camera_has_lanes_and_says_so(
+    view: EpisodeView, clocks: tuple[Clock, ...], words_of: Words
+) -> None:
+    blind = replace(view, cameras={})
+    assert "no camera" in words_of(recording.camera_views(blind, [0, 3], {}))
+    others = [clock for clock in clocks if clock.kind != "camera"]
+    whole, _ = recording.clock_lanes(blind, others).axes
+    assert [label.get_text() for label in whole.get_yticklabels()] == [
+        "sensor", "state, poses", "VL rows", "ticks",
+    ]  # fmt: skip
+
+
+def test_frames_of_any_size_stand_side_by_side(view: EpisodeView) -> None:
+    sizes = ((9, 16), (48, 64), (64, 48))
+    mixed = [np.full((*size, 3), 7, np.uint8) for size in sizes]
+    figure = recording.camera_views(view, [0, 3, 5], {"View1": mixed, "View2": mixed[::-1]})
+    figure.draw_without_rendering()
+    for axis, (high, wide) in zip(figure.axes[:3], sizes, strict=True):
+        assert axis.images[0].get_size() == (high, wide)
+        box = axis.get_window_extent()
+        assert box.height / box.width == pytest.approx(high / wide, rel=0.02)
+    assert figure.axes[0].get_window_extent().y0 > figure.axes[3].title.get_window_extent().y1
 
 
 def test_a_stream_that_is_not_there_is_said(view: EpisodeView, words_of: Words) -> None:
@@ -147,6 +213,16 @@ def test_steps_beyond_a_histogram_are_counted(clocks: tuple[Clock, ...]) -> None
     assert sum(bar.get_height() for bar in state.patches) == len(clocks[4].time) - 2
 
 
+def test_steps_beyond_both_edges_are_one_entry_of_the_legend() -> None:
+    steps = np.full(100, 0.1)
+    steps[20], steps[50] = 0.01, 0.5
+    uneven = Clock("View1", "camera", np.cumsum(steps), 10.0, 0.0, ())
+    even = Clock("state", "stream", np.arange(100) / 10, 10.0, 0.0, ())
+    for shown in ((uneven, even), (even, uneven)):
+        said = [text.get_text() for text in recording.clock_steps(shown).legends[0].get_texts()]
+        assert said == ["steps", "median", "steps beyond the panel"]
+
+
 def test_a_long_stream_keeps_its_extremes_and_its_gaps() -> None:
     time = np.arange(100_000) / 1000
     time[60_000:] += 5.0
@@ -198,14 +274,29 @@ def test_profiles_and_grippers_are_apart() -> None:
     ]
 
 
+def test_channels_that_a_number_tells_apart_share_a_name() -> None:
+    assert unnumbered("aline_0012") == unnumbered("aline_7") == "aline_#"
+    assert unnumbered("joint_1_vel") != unnumbered("joint_1_pos")
+    assert unnumbered("force") == "force"
+
+
 @pytest.mark.parametrize("format", ["png", "svg"])
 def test_the_same_recording_is_the_same_bytes(
     view: EpisodeView, clocks: tuple[Clock, ...], format: str
 ) -> None:
-    written = []
-    for _ in range(2):
-        stream = io.BytesIO()
-        told = {"Software": None} if format == "png" else {"Date": None}
-        recording.clock_lanes(view, clocks).savefig(stream, format=format, metadata=told)
-        written.append(stream.getvalue())
-    assert written[0] == written[1]
+    frame = np.zeros((9, 16, 3), np.uint8)
+    frames = {name: [frame, frame] for name in view.cameras}
+    touching = (Contact(view.zero + 2.0, view.zero + 3.0),)
+    draws: tuple[Callable[[], Figure], ...] = (
+        lambda: recording.camera_views(view, [3, 5], frames),
+        lambda: recording.sensor(view, touching),
+        lambda: recording.motion(view),
+        lambda: recording.clock_lanes(view, clocks),
+        lambda: recording.clock_steps(clocks),
+    )
+    told = {"Software": None} if format == "png" else {"Date": None}
+    for draw in draws:
+        written = [io.BytesIO(), io.BytesIO()]
+        for stream in written:
+            draw().savefig(stream, format=format, metadata=told)
+        assert written[0].getvalue() == written[1].getvalue()

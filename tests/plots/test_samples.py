@@ -1,17 +1,21 @@
 """Pictures of training samples and of their batch mark what is not real."""
 
+import io
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from matplotlib.colors import same_color
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from pipeline.datasets import UnifiedBatch, UnifiedVLADataset, unified_collate_fn
 from pipeline.plots import recording
-from pipeline.plots.recording.masks import MASKED, MISSING, PADDED, REAL
+from pipeline.plots.recording.masks import COLOURS, MASKED, MISSING, PADDED, REAL
 
 Drawn = tuple[UnifiedVLADataset, UnifiedBatch]
 
@@ -24,8 +28,20 @@ def drawn(raw: Path) -> Drawn:
 
 
 def kinds(figure: Figure, title: str) -> np.ndarray:
+    """What a map shows at (sample, position), by the colours of its spans."""
     axis = next(axis for axis in figure.axes if axis.get_title(loc="left").startswith(title))
-    return np.asarray(axis.images[0].get_array())
+    (left, right), (bottom, _) = axis.get_xlim(), axis.get_ylim()
+    found = np.full((round(bottom + 0.5), round(right - left)), -1)
+    for spans in axis.collections:
+        (kind,) = [
+            number
+            for number, ink in enumerate(COLOURS)
+            if same_color(ink, spans.get_facecolor()[0])
+        ]
+        for path in spans.get_paths():
+            box = path.get_extents()
+            found[round((box.y0 + box.y1) / 2), round(box.x0 - left) : round(box.x1 - left)] = kind
+    return found
 
 
 def test_samples_have_a_column_each_and_say_what_they_reuse(drawn: Drawn) -> None:
@@ -35,8 +51,42 @@ def test_samples_have_a_column_each_and_say_what_they_reuse(drawn: Drawn) -> Non
     assert len(figure.axes) == 3 * 10
     title = figure.axes[1].get_title()
     assert f"tick 20 of {len(dataset)}" in title
-    assert "reuses VL row 6, 2 ticks old" in title
+    assert "reuses VL row 6,\n2 ticks old" in title
     assert f"{1000 * float(batch.feature_age[1]):.0f} ms old" in title
+
+
+def test_what_samples_have_in_common_is_said_once(
+    drawn: Drawn, words_of: Callable[[Figure], str]
+) -> None:
+    dataset, batch = drawn
+    figure = recording.samples(dataset, batch)
+    assert figure.get_suptitle().splitlines()[1] == f"“{batch.instruction[0]}”"
+    assert words_of(figure).count(batch.instruction[0]) == 1
+    other = replace(batch, instruction=["one", "two", "a sentence of more words than a column"])
+    figure = recording.samples(dataset, other)
+    assert not figure.get_suptitle()
+    titles = [axis.get_title().splitlines()[1] for axis in figure.axes[:3]]
+    assert titles[:2] == ["“one”", "“two”"]
+    assert titles[2].startswith("“a sentence of") and titles[2].endswith("…")
+
+
+def test_five_samples_are_read_at_the_width_of_a_page(drawn: Drawn) -> None:
+    dataset, _ = drawn
+    five = unified_collate_fn([dataset[at] for at in range(5)])
+    figure = recording.samples(dataset, five)
+    figure.draw_without_rendering()
+    smallest = min(text.get_fontsize() for text in figure.findobj(Text) if text.get_text())
+    assert smallest / 72 * 720 / figure.get_figwidth() >= 8
+    titles = [axis.title.get_window_extent() for axis in figure.axes[:5]]
+    assert all(left.x1 < right.x0 for left, right in pairwise(titles))
+
+
+def test_the_maps_of_a_batch_are_drawn_without_images_and_name_the_views(drawn: Drawn) -> None:
+    figure = recording.batch(drawn[1])
+    assert not any(axis.images for axis in figure.axes)
+    frames = figure.axes[3]
+    assert [label.get_text() for label in frames.get_xticklabels()] == ["View1", "View2", "View5"]
+    assert frames.get_title(loc="left") == "frames"
 
 
 def test_padding_and_masked_steps_are_hatched(drawn: Drawn) -> None:
@@ -79,3 +129,11 @@ def test_the_map_of_a_batch_tells_real_from_padded_and_masked(drawn: Drawn) -> N
     assert sensor[0, 0] == PADDED
     assert sensor[0, -1] == REAL
     assert kinds(figure, "action chunk")[2].tolist() == [REAL, MASKED, MASKED, MASKED]
+
+
+def test_the_same_samples_are_the_same_bytes(drawn: Drawn) -> None:
+    for draw in (lambda: recording.samples(*drawn), lambda: recording.batch(drawn[1])):
+        written = [io.BytesIO(), io.BytesIO()]
+        for stream in written:
+            draw().savefig(stream, format="svg", metadata={"Date": None})
+        assert written[0].getvalue() == written[1].getvalue()

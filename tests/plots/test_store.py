@@ -1,9 +1,11 @@
 """Pictures of a store show what was found, for the smallest store and for one with flaws."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib as mpl
+import matplotlib.image as mpl_image
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
@@ -12,6 +14,7 @@ from pipeline.config import InspectParams
 from pipeline.inspection.store import StoreView, inspect_store
 from pipeline.plots import store as pictures
 from pipeline.plots import store_features as feature_pictures
+from pipeline.plots import store_interactive
 from pipeline.plots.style import RC, write
 from pipeline.store import FeatureStore
 
@@ -62,7 +65,8 @@ def test_every_picture_is_drawn(flawed, tmp_path, name):
 
 @pytest.mark.parametrize("name", [name for name in EVERY if name != "likeness"])
 def test_the_smallest_store_can_be_drawn(smallest, tmp_path, name):
-    write(tmp_path, {f"{name}.png": lambda: EVERY[name](smallest)})
+    (path,) = write(tmp_path, {f"{name}.png": lambda: EVERY[name](smallest)})
+    assert mpl_image.imread(path)[..., :3].std() > 0.01  # more than a blank sheet
 
 
 def test_coverage_marks_what_is_absent(flawed):
@@ -90,18 +94,65 @@ def test_sizes_are_of_the_whole_store(flawed):
 def test_pairs_that_are_alike_are_framed(flawed):
     with mpl.rc_context(RC):
         axis = feature_pictures.likeness(flawed).axes[0]
-    framed = {
-        (int(line.get_xdata()[0]), int(line.get_ydata()[0]))
-        for line in axis.lines
-        if line.get_marker() == "s"
-    }
-    assert framed == {(1, 4), (4, 1)}
+    (frames,) = axis.collections
+    assert {tuple(place) for place in np.asarray(frames.get_offsets())} == {(1, 4), (4, 1)}
+
+
+@pytest.mark.parametrize(("count", "frames"), [(200, []), (60, [60 * 59])])
+def test_alike_episodes_take_a_bounded_number_of_artists(smallest, count, frames):
+    """200 of them are 19 900 pairs."""
+    likeness = np.ones((count, count), np.float32)
+    np.fill_diagonal(likeness, np.nan)
+    found = replace(smallest.duplicates, episodes=np.arange(count), likeness=likeness)
+    many = replace(smallest, duplicates=found, episodes=smallest.episodes * count)
+    with mpl.rc_context(RC):
+        axis = feature_pictures.likeness(many).axes[0]
+    assert [len(np.asarray(one.get_offsets())) for one in axis.collections] == frames
+    assert (len(axis.images), len(axis.lines)) == (1, 0)
 
 
 def test_every_row_is_a_dot(flawed):
     with mpl.rc_context(RC):
         axis = feature_pictures.projection(flawed, "progress").axes[0]
     assert len(axis.collections[0].get_offsets()) == 6 * ROWS
+
+
+def test_dots_are_coloured_by_episode_while_each_has_its_own_colour(flawed):
+    figure = store_interactive.projection(flawed, "episode")
+    assert [trace.name for trace in figure.data] == [one.name for one in flawed.episodes]
+    assert figure.layout.showlegend
+    assert len({trace.marker.color for trace in figure.data}) == 6
+    second = figure.data[1]
+    assert set(second.text) == {"right/episode_001"}
+    assert second.customdata[3].tolist() == pytest.approx([13, 0.9, 3 / 9])
+    assert np.column_stack([second.x, second.y]) == pytest.approx(
+        flawed.projection.points[ROWS : 2 * ROWS]
+    )
+
+
+def test_dots_of_many_episodes_are_coloured_by_source_then_by_task(tiny_store, tmp_path):
+    view = inspect_store(tiny_store(tmp_path, episodes=7, ticks=6), InspectParams())
+    figure = store_interactive.projection(view, "episode")
+    assert (store_interactive.trait(view), [trace.name for trace in figure.data]) == (
+        "source",
+        ["left", "right"],
+    )
+    assert [len(trace.x) for trace in figure.data] == [8, 6]
+    alike = [replace(one, source="left") for one in view.episodes]
+    told = [replace(one, instruction=f"task {one.index % 3}") for one in alike]
+    assert store_interactive.trait(replace(view, episodes=tuple(told))) == "instruction"
+    one_task = replace(view, episodes=tuple(alike))
+    assert store_interactive.trait(one_task) is None
+    (dots,) = store_interactive.projection(one_task, "episode").data
+    assert len(set(dots.marker.color)) == 6
+
+
+def test_dots_are_coloured_by_progress(flawed):
+    figure = store_interactive.projection(flawed, "progress")
+    (dots,) = figure.data
+    assert dots.marker.color.tolist() == flawed.projection.progress.tolist()
+    assert not figure.layout.showlegend
+    assert figure.layout.xaxis.title.text.startswith("component 1 (")
 
 
 def test_numbered_channels_are_drawn_together(flawed):

@@ -1,5 +1,6 @@
 """Finding the episodes of the params' sources."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -117,6 +118,37 @@ def test_a_root_that_is_not_there_is_named_itself(tmp_path):
 def test_nothing_found_says_what_was_looked_for(root, path, message):
     with pytest.raises(RecordingError, match=f"source 's'.*{message}"):
         open_recordings([Source(name="s", path=path)], root)
+
+
+@pytest.mark.parametrize(
+    ("path", "meant"),
+    [
+        ("sets/banana/data", "sets/banana, which is a LeRobot data set"),
+        ("sets/banana/data/chunk-*", "sets/banana, which is a LeRobot data set"),
+        ("sets/banana/datas", "sets/banana, which is a LeRobot data set"),
+        ("raw/Blue_point/e9/View1", "raw/Blue_point/e9, which is an episode ('raw')"),
+        ("old/White/recv_all_1/data.pkl", "old/White/recv_all_1, which is an episode ('old')"),
+    ],
+)
+def test_a_path_too_deep_is_told_what_it_lies_in(root, path, meant):
+    with pytest.raises(RecordingError) as refused:
+        open_recordings([Source(name="s", path=path)], root)
+    assert str(refused.value).endswith(f". Did you mean {root}/{meant}?")
+
+
+def test_a_path_that_lies_in_no_episode_is_asked_nothing(root):
+    (root / "raw" / "empty").mkdir()
+    with pytest.raises(RecordingError, match=r"path or format$"):
+        open_recordings([Source(name="s", path="raw/empty")], root)
+
+
+def test_a_name_that_is_not_utf_8_is_refused(root):
+    try:
+        (root / "raw/Red_point/e9").rename(root / os.fsdecode(b"raw/Red_point/e\xff9"))
+    except OSError:
+        pytest.skip("this file system takes UTF-8 names alone")
+    with pytest.raises(RecordingError, match=r"source 's': the name of .*/e\\udcff9' is not UTF-8"):
+        open_recordings([Source(name="s", path="raw")], root)
 
 
 def test_every_bad_episode_is_listed_and_the_rest_opened(root, truth, write):

@@ -1,7 +1,5 @@
-"""A real browser that looks at pages, and a report with every kind of block."""
+"""What a browser must find of a page, and a report with every kind of block."""
 
-import os
-import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,7 +9,7 @@ import numpy as np
 import plotly.graph_objects as go
 import pytest
 from matplotlib.figure import Figure
-from playwright.sync_api import Browser, Page, Route, sync_playwright
+from playwright.sync_api import Browser, Page, Route
 
 from pipeline.plots.style import GRID, INK, canvas
 from pipeline.report import (
@@ -29,7 +27,6 @@ from pipeline.report import (
 )
 
 DESKTOP, PHONE = (1280, 900), (390, 844)
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
 @dataclass
@@ -41,22 +38,6 @@ class Visit:
 
 
 Visitor = Callable[..., Visit]
-
-
-# One a module, not one a session: while playwright runs, no other test can run an event loop.
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    """Headless Chromium; where CI has none that is a failure, so that a green CI has looked."""
-    found = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if found is None:
-        said = f"no browser to look at pages with: none of {', '.join(BROWSERS)} is installed"
-        if os.environ.get("CI"):
-            pytest.fail(said)
-        pytest.skip(said)
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=found, args=["--no-sandbox"])
-        yield browser
-        browser.close()
 
 
 @pytest.fixture

@@ -12,6 +12,7 @@ from pipeline.batches import Windows
 from pipeline.checkpoint import PolicyCheckpoint, policy_shape, source_of
 from pipeline.config import TrainHeadParams
 from pipeline.evaluation import (
+    BASELINES,
     Curve,
     Curves,
     Experiment,
@@ -91,18 +92,6 @@ def judgement(
     )
 
 
-def blocks(report: Report, kind: type) -> list[Any]:
-    found: list[Any] = []
-
-    def gather(sections: Any) -> None:
-        for section in sections:
-            found.extend(block for block in section.blocks if isinstance(block, kind))
-            gather(section.parts)
-
-    gather(report.sections)
-    return found
-
-
 def section(report: Report, title: str) -> Section:
     (found,) = (one for one in report.sections if one.title == title)
     return found
@@ -111,7 +100,7 @@ def section(report: Report, title: str) -> Section:
 def test_tables_say_what_the_comparison_says(judgement: Judgement) -> None:
     comparison = judgement.comparison
     report = evaluation_report(judgement)
-    errors, dimensions, steps, episodes, streams = blocks(report, Table)
+    errors, dimensions, steps, episodes, streams = report.blocks(Table)
     assert errors.rows[-1][1] == comparison.overall("policy")
     assert errors.rows[-1][-1] == comparison.relative()
     assert errors.strong == {len(errors.rows) - 1}
@@ -129,8 +118,25 @@ def test_tables_say_what_the_comparison_says(judgement: Judgement) -> None:
     assert dict(report.tiles)["held-out episodes"] == "3"
 
 
+def test_groups_in_which_a_baseline_is_better_stand_at_the_top(judgement: Judgement) -> None:
+    comparison = judgement.comparison
+    group, *_ = comparison.varying_groups()
+    places = list(group.dimensions)
+    best = min((comparison.scores[one].mae for one in BASELINES), key=group.mean)
+    lowest = np.min([comparison.scores[one].mae for one in BASELINES], axis=0)
+    for factor in (0.5, 1.72):
+        mae = 0.5 * lowest
+        mae[places] = factor * best[places]
+        policy = replace(comparison.scores["policy"], mae=mae)
+        scores = {**comparison.scores, "policy": policy}
+        found = replace(judgement, comparison=replace(comparison, scores=scores))
+        said = f"A baseline is better in {group.name} (1.72 times the best baseline's error)."
+        summary = evaluation_report(found).summary
+        assert (said in summary) == ("A baseline is better" in summary) == (factor > 1)
+
+
 def test_params_spec_and_what_was_judged_are_there(judgement: Judgement) -> None:
-    trained, spec, source, judged = blocks(evaluation_report(judgement), Document)
+    trained, spec, source, judged = evaluation_report(judgement).blocks(Document)
     assert trained.content["horizon"] == 4
     assert spec.content["digest"] == "tiny-spec"
     sensor = source.content["streams"]["sensor"]["names"]
@@ -173,7 +179,7 @@ def test_a_page_with_frames_and_without_is_sound(
 def test_what_is_missing_is_said(judgement: Judgement) -> None:
     bare = replace(judgement, study=None, curves=Curves({}, "No training curves: gone."))
     report = evaluation_report(bare)
-    assert {one.name for one in blocks(report, Picture)}.isdisjoint({"modalities", "curves"})
+    assert {one.name for one in report.blocks(Picture)}.isdisjoint({"modalities", "curves"})
     (training,) = section(report, "Training").blocks
     assert training.words == "No training curves: gone."
     (streams,) = section(report, "Which streams are used").blocks
@@ -190,7 +196,7 @@ def test_experiments_are_one_page(tmp_path: Path, assert_page_is_sound: Sound) -
         for expert, error in (("regression", 0.3), ("diffusion", 0.2))
     ]  # fmt: skip
     report = comparison_report(experiments)
-    (table,) = blocks(report, Table)
+    (table,) = report.blocks(Table)
     assert table.strong == {1}
     assert [row[3] for row in table.rows] == [0.3, 0.2, 0.5, 0.4, 0.45]
     assert dict(report.tiles)["by"] == "diffusion-concat"

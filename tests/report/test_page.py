@@ -14,7 +14,18 @@ from plotly.offline import get_plotlyjs
 
 from pipeline.errors import DiskFull
 from pipeline.plots.style import GRID, INK, canvas
-from pipeline.report import PAGE, Picture, Report, Section, Text, write_report
+from pipeline.report import (
+    PAGE,
+    Notice,
+    Notices,
+    Picture,
+    Place,
+    Report,
+    Section,
+    Text,
+    write_report,
+)
+from pipeline.report.page import MOST_PLACES
 from pipeline.report.svg import inline_svg
 
 
@@ -134,3 +145,31 @@ def test_equal_titles_have_anchors_of_their_own(every_block: Report, tmp_path: P
     write_report(tmp_path, every_block)
     page = (tmp_path / PAGE).read_text()
     assert page.count('<section id="words">') == page.count('<section id="words-2">') == 1
+
+
+def test_every_place_of_a_finding_is_there(tmp_path: Path) -> None:
+    count = MOST_PLACES + 40
+    places = [
+        Place(f"e{index}", "view V", index / 4, index / 4 + 1, f"found {index}")
+        for index in range(count)
+    ]
+    gap = Notice("warning", "gap", f"view V · {count} episodes", "found 0", places)
+    alone = Notice("error", "unreadable", "e7", "no `file`", [Place("e7", "", None, None, "no")])
+    found = Notices([gap, alone], "fine")
+    write_report(tmp_path, Report("R", "", sections=[Section("S", [found])]))
+    page = (tmp_path / PAGE).read_text()
+    named = "e0 0.00–1.00 s; e1 0.25–1.25 s; e2 0.50–1.50 s; and 337 more"
+    assert f"view V · {count} episodes · {named}</span>" in page
+    assert "<p>The first: found 0</p>" in page and "Each of the 340" in page
+    for index in range(MOST_PLACES):
+        assert f'<span class="where">{places[index]}</span> found {index}</li>' in page
+    assert f"found {MOST_PLACES}<" not in page
+    assert 'The other 40 stand in <a href="findings.csv">' in page
+    assert page.count('<details class="places">') == 1
+    table = (tmp_path / "findings.csv").read_text().splitlines()
+    assert table[0] == "severity,kind,stream,episode,start_s,stop_s,message"
+    assert table[-2:] == [
+        f"warning,gap,view V,e{count - 1},84.750,85.750,found {count - 1}",
+        "error,unreadable,,e7,,,no",
+    ]
+    assert len(table) == count + 2

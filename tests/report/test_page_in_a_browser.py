@@ -14,7 +14,13 @@ def test_a_browser_finds_every_block_sound(
     every_block: Report, tmp_path: Path, assert_page_is_sound: Callable[[Path], None]
 ) -> None:
     files = write_report(tmp_path, every_block)
-    assert [file.name for file in files] == [PAGE, "one.png", "two.png", "lanes.png"]
+    assert [file.name for file in files] == [
+        PAGE,
+        "one.png",
+        "two.png",
+        "lanes.png",
+        "findings.csv",
+    ]
     assert {file.name for file in tmp_path.iterdir()} == {file.name for file in files}
     assert_page_is_sound(tmp_path / PAGE)
 

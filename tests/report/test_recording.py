@@ -1,21 +1,20 @@
 """The page of recordings: all of it there, and what is not there said in words."""
 
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from pipeline.config import Params, load_params
 from pipeline.inspection.facts import ChannelStatistics, Flaw, PromptToken
+from pipeline.inspection.subject import subject_of
 from pipeline.report import (
-    Block,
     Chart,
     Document,
     Notices,
     Picture,
     Report,
-    Section,
     Table,
     Text,
     Tokens,
@@ -24,21 +23,10 @@ from pipeline.report import (
 from pipeline.report.flaws import notices
 from pipeline.report.model_input import runs
 from pipeline.report.recording import recordings_report
+from pipeline.report.recording_episode import jitter_unit
 from pipeline.report.statistics_table import statistics_table
-from pipeline.report.subject import subject_of
-from pipeline.simulation.insertion_formats import write_raw
-from pipeline.simulation.recorder import simulate_episode
 
 PARAMS = Path(__file__).resolve().parents[2] / "params.yaml"
-EPOCH_S = 1.767e9 + 0.25
-
-
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with one raw recording."""
-    folder = tmp_path_factory.mktemp("lab") / "raw"
-    write_raw(folder, simulate_episode(4, EPOCH_S))
-    return folder
 
 
 @pytest.fixture
@@ -55,14 +43,8 @@ def report_of(params: Params) -> Report:
     return recordings_report(subject.recordings(None), params, subject.name)
 
 
-def blocks_of(sections: list[Section]) -> Iterator[Block]:
-    for section in sections:
-        yield from section.blocks
-        yield from blocks_of(list(section.parts))
-
-
 def words_of(report: Report) -> str:
-    return "\n".join(one.words for one in blocks_of(report.sections) if isinstance(one, Text))
+    return "\n".join(one.words for one in report.blocks(Text))
 
 
 def test_the_page_of_a_recording_is_whole_and_sound(
@@ -72,14 +54,13 @@ def test_the_page_of_a_recording_is_whole_and_sound(
     assert_page_is_sound: Callable[[Path], None],
 ) -> None:
     report = report_of(params_of(recorded))
-    blocks = list(blocks_of(report.sections))
     files = write_report(tmp_path, report)
-    names = {file.stem.rpartition("-")[2] for file in files[1:]}
+    names = {file.stem.rpartition("-")[2] for file in files if file.suffix == ".png"}
     assert names == {"views", "sensor", "motion", "clocks", "steps", "samples", "batch"}
-    assert sum(isinstance(one, Chart) for one in blocks) == 1
-    (document,) = (one for one in blocks if isinstance(one, Document))
+    assert len(list(report.blocks(Chart))) == 1
+    (document,) = report.blocks(Document)
     assert document.content["digest"]
-    (prompt,) = (one for one in blocks if isinstance(one, Tokens))
+    (prompt,) = report.blocks(Tokens)
     assert [run.note for run in prompt.runs if run.kind == "image"] == [
         f"× 24, {view}" for view in ("View1", "View2", "View5")
     ]
@@ -99,7 +80,7 @@ def test_what_is_missing_is_said(
     assert str(sensor) in said
     assert "No sample can be made" in said
     assert "nowhere" in said and "python -m stages.demo" in said
-    first = next(one for one in blocks_of(report.sections) if isinstance(one, Notices))
+    first = next(report.blocks(Notices))
     assert [one.severity for one in first.notices] == ["error"]
     assert folder.name in first.notices[0].where
 
@@ -111,13 +92,14 @@ def test_all_episodes_are_checked_and_some_are_shown(
     for index in range(4):
         shutil.copytree(episode, tmp_path / f"episode_{index}")
     report = report_of(params_of(tmp_path, "inspect.episodes=2"))
-    table = next(one for one in blocks_of(report.sections) if isinstance(one, Table))
+    table = next(report.blocks(Table))
     assert [row[0] for row in table.rows] == [f"episode_{index}" for index in range(4)]
-    assert table.strong == {0, 3}
+    # The copies of the first are flaws, so that they come before it.
+    assert table.strong == {1, 2}
     titles = [section.title for section in report.sections]
-    assert titles[2:4] == ["episode_0", "episode_3"]
-    names = [one.name for one in blocks_of(report.sections) if isinstance(one, Picture)]
-    assert "episode1-episode_0-views" in names and "episode2-episode_3-views" in names
+    assert titles[2:4] == ["episode_1", "episode_2"]
+    names = [one.name for one in report.blocks(Picture)]
+    assert "episode1-episode_1-views" in names and "episode2-episode_2-views" in names
 
 
 def test_a_flaw_of_many_episodes_is_one_notice() -> None:
@@ -129,10 +111,10 @@ def test_a_flaw_of_many_episodes_is_one_notice() -> None:
     zeros = {("lab", f"e{index}"): 100.0 for index in range(200)}
     error, gap = notices(flaws, zeros)
     assert (error.severity, error.kind, error.where) == ("error", "unreadable", "e7")
-    assert gap.where == (
-        "view View1 · 200 episodes · e0 0.50–1.00 s; e1 0.50–1.00 s; e2 0.50–1.00 s; and 197 more"
-    )
-    assert gap.message == "The first: found 0"
+    assert gap.where == "view View1 · 200 episodes"
+    assert gap.message == "found 0"
+    assert [str(one) for one in gap.places] == [f"e{index} 0.50–1.00 s" for index in range(200)]
+    assert [one.message for one in gap.places] == [f"found {index}" for index in range(200)]
 
 
 def test_channels_that_differ_by_a_number_are_one_row() -> None:
@@ -162,3 +144,18 @@ def test_image_tokens_are_folded_view_by_view() -> None:
         ("<i>", "image", "× 3, View1"),
         ("<i>", "image", "× 1, View2"),
     ]
+
+
+@pytest.mark.parametrize(
+    ("jitters_s", "unit"),
+    [
+        ([0.027574, 2e-6, float("nan")], "ms"),
+        ([9.2e-4], "µs"),
+        ([1.5, 0.1], "s"),
+        ([0.0], "µs"),
+        ([float("nan")], "µs"),
+    ],
+)
+def test_jitter_is_told_in_a_unit_of_its_size(jitters_s: list[float], unit: str) -> None:
+    name, seconds = jitter_unit(jitters_s)
+    assert name == unit and seconds == {"s": 1, "ms": 1e-3, "µs": 1e-6}[unit]

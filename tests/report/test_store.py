@@ -59,6 +59,18 @@ def test_what_looks_wrong_is_named_with_episode_and_time(report):
 def test_sizes_list_every_array(report, view):
     table = next(one for one in blocks(report, "Size") if isinstance(one, Table))
     assert [row[0] for row in table.rows] == [one.name for one in view.sizes]
+    assert table.columns[-2:] == ("on the disk [MiB]", "share [%]")
+    assert sum(row[-2] for row in table.rows) * 2**20 == pytest.approx(view.disk_bytes)
+    assert sum(row[-1] for row in table.rows) == pytest.approx(100)
+
+
+def test_rows_that_are_not_finite_are_said_to_be_left_out(view):
+    kept = view.sampled.but(np.arange(6 * ROWS) == 34)
+    words = [one.words for one in blocks(store_report(replace(view, sampled=kept)), "Features")[:1]]
+    assert words == ["Of all VL rows, but 1 with what is not finite."]
+    none = view.sampled.but(np.ones(6 * ROWS, np.bool_))
+    (only,) = blocks(store_report(replace(view, sampled=none)), "Features")
+    assert only.words == "Every VL row looked at holds features that are no numbers."
 
 
 def test_the_spec_is_there_whole(report, view):

@@ -58,6 +58,23 @@ def test_a_misspelt_key_is_told_which_was_meant(capsys):
     assert "data.sources.0.path: Field required" in said
 
 
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (["cr5.yaml"], "cr5.yaml; did you mean --params cr5.yaml?"),
+        (["--parms", "cr5.yaml"], "--parms cr5.yaml; did you mean --params cr5.yaml?"),
+        (["--parms=cr5.yaml"], "--parms=cr5.yaml; did you mean --params=cr5.yaml?"),
+        (["data.action_hz=5"], "data.action_hz=5; did you mean --set data.action_hz=5?"),
+        (["--repare"], "--repare; did you mean --repair?"),
+        (["--verbose"], "--verbose"),
+    ],
+)
+def test_an_argument_that_is_none_is_told_which_was_meant(capsys, wrong, said):
+    with pytest.raises(SystemExit, match="2"):
+        run("Summary.", print, wrong, SHORTHANDS[:2])
+    assert capsys.readouterr().err.endswith(f"error: unrecognized arguments: {said}\n")
+
+
 SHORTHANDS = (
     Shorthand("--repair", "verify.repair", "mend"),
     Shorthand("--reextract", "verify.reextract", "rows", "N"),

@@ -6,14 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.report import Notice, Notices, Report, Section
-from pipeline.simulation.insertion_formats import write_raw
-from pipeline.simulation.recorder import simulate_episode
+from pipeline.report import Notice, Notices, Place, Report, Section
 from stages import inspect
 from stages.command import run
 
 PARAMS = Path(__file__).resolve().parents[2] / "params.yaml"
-EPOCH_S = 1.767e9 + 0.25
 
 
 @pytest.fixture
@@ -29,14 +26,6 @@ def looked(
         return run("", inspect.main, words, shorthands=[inspect.PATH])
 
     return look
-
-
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with one raw recording in it."""
-    folder = tmp_path_factory.mktemp("lab") / "raw"
-    write_raw(folder, simulate_episode(4, EPOCH_S))
-    return folder
 
 
 def test_recordings_and_a_damaged_one_are_a_page(
@@ -56,6 +45,7 @@ def test_recordings_and_a_damaged_one_are_a_page(
     assert "episodes 2 · " in out and "errors 1" in out
     assert "error: unreadable: " in out and "broken" in out
     assert out.splitlines()[-1].startswith(f"{page}: ")
+    assert "error,unreadable," in page.with_name("findings.csv").read_text()
     assert page.is_file() and len(list(page.parent.glob("*.png"))) >= 4
 
 
@@ -107,5 +97,15 @@ def test_the_summary_says_the_worst_first_and_how_much_more_there_is() -> None:
     lines = list(inspect.summary(report))
     assert lines[:4] == ["R", "episodes 9", "error: unreadable: e9", "    two lines"]
     assert lines[4:6] == ["warning: gap: e0 1.00 s", "    x"]
-    assert lines[-1] == "… and 2 more on the page"
+    assert lines[-1] == "… and 2 more on the page and in findings.csv"
     assert len(lines) == 2 + 2 * inspect.SAID + 1
+
+
+def test_the_summary_says_one_place_and_what_was_found_there() -> None:
+    places = [Place(f"e{index}", "sensor", 1.0, 2.0, f"found {index}") for index in range(4)]
+    found = Notice("warning", "gap", "sensor · 4 episodes", "found 0", places)
+    report = Report("R", "", [], [Section("S", [Notices([found], "fine")])])
+    assert list(inspect.summary(report))[2:] == [
+        "warning: gap: sensor · 4 episodes, the first e0 1.00–2.00 s",
+        "    found 0",
+    ]

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from pipeline.amounts import size
 from pipeline.errors import StoreIncomplete, StoreMismatch
 from pipeline.store import FeatureStore, check_trailers
 from pipeline.store.archive import archive
@@ -97,7 +98,7 @@ class TestSound:
         assert findings.bytes == sum(path.stat().st_size for path in files)
         specs = [read_spec(store, path.parent.relative_to(store)) for path in store.glob("*/*/c")]
         assert findings.row_bytes == sum(spec.data_bytes for spec in specs)
-        assert f"{findings.row_bytes / 2**20:.1f} MiB of rows in" in findings.summary()
+        assert f"{size(findings.row_bytes)} of rows in" in findings.summary()
         assert findings.rows == 6 * ROWS
 
     def test_over_several_chunks_and_blocks(self, tiny_store, tmp_path, monkeypatch):

@@ -239,6 +239,14 @@ class TestOpen:
         with pytest.raises(StoreIncomplete, match="no file"):
             FeatureStore.open(path)
 
+    @pytest.mark.parametrize("ending", [".part", ".repair.part"])
+    def test_refuses_a_build_by_its_name(self, tiny_store, tmp_path, ending):
+        path = tiny_store(tmp_path)
+        build = path.rename(path.with_name(path.name + ending))
+        with pytest.raises(StoreIncomplete, match="only the unfinished build") as refused:
+            FeatureStore.open(build)
+        assert f"extract.store={path}." in str(refused.value)
+
     def test_refuses_another_schema(self, tiny_store, tmp_path):
         path = tiny_store(tmp_path)
         zarr.open_group(path, mode="r+").attrs["schema"] = 99

@@ -9,6 +9,8 @@ import pytest
 
 from pipeline.training.live_page import MOST_POINTS, REFRESH_S, LivePage, chart, thinned
 
+ROOT = Path(__file__).resolve().parents[2]
+
 
 class Clock:
     """A clock that stands still unless told, and on which drawing takes `drawing_s`."""
@@ -52,6 +54,20 @@ def test_it_draws_itself_again_until_the_run_ends(tmp_path: Path, clock: Clock) 
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
     headings = re.findall(r"<h2>(.*?)</h2>", said)
     assert headings == ["Held-out ticks", "Training", "Schedule"]
+    assert "<b>val/error [training std]</b> 0.3 at step 20" in said
+    assert "the mean over the steps since the point before it" in said
+    assert "what is neither translation" in said
+
+
+def test_its_colours_are_those_of_the_other_pages(tmp_path: Path) -> None:
+    live = LivePage(tmp_path, "head", 10)
+    live.close(finished=True)
+    css = (ROOT / "pipeline/report/templates/page.css").read_text(encoding="utf-8")
+    for name in ("paper", "panel", "ink", "soft", "grid", "blue"):
+        found = re.search(rf"--{name}: light-dark\((#\w+), (#\w+)\)", css)
+        assert found is not None
+        for colour in found.groups():
+            assert colour in page(tmp_path), f"{name} {colour}"
 
 
 def test_it_asks_for_nothing_and_the_same_numbers_give_the_same_bytes(tmp_path: Path) -> None:
@@ -119,6 +135,15 @@ def test_a_long_curve_is_thinned_to_means() -> None:
     points = thinned([(step, float(step % 2)) for step in range(100_000)])
     assert len(points) <= MOST_POINTS
     assert all(value == pytest.approx(0.5, abs=0.01) for _, value in points)
+
+
+def test_the_words_of_a_thinned_curve_are_of_its_true_points() -> None:
+    points = [(step, 2.0 + math.cos(step)) for step in range(1, 5 * MOST_POINTS)]
+    points[702] = (703, 0.001)
+    points[-1] = (points[-1][0], 1.75)
+    figure, line = shape("val/error", *points)
+    assert len(line) <= MOST_POINTS < len(points)
+    assert f"1.75 at step {points[-1][0]:,}, lowest 0.001 at 703" in "".join(figure.itertext())
 
 
 @pytest.mark.parametrize("values", [[0.0], [3.0, 3.0], [-1.0, -1.0], [-1.0, 2.0], [5e-324, 1.0]])

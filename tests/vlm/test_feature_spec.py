@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from huggingface_hub.errors import LocalEntryNotFoundError
 from numpy.typing import NDArray
 from safetensors.torch import load_file, save_file
 
@@ -298,8 +299,25 @@ def test_a_hub_id_that_is_not_there_says_what_to_run(
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(VLMError, match=r"stages\.demo.*hf download models/demo_vlm"):
+    with pytest.raises(VLMError, match=r"stages\.demo.*hf download models/demo_vlm") as refused:
         resolve_checkpoint("models/demo_vlm")
+    said = str(refused.value)
+    assert "no folder of that name here; and as a hub id, it is neither whole in the local" in said
+    assert "Error" not in said and "stages.doctor" in said
+
+
+@pytest.mark.parametrize("error", [OSError("the hub says no\nand more"), PermissionError("denied")])
+def test_a_download_that_is_refused_says_why(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, error: OSError
+) -> None:
+    def refuse(*args: object, local_files_only: bool = False, **settings: object) -> str:
+        raise LocalEntryNotFoundError("not cached") if local_files_only else error
+
+    monkeypatch.setattr("huggingface_hub.snapshot_download", refuse)
+    monkeypatch.chdir(tmp_path)
+    why = str(error).partition("\n")[0]
+    with pytest.raises(VLMError, match=rf"as a hub id, it cannot be downloaded: {why}\. If it is"):
+        resolve_checkpoint("someone/small-vl")
 
 
 def test_a_cached_hub_copy_is_used_without_network(

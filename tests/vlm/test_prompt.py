@@ -49,6 +49,16 @@ def test_control_tokens_are_refused(demo_checkpoint: Path, token: str) -> None:
         PromptRenderer(demo_checkpoint, f"{{instruction}}{token}")
 
 
+def test_a_token_is_described_by_its_text_and_its_kind(demo_checkpoint: Path) -> None:
+    renderer = PromptRenderer(demo_checkpoint, "{instruction} {images}")
+    text = renderer.render("바늘 in", 1)
+    described = [renderer.describe(token) for token in renderer.tokenize(text)]
+    assert ("<|im_start|>", "special") in described and ("<|image_pad|>", "image") in described
+    assert all("\ufffd" not in said for said, _ in described)
+    words = "".join(said for said, kind in described if kind == "text")
+    assert words.startswith("system\nYou are") and " in " in words
+
+
 def test_tokens_are_the_tokenizers_with_one_placeholder_a_merged_patch(
     demo_checkpoint: Path,
     extractor: Callable[..., Any],

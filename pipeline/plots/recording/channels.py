@@ -4,10 +4,8 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from pipeline.inspection.channels import PROFILE_CHANNELS, unnumbered
 from pipeline.recordings import Channels
-
-PROFILE_CHANNELS = 24
-"""So many numbered channels in a row are one profile: an image over time, not curves."""
 
 
 @dataclass(frozen=True)
@@ -60,8 +58,8 @@ def short_names(names: Sequence[str]) -> list[str]:
 
 def _stem(name: str) -> str:
     """`joint` of `joint_1`, `pose` of `pose_x`, `joint_vel` of `joint_1_vel`; else ''."""
-    numbered = re.sub(r"_?\d+", "", name)
+    numbered = unnumbered(name)
     if numbered != name:
-        return numbered
+        return numbered.replace("_#", "").replace("#", "")
     lettered = re.fullmatch(r"(.+)_[a-z]", name)
     return lettered[1] if lettered else ""

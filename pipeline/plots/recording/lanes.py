@@ -10,11 +10,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 from numpy.typing import NDArray
 
-from pipeline.inspection.clocks import usual_step
+from pipeline.inspection.clocks import equal_clocks, usual_step
 from pipeline.inspection.facts import Clock, EpisodeView
 from pipeline.plots.recording import reuse
 from pipeline.plots.recording.drawing import GAP, words
-from pipeline.plots.recording.thinning import worst_steps
+from pipeline.plots.recording.thinning import evenness
 from pipeline.plots.style import GRID, INK, PALETTE, canvas
 
 LANE_COLOURS = {"camera": PALETTE[0], "stream": PALETTE[4], "tick": INK, "vl_row": PALETTE[2]}
@@ -27,10 +27,9 @@ _GAP_LABELS = 8
 _ROWS_ZOOMED = 5
 _ZOOM_S, _LEAST_ZOOM_S = 1.5, 0.5
 """Of what is shown from near: without VL rows, and with rows that follow fast."""
-_OVERVIEW = (
-    "the whole episode (grey: the stretch below). A dense clock is a band as high as its usual "
-    "step over the longest one there"
-)
+_OVERVIEW = "the whole episode (grey: the stretch below)"
+BAND = "height of a band: share of the usual rate (usual step / longest step there)"
+"""What is said where a lane's entries lie too close for marks."""
 _HALF = 0.36
 """Of a lane: how far its marks reach up and down."""
 
@@ -57,21 +56,16 @@ def clock_lanes(view: EpisodeView, clocks: Sequence[Clock]) -> Figure:
 
 def same_clock_once(clocks: Sequence[Clock]) -> list[Clock]:
     """The clocks, streams with the very same times as one whose name lists theirs."""
-    found: list[Clock] = []
-    for clock in clocks:
-        same = next(
-            (
-                index
-                for index, one in enumerate(found)
-                if one.kind == clock.kind == "stream" and np.array_equal(one.time, clock.time)
-            ),
-            None,
-        )
-        if same is None:
-            found.append(clock)
-        else:
-            found[same] = replace(found[same], name=f"{found[same].name}, {clock.name}")
-    return found
+    streams = [clock for clock in clocks if clock.kind == "stream"]
+    names = {
+        streams[same[0]].name: ", ".join(streams[at].name for at in same)
+        for same in equal_clocks([clock.time for clock in streams])
+    }
+    return [
+        clock if clock.kind != "stream" else replace(clock, name=names[clock.name])
+        for clock in clocks
+        if clock.kind != "stream" or clock.name in names
+    ]
 
 
 def zoom(view: EpisodeView, clocks: Sequence[Clock]) -> tuple[float, float]:
@@ -161,15 +155,14 @@ def marks(
 def _evenness(axis: Axes, clock: Clock, lane: int, zero: float, span: tuple[float, float]) -> None:
     """A band as high as the usual step over the longest one there: full where no entry is lost."""
     edges = np.linspace(*span, _BINS + 1)
-    longest = worst_steps(clock.time, edges)
-    usual = usual_step(clock.time)
-    height = 2 * _HALF * np.minimum(usual / np.maximum(longest, 1e-12), 1.0)
+    height = 2 * _HALF * evenness(clock.time, edges)
     axis.fill_between(
         np.repeat(edges - zero, 2)[1:-1],
         lane + _HALF,
         lane + _HALF - np.repeat(height, 2),
         color=LANE_COLOURS[clock.kind],
         lw=0,
+        label=BAND,
     )
 
 
@@ -221,4 +214,9 @@ def _legend(figure: Figure, view: EpisodeView) -> None:
     if view.timeline is None:
         handles = handles[:2]
     gap = Patch(facecolor="none", edgecolor=GAP, hatchcolor=GAP, hatch="////", label="gap")
-    figure.legend(handles=[*handles, gap], loc="outside lower center", ncols=3, fontsize=8.5)
+    drawn = [one.get_label() for axis in figure.axes for one in axis.collections]
+    said = BAND if BAND in drawn else None
+    figure.legend(
+        handles=[*handles, gap], loc="outside lower center", ncols=3, fontsize=8.5, title=said,
+        title_fontsize=8.5,
+    )  # fmt: skip

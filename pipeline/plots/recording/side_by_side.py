@@ -1,6 +1,5 @@
 """The picture of training samples: all that a policy sees at a tick, and what it should do."""
 
-import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -9,16 +8,25 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from pipeline.datasets import UnifiedBatch, UnifiedVLADataset
 from pipeline.plots.recording.channels import Group, groups
 from pipeline.plots.recording.drawing import absent, curves, legend_beside, names, words
+from pipeline.plots.recording.masks import seen_views
 from pipeline.plots.style import canvas
 from pipeline.recordings import Channels
 
-_COLUMN_IN, _PANEL_IN = 2.5, 1.15
-_INSTRUCTION_WIDTH = 38
+_WIDTH_IN, _BESIDE_IN = 10.0, 1.6
+"""Of the picture, as long as its columns are no narrower than the least; and what is beside them.
+
+At a page's width its smallest text, 8 points, then is no smaller than 8 pixels.
+"""
+_LEAST_COLUMN_IN, _COLUMN_IN, _PANEL_IN = 1.65, 2.5, 1.15
+_SMALL = 8
+_CHARACTERS_AN_IN = 14
+"""Of `_SMALL` text."""
 
 
 @dataclass(frozen=True)
@@ -41,9 +49,10 @@ def samples(dataset: UnifiedVLADataset, batch: UnifiedBatch) -> Figure:
     rows = _rows(dataset, batch)
     if not rows or not len(batch):
         return words("The batch has no sample.")
-    heights = [_height(row, batch) for row in rows]
-    width = _COLUMN_IN * len(batch)
-    figure = canvas(width + 1.6, sum(heights) + 1.5)
+    column = (_WIDTH_IN - _BESIDE_IN) / len(batch)
+    column = min(max(column, _LEAST_COLUMN_IN), _COLUMN_IN)
+    heights = [_height(row, batch, column) for row in rows]
+    figure = canvas(column * len(batch) + _BESIDE_IN, sum(heights) + 1.8)
     axes = figure.subplots(
         len(rows), len(batch), squeeze=False, gridspec_kw={"height_ratios": heights}
     )
@@ -52,15 +61,16 @@ def samples(dataset: UnifiedVLADataset, batch: UnifiedBatch) -> Figure:
         for index, axis in enumerate(line):
             _panel(axis, row, batch, index)
             _only_outer_labels(axis, row, index, last)
+        if last and row.kind != "view":
+            along = "steps ahead" if row.kind == "action" else "readings before the tick"
+            line[(len(line) - 1) // 2].set_xlabel(along, fontsize=_SMALL)
         _together(line, row)
-    for index, axis in enumerate(axes[0]):
-        axis.set_title(_title(dataset, batch, index), fontsize=8.5)
+    _titles(figure, axes[0], dataset, batch, int(_CHARACTERS_AN_IN * column))
     return figure
 
 
 def _rows(dataset: UnifiedVLADataset, batch: UnifiedBatch) -> list[_Row]:
-    seen = [] if batch.images is None else sorted({view for one in batch.images for view in one})
-    rows = [_Row("view", view) for view in seen]
+    rows = [_Row("view", view) for view in seen_views(batch.images or ())]
     for kind in ("sensor", "state", "action"):
         channels = _channels(dataset.store.streams[kind])
         found = groups(channels, by_name=False)
@@ -73,11 +83,11 @@ def _channels(named: dict[str, Any]) -> Channels:
     return Channels(tuple(named["names"]), tuple(named["units"]))
 
 
-def _height(row: _Row, batch: UnifiedBatch) -> float:
+def _height(row: _Row, batch: UnifiedBatch, column: float) -> float:
     if row.kind != "view":
         return _PANEL_IN
     frame = next(one[row.name] for one in batch.images or () if row.name in one)
-    return _COLUMN_IN * frame.shape[0] / frame.shape[1]
+    return column * frame.shape[0] / frame.shape[1]
 
 
 def _panel(axis: Axes, row: _Row, batch: UnifiedBatch, index: int) -> None:
@@ -147,26 +157,21 @@ def _chunk(axis: Axes, group: Group, batch: UnifiedBatch, index: int) -> None:
 
 
 def _only_outer_labels(axis: Axes, row: _Row, index: int, last: bool) -> None:
-    axis.tick_params(labelsize=8)
+    axis.tick_params(labelsize=_SMALL)
     if index == 0:
-        said = row.name if row.kind == "view" else f"{row.kind}\n{_quantity(row)}"
-        axis.set_ylabel(said, fontsize=9)
+        axis.set_ylabel(row.name if row.kind == "view" else _quantity(row), fontsize=_SMALL)
     else:
         axis.tick_params(labelleft=False)
-    if row.kind == "view":
-        return
-    if last:
-        axis.set_xlabel(
-            "steps ahead" if row.kind == "action" else "readings before the tick", fontsize=8
-        )
-    else:
-        axis.tick_params(labelbottom=False)
+    if row.kind != "view":
+        axis.xaxis.set_major_locator(MaxNLocator(3, integer=True))
+        axis.tick_params(labelbottom=last)
 
 
 def _quantity(row: _Row) -> str:
     if row.kind == "state":
-        return f"change {row.name}"
-    return f"{row.name}, depth" if row.group is not None and row.group.is_profile else row.name
+        return f"state {row.name},\nchange since the\nwindow began"
+    depth = ", depth" if row.group is not None and row.group.is_profile else ""
+    return f"{row.kind}\n{row.name}{depth}"
 
 
 def _together(line: Sequence[Axes], row: _Row) -> None:
@@ -189,7 +194,35 @@ def _together(line: Sequence[Axes], row: _Row) -> None:
     labelled = [axis for axis in line if axis.lines]
     if labelled and len(row.group.names) > 1:
         # The last sample's window is the fullest: a single reading has a marker in place of a line.
-        legend_beside(line[-1], of=labelled[-1], fontsize=7.5)
+        legend_beside(line[-1], of=labelled[-1], fontsize=_SMALL)
+
+
+def _titles(
+    figure: Figure, axes: Sequence[Axes], dataset: UnifiedVLADataset, batch: UnifiedBatch, room: int
+) -> None:
+    """What tells a sample from the others above its column; above all what they have in common."""
+    places = [(dataset.store.episodes[number].id, said) for number, said in _subjects(batch)]
+    alone = len(set(places)) == 1
+    for index, axis in enumerate(axes):
+        own = [] if alone else [_one_line(part, room) for part in _named(*places[index])]
+        axis.set_title("\n".join([*own, _title(dataset, batch, index)]), fontsize=_SMALL)
+    common = _named(*places[0]) if alone else []
+    common += [] if batch.images is not None else ["features of a store, no frames"]
+    if common:
+        wide = int(_CHARACTERS_AN_IN * (figure.get_figwidth() - 1))
+        figure.suptitle("\n".join(_one_line(part, wide) for part in common), fontsize=9)
+
+
+def _subjects(batch: UnifiedBatch) -> list[tuple[int, str]]:
+    return list(zip(batch.episode.tolist(), batch.instruction, strict=True))
+
+
+def _named(episode: str, instruction: str) -> list[str]:
+    return [episode.split("/")[-1], f"“{instruction}”"]
+
+
+def _one_line(said: str, room: int) -> str:
+    return said if len(said) <= room else f"{said[: room - 1].rstrip()}…"
 
 
 def _title(dataset: UnifiedVLADataset, batch: UnifiedBatch, index: int) -> str:
@@ -200,12 +233,8 @@ def _title(dataset: UnifiedVLADataset, batch: UnifiedBatch, index: int) -> str:
     since = float(batch.time[index]) - float(store.array("tick/time")[episode.ticks.start])
     age = 1000 * float(batch.feature_age[index])
     old = tick - row * store.vlm_reuse_count
-    frames = "" if batch.images is not None else "\nfeatures of a store, no frames"
-    said = textwrap.shorten(batch.instruction[index], _INSTRUCTION_WIDTH, placeholder=" …")
     return (
-        f"{textwrap.shorten(episode.id.split('/')[-1], 36)}\n"
-        f"tick {tick} of {len(episode.ticks)}, {since:.2f} s\n"
-        f"“{said}”\n"
-        f"reuses VL row {row}, {old} {'tick' if old == 1 else 'ticks'} old\n"
-        f"newest frame {age:.0f} ms old{frames}"
+        f"tick {tick} of {len(episode.ticks)}\nat {since:.2f} s\n"
+        f"reuses VL row {row},\n{old} {'tick' if old == 1 else 'ticks'} old\n"
+        f"newest frame {age:.0f} ms old"
     )

@@ -4,13 +4,14 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pipeline.inspection.facts import Clock
 from pipeline.plots.recording.drawing import GAP, say, words
 from pipeline.plots.recording.lanes import same_clock_once
-from pipeline.plots.style import INK, PALETTE, canvas, legend_below
+from pipeline.plots.style import INK, PALETTE, canvas
 
 _COLUMNS = 3
 _BINS = 41
@@ -35,10 +36,18 @@ def clock_steps(clocks: Sequence[Clock]) -> Figure:
         axis.set_ylabel("steps")
     for axis, clock in zip(axes, shown, strict=False):
         _histogram(axis, clock)
-    drawn = [axis for axis in axes[: len(shown)] if axis.get_legend_handles_labels()[0]]
-    if drawn:
-        legend_below(figure, drawn[0], 3)
+    _legend(figure, list(axes))
     return figure
+
+
+def _legend(figure: Figure, axes: Sequence[Axes]) -> None:
+    """What any panel shows, once each."""
+    shown: dict[str, Artist] = {}
+    for axis in axes:
+        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
+            shown.setdefault(label, handle)
+    if shown:
+        figure.legend(list(shown.values()), list(shown), loc="outside lower center", ncols=3)
 
 
 def _histogram(axis: Axes, clock: Clock) -> None:

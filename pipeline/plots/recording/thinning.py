@@ -6,11 +6,13 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.inspection.clocks import shortest_gap, usual_step
+from pipeline.inspection.clocks import GAP_FACTOR, shortest_gap, usual_step
 from pipeline.timeline import last_at
 
 POINTS = 1200
 """Columns of a curve or an image; about the dots of a picture's width."""
+_LEAST_S = 1e-3
+"""Seconds that an image covers at least."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,9 @@ def columns(
     clock has a gap there.
     """
     gap = shortest_gap(time)
-    edges = np.linspace(time[0], time[-1] + np.fmax(usual_step(time), 1e-9), count + 1)
+    # A single reading too is as wide as a time of day can tell.
+    stop = max(time[-1] + np.nan_to_num(usual_step(time)), time[0] + _LEAST_S)
+    edges = np.linspace(time[0], stop, count + 1)
     bounds = np.append(np.searchsorted(time, edges[:-1]), len(time))
     held = last_at(time, edges[:-1])
     shown = np.full((count, values.shape[1]), np.nan)
@@ -65,6 +69,19 @@ def columns(
         elif edges[column] - time[held[column]] < gap:
             shown[column] = values[held[column]]
     return edges, shown.T
+
+
+def evenness(time: NDArray[np.float64], edges: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(bin,) from 0 to 1: the longest step that is usual over the longest one between two edges.
+
+    1 where no entry is lost, also of a clock in bursts; 0 before the first entry, after the last.
+    """
+    longest = worst_steps(time, edges)
+    known = np.isfinite(longest)
+    usual = shortest_gap(time) / GAP_FACTOR
+    shares = np.zeros(len(longest))
+    shares[known] = np.minimum(usual / np.maximum(longest[known], 1e-12), 1.0)
+    return shares
 
 
 def worst_steps(time: NDArray[np.float64], edges: NDArray[np.float64]) -> NDArray[np.float64]:

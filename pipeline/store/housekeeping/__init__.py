@@ -6,7 +6,7 @@
 
 from pipeline.store.housekeeping.inventory import Inventory, take_inventory
 from pipeline.store.housekeeping.leftovers import Leftover, kept_back, leftovers, named, remove
-from pipeline.store.housekeeping.listing import size, table
+from pipeline.store.housekeeping.listing import table
 
 __all__ = [
     "Inventory",
@@ -15,7 +15,6 @@ __all__ = [
     "leftovers",
     "named",
     "remove",
-    "size",
     "table",
     "take_inventory",
 ]

@@ -4,6 +4,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from pipeline.amounts import size
 from pipeline.store.housekeeping.contents import Contents
 from pipeline.store.housekeeping.inventory import GROUPS, Entry, Inventory
 
@@ -28,14 +29,6 @@ def table(inventory: Inventory, dependents: Mapping[Path, Sequence[str]]) -> lis
         lines.append(_aligned(row, widths))
         lines += [f"    {line}" for line in _details(inventory, one, dependents.get(one.path, ()))]
     return [*lines, "", *_specs(things), *_total(inventory)]
-
-
-def size(count: int) -> str:
-    """Bytes for people."""
-    for unit, factor in (("GiB", 2**30), ("MiB", 2**20)):
-        if count >= factor:
-            return f"{count / factor:.1f} {unit}"
-    return f"{count / 2**10:.0f} KiB"
 
 
 def clause(damage: str) -> str:

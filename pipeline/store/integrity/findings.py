@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.amounts import size
 from pipeline.store.mending import mend, start_over
 from pipeline.store.replacement import Inode
 
@@ -133,8 +134,8 @@ class Findings:
         """For people: how much was checked, how fast."""
         rate = self.bytes / 1e9 / self.seconds if self.seconds else 0.0
         return (
-            f"{self.store}: checked {self.rows} feature rows, {self.row_bytes / 2**20:.1f} MiB of "
-            f"rows in {self.bytes / 2**20:.1f} MiB of files, in {self.seconds:.1f} s "
+            f"{self.store}: checked {self.rows} feature rows, {size(self.row_bytes)} of "
+            f"rows in {size(self.bytes)} of files, in {self.seconds:.1f} s "
             f"({rate:.2f} GB/s)"
         )
 

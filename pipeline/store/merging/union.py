@@ -19,6 +19,7 @@ import numpy as np
 import zarr
 from tqdm import tqdm
 
+from pipeline.amounts import size
 from pipeline.durable import free_bytes, recover
 from pipeline.errors import ConfigError, DiskFull, StoreIncomplete, StoreMismatch
 from pipeline.store.integrity import verify
@@ -213,8 +214,8 @@ def _check_space(build: StoreBuild, first: Mapping[str, ArraySpec], ends: dict[s
     free = free_bytes(build.part)
     if needed > free:
         raise DiskFull(
-            f"{build.target}: the merged store needs {needed / 2**20:.0f} MiB, "
-            f"{build.part.parent} has {free / 2**20:.0f} MiB free. Make room, or name a place on "
+            f"{build.target}: the merged store needs {size(needed)}, "
+            f"{build.part.parent} has {size(free)} free. Make room, or name a place on "
             "another disk with --into."
         )
 

@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.config import Params, load_params
 from pipeline.errors import ConfigError, RecordingError
-from pipeline.report.subject import subject_of
+from pipeline.inspection.subject import subject_of
 
 PARAMS = Path(__file__).resolve().parents[2] / "params.yaml"
 

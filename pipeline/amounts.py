@@ -1,0 +1,17 @@
+"""Bytes and seconds, as people read them."""
+
+
+def size(count: float) -> str:
+    """Bytes in the largest binary unit of which there is a whole one: `512 B`, `1.5 GiB`."""
+    for unit, factor in (("TiB", 2**40), ("GiB", 2**30), ("MiB", 2**20)):
+        if count >= factor:
+            return f"{count / factor:.1f} {unit}"
+    return f"{count / 2**10:.0f} KiB" if count >= 2**10 else f"{count:.0f} B"
+
+
+def duration(seconds: float) -> str:
+    """Seconds to three digits, minutes from two of them on, hours from two of those."""
+    if seconds < 120:
+        return f"{seconds:.3g} s"
+    minutes = seconds / 60
+    return f"{minutes:.1f} min" if minutes < 120 else f"{minutes / 60:,.1f} h"

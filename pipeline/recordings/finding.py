@@ -1,0 +1,152 @@
+"""Where the episodes of a source lie, and which format they are of."""
+
+import glob
+import os
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.config import Source
+from pipeline.errors import RecordingError
+from pipeline.recordings import lerobot, pickled, raw, windowed
+from pipeline.recordings.reader import FileRecording, absolute, natural_key
+
+Found = tuple[Sequence[FileRecording], Sequence[str]]
+"""Episodes, and lines about those that are not there."""
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A format: what marks its folders, and how one is opened."""
+
+    marker: str
+    marks: Callable[[Path, Collection[str]], bool]
+    open: Callable[[Path, Source, Sequence[str] | None], Found]
+
+
+def _one(
+    episode: Callable[[Path, Source, Sequence[str] | None], FileRecording],
+) -> Callable[[Path, Source, Sequence[str] | None], Found]:
+    return lambda path, source, views: ([episode(path, source, views)], [])
+
+
+READERS = {
+    "new": Reader(windowed.MARKER, windowed.is_episode, _one(windowed.WindowedRecording)),
+    "old": Reader(pickled.MARKER, pickled.is_episode, _one(pickled.PickledRecording)),
+    "raw": Reader(raw.MARKER, raw.is_episode, _one(raw.RawRecording)),
+    "lerobot": Reader(lerobot.MARKER, lerobot.is_root, lerobot.open_data_set),
+}
+"""In the order of detection."""
+
+_DEEPEST = 4
+"""Levels below a LeRobot root at which its files lie: videos/chunk-000/view/episode.mp4."""
+
+
+def episode_folders(source: Source, root: Path) -> list[tuple[Path, Reader]]:
+    """The source's episode folders and LeRobot roots, each once, in natural order.
+
+    Raises `RecordingError` where a path has none, and where a name is not UTF-8: a store could not
+    keep it.
+    """
+    found: dict[Path, tuple[Path, Reader]] = {}
+    for pattern in source.paths:
+        full = absolute(root / pattern)
+        matches = _matches(full)
+        if not matches:
+            lost = "" if root.is_dir() else f": {root} is no folder; see python -m stages.doctor"
+            raise RecordingError(
+                f"source {source.name!r}: {pattern!r} matches nothing; looked for folders {full}. "
+                f"Mend data.root or the source's path{lost}{_around(full)}"
+            )
+        episodes = [pair for match in matches for pair in _episodes(match, source)]
+        if not episodes:
+            raise RecordingError(
+                f"source {source.name!r}: {pattern!r} matches {len(matches)} folder(s), none with "
+                f"an episode in it; looked under {full} for folders with "
+                f"{_wanted_markers(source)}. Mend the source's path or format"
+                f"{_around(matches[0])}"
+            )
+        for folder, reader in episodes:
+            _check_name(source, folder)
+            found.setdefault(folder.resolve(), (folder, reader))
+    return sorted(found.values(), key=lambda pair: natural_key(pair[0]))
+
+
+def _matches(full: Path) -> list[Path]:
+    """The folders that a path or glob means; a glob's end `/**` is the search that follows."""
+    if full.is_dir():
+        return [full]
+    while full.name == "**":
+        full = full.parent
+    # glob follows symbolic links, as data folders often are; pathlib's ** does not.
+    found = [Path(match) for match in glob.glob(str(full), recursive=True)]  # noqa: PTH207
+    return sorted((path for path in found if path.is_dir()), key=natural_key)
+
+
+def _episodes(
+    folder: Path, source: Source, seen: frozenset[Path] = frozenset()
+) -> Iterator[tuple[Path, Reader]]:
+    """Episode folders at or below a folder; nothing is looked for inside an episode."""
+    names = listing(folder)
+    format = _detect(folder, names, source)
+    if format is not None:
+        yield folder, READERS[format]
+        return
+    seen |= {folder.resolve()}
+    for name in sorted(names, key=natural_key):
+        below = folder / name
+        if not name.startswith(".") and below.is_dir() and below.resolve() not in seen:
+            yield from _episodes(below, source, seen)
+
+
+def _detect(folder: Path, names: Collection[str], source: Source) -> str | None:
+    if source.format != "auto" and READERS[source.format].marks(folder, names):
+        return source.format
+    format = _format(folder, names)
+    if format is not None and source.format != "auto":
+        raise RecordingError(
+            f"source {source.name!r}: {folder} is not of the format {source.format!r} that params "
+            f"ask for (no {READERS[source.format].marker}), it looks like {format!r} "
+            f"({READERS[format].marker}). Set the source's format to auto or {format}"
+        )
+    return format
+
+
+def _around(path: Path) -> str:
+    """A question about the episode or data set that a path lies in, if it lies in one."""
+    for folder in path.parents[:_DEEPEST]:
+        if not (folder.is_dir() and os.access(folder, os.R_OK)):
+            continue
+        format = _format(folder, listing(folder))
+        if format is not None:
+            what = "a LeRobot data set" if format == "lerobot" else f"an episode ({format!r})"
+            return f". Did you mean {folder}, which is {what}?"
+    return ""
+
+
+def _check_name(source: Source, folder: Path) -> None:
+    try:
+        str(folder).encode()
+    except UnicodeEncodeError:
+        raise RecordingError(
+            f"source {source.name!r}: the name of {str(folder)!r} is not UTF-8, so no store could "
+            "keep it. Rename the folder"
+        ) from None
+
+
+def _format(folder: Path, names: Collection[str]) -> str | None:
+    return next((name for name, one in READERS.items() if one.marks(folder, names)), None)
+
+
+def listing(folder: Path) -> list[str]:
+    """The names in a folder; `RecordingError` where it cannot be read."""
+    try:
+        return os.listdir(folder)
+    except OSError as error:
+        raise RecordingError(f"{folder}: cannot be listed: {error}") from None
+
+
+def _wanted_markers(source: Source) -> str:
+    if source.format != "auto":
+        return READERS[source.format].marker
+    return ", or ".join(reader.marker for reader in READERS.values())
