@@ -27,8 +27,6 @@ _TICK_S = 0.1
 """Of an episode without ticks."""
 _FEWEST = 20
 """Steps below which nothing is said of how a clock runs."""
-_LISTED = 5
-"""Gaps of one clock that are told one by one; of more, the longest and their number."""
 
 
 def clock_flaws(view: EpisodeView, said: Nominal) -> Iterator[Flaw]:
@@ -49,12 +47,11 @@ def clock_flaws(view: EpisodeView, said: Nominal) -> Iterator[Flaw]:
 def _gaps(view: EpisodeView, names: str, time: NDArray[np.float64]) -> Iterator[Flaw]:
     step = usual_step(time)
     tick = _TICK_S if view.timeline is None else usual_step(view.timeline.time)
-    found = [gap for gap in gaps(time) if not gap.stop_s - gap.start_s <= tick]
-    found.sort(key=lambda gap: gap.start_s - gap.stop_s)
     rest = float(time[-1] - time[0])
-    shown = found if len(found) <= _LISTED else found[:1]
-    for gap in shown:
+    for gap in gaps(time):
         length = gap.stop_s - gap.start_s
+        if length <= tick:
+            continue
         jumped = length > rest - length
         kind = "clock jump" if jumped else "gap"
         said = (
@@ -65,9 +62,6 @@ def _gaps(view: EpisodeView, names: str, time: NDArray[np.float64]) -> Iterator[
             f"every {step:.3g} s"
         )
         said += _age_there(view, names, gap)
-        if len(found) > _LISTED:
-            total = sum(one.stop_s - one.start_s for one in found)
-            said += f"; {len(found)} gaps in all, {total:.2f} s together"
         yield view.flaw(kind, names, said, gap.start_s, gap.stop_s)
 
 
