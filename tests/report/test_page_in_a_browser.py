@@ -98,7 +98,8 @@ def test_light_and_dark_can_be_chosen_and_are_remembered(
         if remembered is not None:
             break
     assert remembered == "dark"
-    assert visit.page.evaluate(ink) != light
+    drawn = "document.querySelector('.chart text') !== null"
+    visit.page.wait_for_function(f"before => {drawn} && ({ink})() !== before", arg=light)
     assert visit.trouble == []
 
 
