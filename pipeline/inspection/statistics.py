@@ -1,6 +1,6 @@
-"""Per-channel statistics of one episode."""
+"""Per-channel statistics: of one episode, and of any values by channel."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,11 @@ def channel_statistics(view: EpisodeView) -> tuple[ChannelStatistics, ...]:
     Streams `sensor`, `state`, `poses` where they are not columns of the state, and `action`: what
     the ticks have, which is derived from poses in some formats; as recorded where there is no tick.
     """
-    return tuple(one for stream in _streams(view) for one in _statistics(*stream))
+    return tuple(
+        one
+        for stream, channels, values in _streams(view)
+        for one in statistics_of(stream, channels.names, channels.units, values)
+    )
 
 
 def _streams(view: EpisodeView) -> Iterator[tuple[str, Channels, NDArray[np.float32]]]:
@@ -34,11 +38,12 @@ def _streams(view: EpisodeView) -> Iterator[tuple[str, Channels, NDArray[np.floa
         yield "action", view.timeline.action_channels, view.timeline.action
 
 
-def _statistics(
-    stream: str, channels: Channels, values: NDArray[np.float32]
+def statistics_of(
+    stream: str, names: Sequence[str], units: Sequence[str], values: NDArray[np.floating]
 ) -> Iterator[ChannelStatistics]:
+    """Of each channel of `values` (reading, channel), which stay as they are."""
     for first in range(0, values.shape[1], _COLUMNS):
-        block = np.ascontiguousarray(values[:, first : first + _COLUMNS].T)
+        block = values[:, first : first + _COLUMNS].T.astype(np.float32, order="C")
         block.sort(axis=1)
         points = _percentiles(block)
         mean = block.mean(axis=1, dtype=np.float64).tolist()
@@ -47,8 +52,8 @@ def _statistics(
             minimum, low, median, high, maximum = points[column].tolist()
             yield ChannelStatistics(
                 stream=stream,
-                name=channels.names[first + column],
-                unit=channels.units[first + column],
+                name=names[first + column],
+                unit=units[first + column],
                 count=len(values),
                 minimum=minimum,
                 low=low,

@@ -1,18 +1,17 @@
 """Statistics of the channels of state, sensor and action over a whole store, in bounded memory."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.inspection.facts import ChannelStatistics
+from pipeline.inspection.statistics import statistics_of
 from pipeline.store import FeatureStore
 
 SAMPLE_BYTES = 64 * 2**20
 """Of float32 values that are in memory at a time."""
 _ARRAYS = {"action": "tick/action", "state": "state/values", "sensor": "sensor/values"}
-_LOW, _HIGH = 0.01, 0.99
 
 
 @dataclass(frozen=True)
@@ -41,9 +40,8 @@ def stream_statistics(
         if values.size:
             said = store.streams[stream]
             rows = evenly(len(values), max(2, sample_bytes // (4 * values.shape[1])))
-            sample = values[rows].astype(np.float32)
-            channels = _channels(stream, sample, said["names"], said["units"])
-            found.append(StreamStatistics(stream, len(values), len(rows), channels))
+            channels = statistics_of(stream, said["names"], said["units"], values[rows])
+            found.append(StreamStatistics(stream, len(values), len(rows), tuple(channels)))
     return tuple(found)
 
 
@@ -51,22 +49,3 @@ def evenly(total: int, most: int) -> NDArray[np.int64]:
     """At most `most` of `total` indices, ascending and evenly spread."""
     count = min(total, most)
     return np.arange(count, dtype=np.int64) * total // max(1, count)
-
-
-def _channels(
-    stream: str, sample: NDArray[np.float32], names: Sequence[str], units: Sequence[str]
-) -> tuple[ChannelStatistics, ...]:
-    mean, std = sample.mean(axis=0, dtype=np.float64), sample.std(axis=0, dtype=np.float64)
-    columns = np.stack(
-        [
-            sample.min(axis=0),
-            *np.quantile(sample, (_LOW, 0.5, _HIGH), axis=0, overwrite_input=True),
-            sample.max(axis=0),
-            mean,
-            std,
-        ]
-    ).T.tolist()
-    return tuple(
-        ChannelStatistics(stream, name, unit, len(sample), *numbers)
-        for name, unit, numbers in zip(names, units, columns, strict=True)
-    )

@@ -393,19 +393,24 @@ class TestScheduler:
         assert_same(params.extract.store, here)
 
 
+def with_two_workers(document, folder: Path) -> "subprocess.Popen[str]":
+    """The command with two local workers, in a process group of its own."""
+    file = folder / "params.yaml"
+    file.write_text(yaml.safe_dump(document))
+    return subprocess.Popen(
+        [sys.executable, "-c", STAGE, "--params", str(file), "--set", "extract.workers=2"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
 class TestLocalProcesses:
     def test_ctrl_c_leaves_no_process_and_the_next_run_with_two_completes(
         self, changed, document, here, tmp_path
     ):
-        file = tmp_path / "params.yaml"
-        file.write_text(yaml.safe_dump(document))
-        process = subprocess.Popen(
-            [sys.executable, "-c", STAGE, "--params", str(file), "--set", "extract.workers=2"],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            start_new_session=True,
-        )
+        process = with_two_workers(document, tmp_path)
         assert process.stderr is not None
         assert process.stderr.readline() == "marked\n"
         os.killpg(process.pid, signal.SIGINT)
@@ -456,15 +461,7 @@ class TestStart:
 
     def begun(self, document, tmp_path: Path) -> "tuple[subprocess.Popen[str], int]":
         """The command, and the process of a worker that imports what it needs."""
-        file = tmp_path / "params.yaml"
-        file.write_text(yaml.safe_dump(document))
-        process = subprocess.Popen(
-            [sys.executable, "-c", STAGE, "--params", str(file), "--set", "extract.workers=2"],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            start_new_session=True,
-        )
+        process = with_two_workers(document, tmp_path)
         deadline = time.monotonic() + 60
         while time.monotonic() < deadline:
             for pid, command in of_group(process.pid).items():

@@ -15,7 +15,7 @@ from pipeline.errors import RecordingError, VLMError
 from pipeline.inspection.facts import EpisodeView
 from pipeline.inspection.prompt import view_prompt
 from pipeline.inspection.samples import samples
-from pipeline.inspection.statistics import channel_statistics
+from pipeline.inspection.statistics import channel_statistics, statistics_of
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 
 Look = Callable[..., EpisodeView]
@@ -67,6 +67,15 @@ def test_samples_follow_the_seed_and_are_never_more_than_ticks(
     assert ticks[0] == ticks[1] != ticks[2]
     assert samples(view, params, 1, 0)[1].tick.tolist() == [0]
     assert len(samples(view, params, 10_000, 0)[1]) == len(view.timeline.time)
+
+
+@pytest.mark.parametrize("channels", [1, 2, 17])
+def test_statistics_leave_the_values_as_they_are(channels: int) -> None:
+    values = np.random.default_rng(0).normal(size=(50, channels)).astype(np.float32)
+    before = values.copy()
+    names = [f"c{index}" for index in range(channels)]
+    assert len(list(statistics_of("state", names, names, values))) == channels
+    assert np.array_equal(values, before)
 
 
 def test_statistics_of_every_channel(healthy: Path, look: Look) -> None:
