@@ -42,15 +42,23 @@ Visitor = Callable[..., Visit]
 
 @pytest.fixture
 def browser_page(browser: Browser) -> Iterator[Visitor]:
-    """`browser_page(path, size=…, scheme=…, **context)` loads a page from its file."""
+    """`browser_page(path, size=…, scheme=…, script=…, **context)` loads a page from its file.
+
+    `script` runs before the page's own.
+    """
     contexts = []
 
     def visit(
-        path: Path, size: tuple[int, int] = DESKTOP, scheme: str = "light", **options: Any
+        path: Path,
+        size: tuple[int, int] = DESKTOP,
+        scheme: str = "light",
+        script: str = "",
+        **options: Any,
     ) -> Visit:
         viewport = {"width": size[0], "height": size[1]}
         context = browser.new_context(viewport=viewport, color_scheme=scheme, **options)
         contexts.append(context)
+        context.add_init_script(script)
         page = context.new_page()
         visit = Visit(page)
         address = path.resolve().as_uri()

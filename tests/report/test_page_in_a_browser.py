@@ -1,5 +1,6 @@
 """The page as a reader has it: sound at every width, with and without scripts, on paper."""
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -82,24 +83,42 @@ def test_a_picture_opens_by_its_keys(
         assert page.locator("dialog[open]").count() == 0
 
 
+INK = "() => getComputedStyle(document.querySelector('.chart text')).fill"
+# A browser hands over what it stored in its own time: here the test is what keeps it.
+STORAGE = """
+const kept = %s;
+const storage = { getItem: (key) => kept[key] ?? null, setItem: (key, value) => kept[key] = value };
+Object.defineProperty(window, "localStorage", { get: () => { %s return storage; } });
+Object.defineProperty(window, "kept", { value: kept });
+"""
+
+
 def test_light_and_dark_can_be_chosen_and_are_remembered(
-    every_block: Report, tmp_path: Path, browser_page
+    every_block: Report, tmp_path: Path, browser_page: Callable[..., Any]
 ) -> None:
-    write_report(tmp_path, every_block)
-    visit = browser_page(tmp_path / PAGE, scheme="light")
-    ink = "() => getComputedStyle(document.querySelector('.chart text')).fill"
-    light = visit.page.evaluate(ink)
-    visit.page.locator("#theme").click()
-    visit.page.wait_for_function(f"before => ({ink})() !== before", arg=light)
-    # The browser hands what was stored to the next page in its own time.
-    for _ in range(20):
-        visit.page.reload()
-        remembered = visit.page.evaluate("() => document.documentElement.dataset.theme")
-        if remembered is not None:
-            break
-    assert remembered == "dark"
+    page = write_report(tmp_path, every_block)[0]
+    first = browser_page(page, script=STORAGE % ("{}", ""))
+    light = first.page.evaluate(INK)
+    first.page.locator("#theme").click()
+    first.page.wait_for_function(f"before => ({INK})() !== before", arg=light)
+    kept = first.page.evaluate("() => kept")
+    assert kept == {f"theme:{page.resolve().as_posix()}": "dark"}
+    again = browser_page(page, script=STORAGE % (json.dumps(kept), ""))
+    assert again.page.evaluate("() => document.documentElement.dataset.theme") == "dark"
     drawn = "document.querySelector('.chart text') !== null"
-    visit.page.wait_for_function(f"before => {drawn} && ({ink})() !== before", arg=light)
+    again.page.wait_for_function(f"before => {drawn} && ({INK})() !== before", arg=light)
+    assert first.trouble == again.trouble == []
+
+
+def test_light_and_dark_can_be_chosen_where_nothing_may_be_stored(
+    every_block: Report, tmp_path: Path, browser_page: Callable[..., Any]
+) -> None:
+    refused = "throw new DOMException('denied', 'SecurityError');"
+    page = write_report(tmp_path, every_block)[0]
+    visit = browser_page(page, script=STORAGE % ("{}", refused))
+    for chosen in ("dark", "light"):
+        visit.page.locator("#theme").click()
+        assert visit.page.evaluate("() => document.documentElement.dataset.theme") == chosen
     assert visit.trouble == []
 
 
