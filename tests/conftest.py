@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import signal
 import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -15,7 +16,7 @@ from jaxtyping import install_import_hook
 
 from pipeline.simulation.insertion_formats import write_raw
 from pipeline.simulation.recorder import simulate_episode
-from pipeline.store import SCHEMA, FeatureStore, Sizes, StoreBuild, arrays
+from pipeline.store import SCHEMA, FeatureStore, Sizes, StoreBuild, arrays, schema
 from pipeline.store.chunks import ChunkFiles, row_checksums
 from pipeline.store.metadata import note_metadata
 from pipeline.store.schema import read_specs
@@ -23,6 +24,11 @@ from pipeline.vlm.demo_checkpoint import write_demo_checkpoint
 
 # Before anything imports them: every shape annotation of the models is checked in tests.
 install_import_hook("pipeline.models", "beartype.beartype")
+
+# A shell that runs tests in the background has them ignore Ctrl-C, and so would every process that
+# they start to see it stop.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 ROOT = Path(__file__).resolve().parents[1]
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
@@ -38,13 +44,22 @@ def shared_data() -> Path:
 
 
 @pytest.fixture(scope="session")
-def tiny_store() -> Callable[..., Path]:
-    """`tiny_store(folder, ...)` writes a small finished store and returns its path.
+def tiny_store(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """`tiny_store(folder, ...)`: a copy of a small finished store, written once for all tests.
 
     The action follows from the features (first two channels), the newest sensor reading (third)
     and the newest state (fourth), so that a policy has something to learn from each.
     """
-    return write_tiny_store
+    originals: dict[tuple[Any, ...], Path] = {}
+
+    def copied(folder: Path, *, name: str = "tiny", **changed: Any) -> Path:
+        key = (name, schema.CHUNK_BYTES, *sorted(changed.items()))
+        if key not in originals:
+            place = tmp_path_factory.mktemp("original")
+            originals[key] = write_tiny_store(place, name=name, **changed)
+        return Path(shutil.copytree(originals[key], folder / f"{name}.zarr"))
+
+    return copied
 
 
 @pytest.fixture(scope="session")
