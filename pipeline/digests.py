@@ -7,6 +7,7 @@ The ledger only saves reading: losing it costs time, never correctness.
 import hashlib
 import sqlite3
 from pathlib import Path
+from typing import Any
 
 from pipeline.errors import (
     ConfigError,
@@ -17,6 +18,12 @@ from pipeline.errors import (
 )
 
 _BLOCK = 4 * 2**20
+_TABLES = (
+    "file (path TEXT PRIMARY KEY, size INTEGER, mtime_ns INTEGER, digest TEXT)",
+    "rate (what TEXT PRIMARY KEY, rows_per_s REAL)",
+    "batch_size (what TEXT PRIMARY KEY, rows INTEGER)",
+    "bad (episode TEXT PRIMARY KEY, reason TEXT)",
+)
 
 
 class ContentDigests:
@@ -38,19 +45,8 @@ class ContentDigests:
         self._database = sqlite3.connect(self._ledger, isolation_level=None)
         self._database.execute("PRAGMA journal_mode = WAL")
         self._database.execute("PRAGMA synchronous = OFF")
-        self._database.execute(
-            "CREATE TABLE IF NOT EXISTS file "
-            "(path TEXT PRIMARY KEY, size INTEGER, mtime_ns INTEGER, digest TEXT)"
-        )
-        self._database.execute(
-            "CREATE TABLE IF NOT EXISTS rate (what TEXT PRIMARY KEY, rows_per_s REAL)"
-        )
-        self._database.execute(
-            "CREATE TABLE IF NOT EXISTS batch_size (what TEXT PRIMARY KEY, rows INTEGER)"
-        )
-        self._database.execute(
-            "CREATE TABLE IF NOT EXISTS bad (episode TEXT PRIMARY KEY, reason TEXT)"
-        )
+        for table in _TABLES:
+            self._database.execute(f"CREATE TABLE IF NOT EXISTS {table}")
 
     def close(self) -> None:
         """Close the ledger."""
@@ -63,12 +59,12 @@ class ContentDigests:
         """
         try:
             place, status = str(path.resolve()), path.stat()
-            known = self._database.execute(
+            known = self._known(
                 "SELECT digest FROM file WHERE path = ? AND size = ? AND mtime_ns = ?",
                 (place, status.st_size, status.st_mtime_ns),
-            ).fetchone()
+            )
             if known:
-                return str(known[0])
+                return known
             digest = file_digest(path)
         except OSError as error:
             raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
@@ -82,10 +78,7 @@ class ContentDigests:
 
     def rate(self, what: str) -> float | None:
         """Rows a second of the last session under that name."""
-        row = self._database.execute(
-            "SELECT rows_per_s FROM rate WHERE what = ?", (what,)
-        ).fetchone()
-        return float(row[0]) if row else None
+        return self._known("SELECT rows_per_s FROM rate WHERE what = ?", (what,))
 
     def note_batch_size(self, what: str, rows: int) -> None:
         """Remember how many rows a batch were fastest, so that it is not searched again."""
@@ -93,10 +86,7 @@ class ContentDigests:
 
     def batch_size(self, what: str) -> int | None:
         """The fastest batch size that is known under that name."""
-        row = self._database.execute(
-            "SELECT rows FROM batch_size WHERE what = ?", (what,)
-        ).fetchone()
-        return int(row[0]) if row else None
+        return self._known("SELECT rows FROM batch_size WHERE what = ?", (what,))
 
     def note_bad(self, episode: str, reason: str) -> None:
         """Remember that the episode of this digest cannot be used."""
@@ -104,10 +94,12 @@ class ContentDigests:
 
     def bad(self, episode: str) -> str | None:
         """Why the episode of this digest cannot be used; None where nothing is known."""
-        row = self._database.execute(
-            "SELECT reason FROM bad WHERE episode = ?", (episode,)
-        ).fetchone()
-        return str(row[0]) if row else None
+        return self._known("SELECT reason FROM bad WHERE episode = ?", (episode,))
+
+    def _known(self, query: str, values: tuple[object, ...]) -> Any:
+        """The one value that a query finds; None where it finds nothing."""
+        row = self._database.execute(query, values).fetchone()
+        return row[0] if row else None
 
     def _write(self, statement: str, values: tuple[object, ...]) -> None:
         try:

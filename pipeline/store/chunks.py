@@ -62,6 +62,12 @@ def check_trailers(root: Path) -> None:
                 files.check(bar.update)
 
 
+def read_rows(root: Path, spec: ArraySpec, start: int = 0, stop: int | None = None) -> NDArray[Any]:
+    """Rows start..stop - 1 of an array of a store or a build, or all, as they are on disk."""
+    with closing(ChunkFiles(root, spec, writable=False)) as files:
+        return files.read(start, (spec.shape[0] if stop is None else stop) - start)
+
+
 class ChunkFiles:
     """Row-wise access to the files of one array of a build.
 
@@ -134,16 +140,13 @@ class ChunkFiles:
         if not self.spec.row_bytes:
             return np.zeros((count, *self.spec.shape[1:]), self.spec.dtype)
         for chunk, first, rows in self._spans(start, count):
-            wanted = rows * self.spec.row_bytes
-            part = os.pread(self._descriptor(chunk), wanted, self._offset(first))
-            while len(part) < wanted:
-                more = os.pread(
-                    self._descriptor(chunk), wanted - len(part), self._offset(first) + len(part)
-                )
-                if not more:
+            wanted, offset = rows * self.spec.row_bytes, self._offset(first)
+            while wanted:
+                part = os.pread(self._descriptor(chunk), wanted, offset)
+                if not part:
                     raise self._incomplete(chunk, "the file ends early")
-                part += more
-            raw += part
+                raw += part
+                wanted, offset = wanted - len(part), offset + len(part)
         return np.frombuffer(raw, self.spec.dtype).reshape(count, *self.spec.shape[1:])
 
     def damage(self, chunk: int) -> str | None:

@@ -1,6 +1,7 @@
 """Take over what another store or an abandoned build already knows."""
 
 import json
+from contextlib import closing
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -125,10 +126,7 @@ class Donor:
         return self._read(KEYS)
 
     def _read(self, name: str) -> NDArray[Any]:
-        files = ChunkFiles(self.path, self.specs[name], writable=False)
-        try:
+        with closing(ChunkFiles(self.path, self.specs[name], writable=False)) as files:
             if self.path.suffix == ".zarr":  # a build has no trailers yet
                 files.check()
             return files.read(0, self.specs[name].shape[0])
-        finally:
-            files.close()

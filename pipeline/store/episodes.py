@@ -11,6 +11,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+SAID = ("id", "path", "format", "instruction", "content", "digest")
+"""What `episode/text` says of each episode."""
+
 
 @dataclass(frozen=True)
 class Episode:
@@ -87,7 +90,7 @@ class EpisodeRows:
     states: int
     source: str
     said: Mapping[str, str]
-    """The fields of `Episode` that are text, but its source."""
+    """The fields named in `SAID`."""
 
     @property
     def text(self) -> bytes:

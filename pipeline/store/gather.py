@@ -16,7 +16,7 @@ from torch import Tensor
 
 from pipeline.store.batch import Batch
 from pipeline.store.episodes import episode_of
-from pipeline.store.mapping import available_bytes, fitting, read_at_random, will_need
+from pipeline.store.mapping import available_bytes, fitting, populate, read_at_random, will_need
 
 # OpenMP's threads do not survive a fork, and a forked process that waits for them waits for ever.
 os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
@@ -150,9 +150,19 @@ class Gatherer:
             self._tensors[name] = tensor
         return self._tensors[name]
 
-    def array(self, name: str) -> NDArray[Any]:
-        """The same as it is in the store."""
-        return self._arrays[WIDE[name]]
+    def feature_age(self, tick: Index, row: Index) -> NDArray[np.float64]:
+        """(tick,) s since the newest frame of the VL row of each tick; since the row's own tick
+        where it has no frame at all."""
+        shown = self._arrays["vl/frame_time"][row]
+        newest = np.fmax.reduce(shown, axis=1, initial=-np.inf)
+        newest = np.where(np.isfinite(newest), newest, self._arrays["vl/time"][row])
+        return self._arrays["tick/time"][tick] - newest
+
+    def populate(self, but: Collection[str]) -> None:
+        """Read the wide fields that fit in memory into it, one by one, without those in `but`."""
+        for name in self.in_memory:
+            if name not in but:
+                populate(self._arrays[WIDE[name]])
 
     def _by_variant(self, array: NDArray[Any]) -> tuple[int, ...]:
         rows, slots, *rest = array.shape
@@ -168,15 +178,8 @@ class Gatherer:
         view = view if variant is None else view + variant
         valid = self._arrays["vl/slot_valid"]
         np.not_equal(valid.reshape(self._by_variant(valid))[view], 0, out=batch.slot_valid.numpy())
-        now, age = self._arrays["tick/time"][tick], batch.feature_age.numpy()
-        np.subtract(now, self._newest_frame(row), out=age, casting="same_kind")
+        batch.feature_age.numpy()[:] = self.feature_age(tick, row)
         return view
-
-    def _newest_frame(self, row: Index) -> NDArray[np.float64]:
-        """Capture time of each VL row's newest frame; its tick where it has no frame at all."""
-        shown = self._arrays["vl/frame_time"][row]
-        newest = np.fmax.reduce(shown, axis=1, initial=-np.inf)
-        return np.where(np.isfinite(newest), newest, self._arrays["vl/time"][row])
 
     def _window(
         self, stream: str, batch: Batch, tick: Index, episode: Index, lag_s: float
@@ -200,7 +203,7 @@ class Gatherer:
         """Have the disk read what is about to be copied from a map that memory has no room for."""
         if name not in self.in_memory:
             variants = self._variants if name == "features" else 1
-            will_need(self.array(name), first // variants, rows)
+            will_need(self._arrays[WIDE[name]], first // variants, rows)
 
 
 def copy_windows(readings: Tensor, window: Window, out: Tensor) -> None:

@@ -27,11 +27,6 @@ def note_metadata(root: Path) -> None:
         group.attrs.put({**group.attrs.asdict(), ATTRIBUTE: found})
 
 
-def has_digest(root: Path) -> bool:
-    """Whether the metadata can be checked: stores of earlier versions have no digest."""
-    return _found_and_stored(root)[1] is not None
-
-
 def metadata_damage(root: Path) -> str | None:
     """What is wrong with the metadata; None where they give their digest, or have none.
 

@@ -15,7 +15,7 @@ from pipeline.errors import StoreIncomplete, StoreMismatch
 from pipeline.store.batch import Batch
 from pipeline.store.episodes import Episode, episode_of, read_episodes
 from pipeline.store.gather import Gatherer, Selection
-from pipeline.store.mapping import map_flat, populate
+from pipeline.store.mapping import map_flat
 from pipeline.store.mending import extract_command, mend, restore_command, start_over
 from pipeline.store.schema import SCHEMA, TRAILER_BYTES, ArraySpec, chunk_paths, read_specs
 
@@ -139,6 +139,10 @@ class FeatureStore:
         """The index of the episode of each of these store-global ticks."""
         return episode_of(self._arrays, ticks)
 
+    def feature_age(self, ticks: NDArray[np.int64]) -> NDArray[np.float64]:
+        """(tick,) s since the newest frame that the features of these ticks have seen."""
+        return self._gatherer.feature_age(ticks, self._arrays["tick/vl_row"][ticks])
+
     def gather(
         self,
         ticks: Sequence[int] | NDArray[np.int64],
@@ -223,9 +227,8 @@ class FeatureStore:
         """
         if not self._warmed:
             self._warmed = True
-            fields = [field for field in self._gatherer.in_memory if field not in but]
-            arrays = [self._gatherer.array(field) for field in fields]
-            threading.Thread(target=_populate, args=(arrays,), name="warm", daemon=True).start()
+            read = self._gatherer.populate
+            threading.Thread(target=read, args=(but,), name="warm", daemon=True).start()
 
     @cached_property
     def _gatherer(self) -> Gatherer:
@@ -241,11 +244,6 @@ class FeatureStore:
                 f"{self.path}: variants lie in 0..{self.variants - 1}, asked for "
                 f"{variants.min()}..{variants.max()}. A store holds `vlm.variants` of them."
             )
-
-
-def _populate(arrays: Sequence[NDArray[Any]]) -> None:
-    for array in arrays:
-        populate(array)
 
 
 def _mapped(root: Path, spec: ArraySpec) -> NDArray[Any]:

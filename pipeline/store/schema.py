@@ -93,13 +93,9 @@ class ArraySpec:
 
 
 def chunk_paths(root: Path, spec: ArraySpec) -> list[Path]:
-    """The chunk files of an array on disk, in order."""
-    array = zarr.open_array(root, path=spec.name, mode="r")
-    zeros = (0,) * (array.ndim - 1)
-    return [
-        root / spec.name / array.metadata.encode_chunk_key((chunk, *zeros))
-        for chunk in range(spec.chunk_count)
-    ]
+    """The chunk files of an array on disk, in order, under the default chunk keys of zarr v3."""
+    zeros = ["0"] * (len(spec.shape) - 1)
+    return [Path(root, spec.name, "c", str(chunk), *zeros) for chunk in range(spec.chunk_count)]
 
 
 @dataclass(frozen=True)

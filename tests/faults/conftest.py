@@ -1,12 +1,19 @@
-"""One extracted store for all faults, copied for each, and stages as processes of their own."""
+"""One extracted store for all faults, copied for each, and stages as processes of their own.
+
+Where a test needs a process and not an interpreter, `fork` makes one of a server that has imported
+what stages need: to import it takes longer than most tests.
+"""
 
 import importlib
 import importlib.util
+import multiprocessing
 import os
 import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +33,7 @@ assert _spec.loader is not None
 _extraction = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(_extraction)
 write_episode = _extraction.write_episode
+recorded_once = _extraction.recorded_once
 make_document = _extraction.make_document
 
 SMALL_HEAD: dict[str, Any] = {
@@ -144,26 +152,34 @@ def start() -> Callable[..., Started]:
     return start
 
 
-@pytest.fixture
-def stage(start: Callable[..., Started]) -> Callable[..., tuple[int, str, str]]:
-    """`stage(...)`: as `start`, run to its end: exit code, what it said, what it complained of.
+Fork = Callable[..., tuple[BaseProcess, Connection]]
 
-    It never ends in a SIGBUS, nor in a traceback.
+
+@pytest.fixture(scope="session")
+def fork() -> Fork:
+    """`fork(work, *arguments)`: a process that does `work(*arguments, told)`, and what it tells.
+
+    `told.send` tells; `work` is a function of a module.
     """
+    server = multiprocessing.get_context("forkserver")
+    server.set_forkserver_preload(["stages.evaluate", "stages.extract", "stages.store"])
 
-    def run_apart(what: str, params: Path, *options: str) -> tuple[int, str, str]:
-        process = start(what, params, *options)
-        said, complained = process.communicate(timeout=240)
-        assert process.returncode >= 0, f"ended by signal {-process.returncode}"
-        assert "Traceback" not in complained, complained
-        return process.returncode, said, complained
+    def begin(work: Callable[..., None], *arguments: Any) -> tuple[BaseProcess, Connection]:
+        heard, told = server.Pipe(duplex=False)
+        process = server.Process(target=work, args=(*arguments, told))
+        process.start()
+        told.close()  # so that its end is heard
+        return process, heard
 
-    return run_apart
+    return begin
 
 
 @pytest.fixture
 def here(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
-    """`here("stages.verify", params, *options)`: the same in this process, which is quicker."""
+    """`here("stages.verify", params, *options)`: a stage in this process, which is quicker.
+
+    Exit code, what it said, what it complained of.
+    """
 
     def run_here(name: str, params: Path, *options: str) -> tuple[int, str, str]:
         module = importlib.import_module(name)

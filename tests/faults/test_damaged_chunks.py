@@ -55,20 +55,31 @@ def test_it_is_named_by_everything_that_reads(store: Path, params: Path, here, h
             assert chunk in complained
 
 
+@pytest.fixture(scope="module")
+def right(extracted, write_episode, tmp_path_factory) -> FeatureStore:
+    """What extraction makes of an undamaged store and one more episode."""
+    source, document = extracted
+    folder = Path(shutil.copytree(source, tmp_path_factory.mktemp("right") / "copy"))
+    write_episode(folder / "recordings" / "Touch_dot" / "episode_4", 4)
+    path = folder / "stores" / "made.zarr"
+    changed = {
+        "data": document["data"] | {"root": str(folder / "recordings")},
+        "extract": document["extract"] | {"store": str(path)},
+    }
+    extract(Params.model_validate(document | changed), nothing)
+    return FeatureStore.open(path)
+
+
 @pytest.mark.parametrize("chunk", CHUNKS)
 @pytest.mark.parametrize("harm", HARMS)
 def test_an_extraction_beside_it_takes_no_wrong_row(
-    document, store: Path, recordings: Path, write_episode, tmp_path: Path, harm, chunk
+    document, store: Path, recordings: Path, write_episode, right: FeatureStore, harm, chunk
 ) -> None:
     """Of the old store only rows that give their checksums are taken; streams are read anew."""
-    whole = tmp_path / "whole.zarr"
-    shutil.copytree(store, whole)
     write_episode(recordings / "Touch_dot" / "episode_4", 4)
-    other = document | {"extract": document["extract"] | {"store": str(whole)}}
-    extract(Params.model_validate(other), nothing)
     HARMS[harm](store / chunk)
     extract(Params.model_validate(document), nothing)
-    mended, right = FeatureStore.open(store), FeatureStore.open(whole)
+    mended = FeatureStore.open(store)
     assert len(mended.episodes) == 4
     for name in set(ARRAY_NAMES) - {"vl/features", "vl/checksum"}:
         assert np.array_equal(mended.array(name), right.array(name), equal_nan=True), name

@@ -1,24 +1,29 @@
 """A disk that fills up: exit 2, a message that names the place, and the next run completes."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import redirect_stderr, redirect_stdout
+from importlib import import_module
+from io import StringIO
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import pytest
 
 from pipeline.store import FeatureStore
 from pipeline.store.archive import is_archive
-
-UNCHECKED = """
-import sys
-from importlib import import_module
-name = sys.argv.pop()
-for room in ("pipeline.extraction.layout", "pipeline.store.merging.union"):
-    import_module(room).free_bytes = lambda path: 2**40  # as where another program fills the disk
-stage = import_module(name)
 from stages.command import run
-sys.exit(run("", stage.main, sys.argv[1:], getattr(stage, "SHORTHANDS", ())))
-"""
+
+
+def run_unchecked(name: str, params: Path, options: Sequence[str], told: Connection) -> None:
+    """Run a stage that finds room for all it plans, as where another program fills the disk."""
+    for room in ("pipeline.extraction.layout", "pipeline.store.merging.union"):
+        import_module(room).free_bytes = lambda path: 2**40
+    stage = import_module(name)
+    arguments = ["--params", str(params), *options]
+    with redirect_stdout(StringIO()), redirect_stderr(StringIO()) as complained:
+        code = run("", stage.main, arguments, getattr(stage, "SHORTHANDS", ()))
+    told.send((code, complained.getvalue()))
 
 
 def fill(disk: Path, leave: int) -> Path:
@@ -38,7 +43,7 @@ def fill(disk: Path, leave: int) -> Path:
 
 
 @pytest.fixture
-def full_then_free(stage, here, small_disk: Path) -> Callable[..., None]:
+def full_then_free(fork, here, small_disk: Path) -> Callable[..., None]:
     """`full_then_free(leave, name, params, *options)`: on a disk with no more room, then with it.
 
     The first run is a process of its own: a SIGBUS would end this one.
@@ -46,7 +51,9 @@ def full_then_free(stage, here, small_disk: Path) -> Callable[..., None]:
 
     def check(leave: int, name: str, params: Path, *options: str) -> None:
         ballast = fill(small_disk, leave)
-        code, _, complained = stage(UNCHECKED, params, *options, name)
+        process, heard = fork(run_unchecked, name, params, options)
+        code, complained = heard.recv()  # nothing comes of one that ends by a signal or traceback
+        process.join()
         assert code == 2, complained
         assert complained.startswith("error: ")
         assert str(small_disk) in complained

@@ -3,50 +3,89 @@
 import random
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
 
-SLOWED = """
-import sys, time
+from pipeline.store.chunks import ChunkFiles
 from pipeline.training import Trainer
-from stages import train_head
+from stages import store, train_head
 from stages.command import run
 
-step = Trainer._train_step
-def slow(self, *rest):
-    stopped = step(self, *rest)
-    print("step", self.step, flush=True)
-    time.sleep(0.01)
-    return stopped
-Trainer._train_step = slow
-sys.exit(run("", train_head.main, sys.argv[1:]))
-"""
+
+def train(params: Path, told: Connection) -> None:
+    """Train, and tell of each step."""
+    step = Trainer._train_step
+
+    def slow(self: Trainer, *rest: Any) -> bool:
+        stopped = step(self, *rest)
+        told.send(self.step)
+        time.sleep(0.01)
+        return stopped
+
+    Trainer._train_step = slow
+    torch.set_num_threads(1)
+    run("", train_head.main, ["--params", str(params)])
+
+
+def merge(params: Path, words: list[str], told: Connection) -> None:
+    """Merge stores, and tell of each write."""
+    write = ChunkFiles.write
+
+    def slow(self: ChunkFiles, *rest: Any) -> None:
+        told.send("write")
+        time.sleep(0.005)
+        write(self, *rest)
+
+    ChunkFiles.write = slow
+    run("", store.main, ["--params", str(params), *words], store.SHORTHANDS)
+
+
+@pytest.fixture
+def kill_after(fork) -> Callable[..., None]:
+    """`kill_after(count, wait_s, work, ...)`: SIGKILL it so long after it told so often."""
+
+    def kill(count: int, wait_s: float, work: Callable[..., None], *arguments: Any) -> None:
+        process, heard = fork(work, *arguments)
+        for _ in range(count):
+            heard.recv()
+        time.sleep(wait_s)
+        assert process.is_alive(), "the kill came too late to test anything"
+        process.kill()
+        process.join()
+        assert process.exitcode == -signal.SIGKILL
+
+    return kill
+
+
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """Sums of tensors go by the number of threads; all processes of a test have to agree."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 @pytest.mark.parametrize(
     ("kills", "seed"), [(3, 0), *(pytest.param(8, n, marks=pytest.mark.slow) for n in range(1, 4))]
 )
+@pytest.mark.usefixtures("one_thread")
 def test_a_training_killed_again_and_again(
-    tiny_store: Callable[..., Path], head_params, start, stage, tmp_path: Path, kills, seed
+    tiny_store: Callable[..., Path], head_params, kill_after, here, tmp_path: Path, kills, seed
 ) -> None:
     """Between checkpoints, while one is written, while it is judged: wherever the kill falls."""
     chance = random.Random(seed)
-    store = tiny_store(tmp_path)
-    killed, whole = head_params(store, "killed"), head_params(store, "whole")
+    path = tiny_store(tmp_path)
+    killed, whole = head_params(path, "killed"), head_params(path, "whole")
     for _ in range(kills):
-        process = start(SLOWED, killed)
-        steps = chance.randint(1, 12)
-        assert process.stdout is not None
-        while steps and (line := process.stdout.readline()):
-            steps -= line.startswith("step ")
-        time.sleep(chance.uniform(0.0, 0.02))
-        assert process.poll() is None, "the kill came too late to test anything"
-        process.send_signal(signal.SIGKILL)
-        process.communicate()
+        kill_after(chance.randint(1, 12), chance.uniform(0.0, 0.02), train, killed)
     for params in (killed, whole):
-        code, _, complained = stage("stages.train_head", params)
+        code, _, complained = here("stages.train_head", params)
         assert code == 0, complained
     for name in ("best", "last"):
         weights = [
@@ -57,41 +96,19 @@ def test_a_training_killed_again_and_again(
     assert not list((tmp_path / "killed").glob("head.part*"))
 
 
-MERGING = """
-import sys, time
-from pipeline.store import writer
-from stages import store
-from stages.command import run
-
-write = writer.ChunkFiles.write
-def slow(self, *rest):
-    print("write", flush=True)
-    time.sleep(0.005)
-    write(self, *rest)
-writer.ChunkFiles.write = slow
-sys.exit(run("", store.main, sys.argv[1:], store.SHORTHANDS))
-"""
-
-
 def test_a_merge_killed_again_and_again(
-    tiny_store: Callable[..., Path], head_params, start, stage, tmp_path: Path
+    tiny_store: Callable[..., Path], head_params, kill_after, here, tmp_path: Path
 ) -> None:
     chance = random.Random(0)
     inputs = [str(tiny_store(tmp_path, name=name, seed=seed)) for seed, name in enumerate("ab")]
     params = head_params(Path("unused.zarr"))
     words = ["merge", *inputs, "--into"]
     for _ in range(3):
-        process = start(MERGING, params, *words, str(tmp_path / "killed.zarr"))
-        writes = chance.randint(1, 40)
-        assert process.stdout is not None
-        while writes and (line := process.stdout.readline()):
-            writes -= line == "write\n"
-        assert process.poll() is None, "the kill came too late to test anything"
-        process.send_signal(signal.SIGKILL)
-        process.communicate()
+        wanted = [*words, str(tmp_path / "killed.zarr")]
+        kill_after(chance.randint(1, 40), 0.0, merge, params, wanted)
         assert not (tmp_path / "killed.zarr").exists()
     for name in ("killed", "whole"):
-        code, _, complained = stage("stages.store", params, *words, str(tmp_path / f"{name}.zarr"))
+        code, _, complained = here("stages.store", params, *words, str(tmp_path / f"{name}.zarr"))
         assert code == 0, complained
     held = [
         {path.relative_to(place): path.read_bytes() for path in place.rglob("*") if path.is_file()}

@@ -270,6 +270,11 @@ class TestStructure:
             ("tick/time", lambda one: one.update(dimension_names=["time"]), "the dimensions"),
             ("tick/time", lambda one: one["codecs"].pop(), "expected the codecs"),
             (
+                "tick/time",
+                lambda one: one["chunk_key_encoding"]["configuration"].update(separator="."),
+                "expected the chunk keys",
+            ),
+            (
                 "tick/action",
                 lambda one: one["chunk_grid"]["configuration"].update(chunk_shape=[100, 5]),
                 "expected chunks of a multiple of 4096 whole rows",

@@ -51,7 +51,7 @@ class Killed(BaseException):
 
 class TestCommit:
     @settings(
-        max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+        max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
     )
     @given(
         batches=st.lists(

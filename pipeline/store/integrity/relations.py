@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.store.chunks import ChunkFiles
+from pipeline.store.chunks import read_rows
+from pipeline.store.episodes import SAID
 from pipeline.store.integrity.findings import Damage, Places
 from pipeline.store.schema import ArraySpec
 
@@ -24,7 +25,6 @@ _ENDS = {
     "state": "state/time",
     "text": "episode/text",
 }
-_SAID = {"id", "path", "format", "instruction", "content", "digest"}
 
 
 class EpisodeTable:
@@ -67,7 +67,7 @@ class EpisodeTable:
                 yield self._damage(f"episode/{kind}_start", what)
         for episode, said in enumerate(self.said):
             if said is None:
-                what = f"episode {episode}: expected a JSON object with {sorted(_SAID)}"
+                what = f"episode {episode}: expected a JSON object with {sorted(SAID)}"
                 yield self._damage("episode/text", what)
         if "episode/source" in self._specs:
             sources = self._read("episode/source")
@@ -102,7 +102,7 @@ class EpisodeTable:
         return Damage(array, None, self._root / array, what)
 
     def _read(self, name: str) -> NDArray[Any]:
-        return _rows(self._root, self._specs[name], 0, self._specs[name].shape[0])
+        return read_rows(self._root, self._specs[name])
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ class RelationTask:
     def _falls(self, edges: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Where a value is less than the one before it in the same episode."""
         first = max(0, self.start - 1)
-        values = _rows(self.root, self.spec, first, self.stop - first)
+        values = read_rows(self.root, self.spec, first, self.stop)
         falls = np.zeros(len(values), np.bool_)
         falls[1:] = values[1:] < values[:-1]
         starts = edges[(edges >= first) & (edges < self.stop)]
@@ -162,7 +162,7 @@ class RelationTask:
         return tick, np.searchsorted(self.edges["tick"], tick, side="right") - 1
 
     def _values(self) -> NDArray[Any]:
-        return _rows(self.root, self.spec, self.start, self.stop - self.start)
+        return read_rows(self.root, self.spec, self.start, self.stop)
 
 
 def relation_tasks(
@@ -195,12 +195,4 @@ def _said(text: bytes) -> dict[str, Any] | None:
         said = json.loads(text)
     except ValueError:
         return None
-    return said if isinstance(said, dict) and set(said) >= _SAID else None
-
-
-def _rows(root: Path, spec: ArraySpec, start: int, count: int) -> NDArray[Any]:
-    files = ChunkFiles(root, spec, writable=False)
-    try:
-        return files.read(start, count)
-    finally:
-        files.close()
+    return said if isinstance(said, dict) and set(said) >= set(SAID) else None

@@ -17,7 +17,7 @@ from tqdm import tqdm
 from pipeline.durable import disk_full_named, sync
 from pipeline.store.chunks import ChunkFiles, row_checksums
 from pipeline.store.environments import EnvironmentLog
-from pipeline.store.integrity.findings import Findings
+from pipeline.store.integrity.findings import Findings, runs_of
 from pipeline.store.replacement import refuse_replaced
 from pipeline.store.schema import (
     CHECKSUMS,
@@ -170,12 +170,9 @@ def _share(files: ChunkFiles, chunk: int, path: Path) -> None:
 
 def _runs(sound: NDArray[np.bool_], rows: range, most: int) -> Iterator[tuple[int, int]]:
     """(start, stop) of consecutive sound rows among these, in pieces of at most `most`."""
-    inside = rows.start + np.flatnonzero(sound[_slice(rows)])
-    for run in np.split(inside, np.flatnonzero(np.diff(inside) != 1) + 1):
-        if len(run):
-            stop = int(run[-1]) + 1
-            for start in range(int(run[0]), stop, most):
-                yield start, min(start + most, stop)
+    for first, last in runs_of(rows.start + np.flatnonzero(sound[_slice(rows)])):
+        for start in range(first, last + 1, most):
+            yield start, min(start + most, last + 1)
 
 
 def _slice(rows: range) -> slice:

@@ -24,6 +24,7 @@ from pipeline.store.schema import (
 )
 
 GROUPS = sorted({name.split("/")[0] for name in ARRAY_NAMES})
+_CHUNK_KEYS = {"name": "default", "configuration": {"separator": "/"}}
 NO_DIGEST = "an earlier version wrote it without a metadata_digest: attributes cannot be checked"
 
 
@@ -169,6 +170,9 @@ def _differences(root: Path, found: ArraySpec, expected: ArraySpec) -> Iterator[
         yield (
             f"expected chunks of a multiple of {ROW_MULTIPLE} whole rows {whole}, found {chunks}"
         )
+    keys = document["chunk_key_encoding"]
+    if keys != _CHUNK_KEYS:
+        yield f"expected the chunk keys {_CHUNK_KEYS}, found {keys}"
     ordered = {"endian": "little"} if found.dtype.itemsize > 1 else None
     codecs = [(one["name"], one.get("configuration")) for one in document["codecs"]]
     if codecs != [("bytes", ordered), ("crc32c", None)]:

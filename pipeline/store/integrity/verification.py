@@ -29,7 +29,7 @@ from pipeline.store.integrity.structure import (
     strange_files,
 )
 from pipeline.store.mending import extract_command, restore_command
-from pipeline.store.metadata import has_digest
+from pipeline.store.metadata import ATTRIBUTE
 from pipeline.store.replacement import inode_of, refuse_replaced
 from pipeline.store.schema import CHECKSUMS, FEATURES, ArraySpec, chunk_paths
 
@@ -50,7 +50,7 @@ def verify(path: Path, threads: int, workers: int | str = 0) -> Findings:
     attrs, unreadable = _attributes(path)
     damaged += unreadable or check_attributes(path, attrs, specs)
     damaged += [] if damaged else check_digest(path)
-    notes = () if damaged or has_digest(path) else (NO_DIGEST,)
+    notes = () if damaged or ATTRIBUTE in attrs else (NO_DIGEST,)
     tasks = _chunk_tasks(path, specs)
     reports = list(run_tasks(tasks, threads, workers, "verify"))
     if workers:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import StoreMismatch
+from pipeline.store.episodes import SAID
 from pipeline.store.reader import Episode, FeatureStore
 from pipeline.store.schema import FEATURES
 
@@ -148,10 +149,7 @@ def _named_apart(episode: Episode, store: Path, names: Mapping[tuple[str, str], 
 
 
 def _text(episode: Episode) -> bytes:
-    said = {
-        name: getattr(episode, name)
-        for name in ("id", "path", "format", "instruction", "content", "digest")
-    }
+    said = {name: getattr(episode, name) for name in SAID}
     return json.dumps(said, ensure_ascii=False).encode()
 
 
