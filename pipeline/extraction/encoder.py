@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pipeline.errors import NumericsError
 from pipeline.extraction.batch_size import BatchSize
 from pipeline.extraction.rows import ReadyRow
+from pipeline.vlm.preparation import Layout
 from pipeline.vlm.qwen import FrozenVLM, Pending
 
 Encoded = tuple[list[ReadyRow], NDArray[Any]]
@@ -78,12 +79,12 @@ class Encoder:
 
         So that waiting rows stay few, the largest group goes when many shapes wait.
         """
-        waiting: dict[Any, list[ReadyRow]] = defaultdict(list)
+        waiting: dict[Layout, list[ReadyRow]] = defaultdict(list)
         for row in rows:
-            shape = row.variants[0].shape_key
-            waiting[shape].append(row)
-            if len(waiting[shape]) >= self._rows:
-                yield waiting.pop(shape)
+            layout = row.variants[0].layout
+            waiting[layout].append(row)
+            if len(waiting[layout]) >= self._rows:
+                yield waiting.pop(layout)
             elif sum(map(len, waiting.values())) >= 4 * self._rows:
                 yield waiting.pop(max(waiting, key=lambda key: len(waiting[key])))
         yield from waiting.values()

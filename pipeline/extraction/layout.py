@@ -12,6 +12,7 @@ from pipeline.config import Params
 from pipeline.durable import free_bytes
 from pipeline.errors import DiskFull, NumericsError
 from pipeline.extraction.check import CheckedEpisode, embodiment_of
+from pipeline.extraction.plan import store_bytes
 from pipeline.extraction.survey import Survey, shown_path
 from pipeline.recordings import Stream
 from pipeline.store import SCHEMA, Donor, Sizes, StoreBuild, arrays
@@ -29,7 +30,7 @@ def check_space(
         build.linkable(name, donor.specs[name], rows) * build.specs[name].chunk_bytes
         for donor, name, rows in _linkable(build, checked, donors)
     )
-    needed = sum(spec.data_bytes for spec in build.specs.values()) - linked
+    needed = store_bytes(build.specs) - linked
     free = free_bytes(build.part)
     if needed > free:
         raise DiskFull(

@@ -96,5 +96,5 @@ def _scatter(height: float, decay_bins: float) -> NDArray[np.float32]:
 
 
 _SCATTER: Final = _scatter(60.0, 180.0)
-_SURFACE: Final = _scatter(60.0, 180.0) + _peak(130.0, 14.0)
+_SURFACE: Final = _SCATTER + _peak(130.0, 14.0)
 _LAYER: Final = _peak(80.0, 18.0)

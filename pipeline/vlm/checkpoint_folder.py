@@ -1,7 +1,6 @@
 """Where a checkpoint or an adapter lies on disk, and which of its files decide what it says."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -185,8 +184,3 @@ def adapter_files(folder: Path) -> list[Path]:
             )
     read_json(files[0])
     return files
-
-
-def content_digests(files: list[Path], digest_file: Callable[[Path], str]) -> dict[str, str]:
-    """The content digest of each file by name."""
-    return {path.name: digest_file(path) for path in files}

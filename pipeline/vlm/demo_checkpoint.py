@@ -8,8 +8,8 @@ pooling keeps.
 
 import json
 import math
-import shutil
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from tokenizers import AddedToken, Regex, Tokenizer, decoders, normalizers, pre_
 from tokenizers.models import BPE
 from transformers import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
 
+from pipeline.durable import replace_folder
 from pipeline.vlm.loading import quiet_transformers
 
 _SPECIAL_TOKENS = (
@@ -87,27 +88,18 @@ _VOCABULARY = 1536
 def write_demo_checkpoint(folder: Path, seed: int = 0) -> None:
     """Write the demo's checkpoint to `folder`, whole or not at all; same seed, same bytes.
 
-    What stood there before is replaced.
+    What stood there before is replaced. Raises `DiskFull`.
     """
-    part = folder.with_name(f".{folder.name}.part")
-    shutil.rmtree(part, ignore_errors=True)
-    part.mkdir(parents=True)
+    replace_folder(folder, partial(_write, seed=seed))
+
+
+def _write(folder: Path, seed: int) -> None:
     tokenizer = _train_tokenizer()
-    tokenizer.save(str(part / "tokenizer.json"))
-    _write_json(part / "tokenizer_config.json", _tokenizer_config())
-    _write_json(part / "preprocessor_config.json", _processor_config())
+    tokenizer.save(str(folder / "tokenizer.json"))
+    _write_json(folder / "tokenizer_config.json", _tokenizer_config())
+    _write_json(folder / "preprocessor_config.json", _processor_config())
     with quiet_transformers():
-        _model(tokenizer, seed).save_pretrained(part)
-    _replace(part, folder)
-
-
-def _replace(part: Path, folder: Path) -> None:
-    old = folder.with_name(f".{folder.name}.old")
-    shutil.rmtree(old, ignore_errors=True)
-    if folder.exists():
-        folder.rename(old)
-    part.rename(folder)
-    shutil.rmtree(old, ignore_errors=True)
+        _model(tokenizer, seed).save_pretrained(folder)
 
 
 def _write_json(path: Path, document: dict[str, Any]) -> None:

@@ -18,7 +18,6 @@ from pipeline.config import VLMParams
 from pipeline.errors import VLMError
 from pipeline.vlm.checkpoint_folder import (
     adapter_files,
-    content_digests,
     read_config,
     resolve_checkpoint,
     tokenizer_files,
@@ -95,9 +94,9 @@ def feature_spec(
     renderer = PromptRenderer(folder, vlm.prompt)
     document = {
         "extractor_version": EXTRACTOR_VERSION,
-        "weights": _digest(content_digests(weight_files(folder), digest_file)),
+        "weights": _files_digest(weight_files(folder), digest_file),
         "adapter": _adapter_digest(vlm.adapter, digest_file),
-        "tokenizer": _digest(content_digests(tokenizer_files(folder), digest_file)),
+        "tokenizer": _files_digest(tokenizer_files(folder), digest_file),
         "chat_template": renderer.chat_template,
         "prompt": vlm.prompt,
         "example_prompt": renderer.render(_PLACEHOLDER_INSTRUCTION, len(ordered)),
@@ -197,7 +196,11 @@ def _adapter_digest(adapter: str | None, digest_file: Callable[[Path], str]) -> 
     if adapter is None:
         return None
     folder = resolve_checkpoint(adapter, setting="vlm.adapter")
-    return _digest(content_digests(adapter_files(folder), digest_file))
+    return _files_digest(adapter_files(folder), digest_file)
+
+
+def _files_digest(files: Sequence[Path], digest_file: Callable[[Path], str]) -> str:
+    return _digest({path.name: digest_file(path) for path in files})
 
 
 def _digest(document: Any) -> str:

@@ -46,11 +46,6 @@ class PreparedRow:
     """(image, height, width, 3) RGB at the spec's image size, views in order."""
     layout: Layout
 
-    @property
-    def shape_key(self) -> Layout:
-        """Equal for rows that batch without padding."""
-        return self.layout
-
 
 class Preparer:
     """Makes `PreparedRow`s; may be used from several threads (the resize releases the GIL)."""

@@ -68,7 +68,7 @@ class FrozenVLM:
         """Features of each row in the storage dtype, and which slots are valid, both on the CPU.
 
         A slot whose view is missing is zero and invalid. A row is the same, within the compute
-        dtype's noise, whatever rows stand beside it; rows of equal `shape_key` are fastest.
+        dtype's noise, whatever rows stand beside it; rows of equal `layout` are fastest.
         Raises `NumericsError` naming row and slot where a feature is NaN or infinite.
         """
         return self.submit(rows).result()

@@ -1,8 +1,12 @@
-"""Small recordings in the windowed format, and params that extract them."""
+"""Small recordings in the windowed format, params that extract them, processes that do."""
 
 import json
 import shutil
-from collections.abc import Callable
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,6 +17,7 @@ import yaml
 from PIL import Image
 
 from pipeline.config import Params
+from pipeline.extraction import extract
 
 
 @pytest.fixture(scope="session")
@@ -81,17 +86,22 @@ def stand_still() -> Callable[[Path], None]:
 
 
 @pytest.fixture(scope="session")
-def make_document(demo_checkpoint: Path) -> Callable[[Path], dict[str, Any]]:
-    """`make_document(folder)` writes recordings there, and says what params.yaml would.
+def recorded_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three episodes of one task, to be copied; the last has one view only and no sensor."""
+    root = tmp_path_factory.mktemp("recorded")
+    _write_episode(root / "Touch_dot" / "episode_1", 1)
+    _write_episode(root / "Touch_dot" / "episode_2", 2, seconds=3.0)
+    _write_episode(root / "Press" / "episode_3", 3, views=("View2",), sensor=False)
+    return root
 
-    Three episodes of one task; the last has one view only and no sensor.
-    """
+
+@pytest.fixture(scope="session")
+def make_document(demo_checkpoint: Path, recorded_once: Path) -> Callable[[Path], dict[str, Any]]:
+    """`make_document(folder)` copies recordings there, and says what params.yaml would."""
 
     def make(folder: Path) -> dict[str, Any]:
         root = folder / "recordings"
-        _write_episode(root / "Touch_dot" / "episode_1", 1)
-        _write_episode(root / "Touch_dot" / "episode_2", 2, seconds=3.0)
-        _write_episode(root / "Press" / "episode_3", 3, views=("View2",), sensor=False)
+        shutil.copytree(recorded_once, root)
         return {
             "data": {"root": str(root), "sources": [{"name": "made", "path": "."}]},
             "vlm": {
@@ -124,6 +134,24 @@ def params(document: dict[str, Any]) -> Params:
     return Params.model_validate(document)
 
 
+@pytest.fixture(scope="session")
+def extracted_once(
+    make_document: Callable[[Path], dict[str, Any]], tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """The store that `params` make, to be copied."""
+    params = Params.model_validate(make_document(tmp_path_factory.mktemp("extracted")))
+    extract(params, lambda line: None)
+    return params.extract.store
+
+
+@pytest.fixture
+def extracted(extracted_once: Path, params: Params) -> None:
+    """`params` have been extracted already."""
+    ledger = f"{extracted_once.name}.files.sqlite"
+    shutil.copytree(extracted_once, params.extract.store)
+    shutil.copyfile(extracted_once.with_name(ledger), params.extract.store.with_name(ledger))
+
+
 @pytest.fixture
 def params_file(document: dict[str, Any], tmp_path: Path) -> Path:
     path = tmp_path / "params.yaml"
@@ -142,3 +170,86 @@ def laid_over(document: dict[str, Any], **sections: dict[str, Any]) -> Params:
     """The params of a document with some values of its sections replaced."""
     merged = {name: {**document.get(name, {}), **sections.get(name, {})} for name in document}
     return Params.model_validate(merged)
+
+
+FORKING = """
+import json, os, signal, sys
+import distributed, stages.extract, pipeline.extraction.cluster
+import transformers.models.qwen2_5_vl.modeling_qwen2_5_vl
+
+running = set()
+for line in iter(sys.stdin.readline, ""):
+    asked = json.loads(line)
+    if "poll" in asked:
+        ended, status = os.waitpid(asked["poll"], os.WNOHANG)
+        running.discard(ended)
+        answer = os.waitstatus_to_exitcode(status) if ended else None
+    elif answer := os.fork():
+        running.add(answer)
+    else:
+        os.setsid()
+        for number, (name, mode) in enumerate(
+            [(os.devnull, os.O_RDONLY), *((name, os.O_WRONLY | os.O_CREAT) for name in asked["to"])]
+        ):
+            os.dup2(os.open(name, mode, 0o600), number)
+        sys.argv[1:] = asked["arguments"]
+        exec(asked["code"], {"__name__": "__main__"})
+        sys.exit()
+    print(json.dumps(answer), flush=True)
+for process in running:
+    os.kill(process, signal.SIGKILL)
+"""
+"""Forks processes that have imported what extraction needs, which takes each seconds otherwise."""
+
+
+@dataclass
+class Process:
+    """A process that runs Python code to the end of its interpreter, in a session of its own."""
+
+    pid: int
+    stdout: Path
+    stderr: Path
+    _ask: Callable[..., Any]
+    _code: int | None = None
+
+    def poll(self) -> int | None:
+        """Its exit code; minus the signal that it was killed by; None while it runs."""
+        if self._code is None:
+            self._code = self._ask(poll=self.pid)
+        return self._code
+
+    def wait(self) -> int:
+        """Its exit code, once it has ended."""
+        while (code := self.poll()) is None:
+            time.sleep(0.02)
+        return code
+
+
+@pytest.fixture(scope="session")
+def begin() -> Iterator[Callable[..., Process]]:
+    """`begin(code, folder, *arguments)` begins a process whose output is kept in the folder."""
+    with subprocess.Popen(
+        [sys.executable, "-c", FORKING],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    ) as server:
+        asked, answers = server.stdin, server.stdout
+        assert asked is not None
+        assert answers is not None
+
+        def ask(**what: Any) -> Any:
+            asked.write(json.dumps(what) + "\n")
+            asked.flush()
+            return json.loads(answers.readline())
+
+        def begin(code: str, folder: Path, *arguments: str) -> Process:
+            number = len(list(folder.glob("*.stderr")))
+            to = folder / f"{number}.stdout", folder / f"{number}.stderr"
+            for path in to:
+                path.touch()
+            pid = ask(code=code, arguments=arguments, to=[str(path) for path in to])
+            return Process(pid, *to, ask)
+
+        yield begin

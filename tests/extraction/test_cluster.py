@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -18,10 +18,10 @@ from pathlib import Path
 import dask
 import numpy as np
 import pytest
-import yaml
 from distributed import LocalCluster
 
 from pipeline import errors
+from pipeline.config import Params
 from pipeline.digests import ContentDigests, file_digest
 from pipeline.errors import ConfigError, PipelineError, RecordingError, StoreIncomplete, VLMError
 from pipeline.extraction import extract
@@ -36,16 +36,25 @@ from pipeline.store.schema import ARRAY_NAMES, read_specs
 from pipeline.vlm.feature_spec import feature_spec
 
 BATCH = 4
+PATIENCE_S = 200
+"""For what takes seconds, on a machine that does much else."""
 PRELOADED = """
 import os, signal, time
+from collections import defaultdict
 from contextlib import suppress
 from pathlib import Path
 from pipeline.errors import NumericsError
 from pipeline.extraction.encoder import Encoder
-from pipeline.extraction.worker import RangeComputer
+from pipeline.extraction.worker import ExtractionPlugin, RangeComputer
 
 control = Path({control!r})
-prepare, encode = RangeComputer.prepared, Encoder.encoded
+prepare, encode, begin = RangeComputer.prepared, Encoder.encoded, ExtractionPlugin.setup
+
+def setup(self, worker, begin=begin):
+    with suppress(FileNotFoundError):
+        (control / "kill-at-setup").unlink()
+        os.kill(os.getpid(), signal.SIGKILL)
+    begin(self, worker)
 
 def prepared(self, piece, prepare=prepare):
     name = Path(piece.recording.path).name
@@ -65,21 +74,30 @@ def encoded(self, rows, encode=encode):
             name = Path(one.where.split(",")[0]).name
             if (control / f"nan-{{name}}").exists():
                 raise NumericsError(f"{{one.where}}: expected finite features")
-        deadline = time.monotonic() + 60
-        while (control / "wait-for-three").exists() and time.monotonic() < deadline:
-            lines = (control / "computed").read_text().splitlines()
-            if len({{line.split()[0] for line in lines}}) == 3:
-                break
-            time.sleep(0.02)
-        if (control / "kill").exists():
-            with suppress(FileNotFoundError):
+        if (control / "wait-for-three").exists():
+            wait_until(lambda: len(rows_by_process()) == 3)
+        before = rows_by_process()[os.getpid()] - {{one.row for one in batch}}
+        if (control / "kill").exists() and before:
+            wait_until(lambda: before <= set(map(int, (control / "marked").read_text().split())))
+            with suppress(FileNotFoundError):  # another was first
                 (control / "kill").unlink()
-                time.sleep(0.5)  # what was done before has been reported
                 os.kill(os.getpid(), signal.SIGKILL)
         yield batch, features
 
+def rows_by_process():
+    found = defaultdict(set)
+    for line in (control / "computed").read_text().splitlines():
+        process, *rows = map(int, line.split())
+        found[process] |= set(rows)
+    return found
+
+def wait_until(true):
+    deadline = time.monotonic() + 200
+    while not true() and time.monotonic() < deadline:
+        time.sleep(0.02)
+
 if prepare.__module__ == RangeComputer.__module__:  # a worker may run this twice
-    RangeComputer.prepared, Encoder.encoded = prepared, encoded
+    RangeComputer.prepared, Encoder.encoded, ExtractionPlugin.setup = prepared, encoded, setup
 """
 """Run by each worker as it starts: it notes what it does, and does what the tests ask for."""
 
@@ -142,16 +160,16 @@ def two_workers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Workers]:
 
 @pytest.fixture
 def workers(two_workers: Workers) -> Workers:
-    two_workers.cluster.wait_for_workers(2, timeout=120)  # one that was killed comes back
+    two_workers.cluster.wait_for_workers(2, timeout=PATIENCE_S)  # one that was killed comes back
     two_workers.forget()
     return two_workers
 
 
-@pytest.fixture
-def here(changed, tmp_path) -> FeatureStore:
+@pytest.fixture(scope="module")
+def here(make_document, tmp_path_factory) -> FeatureStore:
     """The store that this process makes of the same recordings."""
-    params = changed(extract={"store": str(tmp_path / "here.zarr")})
-    extract(params, lambda line: None)
+    params = Params.model_validate(make_document(tmp_path_factory.mktemp("here")))
+    run(params)
     return FeatureStore.open(params.extract.store)
 
 
@@ -221,11 +239,21 @@ class TestStore:
 
 
 class TestDeaths:
-    def test_a_killed_worker_loses_one_batch(self, changed, workers, here):
-        workers.ask("kill")
-        params = changed(extract={"workers": workers.address})
+    def test_a_killed_worker_loses_one_batch(self, changed, workers, tmp_path, monkeypatch):
+        def noted(self, rows, *args, mark=StoreBuild.mark):
+            mark(self, rows, *args)
+            with (workers.control / "marked").open("a") as log:
+                log.write(" ".join(map(str, (*rows, ""))))
+
+        pages = {"layers": [-1, 1]}  # a row fills a page, so that no task has two batches
+        expected = changed(vlm=pages, extract={"store": str(tmp_path / "expected.zarr")})
+        run(expected)
+        monkeypatch.setattr(StoreBuild, "mark", noted)
+        workers.ask("marked")
+        workers.ask("kill")  # one that computes when all that it did before is marked
+        params = changed(vlm=pages, extract={"workers": workers.address})
         run(params)
-        assert_same(params.extract.store, here)
+        assert_same(params.extract.store, FeatureStore.open(expected.extract.store))
         times, _ = workers.computed()
         assert 1 <= times.total() - len(times) <= BATCH
 
@@ -236,7 +264,7 @@ class TestDeaths:
         def joined_after_first(self, *args):
             if not joined:
                 joined.append(begun("worker", workers.address, *WORKER, "--preload", preload))
-                workers.cluster.wait_for_workers(3, timeout=120)
+                workers.cluster.wait_for_workers(3, timeout=PATIENCE_S)
                 workers.ask("wait-for-three")
             mark(self, *args)
 
@@ -376,7 +404,6 @@ class TestScheduler:
         try:
             while not address_file.exists():
                 time.sleep(0.05)
-            monkeypatch.setattr("pipeline.extraction.connection._TIMEOUT_S", 2)
             monkeypatch.setattr(StoreBuild, "mark", then_killed)
             address = json.loads(address_file.read_text())["address"]
             params = changed(extract={"workers": address, "batch_size": 1})
@@ -393,38 +420,20 @@ class TestScheduler:
         assert_same(params.extract.store, here)
 
 
-def with_two_workers(document, folder: Path) -> "subprocess.Popen[str]":
-    """The command with two local workers, in a process group of its own."""
-    file = folder / "params.yaml"
-    file.write_text(yaml.safe_dump(document))
-    return subprocess.Popen(
-        [sys.executable, "-c", STAGE, "--params", str(file), "--set", "extract.workers=2"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-
-
 class TestLocalProcesses:
     def test_ctrl_c_leaves_no_process_and_the_next_run_with_two_completes(
-        self, changed, document, here, tmp_path
+        self, changed, params_file, begin, here, tmp_path
     ):
-        process = with_two_workers(document, tmp_path)
-        assert process.stderr is not None
-        assert process.stderr.readline() == "marked\n"
+        process = begin(STAGE, tmp_path, "--params", str(params_file), *TWO)
+        wait_for(lambda: process.stderr.read_text() == "marked\n", process)
         os.killpg(process.pid, signal.SIGINT)
-        _, said = process.communicate(timeout=60)
-        assert process.returncode == 1
-        assert set(said.splitlines()) <= {
-            "marked",
-            "stopped; run the same command again",
-        }
+        assert process.wait() == 1
+        assert process.stderr.read_text() == "marked\nstopped; run the same command again\n"
         assert not left_of_group(process.pid)
-        store = Path(document["extract"]["store"])
+        with_workers = changed(extract={"workers": 2, "batch_size": 1})
+        store = with_workers.extract.store
         missing = missing_of(store)
         assert missing
-        with_workers = changed(extract={"workers": 2, "batch_size": 1})
         report = run(with_workers)
         assert report is not None
         assert report.computed == len(missing)
@@ -438,39 +447,39 @@ class TestLocalProcesses:
 class TestStart:
     """Of local processes, which takes long enough to be cut short."""
 
-    def test_a_worker_killed_as_it_starts_is_said(self, document, tmp_path):
-        process, starting = self.begun(document, tmp_path)
-        os.kill(starting, signal.SIGKILL)
-        _, said = process.communicate(timeout=90)
-        assert process.returncode == 2
-        why = r"2 worker processes could not be started|a worker died as it began"
-        assert re.match(f"error: extract.workers: ({why})", said), said
+    def test_a_worker_killed_as_it_starts_is_said(self, params_file, begin, tmp_path):
+        process = self.begun(begin, params_file, tmp_path)
+        (tmp_path / "kill").touch()
+        assert process.wait() == 2
+        said = process.stderr.read_text()
+        assert re.match(r"error: extract.workers: 2 worker processes could not be started", said)
         assert len(said.splitlines()) == 1
         assert not left_of_group(process.pid)
 
+    def test_a_worker_killed_as_it_is_told_what_to_do_is_said(self, changed, workers):
+        workers.ask("kill-at-setup")
+        with pytest.raises(PipelineError, match=r"extract\.workers: a worker died as it began"):
+            run(changed(extract={"workers": workers.address}))
+
     @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
-    def test_stopped_as_workers_start(self, document, tmp_path, how):
-        process, _ = self.begun(document, tmp_path)
+    def test_stopped_as_workers_start(self, params_file, begin, tmp_path, how):
+        process = self.begun(begin, params_file, tmp_path)
         if how == signal.SIGINT:
             os.killpg(process.pid, how)  # as a terminal does
         else:
-            process.send_signal(how)
-        _, said = process.communicate(timeout=30)
-        assert (process.returncode, said) == (1, "stopped; run the same command again\n")
+            os.kill(process.pid, how)
+        assert process.wait() == 1
+        assert process.stderr.read_text() == "stopped; run the same command again\n"
         assert not left_of_group(process.pid)
 
-    def begun(self, document, tmp_path: Path) -> "tuple[subprocess.Popen[str], int]":
-        """The command, and the process of a worker that imports what it needs."""
-        process = with_two_workers(document, tmp_path)
-        deadline = time.monotonic() + 60
-        while time.monotonic() < deadline:
-            for pid, command in of_group(process.pid).items():
-                if "spawn_main" in command:
-                    time.sleep(0.5)
-                    return process, pid
-            time.sleep(0.02)
-        process.kill()
-        pytest.fail(f"no worker was begun: {process.communicate()}")
+    def begun(self, begin, params_file: Path, folder: Path):
+        """The command; a worker of it has begun, and will not be up before the test ends."""
+        preload = folder / "starting.py"
+        preload.write_text(STARTING.format(control=str(folder)))
+        code = f"import dask\ndask.config.set({{'distributed.worker.preload': {str(preload)!r}}})\n"
+        process = begin(code + STAGE, folder, "--params", str(params_file), *TWO)
+        wait_for((folder / "starting").exists, process)
+        return process
 
 
 STAGE = """
@@ -482,14 +491,29 @@ from stages.extract import main
 def mark(self, *args, mark=StoreBuild.mark):
     mark(self, *args)
     print("marked", file=sys.stderr, flush=True)
-    time.sleep(0.5)
+    time.sleep(600)
 
-if __name__ == "__main__":
-    StoreBuild.mark = mark
-    raise SystemExit(run("", main, sys.argv[1:]))
+StoreBuild.mark = mark
+raise SystemExit(run("", main, sys.argv[1:]))
 """
-"""The stage, which says when rows are marked and leaves time to stop it."""
+"""The stage, which says when rows are marked and then waits to be stopped."""
 
+STARTING = """
+import os, signal, time
+from contextlib import suppress
+from pathlib import Path
+
+control = Path({control!r})
+(control / "starting").touch()
+while not (control / "killed").exists():
+    with suppress(FileNotFoundError):
+        (control / "kill").rename(control / "killed")
+        os.kill(os.getpid(), signal.SIGKILL)
+    time.sleep(0.02)
+"""
+"""Run by each worker as it starts: it goes no further, until one was asked to kill itself."""
+
+TWO = ("--set", "extract.workers=2")
 
 WORKER = ("--nthreads", "2", "--no-nanny", "--death-timeout", "60", "--no-dashboard")
 
@@ -503,9 +527,16 @@ def begun(role: str, *options: str) -> "subprocess.Popen[bytes]":
     )
 
 
+def wait_for(true: Callable[[], bool], process) -> None:
+    """Return when something is so; fail where the process ends before."""
+    while not true():
+        assert process.poll() is None, process.stderr.read_text()
+        time.sleep(0.02)
+
+
 def left_of_group(group: int) -> list[str]:
     """The processes of a process group that do not see that their parent is gone, and end."""
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + PATIENCE_S
     while (left := of_group(group)) and time.monotonic() < deadline:
         time.sleep(0.05)
     return list(left.values())

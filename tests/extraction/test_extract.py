@@ -54,8 +54,8 @@ def no_model_later(monkeypatch):
 
 
 class TestWhatItWrites:
+    @pytest.mark.usefixtures("extracted")
     def test_streams_and_ticks_are_the_recordings(self, params):
-        run(params)
         store = FeatureStore.open(params.extract.store)
         opened = open_recordings(params.data.sources, params.data.root)
         assert [one.id for one in store.episodes] == [one.id for one in opened.recordings]
@@ -81,8 +81,8 @@ class TestWhatItWrites:
                     assert np.array_equal(store.array(f"{stream}/values")[inside], mine.values)
                     assert np.array_equal(store.array(f"{stream}/time")[inside], mine.time)
 
+    @pytest.mark.usefixtures("extracted")
     def test_features_are_what_the_model_says_of_each_row_alone(self, params):
-        run(params)
         store = FeatureStore.open(params.extract.store)
         spec = feature_spec(
             params.vlm, "float32", store.streams["views"], lambda path: path.read_bytes().hex()
@@ -102,8 +102,8 @@ class TestWhatItWrites:
                 assert torch.allclose(torch.from_numpy(stored), alone[0], atol=2e-5)
                 assert np.array_equal(store.array("vl/slot_valid")[row], valid[0].numpy())
 
+    @pytest.mark.usefixtures("extracted")
     def test_a_missing_view_is_marked_and_zero(self, params):
-        run(params)
         store = FeatureStore.open(params.extract.store)
         press = next(one for one in store.episodes if one.id == "episode_3")
         view1 = [slot.get("view") == "View1" for slot in store.attrs["slots"]]
@@ -140,10 +140,10 @@ class TestWhatItTakesOver:
             f"{params.extract.store}: up to date, nothing to do (stages.verify reads what it holds)"
         ]
 
+    @pytest.mark.usefixtures("extracted")
     def test_an_added_episode_computes_only_its_rows(
         self, params, recordings, counted, write_episode
     ):
-        run(params)
         before = FeatureStore.open(params.extract.store)
         known = {bytes(key): row for row, key in enumerate(before.array("vl/key"))}
         counted.clear()
@@ -159,8 +159,8 @@ class TestWhatItTakesOver:
                 old = before.array("vl/features")[known[bytes(key)]]
                 assert np.array_equal(store.array("vl/features")[row], old)
 
+    @pytest.mark.usefixtures("extracted")
     def test_another_reuse_count_takes_the_rows_whose_key_is_known(self, params, changed, counted):
-        run(params)
         rows = len(FeatureStore.open(params.extract.store).array("vl/time"))
         counted.clear()
         report, said = run(changed(data={"vlm_reuse_count": 1}))
@@ -169,28 +169,30 @@ class TestWhatItTakesOver:
         assert any(f"{rows} known" in line for line in said), "without decoding a frame"
         assert any("vlm_reuse_count" in line for line in said)
 
+    @pytest.mark.usefixtures("extracted")
     def test_another_prompt_computes_everything_and_says_why(self, params, changed, counted):
-        run(params)
         counted.clear()
         report, said = run(changed(vlm={"prompt": "{images} do: {instruction}"}))
         assert report.taken == 0
         assert sum(counted) == report.rows
         assert any("prompt: '{instruction}" in line for line in said)
 
+    @pytest.mark.usefixtures("extracted")
     def test_the_speed_knobs_change_nothing(self, params, changed, no_model_later):
-        run(params)
         no_model_later()
         knobs = {"batch_size": 1, "decode_threads": 1, "device": "cpu"}
         assert run(changed(extract=knobs, vlm={"attention": "eager"}))[0] is None
 
+    @pytest.mark.usefixtures("extracted")
     def test_a_touched_file_is_read_again_and_found_equal(self, params, recordings):
-        run(params)
+        run(params)  # notes what the files hold
         path = recordings / "Touch_dot/episode_1/robot_states.npz"
         path.write_bytes(path.read_bytes())
         assert run(params)[0] is None
 
+    @pytest.mark.usefixtures("extracted")
     def test_a_changed_file_is_noticed(self, params, recordings):
-        run(params)
+        run(params)  # notes what the files hold
         path = recordings / "Touch_dot/episode_1/robot_states.npz"
         stored = dict(np.load(path))
         for name in stored:
@@ -201,15 +203,15 @@ class TestWhatItTakesOver:
         assert any("1 episode(s) are new or their files changed" in line for line in said)
         assert any("1 episode(s) of the store are gone or changed" in line for line in said)
 
+    @pytest.mark.usefixtures("extracted")
     def test_another_reuse_count_is_no_lost_episode(self, params):
-        run(params)
         other = params.data.model_copy(update={"vlm_reuse_count": 2})
         _, said = run(params.model_copy(update={"data": other}))
         assert any("have another instruction" in line for line in said)
         assert not any("gone or changed" in line for line in said)
 
+    @pytest.mark.usefixtures("extracted")
     def test_a_lost_ledger_costs_nothing_but_reading(self, params, no_model_later):
-        run(params)
         ledger = params.extract.store.with_name("made.zarr.files.sqlite")
         ledger.write_bytes(b"not a database" * 100)
         no_model_later()
@@ -277,7 +279,8 @@ def test_a_store_that_a_cache_handed_out_as_symbolic_links_is_not_written_throug
     monkeypatch.setattr("pipeline.store.schema.CHUNK_BYTES", 4096)
     (recordings / "Zlast").mkdir()
     for index in range(7):
-        write_episode(recordings / "Zlast" / f"episode_{index}", 20 + index, seconds=6.0)
+        episode = recordings / "Zlast" / f"episode_{index}"
+        write_episode(episode, 20 + index, seconds=4.5, views=("View2",))
     run(params)
     cache = tmp_path / "cache"
     params.extract.store.rename(cache)
@@ -296,8 +299,8 @@ def test_a_store_that_a_cache_handed_out_as_symbolic_links_is_not_written_throug
 
 
 class TestOutOfMemory:
+    @pytest.mark.usefixtures("extracted")
     def test_halves_the_batch_and_goes_on(self, params, monkeypatch):
-        run(params)
         expected = FeatureStore.open(params.extract.store).array("vl/features").copy()
         shutil.rmtree(params.extract.store)
         real = FrozenVLM.submit
@@ -353,8 +356,8 @@ class TestPlan:
         notes = [line for line in lines if "ticks at" in line]
         assert notes == ([] if said is None else [f"source 'made': {said}"])
 
+    @pytest.mark.usefixtures("extracted")
     def test_names_a_time_once_a_speed_is_known(self, params, changed):
-        run(params)
         _, said = run(changed(extract={"plan": True}, data={"vlm_reuse_count": 2}))
         assert any("rows/s, as last measured" in line for line in said)
 
@@ -425,8 +428,8 @@ class TestRefusals:
         run(params)
         assert not counted, "removing it changes no feature"
 
+    @pytest.mark.usefixtures("extracted")
     def test_stop_stops_beside_a_finished_store_too(self, params, recordings):
-        run(params)
         (recordings / "Press/episode_3/metadata.json").write_text("{")
         with pytest.raises(RecordingError, match=r"1 of 3 episodes.*\n.*metadata\.json"):
             run(params)
@@ -456,9 +459,9 @@ class TestRefusals:
             run(params)
 
 
+@pytest.mark.usefixtures("extracted")
 def test_finished_files_never_change(params, recordings, tmp_path, write_episode):
     """Hard links to a finished store, as a cache makes them, keep their bytes."""
-    run(params)
     cache = tmp_path / "cache"
     shutil.copytree(params.extract.store, cache, copy_function=lambda a, b: Path(b).hardlink_to(a))
     before = {path: path.read_bytes() for path in cache.rglob("*") if path.is_file()}

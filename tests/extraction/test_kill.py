@@ -3,18 +3,21 @@
 import os
 import random
 import signal
-import subprocess
-import sys
 import time
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import google_crc32c
 import numpy as np
 import pytest
 import yaml
 
+from pipeline.config import Params
+from pipeline.extraction import extract
 from pipeline.store import FeatureStore, StoreBuild, part_path, read_plan
 from pipeline.store.schema import ARRAY_NAMES, read_specs
 
@@ -23,29 +26,38 @@ IN_FLIGHT = 3
 """Batches that a kill may lose: one with the model or waiting to be handed in, one that waits for
 the disk and one that is being written."""
 COUNTED = """
-import os, sys
+import sys, time
+from pathlib import Path
+from pipeline.store import StoreBuild
 from pipeline.vlm.qwen import FrozenVLM
-real = FrozenVLM.submit
-def submit(self, rows):
-    with open(sys.argv[1], "a") as log:
-        log.write(f"{len(rows)}\\n")
-    return real(self, rows)
+log, marked, batches = Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3])
+given = []
+def submit(self, rows, submit=FrozenVLM.submit):
+    if len(given) == batches:
+        time.sleep(600)
+    given.append(len(rows))
+    with log.open("a") as noted:
+        noted.write(f"{len(rows)}\\n")
+    return submit(self, rows)
 FrozenVLM.submit = submit
-import pipeline.store.writer as writer
-def slow_commit(self, *args, commit=writer.StoreBuild.commit):
-    import time
+def slow_commit(self, *args, commit=StoreBuild.commit):
     commit(self, *args)
+    marked.touch()
     time.sleep(0.03)
-writer.StoreBuild.commit = slow_commit
+StoreBuild.commit = slow_commit
 from stages.extract import main
 from stages.command import run
-raise SystemExit(run("", main, sys.argv[2:]))
+raise SystemExit(run("", main, sys.argv[4:]))
 """
-"""Runs the stage, noting every batch the model is given, slowly enough to be killed midway."""
+"""Runs the stage, noting every batch the model is given and that rows are marked; after so many
+batches it waits to be stopped."""
+BATCHES = 12
+"""Of all rows."""
 
 
-def command(log: Path, params: Path) -> list[str]:
-    return [sys.executable, "-c", COUNTED, str(log), "--params", str(params)]
+def document_of(document: dict, store: Path) -> dict:
+    """The document of the same extraction into another store."""
+    return {**document, "extract": {"store": str(store), "batch_size": BATCH}}
 
 
 @dataclass(frozen=True)
@@ -60,47 +72,52 @@ class Killed:
     """Whether the build was under way."""
 
 
-def killed_runs(document: dict, folder: Path, kills: int, seed: int) -> tuple[Path, list[Killed]]:
+def killed_runs(
+    begin: Callable, document: dict, folder: Path, kills: int, seed: int
+) -> tuple[Path, list[Killed]]:
     """Start the stage and kill it, `kills` times, then let it finish.
 
-    Each kill comes a random while after the session's first sign of life: the build that it
-    begins, or the first batch that it computes.
+    Each kill comes a random while after a sign of life of the session: the build that it begins or
+    goes on with, the first batch that it computes, or (in the first session) that it marks.
     """
     chance = random.Random(seed)
     store, log = folder / "killed.zarr", folder / "killed.log"
     params = folder / "killed.yaml"
-    params.write_text(
-        yaml.safe_dump({**document, "extract": {"store": str(store), "batch_size": BATCH}})
-    )
+    params.write_text(yaml.safe_dump(document_of(document, store)))
     log.touch()
     sessions: list[Killed] = []
-    for _ in range(kills):
+    for number in range(kills):
         computed, marked = computed_of(log), marked_of(store)
-        midway = killed_once(command(log, params), store, log, chance)
-        session = Killed(computed_of(log) - computed, marked_of(store) - marked, midway)
-        sessions.append(session)
+        mark, batches = folder / f"mark{number}", chance.randint(2, BATCHES // kills)
+        signs = {
+            "build": part_path(store).exists,
+            "batch": partial(grown, log, log.stat().st_size),
+            "mark": mark.exists,
+        }
+        sign = chance.choice(["build", "batch"]) if number else "mark"
+        arguments = log, mark, batches, "--params", params
+        process = begin(COUNTED, folder, *map(str, arguments))
+        midway = killed_once(process, signs[sign], chance.uniform(0.0, 0.2))
+        sessions.append(Killed(computed_of(log) - computed, marked_of(store) - marked, midway))
     before = marked_of(store)
-    computed = computed_of(log)
-    done = subprocess.run(command(log, params), capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    rows = len(FeatureStore.open(store).array("vl/time"))
-    assert computed_of(log) - computed == rows - before, "just what was missing is computed"
+    report = extract(Params.model_validate(document_of(document, store)), lambda line: None)
+    assert report is not None
+    assert report.computed == report.rows - before, "just what was missing is computed"
     return store, sessions
 
 
-def killed_once(command: list[str], store: Path, log: Path, chance: random.Random) -> bool:
-    """Whether the build was under way when the kill came."""
-    part, begun = part_path(store), log.stat().st_size
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-    sign = chance.choice(["build", "batch"])
-    while process.poll() is None:
-        if (sign == "build" and part.exists()) or log.stat().st_size > begun:
-            break
+def grown(log: Path, size: int) -> bool:
+    return log.stat().st_size > size
+
+
+def killed_once(process: Any, sign: Callable[[], bool], delay_s: float) -> bool:
+    """Whether it was still at work when the kill came."""
+    while process.poll() is None and not sign():
         time.sleep(0.002)
-    time.sleep(chance.uniform(0.0, 0.2))
-    midway = part.exists() and process.poll() is None
-    process.send_signal(signal.SIGKILL)
-    process.communicate()
+    time.sleep(delay_s)
+    if midway := process.poll() is None:
+        os.kill(process.pid, signal.SIGKILL)
+    process.wait()
     return midway
 
 
@@ -128,13 +145,8 @@ def document(make_document, tmp_path_factory) -> dict:
 @pytest.fixture(scope="module")
 def undisturbed(document, tmp_path_factory) -> FeatureStore:
     """The store of a run that nobody kills."""
-    tmp_path = tmp_path_factory.mktemp("undisturbed")
-    store = tmp_path / "undisturbed.zarr"
-    params = tmp_path / "undisturbed.yaml"
-    params.write_text(
-        yaml.safe_dump({**document, "extract": {"store": str(store), "batch_size": BATCH}})
-    )
-    subprocess.run(command(tmp_path / "log", params), check=True, stdout=subprocess.DEVNULL)
+    store = tmp_path_factory.mktemp("undisturbed") / "undisturbed.zarr"
+    extract(Params.model_validate(document_of(document, store)), lambda line: None)
     return FeatureStore.open(store)
 
 
@@ -153,12 +165,14 @@ def assert_equal_stores(found: FeatureStore, expected: FeatureStore) -> None:
     ("kills", "seed"),
     [(3, 0), *(pytest.param(6, seed, marks=pytest.mark.slow) for seed in range(1, 6))],
 )
-def test_random_kills_end_in_the_undisturbed_store(document, undisturbed, tmp_path, kills, seed):
-    store, sessions = killed_runs(document, tmp_path, kills, seed)
+def test_random_kills_end_in_the_undisturbed_store(
+    begin, document, undisturbed, tmp_path, kills, seed
+):
+    store, sessions = killed_runs(begin, document, tmp_path, kills, seed)
     assert sum(one.midway for one in sessions) >= kills - 1, "the kills came too late"
     for one in sessions:
         assert 0 <= one.computed - one.marked <= IN_FLIGHT * BATCH, sessions
-    assert any(one.marked for one in sessions), "no kill came after a commit"
+    assert sessions[0].marked, "no kill came after a commit"
     assert_equal_stores(FeatureStore.open(store), undisturbed)
     assert sorted(path.name for path in tmp_path.glob("killed.zarr*")) == [
         "killed.zarr",
@@ -167,21 +181,17 @@ def test_random_kills_end_in_the_undisturbed_store(document, undisturbed, tmp_pa
     ]
 
 
-def test_sigterm_stops_cleanly_and_the_next_run_continues(document, undisturbed, tmp_path):
+def test_sigterm_stops_cleanly_and_the_next_run_continues(begin, document, undisturbed, tmp_path):
     store, params, log = tmp_path / "stopped.zarr", tmp_path / "stopped.yaml", tmp_path / "log2"
-    params.write_text(
-        yaml.safe_dump({**document, "extract": {"store": str(store), "batch_size": BATCH}})
-    )
-    process = subprocess.Popen(
-        command(log, params), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+    params.write_text(yaml.safe_dump(document_of(document, store)))
+    mark = tmp_path / "mark"
+    process = begin(COUNTED, tmp_path, str(log), str(mark), "2", "--params", str(params))
     while not log.exists() and process.poll() is None:
         time.sleep(0.01)
     os.kill(process.pid, signal.SIGTERM)
-    _, said = process.communicate()
-    assert process.returncode == 1
-    assert "Traceback" not in said
-    assert "run the same command again" in said
-    done = subprocess.run(command(log, params), capture_output=True, text=True, check=True)
-    assert "continuing the interrupted build" in done.stdout
+    assert process.wait() == 1
+    assert process.stderr.read_text() == "stopped; run the same command again\n"
+    said: list[str] = []
+    extract(Params.model_validate(document_of(document, store)), said.append)
+    assert "continuing the interrupted build" in said[0]
     assert_equal_stores(FeatureStore.open(store), undisturbed)

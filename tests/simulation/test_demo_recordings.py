@@ -2,6 +2,7 @@
 
 import errno
 import json
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,7 @@ def recordings(root: Path, name: str) -> list[Recording]:
     return list(opened.recordings)
 
 
+@cache
 def simulated(name: str) -> list[SimulatedEpisode]:
     """The episodes that a set was written from."""
     seeds = np.random.SeedSequence

@@ -1,4 +1,4 @@
-"""A demo checkpoint written once, and what the tests of the frozen model share."""
+"""What the tests of the frozen model share."""
 
 import hashlib
 from collections.abc import Callable
@@ -10,7 +10,6 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.config import VLMParams
-from pipeline.vlm.demo_checkpoint import write_demo_checkpoint
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.qwen import FrozenVLM
@@ -26,13 +25,6 @@ class Extractor:
     spec: FeatureSpec
     preparer: Preparer
     model: FrozenVLM
-
-
-@pytest.fixture(scope="session")
-def demo_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("vlm") / "demo"
-    write_demo_checkpoint(folder)
-    return folder
 
 
 @pytest.fixture(scope="session")

@@ -38,12 +38,16 @@ def jobs(make_frame: Callable[..., NDArray[np.uint8]]) -> list[tuple[str, dict[s
 
 @pytest.fixture(scope="module")
 def prepare(extractor: Callable[..., Any], jobs: list[Any]) -> Callable[..., Any]:
-    """The frozen extractor of some params, its rows and their features."""
+    """The frozen extractor of some params, its rows and their features; made once each."""
+    made: dict[str, tuple[Any, list[PreparedRow], Tensor]] = {}
 
     def make(*args: Any, **changes: Any) -> tuple[Any, list[PreparedRow], Tensor]:
-        frozen = extractor(*args, **(POOLING | changes))
-        rows = [frozen.preparer.prepare(*job) for job in jobs]
-        return frozen, rows, frozen.model.encode(rows)[0]
+        asked = repr((args, changes))
+        if asked not in made:
+            frozen = extractor(*args, **(POOLING | changes))
+            rows = [frozen.preparer.prepare(*job) for job in jobs]
+            made[asked] = frozen, rows, frozen.model.encode(rows)[0]
+        return made[asked]
 
     return make
 

@@ -85,7 +85,7 @@ def test_rows_prepared_in_threads_are_the_same(
     with ThreadPoolExecutor(4) as threads:
         together = list(threads.map(lambda job: preparer.prepare(*job), jobs))
     for one, other in zip(alone, together, strict=True):
-        assert one.shape_key == other.shape_key
+        assert one.layout == other.layout
         assert np.array_equal(one.token_ids, other.token_ids)
         assert np.array_equal(one.pixels, other.pixels)
 
