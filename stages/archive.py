@@ -12,15 +12,21 @@ an archive is named and never restored.
                                                  copy.zarr from the archive a.zarr
 """
 
+from stages.command import Shorthand, run
+
+RESTORE = Shorthand("--restore", "archive.restore", "make the store from its archive")
+
+if __name__ == "__main__":  # here, for --help waits for no import below
+    raise SystemExit(
+        run(__doc__ or "", "stages.archive", shorthands=[RESTORE], sections=("archive",))
+    )
+
 import time
 from pathlib import Path
 
 from pipeline.config import Params
 from pipeline.errors import ConfigError
 from pipeline.store.archive import archive, restore
-from stages.command import Shorthand, run
-
-RESTORE = Shorthand("--restore", "archive.restore", "make the store from its archive")
 
 
 def main(params: Params) -> None:
@@ -56,7 +62,3 @@ def _places(params: Params) -> tuple[Path, Path]:
             "place, or set it to null for one beside the store."
         )
     return store, output
-
-
-if __name__ == "__main__":
-    raise SystemExit(run(__doc__ or "", main, shorthands=[RESTORE], sections=("archive",)))

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
+from importlib import import_module
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -53,7 +54,7 @@ class Shorthand:
 
 def run(
     summary: str,
-    work: Callable[[Params], None],
+    work: Callable[[Params], None] | str,
     arguments: Sequence[str] | None = None,
     shorthands: Sequence[Shorthand] = (),
     sections: Sequence[str] = (),
@@ -61,8 +62,9 @@ def run(
     """Parse the options, do the work, return the exit code.
 
     0 done; 2 something the user can mend, said in one message without a traceback; 1 stopped by
-    Ctrl-C or SIGTERM, or a bug, which keeps its traceback. `sections` are those of params.yaml that
-    `--keys` lists.
+    Ctrl-C or SIGTERM, or a bug, which keeps its traceback. `work` may name a module whose `main` it
+    is: it is imported, which takes seconds, once options and params are known to be good.
+    `sections` are those of params.yaml that `--keys` lists.
     """
     parser = argparse.ArgumentParser(
         description=summary, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -96,7 +98,9 @@ def run(
     ]
     signal.signal(signal.SIGTERM, _terminate)
     try:
-        work(load_params(options.params, overrides))
+        params = load_params(options.params, overrides)
+        main = import_module(work).main if isinstance(work, str) else work
+        main(params)
     except PipelineError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

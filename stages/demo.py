@@ -11,13 +11,17 @@ not write is refused.
 Next: python -m stages.inspect (look at them), stages.extract (the store)
 """
 
+from stages.command import run
+
+if __name__ == "__main__":  # here, for --help waits for no import below
+    raise SystemExit(run(__doc__ or "", "stages.demo", sections=("demo",)))
+
 from pathlib import Path
 
 from pipeline.config import Params
 from pipeline.durable import replace_folder, write_document
 from pipeline.simulation.demo_recordings import MARKER, refuse_foreign, write_demo_recordings
 from pipeline.vlm.demo_checkpoint import write_demo_checkpoint
-from stages.command import run
 
 
 def main(params: Params) -> None:
@@ -32,7 +36,3 @@ def main(params: Params) -> None:
 
     replace_folder(demo.checkpoint, write_marked)
     print(f"{demo.episodes} episodes a format in {demo.recordings}, checkpoint {demo.checkpoint}")
-
-
-if __name__ == "__main__":
-    raise SystemExit(run(__doc__ or "", main, sections=("demo",)))

@@ -23,9 +23,13 @@ changed; added recordings compute only their rows; extract.batch_size and worker
 Next: python -m stages.inspect STORE (look at it), stages.train_head (train). docs/ says the rest.
 """
 
+from stages.command import run
+
+if __name__ == "__main__":  # here, for --help waits for no import below
+    raise SystemExit(run(__doc__ or "", "stages.extract", sections=("data", "vlm", "extract")))
+
 from pipeline.config import Params
 from pipeline.extraction import extract
-from stages.command import run
 
 
 def main(params: Params) -> None:
@@ -43,7 +47,3 @@ def main(params: Params) -> None:
                 f"the model worked {report.model_share:.0%} of the time and waited "
                 f"{report.waited_share:.0%} for frames"
             )
-
-
-if __name__ == "__main__":
-    raise SystemExit(run(__doc__ or "", main, sections=("data", "vlm", "extract")))

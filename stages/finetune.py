@@ -16,6 +16,11 @@ Works in `<finetune.output>.part` and renames it when finished; stopped or kille
 goes on from the last checkpoint. At its end it prints what to run next.
 """
 
+from stages.command import run
+
+if __name__ == "__main__":  # here, for --help waits for no import below
+    raise SystemExit(run(__doc__ or "", "stages.finetune", sections=("finetune", "train_head")))
+
 from pipeline.config import Params
 from pipeline.finetuning import Live, head_params, next_steps, out_of_memory_named
 from pipeline.finetuning.params import left_out
@@ -23,7 +28,6 @@ from pipeline.sampling import split_by_episode
 from pipeline.store import FeatureStore, build_lock, check_trailers
 from pipeline.training import Trainer, check_loggers, open_run, process_group
 from pipeline.training.world import process_device
-from stages.command import run
 
 
 def main(params: Params) -> None:
@@ -47,7 +51,3 @@ def main(params: Params) -> None:
             trainer.fit()
         world.say(f"best and last checkpoint: {opened.output}; curves: {head.logs}")
         world.say(*next_steps(params.finetune, store))
-
-
-if __name__ == "__main__":
-    raise SystemExit(run(__doc__ or "", main, sections=("finetune", "train_head")))

@@ -15,13 +15,17 @@ predicted from the others), probe.horizon (ticks of the action chunk that is pre
 Next: set vlm.pooling to that line, then python -m stages.extract
 """
 
+from stages.command import run
+
+if __name__ == "__main__":  # here, for --help waits for no import below
+    raise SystemExit(run(__doc__ or "", "stages.probe", sections=("probe",)))
+
 from functools import partial
 
 from pipeline.config import Params
 from pipeline.plots.probe import write_probe_plots
 from pipeline.probing import advice, probe, table, write_tables
 from pipeline.store import FeatureStore, check_trailers
-from stages.command import run
 
 
 def main(params: Params) -> None:
@@ -38,7 +42,3 @@ def main(params: Params) -> None:
     print(table(study))
     print(advice(study))
     print(f"{wanted.output}: {', '.join(file.name for file in files)}")
-
-
-if __name__ == "__main__":
-    raise SystemExit(run(__doc__ or "", main, sections=("probe",)))

@@ -12,6 +12,26 @@
 list and gc without --remove write nothing. Next after a merge: python -m stages.verify
 """
 
+from stages.command import Shorthand, run
+
+SHORTHANDS = (
+    Shorthand("action", "stores.action", "list, merge or gc", "ACTION", "?"),
+    Shorthand(
+        "inputs",
+        "stores.inputs",
+        "the stores to merge; the unfinished builds that gc removes",
+        "STORE",
+        "*",
+    ),
+    Shorthand("--into", "stores.output", "the store to merge into", "STORE"),
+    Shorthand("--remove", "stores.remove", "gc removes what it lists"),
+)
+
+if __name__ == "__main__":  # here, for --help waits for no import below
+    raise SystemExit(
+        run(__doc__ or "", "stages.store", shorthands=SHORTHANDS, sections=("stores",))
+    )
+
 import sys
 from pathlib import Path
 
@@ -31,20 +51,6 @@ from pipeline.store.housekeeping import (
 )
 from pipeline.store.merging import merge
 from pipeline.training.dependents import find_trained
-from stages.command import Shorthand, run
-
-SHORTHANDS = (
-    Shorthand("action", "stores.action", "list, merge or gc", "ACTION", "?"),
-    Shorthand(
-        "inputs",
-        "stores.inputs",
-        "the stores to merge; the unfinished builds that gc removes",
-        "STORE",
-        "*",
-    ),
-    Shorthand("--into", "stores.output", "the store to merge into", "STORE"),
-    Shorthand("--remove", "stores.remove", "gc removes what it lists"),
-)
 
 
 def main(params: Params) -> None:
@@ -151,7 +157,3 @@ def _selected(wanted: StoresParams) -> list[Leftover]:
         for folder, paths in by_folder.items()
         for one in named(take_inventory(folder, subfolders=False), paths)
     ]
-
-
-if __name__ == "__main__":
-    raise SystemExit(run(__doc__ or "", main, shorthands=SHORTHANDS, sections=("stores",)))

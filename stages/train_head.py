@@ -19,12 +19,16 @@ from the last checkpoint; finished, it does nothing; with other params it begins
 Next: python -m stages.evaluate
 """
 
+from stages.command import run
+
+if __name__ == "__main__":  # here, for --help waits for no import below
+    raise SystemExit(run(__doc__ or "", "stages.train_head", sections=("train_head",)))
+
 from pipeline.batches import open_store
 from pipeline.config import Params
 from pipeline.sampling import split_by_episode
 from pipeline.store import build_lock, check_trailers
 from pipeline.training import Trainer, check_loggers, open_run, process_group
-from stages.command import run
 
 
 def main(params: Params) -> None:
@@ -47,7 +51,3 @@ def main(params: Params) -> None:
             world.say(*trainer.summary())
             trainer.fit()
         world.say(f"best and last checkpoint: {opened.output}; curves: {head.logs}")
-
-
-if __name__ == "__main__":
-    raise SystemExit(run(__doc__ or "", main, sections=("train_head",)))

@@ -11,17 +11,23 @@ where the store is sound; 2 with everything that is wrong and what to run next.
 The store itself is never written to.
 """
 
-from pipeline.config import Params
-from pipeline.errors import NumericsError, StoreIncomplete
-from pipeline.extraction.reextract import reextract
-from pipeline.extraction.repair import repair, with_identity
-from pipeline.store.integrity import verify
 from stages.command import Shorthand, run
 
 SHORTHANDS = (
     Shorthand("--reextract", "verify.reextract", "random rows to compute again", value="N"),
     Shorthand("--repair", "verify.repair", "begin a new build without what is damaged"),
 )
+
+if __name__ == "__main__":  # here, for --help waits for no import below
+    raise SystemExit(
+        run(__doc__ or "", "stages.verify", shorthands=SHORTHANDS, sections=("verify",))
+    )
+
+from pipeline.config import Params
+from pipeline.errors import NumericsError, StoreIncomplete
+from pipeline.extraction.reextract import reextract
+from pipeline.extraction.repair import repair, with_identity
+from pipeline.store.integrity import verify
 
 
 def main(params: Params) -> None:
@@ -44,7 +50,3 @@ def main(params: Params) -> None:
         if found.beyond:
             said = [f"{store}: rows are not what they would be today:", *found.refusals()]
             raise NumericsError("\n".join(said))
-
-
-if __name__ == "__main__":
-    raise SystemExit(run(__doc__ or "", main, shorthands=SHORTHANDS, sections=("verify",)))

@@ -1,6 +1,7 @@
 """Exit codes and messages that every stage shares."""
 
 import os
+import runpy
 import signal
 import subprocess
 import sys
@@ -9,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import RecordingError
+from stages import command
 from stages.command import Shorthand, run
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -142,29 +144,41 @@ def test_one_and_a_word_when_stopped(capsys, sent):
     assert "run the same command again" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    "stage",
-    [
-        "demo",
-        "extract",
-        "train_head",
-        "evaluate",
-        "compare",
-        "finetune",
-        "verify",
-        "archive",
-        "probe",
-        "store",
-    ],
-)
-def test_help_explains_each_stage_from_any_folder(stage, tmp_path):
+def test_work_that_is_named_is_imported_when_the_params_are_good(monkeypatch, tmp_path):
+    (tmp_path / "named_work.py").write_text("seen = []\nmain = seen.append\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert run("Summary.", "named_work", ["--params", PARAMS, "--set", "nothing.like=it"]) == 2
+    assert "named_work" not in sys.modules
+    assert run("Summary.", "named_work", ["--params", PARAMS, "--set", "data.action_hz=5"]) == 0
+    assert sys.modules.pop("named_work").seen[0].data.action_hz == 5
+
+
+STAGES = sorted(path.stem for path in ROOT.glob("stages/[a-z]*.py") if path.stem != "command")
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_help_explains_each_stage_from_any_folder_at_once(stage, tmp_path):
+    """Nothing that takes seconds to import is imported for it."""
+    for heavy in ("torch", "zarr", "matplotlib", "transformers"):
+        # The working directory is the first place that `python -m` imports from.
+        (tmp_path / f"{heavy}.py").write_text("raise ImportError(__name__)")
     done = subprocess.run(
         [sys.executable, "-m", f"stages.{stage}", "--help"],
         cwd=tmp_path,
         capture_output=True,
         text=True,
-        check=True,
+        check=False,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
     )
+    assert done.returncode == 0, done.stderr
     assert "--set section.key=value" in done.stdout
     assert len(done.stdout.split()) > 30
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_stage_runs_its_own_work(stage, monkeypatch):
+    given = []
+    monkeypatch.setattr(command, "run", lambda summary, work, **_: given.append(work))
+    with pytest.raises(SystemExit):
+        runpy.run_path(str(ROOT / f"stages/{stage}.py"), run_name="__main__")
+    assert given == [f"stages.{stage}"]
