@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from jaxtyping import install_import_hook
 
 from pipeline.simulation.insertion_formats import write_raw
@@ -60,6 +61,37 @@ def tiny_store(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
         return Path(shutil.copytree(originals[key], folder / f"{name}.zarr"))
 
     return copied
+
+
+@pytest.fixture(scope="session")
+def tiny_head() -> Callable[..., dict[str, Any]]:
+    """`tiny_head(folder, key=value, ...)`: the section `train_head` of a policy of a few hundred
+    weights that works below this folder and trains in a moment on a tiny store."""
+
+    def section(folder: Path, **changed: Any) -> dict[str, Any]:
+        return {
+            "sensor_encoder": {"channels": [8], "layers": 0, "heads": 1, "output_dim": 8},
+            "state_encoder": {"dim": 8, "layers": 0, "heads": 1, "output_dim": 8},
+            "expert": {"dim": 8, "layers": 1, "heads": 1},
+            "sensor_window": 6,
+            "state_window": 5,
+            "batch_size": 8,
+            "max_steps": 3,
+            "device": "cpu",
+            "output": str(folder / "head"),
+            "logs": str(folder / "logs"),
+        } | changed
+
+    return section
+
+
+@pytest.fixture(scope="module")
+def one_thread() -> Iterator[None]:
+    """Sums over several threads are taken in another order, so that bits differ."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="session")

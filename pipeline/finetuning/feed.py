@@ -5,7 +5,6 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Self
 
 import numpy as np
@@ -27,11 +26,6 @@ class LiveBatch(Batch):
     """The distinct VL rows of the batch, each once."""
     row_of: Int64[Tensor, " batch"]
     """Index into `rows` of each tick."""
-
-    @classmethod
-    def of(cls, batch: Batch, rows: Sequence[PreparedRow], row_of: Int64[Tensor, " batch"]) -> Self:
-        """The batch with these rows; its tensors are shared."""
-        return cls(**vars(batch), rows=rows, row_of=row_of)
 
 
 @dataclass(frozen=True)
@@ -75,7 +69,8 @@ class LiveFeed(Iterator[tuple[Draw, LiveBatch]]):
         coming = self._coming.popleft()
         rows = [row for future in coming.rows for row in future.result()]
         self.waited_s += time.perf_counter() - started
-        return draw, LiveBatch.of(batch, rows, coming.row_of.to(batch.features.device))
+        row_of = coming.row_of.to(batch.features.device)
+        return draw, LiveBatch(**vars(batch), rows=rows, row_of=row_of)
 
     def close(self) -> None:
         """Stop all threads and wait for them."""
@@ -85,12 +80,7 @@ class LiveFeed(Iterator[tuple[Draw, LiveBatch]]):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         self.close()
 
     def _announce(self, draw: Draw) -> Draw:

@@ -13,7 +13,6 @@ from pipeline.normalization import fit_channels
 from pipeline.probing.folds import Folds
 from pipeline.probing.moments import Moments
 from pipeline.probing.readers import Reader, check
-from pipeline.probing.summaries import Summaries
 from pipeline.store import FeatureStore
 
 _BLOCK_BYTES = 64 * 2**20
@@ -47,15 +46,16 @@ class Block:
 class Table:
     """The ticks of every part with what is predicted and what is known beside the features.
 
+    `summaries` (tick, column) are those of `summarize` at the ticks of the folds.
     Nothing here grows with the ticks but their numbers and the file of `summaries`.
     """
 
     def __init__(
-        self, store: FeatureStore, folds: Folds, summaries: Summaries, horizon: int
+        self, store: FeatureStore, folds: Folds, summaries: NDArray[np.float32], horizon: int
     ) -> None:
         self.store = store
         self.folds = folds
-        self.beside = summaries.width
+        self.beside = summaries.shape[1]
         self.targets = horizon * store.action_dim
         self._summaries = summaries
         self._steps = np.arange(horizon)
@@ -115,7 +115,7 @@ class Table:
     def _beside(self, at: NDArray[np.int64]) -> Tensor:
         chunk = self.store.array("tick/action")[self.folds.ticks[at, None] + self._steps]
         target = (chunk.astype(np.float64) - self._action.mean) / self._action.scale
-        known = self._summaries.values[at].astype(np.float64)
+        known = self._summaries[at].astype(np.float64)
         return torch.from_numpy(np.concatenate([known, target.reshape(len(at), -1)], axis=1))
 
 

@@ -34,10 +34,7 @@ class Moments:
 
 def total(parts: Sequence[Moments]) -> Moments:
     """Over all parts, in their order."""
-    summed = parts[0]
-    for one in parts[1:]:
-        summed = summed + one
-    return summed
+    return sum(parts[1:], start=parts[0])
 
 
 def variance(moments: Moments, targets: int) -> Tensor:

@@ -1,7 +1,6 @@
 """What the other streams know at a tick: a few numbers for each causal window."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from tempfile import TemporaryFile
 
 import numpy as np
@@ -22,28 +21,17 @@ _SAMPLE_TICKS = 2048
 _BATCH_TICKS = 64
 
 
-@dataclass(frozen=True, eq=False)
-class Summaries:
-    """State and sensor at every tick that is read, for a linear reader."""
-
-    values: NDArray[np.float32]
-    """(tick, column), in a file without a name that ends with the process; no column where the
-    store has neither stream."""
-
-    @property
-    def width(self) -> int:
-        """Columns."""
-        return self.values.shape[1]
-
-
 def summarize(
     store: FeatureStore,
     ticks: NDArray[np.int64],
     fold: NDArray[np.int64],
     sensor_window: int,
     state_window: int,
-) -> Summaries:
+) -> NDArray[np.float32]:
     """The last, the mean and the spread of every channel over the window before each tick.
+
+    (tick, column), in a file without a name that ends with the process; no column where the store
+    has neither stream.
 
     Channels of one unit that are more than `GROUP_WIDTH`, as those of an A-scan, are projected on
     that many main directions of each summary, so a force beside them is not lost. The windows are
@@ -57,7 +45,7 @@ def summarize(
     projections = _fitted(store, ticks[::step], fold[::step], windows, groups)
     width = sum(one.width + 1 for one in projections.values())
     if not width:
-        return Summaries(np.empty((len(ticks), 0), np.float32))
+        return np.empty((len(ticks), 0), np.float32)
     # Beside the few sums, this is the only thing that grows with the ticks: it may leave memory.
     with TemporaryFile() as file:
         values = np.memmap(file, np.float32, "w+", shape=(len(ticks), width))
@@ -69,7 +57,7 @@ def summarize(
             parts += [torch.where(known, project(summary), 0.0), known.double()]
         values[done : done + len(batch)] = torch.cat(parts, dim=1).float().numpy()
         done += len(batch)
-    return Summaries(values)
+    return values
 
 
 def _fitted(

@@ -1,16 +1,13 @@
 """An exponential moving average of a module's weights."""
 
 import copy
-from typing import Generic, TypeVar
 
 import torch
 from torch import nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
-Module = TypeVar("Module", bound=nn.Module)
 
-
-class WeightAverage(Generic[Module]):
+class WeightAverage:
     """A second module whose weights trail those of a first; it is the one that is judged.
 
     After update t (from 1): average += (1 - d) (weights - average), d = min(decay, t / (t + 9)):
@@ -20,7 +17,7 @@ class WeightAverage(Generic[Module]):
     vision-language model may be gigabytes) and buffers (normalisation, group weights).
     """
 
-    def __init__(self, module: Module, decay: float) -> None:
+    def __init__(self, module: nn.Module, decay: float) -> None:
         frozen = [value for value in module.parameters() if not value.requires_grad]
         shared = {id(value): value for value in (*frozen, *module.buffers())}
         self.module = copy.deepcopy(module, shared).requires_grad_(False).eval()

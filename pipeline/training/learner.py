@@ -53,7 +53,7 @@ class Learner:
         """The parameters that learn, by name; the others are neither averaged nor kept."""
         world.spread(value.data for value in self.learning.values())
         self.optimizer = make_optimizer(self.module, params, peak_rates(self.module, front, params))
-        self.average: WeightAverage[nn.Module] = WeightAverage(self.module, params.ema_decay)
+        self.average = WeightAverage(self.module, params.ema_decay)
         self._terminal = TerminalStop(store, device) if params.terminal_stop else None
         self._compiled = compiled(self.trained.loss, device) if params.compile else None
 

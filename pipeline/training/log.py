@@ -4,7 +4,6 @@ import csv
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from pipeline.config import TrainHeadParams
@@ -65,12 +64,7 @@ class TrainingLog:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *raised: object) -> None:
         with disk_full_named(self._folder), ExitStack() as closing:
             # Whatever one logger does, the others are closed too.
             for logger in reversed(self._loggers):

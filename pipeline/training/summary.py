@@ -27,26 +27,16 @@ def describe_data(
     if split.note:
         lines.append(f"split: {split.note}")
     streams = {
-        "sensor": (
-            store.sensor_channels,
-            shape.sensor_channels,
-            params.sensor_enabled,
-            "sensor_enabled",
-        ),
-        "state": (
-            store.state_dim,
-            shape.state_dim,
-            params.robot_state_enabled,
-            "robot_state_enabled",
-        ),
-        "features": (slots * dim, slots * dim, params.features_enabled, "features_enabled"),
+        "sensor": (store.sensor_channels, shape.sensor_channels, "sensor_enabled"),
+        "state": (store.state_dim, shape.state_dim, "robot_state_enabled"),
+        "features": (slots * dim, slots * dim, "features_enabled"),
     }
-    for stream, (stored, trained, enabled, param) in streams.items():
+    for stream, (stored, trained, switch) in streams.items():
         if not trained:
             lacking = "the training episodes" if stored else "the store"
             lines.append(f"{stream}: absent from {lacking}, its encoder is disabled")
-        elif not enabled:
-            lines.append(f"{stream}: disabled by train_head.{param}")
+        elif not getattr(params, switch):
+            lines.append(f"{stream}: disabled by train_head.{switch}")
     return lines
 
 

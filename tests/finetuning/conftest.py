@@ -3,13 +3,12 @@
 import copy
 import json
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image, ImageDraw
 
 from pipeline.config import Params
@@ -39,13 +38,9 @@ SMALL_TUNING: dict[str, Any] = {
 }
 
 
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Sums over several threads are taken in another order, so that bits differ."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+@pytest.fixture(autouse=True, scope="module")
+def _bits_are_compared(one_thread: None) -> None:
+    """In every test of this room."""
 
 
 def _write_episode(folder: Path, seed: int, views: tuple[str, ...] = VIEWS) -> None:

@@ -38,7 +38,14 @@ def any_policy(request: pytest.FixtureRequest, build_policy: BuildPolicy) -> Pol
     expert, fusion = request.param
     kind = "joint" if KINDS.index(request.param) % 2 else "force_aware"
     sensor = {"kind": kind, "channels": [16, 32], "layers": 1, "heads": 2, "output_dim": 24}
-    policy = build_policy(model_type=expert, fusion_strategy=fusion, sensor_encoder=sensor)
+    steps = {"sampling_steps": 3}
+    policy = build_policy(
+        model_type=expert,
+        fusion_strategy=fusion,
+        sensor_encoder=sensor,
+        diffusion=steps,
+        flow_matching=steps,
+    )
     # Experts may begin with weights of zero; an answer that ignores the context tests nothing.
     with torch.no_grad():
         for parameter in policy.expert.parameters():

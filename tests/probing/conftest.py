@@ -14,10 +14,15 @@ from pipeline.store import FeatureStore
 Rewrite = Callable[[FeatureStore, np.random.Generator], None]
 
 
+@pytest.fixture(scope="session")
+def _written(tiny_store: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tiny_store(tmp_path_factory.mktemp("probing"))
+
+
 @pytest.fixture
-def store(tiny_store: Callable[..., Path], tmp_path: Path) -> FeatureStore:
+def store(_written: Path) -> FeatureStore:
     """Six episodes of 30 ticks, three slots of eight; what is written into it stays in memory."""
-    return FeatureStore.open(tiny_store(tmp_path))
+    return FeatureStore.open(_written)
 
 
 @pytest.fixture

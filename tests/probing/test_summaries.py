@@ -19,7 +19,7 @@ FOLD = TICKS // 30 % 3
 def test_last_mean_and_spread_of_the_causal_window(
     store: FeatureStore, limited: Callable[[np.ndarray, np.ndarray], np.ndarray]
 ) -> None:
-    values = summarize(store, TICKS, FOLD, 20, 100).values
+    values = summarize(store, TICKS, FOLD, 20, 100)
     ends = store.array("tick/sensor_end")[TICKS]
     starts = store.array("episode/sensor_start")[TICKS // 30]
     readings = store.array("sensor/values").astype(np.float64)
@@ -35,15 +35,15 @@ def test_last_mean_and_spread_of_the_causal_window(
 
 
 def test_nothing_later_than_the_tick_is_read(store: FeatureStore) -> None:
-    before = np.array(summarize(store, TICKS[:3], FOLD[:3], 20, 20).values)
+    before = np.array(summarize(store, TICKS[:3], FOLD[:3], 20, 20))
     store.array("sensor/values")[store.array("tick/sensor_end")[TICKS[2]] :] = 1e3
     store.array("state/values")[store.array("tick/state_end")[TICKS[2]] :] = 1e3
-    np.testing.assert_array_equal(summarize(store, TICKS[:3], FOLD[:3], 20, 20).values, before)
+    np.testing.assert_array_equal(summarize(store, TICKS[:3], FOLD[:3], 20, 20), before)
 
 
 def test_ticks_without_a_reading_say_so(store: FeatureStore) -> None:
     store.array("tick/sensor_end")[30:60] = store.array("episode/sensor_start")[1]
-    values = summarize(store, TICKS, FOLD, 20, 20).values
+    values = summarize(store, TICKS, FOLD, 20, 20)
     missing = TICKS // 30 == 1
     assert (values[missing, :16] == 0).all()
     assert (values[~missing, 15] == 1).all()
@@ -56,7 +56,7 @@ def test_a_force_is_not_lost_beside_a_wide_scan(
     monkeypatch.setattr("pipeline.probing.summaries.GROUP_WIDTH", 2)
     store = FeatureStore.open(tiny_store(tmp_path, sensor_channels=9, state_dim=0))
     store.streams["sensor"]["units"][4] = "N"
-    values = summarize(store, TICKS, FOLD, 1, 1).values
+    values = summarize(store, TICKS, FOLD, 1, 1)
     assert values.shape[1] == 3 * (2 + 1) + 1
     force = store.array("sensor/values")[store.array("tick/sensor_end")[TICKS] - 1, 4]
     correlations = [abs(np.corrcoef(force, column)[0, 1]) for column in values[:, :3].T]
@@ -65,7 +65,7 @@ def test_a_force_is_not_lost_beside_a_wide_scan(
 
 def test_no_stream_is_no_column(tiny_store: Callable[..., Path], tmp_path: Path) -> None:
     store = FeatureStore.open(tiny_store(tmp_path, sensor_channels=0, state_dim=0))
-    assert summarize(store, TICKS, FOLD, 5, 5).values.shape == (len(TICKS), 0)
+    assert summarize(store, TICKS, FOLD, 5, 5).shape == (len(TICKS), 0)
 
 
 @pytest.mark.parametrize("window", [1, 20])

@@ -28,7 +28,9 @@ def flip() -> Callable[[Path, str], Path]:
 
 
 @pytest.fixture(scope="session")
-def quick_params(tiny_store: Callable[..., Path]) -> Callable[[Path], dict[str, Any]]:
+def quick_params(
+    tiny_store: Callable[..., Path], tiny_head: Callable[..., dict[str, Any]]
+) -> Callable[[Path], dict[str, Any]]:
     """`quick_params(folder)`: params of a head that trains in a moment, its tiny store there."""
 
     def document(folder: Path) -> dict[str, Any]:
@@ -36,18 +38,7 @@ def quick_params(tiny_store: Callable[..., Path]) -> Callable[[Path], dict[str, 
             "data": {"sources": [{"name": "left", "path": "a"}, {"name": "right", "path": "b"}]},
             "vlm": {"checkpoint": "unused"},
             "extract": {"store": str(tiny_store(folder))},
-            "train_head": {
-                "sensor_encoder": {"channels": [8], "layers": 0, "heads": 1, "output_dim": 8},
-                "state_encoder": {"dim": 8, "layers": 0, "heads": 1, "output_dim": 8},
-                "expert": {"dim": 8, "layers": 1, "heads": 1},
-                "batch_size": 8,
-                "max_steps": 3,
-                "sensor_window": 6,
-                "state_window": 5,
-                "device": "cpu",
-                "output": str(folder / "head"),
-                "logs": str(folder / "logs"),
-            },
+            "train_head": tiny_head(folder),
         }
 
     return document

@@ -2,44 +2,38 @@
 
 import json
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 import yaml
 from PIL import Image
 
 from stages import evaluate, extract, finetune, train_head
 from stages.command import run
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 Start = Callable[..., "subprocess.Popen[str]"]
-SLOWED = """
+HELD = """
 import sys, time
 from pipeline.training import Trainer
 from stages import finetune
 from stages.command import run
 
 step = Trainer._train_step
-def slow(self, *rest):
-    stopped = step(self, *rest)
-    print("step", self.step, flush=True)
-    time.sleep(0.05)
+def held(self, batches, interrupted):
+    stopped = step(self, batches, interrupted)
+    if self.step == 3:
+        print("holding", flush=True)
+        while not interrupted():
+            time.sleep(0.01)
     return stopped
-Trainer._train_step = slow
+Trainer._train_step = held
 sys.exit(run("", finetune.main, ["--params", sys.argv[1]]))
 """
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Sums over several threads are taken in another order, so that bits differ."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+"""A tuning that waits after its third step until it is stopped."""
 
 
 @pytest.fixture(scope="session")
@@ -181,11 +175,11 @@ def test_killed_in_mid_run_it_ends_where_an_undisturbed_run_ends(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    process = started_until(SLOWED, write_params("killed"), "step 3")
+    process = started_until(HELD, write_params("killed"), "holding")
     assert run("", finetune.main, ["--params", str(write_params("killed"))]) == 2
     assert "being built by process" in capsys.readouterr().err
     process.kill()
-    process.communicate(timeout=60)
+    process.communicate()
     assert (tmp_path / "killed.part/last/adapter/adapter_config.json").exists()
     for name in ("undisturbed", "killed"):
         assert run("", finetune.main, ["--params", str(write_params(name))]) == 0

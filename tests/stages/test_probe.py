@@ -72,13 +72,16 @@ def test_a_ranking_files_and_pictures(params: Path, capsys: pytest.CaptureFixtur
     assert np.mean(told) == pytest.approx(float(groups[0]["r2_beside"]), abs=1e-5)
 
 
-def test_the_same_again_gives_the_same_bytes(params: Path) -> None:
-    report = params.parent / "report"
+def test_the_same_again_gives_the_same_bytes_and_leaves_the_store(params: Path) -> None:
+    report, store = params.parent / "report", params.parent / "tiny.zarr"
+    stored = {file: file.read_bytes() for file in store.rglob("*") if file.is_file()}
     assert run("", probe.main, ["--params", str(params)]) == 0
     before = {name: (report / name).read_bytes() for name in FILES}
     again = ["--params", str(params), "--set", "probe.threads=1"]
     assert run("", probe.main, again) == 0
     assert {name: (report / name).read_bytes() for name in FILES} == before
+    assert {file: file.read_bytes() for file in store.rglob("*") if file.is_file()} == stored
+    FeatureStore.open(store)
 
 
 def test_what_cannot_be_probed_is_said(
@@ -94,14 +97,6 @@ def test_what_cannot_be_probed_is_said(
     assert run("", probe.main, ["--params", str(params), "--set", "probe.horizon=31"]) == 2
     assert "shorter probe.horizon" in capsys.readouterr().err
     assert not (params.parent / "report").exists()
-
-
-def test_the_store_is_left_as_it_is(params: Path) -> None:
-    path = params.parent / "tiny.zarr"
-    before = {file: file.read_bytes() for file in path.rglob("*") if file.is_file()}
-    assert run("", probe.main, ["--params", str(params)]) == 0
-    assert {file: file.read_bytes() for file in path.rglob("*") if file.is_file()} == before
-    FeatureStore.open(path)
 
 
 def test_a_damaged_store_is_refused(

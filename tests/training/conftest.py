@@ -1,11 +1,11 @@
 """A small store and a policy of a few thousand parameters that trains in a second."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 
 from pipeline.config import TrainHeadParams
 from pipeline.sampling import split_by_episode
@@ -38,27 +38,31 @@ def store(
     return FeatureStore.open(tiny_store(tmp_path_factory.mktemp("training")))
 
 
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Sums over several threads are taken in another order, so that bits differ."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+@pytest.fixture(autouse=True, scope="module")
+def _bits_are_compared(one_thread: None) -> None:
+    """In every test of this room."""
 
 
-@pytest.fixture
-def params(tmp_path: Path) -> Callable[..., TrainHeadParams]:
-    """`params(key=value, ...)`: small params that work below the test's folder."""
+@pytest.fixture(scope="session")
+def params_below() -> Callable[..., TrainHeadParams]:
+    """`params_below(folder, key=value, ...)`: small params that work below this folder."""
 
-    def make(**changed: Any) -> TrainHeadParams:
-        places = {"output": tmp_path / "head", "logs": tmp_path / "logs"}
+    def make(folder: Path, **changed: Any) -> TrainHeadParams:
+        places = {"output": folder / "head", "logs": folder / "logs"}
         return TrainHeadParams.model_validate(SMALL | places | changed)
 
     return make
 
 
 @pytest.fixture
+def params(
+    params_below: Callable[..., TrainHeadParams], tmp_path: Path
+) -> Callable[..., TrainHeadParams]:
+    """`params(key=value, ...)`: small params that work below the test's folder."""
+    return partial(params_below, tmp_path)
+
+
+@pytest.fixture(scope="session")
 def trainer() -> Callable[[FeatureStore, TrainHeadParams], Trainer]:
     """A trainer that begins anew or goes on with what lies at the params' output."""
 

@@ -21,28 +21,32 @@ from pipeline.training import Trainer, World, process_group
 from pipeline.training.world import process_device
 
 ROOT = Path(__file__).resolve().parents[2]
+FAILURES = ("open 0", "open 1", "step 1")
+"""Where one process alone fails, and its rank."""
 Make = Callable[..., Any]
 TRAIN = """
-import os, sys, time
+import contextlib, io, json, os, sys, time
+from datetime import timedelta
+from pathlib import Path
+import torch.distributed as dist
 import pipeline.training.loop as loop
 from pipeline.errors import StoreIncomplete
+from pipeline.training import speaker
 from stages import train_head
 from stages.command import run
 
 loop.LOG_EVERY = 1
-slow = float(sys.argv.pop(1))
-step = loop.Trainer._train_step
+step, fitted, opened = loop.Trainer._train_step, loop.Trainer.fit, train_head.open_store
+rank = os.environ["RANK"]
 
-def train_step(self, *rest):
-    stopped = step(self, *rest)
-    if slow and self.world.first:
-        print("step", self.step, flush=True)
-    time.sleep(slow)
+def train_step(self, batches, interrupted):
+    stopped = step(self, batches, interrupted)
+    if self.step == hold:
+        if self.world.first:
+            print("holding", flush=True)
+        while not interrupted():
+            time.sleep(0.01)
     return stopped
-
-loop.Trainer._train_step = train_step
-place, rank = sys.argv.pop(1), os.environ["RANK"]
-fitted = loop.Trainer.fit
 
 def fail(*rest, **named):
     raise StoreIncomplete(f"no store on the machine of {rank}")
@@ -51,11 +55,31 @@ def fit(self):
     self.learner.step = fail
     fitted(self)
 
-if place == f"open {rank}":
-    train_head.open_store = fail
-if place == f"step {rank}":
-    loop.Trainer.fit = fit
-sys.exit(run("", train_head.main, sys.argv[1:]))
+def train(arguments, fails="", holds=None):
+    global hold
+    hold = holds
+    # Rank 0 is waited for where it fails too, however late; where it does not, for a moment.
+    alone = fails.endswith("1")
+    speaker.PRECEDENCE = timedelta(seconds=0.2 if alone else 200)
+    train_head.open_store = fail if fails == f"open {rank}" else opened
+    loop.Trainer.fit = fit if fails == f"step {rank}" else fitted
+    return run("", train_head.main, arguments)
+
+case = json.loads(sys.argv[1])
+if isinstance(case, dict):
+    loop.Trainer._train_step = train_step
+    sys.exit(train(**case))
+prefix, found = dist.PrefixStore, []
+for number, one in enumerate(case):
+    # A meeting of its own for each, at the port of all.
+    dist.PrefixStore = lambda name, store: prefix(f"{number} {name}", store)
+    with contextlib.redirect_stderr(io.StringIO()) as err:
+        try:
+            code = train(**one)
+        except SystemExit as end:
+            code = end.code
+    found.append((code, err.getvalue()))
+Path(sys.argv[2] + rank).write_text(json.dumps(found))
 """
 PRIMITIVES = """
 import torch
@@ -141,6 +165,11 @@ def write(store: FeatureStore, params: Make, tmp_path: Path) -> Make:
     return make
 
 
+def case(written: Path, **how: Any) -> dict[str, Any]:
+    """A training of these params: `fails="PLACE RANK"` there, `holds=STEP` till it is stopped."""
+    return {"arguments": ["--params", str(written)]} | how
+
+
 def curves(logs: Path) -> dict[str, list[float]]:
     return {
         str(file.relative_to(logs)): [
@@ -181,11 +210,11 @@ def test_two_processes_follow_the_curve_of_one_that_accumulates(
         "loggers": ["report", "tensorboard"],
     }
     together = write("together", grad_accumulation=2, **chosen)
-    process = torchrun(script, 0, "", "--params", together)
+    process = torchrun(script, json.dumps(case(together)))
     alone = write("alone", grad_accumulation=4, **chosen)
     monkeypatch.setattr("pipeline.training.loop.LOG_EVERY", 1)
     done = train_alone(trainer, store, alone)
-    out, err = process.communicate(timeout=120)
+    out, err = process.communicate()
     assert process.returncode == 0, err
     assert "device cpu on 2 processes" in out
     assert out.count("parameters") == 1, "one process speaks"
@@ -203,71 +232,61 @@ def test_two_processes_follow_the_curve_of_one_that_accumulates(
 def test_a_signal_to_torchrun_stops_all_after_one_step_and_one_process_can_go_on(
     store: FeatureStore, trainer: Make, write: Make, script: Path, tmp_path: Path
 ) -> None:
-    written = write("together", model_type="diffusion", checkpoint_every=1000, max_steps=30)
-    process = torchrun(script, 0.05, "", "--params", written)
+    written = write("together", model_type="diffusion", checkpoint_every=1000, max_steps=12)
+    process = torchrun(script, json.dumps(case(written, holds=6)))
     assert process.stdout is not None
-    while "step 6" not in (line := process.stdout.readline()):
+    while "holding" not in (line := process.stdout.readline()):
         assert line, "ended before step 6"
     process.send_signal(signal.SIGTERM)
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate()
     assert err.count("stopped; run the same command again") == 1
     last = json.loads((tmp_path / "together.part/last/trainer.json").read_text())
-    assert 6 <= last["step"] <= 10
+    assert last["step"] == 7
     head = load_params(written, ["train_head.grad_accumulation=2"]).train_head
     resumed = trainer(store, head)
-    assert (resumed.run.status, resumed.step) == ("resumed", last["step"])
+    assert (resumed.run.status, resumed.step) == ("resumed", 7)
     resumed.fit()
     train_alone(
-        trainer, store, write("alone", model_type="diffusion", max_steps=30, grad_accumulation=2)
+        trainer, store, write("alone", model_type="diffusion", max_steps=12, grad_accumulation=2)
     )
     assert same(tmp_path / "together/last", tmp_path / "alone/last")
 
 
-def test_a_loss_that_is_not_finite_is_said_once_and_nobody_waits(write: Make, script: Path) -> None:
-    process = torchrun(script, 0, "", "--params", write("together", lr=1e30))
-    _, err = process.communicate(timeout=100)
-    assert process.returncode == 1
-    assert err.count("error: step") == 1
-    assert "expected a finite loss and gradient" in err
-
-
-def test_what_only_rank_0_finds_ends_all(write: Make, script: Path, tmp_path: Path) -> None:
-    with build_lock(tmp_path / "together"):
-        process = torchrun(script, 0, "", "--params", write("together"))
-        _, err = process.communicate(timeout=100)
-    assert process.returncode == 1
-    assert err.count("being built by") == 1
-    assert "SaidByFirst" not in err
-
-
-@pytest.mark.parametrize(
-    ("override", "said"),
-    [
-        ("train_head.store=nowhere.zarr", "no finished store"),
-        ("train_head.device=cuda:0", "expected auto, cpu or cuda for 2 processes"),
-    ],
-)
-def test_what_all_processes_find_is_said_once(
-    write: Make, script: Path, override: str, said: str
+def test_what_goes_wrong_is_said_once_and_nobody_waits(
+    write: Make, script: Path, tmp_path: Path
 ) -> None:
-    process = torchrun(script, 0, "", "--params", write("together"), "--set", override)
-    _, err = process.communicate(timeout=100)
+    """One case after the other between the same two processes, which must all end each."""
+    cases = [
+        (case(write("diverging", lr=1e30)), "error: step"),
+        (case(write("held")), "being built by"),
+        (case(write("nowhere", store="nowhere.zarr")), "no finished store"),
+        (case(write("cuda", device="cuda:0")), "expected auto, cpu or cuda for 2 processes"),
+        *(
+            (case(write(fails), fails=fails), f"no store on the machine of {fails[-1]}")
+            for fails in FAILURES
+        ),
+    ]
+    with build_lock(tmp_path / "held"):
+        process = torchrun(script, json.dumps([one for one, _ in cases]), tmp_path / "found")
+        _, err = process.communicate()
+    assert process.returncode == 0, err
+    found = [json.loads((tmp_path / f"found{rank}").read_text()) for rank in range(2)]
+    for (one, said), of_first, of_other in zip(cases, *found, strict=True):
+        alone = one.get("fails", "").endswith("1")
+        speaks, quiet = (of_other, of_first) if alone else (of_first, of_other)
+        assert (speaks[0], quiet[0]) == (2, 2), one
+        assert speaks[1].count("error: ") == 1
+        assert speaks[1].count(said) == 1
+        assert ("error: process of rank 1: " in speaks[1]) == alone
+        assert quiet[1] == ""
+
+
+def test_a_process_that_fails_alone_ends_torchrun(write: Make, script: Path) -> None:
+    process = torchrun(script, json.dumps(case(write("together"), fails="step 1")))
+    _, err = process.communicate()
     assert process.returncode == 1
     assert err.count("error: ") == 1
-    assert err.count(said) == 1
-    assert "process of rank" not in err, "rank 0 speaks"
-
-
-@pytest.mark.parametrize(("place", "rank"), [("open", 0), ("open", 1), ("step", 1)])
-def test_what_one_process_finds_is_said_and_nobody_waits(
-    write: Make, script: Path, place: str, rank: int
-) -> None:
-    process = torchrun(script, 0, f"{place} {rank}", "--params", write("together"))
-    _, err = process.communicate(timeout=100)
-    assert process.returncode == 1
-    assert err.count("error: ") == 1
-    assert err.count(f"no store on the machine of {rank}") == 1
-    assert ("error: process of rank 1: " in err) == (rank == 1)
+    assert err.count("error: process of rank 1: no store on the machine of 1") == 1
     assert "stopped; the same command" not in err
     assert "Connection closed" not in err
 
@@ -275,7 +294,7 @@ def test_what_one_process_finds_is_said_and_nobody_waits(
 def test_what_processes_tell_each_other(tmp_path: Path) -> None:
     script = tmp_path / "primitives.py"
     script.write_text(PRIMITIVES)
-    out, err = torchrun(script).communicate(timeout=100)
+    out, err = torchrun(script).communicate()
     assert "done 0" in out, err
     assert "done 1" in out, err
 

@@ -14,7 +14,7 @@ from pipeline.training import Trainer, World, open_run
 from pipeline.training.state import read_trainer
 
 Make = Callable[..., Any]
-STEPS = 7
+STEPS = 5
 
 
 def weights(trainer: Trainer) -> list[torch.Tensor]:
@@ -37,7 +37,8 @@ def test_every_step_can_be_gone_on_from(
         "model_type": model_type,
         "grad_accumulation": accumulation,
         "max_steps": STEPS,
-        "eval_every": 3,
+        "warmup_steps": 2,
+        "eval_every": 2,
         "checkpoint_every": 1,
         "drop_sensor": 0.3,
         "sensor_lr": 1e-3,
@@ -67,6 +68,19 @@ def test_every_step_can_be_gone_on_from(
         assert resumed.standing == whole.standing
 
 
+@pytest.fixture(scope="module")
+def of_two_parts(
+    store: FeatureStore,
+    params_below: Make,
+    trainer: Make,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Path:
+    """A finished run of two parts a step, to be copied."""
+    chosen = params_below(tmp_path_factory.mktemp("parts"), grad_accumulation=2, max_steps=2)
+    trainer(store, chosen).fit()
+    return chosen.output
+
+
 @pytest.mark.parametrize(
     ("size", "accumulation", "status"),
     [(1, 2, "finished"), (2, 1, "finished"), (1, 4, "new"), (1, 1, "new"), (2, 2, "new")],
@@ -74,14 +88,14 @@ def test_every_step_can_be_gone_on_from(
 def test_parts_may_be_shared_out_anew_but_not_cut_anew(
     store: FeatureStore,
     params: Make,
-    trainer: Make,
     monkeypatch: pytest.MonkeyPatch,
+    of_two_parts: Path,
     size: int,
     accumulation: int,
     status: str,
 ) -> None:
     """What one process of two parts did is the run of two processes of one part, and no other."""
-    trainer(store, params(grad_accumulation=2, max_steps=2)).fit()
+    shutil.copytree(of_two_parts, params().output)
     monkeypatch.setattr(World, "current", lambda: World(0, size))
     given = params(grad_accumulation=accumulation, max_steps=2)
     assert open_run(given, store).status == status

@@ -3,6 +3,7 @@
 import os
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,23 +21,46 @@ class Stop(Exception):
     """Stands for the end of the process."""
 
 
-@pytest.fixture
-def unfinished(
-    store: FeatureStore, params: Make, trainer: Make, monkeypatch: pytest.MonkeyPatch
+@pytest.fixture(scope="session")
+def params_below(params_below: Make) -> Make:
+    """Of few steps: what is asked here is not how well it learns."""
+    return partial(params_below, max_steps=6, warmup_steps=2, eval_every=3, checkpoint_every=2)
+
+
+@pytest.fixture(scope="module")
+def runs(
+    store: FeatureStore,
+    params_below: Make,
+    trainer: Make,
+    tmp_path_factory: pytest.TempPathFactory,
 ) -> Path:
-    """A run stopped at step 11, its last checkpoint at step 10."""
+    """`head`, which is finished, and `stopped.part`, stopped at step 5; both to be copied."""
+    folder = tmp_path_factory.mktemp("runs")
+    trainer(store, params_below(folder)).fit()
     real = Trainer._train_step
 
     def killed(self: Trainer, *rest: Any) -> bool:
-        if self.step == 11:
+        if self.step == 5:
             raise Stop
         return real(self, *rest)
 
-    with monkeypatch.context() as patched:
+    with pytest.MonkeyPatch.context() as patched:
         patched.setattr(Trainer, "_train_step", killed)
         with pytest.raises(Stop):
-            trainer(store, params()).fit()
-    return params().output.with_name("head.part")
+            trainer(store, params_below(folder, output=folder / "stopped")).fit()
+    return folder
+
+
+@pytest.fixture
+def finished(runs: Path, params: Make) -> Path:
+    """The output of a run that has come to its end."""
+    return shutil.copytree(runs / "head", params().output)
+
+
+@pytest.fixture
+def unfinished(runs: Path, params: Make) -> Path:
+    """The folder of a run stopped at step 5, its last checkpoint at step 4."""
+    return shutil.copytree(runs / "stopped.part", params().output.with_name("head.part"))
 
 
 def test_a_finished_run_is_left_alone(store: FeatureStore, params: Make, trainer: Make) -> None:
@@ -51,9 +75,8 @@ def test_a_finished_run_is_left_alone(store: FeatureStore, params: Make, trainer
 
 
 def test_another_run_replaces_a_finished_one_when_it_is_finished(
-    store: FeatureStore, params: Make, trainer: Make
+    store: FeatureStore, params: Make, trainer: Make, finished: Path
 ) -> None:
-    trainer(store, params()).fit()
     other = trainer(store, params(seed=5))
     assert other.run.status == "new"
     assert "holds another run" in other.run.notes[0]
@@ -145,7 +168,7 @@ def test_a_checkpoint_swap_that_was_killed_is_recovered(
         (unfinished / "last.new").mkdir()
     else:  # killed between the two renames
         last.rename(unfinished / "last.old")
-    assert trainer(store, params()).step == 10
+    assert trainer(store, params()).step == 4
 
 
 @pytest.mark.parametrize("file", ["trainer.safetensors", "policy.safetensors", "trainer.json"])
@@ -159,10 +182,9 @@ def test_a_truncated_checkpoint_is_named(
 
 
 def test_a_finish_that_was_killed_is_recovered(
-    store: FeatureStore, params: Make, trainer: Make
+    store: FeatureStore, params: Make, finished: Path
 ) -> None:
-    trainer(store, params()).fit()
-    output = params().output
+    output = finished
     output.rename(output.with_name("head.part-replaced"))
     assert open_run(params(), store).status == "finished"
     output.with_name("head.part-replaced").mkdir()
@@ -193,10 +215,9 @@ def test_checkpoints_without_their_run_are_not_guessed_at(
     "file", ["best/policy.json", "best/policy.safetensors", "last/policy.json", "best"]
 )
 def test_a_damaged_finished_run_is_trained_again(
-    store: FeatureStore, params: Make, trainer: Make, harm: str, file: str
+    store: FeatureStore, params: Make, trainer: Make, finished: Path, harm: str, file: str
 ) -> None:
-    trainer(store, params()).fit()
-    path = params().output / file
+    path = finished / file
     if path.is_dir():
         shutil.rmtree(path)
     elif harm == "remove":
