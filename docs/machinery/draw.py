@@ -30,12 +30,13 @@ DRAWINGS = {
 def documents() -> dict[str, str]:
     """Every file's name and text.
 
-    The README's figure is one file for light and one for dark: GitHub's theme is not the system's.
+    The README's figures, one of them for phones, are a file for light and one for dark each:
+    GitHub's theme is not the system's.
     """
     files = {f"{name}.svg": draw().svg() for name, draw in DRAWINGS.items()}
-    readme = overview.pipeline()
-    files["pipeline-light.svg"] = readme.svg(LIGHT)
-    files["pipeline-dark.svg"] = readme.svg(DARK)
+    for name, draw in (("pipeline", overview.pipeline), ("narrow", overview.narrow)):
+        files[f"{name}-light.svg"] = draw().svg(LIGHT)
+        files[f"{name}-dark.svg"] = draw().svg(DARK)
     return files
 
 

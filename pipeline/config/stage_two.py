@@ -49,9 +49,10 @@ class TrainHeadParams(Section):
     horizon: int = Field(default=8, ge=1)
     """Ticks an action chunk."""
     sensor_window: int = Field(default=65, ge=1)
-    """Readings before the tick."""
+    """Readings up to the tick, at the sensor's own rate: 65 are 0.1 s at 650 Hz."""
     state_window: int = Field(default=100, ge=1)
-    """Readings before the tick."""
+    """Readings up to the tick, not ticks: take the seconds that matter times the state's own rate.
+    100 are 1 s at 100 Hz, but 10 s of a data set at 10 Hz."""
     terminal_stop: bool = False
     """Beyond an episode's end, train to stand still (zero deltas and velocities, the last absolute
     action) instead of leaving those steps of the chunk out of the loss."""
@@ -124,7 +125,7 @@ class TrainHeadParams(Section):
     """Folder of the curves."""
     loggers: tuple[Logger, ...] = ("report",)
     """Who shows the curves while it trains, beside the files that DVC plots: `report` a page in
-    `logs`, `dvclive` dvclive's own page `<logs>.dvclive.html`, which is blank without a network,
+    `logs`, `dvclive` dvclive's own page `<logs>.dvclive.html`, whose charts need a network,
     `tensorboard` event files in `<logs>.tensorboard`, `wandb` Weights & Biases."""
     wandb_project: str = "vla-feature-cache"
     """Where Weights & Biases puts the run; its own environment variables decide the rest."""

@@ -11,6 +11,11 @@ from types import ModuleType
 import pytest
 import yaml
 
+import stages.demo
+import stages.extract
+import stages.train_head
+from pipeline.config import load_params
+
 ROOT = Path(__file__).resolve().parents[2]
 MACHINERY = ROOT / "docs" / "machinery"
 
@@ -45,27 +50,19 @@ def machinery() -> Iterator[Callable[[str], ModuleType]]:
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder as a quick start leaves it: params.yaml, recordings, checkpoint, store, head.
 
-    Two episodes a format, a few steps of training: small, but written by the commands themselves.
+    Two episodes of two formats in the store, a few steps of training: small, but written by the
+    commands themselves.
     """
     folder = tmp_path_factory.mktemp("demo")
     document = yaml.safe_load((ROOT / "params.yaml").read_text(encoding="utf-8"))
     document["demo"]["episodes"] = 2
+    document["data"]["sources"] = [{"name": name, "path": name} for name in ("new", "old")]
     document["train_head"] |= {"max_steps": 4, "eval_every": 4, "warmup_steps": 1}
     document["train_head"]["check_store"] = False
     (folder / "params.yaml").write_text(yaml.safe_dump(document), encoding="utf-8")
-    code = (
-        "import stages.demo, stages.extract, stages.train_head\n"
-        "from pathlib import Path\n"
-        "from pipeline.config import load_params\n"
-        "params = load_params(Path('params.yaml'))\n"
-        "for stage in (stages.demo, stages.extract, stages.train_head): stage.main(params)\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+    with pytest.MonkeyPatch.context() as patched:
+        patched.chdir(folder)
+        params = load_params(Path("params.yaml"))
+        for stage in (stages.demo, stages.extract, stages.train_head):
+            stage.main(params)
     return folder

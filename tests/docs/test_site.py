@@ -83,33 +83,42 @@ def reader(browser) -> Iterator[Callable[..., Reader]]:
     assert [trouble for one in readers for trouble in one.trouble] == []
 
 
+def open_page(visitor: Reader, path: Path) -> None:
+    visitor.page.goto(path.as_uri())
+    # What the page's scripts do at once, done.
+    visitor.page.wait_for_function("document.body.hasAttribute('data-md-color-scheme')")
+    assert not visitor.trouble, f"{path.name}: {visitor.trouble}"
+
+
+def width(visitor: Reader) -> int:
+    return visitor.page.evaluate("document.documentElement.scrollWidth")
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_a_page_loads_alone_and_fits_every_screen(site, reader, name):
+    visitor = reader(viewport={"width": DESKTOP[0], "height": DESKTOP[1]})
+    open_page(visitor, site / f"{name}.html")
+    for size in (DESKTOP, PHONE):
+        visitor.page.set_viewport_size({"width": size[0], "height": size[1]})
+        assert width(visitor) <= size[0], f"{width(visitor)} px wide"
+
+
 @pytest.mark.parametrize(
-    ("size", "scheme"), [(DESKTOP, "light"), (PHONE, "dark")], ids=["desktop", "phone"]
+    ("size", "scheme", "shown"),
+    [(DESKTOP, "light", "default"), (PHONE, "dark", "slate")],
+    ids=["desktop", "phone"],
 )
-def test_pages_load_alone_and_fit_the_screen(site, reader, size, scheme):
+def test_page_and_figures_take_the_colours_of_the_system(site, reader, size, scheme, shown):
     viewport = {"width": size[0], "height": size[1]}
     visitor = reader(viewport=viewport, color_scheme=scheme)
     page = visitor.page
-    for name in PAGES:
-        page.goto((site / f"{name}.html").as_uri())
-        page.wait_for_load_state("networkidle")
-        width = page.evaluate("document.documentElement.scrollWidth")
-        assert width <= size[0], f"{name} is {width} px wide"
-        shown = page.evaluate("document.body.getAttribute('data-md-color-scheme')")
-        assert shown == {"light": "default", "dark": "slate"}[scheme]
-        assert not visitor.trouble, f"{name}: {visitor.trouble}"
-
-
-def test_figures_take_the_colours_of_the_page(site, reader):
-    colours = {}
-    for scheme in ("light", "dark"):
-        page = reader(color_scheme=scheme).page
-        page.goto((site / "concepts.html").as_uri())
-        text = page.locator("figure.drawing svg text").first
-        colours[scheme] = text.evaluate("node => getComputedStyle(node).fill")
-        assert page.locator("figure.drawing svg").count() >= 6
-    assert colours["light"] == "rgb(31, 35, 40)"
-    assert colours["dark"] == "rgb(230, 233, 238)"
+    open_page(visitor, site / "concepts.html")
+    assert page.evaluate("document.body.getAttribute('data-md-color-scheme')") == shown
+    assert width(visitor) <= size[0]
+    assert page.locator("figure.drawing svg").count() >= 6
+    text = page.locator("figure.drawing svg text").first
+    colour = {"default": "rgb(31, 35, 40)", "slate": "rgb(230, 233, 238)"}[shown]
+    assert text.evaluate("node => getComputedStyle(node).fill") == colour
 
 
 def test_search_finds_a_parameter_without_a_server(site, reader):

@@ -10,6 +10,7 @@ STREAMS = (
     ("state", "joints, poses"),
     ("action", "actions"),
 )
+ENCODERS = (("vl", "features"), ("sensor", "sensor encoder"), ("state", "state encoder"))
 LANES = (96, 142, 188, 234)
 
 
@@ -82,8 +83,7 @@ def _store(drawing: Drawing, left: float, top: float, width: float, height: floa
 
 
 def _stage_two(drawing: Drawing) -> None:
-    names = (("vl", "features"), ("sensor", "sensor encoder"), ("state", "state encoder"))
-    for index, (colour, name) in enumerate(names):
+    for index, (colour, name) in enumerate(ENCODERS):
         y = 98 + 68 * index
         drawing.box(574, y - 18, 128, 36, colour, fill=0.14)
         drawing.text(638, y + 5, name, colour, anchor="middle", bold=True)
@@ -96,6 +96,63 @@ def _stage_two(drawing: Drawing) -> None:
     drawing.text(788, 194, "8 steps", "mute", anchor="middle")
     drawing.arrow((788, 208), (788, 250), colour="action", width=2)
     drawing.text(816, 270, ["checkpoint,", "evaluate"], anchor="end")
+
+
+def narrow() -> Drawing:
+    """The flow from top to bottom, as wide as a phone."""
+    drawing = Drawing(
+        400,
+        604,
+        "Stage one runs the frozen model once for every three ticks and writes a store with its "
+        "features and the raw streams; stage two trains from the store alone.",
+    )
+    drawing.text(8, 22, "Recordings", bold=True, size=16)
+    drawing.text(392, 22, "four formats", "mute", anchor="end")
+    for (colour, name), left, width in zip(
+        (
+            ("frame", "camera frames"),
+            ("sensor", "sensor"),
+            ("state", "state"),
+            ("action", "action"),
+        ),
+        (8, 178, 252, 326),
+        (160, 68, 68, 66),
+        strict=True,
+    ):
+        _named(drawing, left, 34, width, colour, name)
+        end = 88 if colour == "frame" else 244
+        drawing.arrow((left + width / 2, 70), (left + width / 2, end), colour=colour, width=2)
+    drawing.text(8, 108, "Stage one: once", bold=True, size=16)
+    drawing.text(8, 128, "for every 3rd tick", "mute")
+    drawing.box(8, 140, 160, 50, "vl", fill=0.14, line=2)
+    drawing.text(88, 161, "frozen Qwen2.5-VL", "vl", anchor="middle", bold=True)
+    drawing.text(88, 180, "layer, norm, pooling", "mute", anchor="middle")
+    drawing.arrow((88, 192), (88, 244), colour="vl", width=2)
+    drawing.text(98, 222, "features", "vl")
+    drawing.text(286, 160, ["raw streams,", "as recorded"], "mute", anchor="middle", halo=True)
+    drawing.box(8, 248, 384, 76, line=2)
+    drawing.text(200, 270, "The store", anchor="middle", bold=True, size=16)
+    said = ["zarr, memory-mapped; every row has", "a key of what it is and a checksum"]
+    drawing.text(200, 292, said, "mute", anchor="middle")
+    drawing.arrow((200, 326), (200, 352), width=2)
+    drawing.text(8, 372, "Stage two: every step", bold=True, size=16)
+    drawing.text(392, 372, "no image, no VLM", "mute", anchor="end")
+    for (colour, name), left, width in zip(ENCODERS, (8, 116, 258), (100, 134, 134), strict=True):
+        _named(drawing, left, 386, width, colour, name)
+        drawing.arrow((left + width / 2, 422), (left + width / 2, 442))
+    drawing.box(8, 444, 384, 32, fill=0.04)
+    drawing.text(200, 465, "fusion", anchor="middle", bold=True)
+    drawing.arrow((200, 478), (200, 500))
+    drawing.box(100, 502, 200, 40, "action", fill=0.14, line=2)
+    drawing.text(200, 527, "action expert, 8 steps", "action", anchor="middle", bold=True)
+    drawing.arrow((200, 544), (200, 574), colour="action", width=2)
+    drawing.text(200, 594, "checkpoint, evaluate", anchor="middle")
+    return drawing
+
+
+def _named(drawing: Drawing, left: float, top: float, width: float, colour: str, name: str) -> None:
+    drawing.box(left, top, width, 34, colour, fill=0.14)
+    drawing.text(left + width / 2, top + 22, name, colour, anchor="middle", bold=True)
 
 
 def icon() -> Drawing:
