@@ -30,10 +30,10 @@ from zarr.codecs import BloscCodec, BloscShuffle, ZstdCodec
 from zarr.codecs.numcodecs import Shuffle
 
 from benchmarks.timing import arguments, at_least, report
+from benchmarks.workload import ROWS_AN_EPISODE, write_recordings
 from pipeline.config import Source, load_params
 from pipeline.extraction import extract
 from pipeline.recordings import open_recordings
-from pipeline.simulation.demo_recordings import write_demo_recordings
 from pipeline.store.archive.codecs import (
     Choice,
     Codec,
@@ -103,13 +103,14 @@ def _store(options: Namespace) -> Generator[Path]:
         yield there
         return
     with tempfile.TemporaryDirectory() as folder:
-        place, episodes = Path(folder), 1 if options.quick else 4
+        place = Path(folder)
         overrides = [
-            f"data.root={place / 'data'}",
+            f"data.root={place / 'recordings'}",
+            "data.sources=[{name: raw, path: raw}]",
             f"vlm.checkpoint={place / 'vlm'}",
             f"extract.store={place / 'demo.zarr'}",
         ]
-        write_demo_recordings(place / "data", episodes, seed=0)
+        write_recordings(place, ROWS_AN_EPISODE * (1 if options.quick else 16))
         write_demo_checkpoint(place / "vlm")
         params = load_params(Path("params.yaml"), overrides)
         extract(params, say=lambda line: print(line, file=sys.stderr))

@@ -128,6 +128,7 @@ def _lmdb(folder: Path, values: NDArray[Any]) -> Read:
         with environment.begin(buffers=True) as reading:
             for index, row in enumerate(rows.tolist()):
                 found = reading.get(row.to_bytes(8, "big"))
+                assert found is not None, row
                 out[index] = np.frombuffer(found, dtype).reshape(shape)
         return out
 

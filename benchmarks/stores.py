@@ -68,7 +68,7 @@ def _layout(
     episode, inside = np.divmod(np.arange(episodes * ticks), ticks)
     edges = np.arange(episodes + 1)
 
-    def clock(count: int) -> NDArray[np.float64]:
+    def clock(count: int) -> NDArray[np.generic]:
         return np.tile(np.arange(count) * (0.1 * ticks / max(1, count)), episodes)
 
     return {

@@ -2,24 +2,49 @@
 
 import json
 import os
+import runpy
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-BENCHMARKS = sorted(
+BENCHMARKS = {
     path.stem
     for path in (ROOT / "benchmarks").glob("*.py")
     if '__name__ == "__main__"' in path.read_text(encoding="utf-8")
-)
+}
+ALONE = "gather"
+"""It forks, which a process with the threads of other tests should not."""
 
 
-@pytest.mark.parametrize("name", BENCHMARKS)
-def test_a_quick_run_prints_one_line_of_json(name, tmp_path):
+def assert_is_a_report(out: str, name: str) -> None:
+    assert out.count("\n") == 1
+    line: dict[str, Any] = json.loads(out)
+    assert line["command"] == f"python -m benchmarks.{name} --quick"
+    assert line["quick"] is True
+    assert line["machine"]["cores"] >= 1
+    assert {"settings", "results", "ratios", "targets"} <= set(line)
+    for target in line["targets"]:
+        assert {"what", "found", "wanted", "reached"} <= set(target)
+
+
+@pytest.mark.parametrize("name", sorted(BENCHMARKS - {ALONE}))
+def test_a_quick_run_prints_one_line_of_json(name, tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(sys, "argv", ["benchmarks", "--quick"])
+    runpy.run_module(f"benchmarks.{name}", run_name="__main__", alter_sys=True)
+    assert_is_a_report(capfd.readouterr().out, name)
+    assert not list(tmp_path.iterdir()), "it cleans up"
+
+
+def test_the_command_that_a_report_names_is_that_of_its_run(tmp_path):
     done = subprocess.run(
-        [sys.executable, "-m", f"benchmarks.{name}", "--quick"],
+        [sys.executable, "-m", f"benchmarks.{ALONE}", "--quick"],
         cwd=ROOT,
         capture_output=True,
         text=True,
@@ -27,11 +52,4 @@ def test_a_quick_run_prints_one_line_of_json(name, tmp_path):
         env=os.environ | {"TMPDIR": str(tmp_path), "OMP_NUM_THREADS": "1"},
     )
     assert done.returncode == 0, done.stderr[-2000:]
-    assert done.stdout.count("\n") == 1
-    line = json.loads(done.stdout)
-    assert line["command"] == f"python -m benchmarks.{name} --quick"
-    assert line["quick"] is True
-    assert line["machine"]["cores"] >= 1
-    assert {"settings", "results", "ratios", "targets"} <= set(line)
-    for target in line["targets"]:
-        assert {"what", "found", "wanted", "reached"} <= set(target)
+    assert_is_a_report(done.stdout, ALONE)

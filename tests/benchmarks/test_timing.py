@@ -5,6 +5,7 @@ import sys
 
 import pytest
 
+from benchmarks import timing
 from benchmarks.timing import Race, at_least, at_most, command, race, report
 
 
@@ -16,16 +17,17 @@ def test_rounds_are_interleaved_and_warm_up_does_not_count():
     assert [len(seconds) for seconds in result.seconds.values()] == [2, 2]
 
 
-def test_short_work_is_called_until_it_fills_the_time():
+def test_short_work_is_called_until_it_fills_the_time(monkeypatch):
     calls = 0
+    monkeypatch.setattr(timing.time, "perf_counter", lambda: calls / 1024)
 
     def work() -> None:
         nonlocal calls
         calls += 1
 
-    result = race({"work": work}, rounds=1, least_s=1e-3)
-    assert calls > 10
-    assert result.median("work") < 1e-3
+    result = race({"work": work}, rounds=1, least_s=1 / 16)
+    assert calls == 1 + 64
+    assert result.median("work") == 1 / 1024
 
 
 def test_a_ratio_is_the_median_of_the_ratios_of_each_round():
