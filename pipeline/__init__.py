@@ -5,6 +5,7 @@
 `errors`       what can go wrong, named
 `config`       params.yaml -> Params
 `amounts`      bytes and seconds, as people read them
+`channels`     channels by name: which are alike, and which hardly move
 `digests`      content digests of files, remembered
 `durable`      files that survive a kill
 `device`       which device does the tensor maths

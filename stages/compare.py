@@ -1,16 +1,24 @@
 """Put the evaluations of several experiments side by side, beside the baselines of all of them.
 
-Writes report.html, experiments.csv and experiments.png into `compare.output`; the table with the
-training times as Markdown beside that folder, for DVC tracks what is in it and a clock never says
-the same twice.
+Takes every folder of `compare.reports` that stages.evaluate wrote, and passes over what else lies
+there, such as the logs of a training. Writes report.html, experiments.csv and experiments.png into
+`compare.output`; the table with the training times as Markdown beside that folder, for DVC tracks
+what is in it and a clock never says the same twice.
+
+  python -m stages.compare                                   of dvc repro experiments/dvc.yaml
+  python -m stages.compare --set compare.reports=reports     reports/evaluate, reports/blind, …
 """
+
+from stages.command import run
+
+if __name__ == "__main__":  # here, for --help waits for no import below
+    raise SystemExit(run(__doc__ or "", "stages.compare", sections=("compare",)))
 
 from pipeline.config import Params
 from pipeline.durable import disk_full_named, fresh
 from pipeline.evaluation import experiment_rows, experiments_table, read_experiments, write_rows
 from pipeline.report import write_report
 from pipeline.report.comparison import comparison_report
-from stages.command import run
 
 
 def main(params: Params) -> None:
@@ -27,7 +35,3 @@ def main(params: Params) -> None:
     best = min(experiments, key=lambda one: one.error)
     print(f"lowest held-out error: {best.name}")
     print(f"{', '.join(str(file) for file in [*files, markdown])}")
-
-
-if __name__ == "__main__":
-    raise SystemExit(run(__doc__ or "", main, sections=("compare",)))

@@ -7,9 +7,15 @@ where their recordings still lie below `data.root`.
 An archive of a store serves as well: it is restored once, to `train_head.scratch`.
 """
 
+from stages.command import run
+
+if __name__ == "__main__":  # here, for --help waits for no import below
+    raise SystemExit(run(__doc__ or "", "stages.evaluate", sections=("evaluate",)))
+
+from functools import partial
 from pathlib import Path
 
-from pipeline.batches import Windows, open_store
+from pipeline.batches import open_store
 from pipeline.checkpoint import PolicyCheckpoint, find_policy, load_policy
 from pipeline.config import Params
 from pipeline.device import resolve_device
@@ -18,26 +24,22 @@ from pipeline.evaluation import (
     JUDGED,
     Judgement,
     check_store,
-    held_out_ticks,
-    judge,
-    judge_modalities,
-    judged_document,
+    judgement,
     modality_table,
-    read_curves,
     table,
     write_tables,
 )
 from pipeline.report import write_report
 from pipeline.report.evaluation import evaluation_report
 from pipeline.store import FeatureStore, check_trailers
-from stages.command import run
 
 
 def main(params: Params) -> None:
     """Judge the checkpoint that `evaluate` names."""
     checkpoint = load_policy(find_policy(params.evaluate.checkpoint))
     store = _store_for(checkpoint, params)
-    found = _judgement(checkpoint, store, params)
+    device, say = resolve_device(params.evaluate.device), partial(print, flush=True)
+    found = judgement(checkpoint, store, params.evaluate, device, params.data.root, say)
     files = _write(params.evaluate.output, found)
     print(table(found.comparison))
     if found.study is not None:
@@ -57,53 +59,9 @@ def _store_for(checkpoint: PolicyCheckpoint, params: Params) -> FeatureStore:
     return store
 
 
-def _judgement(checkpoint: PolicyCheckpoint, store: FeatureStore, params: Params) -> Judgement:
-    wanted = params.evaluate
-    device = resolve_device(wanted.device)
-    ticks = held_out_ticks(store, checkpoint.held_out_ticks, checkpoint.held_out_content)
-    policy = checkpoint.policy(device)
-    judged = judged_document(checkpoint, policy, store, wanted.samples, wanted.batch_size)
-    print(
-        f"{wanted.checkpoint} (step {checkpoint.step}) on {len(ticks)} held-out ticks of "
-        f"{len(checkpoint.held_out_ticks)} episode(s) in {store.path}, device {device}, "
-        f"{judged['policy']['samples']} chunk(s) a tick",
-        flush=True,
-    )
-    comparison, predictions = judge(
-        policy,
-        store,
-        ticks,
-        Windows.of(checkpoint.params),
-        wanted.batch_size,
-        checkpoint.normalization,
-        progress=True,
-        samples=wanted.samples,
-    )
-    study = None
-    if wanted.modalities:
-        study = judge_modalities(
-            checkpoint, policy, store, ticks, wanted.batch_size, wanted.samples, progress=True
-        )
-    return Judgement(
-        name=str(wanted.checkpoint),
-        checkpoint=checkpoint,
-        store=store,
-        comparison=comparison,
-        predictions=predictions,
-        study=study,
-        judged=judged,
-        curves=read_curves(checkpoint),
-        recordings=params.data.root,
-    )
-
-
 def _write(folder: Path, found: Judgement) -> list[Path]:
     """The tables, the page with its pictures, and what was judged; returns their paths."""
     folder.mkdir(parents=True, exist_ok=True)
     files = write_tables(folder, found.comparison, found.predictions, found.store, found.study)
     write_document(folder / JUDGED, found.judged)
     return [*files, folder / JUDGED, *write_report(folder, evaluation_report(found))]
-
-
-if __name__ == "__main__":
-    raise SystemExit(run(__doc__ or "", main, sections=("evaluate",)))

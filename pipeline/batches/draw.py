@@ -72,6 +72,7 @@ class Feed(Protocol):
         kind: type[BaseException] | None,
         error: BaseException | None,
         trace: TracebackType | None,
+        /,
     ) -> None: ...
 
     def __iter__(self) -> Iterator[tuple[Draw, Batch]]: ...

@@ -9,7 +9,6 @@ import threading
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import astuple, dataclass
-from types import TracebackType
 from typing import Self
 
 import torch
@@ -107,12 +106,7 @@ class Prefetch(Iterator[tuple[Draw, Batch]]):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         self.close()
 
     def _deliver(self, buffer: _Buffer) -> Batch:

@@ -2,13 +2,12 @@
 
 from pipeline.evaluation.cells import write_rows
 from pipeline.evaluation.curves import Curve, Curves, read_curves
-from pipeline.evaluation.experiments import (
-    Experiment,
+from pipeline.evaluation.experiment_tables import (
     experiment_errors,
     experiment_rows,
     experiments_table,
-    read_experiments,
 )
+from pipeline.evaluation.experiments import Experiment, read_experiments
 from pipeline.evaluation.held_out import (
     check_store,
     held_out_contents,
@@ -16,7 +15,7 @@ from pipeline.evaluation.held_out import (
     held_out_ticks,
     judge,
 )
-from pipeline.evaluation.judged import JUDGED, Judgement, judged_document
+from pipeline.evaluation.judged import JUDGED, Judgement, judged_document, judgement
 from pipeline.evaluation.modalities import ModalityStudy, Spoilt, judge_modalities
 from pipeline.evaluation.modality_tables import FOOTNOTE as MODALITY_FOOTNOTE
 from pipeline.evaluation.modality_tables import (
@@ -35,7 +34,15 @@ from pipeline.evaluation.predictions import (
     predict,
 )
 from pipeline.evaluation.scores import Comparison, Group, Scores, compare
-from pipeline.evaluation.tables import FOOTNOTE, HEADINGS, error_rows, metrics, table, write_tables
+from pipeline.evaluation.tables import (
+    FOOTNOTE,
+    HEADINGS,
+    error_rows,
+    metrics,
+    still_dimensions,
+    table,
+    write_tables,
+)
 
 __all__ = [
     "BASELINES",
@@ -70,12 +77,14 @@ __all__ = [
     "judge_modalities",
     "judged_document",
     "judged_on",
+    "judgement",
     "metrics",
     "modality_errors",
     "modality_table",
     "predict",
     "read_curves",
     "read_experiments",
+    "still_dimensions",
     "table",
     "with_unit",
     "write_rows",

@@ -1,9 +1,9 @@
-"""Evaluations of several experiments -> one table."""
+"""Evaluations of several experiments, read back where they may stand in one table."""
 
 import csv
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -12,12 +12,12 @@ from typing import Any, get_args
 from pipeline.checkpoint import describe, differences
 from pipeline.config import FusionStrategy, ModelType
 from pipeline.errors import ConfigError
-from pipeline.evaluation.cells import aligned, cell, ratio
 from pipeline.evaluation.judged import JUDGED
 from pipeline.evaluation.predictions import BASELINES, METHODS
 from pipeline.evaluation.scores import Group
-from pipeline.evaluation.tables import ERRORS, HEADINGS, OVERALL
+from pipeline.evaluation.tables import ERRORS, OVERALL
 
+_OVERALL = (OVERALL, "training std")
 _SAME = 1e-4
 """Relative difference of two baselines that rounding on another machine explains."""
 
@@ -49,35 +49,46 @@ class Experiment:
     step: int
     parameters: int
     samples: int
-    errors: Mapping[str, Mapping[str, float]]
-    """`overall` [training std] and each action group -> error of the policy and each baseline."""
+    errors: Mapping[tuple[str, str], Mapping[str, float]]
+    """Name and unit of `OVERALL` and each action group -> error of the policy and each baseline."""
     training_s: float | None
     """Time that its training took; None where its speed file is not there."""
+
+    @staticmethod
+    def key(group: tuple[str, str]) -> str:
+        """A group of `errors` as one word of a file."""
+        return OVERALL if group == _OVERALL else Group(*group, ()).key
+
+    @property
+    def overall(self) -> Mapping[str, float]:
+        """The overall errors [training std] of the policy and each baseline."""
+        return self.errors[_OVERALL]
 
     @property
     def error(self) -> float:
         """The policy's overall error."""
-        return self.errors[OVERALL]["policy"]
+        return self.overall["policy"]
 
     @property
     def relative(self) -> float | None:
         """It, divided by that of the best baseline."""
-        best = min(self.errors[OVERALL][method] for method in BASELINES)
+        best = min(self.overall[method] for method in BASELINES)
         return self.error / best if best > 0 else None
 
 
 def read_experiments(reports: Path) -> tuple[Experiment, ...]:
     """The evaluations in the folders of `reports`, ordered by expert, fusion and name.
 
-    Raises `ConfigError` where there is none, where a folder is no evaluation, where they were not
-    judged on the same ticks, and where stochastic policies were not sampled alike.
+    What else lies there, such as the logs of a training, is passed over. Raises `ConfigError`
+    where there is none, where one lacks a file or cannot be read, where they were not judged on the
+    same ticks, and where stochastic policies were not sampled alike.
     """
-    folders = sorted(path for path in reports.glob("*") if path.is_dir())
+    folders = [path for path in sorted(reports.glob("*")) if _is_evaluation(path)]
     if not folders:
         raise ConfigError(
-            f"compare.reports: expected one folder for each experiment in {reports}, found none. "
-            "Run stages.evaluate for each with its own evaluate.output there, or "
-            "dvc repro experiments/dvc.yaml."
+            f"compare.reports: expected one folder for each experiment in {reports}, each with a "
+            f"{JUDGED}, found none. Run stages.evaluate for each with its own evaluate.output "
+            "there, or dvc repro experiments/dvc.yaml."
         )
     judged = [_read(folder, JUDGED, "policy", "drawn", "on") for folder in folders]
     named = [(folder.name, what) for folder, what in zip(folders, judged, strict=True)]
@@ -90,63 +101,6 @@ def read_experiments(reports: Path) -> tuple[Experiment, ...]:
     for one, other in pairwise(found):
         _check_baselines(reports, one, other)
     return tuple(sorted(found, key=_order))
-
-
-def experiment_errors(
-    experiments: Sequence[Experiment],
-) -> tuple[list[str], list[tuple[Any, ...]]]:
-    """Columns and rows of a table: an experiment a row, a baseline a row; mean absolute errors.
-
-    `samples` are the chunks a tick whose mean was judged.
-    """
-    units = list(experiments[0].errors)
-    names = ["overall [training std]" if unit == OVERALL else unit for unit in units]
-    columns = ["experiment", "expert", "fusion", *names, "policy / best", "samples", "parameters"]
-    rows: list[tuple[Any, ...]] = [
-        (
-            *(one.name, one.model_type, one.fusion_strategy),
-            *(one.errors[unit]["policy"] for unit in units),
-            *(one.relative, one.samples, one.parameters),
-        )
-        for one in experiments
-    ]
-    for method in BASELINES:
-        errors = (experiments[0].errors[unit][method] for unit in units)
-        rows.append((f"baseline: {HEADINGS[method]}", "", "", *errors, None, None, None))
-    return columns, rows
-
-
-def experiments_table(experiments: Sequence[Experiment], markdown: bool = False) -> str:
-    """`experiment_errors` and the time that each training took, as lines."""
-    columns, rows = experiment_errors(experiments)
-    lines = [[*columns, "trained"]]
-    for place, (name, expert, fusion, *errors, relative, samples, parameters) in enumerate(rows):
-        cells = [name, expert, fusion, *(f"{error:.4g}" for error in errors)]
-        if place >= len(experiments):
-            lines.append([*cells, "", "", "", ""])
-            continue
-        trained = experiments[place].training_s
-        cells += [ratio(relative), str(samples), f"{parameters:,}"]
-        lines.append([*cells, "-" if trained is None else f"{trained:.0f} s"])
-    if not markdown:
-        return "\n".join(aligned(lines, left=3))
-    ruler = ["---"] * 3 + ["---:"] * (len(lines[0]) - 3)
-    return "\n".join(f"| {' | '.join(line)} |" for line in [lines[0], ruler, *lines[1:]]) + "\n"
-
-
-def experiment_rows(experiments: Sequence[Experiment]) -> Iterable[Sequence[object]]:
-    """Lines of a CSV file, without the time of training: what the clock says is never tracked."""
-    units = list(experiments[0].errors)
-    yield [
-        *("experiment", "model_type", "fusion_strategy", "step", "parameters", "samples"),
-        *(f"{unit}_{method}" for unit in units for method in ("policy", *BASELINES)),
-    ]
-    for one in experiments:
-        yield [
-            *(one.name, one.model_type, one.fusion_strategy),
-            *(one.step, one.parameters, one.samples),
-            *(cell(one.errors[unit][m]) for unit in units for m in ("policy", *BASELINES)),
-        ]
 
 
 def speed_file(logs: Path) -> Path:
@@ -163,6 +117,11 @@ def training_seconds(logs: Path) -> float | None:
     return float(rows[-1]["trained_s"]) if rows and rows[-1].get("trained_s") else None
 
 
+def _is_evaluation(folder: Path) -> bool:
+    """Whether stages.evaluate wrote to it, be it that one of its files is gone."""
+    return any((folder / name).exists() for name in (JUDGED, ERRORS))
+
+
 def _experiment(folder: Path, policy: Mapping[str, Any]) -> Experiment:
     try:
         return Experiment(
@@ -175,19 +134,17 @@ def _experiment(folder: Path, policy: Mapping[str, Any]) -> Experiment:
         raise ConfigError(_no_evaluation(folder, f"it lacks {error}")) from None
 
 
-def _errors(folder: Path) -> dict[str, dict[str, float]]:
+def _errors(folder: Path) -> dict[tuple[str, str], dict[str, float]]:
     """Of `OVERALL`, which comes first, and each action group, by method."""
-    rows = list(csv.DictReader(_text(folder, ERRORS).splitlines()))
+    rows = csv.DictReader(_text(folder, ERRORS).splitlines())
     try:
         errors = {
-            row["group"] if row["group"] == OVERALL else Group(row["group"], row["unit"], ()).key: {
-                method: float(row[method]) for method in METHODS
-            }
+            (row["group"], row["unit"]): {method: float(row[method]) for method in METHODS}
             for row in rows
         }
     except ValueError as error:
         raise ConfigError(_no_evaluation(folder, f"{ERRORS} cannot be read: {error}")) from None
-    return {OVERALL: errors.pop(OVERALL), **errors}
+    return {_OVERALL: errors.pop(_OVERALL), **errors}
 
 
 def _check_same(
@@ -204,21 +161,22 @@ def _check_same(
 
 
 def _check_baselines(reports: Path, one: Experiment, other: Experiment) -> None:
-    for unit, errors in one.errors.items():
+    for group, errors in one.errors.items():
         for method in BASELINES:
-            found = other.errors.get(unit, {}).get(method, math.nan)
+            found = other.errors.get(group, {}).get(method, math.nan)
             if not math.isclose(errors[method], found, rel_tol=_SAME, abs_tol=1e-9):
                 raise ConfigError(
                     f"compare.reports: expected the same baselines in all evaluations in "
-                    f"{reports}, found {method} ({unit}) {errors[method]} in {one.name} and "
-                    f"{found} in {other.name}: they were trained on other recordings. Train and "
-                    "evaluate all of them on one store, or move those that do not belong away."
+                    f"{reports}, found {method} ({one.key(group)}) {errors[method]} in {one.name} "
+                    f"and {found} in {other.name}: they were trained on other recordings. Train "
+                    "and evaluate all of them on one store, or move those that do not belong away."
                 )
 
 
 def _read(folder: Path, name: str, *keys: str) -> dict[str, Any]:
+    text = _text(folder, name)
     try:
-        document = json.loads(_text(folder, name))
+        document = json.loads(text)
     except ValueError as error:
         raise ConfigError(_no_evaluation(folder, f"{name} is no JSON: {error}")) from None
     lacking = [key for key in keys if key not in document]

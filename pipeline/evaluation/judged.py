@@ -1,13 +1,18 @@
-"""What an evaluation was made of, so that two of them can be told to be of the same things."""
+"""A policy judged, and what of, so that two judgements can be told to be of the same things."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
+
+from pipeline.batches import Windows
 from pipeline.checkpoint import PolicyCheckpoint, source_of
-from pipeline.evaluation.curves import Curves
-from pipeline.evaluation.modalities import ModalityStudy
+from pipeline.config import EvaluateParams
+from pipeline.evaluation.curves import Curves, read_curves
+from pipeline.evaluation.held_out import held_out_ticks, judge
+from pipeline.evaluation.modalities import ModalityStudy, judge_modalities
 from pipeline.evaluation.predictions import Predictions
 from pipeline.evaluation.scores import Comparison
 from pipeline.models import Trainable
@@ -33,6 +38,55 @@ class Judgement:
     curves: Curves
     recordings: Path
     """Below which a relative path of the store lies."""
+
+
+def judgement(
+    checkpoint: PolicyCheckpoint,
+    store: FeatureStore,
+    wanted: EvaluateParams,
+    device: torch.device,
+    recordings: Path,
+    say: Callable[[str], None],
+) -> Judgement:
+    """The policy of this checkpoint judged on its held-out ticks of a store that it fits.
+
+    What is judged on what is said first. Raises `CheckpointMismatch` as `held_out_ticks` does, and
+    `NumericsError` as `predict`.
+    """
+    ticks = held_out_ticks(store, checkpoint.held_out_ticks, checkpoint.held_out_content)
+    policy = checkpoint.policy(device)
+    judged = judged_document(checkpoint, policy, store, wanted.samples, wanted.batch_size)
+    say(
+        f"{wanted.checkpoint} (step {checkpoint.step}) on {len(ticks)} held-out ticks of "
+        f"{len(checkpoint.held_out_ticks)} episode(s) in {store.path}, device {device}, "
+        f"{judged['policy']['samples']} chunk(s) a tick"
+    )
+    comparison, predictions = judge(
+        policy,
+        store,
+        ticks,
+        Windows.of(checkpoint.params),
+        wanted.batch_size,
+        checkpoint.normalization,
+        progress=True,
+        samples=wanted.samples,
+    )
+    study = None
+    if wanted.modalities:
+        study = judge_modalities(
+            checkpoint, policy, store, ticks, wanted.batch_size, wanted.samples, progress=True
+        )
+    return Judgement(
+        name=str(wanted.checkpoint),
+        checkpoint=checkpoint,
+        store=store,
+        comparison=comparison,
+        predictions=predictions,
+        study=study,
+        judged=judged,
+        curves=read_curves(checkpoint),
+        recordings=recordings,
+    )
 
 
 def judged_document(

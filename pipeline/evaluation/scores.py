@@ -1,12 +1,13 @@
 """How far actions are from the recorded ones, in physical units."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.channels import hardly_moving
 from pipeline.evaluation.predictions import BASELINES, Actions, Predictions
 
 Errors = NDArray[np.float64]
@@ -100,6 +101,19 @@ class Comparison:
         """The groups with something to predict."""
         varying = set(self.varying())
         return [group for group in self.groups if varying & set(group.dimensions)]
+
+    def still(self) -> dict[int, float]:
+        """The dimensions that vary, but hardly: in `overall`, noise that counts like a motion.
+
+        Each with the usual training deviation of those alike.
+        """
+        return hardly_moving(self.scale, self.names, self.units)
+
+    def without_still(self) -> "Comparison":
+        """The same, in which what is `still` counts as not varying: it weighs nothing."""
+        scale = self.scale.copy()
+        scale[list(self.still())] = 0
+        return replace(self, scale=scale)
 
     def in_training_std(self, errors: Errors) -> Errors:
         """Errors (..., action_dim) of the `varying` dimensions, by their training deviations."""

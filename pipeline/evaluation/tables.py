@@ -7,7 +7,7 @@ from typing import Any
 from pipeline.durable import write_document
 from pipeline.evaluation.cells import aligned, cell, numbers, ratio, write_rows
 from pipeline.evaluation.modalities import ModalityStudy
-from pipeline.evaluation.modality_tables import modality_rows, stream_rows
+from pipeline.evaluation.modality_tables import best_baseline, modality_rows, stream_rows
 from pipeline.evaluation.names import with_unit
 from pipeline.evaluation.predictions import METHODS, Predictions
 from pipeline.evaluation.scores import Comparison
@@ -69,14 +69,35 @@ def error_rows(comparison: Comparison) -> list[tuple[str, list[float], float | N
     return [*rows, ("overall [training std]", overall, comparison.relative())]
 
 
+def still_dimensions(comparison: Comparison) -> str:
+    """Which dimensions hardly move, and what the overall error is without; empty without any."""
+    still = comparison.still()
+    if not still:
+        return ""
+    names = ", ".join(comparison.names[index] for index in still)
+    largest = max(still, key=lambda index: comparison.scale[index] / still[index])
+    moving = comparison.without_still()
+    relative, best = moving.relative(), HEADINGS[best_baseline(moving)]
+    beside = "" if relative is None else f", {ratio(relative)} times the best baseline's ({best})"
+    return (
+        f"hardly moving: {names} (training std at most {comparison.scale[largest]:.2g}, where "
+        f"{still[largest]:.2g} is usual for such dimensions), {len(still)} of the "
+        f"{len(comparison.varying())} dimensions in the overall error; without, it is "
+        f"{moving.overall('policy'):.3f}{beside}"
+    )
+
+
 def table(comparison: Comparison) -> str:
-    """Mean absolute errors of policy and baselines, a line a group and a footnote."""
+    """Mean absolute errors of policy and baselines, a line a group and a footnote.
+
+    Below them, where there are any, the dimensions that hardly move.
+    """
     lines = [["mean absolute error", *(HEADINGS[method] for method in METHODS), "policy / best"]]
     lines += [
         [name, *(f"{error:.4g}" for error in errors), ratio(relative)]
         for name, errors, relative in error_rows(comparison)
     ]
-    return "\n".join([*aligned(lines), FOOTNOTE])
+    return "\n".join([*aligned(lines), FOOTNOTE, still_dimensions(comparison)]).rstrip("\n")
 
 
 def write_tables(

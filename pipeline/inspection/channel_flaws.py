@@ -1,46 +1,33 @@
-"""What looks wrong in the values: flat, still, frozen and clipped channels, actions far beyond
-others."""
+"""What looks wrong in the values: flat, still and frozen channels, actions and states
+far beyond others."""
 
-import re
-from collections import defaultdict
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
+from pipeline.channels import hardly_moving, named
 from pipeline.inspection.clocks import usual_step
 from pipeline.inspection.contact import force_columns
 from pipeline.inspection.facts import EpisodeView, Flaw
 from pipeline.inspection.runs import runs
-from pipeline.recordings import Stream
+from pipeline.inspection.saturation import saturated
+from pipeline.recordings import Channels, Stream
 
-STILL = 0.01
-"""Times the median standard deviation of the channels of its kind, below which one hardly moves."""
 FROZEN_S = 0.5
 """A sensor whose channels all repeat for as long stands still."""
-CLIPPED_SHARE, CLIPPED_RUN = 0.01, 5
-"""Share of a channel's readings at the end of its range, and how many of them in a row."""
-PILED_UP = 3
-"""Times as many readings at the end of the range as at the value next to it."""
-TOGETHER = 3
-"""Channels of one converter that are clipped at least: what is bright enough for one is wide."""
 OUTLIER = 20.0
-"""Times the 95th percentile of how far actions depart from their neighbours; and farther than all
-other actions are apart."""
+"""Times the 95th percentile of how far entries depart from their neighbours; and farther than all
+others are apart."""
 
 _FEWEST = 20
 """Entries below which nothing is said of a stream's values."""
-_WIDE = 8
-"""Channels of one unit, from which their common largest value is taken for the end of the range."""
-_ALIKE = 3
-"""Moving channels of one kind, from which what is usual for them is known."""
 _NEIGHBOURS = 5
-_SHOWN = 4
 
 
 def channel_flaws(view: EpisodeView) -> Iterator[Flaw]:
-    """Flaws of kind flat channel, still channel, frozen, saturated and action outlier."""
+    """Flaws of kind flat channel, still channel, frozen, saturated, action and state outlier."""
     for name, stream in view.streams.items():
         if name != "poses" and len(stream.time) >= _FEWEST:
             yield from _flat(view, name, stream)
@@ -48,18 +35,11 @@ def channel_flaws(view: EpisodeView) -> Iterator[Flaw]:
                 yield from _still(view, name, stream)
     if view.sensor is not None and len(view.sensor.time) >= _FEWEST:
         yield from _frozen(view, view.sensor)
-        yield from _saturated(view, view.sensor)
-    yield from _outliers(view)
-
-
-def named(names: Sequence[str], columns: Sequence[int]) -> str:
-    """Channels by name, neighbours as one run: `aline_0003–aline_0007, aline_0100`."""
-    places = np.asarray(columns, np.int64)
-    groups = np.split(places, np.flatnonzero(np.diff(places) > 1) + 1)
-    ends = [(names[int(group[0])], names[int(group[-1])]) for group in groups]
-    said = [first if first == last else f"{first}–{last}" for first, last in ends]
-    more = f" and {len(said) - _SHOWN} more" if len(said) > _SHOWN + 1 else ""
-    return ", ".join(said[:_SHOWN] if more else said) + more
+        yield from saturated(view, view.sensor)
+    if (line := view.timeline) is not None:
+        yield from _outliers(view, "action", "tick", line.action_channels, line.time, line.action)
+    if (state := view.state) is not None:
+        yield from _outliers(view, "state", "row", state.channels, state.time, state.values)
 
 
 def _flat(view: EpisodeView, name: str, stream: Stream) -> Iterator[Flaw]:
@@ -74,33 +54,35 @@ def _flat(view: EpisodeView, name: str, stream: Stream) -> Iterator[Flaw]:
     else:
         said = f"{len(columns)} of {len(names)} channels never change: {named(names, columns)}"
     others = "no channel varies" if flat.all() else "the others vary"
-    yield view.flaw("flat channel", name, f"{said}; {others}")
+    span = float(stream.time[0]), float(stream.time[-1])
+    yield view.flaw("flat channel", name, f"{said}; {others}", *span)
 
 
 def _still(view: EpisodeView, name: str, stream: Stream) -> Iterator[Flaw]:
-    """Channels that hardly move beside others of their kind, such as joints, and their unit."""
-    names, units = stream.channels.names, stream.channels.units
-    std = stream.values.std(axis=0, dtype=np.float64)
-    kinds: dict[tuple[str, str], list[int]] = defaultdict(list)
-    for column in np.flatnonzero(np.ptp(stream.values, axis=0) > 0).tolist():
-        kinds[re.sub(r"\d+", "#", names[column]), units[column]].append(column)
-    usual = {
-        column: float(np.median(std[columns]))
-        for columns in kinds.values()
-        if len(columns) >= _ALIKE
-        for column in columns
-    }
-    columns = sorted(column for column, each in usual.items() if std[column] < STILL * each)
-    if not columns:
-        return
+    if (still := still_channels(stream.channels, stream.values)) is not None:
+        span = float(stream.time[0]), float(stream.time[-1])
+        yield view.flaw("still channel", name, still[1], *span)
+
+
+def still_channels(
+    channels: Channels, values: NDArray[np.floating]
+) -> tuple[list[int], str] | None:
+    """Columns that hardly move beside others of their kind, such as joints, and their unit.
+
+    And what is said of them; None where there are none. `values` are (row, channel).
+    """
+    names, varies = channels.names, np.ptp(values, axis=0) > 0
+    std = np.where(varies, values.std(axis=0, dtype=np.float64), 0)
+    usual = hardly_moving(std, names, channels.units)
+    if not usual:
+        return None
+    columns = list(usual)
     largest = max(columns, key=lambda column: std[column] / usual[column])
     what = "hardly moves" if len(columns) == 1 else "hardly move"
-    yield view.flaw(
-        "still channel",
-        name,
+    return columns, (
         f"{named(names, columns)} {what}: a standard deviation of {std[largest]:.2g} at most, "
         f"where {usual[largest]:.2g} is usual for such channels; training scales every channel to "
-        "unit spread, so that their noise would count like a motion",
+        "unit spread, so that their noise would count like a motion"
     )
 
 
@@ -126,107 +108,44 @@ def _frozen(view: EpisodeView, sensor: Stream) -> Iterator[Flaw]:
 
 
 def _repeats(values: NDArray[np.float32], columns: Sequence[int]) -> NDArray[np.bool_]:
-    """(reading - 1,) whether a reading is that before; row by row only where one column agrees."""
-    first = values[:, columns[0]]
-    same = first[1:] == first[:-1]
-    places = np.flatnonzero(same)
-    for place in places:
-        same[place] = np.array_equal(values[place, columns], values[place + 1, columns])
+    """(reading - 1,) whether a reading is that before, in these columns."""
+    places = np.arange(len(values) - 1)
+    for column in columns:
+        places = places[values[places, column] == values[places + 1, column]]
+    same = np.zeros(len(values) - 1, np.bool_)
+    same[places] = True
     return same
 
 
-def _saturated(view: EpisodeView, sensor: Stream) -> Iterator[Flaw]:
-    """Channels that are clipped, in one line for each end of the range."""
-    values, wide = sensor.values, _wide_columns(sensor)
-    largest, smallest = values.max(axis=0), values.min(axis=0)
-    for end, own in (("upper", largest), ("lower", smallest)):
-        reached = own.copy()
-        # Channels of one converter end at one value.
-        if wide:
-            reached[wide] = own[wide].max() if end == "upper" else own[wide].min()
-        candidates = np.flatnonzero((own == reached) & (own != 0) & (largest > smallest))
-        clipped = [
-            (column, at_end)
-            for column in candidates.tolist()
-            if (at_end := _clipped(values[:, column], own[column])) is not None
-        ]
-        if sum(column in wide for column, _ in clipped) < TOGETHER:
-            clipped = [one for one in clipped if one[0] not in wide]
-        if clipped:
-            yield _clipped_flaw(view, sensor, end, clipped)
-
-
-def _clipped(values: NDArray[np.float32], end: np.float32) -> NDArray[np.bool_] | None:
-    """Where a channel stands at an end of its range; None where that is no clipping.
-
-    A channel that rests at its end, as a force does at zero load, is not clipped there.
-    """
-    at_end = values == end
-    away = abs(float(end) - float(np.median(values))) > 0.2 * float(np.ptp(values))
-    if not away or at_end.mean() < CLIPPED_SHARE or not _piled_up(values, at_end):
-        return None
-    plateaus = [start for start, stop in runs(at_end) if stop - start >= CLIPPED_RUN]
-    return at_end if plateaus else None
-
-
-def _clipped_flaw(
-    view: EpisodeView, sensor: Stream, end: str, clipped: Sequence[tuple[int, NDArray[np.bool_]]]
-) -> Flaw:
-    columns = [column for column, _ in clipped]
-    anywhere = np.logical_or.reduce([at_end for _, at_end in clipped])
-    places = np.flatnonzero(anywhere)
-    start, stop = float(sensor.time[places[0]]), float(sensor.time[places[-1]])
-    names = sensor.channels.names
-    value = sensor.values[places[0], next(column for column, at in clipped if at[places[0]])]
-    return view.flaw(
-        "saturated",
-        "sensor",
-        f"{named(names, columns)} ({len(columns)} of {len(names)} channels) stand at the {end} end "
-        f"of their range, {value:g}, in {100 * anywhere.mean():.1f} % of the readings, first at "
-        f"{start - view.zero:.2f} s; expected under {100 * CLIPPED_SHARE:g} %",
-        start,
-        stop,
-    )
-
-
-def _piled_up(values: NDArray[np.float32], at_end: NDArray[np.bool_]) -> bool:
-    """Whether far more readings stand at the end than at the value next to it, as clipping does."""
-    end = values[np.argmax(at_end)]
-    others = values[~at_end]
-    beside = others[np.argmin(np.abs(others - end))]
-    return bool(np.count_nonzero(at_end) >= PILED_UP * np.count_nonzero(others == beside))
-
-
-def _wide_columns(sensor: Stream) -> list[int]:
-    force = set(force_columns(sensor))
-    columns = [c for c in range(len(sensor.channels.names)) if c not in force]
-    one_unit = len({sensor.channels.units[column] for column in columns}) == 1
-    return columns if one_unit and len(columns) >= _WIDE else []
-
-
-def _outliers(view: EpisodeView) -> Iterator[Flaw]:
-    """Single ticks whose action leaps off and back, unlike anything else in the episode."""
-    line = view.timeline
-    if line is None or len(line.time) < _FEWEST:
+def _outliers(
+    view: EpisodeView,
+    name: str,
+    entry: str,
+    channels: Channels,
+    time: NDArray[np.float64],
+    recorded: NDArray[np.float32],
+) -> Iterator[Flaw]:
+    """Single entries that leap off and back, unlike anything else in the episode."""
+    if len(time) < _FEWEST:
         return
-    action = line.action.astype(np.float64)
-    away = np.abs(action - median_filter(action, size=(_NEIGHBOURS, 1), mode="nearest"))
+    values = recorded.astype(np.float64)
+    # Mirrored, so that the first and the last entry have neighbours to depart from.
+    away = np.abs(values - median_filter(values, size=(_NEIGHBOURS, 1), mode="mirror"))
     usual = np.percentile(away, 95, axis=0)
-    names, units = line.action_channels.names, line.action_channels.units
     for column in np.flatnonzero(usual > 0).tolist():
-        ticks = np.flatnonzero(away[:, column] > OUTLIER * usual[column])
-        others = np.delete(action[:, column], ticks)
-        ticks = ticks[away[ticks, column] > np.ptp(others)]
-        if not len(ticks):
+        places = np.flatnonzero(away[:, column] > OUTLIER * usual[column])
+        others = np.delete(values[:, column], places)
+        places = places[away[places, column] > np.ptp(others)]
+        if not len(places):
             continue
-        worst = int(ticks[np.argmax(away[ticks, column])])
-        begin, stop = float(line.time[ticks[0]]), float(line.time[ticks[-1]])
+        worst = int(places[np.argmax(away[places, column])])
+        said = f"{channels.names[column]} leaps to {values[worst, column]:.4g}"
         yield view.flaw(
-            "action outlier",
-            "action",
-            f"{names[column]} leaps to {action[worst, column]:.4g} {units[column]}".rstrip()
-            + f" at {line.time[worst] - view.zero:.2f} s (tick {worst}; {len(ticks)} such ticks); "
-            f"all others stay within {others.min():.4g} to {others.max():.4g}",
-            begin,
-            stop + usual_step(line.time),
+            f"{name} outlier",
+            name,
+            f"{said} {channels.units[column]}".rstrip()
+            + f" at {time[worst] - view.zero:.2f} s ({entry} {worst}; {len(places)} such {entry}s)"
+            f"; all others stay within {others.min():.4g} to {others.max():.4g}",
+            float(time[places[0]]),
+            float(time[places[-1]]) + usual_step(time),
         )

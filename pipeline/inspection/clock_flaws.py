@@ -47,22 +47,47 @@ def clock_flaws(view: EpisodeView, said: Nominal) -> Iterator[Flaw]:
 def _gaps(view: EpisodeView, names: str, time: NDArray[np.float64]) -> Iterator[Flaw]:
     step = usual_step(time)
     tick = _TICK_S if view.timeline is None else usual_step(view.timeline.time)
-    rest = float(time[-1] - time[0])
+    ends = _ends(view)
     for gap in gaps(time):
         length = gap.stop_s - gap.start_s
         if length <= tick:
             continue
-        jumped = length > rest - length
-        kind = "clock jump" if jumped else "gap"
+        why = _set_there(ends, time, gap)
+        kind = "clock jump" if why else "gap"
         said = (
-            f"the clock jumps by {length:.2f} s at {gap.start_s - view.zero:.2f} s, and all its "
-            f"other steps together make {rest - length:.2f} s"
-            if jumped
+            f"the clock jumps by {length - step:.2f} s at {gap.start_s - view.zero:.2f} s: {why}"
+            if why
             else f"no entry for {length:.2f} s from {gap.start_s - view.zero:.2f} s, expected one "
             f"every {step:.3g} s"
         )
         said += _age_there(view, names, gap)
         yield view.flaw(kind, names, said, gap.start_s, gap.stop_s)
+
+
+def _ends(view: EpisodeView) -> list[tuple[float, float]]:
+    """The longest step of every clock, and its last instant."""
+    return [(float(np.diff(time).max(initial=0)), float(time[-1])) for time in view.clocks.values()]
+
+
+def _set_there(ends: list[tuple[float, float]], time: NDArray[np.float64], gap: Gap) -> str:
+    """Why the clock was set there, empty where entries lack.
+
+    A clock that was set ends apart from those without such a step, and near them less the step; one
+    that lacks entries ends with them. Where all have such a step, it was set if the step is longer
+    than all its others.
+    """
+    length = gap.stop_s - gap.start_s
+    others = [end for longest, end in ends if longest < length / 2]
+    if not others:
+        rest = float(time[-1] - time[0]) - length
+        return f"all its other steps together make {rest:.2f} s" if length > rest else ""
+    end = float(time[-1])
+    apart, left = (min(abs(end - moved - other) for other in others) for moved in (0, length))
+    return (
+        f"it ends {apart:.2f} s from the nearest other clock, {left:.2f} s without the jump"
+        if apart >= LOST_S and left < apart / 2
+        else ""
+    )
 
 
 def _age_there(view: EpisodeView, names: str, gap: Gap) -> str:
@@ -91,25 +116,37 @@ def _repeated(view: EpisodeView, names: str, time: NDArray[np.float64]) -> Itera
 def _dropped(
     view: EpisodeView, names: str, time: NDArray[np.float64], said: Nominal
 ) -> Iterator[Flaw]:
-    """A camera that loses frames one by one, all over the episode; gaps are told apart."""
+    """A camera that loses frames one by one; gaps are told apart.
+
+    Its place is the shortest span that holds half of the long steps.
+    """
     steps = np.diff(time)
     usual = usual_step(time)
-    steps = steps[steps < shortest_gap(time)]
+    small = steps < shortest_gap(time)
+    begun, steps = time[:-1][small], steps[small]
     # Stamps in bursts have long steps between them and lack nothing.
     if not names.startswith("view ") or len(steps) < _FEWEST or usual > float(np.median(steps)):
         return
-    long = int(np.count_nonzero(steps >= DROPPED_STEP * usual))
+    places = np.flatnonzero(steps >= DROPPED_STEP * usual)
+    long = len(places)
     lost = float(steps.sum()) / usual - len(steps)
     if long < DROPPED or min(long, lost) <= DROPPED_SHARE * len(steps):
         return
+    half = (long + 1) // 2
+    starts, stops = begun[places], (begun + steps)[places]
+    most = int(np.argmin(stops[half - 1 :] - starts[: long - half + 1]))
+    start, stop = float(starts[most]), float(stops[most + half - 1])
     expected = _expected_rate(names, said)
     nominal = "" if expected is None else f", {expected:.3g} Hz by {said.where}"
     yield view.flaw(
         "dropped frames",
         names,
         f"{long} of {len(steps)} steps take at least {DROPPED_STEP:g} times the usual "
-        f"{1e3 * usual:.0f} ms (up to {1e3 * steps.max():.0f} ms): there is time for {lost:.0f} "
+        f"{1e3 * usual:.0f} ms (up to {1e3 * steps.max():.0f} ms), half of them from "
+        f"{start - view.zero:.2f} to {stop - view.zero:.2f} s: there is time for {lost:.0f} "
         f"more frames; {len(steps) / steps.sum():.1f} Hz on average{nominal}",
+        start,
+        stop,
     )
 
 
@@ -135,18 +172,25 @@ def _rates(view: EpisodeView, said: Nominal) -> Iterator[Flaw]:
 
 
 def _lost_ticks(view: EpisodeView) -> Iterator[Flaw]:
-    """What a stream costs that begins after most of the others or ends before most of them."""
+    """What a stream costs that begins after most of the others or ends before most of them.
+
+    A clock that was set ends where it would have without.
+    """
     clocks = view.clocks
     if len(clocks) < 2:
         return
+    most, have, do = (
+        ("the other stream", "has", "does") if len(clocks) == 2 else ("most streams", "have", "do")
+    )
     middle = (len(clocks) - 1) // 2
     starts = {name: float(time[0]) for name, time in clocks.items()}
-    stops = {name: float(time[-1]) for name, time in clocks.items()}
+    ends = _ends(view)
+    stops = {name: float(time[-1]) - _set_by(ends, time) for name, time in clocks.items()}
     begun = sorted(starts.values())[middle]
     ended = sorted(stops.values(), reverse=True)[middle]
     for time, limit, said in (
-        (max(starts.values()), begun, "begins {:.2f} s after most streams have"),
-        (min(stops.values()), ended, "ends {:.2f} s before most streams do"),
+        (max(starts.values()), begun, f"begins {{:.2f}} s after {most} {have}"),
+        (min(stops.values()), ended, f"ends {{:.2f}} s before {most} {do}"),
     ):
         lost = abs(time - limit)
         if lost < LOST_S:
@@ -160,6 +204,12 @@ def _lost_ticks(view: EpisodeView) -> Iterator[Flaw]:
             min(time, limit),
             max(time, limit),
         )
+
+
+def _set_by(ends: list[tuple[float, float]], time: NDArray[np.float64]) -> float:
+    """Seconds by which a clock was set in all."""
+    found = [gap.stop_s - gap.start_s for gap in gaps(time) if _set_there(ends, time, gap)]
+    return sum(found) - len(found) * usual_step(time) if found else 0.0
 
 
 def _share(view: EpisodeView, lost_s: float) -> str:

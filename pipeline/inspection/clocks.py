@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.inspection.facts import Clock, EpisodeView, Gap
+from pipeline.inspection.facts import Clock, ClockKind, EpisodeView, Gap
 
 GAP_FACTOR = 2.5
 """Usual steps from which a step is a gap."""
@@ -96,12 +96,12 @@ def _usual(time: NDArray[np.float64]) -> tuple[float, float]:
     return (mean, float(kept[-1])) if median < _BURSTS * mean else (median, median)
 
 
-def _clock(name: str, kind: str, time: NDArray[np.float64]) -> Clock:
+def _clock(name: str, kind: ClockKind, time: NDArray[np.float64]) -> Clock:
     step, steps = usual_step(time), np.diff(time)
     small = steps[steps < shortest_gap(time)]
     return Clock(
         name=name,
-        kind=kind,  # pyright: ignore[reportArgumentType]
+        kind=kind,
         time=time,
         rate_hz=1 / step if step > 0 else float("nan"),
         jitter_s=float(small.std()) if len(small) > 1 else float("nan"),

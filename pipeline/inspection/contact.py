@@ -3,8 +3,8 @@
 The rule: at the start the needle is clear, so the median force of the first `_REST_S` is rest; the
 noise is what the force does from reading to reading and within that time. The force, smoothed by a
 running median, is in contact from where it leaves rest by `_ENTER` times its noise until it is back
-within `_LEAVE` times: hysteresis, as for edges in J. Canny, "A computational approach to edge
-detection", IEEE TPAMI 8(6), 1986. A force in newtons has to leave rest by `_LEAST_N` at least.
+within `_LEAVE` times: hysteresis, as in O. H. Schmitt, "A thermionic trigger", Journal of
+Scientific Instruments 15(1), 1938. A force in newtons has to leave rest by `_LEAST_N` at least.
 
 Its limits: a recording that begins in contact shows only what presses harder or less; a sensor that
 drifts by more than the threshold makes a contact seem to begin early, or to last when the needle
@@ -28,6 +28,13 @@ _APART_S, _SHORTEST_S = 0.1, 0.05
 """Contacts nearer than this are one; shorter ones are none."""
 _MAD_TO_STD = 1.4826
 """Of normal noise, standard deviation over median absolute deviation."""
+
+RULE = (
+    f"In contact: from where the force leaves its median of the first {_REST_S:g} s by "
+    f"{_ENTER:g} times its noise (in newtons by {_LEAST_N:g} at least) until it is back within "
+    f"{100 * _LEAVE / _ENTER:.0f} % of that."
+)
+"""The rule in a sentence, for a caption."""
 
 
 def contacts(view: EpisodeView) -> tuple[Contact, ...]:
@@ -74,11 +81,12 @@ def _mad(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _hysteresis(values: NDArray[np.float64], enter: float, leave: float) -> NDArray[np.bool_]:
-    """Where values are above `leave` in a run that somewhere reaches `enter`, which is above 0."""
-    above = (values > leave) & (values > 0)
+    """From where values reach `enter` until they are no longer above `leave`, nor above 0."""
     kept = np.zeros(len(values), np.bool_)
-    for start, stop in runs(above):
-        kept[start:stop] = bool((values[start:stop] >= enter).any())
+    for start, stop in runs((values > leave) & (values > 0)):
+        reached = np.flatnonzero(values[start:stop] >= enter)
+        if len(reached):
+            kept[start + reached[0] : stop] = True
     return kept
 
 

@@ -15,32 +15,7 @@ from pipeline.recordings import CameraStream, RecordedAction, Recording, Stream
 from pipeline.timeline import ActionRotation, Timeline
 
 Severity = Literal["error", "warning"]
-
-
-KINDS = {
-    "unreadable": "a file is missing, damaged or contradicts itself",
-    "no ticks": "the streams leave no instant to train on",
-    "embodiment": "channels are not those of the other recordings",
-    "missing": "something is not there that should be",
-    "frame size": "frames of one view in several sizes",
-    "duplicate recording": "an episode that is there twice",
-    "dead camera": "frames of one colour",
-    "duplicate frames": "a camera that stands still while the scene does not",
-    "flat channel": "a channel that never varies, beside others that do",
-    "still channel": "a channel that hardly moves, beside others of its kind that do",
-    "frozen": "readings that repeat, all channels of them",
-    "saturated": "readings clipped at the end of their range",
-    "gap": "a clock with no entry for long",
-    "clock jump": "a step longer than the rest of the clock",
-    "repeated times": "entries stamped with one time",
-    "rate": "more or fewer entries a second than the recording says",
-    "dropped frames": "a camera that loses frames all over the episode",
-    "frame count": "fewer frames than expected",
-    "lost ticks": "a stream that begins late or ends early",
-    "old frames": "a camera slower than the ticks need it",
-    "action outlier": "an action far beyond all others",
-}
-"""What can be found in a recording, and what each means."""
+ClockKind = Literal["camera", "stream", "tick", "vl_row"]
 
 
 @dataclass(frozen=True)
@@ -48,7 +23,7 @@ class Flaw:
     """Something that looks wrong, and where."""
 
     kind: str
-    """Of a recording, one of `KINDS`."""
+    """As docs/looking.md explains it: `gap`, `dead camera`, …"""
     severity: Severity
     """An error keeps extraction from using the episode; a warning does not."""
     source: str
@@ -138,7 +113,7 @@ class Clock:
     name: str
     """`View1`, `sensor`, `state`, `poses`, `action`, `ticks`, `VL rows`; `poses` only where they
     have a clock of their own."""
-    kind: Literal["camera", "stream", "tick", "vl_row"]
+    kind: ClockKind
     time: NDArray[np.float64]
     """(entry,) s."""
     rate_hz: float

@@ -87,13 +87,13 @@ def survey_recordings(opened: Opened, params: Params) -> RecordingsOverview:
     flaws: list[tuple[Flaw, ...]] = []
     embodiments: list[tuple[Recording, Embodiment]] = []
     held: list[frozenset[str]] = []
-    digests: list[str | None] = []
+    digests: list[dict[str, str]] = []
     for recording in tqdm(opened.recordings, "inspecting", unit="episode", disable=None):
         view = view_episode(recording, params.data, rotation)
         flaws.append(find_flaws(view))
         summaries.append(_summary(view))
         held.append(frozenset(view.clocks))
-        digests.append(_motion_digest(view))
+        digests.append(_motion_digests(view))
         if view.timeline is not None:
             line = view.timeline
             found = Embodiment.of(line.action_channels, line.action_kind, view.sensor, view.state)
@@ -179,49 +179,51 @@ def _missing(
         )
 
 
-def _motion_digest(view: EpisodeView) -> str | None:
-    """What the clocks and values of state and action come to, those of the sensor without either.
+def _motion_digests(view: EpisodeView) -> dict[str, str]:
+    """What the values of state and action come to, those of the sensor without either.
 
-    None where nothing moves or nothing is there: such episodes can be equal by chance.
+    Those that never change are left out: they can be equal by chance. Clocks are no part of it: two
+    formats give the same rows other times.
     """
-    motion = [stream for name in ("state", "action") if (stream := view.streams.get(name))]
-    streams = motion or ([view.sensor] if view.sensor is not None else [])
-    if not any(np.ptp(stream.values, axis=0).any() for stream in streams):
-        return None
-    digest = blake2b(digest_size=16)
-    for stream in streams:
-        digest.update(repr((stream.channels.names, stream.values.shape)).encode())
-        digest.update(stream.time.tobytes())
-        digest.update(stream.values.tobytes())
-    return digest.hexdigest()
+    motion = {name: view.streams[name] for name in ("state", "action") if name in view.streams}
+    streams = motion or ({} if view.sensor is None else {"sensor": view.sensor})
+    return {
+        name: blake2b(stream.values.tobytes(), digest_size=16).hexdigest()
+        for name, stream in streams.items()
+        if np.ptp(stream.values, axis=0).any()
+    }
 
 
 def _duplicates(
-    summaries: Sequence[EpisodeSummary], digests: Sequence[str | None]
+    summaries: Sequence[EpisodeSummary], digests: Sequence[Mapping[str, str]]
 ) -> Iterator[tuple[int, Flaw]]:
-    """Places of episodes that were there before, with a flaw that names the first."""
-    first: dict[str, EpisodeSummary] = {}
-    for place, (one, digest) in enumerate(zip(summaries, digests, strict=True)):
-        if digest is None:
-            continue
-        other = first.setdefault(digest, one)
-        if other is not one:
-            source = "" if other.source == one.source else f"{other.source}/"
-            message = (
-                f"the same recording as {source}{other.episode} ({other.path}): equal clocks and "
-                "equal values; it would count twice. Leave one of them out of data.sources"
-            )
-            flaw = Flaw(
-                "duplicate recording",
-                "warning",
-                one.source,
-                one.episode,
-                "episode",
-                None,
-                None,
-                message,
-            )
-            yield place, flaw
+    """Places of episodes that were there before, with a flaw that names the first.
+
+    They agree in every digest that both have, and in one at least.
+    """
+    firsts: dict[tuple[str, str], list[int]] = defaultdict(list)
+    for place, (one, motion) in enumerate(zip(summaries, digests, strict=True)):
+        alike = sorted({first for digest in motion.items() for first in firsts[digest]})
+        for first in alike:
+            common = sorted(motion.keys() & digests[first].keys(), reverse=True)
+            if all(motion[name] == digests[first][name] for name in common):
+                yield place, _duplicate(one, summaries[first], common)
+                break
+        else:
+            for digest in motion.items():
+                firsts[digest].append(place)
+
+
+def _duplicate(one: EpisodeSummary, other: EpisodeSummary, common: Sequence[str]) -> Flaw:
+    source = "" if other.source == one.source else f"{other.source}/"
+    message = (
+        f"the same recording as {source}{other.episode} ({other.path}): all values of "
+        f"{' and '.join(common)} are equal, and nothing else was compared; it would count twice. "
+        "Leave one of them out of data.sources"
+    )
+    return Flaw(
+        "duplicate recording", "warning", one.source, one.episode, "episode", None, None, message
+    )
 
 
 def _not_opened(opened: Opened) -> Iterator[Flaw]:

@@ -3,8 +3,9 @@ frozen cameras.
 
 What is looked at, so that a long episode costs no more than a short one:
 - JPEG files: all of them for duplicates (two files are the same picture where their bytes are);
-  every frame that a VL row sees is checked at an eighth of its size, as extraction does, and asked
-  for its size; `RUNS` pairs of neighbours, evenly spread, are decoded whole.
+  every frame that a VL row sees is checked at an eighth of its size, as extraction does, looked at
+  for one colour and asked for its size; `RUNS` pairs of neighbours, evenly spread, are decoded
+  whole.
 - Videos and pictures in rows: all frames of an episode of up to `MOST_FRAMES`, else `RUNS` runs of
   neighbours, evenly spread. The packets of a whole video are read in any case.
 
@@ -49,9 +50,8 @@ class _Looked:
     """(frame,) numbers of the frames that were compared."""
     equal: NDArray[np.bool_]
     """(frame - 1,) whether a frame is that before."""
-    one_colour: dict[int, float]
-    """Mean value of each decoded frame that shows nothing."""
-    decoded: int
+    levels: dict[int, tuple[float, float]]
+    """Mean and standard deviation by frame, of those that were looked at for one colour."""
     noisy: bool
     sizes: dict[int, tuple[int, ...]]
     """(height, width) by frame, of those that were decoded or that a VL row sees."""
@@ -68,18 +68,20 @@ def pixel_flaws(view: EpisodeView) -> Iterator[Flaw]:
     for name, seen in looked.items():
         yield from _resized(view, name, seen)
         yield from _dead(view, name, seen)
-        if len(seen.one_colour) < seen.decoded:
+        if not _blank(seen).all():
             yield from _duplicates(view, name, looked)
 
 
 def _look(view: EpisodeView, name: str, camera: CameraStream) -> _Looked:
     frames = len(camera.time)
     sizes: dict[int, tuple[int, ...]] = {}
+    seen: dict[int, tuple[float, float]] = {}
     repeats = camera.repeats()
     if repeats is not None:
         if view.timeline is not None:
             served = np.unique(view.timeline.frames[name]).tolist()
-            camera.check(served)
+            if (thumbnails := camera.check(served)) is not None:
+                seen = dict(zip(served, map(_level, thumbnails), strict=True))
             if (told := camera.sizes(served)) is not None:
                 sizes |= zip(served, map(tuple, told.tolist()), strict=True)
         index = _neighbours(frames, 2 * RUNS)
@@ -87,13 +89,13 @@ def _look(view: EpisodeView, name: str, camera: CameraStream) -> _Looked:
     else:
         index = _neighbours(frames, MOST_FRAMES)
         compared, equal = index, np.zeros(max(0, len(index) - 1), np.bool_)
-    one_colour: dict[int, float] = {}
+    levels: dict[int, tuple[float, float]] = {}
     differing: list[float] = []
     before: NDArray[np.uint8] | None = None
     for place, frame in enumerate(camera.read(index.tolist())):
         sizes[int(index[place])] = frame.shape[:2]
-        if float(frame.std()) <= ONE_COLOUR:
-            one_colour[int(index[place])] = float(frame.mean())
+        if not seen:
+            levels[int(index[place])] = _level(frame)
         if before is not None and before.shape == frame.shape:
             differs = float((frame != before).any(axis=2).mean())
             if compared is index:
@@ -104,7 +106,17 @@ def _look(view: EpisodeView, name: str, camera: CameraStream) -> _Looked:
     noisy = bool(differing) and float(np.percentile(differing, 10)) > NOISY
     if noisy and compared is not index:
         noisy = min(_beside(camera, equal), default=1.0) > NOISY
-    return _Looked(compared, equal, one_colour, len(index), noisy, dict(sorted(sizes.items())))
+    return _Looked(compared, equal, seen or levels, noisy, dict(sorted(sizes.items())))
+
+
+def _level(frame: NDArray[np.uint8]) -> tuple[float, float]:
+    """Mean of all values, and the standard deviation of the colour that varies most."""
+    return float(frame.mean()), float(frame.std(axis=(0, 1)).max())
+
+
+def _blank(seen: _Looked) -> NDArray[np.bool_]:
+    """(frame looked at,) whether it shows nothing."""
+    return np.array([spread <= ONE_COLOUR for _, spread in seen.levels.values()], np.bool_)
 
 
 def _beside(camera: CameraStream, equal: NDArray[np.bool_]) -> Iterator[float]:
@@ -151,19 +163,24 @@ def _resized(view: EpisodeView, name: str, seen: _Looked) -> Iterator[Flaw]:
 
 
 def _dead(view: EpisodeView, name: str, seen: _Looked) -> Iterator[Flaw]:
-    if not seen.one_colour:
-        return
-    time = view.cameras[name].time
-    dead = sorted(seen.one_colour)
-    whole = len(dead) == seen.decoded
-    start, stop = float(time[dead[0]]), float(time[dead[-1]])
-    level = float(np.mean(list(seen.one_colour.values())))
-    where = "all" if whole else f"{len(dead)} of the"
-    said = f"{where} {seen.decoded} frames looked at are of one colour (mean {level:.0f} of 255)"
-    if not whole:
-        said += f", the first at {start - view.zero:.2f} s, the last at {stop - view.zero:.2f} s"
-    span = (None, None) if whole else (start, stop)
-    yield view.flaw("dead camera", f"view {name}", f"{said}; expected a picture", *span)
+    time, frames = view.cameras[name].time, list(seen.levels)
+    for first, stop in runs(_blank(seen)):
+        dead = frames[first:stop]
+        level = float(np.mean([seen.levels[frame][0] for frame in dead]))
+        said = f"of one colour (mean {level:.0f} of 255)"
+        if len(dead) == len(frames):
+            said = f"all {len(frames)} frames looked at are {said}"
+            yield view.flaw("dead camera", f"view {name}", f"{said}; expected a picture")
+            return
+        begin, end = float(time[dead[0]]), float(time[dead[-1]])
+        yield view.flaw(
+            "dead camera",
+            f"view {name}",
+            f"{len(dead)} of the {len(frames)} frames looked at are {said}: frames {dead[0]} to "
+            f"{dead[-1]}, {begin - view.zero:.2f} to {end - view.zero:.2f} s; expected a picture",
+            begin,
+            end,
+        )
 
 
 def _duplicates(view: EpisodeView, name: str, looked: Mapping[str, _Looked]) -> Iterator[Flaw]:
@@ -178,7 +195,7 @@ def _duplicates(view: EpisodeView, name: str, looked: Mapping[str, _Looked]) -> 
             "expected a camera that runs",
         )
         return
-    told = 0
+    told = np.zeros(pairs, np.bool_)
     for first, last in runs(seen.equal):
         start, stop = (int(seen.index[place]) for place in (first, last))
         frozen = (
@@ -188,7 +205,7 @@ def _duplicates(view: EpisodeView, name: str, looked: Mapping[str, _Looked]) -> 
             and _others_move(view, name, looked, float(time[start]), float(time[stop]))
         )
         if frozen:
-            told += last - first
+            told[first:last] = True
             yield view.flaw(
                 "duplicate frames",
                 f"view {name}",
@@ -199,13 +216,17 @@ def _duplicates(view: EpisodeView, name: str, looked: Mapping[str, _Looked]) -> 
                 float(time[start]),
                 float(time[stop]),
             )
-    single = int(seen.equal.sum()) - told
-    if seen.noisy and single >= DUPLICATES and single > DUPLICATE_SHARE * pairs:
+    single = time[seen.index[1:][seen.equal & ~told]]
+    if seen.noisy and len(single) >= DUPLICATES and len(single) > DUPLICATE_SHARE * pairs:
+        instants = ", ".join(f"{one - view.zero:.2f}" for one in single[:DUPLICATES])
         yield view.flaw(
             "duplicate frames",
             f"view {name}",
-            f"{single} of {pairs} frames compared are the picture before, here and there; "
-            "the camera is slower than its frames are stamped, or frames were stored twice",
+            f"{len(single)} of {pairs} frames compared are the picture before, first at "
+            f"{instants} s, last at {single[-1] - view.zero:.2f} s; the camera is slower than its "
+            "frames are stamped, or frames were stored twice",
+            float(single[0]),
+            float(single[-1]),
         )
 
 

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.store import Episode, FeatureStore, episode_name
-from pipeline.store.gather import WIDE
 
 _BLOCK_TICKS = 65536
 
@@ -38,7 +37,7 @@ class Ages:
     """How old the features are at each tick: time of the tick less capture time of the frame."""
 
     newest: NDArray[np.float32]
-    """(tick,) s since the newest frame, as `FeatureStore.gather` says in `feature_age`."""
+    """(tick,) s since the newest frame, as `FeatureStore.feature_age` says."""
     by_view: NDArray[np.float32]
     """(tick, view) s since the frame of each view; NaN where the view is missing."""
     views: tuple[str, ...]
@@ -61,9 +60,7 @@ def ages(store: FeatureStore) -> Ages:
     shown = store.array("vl/frame_time")
     for start in range(0, store.ticks, _BLOCK_TICKS):
         ticks = np.arange(start, min(start + _BLOCK_TICKS, store.ticks))
-        empty = store.empty_batch(len(ticks), 1, 1, 1, but=WIDE)
-        batch, _ = store.select(ticks, (1, 1, 1), (0, 0.0, 0.0), empty, None)
-        newest[ticks] = batch.feature_age.numpy()
+        newest[ticks] = store.feature_age(ticks)
         by_view[ticks] = time[ticks, None] - shown[row_of[ticks]]
     return Ages(newest, by_view, views, store.vlm_reuse_count * tick_step(store))
 

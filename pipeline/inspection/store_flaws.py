@@ -41,6 +41,7 @@ def episode_flaws(
     yield from _instructions(episodes)
     yield from _constant(statistics)
     yield from _not_finite(statistics)
+    yield from _still(statistics)
     yield from _noise(statistics)
 
 
@@ -134,10 +135,10 @@ def _instructions(episodes: Sequence[EpisodeCoverage]) -> Iterator[Flaw]:
     said: dict[str, Counter[str]] = defaultdict(Counter)
     for one in episodes:
         said[one.source][one.instruction] += 1
+    most = {source: (*counts.most_common(1)[0], counts.total()) for source, counts in said.items()}
     for one in episodes:
-        counts = said[one.source]
-        (usual, often), total = counts.most_common(1)[0], counts.total()
-        rare = counts[one.instruction] <= max(1, _RARE * total) < often
+        usual, often, total = most[one.source]
+        rare = said[one.source][one.instruction] <= max(1, _RARE * total) < often
         if not one.instruction.strip():
             found = "the prompt says nothing of the task; set `instruction` of its data source"
             yield flaw_of(one, "no instruction", "instruction", found)
@@ -167,16 +168,24 @@ def _not_finite(statistics: Sequence[StreamStatistics]) -> Iterator[Flaw]:
             yield Flaw("not finite", "error", "", "", stream.stream, None, None, found)
 
 
-def _noise(statistics: Sequence[StreamStatistics]) -> Iterator[Flaw]:
-    """Channels that vary far less than the others of their unit, which normalising hides."""
+def _still(statistics: Sequence[StreamStatistics]) -> Iterator[Flaw]:
     for stream in statistics:
+        if stream.still is not None:
+            where = ("", "", stream.stream, None, None)
+            yield Flaw("still channel", "warning", *where, stream.still[1])
+
+
+def _noise(statistics: Sequence[StreamStatistics]) -> Iterator[Flaw]:
+    """Other channels that vary far less than those of their unit, which normalising hides."""
+    for stream in statistics:
+        told = {stream.channels[at].name for at in stream.still[0]} if stream.still else set[str]()
         by_unit: dict[str, list[ChannelStatistics]] = defaultdict(list)
         for one in stream.channels:
             if one.unit and one.std > 0:
                 by_unit[one.unit].append(one)
         for unit, ones in by_unit.items():
             usual = float(np.median([one.std for one in ones]))
-            quiet = [one for one in ones if one.std < _NOISE * usual]
+            quiet = [one for one in ones if one.std < _NOISE * usual and one.name not in told]
             if quiet and len(ones) >= _COMPARED:
                 most = max(one.std for one in quiet)
                 found = f"{listed([one.name for one in quiet])}: standard deviation up to "

@@ -5,8 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.inspection.channel_flaws import still_channels
 from pipeline.inspection.facts import ChannelStatistics
 from pipeline.inspection.statistics import statistics_of
+from pipeline.recordings import Channels
 from pipeline.store import FeatureStore
 
 SAMPLE_BYTES = 64 * 2**20
@@ -24,6 +26,8 @@ class StreamStatistics:
     looked_at: int
     """Of these, evenly spread; what the statistics are of."""
     channels: tuple[ChannelStatistics, ...]
+    still: tuple[list[int], str] | None
+    """Channels that hardly move, as of a recording; never of the sensor."""
 
 
 def stream_statistics(
@@ -37,11 +41,15 @@ def stream_statistics(
     found: list[StreamStatistics] = []
     for stream, name in _ARRAYS.items():
         values = store.array(name)
+        total = len(values)
         if values.size:
             said = store.streams[stream]
-            rows = evenly(len(values), max(2, sample_bytes // (4 * values.shape[1])))
-            channels = statistics_of(stream, said["names"], said["units"], values[rows])
-            found.append(StreamStatistics(stream, len(values), len(rows), tuple(channels)))
+            rows = evenly(total, max(2, sample_bytes // (4 * values.shape[1])))
+            names, units, values = said["names"], said["units"], values[rows]
+            channels = tuple(statistics_of(stream, names, units, values))
+            named = Channels(tuple(names), tuple(units))
+            still = None if stream == "sensor" else still_channels(named, values)
+            found.append(StreamStatistics(stream, total, len(rows), channels, still))
     return tuple(found)
 
 

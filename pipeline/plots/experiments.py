@@ -25,7 +25,7 @@ def comparison_of_experiments(experiments: Sequence[Experiment]) -> Figure:
     for method in BASELINES:
         style = STYLES[method]
         axis.axvline(
-            experiments[0].errors["overall"][method],
+            experiments[0].overall[method],
             color=style["color"],
             ls=style["linestyle"],
             lw=2,

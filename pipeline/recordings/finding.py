@@ -63,7 +63,7 @@ def episode_folders(source: Source, root: Path) -> list[tuple[Path, Reader]]:
             raise RecordingError(
                 f"source {source.name!r}: {pattern!r} matches {len(matches)} folder(s), none with "
                 f"an episode in it; looked under {full} for folders with "
-                f"{_wanted_markers(source)}. Mend the source's path or format"
+                f"{_wanted_markers(source)}. Mend the path or format"
                 f"{_around(matches[0])}"
             )
         for folder, reader in episodes:

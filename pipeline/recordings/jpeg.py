@@ -2,7 +2,8 @@
 
 import math
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path, PurePath
 from typing import TypeVar
@@ -14,6 +15,9 @@ from PIL import Image
 from pipeline.errors import RecordingError
 from pipeline.recordings.reader import natural_key
 from pipeline.recordings.recording import CameraStream
+
+THUMBNAIL = (32, 18)
+"""Width and height of what is seen of a JPEG that is checked."""
 
 Frame = TypeVar("Frame")
 _EYES = ("left", "right")
@@ -31,9 +35,10 @@ class JpegCamera(CameraStream):
         self.paths = [Path(path) for _, path in timed]
         self.time = np.array([time for time, _ in timed], np.float64)
 
-    def check(self, indices: Sequence[int]) -> None:
-        for index in indices:
-            check_image(self.paths[index], str(self.paths[index]))
+    def check(self, indices: Sequence[int]) -> NDArray[np.uint8] | None:
+        seen = [check_image(self.paths[index], str(self.paths[index])) for index in indices]
+        decoded = [thumbnail for thumbnail in seen if thumbnail is not None]
+        return np.stack(decoded) if seen and len(decoded) == len(seen) else None
 
     def read(self, indices: Sequence[int]) -> Iterator[NDArray[np.uint8]]:
         last, frame = -1, None
@@ -110,40 +115,38 @@ def split_eye(name: str) -> tuple[str, str]:
 
 def read_image(file: Path | bytes, where: str) -> NDArray[np.uint8]:
     """The image (height, width, 3), RGB as stored (EXIF orientation is ignored)."""
-    try:
-        with Image.open(_readable(file)) as image:
-            return np.asarray(image.convert("RGB"))
-    except _UNREADABLE as error:
-        raise RecordingError(f"{where}: cannot be decoded as an image: {error}") from None
+    with _image(file, where) as image:
+        return np.asarray(image.convert("RGB"))
 
 
 def image_size(file: Path, where: str) -> tuple[int, int]:
     """Height and width as the file's header says."""
-    try:
-        with Image.open(file) as image:
-            return image.height, image.width
-    except _UNREADABLE as error:
-        raise RecordingError(f"{where}: cannot be decoded as an image: {error}") from None
+    with _image(file, where) as image:
+        return image.height, image.width
 
 
-def check_image(file: Path | bytes, where: str) -> None:
+def check_image(file: Path | bytes, where: str) -> NDArray[np.uint8] | None:
     """Raise `RecordingError` on an unreadable image.
 
-    A JPEG is decoded at an eighth of its size, a PNG by its checksums.
+    A JPEG is decoded at an eighth of its size and gives some of its pixels, evenly spread, as a
+    `THUMBNAIL`; a PNG is judged by its checksums and gives None.
     """
+    with _image(file, where) as image:
+        if image.format == "PNG":
+            image.verify()
+            return None
+        image.draft("RGB", (max(1, image.width // 8), max(1, image.height // 8)))
+        return np.asarray(image.resize(THUMBNAIL, Image.Resampling.NEAREST).convert("RGB"))
+
+
+@contextmanager
+def _image(file: Path | bytes, where: str) -> Generator[Image.Image, None, None]:
+    """An open image; what goes wrong inside is a `RecordingError` that begins with `where`."""
     try:
-        with Image.open(_readable(file)) as image:
-            if image.format == "PNG":
-                image.verify()
-            else:
-                image.draft("RGB", (max(1, image.width // 8), max(1, image.height // 8)))
-                image.load()
+        with Image.open(BytesIO(file) if isinstance(file, bytes) else file) as image:
+            yield image
     except _UNREADABLE as error:
         raise RecordingError(f"{where}: cannot be decoded as an image: {error}") from None
-
-
-def _readable(file: Path | bytes) -> Path | BytesIO:
-    return BytesIO(file) if isinstance(file, bytes) else file
 
 
 def _view_folders(folder: Path, prefix: str) -> list[Path]:

@@ -65,7 +65,8 @@ def open_data_set(
         if absent is None:
             recordings.append(recording)
         else:
-            missing.append(f"{source.name}: {root} lists {entry.id}, but {absent} is not there")
+            said = f"{absent} is not there: copy it again, or go on without"
+            missing.append(f"{source.name}: {root} lists {entry.id}, but {said}")
     return recordings, missing
 
 

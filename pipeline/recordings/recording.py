@@ -71,10 +71,11 @@ class CameraStream(ABC):
     time: NDArray[np.float64]
 
     @abstractmethod
-    def check(self, indices: Sequence[int]) -> None:
+    def check(self, indices: Sequence[int]) -> NDArray[np.uint8] | None:
         """Raise `RecordingError` naming the first of these frames that cannot be decoded.
 
-        Cheaper than `read`; called before anything expensive runs.
+        Cheaper than `read`; called before anything expensive runs. Gives what was seen on the way:
+        thumbnails (index, height, width, 3), RGB, of one small size; None where nothing was.
         """
 
     @abstractmethod
@@ -174,8 +175,9 @@ def checked_stream(
     if bad.any():
         row, column = np.argwhere(bad)[0]
         raise RecordingError(
-            f"{where}: {values[row, column]} in row {row}, channel {channels.names[column]!r} "
-            f"({int(bad.sum())} such values in all)"
+            f"{where}: {values[row, column]} in row {row}, {time[row] - time[0]:.3f} s after the "
+            f"first, channel {channels.names[column]!r} ({int(bad.sum())} such values in all). "
+            "Mend the recording or leave it out: nothing is filled in"
         )
     return Stream(channels, time, values)
 

@@ -107,7 +107,7 @@ class VideoClip(CameraStream):
                 if frame.pts is None or frame.pts >= pts or spoilt:
                     break
         except av.FFmpegError as error:
-            said = f" ({error})"
+            said = f" ({error.strerror})"
         raise RecordingError(
             f"{self._span.path}: frame {index} of view {self.view!r} cannot be decoded{said}; "
             "the video is damaged there: copy the file again"
@@ -142,7 +142,7 @@ class VideoClip(CameraStream):
                 yield container, stream
         except av.FFmpegError as error:
             raise RecordingError(
-                f"{path}: cannot be read as video: {error}; copy the file again"
+                f"{path}: cannot be read as video: {error.strerror}; copy the file again"
             ) from None
 
 

@@ -56,6 +56,11 @@ def number(value: float) -> str:
     return f"{value:,.{decimals}f}"
 
 
+def sentence(words: str) -> str:
+    """Words of a table or a terminal with a capital and a full stop, to stand in a text."""
+    return f"{words[0].upper()}{words[1:]}."
+
+
 def prose(words: str) -> Markup:
     """Plain words with what stands in backticks as code."""
     parts = re.split(r"`([^`]+)`", words)

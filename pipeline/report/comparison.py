@@ -6,12 +6,15 @@ from functools import partial
 from pipeline import plots
 from pipeline.evaluation import FOOTNOTE, Experiment, experiment_errors
 from pipeline.report.blocks import Picture, Report, Section, Table
+from pipeline.report.cells import sentence
 
 
 def comparison_report(experiments: Sequence[Experiment]) -> Report:
     """The page of these experiments, of which the first are no better than the last."""
     best = min(experiments, key=lambda one: one.error)
     columns, rows = experiment_errors(experiments)
+    edge = columns.index("expert")
+    own = [(row[0], *row[edge:]) for row in rows[: len(experiments)]]
     return Report(
         title="Experiments side by side",
         summary=(
@@ -24,10 +27,9 @@ def comparison_report(experiments: Sequence[Experiment]) -> Report:
                 "Errors",
                 (
                     Table(
-                        columns,
-                        rows,
-                        caption=f"Mean absolute errors; samples: chunks a tick whose mean was "
-                        f"judged. {FOOTNOTE[0].upper()}{FOOTNOTE[1:]}.",
+                        columns[:edge],
+                        [row[:edge] for row in rows],
+                        caption=f"Mean absolute errors. {sentence(FOOTNOTE)}",
                         strong=frozenset({experiments.index(best)}),
                     ),
                     Picture(
@@ -35,6 +37,11 @@ def comparison_report(experiments: Sequence[Experiment]) -> Report:
                         "Held-out error of each experiment, coloured by expert; the baselines are "
                         "lines.",
                         partial(plots.comparison_of_experiments, experiments),
+                    ),
+                    Table(
+                        [columns[0], *columns[edge:]],
+                        own,
+                        caption="What they are; samples: chunks a tick whose mean was judged.",
                     ),
                 ),
             ),

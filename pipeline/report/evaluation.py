@@ -17,9 +17,11 @@ from pipeline.evaluation import (
     error_rows,
     judged_on,
     modality_errors,
+    still_dimensions,
     with_unit,
 )
 from pipeline.report.blocks import Block, Document, Picture, Report, Section, Table, Text
+from pipeline.report.cells import sentence
 from pipeline.report.episodes import episodes, extremes
 
 _NAMES = 8
@@ -40,7 +42,7 @@ def evaluation_report(found: Judgement) -> Report:
             f"{policy['step']}, {policy['parameters']:,} parameters, judged on "
             f"{comparison.ticks:,} held-out ticks of {len(comparison.episodes)} episode(s) of "
             f"{found.store.path.name}, {policy['samples']} chunk(s) a tick."
-            f"{_beaten(comparison)}"
+            f"{_beaten(comparison)}{_still(comparison)}"
         ),
         tiles=_tiles(comparison),
         sections=(
@@ -59,17 +61,25 @@ def _beaten(comparison: Comparison) -> str:
     worse = [
         f"{group.name} ({relative:.2f} times the best baseline's error)"
         for group in comparison.varying_groups()
-        if (relative := comparison.relative(group)) is not None and relative > 1
+        if (relative := comparison.relative(group)) is not None and round(relative, 2) > 1
     ]
     return f" A baseline is better in {', '.join(worse)}." if worse else ""
 
 
+def _still(comparison: Comparison) -> str:
+    """A sentence on the dimensions that hardly move, which the overall error counts like others."""
+    said = still_dimensions(comparison)
+    return f" {sentence(said)}" if said else ""
+
+
 def _tiles(comparison: Comparison) -> list[tuple[str, str]]:
-    relative = comparison.relative()
     tiles = [("overall error [training std]", f"{comparison.overall('policy'):.3f}")]
-    if relative is not None:
-        best = HEADINGS[best_baseline(comparison)]
-        tiles.append((f"of the best baseline's ({best})", f"{100 * relative:.0f} %"))
+    ways = [("of the best baseline's", comparison)]
+    if comparison.still():
+        ways.append(("the same, without what hardly moves", comparison.without_still()))
+    for said, judged in ways:
+        if (relative := judged.relative()) is not None:
+            tiles.append((f"{said} ({HEADINGS[best_baseline(judged)]})", f"{100 * relative:.0f} %"))
     tiles += [
         (with_unit(group.name, group.unit), f"{comparison.group_mae('policy', group):.3g}")
         for group in comparison.varying_groups()
@@ -88,7 +98,7 @@ def _baselines(comparison: Comparison) -> list[Block]:
         Table(
             ["mean absolute error", *(HEADINGS[method] for method in METHODS), "policy / best"],
             rows,
-            caption=FOOTNOTE,
+            caption=sentence(FOOTNOTE),
             strong=frozenset({len(rows) - 1}),
         ),
         Picture(
@@ -165,14 +175,13 @@ def _modalities(study: ModalityStudy | None) -> list[Block]:
             )
         ]
     columns, rows = modality_errors(study)
-    words = f"{judged_on(study)}. {MODALITY_FOOTNOTE}."
     return [
         Text(
-            f"{words[0].upper()}{words[1:]} An error that stays says that the policy does not use "
-            "the stream, or that others tell it the same."
+            f"{sentence(judged_on(study))} {sentence(MODALITY_FOOTNOTE)} An error that stays says "
+            "that the policy does not use the stream, or that others tell it the same."
         ),
         Table(columns, rows, strong=frozenset({0})),
-        *(Text(f"{note[0].upper()}{note[1:]}.") for note in study.notes),
+        *(Text(sentence(note)) for note in study.notes),
         Picture(
             "modalities",
             "The error with one stream spoilt as a multiple of the error with all intact.",

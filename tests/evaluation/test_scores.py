@@ -1,7 +1,9 @@
 """Errors and baselines against values worked out by hand."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -112,6 +114,43 @@ def test_a_group_that_never_varies_is_not_compared_and_weighs_nothing(
     assert comparison.relative(gripper) is None
     assert comparison.group_mae("policy", gripper) == pytest.approx(5.0)
     assert comparison.overall("policy") == pytest.approx(0.0, abs=1e-6)
+
+
+def joints(comparison: Comparison, scale: list[float]) -> Comparison:
+    """The comparison of five dimensions as if they were joints of these training deviations."""
+    names = tuple(f"joint_{index}" for index in range(5))
+    return replace(comparison, names=names, units=("rad",) * 5, scale=np.array(scale))
+
+
+def test_what_hardly_moves_beside_its_like_is_told_and_can_be_left_out(
+    recorded: Recorded, compared: Compared
+) -> None:
+    """By the yardstick of `stages.inspect`: a hundredth of the median of three or more."""
+    error = np.array([0.1, 0.1, 0.1, 0.001, 0.001])
+    found = joints(compared(recorded(np.arange(60), error)), [1.0, 1.0, 1.0, 0.0099, 0.0101])
+    assert found.still() == {3: 1.0}
+    assert found.overall("policy") == pytest.approx((0.3 + 1 / 9.9 + 1 / 10.1) / 5, rel=1e-4)
+    moving = found.without_still()
+    assert moving.overall("policy") == pytest.approx((0.3 + 1 / 10.1) / 4, rel=1e-4)
+    assert moving.varying() == [0, 1, 2, 4] and found.varying() == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"names": ("x", "y", "z", "joint_3", "gripper")},
+        {"units": ("mm", "mm", "mm", "rad", "rad")},
+        {"scale": np.array([0.0, 0.0, 0.0, 1.0, 0.001])},
+    ],
+)
+def test_what_has_no_like_is_not_still(
+    recorded: Recorded, compared: Compared, changed: dict[str, Any]
+) -> None:
+    comparison = compared(recorded(np.arange(60)))
+    assert comparison.still() == {}
+    still = joints(comparison, [1.0, 1.0, 1.0, 0.001, 0.001])
+    assert still.still().keys() == {3, 4}
+    assert replace(still, **changed).still() == {}
 
 
 class FirstFeature(torch.nn.Module):

@@ -3,6 +3,7 @@
 import csv
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import DiskFull
-from pipeline.evaluation import Comparison, Predictions, metrics, table, write_tables
+from pipeline.evaluation import BASELINES, Comparison, Predictions, metrics, table, write_tables
 from pipeline.evaluation.tables import FOOTNOTE
 from pipeline.store import FeatureStore
 
@@ -62,6 +63,25 @@ def test_the_table_lines_up(comparison: Comparison) -> None:
     ]
     assert len({len(line) for line in lines[:-1]}) == 1
     assert lines[3].endswith("-")
+
+
+def test_dimensions_that_hardly_move_are_said_below_the_table(comparison: Comparison) -> None:
+    """Without them it may be that a baseline wins; `metrics.json` stays as it is."""
+    names = tuple(f"joint_{index}" for index in range(5))
+    scale = np.array([0.05, 0.06, 0.07, 1e-9, 0.0])
+    still = replace(comparison, names=names, units=("",) * 5, scale=scale)
+    moving = replace(still, scale=np.array([0.05, 0.06, 0.07, 0.0, 0.0]))
+    error = f"{moving.overall('policy'):.3f}, {moving.relative():.2f} times the best baseline's"
+    best = min(BASELINES, key=moving.overall).replace("_action", "").replace("_", " ")
+    *_, footnote, line = table(still).splitlines()
+    assert footnote == FOOTNOTE
+    assert line == (
+        "hardly moving: joint_3 (training std at most 1e-09, where 0.062 is usual for such "
+        "dimensions), 1 of the 4 dimensions in the overall error; without, it is "
+        f"{error} ({best})"
+    )
+    assert metrics(still)["overall"]["policy"] == pytest.approx(still.overall("policy"), rel=1e-5)
+    assert moving.overall("policy") < 0.01 * still.overall("policy")
 
 
 def test_files_hold_every_dimension_step_episode_and_tick(

@@ -63,6 +63,22 @@ def test_contact_may_pull_and_may_be_sampled_slowly(base: EpisodeView) -> None:
     assert contacts(view_of(base, time, force)) == (Contact(time[30], time[45]),)
 
 
+def test_contact_begins_where_the_force_rises_and_not_where_it_creeps(base: EpisodeView) -> None:
+    time = np.arange(3000) / 500
+    force = 2.0 + np.random.default_rng(0).normal(0, 0.002, 3000)
+    force += np.clip(time - 1, 0, 3) * 0.04 / 3  # N of drift, under the threshold
+    force[2000:2750] += 0.5
+    (found,) = contacts(view_of(base, time, force))
+    assert found.start_s == pytest.approx(time[2000], abs=0.02)
+    assert found.stop_s > time[2740]
+
+
+def test_contact_of_a_real_insertion_begins_with_the_rise(shared_data: Path, look) -> None:
+    view = look(shared_data / "insertion/raw")
+    (found,) = contacts(view)
+    assert 2.4 < found.start_s - view.zero < 2.6 and found.stop_s == view.sensor.time[-1]
+
+
 def test_wrenches_count_by_their_length(base: EpisodeView) -> None:
     rng = np.random.default_rng(0)
     time = np.arange(3000) / 500

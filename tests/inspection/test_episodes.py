@@ -44,7 +44,8 @@ def test_a_nan_leaves_the_other_streams(copied, look: Look, change_npz) -> None:
     view = look(folder)
     (flaw,) = view.flaws
     assert (flaw.kind, flaw.severity, flaw.stream) == ("unreadable", "error", "sensor")
-    assert "nan in row 7, channel 'force'" in flaw.message
+    assert "nan in row 7, 0.01" in flaw.message and "channel 'force'" in flaw.message
+    assert "s after the first" in flaw.message and "leave it out" in flaw.message
     assert view.sensor is None and view.state is not None and len(view.cameras) == 3
     assert view.timeline is not None and not view.timeline.sensor_end.any()
     assert find_flaws(view)[0] == flaw

@@ -2,6 +2,7 @@
 
 import pickle
 import shutil
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,13 +14,13 @@ from pipeline.inspection.overview import RecordingsOverview, survey_recordings
 from pipeline.recordings import open_recordings
 
 
-def survey(*sources: Source) -> RecordingsOverview:
+def survey(*sources: Source, views: Sequence[str] | None = None) -> RecordingsOverview:
     document = {
         "data": {"sources": [source.model_dump() for source in sources]},
         "vlm": {"checkpoint": "none"},
     }
     params = Params.model_validate(document)
-    return survey_recordings(open_recordings(params.data.sources), params)
+    return survey_recordings(open_recordings(params.data.sources, views=views), params)
 
 
 @pytest.fixture
@@ -88,8 +89,28 @@ def test_the_same_recording_twice(many: Path) -> None:
     assert [one.warnings for one in found.summaries] == [0, 0, 0, 1, 1]
 
 
+def test_the_same_recording_in_two_formats(shared_data: Path) -> None:
+    paths = (str(shared_data / "insertion/new"), str(shared_data / "insertion/raw"))
+    found = survey(Source(name="s", path=paths), views=())
+    (flaw,) = [flaw for flaw in found.flaws if flaw.kind == "duplicate recording"]
+    assert flaw.episode == "data_collection_20251108_055533"
+    assert "the same recording as episode_20251108_055533" in flaw.message
+    assert "all values of state are equal, and nothing else was compared" in flaw.message
+
+
+def test_a_recording_without_its_actions_is_still_the_same(many: Path) -> None:
+    found = survey(Source(name="s", path=str(many)))
+    assert found.flaws == ()  # equal states with other actions
+    shutil.copytree(many / "a", many / "d")
+    (many / "d" / "robot_states.npz").unlink()
+    twice = [f for f in survey(Source(name="s", path=str(many))).flaws if "same" in f.message]
+    assert [flaw.episode for flaw in twice] == ["d"]
+    assert "all values of action are equal" in twice[0].message
+
+
 def test_real_recordings_in_two_versions(shared_data: Path) -> None:
-    found = survey(Source(name="s", path=str(shared_data / "lerobot")))
+    # Their motion tells; decoding the videos would tell nothing more.
+    found = survey(Source(name="s", path=str(shared_data / "lerobot")), views=())
     twice = [flaw for flaw in found.flaws if flaw.kind == "duplicate recording"]
     assert [flaw.episode for flaw in twice] == [
         f"cr5_banana_v30_split/episode_{index:06d}" for index in range(5)

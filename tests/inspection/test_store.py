@@ -2,9 +2,11 @@
 
 import json
 import os
+import time
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,7 +15,9 @@ import pytest
 from pipeline.config import InspectParams
 from pipeline.errors import StoreIncomplete, StoreMismatch
 from pipeline.inspection.store import StoreView, inspect_store
+from pipeline.inspection.store_coverage import Ages, EpisodeCoverage
 from pipeline.inspection.store_features import look_at_features, read_slot, sample_rows
+from pipeline.inspection.store_flaws import episode_flaws
 from pipeline.inspection.store_statistics import stream_statistics
 from pipeline.store import FeatureStore
 from pipeline.store.metadata import note_metadata
@@ -355,6 +359,23 @@ class TestFlaws:
             ("no instruction", "left", "episode_004"),
         ]
 
+    def test_as_many_instructions_as_episodes_take_no_time(self):
+        nothing = {"ticks": 0, "vl_rows": 0, "seconds": 0.0, "readings": {}, "covered": {}}
+        episodes = [
+            EpisodeCoverage(n, f"a/{n}", str(n), "a", "raw", f"do {n}", **nothing)
+            for n in range(20_000)
+        ]
+        store: Any = SimpleNamespace(
+            episodes=[SimpleNamespace(ticks=range(0)) for _ in episodes],
+            array=lambda name: np.empty(0),
+        )
+        none = np.empty(0, np.float32)
+        ages = Ages(none, none.reshape(0, 1), ("View1",), np.nan)
+        begin = time.process_time()
+        found = {one.kind for one in episode_flaws(store, episodes, ages, ())}
+        assert time.process_time() - begin < 4
+        assert found == {"short episode"}
+
     def test_a_flat_channel(self, path, plant):
         plant(path, "tick/action", lambda action: action.__setitem__((slice(None), 1), 0))
         (flaw,) = look(path).flaws
@@ -364,15 +385,31 @@ class TestFlaws:
         def quiet(state: np.ndarray) -> None:
             state[:, 2] *= 1e-3
 
-        attributes(path, lambda attrs: attrs["streams"]["state"].update(units=4 * ["rad/s"]))
+        said = {"names": ["x", "y", "z", "other"], "units": 4 * ["rad/s"]}
+        attributes(path, lambda attrs: attrs["streams"]["state"].update(said))
         assert look(path).flaws == ()
         plant(path, "state/values", quiet)
         (flaw,) = look(path).flaws
         assert (flaw.kind, flaw.severity, flaw.stream) == ("noise", "warning", "state")
-        assert flaw.message.startswith("joint_2: ") and "rad/s" in flaw.message
+        assert flaw.message.startswith("z: ") and "rad/s" in flaw.message
 
-    def test_channels_without_a_unit_are_not_compared(self, path, plant):
-        attributes(path, lambda attrs: attrs["streams"]["state"].update(units=4 * [""]))
+    @pytest.mark.parametrize("unit", ["", "rad/s"])
+    @pytest.mark.parametrize("scale", [0, 1e-3])
+    def test_a_joint_that_hardly_moves_is_told_once(self, path, plant, unit, scale):
+        """As of recordings, whose rule it is; one that never moves is flat."""
+        attributes(path, lambda attrs: attrs["streams"]["state"].update(units=4 * [unit]))
+        assert look(path).flaws == ()
+        plant(path, "state/values", lambda state: np.multiply(state[:, 2], scale, out=state[:, 2]))
+        (flaw,) = look(path).flaws
+        kind = "still channel" if scale else "flat channel"
+        assert (flaw.kind, flaw.severity, flaw.stream) == (kind, "warning", "state")
+        assert flaw.message.startswith("joint_2")
+
+    def test_channels_that_are_neither_of_one_unit_nor_of_one_kind_are_not_compared(
+        self, path, plant
+    ):
+        said = {"names": ["x", "y", "z", "other"], "units": 4 * [""]}
+        attributes(path, lambda attrs: attrs["streams"]["state"].update(said))
         plant(path, "state/values", lambda state: np.multiply(state[:, 2], 1e-3, out=state[:, 2]))
         assert look(path).flaws == ()
 

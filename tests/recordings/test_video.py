@@ -164,6 +164,16 @@ def test_a_file_without_video_is_named(tmp_path):
         clip(path, 36).check([0])
 
 
+def test_what_is_no_video_is_named_once_and_in_words(tmp_path):
+    path = tmp_path / "a.mp4"
+    path.write_bytes(b"no video")
+    with pytest.raises(RecordingError) as caught:
+        clip(path, 36).check([0])
+    said = str(caught.value)
+    assert said.startswith(f"{path}: cannot be read as video: Invalid data found")
+    assert said.count(str(path)) == 1 and "Errno" not in said
+
+
 def test_a_build_without_av1_says_so(tmp_path, write, monkeypatch):
     if "libsvtav1" not in av.codecs_available:
         pytest.skip("this PyAV build writes no AV1")

@@ -30,6 +30,9 @@ def experiments(
     }
     path = folder / "params.yaml"
     path.write_text(yaml.safe_dump(document))
+    # Their own pages are not what is compared.
+    monkeypatch = pytest.MonkeyPatch()
+    monkeypatch.setattr(evaluate, "write_report", lambda *_: [])
     for name in NAMES:
         expert, fusion = name.split("-")
         own = [
@@ -43,6 +46,7 @@ def experiments(
         arguments = ["--params", str(path), *(part for one in own for part in ("--set", one))]
         assert run("", train_head.main, arguments) == 0
         assert run("", evaluate.main, arguments) == 0
+    monkeypatch.undo()
     return path
 
 
@@ -67,6 +71,7 @@ def test_a_table_a_file_and_a_picture(
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines[1:5]] == NAMES
     assert lines[0].split()[-3:] == ["samples", "parameters", "trained"]
+    assert "overall [training std]  translation [mm]  rotation [deg]  gripper" in lines[0]
     assert [line.split()[-4] for line in lines[1:5]] == ["1", "1", "2", "2"]
     assert [line.split("  ")[0] for line in lines[5:8]] == [
         "baseline: zero",
@@ -78,6 +83,7 @@ def test_a_table_a_file_and_a_picture(
     assert sorted(path.name for path in output.iterdir()) == names
     assert (output / "experiments.png").read_bytes().startswith(b"\x89PNG")
     rows = list(csv.DictReader((output / "experiments.csv").read_text().splitlines()))
+    assert list(rows[0])[6:12:4] == ["overall_policy", "translation_mm_policy"]
     for row in rows:
         folder = experiments.parent / "reports" / row["experiment"]
         overall = json.loads((folder / "metrics.json").read_text())["overall"]
@@ -159,17 +165,30 @@ def test_a_folder_that_is_no_evaluation_is_named(
     said: str,
 ) -> None:
     (reports / "regression-gated" / name).unlink()
-    assert f"regression-gated, but it has no {name}" in refused(reports, experiments, capsys)
+    error = refused(reports, experiments, capsys)
+    assert f"regression-gated, but it has no {name}. Evaluate that" in error
+    assert error.count("compare.reports:") == error.count("Evaluate that experiment again") == 1
     (reports / "regression-gated" / name).write_text(torn)
     assert said in refused(reports, experiments, capsys)
     (reports / "regression-gated" / name).write_text("{}")
     assert "regression-gated, but it lacks" in refused(reports, experiments, capsys)
 
 
+def test_logs_beside_evaluations_are_passed_over(reports: Path, experiments: Path) -> None:
+    """As docs/training.md lays them: `reports/blind_train` beside `reports/blind`."""
+    logs = experiments.parent / "logs" / "regression-gated"
+    assert (logs / "metrics.json").exists()
+    shutil.copytree(logs, reports / "regression-gated_train")
+    (reports / "regression-gated_train.dvclive.html").write_text("<p>a page</p>")
+    assert sorted(one.name for one in read_experiments(reports)) == sorted(NAMES)
+
+
 def test_nothing_to_compare_says_what_to_run(
     experiments: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert "dvc repro experiments/dvc.yaml" in refused(tmp_path / "none", experiments, capsys)
+    """A folder of logs alone is nothing either."""
+    for reports in (tmp_path / "none", experiments.parent / "logs"):
+        assert "dvc repro experiments/dvc.yaml" in refused(reports, experiments, capsys)
 
 
 @pytest.mark.parametrize(("stage", "of"), [("train", "train_head"), ("evaluate", "evaluate")])

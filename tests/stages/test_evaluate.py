@@ -4,12 +4,15 @@ import json
 import re
 import shutil
 from collections.abc import Callable
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
+from pipeline.report import Picture, Report, Text
 from pipeline.store.archive import archive
 from stages import evaluate, train_head
 from stages.command import run
@@ -43,19 +46,43 @@ def trained(
     return path
 
 
+@pytest.fixture(scope="module")
+def judged(trained: Path) -> tuple[Path, str]:
+    """Where its evaluation lies, whole, and what was said; not to be written to."""
+    said = StringIO()
+    with redirect_stdout(said):
+        assert run("", evaluate.main, ["--params", str(trained)]) == 0
+    return trained.parent / "report", said.getvalue()
+
+
+@pytest.fixture
+def reports(monkeypatch: pytest.MonkeyPatch) -> list[Report]:
+    """The pages that evaluations here would write: most of their time goes into pictures."""
+    found: list[Report] = []
+
+    def kept(folder: Path, report: Report) -> list[Path]:
+        found.append(report)
+        return []
+
+    monkeypatch.setattr(evaluate, "write_report", kept)
+    return found
+
+
+def arguments(trained: Path, output: Path, *overrides: str) -> list[str]:
+    """Of an evaluation into `output` that leaves the streams alone."""
+    told = (f"evaluate.output={output}", "evaluate.modalities=false", *overrides)
+    return ["--params", str(trained), *(part for one in told for part in ("--set", one))]
+
+
+@pytest.mark.usefixtures("reports")
 def test_a_store_that_grew_is_judged_on_the_same_episodes(
-    trained: Path,
-    tiny_store: Callable[..., Path],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    trained: Path, judged: tuple[Path, str], tiny_store: Callable[..., Path], tmp_path: Path
 ) -> None:
-    grown = tiny_store(tmp_path, episodes=9)
-    for store in (trained.parent / "tiny.zarr", grown):
-        assert (
-            run("", evaluate.main, ["--params", str(trained), "--set", f"evaluate.store={store}"])
-            == 0
-        )
-        assert "30 held-out ticks of 1 episode(s)" in capsys.readouterr().out
+    report, said = judged
+    assert "30 held-out ticks of 1 episode(s)" in said
+    grown = f"evaluate.store={tiny_store(tmp_path, episodes=9)}"
+    assert run("", evaluate.main, arguments(trained, tmp_path / "report", grown)) == 0
+    assert (tmp_path / "report/judged.json").read_bytes() == (report / "judged.json").read_bytes()
 
 
 @pytest.mark.parametrize(
@@ -87,6 +114,7 @@ def test_another_store_is_refused_by_name(
 
 
 @pytest.mark.parametrize("array", ["sensor/values", "vl/features"])
+@pytest.mark.usefixtures("reports")
 def test_a_flipped_bit_is_refused_where_it_would_be_judged_on(
     trained: Path,
     tiny_store: Callable[..., Path],
@@ -97,12 +125,11 @@ def test_a_flipped_bit_is_refused_where_it_would_be_judged_on(
 ) -> None:
     store = tiny_store(tmp_path, name="flipped")
     file = flip(store, array)
-    arguments = ["--params", str(trained), "--set", f"evaluate.store={store}"]
-    arguments += ["--set", f"evaluate.output={tmp_path / 'report'}"]
-    assert run("", evaluate.main, arguments) == 2
+    told = arguments(trained, tmp_path / "report", f"evaluate.store={store}")
+    assert run("", evaluate.main, told) == 2
     assert f"{file}: " in capsys.readouterr().err
     assert not (tmp_path / "report").exists()
-    assert run("", evaluate.main, [*arguments, "--set", "train_head.check_store=false"]) == 0
+    assert run("", evaluate.main, [*told, "--set", "train_head.check_store=false"]) == 0
 
 
 def test_a_missing_checkpoint_says_what_to_run(
@@ -113,114 +140,103 @@ def test_a_missing_checkpoint_says_what_to_run(
     assert "Run stages.train_head" in capsys.readouterr().err
 
 
-def test_last_can_be_judged_too(trained: Path) -> None:
+@pytest.mark.usefixtures("reports")
+def test_last_can_be_judged_too(trained: Path, tmp_path: Path) -> None:
     last = f"evaluate.checkpoint={trained.parent / 'head/last'}"
-    assert run("", evaluate.main, ["--params", str(trained), "--set", last]) == 0
+    assert run("", evaluate.main, arguments(trained, tmp_path / "report", last)) == 0
 
 
 def test_the_report_says_what_was_judged_and_which_streams_are_used(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    judged: tuple[Path, str],
 ) -> None:
     """One held-out episode: nothing can be shuffled, and the report says so."""
-    arguments = ["--params", str(trained), "--set", f"evaluate.output={tmp_path / 'report'}"]
-    assert run("", evaluate.main, arguments) == 0
-    said = capsys.readouterr().out
+    report, said = judged
     assert "sensor    zeroed" in said
     assert "sensor shuffled: not judged" in said
     for name in PICTURES:
-        assert (tmp_path / f"report/{name}.png").read_bytes().startswith(b"\x89PNG")
-    streams = (tmp_path / "report/streams.csv").read_text()
-    assert "\nsensor delayed 50 ms," in streams
-    judged = json.loads((tmp_path / "report/judged.json").read_text())
-    assert judged["policy"]["model_type"] == "regression"
-    assert judged["policy"]["samples"] == 1
-    assert judged["drawn"] is None
-    ((name, held_out),) = judged["on"]["held_out"].items()
+        assert (report / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+    assert "\nsensor delayed 50 ms," in (report / "streams.csv").read_text()
+    document = json.loads((report / "judged.json").read_text())
+    assert document["policy"]["model_type"] == "regression"
+    assert document["policy"]["samples"] == 1
+    assert document["drawn"] is None
+    ((name, held_out),) = document["on"]["held_out"].items()
     assert held_out["ticks"] == [0, 30]
-    page = (tmp_path / "report/report.html").read_text()
     place = f"data/demo/recordings/{name.split('/')[1]}"
+    page = (report / "report.html").read_text()
     assert f"No frames: there is no recording at {place} any more." in page
 
 
 def test_the_same_judgement_is_the_same_bytes_wherever_it_is_written(
-    trained: Path, tmp_path: Path
+    trained: Path, judged: tuple[Path, str], tmp_path: Path
 ) -> None:
-    written = []
-    for output in (tmp_path / "one", tmp_path / "else/where"):
-        arguments = ["--params", str(trained), "--set", f"evaluate.output={output}"]
-        assert run("", evaluate.main, arguments) == 0
-        written.append({file.name: file.read_bytes() for file in output.iterdir()})
-    assert written[0] == written[1]
-    assert "report.html" in written[0]
+    output = tmp_path / "else" / "where"
+    told = ["--params", str(trained), "--set", f"evaluate.output={output}"]
+    assert run("", evaluate.main, told) == 0
+    first, second = (
+        {file.name: file.read_bytes() for file in folder.iterdir()}
+        for folder in (judged[0], output)
+    )
+    assert first == second
+    assert "report.html" in first
 
 
-def test_a_report_says_that_the_logs_are_gone(trained: Path, tmp_path: Path) -> None:
+def test_a_report_says_that_the_logs_are_gone(
+    trained: Path, tmp_path: Path, reports: list[Report]
+) -> None:
     logs = shutil.move(trained.parent / "logs", tmp_path / "logs")
-    arguments = ["--params", str(trained), "--set", f"evaluate.output={tmp_path / 'report'}"]
     try:
-        assert run("", evaluate.main, arguments) == 0
+        assert run("", evaluate.main, arguments(trained, tmp_path / "report")) == 0
     finally:
         shutil.move(logs, trained.parent / "logs")
-    assert (
-        f"there are none in {trained.parent / 'logs/plots/metrics'} any more"
-        in (tmp_path / "report/report.html").read_text()
-    )
-    assert not (tmp_path / "report/curves.png").exists()
-
-
-def test_dvc_misses_no_file_of_a_single_episode(trained: Path, tmp_path: Path) -> None:
-    """Nor of one whose streams nobody asked for."""
-    listed = re.findall(r"evaluate\.output}/([\w.]+)", (ROOT / "dvc.yaml").read_text())
-    arguments = ["--set", f"evaluate.output={tmp_path}", "--set", "evaluate.modalities=false"]
-    assert run("", evaluate.main, ["--params", str(trained), *arguments]) == 0
-    assert len(listed) > 8 and set(listed) <= {file.name for file in tmp_path.iterdir()}
+    (report,) = reports
+    gone = f"there are none in {trained.parent / 'logs/plots/metrics'} any more"
+    assert any(gone in text.words for text in report.blocks(Text))
+    assert "curves" not in {picture.name for picture in report.blocks(Picture)}
 
 
 def test_streams_are_left_alone_where_nobody_asks(trained: Path, tmp_path: Path) -> None:
+    """DVC misses no file of such an evaluation either, here of a single episode."""
+    listed = re.findall(r"evaluate\.output}/([\w.]+)", (ROOT / "dvc.yaml").read_text())
     output = tmp_path / "report"
-    arguments = ["--set", f"evaluate.output={output}", "--set", "evaluate.modalities=false"]
-    assert run("", evaluate.main, ["--params", str(trained), *arguments]) == 0
+    assert run("", evaluate.main, arguments(trained, output)) == 0
+    assert len(listed) > 8 and set(listed) <= {file.name for file in output.iterdir()}
     assert not (output / "modalities.png").exists()
     assert (output / "streams.csv").read_text() == "spoilt,times_intact,overall_error\n"
 
 
+@pytest.mark.usefixtures("reports")
 def test_a_sampling_policy_is_judged_on_the_mean_of_samples(trained: Path, tmp_path: Path) -> None:
     head = tmp_path / "head"
-    own = [
+    own = (
         "train_head.model_type=flow_matching",
         f"train_head.output={head}",
         f"train_head.logs={tmp_path / 'logs'}",
         f"evaluate.checkpoint={head}",
-        "evaluate.modalities=false",
-    ]
-    arguments = ["--params", str(trained), *(part for one in own for part in ("--set", one))]
-    assert run("", train_head.main, arguments) == 0
+    )
+    output = tmp_path / "report"
+    assert run("", train_head.main, arguments(trained, output, *own)) == 0
     errors = []
     for samples in (1, 8, 8):
-        output = tmp_path / f"report{len(errors)}"
-        more = ["--set", f"evaluate.samples={samples}", "--set", f"evaluate.output={output}"]
-        assert run("", evaluate.main, [*arguments, *more]) == 0
-        judged = json.loads((output / "judged.json").read_text())
-        assert judged["policy"]["samples"] == samples
-        assert judged["drawn"] == {"samples": samples, "batch_size": 64}
+        told = arguments(trained, output, *own, f"evaluate.samples={samples}")
+        assert run("", evaluate.main, told) == 0
+        document = json.loads((output / "judged.json").read_text())
+        assert document["policy"]["samples"] == samples
+        assert document["drawn"] == {"samples": samples, "batch_size": 64}
         errors.append(json.loads((output / "metrics.json").read_text())["overall"]["policy"])
     assert errors[1] == errors[2] != errors[0]
 
 
+@pytest.mark.usefixtures("reports")
 def test_an_archive_does_what_its_store_does(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    trained: Path, judged: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    packed = tmp_path / "tiny.archive.zarr"
+    packed, output = tmp_path / "tiny.archive.zarr", tmp_path / "report"
     archive(trained.parent / "tiny.zarr", packed, level=1, threads=1)
-    arguments = ["--params", str(trained), "--set", f"train_head.scratch={tmp_path / 'scratch'}"]
-    from_store, from_archive = tmp_path / "from_store", tmp_path / "from_archive"
-    told = [*arguments, "--set", f"evaluate.output={from_store}"]
-    assert run("", evaluate.main, told) == 0
-    archived = [*arguments, "--set", f"extract.store={packed}"]
-    assert run("", train_head.main, archived) == 0
+    own = (f"train_head.scratch={tmp_path / 'scratch'}", f"extract.store={packed}")
+    assert run("", train_head.main, arguments(trained, output, *own)) == 0
     said = capsys.readouterr().out
     assert "feed: compressed" in said and "nothing to do" in said
-    assert run("", evaluate.main, [*archived, "--set", f"evaluate.output={from_archive}"]) == 0
-    assert (from_archive / "metrics.json").read_bytes() == (
-        from_store / "metrics.json"
-    ).read_bytes()
+    assert run("", evaluate.main, arguments(trained, output, *own)) == 0
+    for file in ("metrics.json", "judged.json"):
+        assert (output / file).read_bytes() == (judged[0] / file).read_bytes()
