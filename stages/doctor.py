@@ -14,10 +14,16 @@ params given. Downloads nothing, loads no model, changes nothing; takes some sec
 Exit code 2 where something is missing. Next: python -m stages.extract --set extract.plan=true
 """
 
+from stages.command import run
+
+if __name__ == "__main__":  # here, for --help waits for no import below
+    raise SystemExit(
+        run(__doc__ or "", "stages.doctor", sections=("data", "vlm", "extract", "train_head"))
+    )
+
 from pipeline.config import Params
 from pipeline.errors import PipelineError
 from pipeline.machine import Finding, described, examine
-from stages.command import run
 
 
 def main(params: Params) -> None:
@@ -32,8 +38,7 @@ def main(params: Params) -> None:
             f"{len(lacking)} thing(s) are missing: {subjects}. Do what stands behind -> there, "
             "then run python -m stages.doctor again."
         )
-    print("nothing is missing: stage one and stage two can run with these params")
-
-
-if __name__ == "__main__":
-    raise SystemExit(run(__doc__ or "", main, sections=("data", "vlm", "extract", "train_head")))
+    print(
+        "nothing that was looked at is missing; python -m stages.extract --set extract.plan=true "
+        "reads every episode"
+    )

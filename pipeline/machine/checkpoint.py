@@ -12,6 +12,7 @@ from pipeline.config import Params, VLMParams
 from pipeline.errors import VLMError
 from pipeline.machine.findings import Finding, missing, note, ok
 from pipeline.machine.gpu import GPU, read_accelerator, usable_device
+from pipeline.simulation.demo_recordings import MARKER
 from pipeline.store.mapping import available_bytes
 from pipeline.vlm.checkpoint_folder import (
     adapter_files,
@@ -23,6 +24,7 @@ from pipeline.vlm.checkpoint_folder import (
 
 _BYTES = {"float32": 4, "float16": 2, "bfloat16": 2}
 _EXAMPLE = "set vlm.checkpoint to a folder or a hub id, such as Qwen/Qwen2.5-VL-3B-Instruct"
+_RANDOM = "the demo's random weights: to look at the machinery, not to learn from"
 _BESIDE = 2 * 2**30
 """Roughly what else a GPU holds while the model works: CUDA itself and a batch's activations."""
 
@@ -45,6 +47,8 @@ def check_checkpoint(params: Params) -> list[Finding]:
     if str(folder) != vlm.checkpoint:
         here += " (in the hub's cache)"
     findings = [ok("vlm.checkpoint", here)]
+    if (folder / MARKER).exists():
+        findings = [note("vlm.checkpoint", f"{here}; {_RANDOM}", f"{_EXAMPLE}; docs/real-model.md")]
     if vlm.adapter is not None:
         findings.append(check_adapter(vlm.adapter))
     device = usable_device(params.extract.device)

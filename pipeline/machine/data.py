@@ -44,11 +44,7 @@ def check_source(
     findings = [ok(source.name, f"{said or 'no episode'}{_first_instruction(opened.recordings)}")]
     if opened.bad:
         first = f"{len(opened.bad)} episode(s) cannot be read, first: {opened.bad[0].reason}"
-        if on_bad == "skip":
-            findings.append(note(source.name, first, "left out, as data.on_bad_episode says"))
-        else:
-            remedy = "mend or remove them, or set data.on_bad_episode=skip"
-            findings.append(missing(source.name, first, remedy))
+        findings.append(unusable(source.name, first, on_bad))
     if opened.missing:
         said = f"{len(opened.missing)} listed episode(s) are not there: {opened.missing[0]}"
         findings.append(note(source.name, said, "copy them too, or leave them out"))
@@ -58,6 +54,13 @@ def check_source(
         findings.append(note(source.name, said, "lay it below data.root, for dvc repro"))
     video = _first_video(opened.recordings)
     return findings if video is None else [*findings, check_video(source.name, video, trouble)]
+
+
+def unusable(subject: str, found: str, on_bad: str) -> Finding:
+    """What is said of episodes that cannot be used: they are left out, or nothing runs."""
+    if on_bad == "skip":
+        return note(subject, found, "left out, as data.on_bad_episode says")
+    return missing(subject, found, "mend or remove them, or set data.on_bad_episode=skip")
 
 
 def check_video(source: str, path: Path, trouble: Callable[[str], str | None]) -> Finding:

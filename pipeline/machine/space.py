@@ -10,12 +10,13 @@ from pathlib import Path
 from pipeline.amounts import size
 from pipeline.config import Params
 from pipeline.durable import free_bytes
-from pipeline.errors import PipelineError
+from pipeline.errors import RecordingError, StoreMismatch, VLMError
 from pipeline.extraction.check import CheckedEpisode
 from pipeline.extraction.layout import build_arrays
 from pipeline.extraction.plan import store_bytes
 from pipeline.extraction.survey import Survey, SurveyedEpisode
 from pipeline.machine.checkpoint import local_folder
+from pipeline.machine.data import unusable
 from pipeline.machine.findings import Finding, missing, note, ok
 from pipeline.machine.limits import memory_bytes
 from pipeline.machine.links import links_here
@@ -39,7 +40,7 @@ class Estimate:
     """Chunk files, each of which a process maps."""
     episodes: int
     read: int
-    """Episodes that were looked at; the others are taken to be as long."""
+    """Episodes that were read; the others are taken to be as long."""
 
     def __str__(self) -> str:
         known = "" if self.read == self.episodes else f", judged by {self.read} of them"
@@ -52,18 +53,25 @@ def check_space(params: Params) -> list[Finding]:
     if local_folder(params.vlm.checkpoint, params.vlm.revision) is None:
         return [note("size", "not known before vlm.checkpoint is here; see above")]
     try:
-        estimate = estimate_store(params)
-    except PipelineError:
-        return [note("size", "not known before checkpoint and recordings can be read; see above")]
+        estimate, bad = estimate_store(params)
+    except RecordingError:
+        return [note("size", "not known before the recordings can be read; see above")]
+    except (VLMError, StoreMismatch) as error:
+        return [missing("size", f"not known: {error}", "mend that, and run this again")]
+    findings: list[Finding] = []
+    if bad:
+        said = f"{len(bad)} episode(s) read for the size cannot be used, first: {bad[0]}"
+        findings.append(unusable("episodes", said, params.data.on_bad_episode))
     if estimate is None:
-        return [note("size", "not known: no episode could be read; see above")]
+        return [*findings, note("size", "not known: no episode could be read; see above")]
     links = links_here()
-    there = used_bytes(part_path(target))
+    begun, finished = used_bytes(part_path(target)), used_bytes(target)
     limit = Path("/proc/sys/vm/max_map_count")
     maps = int(limit.read_text(encoding="ascii")) if limit.exists() else None
     return [
-        check_disk(estimate, target, free_bytes(target), there, finished=target.exists()),
-        *([check_cached_copy(estimate, free_bytes(target))] if links == "copy" else []),
+        *findings,
+        check_disk(estimate, target, free_bytes(target), begun, finished=finished > 0),
+        *([check_cached_copy(estimate, free_bytes(target), begun, finished)] * (links == "copy")),
         check_page_cache(estimate, memory_bytes()),
         *([] if maps is None else [check_maps(estimate, maps)]),
     ]
@@ -87,13 +95,18 @@ def check_disk(
     return missing("disk", said, remedy)
 
 
-def check_cached_copy(estimate: Estimate, free: int) -> Finding:
-    """Room for the second store that DVC keeps where it can only copy."""
+def check_cached_copy(estimate: Estimate, free: int, begun: int, finished: int) -> Finding:
+    """Room for the second store that DVC keeps where it can only copy, less what is written."""
+    written = min(finished or begun, estimate.bytes)
     said = f"DVC can only copy into its cache: {size(2 * estimate.bytes)} with its copy"
+    if written:
+        said += f", {size(written)} of it written"
+    if finished:
+        said += ", and the copy too if DVC has seen this store"
+    if 2 * estimate.bytes - written <= free:
+        return ok("DVC's copy", said)
     remedy = "put .dvc/cache on the same disk (dvc cache dir), or call the stages without DVC"
-    return (note if 2 * estimate.bytes > free else ok)(
-        "DVC's copy", said, *([remedy] if 2 * estimate.bytes > free else [])
-    )
+    return note("DVC's copy", said, remedy)
 
 
 def check_page_cache(estimate: Estimate, memory: int) -> Finding:
@@ -113,32 +126,39 @@ def check_maps(estimate: Estimate, limit: int) -> Finding:
     return missing("maps", said, f"sudo sysctl vm.max_map_count={4 * max(estimate.maps, limit)}")
 
 
-def estimate_store(params: Params) -> Estimate | None:
+def estimate_store(params: Params) -> tuple[Estimate | None, list[str]]:
     """What `extract.plan=true` computes, from a few episodes within `BUDGET_S`.
 
-    None where every episode is bad. Raises what reading the recordings raises.
+    And why some of these cannot be used; they count as left out. None where that is all of them.
+    Raises `RecordingError` where a source cannot be opened, `VLMError` where the checkpoint
+    does not fit the params, `StoreMismatch` where two sources are not of one embodiment.
     """
     opened = open_recordings(params.data.sources, params.data.root, params.data.views)
-    if not opened.recordings:
-        return None
     rotation = choose_action_rotation(params.data.action_rotation, opened.recordings)
     checked: list[CheckedEpisode] = []
+    bad: list[str] = []
     until = time.monotonic() + BUDGET_S
     for recording in _spread(opened.recordings)[:MOST_READ]:
-        if checked and time.monotonic() > until:
+        if (checked or bad) and time.monotonic() > until:
             break
-        checked.append(_read(recording, params, rotation))
+        try:
+            checked.append(_read(recording, params, rotation))
+        except RecordingError as error:
+            bad.append(str(error))
+    if not checked:
+        return None, bad
     views = sorted({view for one in checked for view in one.surveyed.recording.view_names()})
     # A digest decides nothing of a size, and reading every weight for it takes long.
     spec = feature_spec(params.vlm, params.extract.dtype, views, lambda path: "")
     survey = Survey(tuple(one.surveyed for one in checked), (), (), spec, rotation, "")
-    times = len(opened.recordings) / len(checked)
+    episodes = len(opened.recordings) - len(bad)
+    times = episodes / len(checked)
     specs = {
         name: replace(one, shape=(math.ceil(one.shape[0] * times), *one.shape[1:]))
         for name, one in build_arrays(checked, survey, params).items()
     }
     maps = sum(one.chunk_count for one in specs.values())
-    return Estimate(store_bytes(specs), maps, len(opened.recordings), len(checked))
+    return Estimate(store_bytes(specs), maps, episodes, len(checked)), bad
 
 
 def used_bytes(folder: Path) -> int:
@@ -154,6 +174,7 @@ def _spread(recordings: Sequence[Recording]) -> list[Recording]:
 
 
 def _read(recording: Recording, params: Params, rotation: ActionRotation) -> CheckedEpisode:
+    _ = recording.instruction  # some formats read it when asked; remembered
     state, sensor = recording.state(), recording.sensor()
     hz, reuse = params.data.action_hz, params.data.vlm_reuse_count
     line = build_timeline(recording, hz, reuse, rotation, state, sensor)

@@ -9,6 +9,7 @@ import pytest
 from pipeline.config import Params
 from pipeline.machine.checkpoint import check_adapter, check_checkpoint, check_fit
 from pipeline.machine.gpu import GPU
+from pipeline.simulation.demo_recordings import MARKER
 
 GIB = 2**30
 Make = Callable[..., Params]
@@ -36,6 +37,18 @@ def test_a_whole_folder(params: Make, demo_checkpoint: Path) -> None:
     assert (here.level, fits.level) == ("ok", "ok")
     assert "whole, 2,519,424 parameters" in here.found
     assert fits.found.startswith("9.6 MiB in float32, memory has")
+
+
+def test_the_demos_random_weights_are_nothing_to_learn_from(
+    params: Make, demo_checkpoint: Path, tmp_path: Path
+) -> None:
+    """Wherever the folder that stages.demo marks lies."""
+    mine = shutil.copytree(demo_checkpoint, tmp_path / "mine")
+    (mine / MARKER).write_text('{"seed": 0}')
+    here, fits = check_checkpoint(params(mine))
+    assert (here.level, fits.level) == ("note", "ok")
+    assert "whole, " in here.found and "random weights" in here.found
+    assert "Qwen/Qwen2.5-VL-3B-Instruct" in here.remedy and "docs/real-model.md" in here.remedy
 
 
 def test_a_folder_with_a_hole(params: Make, demo_checkpoint: Path, tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 """How findings read, and that a group that cannot be looked at is one."""
 
-import time
 from collections.abc import Callable
+from threading import Event
 from types import SimpleNamespace
 from typing import Any
 
@@ -55,7 +55,6 @@ def test_lines_stay_within_the_width_and_words_whole() -> None:
         (ImportError("No module named 'av'"), "missing", "No module named 'av'"),
         (lambda params: _raise(ConfigError("device: cuda:7")), "missing", "device: cuda:7"),
         (lambda params: _raise(OSError("stale handle")), "note", "stale handle"),
-        (lambda params: time.sleep(5), "note", "no answer within 0.1 s"),
         (lambda params: [missing("it", "is not there", "get it")], "missing", "is not there"),
     ],
 )
@@ -67,11 +66,22 @@ def test_what_cannot_be_looked_at_is_a_finding(
     level: str,
     said: str,
 ) -> None:
-    monkeypatch.setattr(machine, "PATIENCE_S", 0.1)
+    monkeypatch.setattr(machine, "PATIENCE_S", 200.0)
     only(check)
     ((title, (finding,)),) = machine.examine(params)
     assert (title, finding.level) == ("A group", level)
     assert said in finding.found
+
+
+def test_what_hangs_is_named_and_left(
+    params: Params, only: Callable[[Any], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    end = Event()
+    monkeypatch.setattr(machine, "PATIENCE_S", 0.01)
+    only(lambda params: end.wait())
+    ((_, (finding,)),) = machine.examine(params)
+    end.set()
+    assert (finding.level, finding.found) == ("note", "not known: no answer within 0.01 s")
 
 
 def test_a_bug_in_a_check_costs_its_group_alone_and_is_raised_at_the_end(
@@ -84,6 +94,7 @@ def test_a_bug_in_a_check_costs_its_group_alone_and_is_raised_at_the_end(
     def load(name: str) -> Any:
         return checks if name != "pipeline.machine.zero" else _raise(NameError("no such name"))
 
+    monkeypatch.setattr(machine, "PATIENCE_S", 200.0)
     monkeypatch.setattr(machine, "import_module", load)
     groups = (
         ("Zeroth", "zero", "sound"),

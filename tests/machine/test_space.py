@@ -9,6 +9,8 @@ import pytest
 import yaml
 
 from pipeline.config import Params
+from pipeline.machine import space
+from pipeline.machine.data import check_data
 from pipeline.machine.limits import Limits, check_limits, memory_bytes, read_limits
 from pipeline.machine.links import Cache, check_cache, check_links, links_here, read_cache
 from pipeline.machine.space import (
@@ -49,9 +51,14 @@ def test_room_for_the_store(free: int, begun: int, finished: bool, level: str) -
 
 
 def test_room_for_the_copy_that_dvc_keeps() -> None:
-    assert check_cached_copy(TEN, 21 * GIB).level == "ok"
-    tight = check_cached_copy(TEN, 15 * GIB)
-    assert tight.level == "note" and "20.0 GiB with its copy" in tight.found
+    assert check_cached_copy(TEN, 21 * GIB, 0, 0).level == "ok"
+    tight = check_cached_copy(TEN, 15 * GIB, 0, 0)
+    assert tight.level == "note" and tight.found.endswith("20.0 GiB with its copy")
+    begun = check_cached_copy(TEN, 15 * GIB, 6 * GIB, 0)
+    assert begun.level == "ok" and begun.found.endswith("6.0 GiB of it written")
+    there = check_cached_copy(TEN, 11 * GIB, 0, 12 * GIB)
+    assert there.level == "ok" and "10.0 GiB of it written, and the copy too if" in there.found
+    assert check_cached_copy(TEN, 9 * GIB, 0, 12 * GIB).level == "note"
 
 
 def test_memory_and_maps() -> None:
@@ -64,8 +71,9 @@ def test_memory_and_maps() -> None:
 
 
 def test_the_estimate_is_what_extraction_takes(
-    tmp_path: Path, demo_checkpoint: Path, recordings: Path
+    tmp_path: Path, demo_checkpoint: Path, recordings: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(space, "BUDGET_S", 200.0)  # every episode is read, however busy it is here
     document = {
         "data": {
             "root": str(recordings),
@@ -80,8 +88,8 @@ def test_the_estimate_is_what_extraction_takes(
         "extract": {"store": str(tmp_path / "made.zarr"), "device": "cpu"},
     }
     params = Params.model_validate(document)
-    before = estimate_store(params)
-    assert before is not None and before.read == before.episodes == 4
+    before, bad = estimate_store(params)
+    assert before is not None and before.read == before.episodes == 4 and not bad
     assert [finding.level for finding in check_space(params)][:1] == ["ok"]
     assert not list(tmp_path.glob("made*")), "a check writes nothing"
     file = tmp_path / "params.yaml"
@@ -109,7 +117,53 @@ def test_without_recordings_the_size_is_not_known(tmp_path: Path, demo_checkpoin
         "vlm": {"checkpoint": str(demo_checkpoint)},
     }
     (finding,) = check_space(Params.model_validate(document))
-    assert finding.level == "note" and "before checkpoint and recordings" in finding.found
+    assert finding.level == "note" and "before the recordings can be read" in finding.found
+
+
+@pytest.mark.parametrize(("on_bad", "level"), [("stop", "missing"), ("skip", "note")])
+def test_an_episode_that_cannot_be_used_is_said_and_the_others_give_the_size(
+    tmp_path: Path,
+    recordings: Path,
+    demo_checkpoint: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    on_bad: str,
+    level: str,
+) -> None:
+    """It opens, so that the recordings' own group finds nothing."""
+    monkeypatch.setattr(space, "BUDGET_S", 200.0)
+    shutil.copytree(recordings / "raw", tmp_path / "raw")
+    states = sorted(tmp_path.glob("raw/**/robot_state_*.csv"))
+    head, *rows = states[0].read_text().splitlines()
+    rows[7] = ",".join([*rows[7].split(",")[:-1], "nan"])
+    states[0].write_text("\n".join([head, *rows]))
+    params = Params.model_validate(
+        {
+            "data": {
+                "root": str(tmp_path),
+                "sources": [{"name": "a", "path": "raw"}],
+                "on_bad_episode": on_bad,
+            },
+            "vlm": {"checkpoint": str(demo_checkpoint)},
+        }
+    )
+    assert {finding.level for finding in check_data(params)} == {"ok"}
+    bad, disk, *_ = check_space(params)
+    assert (bad.level, bad.subject) == (level, "episodes")
+    assert "1 episode(s) read for the size cannot be used" in bad.found
+    assert str(states[0]) in bad.found
+    assert "data.on_bad_episode" in bad.remedy
+    assert disk.level == "ok" and "for 1 episodes;" in disk.found
+
+
+def test_params_that_the_checkpoint_cannot_meet_are_said(
+    recordings: Path, demo_checkpoint: Path
+) -> None:
+    document = {
+        "data": {"root": str(recordings), "sources": [{"name": "a", "path": "raw"}]},
+        "vlm": {"checkpoint": str(demo_checkpoint), "layers": [99]},
+    }
+    (finding,) = check_space(Params.model_validate(document))
+    assert finding.level == "missing" and "99" in finding.found
 
 
 def test_where_every_episode_is_bad_the_size_is_not_known(
