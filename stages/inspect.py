@@ -17,20 +17,28 @@ again replaces the page, its pictures and findings.csv there, and touches no oth
 the checkpoint are remembered in reports/inspect/.files.sqlite, or where stages.extract does it.
 """
 
-from collections.abc import Iterator
-
-from pipeline.config import Params
-from pipeline.inspection.store import inspect_store
-from pipeline.inspection.subject import Subject, subject_of
-from pipeline.report import Notice, Notices, Report, write_report
-from pipeline.report.findings import FINDINGS
-from pipeline.report.recording import recordings_report
-from pipeline.report.store import store_report
 from stages.command import Shorthand, run
 
 PATH = Shorthand(
     "path", "inspect.path", "recordings, folders or globs of them, or a store", "PATH", "*"
 )
+
+if __name__ == "__main__":  # here, for --help waits for no import below
+    raise SystemExit(
+        run(__doc__ or "", "stages.inspect", shorthands=[PATH], sections=("inspect", "data"))
+    )
+
+from collections.abc import Iterator
+
+from pipeline.config import Params
+from pipeline.inspection.store import inspect_store
+from pipeline.inspection.subject import Subject, subject_of
+from pipeline.plots.style import boxes
+from pipeline.report import Notice, Notices, Report, write_report
+from pipeline.report.findings import FINDINGS
+from pipeline.report.recording import recordings_report
+from pipeline.report.store import store_report
+
 SAID = 8
 """Findings that the terminal shows."""
 
@@ -39,8 +47,9 @@ def main(params: Params) -> None:
     """Write the page of what `inspect.path` names."""
     subject = subject_of(params)
     report = _report(subject, params)
-    page, *beside = write_report(subject.folder, report)
-    print("\n".join(summary(report)))
+    with boxes() as said:
+        page, *beside = write_report(subject.folder, report)
+    print("\n".join([*summary(report), *said]))
     pictures = sum(file.suffix == ".png" for file in beside)
     print(f"{page}: the page, with {pictures} pictures and {FINDINGS} beside it")
 
@@ -72,7 +81,3 @@ def _report(subject: Subject, params: Params) -> Report:
 
 def _line(notice: Notice) -> str:
     return " ".join(notice.message.split())
-
-
-if __name__ == "__main__":
-    raise SystemExit(run(__doc__ or "", main, shorthands=[PATH], sections=("inspect", "data")))

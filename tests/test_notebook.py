@@ -2,11 +2,12 @@
 the page of `stages.inspect` shows."""
 
 import sys
-from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import nbformat
 import pytest
+import yaml
 from nbclient import NotebookClient
 from nbformat import NotebookNode
 
@@ -24,53 +25,60 @@ def read() -> NotebookNode:
     return nbformat.read(NOTEBOOK, as_version=4)
 
 
+@dataclass(frozen=True)
+class Shown:
+    """What cells have shown: of the demo, and of a path of the user's."""
+
+    demo: list[NotebookNode]
+    own: list[NotebookNode]
+
+
 @pytest.fixture(scope="module")
-def project(demo_checkpoint, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the params of this project, a demo of one episode a format and the model."""
+def shown(demo_checkpoint, tmp_path_factory: pytest.TempPathFactory) -> Shown:
+    """The outputs of all cells, run by this very Python in a folder of a project.
+
+    One kernel runs them on the demo, of an episode a format, and then again on a path. Every
+    warning of the project's code is an error there, as it is in tests.
+    """
     folder = tmp_path_factory.mktemp("project")
     (folder / "notebooks").mkdir()
     (folder / "models").mkdir()
-    (folder / "params.yaml").write_text((ROOT / "params.yaml").read_text())
+    params = yaml.safe_load((ROOT / "params.yaml").read_text(encoding="utf-8"))
+    params["inspect"] = {"samples": 2, "ticks": 2}
+    (folder / "params.yaml").write_text(yaml.safe_dump(params), encoding="utf-8")
     (folder / "models" / "demo_vlm").symlink_to(demo_checkpoint)
     write_demo_recordings(folder / "data" / "demo", 1, 0)
-    return folder
+
+    own = read().cells
+    path = str(folder / "data" / "demo" / "new")
+    own.insert(0, nbformat.v4.new_code_cell(f"os.environ['RECORDINGS'] = {path!r}"))
+    notebook = read()
+    notebook.cells.insert(0, nbformat.v4.new_code_cell(FIRST))
+    of_demo = len(notebook.cells)
+    notebook.cells += own
+    resources = {"metadata": {"path": str(folder / "notebooks")}}
+    with pytest.MonkeyPatch.context() as patched:
+        # Only the kernel that this interpreter brings along, whatever the user has installed.
+        patched.setenv("JUPYTER_DATA_DIR", str(folder / "jupyter"))
+        patched.setenv("JUPYTER_RUNTIME_DIR", str(folder / "runtime"))
+        patched.setenv("IPYTHONDIR", str(folder / "ipython"))
+        patched.setenv("JUPYTER_PLATFORM_DIRS", "1")
+        patched.setenv("PYTHONPATH", str(ROOT))
+        patched.setenv("RECORDINGS", "")
+        NotebookClient(notebook, timeout=250, kernel_name="python3", resources=resources).execute()
+    return Shown(outputs(notebook.cells[:of_demo]), outputs(notebook.cells[of_demo:]))
 
 
-@pytest.fixture
-def execute(
-    project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Callable[[object], list[NotebookNode]]:
-    """`execute(recordings)`: the outputs of all cells, run by this very Python.
-
-    Every warning of the project's code is an error there, as it is in tests.
-    """
-    # Only the kernel that this interpreter brings along, whatever the user has installed.
-    monkeypatch.setenv("JUPYTER_DATA_DIR", str(tmp_path / "data"))
-    monkeypatch.setenv("JUPYTER_RUNTIME_DIR", str(tmp_path / "runtime"))
-    monkeypatch.setenv("IPYTHONDIR", str(tmp_path / "ipython"))
-    monkeypatch.setenv("JUPYTER_PLATFORM_DIRS", "1")
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
-
-    def run(recordings: object) -> list[NotebookNode]:
-        notebook = read()
-        monkeypatch.setenv("RECORDINGS", str(recordings or ""))
-        notebook.cells.insert(0, nbformat.v4.new_code_cell(FIRST))
-        resources = {"metadata": {"path": str(project / "notebooks")}}
-        client = NotebookClient(notebook, timeout=120, kernel_name="python3", resources=resources)
-        client.execute()
-        return [one for cell in notebook.cells for one in cell.get("outputs", ())]
-
-    return run
+def outputs(cells: list[NotebookNode]) -> list[NotebookNode]:
+    return [one for cell in cells for one in cell.get("outputs", ())]
 
 
-def pictures(outputs: list[NotebookNode]) -> list[NotebookNode]:
-    return [one for one in outputs if "image/png" in one.get("data", {})]
+def pictures(shown: list[NotebookNode]) -> list[NotebookNode]:
+    return [one for one in shown if "image/png" in one.get("data", {})]
 
 
-def said(outputs: list[NotebookNode], stream: str = "stdout") -> str:
-    return "".join(
-        one.text for one in outputs if one.output_type == "stream" and one.name == stream
-    )
+def said(shown: list[NotebookNode], stream: str = "stdout") -> str:
+    return "".join(one.text for one in shown if one.output_type == "stream" and one.name == stream)
 
 
 def test_it_is_kept_without_outputs():
@@ -80,19 +88,18 @@ def test_it_is_kept_without_outputs():
     assert notebook.metadata == {"language_info": {"name": "python"}}
 
 
-def test_it_shows_every_format_of_the_demo(execute):
-    outputs = execute(None)
-    text = said(outputs)
+def test_it_shows_every_format_of_the_demo(shown):
+    text = said(shown.demo)
     assert text.splitlines()[0] == sys.executable
     for source in ("raw", "new", "old", "lerobot"):
         assert f"\n{source}: " in text
     assert "<|vision_start|>" in text and "<|im_end|>" in text and "image tokens:" in text
-    assert len(pictures(outputs)) == 4 * PICTURES_A_RECORDING
-    assert said(outputs, "stderr") == ""
+    assert len(pictures(shown.demo)) == 4 * PICTURES_A_RECORDING
+    assert said(shown.demo, "stderr") == ""
 
 
-def test_it_shows_a_path_of_the_users(execute, project):
-    outputs = execute(project / "data" / "demo" / "new")
-    text = said(outputs)
+def test_it_shows_a_path_of_the_users(shown):
+    text = said(shown.own)
     assert "\nnew: " in text and "\nraw: " not in text
-    assert len(pictures(outputs)) == PICTURES_A_RECORDING
+    assert len(pictures(shown.own)) == PICTURES_A_RECORDING
+    assert said(shown.own, "stderr") == ""

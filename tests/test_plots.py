@@ -218,7 +218,15 @@ def test_curves_mark_the_step_that_was_judged() -> None:
     for axis in figure.axes:
         assert axis.lines[0].get_xdata().tolist() == steps.tolist()
         assert axis.lines[1].get_xdata()[0] == 20
+    assert len({axis.get_xlim() for axis in figure.axes}) == 1
     assert "step 20" in figure.get_suptitle()
+    short = {
+        "train/loss": Curve(steps, np.array([0.31, 0.29, 0.3])),
+        "lr": Curve(steps[:1], steps[:1]),
+    }
+    loss, rate = plots.curves(Curves(short), 20).axes
+    assert (loss.get_yscale(), loss.get_ylim()[0]) == ("linear", 0)
+    assert rate.get_xlim() == loss.get_xlim()
     (axis,) = plots.curves(Curves({"train/other": logged["train/other"]}), 5).axes
     assert axis.get_title() == "train/other"
 
@@ -283,8 +291,9 @@ def test_a_picture_never_writes_through_a_link(tmp_path: Path) -> None:
     cache, report = tmp_path / "cache.png", tmp_path / "report"
     report.mkdir()
     cache.write_bytes(b"cached")
-    (report / "timeline.png").hardlink_to(cache)
-    write(report, pictures(*evaluated(1)))
+    (report / "scatter.png").hardlink_to(cache)
+    write(report, {"scatter.png": pictures(*evaluated(1))["scatter.png"]})
+    assert (report / "scatter.png").read_bytes().startswith(b"\x89PNG")
     assert cache.read_bytes() == b"cached"
 
 
@@ -339,7 +348,7 @@ def compared(errors: dict[str, float], rules: dict[str, float]) -> list[Experime
     return [
         Experiment(
             f"{expert}-{fusion}", expert, fusion, 10, 100, 1,
-            {"overall": {"policy": error, **rules}}, None,
+            {("overall", "training std"): {"policy": error, **rules}}, None,
         )
         for expert, error in errors.items()
         for fusion in ("concat", "gated")

@@ -3,7 +3,9 @@
 It has no title and no colour of text: the page around it has both.
 """
 
+import html
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -34,7 +36,7 @@ def clock_lanes(view: EpisodeView, clocks: Sequence[Clock]) -> go.Figure:
     Hovering tells time and index, of a VL row also which frame of each view it took and how old
     that was, of a tick the VL row that it reuses. Lines lead from frames to VL rows.
     """
-    shown = in_reading_order(clocks)
+    shown = [replace(clock, name=_plain(clock.name)) for clock in in_reading_order(clocks)]
     figure = go.Figure(layout=layout())
     lanes = {clock.name: len(shown) - 1 - index for index, clock in enumerate(shown)}
     _served(figure, view, lanes)
@@ -116,7 +118,7 @@ def _told(view: EpisodeView, clock: Clock, chosen: NDArray[np.int64]) -> list[st
                 [
                     f"VL row {row}",
                     *(
-                        f"{name}: frame {line.frames[name][row]}, "
+                        f"{_plain(name)}: frame {line.frames[name][row]}, "
                         f"{1000 * (line.vl_time[row] - time[row]):.0f} ms old"
                         for name, time in line.frame_time.items()
                     ),
@@ -127,13 +129,19 @@ def _told(view: EpisodeView, clock: Clock, chosen: NDArray[np.int64]) -> list[st
     return [f"{clock.name}, frame {index}" for index in chosen.tolist()]
 
 
+def _plain(name: str) -> str:
+    """A recording's name for plotly, which reads texts as HTML."""
+    return html.escape(name, quote=False)
+
+
 def _served(figure: go.Figure, view: EpisodeView, lanes: dict[str, int]) -> None:
     """Lines from the frames to the VL rows that took them, of as many rows as are marked."""
     line = view.timeline
     if line is None or "VL rows" not in lanes:
         return
     rows = slice(None, None, -(-len(line.vl_time) // SINGLE) or 1)
-    for name, time in line.frame_time.items():
+    for view_name, time in line.frame_time.items():
+        name = _plain(view_name)
         if name not in lanes:
             continue
         # A NaN after each pair ends its line.

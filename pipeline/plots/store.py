@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from pipeline.amounts import size
-from pipeline.inspection.channels import PROFILE_CHANNELS, unnumbered
+from pipeline.channels import PROFILE_CHANNELS, unnumbered
 from pipeline.inspection.facts import ChannelStatistics
 from pipeline.inspection.store import Ages, ArraySize, EpisodeCoverage, StoreView
 from pipeline.plots.style import GRID, INK, PALETTE, canvas
@@ -133,11 +133,11 @@ def numbered(view: StoreView) -> Iterator[tuple[ChannelStatistics, ...]]:
                 yield channels
 
 
-def mark_sources(axis: Axes, episodes: Sequence[EpisodeCoverage]) -> None:
+def mark_sources(axis: Axes, episodes: Sequence[EpisodeCoverage], line: str = INK) -> None:
     """Sources below an axis of episodes, parted by lines; the episodes' names where few."""
     starts = [index for index in range(len(episodes)) if not index or _begins(episodes, index)]
     for start in starts[1:]:
-        axis.axvline(start - 0.5, color=INK, lw=1.0)
+        axis.axvline(start - 0.5, color=line, lw=1.0)
     if len(episodes) <= _NAMED_EPISODES:
         one_source = len(starts) == 1
         names = [_short(one.id if one_source else one.name) for one in episodes]

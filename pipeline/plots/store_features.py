@@ -15,7 +15,7 @@ from pipeline.inspection.store import StoreProjection, StoreView
 from pipeline.plots.store import mark_sources
 from pipeline.plots.style import GRID, INK, PALETTE, canvas
 
-PROGRESS = LinearSegmentedColormap.from_list("progress", ("#0072B2", "#CC79A7", "#E69F00"))
+PROGRESS = "#0072B2", "#CC79A7", "#E69F00"
 """From an episode's begin to its end, in colours that read on white and on black."""
 _AROUND = LinearSegmentedColormap.from_list("around", ("#0072B2", "#f0f0f0", "#D55E00"))
 FRAMED_EPISODES = 60
@@ -102,8 +102,9 @@ def _by_episode(
     image = axis.imshow(ratio, _AROUND, aspect="auto", interpolation="nearest", **limits)
     axis.grid(visible=False)
     axis.tick_params(left=False)
-    mark_sources(axis, view.episodes)
-    figure.colorbar(image, ax=axis, label="median / of all", pad=0.02)
+    # The map is light on a dark page too, where ink is white.
+    mark_sources(axis, view.episodes, "#222222")
+    figure.colorbar(image, ax=axis, label="median in the episode / in all", pad=0.02)
 
 
 def _quantile(norm: np.ndarray, share: float) -> np.ndarray:
@@ -146,7 +147,8 @@ def _by_source(axis: Axes, found: StoreProjection) -> None:
 
 def _by_progress(figure: Figure, axis: Axes, found: StoreProjection) -> None:
     every = np.ones(len(found.points), bool)
-    dots = _dots(axis, found, every, c=found.progress, cmap=PROGRESS, vmin=0, vmax=1)
+    colours = LinearSegmentedColormap.from_list("progress", PROGRESS)
+    dots = _dots(axis, found, every, c=found.progress, cmap=colours, vmin=0, vmax=1)
     bar = figure.colorbar(dots, ax=axis, ticks=(0, 1), fraction=0.05, pad=0.02)
     bar.ax.set_yticklabels(("begin", "end"))
     axis.set_title("by progress within the episode")

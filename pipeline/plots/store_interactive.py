@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pipeline.inspection.store import StoreView
 from pipeline.plots.interactive import layout
+from pipeline.plots.store_features import PROGRESS
 from pipeline.plots.style import PALETTE
 
 Trait = Literal["episode", "source", "instruction"]
@@ -44,7 +45,7 @@ def projection(view: StoreView, by: Literal["episode", "progress"]) -> go.Figure
     kind = trait(view)
     if by == "progress":
         bar = {"title": {"text": "progress"}, "thickness": 12, "outlinewidth": 0}
-        scale = {"colorscale": "Viridis", "cmin": 0.0, "cmax": 1.0, "colorbar": bar}
+        scale = {"colorscale": list(PROGRESS), "cmin": 0.0, "cmax": 1.0, "colorbar": bar}
         _dots(figure, view, every, {"color": found.progress, **scale})
     elif kind is None:
         colours = [PALETTE[one % len(PALETTE)] for one in found.episode.tolist()]

@@ -5,14 +5,19 @@ pictures (Okabe and Ito's palette, which colour-blind readers can tell apart). W
 drawn in `INK` or `GRID` alone: a page exchanges them for its own colours, in light and in dark.
 """
 
-from collections.abc import Callable, Mapping
+import re
+import warnings
+from collections.abc import Callable, Generator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+from matplotlib import font_manager
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter, StrMethodFormatter
 
 from pipeline.durable import disk_full_named, fresh
 
@@ -35,6 +40,39 @@ GRID = "#dddddd"
 RECORDED = INK
 PALETTE = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
 """Of what has no colour of its own; Okabe and Ito's, less what is lost on white or on black."""
+_CJK = (
+    "Noto Sans CJK KR",
+    "Noto Sans CJK JP",
+    "Noto Sans CJK SC",
+    "NanumGothic",
+    "Malgun Gothic",
+    "Apple SD Gothic Neo",
+    "Hiragino Sans",
+    "Yu Gothic",
+    "PingFang SC",
+    "Microsoft YaHei",
+)
+"""Fonts of Debian, Windows and macOS with what Chinese, Japanese and Korean names are made of."""
+NO_FONT = (
+    "A name has letters that no font of this machine has: PNG files show boxes in their place. "
+    "Install a font that has them; fonts-noto-cjk of Debian and Ubuntu has Chinese, Japanese and "
+    "Korean."
+)
+_NO_GLYPH = re.compile(rf"Glyph \d+ |{re.escape(NO_FONT)}")
+
+
+def families() -> list[str]:
+    """Where letters are looked for, one font after the other; only what this machine has."""
+    if not set(_CJK) & set(font_manager.get_font_names()):
+        # Matplotlib remembers its list, which may be older than a font.
+        listed = {font.fname for font in font_manager.fontManager.ttflist}
+        for path in sorted(set(font_manager.findSystemFonts()) - listed):
+            with suppress(OSError, RuntimeError):
+                font_manager.fontManager.addfont(path)
+    here = set(font_manager.get_font_names())
+    return ["DejaVu Sans", *(name for name in _CJK if name in here)]
+
+
 RC: dict[Any, Any] = {
     "figure.constrained_layout.use": True,
     "text.color": INK,
@@ -43,8 +81,12 @@ RC: dict[Any, Any] = {
     "xtick.color": INK,
     "ytick.color": INK,
     "hatch.color": INK,
+    # A name from a recording is no TeX, whatever dollars it has.
+    "text.parse_math": False,
     # Else the ids inside an SVG are drawn by chance.
     "svg.hashsalt": "pipeline",
+    # Matplotlib warns of each that is absent.
+    "font.family": families(),
     "font.size": 10,
     "axes.titlesize": 11,
     "axes.spines.top": False,
@@ -59,15 +101,35 @@ RC: dict[Any, Any] = {
 def write(folder: Path, pictures: Mapping[str, Callable[[], Figure]]) -> list[Path]:
     """Draw each picture in the common style, save it by its name and return the paths.
 
-    Raises `DiskFull`.
+    Warns once, with `NO_FONT`, of letters that cannot be drawn. Raises `DiskFull`.
     """
-    with mpl.rc_context(RC):
+    with mpl.rc_context(RC), boxes() as said:
         for name, draw in pictures.items():
             figure = draw()
             # Without its `Software` entry the file does not change with matplotlib's version.
             with disk_full_named(folder):
                 figure.savefig(fresh(folder / name), dpi=120, metadata={"Software": None})
+    if said:
+        warnings.warn(NO_FONT, stacklevel=2)
     return [folder / name for name in pictures]
+
+
+@contextmanager
+def boxes() -> Generator[set[str]]:
+    """A set that holds `NO_FONT` once a letter was drawn as a box; no letter warns of itself."""
+    said: set[str] = set()
+    show = warnings.showwarning
+
+    def note(message: Warning | str, *where: Any, **more: Any) -> None:
+        if _NO_GLYPH.match(str(message)):
+            said.add(NO_FONT)
+        else:
+            show(message, *where, **more)
+
+    with warnings.catch_warnings():
+        warnings.filterwarnings("always", _NO_GLYPH.pattern, UserWarning)
+        warnings.showwarning = note
+        yield said
 
 
 def canvas(width: float, height: float) -> Figure:
@@ -75,6 +137,13 @@ def canvas(width: float, height: float) -> Figure:
     figure = Figure(figsize=(width, height))
     FigureCanvasAgg(figure)
     return figure
+
+
+def logarithmic(axis: Axes) -> None:
+    """Powers of ten upwards, said in plain numbers: matplotlib's own are TeX."""
+    axis.set_yscale("log")
+    axis.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axis.yaxis.set_minor_formatter(NullFormatter())
 
 
 def legend_below(figure: Figure, axis: Axes, columns: int) -> None:

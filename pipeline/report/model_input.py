@@ -1,6 +1,7 @@
 """What training and the frozen model get of one recording: samples, the batch, the prompt."""
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from itertools import groupby
 
@@ -8,6 +9,7 @@ from pipeline.config import Params
 from pipeline.datasets import UnifiedBatch, UnifiedVLADataset
 from pipeline.errors import PipelineError
 from pipeline.inspection.facts import EpisodeView, PromptToken, PromptView
+from pipeline.inspection.frames import frames_at
 from pipeline.inspection.overview import RecordingsOverview
 from pipeline.inspection.prompt import view_prompt
 from pipeline.inspection.samples import samples
@@ -15,7 +17,9 @@ from pipeline.inspection.spec import remembered_spec
 from pipeline.plots import recording as plots
 from pipeline.report.blocks import Block, Document, Picture, Run, Section, Table, Text, Tokens
 from pipeline.report.recording_episode import Viewer
-from pipeline.vlm.feature_spec import FeatureSpec
+
+_STRETCHED = 0.05
+"""A change of width over height that is said."""
 
 
 def model_input(
@@ -27,13 +31,16 @@ def model_input(
         "What the model and the policy get",
         [Text(f"Of the episode `{said}`, under the params in force.")],
         [
-            Section("Samples and batch", _samples(index, view_of, params)),
+            Section(
+                "Samples and batch",
+                _samples(index, view_of, params, overview.summaries[index].zero),
+            ),
             Section("Prompt", _prompt(view_of(index), overview, params)),
         ],
     )
 
 
-def _samples(index: int, view_of: Viewer, params: Params) -> list[Block]:
+def _samples(index: int, view_of: Viewer, params: Params, zero: float) -> list[Block]:
     @lru_cache(maxsize=1)
     def made() -> tuple[UnifiedVLADataset, UnifiedBatch]:
         return samples(view_of(index), params, params.inspect.samples, params.inspect.seed)
@@ -49,7 +56,7 @@ def _samples(index: int, view_of: Viewer, params: Params) -> list[Block]:
             f"{count} training samples side by side: the frames, the sensor and state windows "
             f"that end at the tick, and the chunk of {head.horizon} actions that begins at it. "
             "The first is the episode's first tick, the last its last.",
-            lambda: plots.samples(*made()),
+            lambda: plots.samples(*made(), zero),
         ),
         Picture(
             "batch",
@@ -66,23 +73,22 @@ def _prompt(view: EpisodeView, overview: RecordingsOverview, params: Params) -> 
     except PipelineError as error:
         return [
             Text(
-                f"Neither the prompt nor the feature spec can be shown: {error}. Name a checkpoint "
-                "that is here with `--set vlm.checkpoint=FOLDER`; the demo's is written by "
-                "`python -m stages.demo`."
+                "Neither the prompt nor the feature spec can be shown: "
+                f"{str(error).rstrip('.')}. Name a checkpoint that is here with "
+                "`--set vlm.checkpoint=FOLDER`; the demo's is written by `python -m stages.demo`."
             )
         ]
     try:
-        blocks = _told(view_prompt(view, params.vlm, spec))
+        prompt = view_prompt(view, params.vlm, spec)
+        recorded = {name: one.shape[:2] for name, (one,) in frames_at(view, [0]).items()}
+        blocks = _told(prompt, recorded)
     except PipelineError as error:
         blocks = [Text(f"The prompt cannot be shown: {error}")]
-    return [*blocks, _document(spec)]
+    said = "Feature spec: what decides what a feature is"
+    return [*blocks, Document(said, spec.attrs())]
 
 
-def _document(spec: FeatureSpec) -> Document:
-    return Document("Feature spec: what decides what a feature is", spec.attrs())
-
-
-def _told(prompt: PromptView) -> list[Block]:
+def _told(prompt: PromptView, recorded: Mapping[str, tuple[int, ...]]) -> list[Block]:
     height, width = prompt.pixels
     images = sum(prompt.image_tokens.values())
     text = len(prompt.tokens) - images
@@ -92,10 +98,40 @@ def _told(prompt: PromptView) -> list[Block]:
             f"{height} × {width} pixels for the model. Attention is causal: a token sees only what "
             "stands before it."
         ),
+        *map(Text, stretched(recorded, prompt.pixels)),
         Tokens(runs(prompt.tokens)),
-        Table(["view", "image tokens"], list(prompt.image_tokens.items()), "Image tokens by view"),
+        Table(
+            ["view", "recorded [pixels]", "for the model [pixels]", "image tokens"],
+            [
+                (name, _size(recorded[name]) if name in recorded else None, _size(prompt.pixels), n)
+                for name, n in prompt.image_tokens.items()
+            ],
+            "Image tokens by view; sizes are height × width",
+        ),
         Table(["token", "times"], list(prompt.special.items()), "Special tokens by name"),
     ]
+
+
+def stretched(recorded: Mapping[str, tuple[int, ...]], pixels: tuple[int, int]) -> list[str]:
+    """A sentence for each size (height, width) that the model sees in another shape."""
+    views: dict[tuple[int, ...], list[str]] = defaultdict(list)
+    for name, size in recorded.items():
+        views[size].append(name)
+    found: list[str] = []
+    for size, names in views.items():
+        wider = pixels[1] / pixels[0] / (size[1] / size[0])
+        more = max(wider, 1 / wider) - 1
+        if more > _STRETCHED:
+            found.append(
+                f"Drawn out by {more:.0%} in {'width' if wider > 1 else 'height'}: "
+                f"{', '.join(names)}, recorded as {_size(size)} pixels, for the model "
+                f"{_size(pixels)}. `vlm.image_resize_height` and `vlm.image_resize_width` say so."
+            )
+    return found
+
+
+def _size(size: tuple[int, ...]) -> str:
+    return f"{size[0]} × {size[1]}"
 
 
 def runs(tokens: Sequence[PromptToken]) -> list[Run]:

@@ -7,6 +7,7 @@ security policy forbids the rest. The same report gives the same bytes.
 import json
 import re
 import shutil
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -18,7 +19,7 @@ from markupsafe import Markup
 from tqdm import tqdm
 
 from pipeline.durable import disk_full_named, sync
-from pipeline.plots.style import RC, write
+from pipeline.plots.style import NO_FONT, RC, boxes, write
 from pipeline.report.blocks import (
     Block,
     Chart,
@@ -43,6 +44,7 @@ NAMED_PLACES = 3
 """Of a notice, those that show at once; all of them unfold."""
 MOST_PLACES = 300
 """Of a notice, those that the page lists; more stand in `findings.csv` only."""
+_TEMPLATES = Path(__file__).parent / "templates"
 _WRITTEN = re.compile(r'<meta name="pictures" content="([^"]*)">')
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 
@@ -123,9 +125,8 @@ class _Page:
     """One page in the making: its pictures' folder, the anchors taken, whether it has charts."""
 
     def __init__(self, report: Report, pictures: Path, names: Sequence[str]) -> None:
-        templates = FileSystemLoader(Path(__file__).parent / "templates")
         self._jinja = Environment(
-            loader=templates,
+            loader=FileSystemLoader(_TEMPLATES),
             autoescape=True,
             undefined=StrictUndefined,
             trim_blocks=True,
@@ -134,17 +135,20 @@ class _Page:
         self._jinja.filters |= {"prose": prose, "breakable": breakable}
         limits = {"named": NAMED_PLACES, "listed": MOST_PLACES, "findings": FINDINGS}
         self._blocks: Any = self._jinja.get_template("blocks.html", globals=limits).module
-        self._templates = Path(__file__).parent / "templates"
         self._report, self._pictures, self._names = report, pictures, names
         self._anchors: set[str] = {"top"}
         self._charts = 0
 
     def html(self) -> str:
         """The whole page."""
-        with tqdm(total=len(self._names), desc="pictures", unit="", disable=None) as self._bar:
+        bar = tqdm(total=len(self._names), desc="pictures", unit="", disable=None)
+        with bar as self._bar, boxes() as said:
             sections = [self._section(section) for section in self._report.sections]
+        if said:
+            warnings.warn(NO_FONT, stacklevel=3)
         return self._jinja.get_template("page.html").render(
             report=self._report,
+            said=said,
             sections=sections,
             pictures=" ".join(self._names),
             style=self._inlined("page.css"),
@@ -154,7 +158,7 @@ class _Page:
         )
 
     def _inlined(self, name: str) -> Markup:
-        return Markup((self._templates / name).read_text(encoding="utf-8"))
+        return Markup((_TEMPLATES / name).read_text(encoding="utf-8"))
 
     def _section(self, section: Section) -> dict[str, Any]:
         return {

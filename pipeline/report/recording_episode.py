@@ -8,8 +8,8 @@ from functools import partial
 from matplotlib.figure import Figure
 
 from pipeline.config import InspectParams
-from pipeline.inspection.clocks import clocks
-from pipeline.inspection.contact import contacts
+from pipeline.inspection.clocks import GAP_FACTOR, clocks
+from pipeline.inspection.contact import RULE, contacts
 from pipeline.inspection.facts import Clock, EpisodeView, Flaw
 from pipeline.inspection.frames import frames_at, read_frames, spread_ticks
 from pipeline.inspection.overview import EpisodeSummary
@@ -102,7 +102,7 @@ def _sensor(view: EpisodeView, draw: Draw, flaws: Sequence[Flaw]) -> list[Block]
         f"{one.start_s - view.zero:.2f}–{one.stop_s - view.zero:.2f} s" for one in touching
     )
     said = f"Contact, by the force alone: {spans}." if spans else "No contact is seen in the force."
-    caption = f"The sensor's {wide:,} channels over time, contact shaded. {said}"
+    caption = f"The sensor's {wide:,} channels over time, contact shaded. {said} {RULE}"
     return [draw("sensor", caption, lambda view: sensor(view, contacts(view)))]
 
 
@@ -120,7 +120,7 @@ def _clocks(view: EpisodeView, draw: Draw) -> list[Block]:
     lanes = draw(
         "clocks",
         "When each stream was sampled, and which VL row serves which ticks; zoom in to see single "
-        "entries. Gaps are marked.",
+        "entries. Gaps are marked; rates are usual ones.",
         lambda view: clock_lanes(view, clocks(view)),
     )
     steps = draw(
@@ -136,12 +136,23 @@ def _clock_table(view: EpisodeView, found: Sequence[Clock]) -> Table:
     last = [one.time[-1] - view.zero if len(one.time) else None for one in found]
     jitters = [one.jitter_s for one in found]
     unit, size = jitter_unit(jitters)
-    heads = ["clock", "entries", "first [s]", "last [s]", "rate [Hz]", f"jitter [{unit}]", "gaps"]
+    heads = [
+        *("clock", "entries", "first [s]", "last [s]"),
+        *("usual rate [Hz]", "on average [Hz]", f"jitter [{unit}]", "gaps"),
+    ]
     rows = [
-        (one.name, len(one.time), begin, end, one.rate_hz, jitter / size, len(one.gaps))
+        (
+            *(one.name, len(one.time), begin, end),
+            *(one.rate_hz, one.mean_rate_hz, jitter / size, len(one.gaps)),
+        )
         for one, begin, end, jitter in zip(found, first, last, jitters, strict=True)
     ]
-    return Table(heads, rows, "Jitter is the standard deviation of the steps that are no gaps.")
+    said = (
+        "The usual rate is one over the usual step; on average are the steps over their time, lost "
+        f"entries and gaps included. A gap is a step of at least {GAP_FACTOR:g} usual ones. Jitter "
+        "is the standard deviation of the steps that are no gaps."
+    )
+    return Table(heads, rows, said)
 
 
 def jitter_unit(jitters_s: Sequence[float]) -> tuple[str, float]:

@@ -5,7 +5,7 @@ from itertools import groupby
 
 import numpy as np
 
-from pipeline.inspection.channels import PROFILE_CHANNELS, unnumbered
+from pipeline.channels import PROFILE_CHANNELS, unnumbered
 from pipeline.inspection.facts import ChannelStatistics
 from pipeline.report.blocks import Table
 

@@ -34,11 +34,13 @@ _CHANNELS = 16
 
 def store_report(view: StoreView) -> Report:
     """The page of a store, by what `inspect_store` found; the same store gives the same page."""
-    rate = "recorded rows" if view.action_hz is None else f"ticks at {view.action_hz:g} Hz"
+    rate = "as recorded" if view.action_hz is None else f"at {view.action_hz:g} Hz"
+    reuse = view.vlm_reuse_count
     return Report(
         title=f"Store: {view.path.name}",
         summary=(
-            f"{rate}, one VL row every {view.vlm_reuse_count} ticks; feature spec "
+            f"Ticks {rate}, features of the model (a VL row) at "
+            f"{'each of them' if reuse == 1 else f'one in {reuse}'}; feature spec "
             f"`{view.spec['digest']}`. Times count from the first tick of their episode."
         ),
         tiles=_tiles(view),
@@ -69,8 +71,8 @@ def _tiles(view: StoreView) -> list[tuple[str, str]]:
 def _notices(view: StoreView) -> Notices:
     return Notices(
         notices(view.flaws, {}),
-        "Nothing: clocks ascend, every stream is where others of its kind are, features follow the "
-        "scene, and no recording is there twice.",
+        "Nothing: clocks ascend, every stream is where others of its kind are, channels move, "
+        "features follow the scene, and no recording is there twice.",
     )
 
 

@@ -62,10 +62,10 @@ def _colours(view: StoreView) -> str:
 
 def _looked_at(view: StoreView) -> str:
     sampled = view.sampled
-    said = "Of all VL rows"
+    said = "Looked at: all VL rows"
     if sampled.looked_at < sampled.total:
-        said = f"Of {sampled.looked_at:,} of {sampled.total:,} VL rows, the same moments of each "
-        said += "episode (`inspect.points`)"
+        said = f"Looked at: {sampled.looked_at:,} of {sampled.total:,} VL rows, the same moments "
+        said += "of each episode (`inspect.points`)"
     said += ", plain frames only" if view.variants > 1 else ""
     return (
         f"{said}, but {sampled.left_out:,} with what is not finite."

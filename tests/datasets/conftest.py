@@ -8,11 +8,13 @@ import pytest
 
 from pipeline.config import Params
 from pipeline.extraction import extract
-from pipeline.simulation.insertion_formats import ABUTTING, OVERLAPPING, write_new, write_old
+from pipeline.simulation.insertion_formats import ABUTTING, write_new, write_old
 from pipeline.simulation.recorder import simulate_episode
 from pipeline.store import FeatureStore
 
 EPOCH_S = 1.767e9 + 0.25
+OVERLAPPING = (130, 65)
+"""Less than the recorder's windows overlap, which would take seconds at every reading."""
 
 
 @pytest.fixture(scope="session")

@@ -56,6 +56,11 @@ def cached(recordings: Path, extracted: FeatureStore) -> UnifiedVLADataset:
     return UnifiedVLADataset(sources(recordings), store=extracted)
 
 
+@pytest.fixture(scope="module")
+def new(recordings: Path) -> UnifiedVLADataset:
+    return UnifiedVLADataset(recordings / "new", "new")
+
+
 def sources(recordings: Path) -> list[Source]:
     """The new ones first: the store has them last."""
     return [Source(name=name, path=str(recordings / name)) for name in ("new", "old")]
@@ -81,16 +86,17 @@ def equal(a: Any, b: Any) -> bool:
 
 
 class TestItems:
-    def test_an_item_is_what_the_timeline_says(self, recordings: Path) -> None:
+    def test_an_item_is_what_the_timeline_says(
+        self, recordings: Path, new: UnifiedVLADataset
+    ) -> None:
         source = Source(name="new", path=str(recordings / "new"))
         recording = open_recordings([source]).recordings[1]
         state, sensor = recording.state(), recording.sensor()
         assert state is not None and sensor is not None
         line = build_timeline(recording, 10.0, 3, "rotvec", state, sensor)
-        data = UnifiedVLADataset([source])
-        offset = data.episodes[1].ticks.start
+        offset = new.episodes[1].ticks.start
         for tick in (0, 1, 7, len(line.time) - 3):
-            item = data[offset + tick]
+            item = new[offset + tick]
             now = line.time[tick]
             assert float(item["time"]) == now
             readings = sensor.values[sensor.time <= now][-65:]
@@ -318,19 +324,19 @@ class TestSplit:
         both = cached.split(0.3)
         assert sorted(both[0].indices + both[1].indices) == list(range(len(cached)))
 
-    @pytest.mark.parametrize("val_fraction", [0.0, 0.3, 0.5, 0.8])
     def test_the_same_with_frames_as_with_features_under_the_names_of_the_store(
-        self, recordings: Path, extracted: FeatureStore, val_fraction: float
+        self, recordings: Path, extracted: FeatureStore
     ) -> None:
         named = [
             Source(name=name, path=str(recordings / folder))
             for name, folder in (("first", "old"), ("second", "new"))
         ]
         live, cached = UnifiedVLADataset(named), UnifiedVLADataset(store=extracted)
-        sides = [[side.indices for side in data.split(val_fraction)] for data in (live, cached)]
-        assert sides[0] == sides[1]
-        trained = split_by_episode(extracted, val_fraction)
-        assert sides[1] == [trained.train.tolist(), trained.held_out.tolist()]
+        for val_fraction in (0.0, 0.3, 0.5, 0.8):
+            sides = [[side.indices for side in data.split(val_fraction)] for data in (live, cached)]
+            assert sides[0] == sides[1]
+            trained = split_by_episode(extracted, val_fraction)
+            assert sides[1] == [trained.train.tolist(), trained.held_out.tolist()]
 
     def test_one_recording_in_two_places_is_on_one_side(self, recordings: Path) -> None:
         new = str(recordings / "new")
@@ -345,18 +351,17 @@ class TestSplit:
 class TestWorkers:
     @pytest.mark.parametrize(("start", "workers"), [("fork", 2), ("spawn", 1)])
     def test_batches_are_those_of_this_process(
-        self, recordings: Path, start: str, workers: int
+        self, new: UnifiedVLADataset, start: str, workers: int
     ) -> None:
-        data = UnifiedVLADataset(recordings / "new", "new")
         loader = DataLoader(
-            data,
+            new,
             batch_sampler=[[0, 1, 5], [70, 40], [3]],
             num_workers=workers,
             collate_fn=unified_collate_fn,
             multiprocessing_context=start,
         )
         for batch, items in zip(loader, loader.batch_sampler, strict=True):
-            assert equal(batch, data.__getitems__(items))
+            assert equal(batch, new.__getitems__(items))
 
     def test_recordings_that_are_open_already_are_the_same_data(
         self, recordings: Path, extracted: FeatureStore, live, cached
@@ -382,12 +387,11 @@ class TestWorkers:
         again = pickle.loads(pickle.dumps(alias))
         assert type(again) is type(alias) and np.array_equal(again.ticks, alias.ticks)
 
-    def test_data_sets_concatenate(self, recordings: Path) -> None:
+    def test_data_sets_concatenate(self, recordings: Path, new: UnifiedVLADataset) -> None:
         parts = [NewAsyncInsertionDataset(path) for path in sorted(recordings.glob("new/*/*"))]
-        whole = UnifiedVLADataset(recordings / "new")
         loader = DataLoader(ConcatDataset(parts), batch_size=90, collate_fn=unified_collate_fn)
         batches = list(loader)
-        expected = whole.__getitems__(range(len(whole)))
+        expected = new.__getitems__(range(len(new)))
         action = torch.cat([batch.action for batch in batches])
         assert torch.equal(action, expected.action)
 

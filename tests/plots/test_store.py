@@ -15,7 +15,7 @@ from pipeline.inspection.store import StoreView, inspect_store
 from pipeline.plots import store as pictures
 from pipeline.plots import store_features as feature_pictures
 from pipeline.plots import store_interactive
-from pipeline.plots.style import RC, write
+from pipeline.plots.style import INK, RC, write
 from pipeline.store import FeatureStore
 
 ROWS = 10
@@ -67,6 +67,13 @@ def test_every_picture_is_drawn(flawed, tmp_path, name):
 def test_the_smallest_store_can_be_drawn(smallest, tmp_path, name):
     (path,) = write(tmp_path, {f"{name}.png": lambda: EVERY[name](smallest)})
     assert mpl_image.imread(path)[..., :3].std() > 0.01  # more than a blank sheet
+
+
+def test_sources_are_parted_on_a_map_that_stays_light_on_a_dark_page(flawed):
+    """A page draws ink in white where it is dark, and the map's middle is nearly white."""
+    _, by_episode, _ = feature_pictures.norms(flawed).axes
+    assert by_episode.lines
+    assert INK not in {line.get_color() for line in by_episode.lines}
 
 
 def test_coverage_marks_what_is_absent(flawed):
@@ -151,6 +158,7 @@ def test_dots_are_coloured_by_progress(flawed):
     figure = store_interactive.projection(flawed, "progress")
     (dots,) = figure.data
     assert dots.marker.color.tolist() == flawed.projection.progress.tolist()
+    assert [colour for _, colour in dots.marker.colorscale] == list(feature_pictures.PROGRESS)
     assert not figure.layout.showlegend
     assert figure.layout.xaxis.title.text.startswith("component 1 (")
 

@@ -1,7 +1,7 @@
 """What a browser must find of a page, and a report with every kind of block."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from pipeline.report import (
     Table,
     Text,
     Tokens,
+    write_report,
 )
 
 DESKTOP, PHONE = (1280, 900), (390, 844)
@@ -132,34 +133,48 @@ LOOK = """() => {
 }"""
 
 
+COLOURED = """() => {
+  const ink = getComputedStyle(document.body).color;
+  return [...document.querySelectorAll(".chart .main-svg")].every(
+    (one) => !one.querySelector("text") || getComputedStyle(one.querySelector("text")).fill === ink,
+  );
+}"""
+
+
 @pytest.fixture
 def assert_page_is_sound(browser_page: Visitor) -> Callable[[Path], None]:
     """`assert_page_is_sound(path)`: at desktop and phone width, in light and in dark.
 
     Nothing errs, no request leaves the page, nothing overflows, every picture and chart is there
     in an ink that contrasts, words contrast as WCAG's AA wants, every link of the contents leads
-    somewhere, and no id is there twice.
+    somewhere, and no id is there twice. Each width is loaded in one scheme and goes over to the
+    other as a system does at dusk.
     """
 
     def check(path: Path) -> None:
-        for size in (DESKTOP, PHONE):
-            for scheme in ("light", "dark"):
-                visit = browser_page(path, size, scheme)
-                here = f"{path.name} at {size}, {scheme}"
-                visit.page.wait_for_function("() => !document.querySelector('.chart > script')")
-                found = visit.page.evaluate(LOOK)
-                assert visit.trouble == [], here
-                assert found["overflow"] <= 0, here
-                assert found["links"] > 0, here
-                for wrong in ("unseen", "unnamed", "undrawn", "faint", "dead", "twice"):
-                    assert found[wrong] == [], f"{here}: {wrong}"
-                inks = found["inks"] + found["chart_inks"]
-                if scheme == "light":
-                    assert found["paper"] > 0.9 and all(ink < 0.1 for ink in inks), (here, found)
-                else:
-                    assert found["paper"] < 0.05 and all(ink > 0.5 for ink in inks), (here, found)
+        for size, schemes in ((DESKTOP, ("light", "dark")), (PHONE, ("dark", "light"))):
+            visit = browser_page(path, size, schemes[0])
+            visit.page.wait_for_function("() => !document.querySelector('.chart > script')")
+            for scheme in schemes:
+                visit.page.emulate_media(color_scheme=scheme)
+                visit.page.wait_for_function(COLOURED)
+                assert_is_sound(visit, scheme, f"{path.name} at {size}, {scheme}")
 
     return check
+
+
+def assert_is_sound(visit: Visit, scheme: str, here: str) -> None:
+    found = visit.page.evaluate(LOOK)
+    assert visit.trouble == [], here
+    assert found["overflow"] <= 0, here
+    assert found["links"] > 0, here
+    for wrong in ("unseen", "unnamed", "undrawn", "faint", "dead", "twice"):
+        assert found[wrong] == [], f"{here}: {wrong}"
+    inks = found["inks"] + found["chart_inks"]
+    if scheme == "light":
+        assert found["paper"] > 0.9 and all(ink < 0.1 for ink in inks), (here, found)
+    else:
+        assert found["paper"] < 0.05 and all(ink > 0.5 for ink in inks), (here, found)
 
 
 def drawn() -> Figure:
@@ -182,7 +197,7 @@ def plotted() -> go.Figure:
     return figure.update_layout(height=320, xaxis_title="time [s]")
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def every_block() -> Report:
     """A report with every kind of block, and with texts that try to break out."""
     long = "a/" + "x" * 200
@@ -227,3 +242,18 @@ def every_block() -> Report:
             ),
         ],
     )
+
+
+@pytest.fixture(scope="session")
+def every_page(every_block: Report, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its page, not to be written to; beside it what comes with it."""
+    return write_report(tmp_path_factory.mktemp("every"), every_block)[0]
+
+
+@pytest.fixture(scope="session")
+def still_page(every_block: Report, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same without its chart, so that it loads at once."""
+    words, pictures, prompt = every_block.sections
+    sections = [words, replace(pictures, parts=()), prompt]
+    still = replace(every_block, sections=sections)
+    return write_report(tmp_path_factory.mktemp("still"), still)[0]

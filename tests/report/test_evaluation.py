@@ -104,6 +104,7 @@ def test_tables_say_what_the_comparison_says(judgement: Judgement) -> None:
     assert errors.rows[-1][1] == comparison.overall("policy")
     assert errors.rows[-1][-1] == comparison.relative()
     assert errors.strong == {len(errors.rows) - 1}
+    assert errors.caption.startswith("Repeat last: ") and errors.caption.endswith(".")
     assert [row[0] for row in dimensions.rows] == list(comparison.names)
     assert dimensions.rows[1][2] == comparison.scores["policy"].mae[1]
     assert [row[:2] for row in steps.rows] == [(0, 0), (1, 100), (2, 200), (3, 300)]
@@ -124,15 +125,32 @@ def test_groups_in_which_a_baseline_is_better_stand_at_the_top(judgement: Judgem
     places = list(group.dimensions)
     best = min((comparison.scores[one].mae for one in BASELINES), key=group.mean)
     lowest = np.min([comparison.scores[one].mae for one in BASELINES], axis=0)
-    for factor in (0.5, 1.72):
+    # 1.002 times would read "1.00 times", which is no better.
+    for factor, times in ((0.5, ""), (1.002, ""), (1.008, "1.01"), (1.72, "1.72")):
         mae = 0.5 * lowest
         mae[places] = factor * best[places]
         policy = replace(comparison.scores["policy"], mae=mae)
         scores = {**comparison.scores, "policy": policy}
         found = replace(judgement, comparison=replace(comparison, scores=scores))
-        said = f"A baseline is better in {group.name} (1.72 times the best baseline's error)."
+        said = f"A baseline is better in {group.name} ({times} times the best baseline's error)."
         summary = evaluation_report(found).summary
-        assert (said in summary) == ("A baseline is better" in summary) == (factor > 1)
+        assert (said in summary) == ("A baseline is better" in summary) == bool(times)
+
+
+def test_dimensions_that_hardly_move_stand_at_the_top(judgement: Judgement) -> None:
+    comparison = judgement.comparison
+    names = tuple(f"joint_{index}" for index in range(5))
+    still = replace(
+        comparison, names=names, units=("",) * 5, scale=np.array([1.0, 1.0, 1.0, 0.001, 0.0])
+    )
+    report = evaluation_report(replace(judgement, comparison=still))
+    assert "Hardly moving: joint_3 (training std at most 0.001, where 1 is usual" in report.summary
+    said = {label.split(" (")[0]: value for label, value in report.tiles}
+    relative = still.without_still().relative()
+    assert relative is not None and relative != still.relative()
+    assert said["the same, without what hardly moves"] == f"{100 * relative:.0f} %"
+    report = evaluation_report(judgement)
+    assert "ardly mov" not in f"{report.summary} {report.tiles}"
 
 
 def test_params_spec_and_what_was_judged_are_there(judgement: Judgement) -> None:
@@ -191,14 +209,20 @@ def test_experiments_are_one_page(tmp_path: Path, assert_page_is_sound: Sound) -
     experiments = [
         Experiment(
             f"{expert}-concat", expert, "concat", 10, 1000, 1,
-            {"overall": {"policy": error, "relative": error / 0.4, **rules}}, 7.0,
+            {
+                ("overall", "training std"): {"policy": error, **rules},
+                ("translation", "mm"): {"policy": 0.1, **rules},
+            }, 7.0,
         )
         for expert, error in (("regression", 0.3), ("diffusion", 0.2))
     ]  # fmt: skip
     report = comparison_report(experiments)
-    (table,) = report.blocks(Table)
+    table, own = report.blocks(Table)
+    assert own.columns == ["experiment", "expert", "fusion", "samples", "parameters"]
+    assert [row[1] for row in own.rows] == ["regression", "diffusion"]
     assert table.strong == {1}
-    assert [row[3] for row in table.rows] == [0.3, 0.2, 0.5, 0.4, 0.45]
+    assert table.columns[:3] == ["experiment", "overall [training std]", "translation [mm]"]
+    assert [row[1] for row in table.rows] == [0.3, 0.2, 0.5, 0.4, 0.45]
     assert dict(report.tiles)["by"] == "diffusion-concat"
     write_report(tmp_path, report)
     assert_page_is_sound(tmp_path / PAGE)

@@ -38,25 +38,26 @@ def pictures(*names: str, draw: Callable[[], Figure] = lambda: canvas(2, 2)) -> 
     return Report("Pictures", "", sections=[Section("All", blocks)])
 
 
-def test_the_same_report_gives_the_same_bytes(every_block: Report, tmp_path: Path) -> None:
-    first = {path.name: path.read_bytes() for path in write_report(tmp_path / "a", every_block)}
-    again = {path.name: path.read_bytes() for path in write_report(tmp_path / "b", every_block)}
-    assert first == again
+def test_the_same_report_gives_the_same_bytes(
+    every_block: Report, every_page: Path, tmp_path: Path
+) -> None:
+    files = write_report(tmp_path, every_block)
+    names = [file.name for file in files]
+    assert names == [PAGE, "one.png", "two.png", "lanes.png", "findings.csv"]
+    assert {file.name for file in tmp_path.iterdir()} == set(names)
+    for file in files:
+        assert file.read_bytes() == every_page.with_name(file.name).read_bytes(), file.name
 
 
-def test_what_is_said_cannot_become_markup(every_block: Report, tmp_path: Path) -> None:
-    write_report(tmp_path, every_block)
-    page = (tmp_path / PAGE).read_text()
+def test_what_is_said_cannot_become_markup(every_page: Path) -> None:
+    page = every_page.read_text()
     assert "<title>A page &lt;of&gt; every block</title>" in page
     assert "<code>code</code> &amp; &lt;script&gt;alert(1)" in page
     assert "\\u003c/script>\\u003cb>" in page
 
 
-def test_pictures_have_no_ink_of_their_own(every_block: Report, tmp_path: Path) -> None:
-    write_report(tmp_path, every_block)
-    svg = re.findall(
-        r"<svg viewBox=.*? role=\"img\".*?</svg>", (tmp_path / PAGE).read_text(), re.DOTALL
-    )
+def test_pictures_have_no_ink_of_their_own(every_page: Path) -> None:
+    svg = re.findall(r"<svg viewBox=.*? role=\"img\".*?</svg>", every_page.read_text(), re.DOTALL)
     assert len(svg) == 3
     for one in svg:
         assert INK not in one and GRID not in one
@@ -83,9 +84,8 @@ def test_names_that_are_no_text_are_shown(tmp_path: Path) -> None:
     assert "<p>caf\\udce9</p>" in page.read_text(encoding="utf-8")
 
 
-def test_plotly_is_there_once_and_only_for_charts(every_block: Report, tmp_path: Path) -> None:
-    write_report(tmp_path, every_block)
-    page = (tmp_path / PAGE).read_text()
+def test_plotly_is_there_once_and_only_for_charts(every_page: Path, tmp_path: Path) -> None:
+    page = every_page.read_text()
     (packed,) = re.findall(r'id="plotly">([^<]*)<', page)
     assert gzip.decompress(base64.b64decode(packed)).decode() == get_plotlyjs()
     assert len(page) < 2_300_000
@@ -141,9 +141,8 @@ def test_names_of_pictures_are_file_stems_each_once(tmp_path: Path) -> None:
         write_report(tmp_path, pictures("../one"))
 
 
-def test_equal_titles_have_anchors_of_their_own(every_block: Report, tmp_path: Path) -> None:
-    write_report(tmp_path, every_block)
-    page = (tmp_path / PAGE).read_text()
+def test_equal_titles_have_anchors_of_their_own(every_page: Path) -> None:
+    page = every_page.read_text()
     assert page.count('<section id="words">') == page.count('<section id="words-2">') == 1
 
 

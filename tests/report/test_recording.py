@@ -21,7 +21,7 @@ from pipeline.report import (
     write_report,
 )
 from pipeline.report.flaws import notices
-from pipeline.report.model_input import runs
+from pipeline.report.model_input import runs, stretched
 from pipeline.report.recording import recordings_report
 from pipeline.report.recording_episode import jitter_unit
 from pipeline.report.statistics_table import statistics_table
@@ -53,14 +53,24 @@ def test_the_page_of_a_recording_is_whole_and_sound(
     tmp_path: Path,
     assert_page_is_sound: Callable[[Path], None],
 ) -> None:
-    report = report_of(params_of(recorded))
+    # Few samples and ticks: five of each are drawn in tests/plots.
+    report = report_of(params_of(recorded, "inspect.samples=2", "inspect.ticks=2"))
     files = write_report(tmp_path, report)
     names = {file.stem.rpartition("-")[2] for file in files if file.suffix == ".png"}
     assert names == {"views", "sensor", "motion", "clocks", "steps", "samples", "batch"}
     assert len(list(report.blocks(Chart))) == 1
+    (clocks,) = [table for table in report.blocks(Table) if table.columns[0] == "clock"]
+    usual, average = map(clocks.columns.index, ("usual rate [Hz]", "on average [Hz]"))
+    # The simulated recorder loses five rows of the robot's.
+    (state,) = [row for row in clocks.rows if row[0] == "state"]
+    assert 95 < state[average] < state[usual] - 0.5
+    (sensor,) = [one for one in report.blocks(Picture) if one.name.endswith("sensor")]
+    assert "by 6 times its noise" in sensor.caption
     (document,) = report.blocks(Document)
     assert document.content["digest"]
     (prompt,) = report.blocks(Tokens)
+    sizes = next(one for one in report.blocks(Table) if "image tokens" in one.columns)
+    assert [row[1:3] for row in sizes.rows] == [("126 × 224", "112 × 168")] * 3
     assert [run.note for run in prompt.runs if run.kind == "image"] == [
         f"× 24, {view}" for view in ("View1", "View2", "View5")
     ]
@@ -79,6 +89,7 @@ def test_what_is_missing_is_said(
     said = words_of(report)
     assert str(sensor) in said
     assert "No sample can be made" in said
+    assert ".. " not in said
     assert "nowhere" in said and "python -m stages.demo" in said
     first = next(report.blocks(Notices))
     assert [one.severity for one in first.notices] == ["error"]
@@ -100,6 +111,16 @@ def test_all_episodes_are_checked_and_some_are_shown(
     assert titles[2:4] == ["episode_1", "episode_2"]
     names = [one.name for one in report.blocks(Picture)]
     assert "episode1-episode_1-views" in names and "episode2-episode_2-views" in names
+
+
+def test_what_the_model_sees_in_another_shape_is_said() -> None:
+    recorded = {"a": (480, 640), "b": (480, 640), "c": (720, 1280), "d": (700, 700)}
+    assert stretched({"c": (720, 1280)}, (364, 644)) == []
+    wide, square = stretched(recorded, (364, 644))
+    assert "33% in width: a, b, recorded as 480 × 640 pixels, for the model 364 × 644" in wide
+    assert "77% in width: d" in square and "`vlm.image_resize_height`" in square
+    (high,) = stretched({"c": (720, 1280)}, (200, 200))
+    assert "78% in height: c" in high
 
 
 def test_a_flaw_of_many_episodes_is_one_notice() -> None:

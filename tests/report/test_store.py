@@ -44,6 +44,18 @@ def test_the_sum_of_the_sources_is_the_store(report, view):
     assert dict(report.tiles)["ticks"] == f"{view.ticks}"
 
 
+@pytest.mark.parametrize(
+    ("hz", "reuse", "said"),
+    [
+        (10.0, 3, "Ticks at 10 Hz, features of the model (a VL row) at one in 3; feature spec"),
+        (None, 1, "Ticks as recorded, features of the model (a VL row) at each of them; feature"),
+    ],
+)
+def test_the_summary_says_what_a_row_is(view, hz, reuse, said):
+    summary = store_report(replace(view, action_hz=hz, vlm_reuse_count=reuse)).summary
+    assert summary.startswith(said)
+
+
 def test_what_looks_wrong_is_named_with_episode_and_time(report):
     notices, checked = blocks(report, "What looks wrong")
     assert isinstance(notices, Notices)
@@ -67,7 +79,7 @@ def test_sizes_list_every_array(report, view):
 def test_rows_that_are_not_finite_are_said_to_be_left_out(view):
     kept = view.sampled.but(np.arange(6 * ROWS) == 34)
     words = [one.words for one in blocks(store_report(replace(view, sampled=kept)), "Features")[:1]]
-    assert words == ["Of all VL rows, but 1 with what is not finite."]
+    assert words == ["Looked at: all VL rows, but 1 with what is not finite."]
     none = view.sampled.but(np.ones(6 * ROWS, np.bool_))
     (only,) = blocks(store_report(replace(view, sampled=none)), "Features")
     assert only.words == "Every VL row looked at holds features that are no numbers."

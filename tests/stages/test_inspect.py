@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.plots.style import RC
 from pipeline.report import Notice, Notices, Place, Report, Section
 from stages import inspect
 from stages.command import run
@@ -39,7 +40,9 @@ def test_recordings_and_a_damaged_one_are_a_page(
         shutil.copytree(episode, tmp_path / "lab" / name)
     next(tmp_path.glob("lab/broken/*sensor*")).write_bytes(b"no archive")
     # As a shell hands out lab/*.
-    assert looked("lab/broken", "lab/sound", "--set", "inspect.episodes=1") == 0
+    few = ("inspect.episodes=1", "inspect.samples=1", "inspect.ticks=1")
+    options = [word for one in few for word in ("--set", one)]
+    assert looked("lab/broken", "lab/sound", *options) == 0
     page = Path("reports/inspect/lab_broken_and_1_more/report.html")
     out = capsys.readouterr().out
     assert "episodes 2 · " in out and "errors 1" in out
@@ -47,6 +50,29 @@ def test_recordings_and_a_damaged_one_are_a_page(
     assert out.splitlines()[-1].startswith(f"{page}: ")
     assert "error,unreadable," in page.with_name("findings.csv").read_text()
     assert page.is_file() and len(list(page.parent.glob("*.png"))) >= 4
+
+
+@pytest.mark.parametrize("alone", [False, True])
+def test_a_korean_name_is_drawn_or_said_to_lack_a_font(
+    looked: Callable[..., int],
+    recorded: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    alone: bool,
+) -> None:
+    (episode,) = recorded.iterdir()
+    shutil.copytree(episode, tmp_path / "바늘_삽입")
+    if alone:
+        monkeypatch.setitem(RC, "font.family", ["DejaVu Sans"])
+    few = ("inspect.samples=1", "inspect.ticks=1", "inspect.output=mine")
+    # Where a warning a letter came through, it would be an error here.
+    assert looked("바늘_삽입", *(word for one in few for word in ("--set", one))) == 0
+    lacking = len(RC["font.family"]) == 1
+    out = capsys.readouterr().out
+    assert out.count("fonts-noto-cjk") == lacking
+    page = (tmp_path / "mine/report.html").read_text(encoding="utf-8")
+    assert page.count("fonts-noto-cjk") == lacking and "바늘_삽입" in page
 
 
 def test_a_store_is_a_page(
@@ -65,7 +91,7 @@ def test_a_store_is_a_page(
     ("place", "said"),
     [
         ("nowhere", "nowhere is not there"),
-        ("empty", "none with an episode in it"),
+        ("empty", "Mend the path or format"),
         ("tiny.zarr.part", "stages.extract"),
         ("copy.zarr", "--restore"),
     ],

@@ -7,7 +7,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from pipeline.plots.recording.channels import Group, short_names
 from pipeline.plots.style import INK, PALETTE, canvas
 
 CONTACT = "#E69F00"
@@ -29,6 +28,11 @@ def say(axis: Axes, said: str) -> None:
     """One sentence in an otherwise empty panel."""
     axis.set_axis_off()
     axis.text(0.5, 0.5, said, ha="center", va="center", transform=axis.transAxes, wrap=True)
+
+
+def centre(axis: Axes, said: str) -> None:
+    """A few words in the middle of a panel."""
+    axis.text(0.5, 0.5, said, ha="center", va="center", transform=axis.transAxes)
 
 
 def colour(index: int) -> tuple[str, str]:
@@ -55,7 +59,8 @@ def curves(
             color=ink,
             ls=line,
             lw=1.3,
-            label=label,
+            # A label that begins with an underscore would drop out of the legend.
+            label=f" {label}" if label.startswith("_") else label,
             drawstyle=style,
             marker=marker,
         )
@@ -73,11 +78,6 @@ def legend_beside(axis: Axes, of: Axes | None = None, fontsize: float = 8) -> No
         ncols=1 + len(labels) // 8,
         handlelength=1.6,
     )
-
-
-def names(group: Group) -> list[str]:
-    """Of the channels of a group, as a legend has room for them."""
-    return short_names(group.names)
 
 
 def absent(axis: Axes, start: float, stop: float) -> None:

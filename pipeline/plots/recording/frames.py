@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from pipeline.inspection.facts import EpisodeView
-from pipeline.plots.recording.drawing import words
+from pipeline.plots.recording.drawing import centre, words
 from pipeline.plots.style import canvas
 from pipeline.timeline import last_at
 
@@ -55,7 +55,7 @@ def _frame(
     axis.set(xticks=[], yticks=[])
     axis.grid(visible=False)
     if column >= len(frames) or ages is None:
-        axis.text(0.5, 0.5, "no frame", ha="center", va="center", transform=axis.transAxes)
+        centre(axis, "no frame")
         return
     axis.imshow(frames[column])
     axis.set_xlabel(f"{1000 * ages[column]:.0f} ms old", fontsize=8, labelpad=2)

@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
+from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch, Rectangle
+from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from pipeline.inspection.clocks import equal_clocks, usual_step
@@ -22,13 +23,20 @@ LANE_COLOURS = {"camera": PALETTE[0], "stream": PALETTE[4], "tick": INK, "vl_row
 _SINGLE, _SINGLE_NEAR = 400, 240
 """Entries that are still shown one by one: over the whole episode, and from near."""
 _BINS = 500
+_GAP: dict[str, Any] = {
+    "facecolor": "none",
+    "edgecolor": GAP,
+    "hatchcolor": GAP,
+    "hatch": "////",
+    "lw": 1.4,
+}
 _GAP_LABELS = 8
 """Gaps of a lane whose length is written, the longest ones."""
 _ROWS_ZOOMED = 5
 _ZOOM_S, _LEAST_ZOOM_S = 1.5, 0.5
 """Of what is shown from near: without VL rows, and with rows that follow fast."""
 _OVERVIEW = "the whole episode (grey: the stretch below)"
-BAND = "height of a band: share of the usual rate (usual step / longest step there)"
+BAND = "band height: usual step / longest step there"
 """What is said where a lane's entries lie too close for marks."""
 _HALF = 0.36
 """Of a lane: how far its marks reach up and down."""
@@ -167,21 +175,19 @@ def _evenness(axis: Axes, clock: Clock, lane: int, zero: float, span: tuple[floa
 
 
 def _gaps(axis: Axes, clock: Clock, lane: int, zero: float) -> None:
-    longest = sorted(clock.gaps, key=lambda gap: gap.start_s - gap.stop_s)[:_GAP_LABELS]
     low, high = axis.get_xlim()
-    for gap in clock.gaps:
-        start, stop = gap.start_s - zero, gap.stop_s - zero
-        if stop < low or start > high:
-            continue
-        box = Rectangle((start, lane - _HALF), stop - start, 2 * _HALF, zorder=3)
-        box.set(facecolor="none", edgecolor=GAP, hatchcolor=GAP, hatch="////", lw=1.4)
-        axis.add_patch(box)
-        if gap in longest:
-            middle = (max(start, low) + min(stop, high)) / 2
-            axis.text(
-                middle, lane - _HALF, f"{stop - start:.2g} s", color=GAP, size=8, ha="center",
-                va="bottom", clip_on=True,
-            )  # fmt: skip
+    ends = np.array([(gap.start_s, gap.stop_s) for gap in clock.gaps]).reshape(-1, 2) - zero
+    ends = ends[(ends[:, 1] >= low) & (ends[:, 0] <= high)]
+    boxes = np.empty((len(ends), 4, 2))
+    boxes[:, :, 0] = ends[:, [0, 1, 1, 0]]
+    boxes[:, :, 1] = lane + _HALF * np.array([-1, -1, 1, 1])
+    # One for all: thousands of gaps as patches take many seconds.
+    axis.add_collection(PolyCollection(list(boxes), zorder=3, **_GAP), autolim=False)
+    for start, stop in ends[np.argsort(ends[:, 0] - ends[:, 1], kind="stable")[:_GAP_LABELS]]:
+        axis.text(
+            (max(start, low) + min(stop, high)) / 2, lane - _HALF, f"{stop - start:.2g} s",
+            color=GAP, size=8, ha="center", va="bottom", clip_on=True,
+        )  # fmt: skip
 
 
 def _lanes(axis: Axes, names: Sequence[str]) -> None:
@@ -213,7 +219,7 @@ def _legend(figure: Figure, view: EpisodeView) -> None:
     ]
     if view.timeline is None:
         handles = handles[:2]
-    gap = Patch(facecolor="none", edgecolor=GAP, hatchcolor=GAP, hatch="////", label="gap")
+    gap = Patch(**_GAP, label="gap")
     drawn = [one.get_label() for axis in figure.axes for one in axis.collections]
     said = BAND if BAND in drawn else None
     figure.legend(

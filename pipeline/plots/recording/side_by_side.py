@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -12,8 +11,8 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from pipeline.datasets import UnifiedBatch, UnifiedVLADataset
-from pipeline.plots.recording.channels import Group, groups
-from pipeline.plots.recording.drawing import absent, curves, legend_beside, names, words
+from pipeline.plots.recording.channels import Group, groups, short_names
+from pipeline.plots.recording.drawing import absent, centre, curves, legend_beside, words
 from pipeline.plots.recording.masks import seen_views
 from pipeline.plots.style import canvas
 from pipeline.recordings import Channels
@@ -39,12 +38,13 @@ class _Row:
     group: Group | None = None
 
 
-def samples(dataset: UnifiedVLADataset, batch: UnifiedBatch) -> Figure:
+def samples(dataset: UnifiedVLADataset, batch: UnifiedBatch, zero: float) -> Figure:
     """The samples of a batch side by side, a column each: frames, windows, action chunk.
 
     Windows end at their tick; hatched is what the episode had not recorded yet, or has not at all,
     and the steps of a chunk that lie past its end and are masked. States are drawn as what they
-    changed since the first of the window. Features of a store have no frames to show.
+    changed since the first of the window. Features of a store have no frames to show. Times of the
+    ticks count from `zero`, an instant of the recording's clock.
     """
     rows = _rows(dataset, batch)
     if not rows or not len(batch):
@@ -65,22 +65,18 @@ def samples(dataset: UnifiedVLADataset, batch: UnifiedBatch) -> Figure:
             along = "steps ahead" if row.kind == "action" else "readings before the tick"
             line[(len(line) - 1) // 2].set_xlabel(along, fontsize=_SMALL)
         _together(line, row)
-    _titles(figure, axes[0], dataset, batch, int(_CHARACTERS_AN_IN * column))
+    _titles(figure, axes[0], dataset, batch, zero, int(_CHARACTERS_AN_IN * column))
     return figure
 
 
 def _rows(dataset: UnifiedVLADataset, batch: UnifiedBatch) -> list[_Row]:
     rows = [_Row("view", view) for view in seen_views(batch.images or ())]
     for kind in ("sensor", "state", "action"):
-        channels = _channels(dataset.store.streams[kind])
-        found = groups(channels, by_name=False)
-        found = sorted(found, key=lambda group: group.is_profile)
+        said = dataset.store.streams[kind]
+        channels = Channels(tuple(said["names"]), tuple(said["units"]))
+        found = sorted(groups(channels, by_name=False), key=lambda group: group.is_profile)
         rows += [_Row(kind, group.label, group) for group in found]
     return rows
-
-
-def _channels(named: dict[str, Any]) -> Channels:
-    return Channels(tuple(named["names"]), tuple(named["units"]))
 
 
 def _height(row: _Row, batch: UnifiedBatch, column: float) -> float:
@@ -104,7 +100,7 @@ def _frame(axis: Axes, batch: UnifiedBatch, index: int, view: str) -> None:
     axis.grid(visible=False)
     frame = (batch.images or ())[index].get(view)
     if frame is None:
-        axis.text(0.5, 0.5, "view missing", ha="center", va="center", transform=axis.transAxes)
+        centre(axis, "view missing")
         absent(axis, 0, 1)
     else:
         axis.imshow(frame)
@@ -121,9 +117,7 @@ def _window(axis: Axes, row: _Row, batch: UnifiedBatch, index: int) -> None:
     if valid < length:
         absent(axis, at[0] - 0.5, at[-1] + 0.5 - valid)
     if not valid:
-        axis.text(
-            0.5, 0.5, f"{row.kind} missing", ha="center", va="center", transform=axis.transAxes
-        )
+        centre(axis, f"{row.kind} missing")
         return
     real, at = values[length - valid :], at[length - valid :]
     if row.group.is_profile:
@@ -131,7 +125,7 @@ def _window(axis: Axes, row: _Row, batch: UnifiedBatch, index: int) -> None:
     else:
         # States lie far apart and move little within a window.
         shown = real - real[0] if row.kind == "state" else real
-        curves(axis, at.astype(np.float64), shown, names(row.group))
+        curves(axis, at.astype(np.float64), shown, short_names(row.group.names))
 
 
 def _image(axis: Axes, real: NDArray[np.float32], at: NDArray[np.int64]) -> None:
@@ -150,7 +144,8 @@ def _chunk(axis: Axes, group: Group, batch: UnifiedBatch, index: int) -> None:
     values = batch.action[index].numpy()[:, list(group.indices)]
     valid = batch.action_valid[index].numpy()
     edges = np.arange(len(values) + 1, dtype=np.float64)
-    curves(axis, edges, np.concatenate([values, values[-1:]]), names(group), steps=True)
+    held = np.concatenate([values, values[-1:]])
+    curves(axis, edges, held, short_names(group.names), steps=True)
     for step in np.flatnonzero(~valid).tolist():
         absent(axis, step, step + 1)
     axis.set_xlim(0, len(values))
@@ -169,17 +164,17 @@ def _only_outer_labels(axis: Axes, row: _Row, index: int, last: bool) -> None:
 
 def _quantity(row: _Row) -> str:
     if row.kind == "state":
-        return f"state {row.name},\nchange since the\nwindow began"
+        return f"{' '.join(filter(None, ['state', row.name]))},\nchange since the\nwindow began"
     depth = ", depth" if row.group is not None and row.group.is_profile else ""
     return f"{row.kind}\n{row.name}{depth}"
 
 
 def _together(line: Sequence[Axes], row: _Row) -> None:
     """One range of values, and of colours, for all samples of a row."""
-    images = [image for axis in line for image in axis.images]
     if row.group is None:
         return
     if row.group.is_profile:
+        images = [image for axis in line for image in axis.images]
         every = [np.asarray(image.get_array()).ravel() for image in images]
         limits = np.percentile(np.concatenate(every), (1, 99.5)) if every else (0, 1)
         for image in images:
@@ -187,34 +182,37 @@ def _together(line: Sequence[Axes], row: _Row) -> None:
         for axis in line:
             axis.set_ylim(len(row.group.indices) - 0.5, -0.5)
         return
-    ranges = [axis.get_ylim() for axis in line if axis.lines]
+    drawn = [axis for axis in line if axis.lines]
+    if not drawn:
+        return
+    lows, highs = zip(*(axis.get_ylim() for axis in drawn), strict=True)
     for axis in line:
-        if ranges:
-            axis.set_ylim(min(low for low, _ in ranges), max(high for _, high in ranges))
-    labelled = [axis for axis in line if axis.lines]
-    if labelled and len(row.group.names) > 1:
+        axis.set_ylim(min(lows), max(highs))
+    if len(row.group.names) > 1:
         # The last sample's window is the fullest: a single reading has a marker in place of a line.
-        legend_beside(line[-1], of=labelled[-1], fontsize=_SMALL)
+        legend_beside(line[-1], of=drawn[-1], fontsize=_SMALL)
 
 
 def _titles(
-    figure: Figure, axes: Sequence[Axes], dataset: UnifiedVLADataset, batch: UnifiedBatch, room: int
+    figure: Figure,
+    axes: Sequence[Axes],
+    dataset: UnifiedVLADataset,
+    batch: UnifiedBatch,
+    zero: float,
+    room: int,
 ) -> None:
     """What tells a sample from the others above its column; above all what they have in common."""
-    places = [(dataset.store.episodes[number].id, said) for number, said in _subjects(batch)]
+    ids = [dataset.store.episodes[number].id for number in batch.episode.tolist()]
+    places = list(zip(ids, batch.instruction, strict=True))
     alone = len(set(places)) == 1
     for index, axis in enumerate(axes):
         own = [] if alone else [_one_line(part, room) for part in _named(*places[index])]
-        axis.set_title("\n".join([*own, _title(dataset, batch, index)]), fontsize=_SMALL)
+        axis.set_title("\n".join([*own, _title(dataset, batch, index, zero)]), fontsize=_SMALL)
     common = _named(*places[0]) if alone else []
     common += [] if batch.images is not None else ["features of a store, no frames"]
     if common:
         wide = int(_CHARACTERS_AN_IN * (figure.get_figwidth() - 1))
         figure.suptitle("\n".join(_one_line(part, wide) for part in common), fontsize=9)
-
-
-def _subjects(batch: UnifiedBatch) -> list[tuple[int, str]]:
-    return list(zip(batch.episode.tolist(), batch.instruction, strict=True))
 
 
 def _named(episode: str, instruction: str) -> list[str]:
@@ -225,12 +223,12 @@ def _one_line(said: str, room: int) -> str:
     return said if len(said) <= room else f"{said[: room - 1].rstrip()}…"
 
 
-def _title(dataset: UnifiedVLADataset, batch: UnifiedBatch, index: int) -> str:
+def _title(dataset: UnifiedVLADataset, batch: UnifiedBatch, index: int, zero: float) -> str:
     store = dataset.store
     episode = store.episodes[int(batch.episode[index])]
     tick = int(batch.tick[index]) - episode.ticks.start
     row = int(batch.vl_row[index]) - episode.vl_rows.start
-    since = float(batch.time[index]) - float(store.array("tick/time")[episode.ticks.start])
+    since = float(batch.time[index]) - zero
     age = 1000 * float(batch.feature_age[index])
     old = tick - row * store.vlm_reuse_count
     return (

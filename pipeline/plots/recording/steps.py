@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from pipeline.inspection.facts import Clock
 from pipeline.plots.recording.drawing import GAP, say, words
 from pipeline.plots.recording.lanes import same_clock_once
-from pipeline.plots.style import INK, PALETTE, canvas
+from pipeline.plots.style import INK, PALETTE, canvas, logarithmic
 
 _COLUMNS = 3
 _BINS = 41
@@ -64,7 +64,7 @@ def _histogram(axis: Axes, clock: Clock) -> None:
     inside = steps[(steps >= low) & (steps <= high)]
     axis.hist(inside, bins=bins.tolist(), color=PALETTE[0], label="steps")
     axis.axvline(median, color=INK, lw=1.2, ls="--", label="median")
-    axis.set_yscale("log")
+    logarithmic(axis)
     axis.minorticks_off()
     axis.set_ylim(bottom=0.7)
     axis.set_xlim(low, high)

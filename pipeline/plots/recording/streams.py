@@ -9,8 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pipeline.inspection.facts import Contact, EpisodeView
-from pipeline.plots.recording.channels import Group, groups
-from pipeline.plots.recording.drawing import CONTACT, curves, legend_beside, names, words
+from pipeline.plots.recording.channels import Group, groups, short_names
+from pipeline.plots.recording.drawing import CONTACT, curves, legend_beside, words
 from pipeline.plots.recording.thinning import columns, curve
 from pipeline.plots.style import canvas
 from pipeline.recordings import Stream
@@ -118,7 +118,7 @@ def _curves(axis: Axes, panel: _Panel, zero: float) -> None:
     stream, group = panel.stream, panel.group
     values = stream.values[:, group.indices]
     shown = curve(stream.time, values)
-    labels, said = names(group), group.label
+    labels, said = short_names(group.names), group.label
     drawn = shown.values
     if panel.changes and np.ptp(values, axis=0).max() < _STANDS_STILL * np.ptp(values):
         drawn = drawn - values[0]
@@ -152,7 +152,8 @@ def _profile(axis: Axes, panel: _Panel, zero: float) -> None:
     axis.set_ylabel(f"depth: channel of {group.name or 'the profile'}")
     # Beside the panel: taken from it, its time axis would no longer stand below the curves'.
     bar = axis.inset_axes((1.01, 0.0, 0.015, 1.0))
-    axis.figure.colorbar(drawn, cax=bar, label=group.unit, extend="both")
+    unit = f"[{group.unit}]" if group.unit else "(no unit)"
+    axis.figure.colorbar(drawn, cax=bar, label=f"{group.name or 'value'} {unit}", extend="both")
 
 
 def _mark_contacts(axis: Axes, contacts: Sequence[Contact], zero: float, over_image: bool) -> None:
