@@ -18,7 +18,7 @@ from pipeline.config import Params
 from pipeline.durable import disk_full_named, fresh
 from pipeline.evaluation import experiment_rows, experiments_table, read_experiments, write_rows
 from pipeline.report import write_report
-from pipeline.report.comparison import comparison_report
+from pipeline.report.evaluation.comparison import comparison_report
 
 
 def main(params: Params) -> None:

@@ -30,7 +30,7 @@ from pipeline.evaluation import (
     write_tables,
 )
 from pipeline.report import write_report
-from pipeline.report.evaluation import evaluation_report
+from pipeline.report.evaluation.evaluation import evaluation_report
 from pipeline.store import FeatureStore, check_trailers
 
 

@@ -35,9 +35,9 @@ from pipeline.inspection.store import inspect_store
 from pipeline.inspection.subject import Subject, subject_of
 from pipeline.plots.style import boxes
 from pipeline.report import Notice, Notices, Report, write_report
-from pipeline.report.findings import FINDINGS
-from pipeline.report.recording import recordings_report
-from pipeline.report.store import store_report
+from pipeline.report.inspection.recording import recordings_report
+from pipeline.report.inspection.store import store_report
+from pipeline.report.page.findings import FINDINGS
 
 SAID = 8
 """Findings that the terminal shows."""

@@ -4,12 +4,18 @@ Those of a probe, of recordings and of stores are in modules apart from these: t
 rooms.
 """
 
-from pipeline.plots.chunks import chunks
-from pipeline.plots.curves import curves
-from pipeline.plots.errors import dimension_horizon, dimensions
-from pipeline.plots.experiments import comparison_of_experiments
-from pipeline.plots.modalities import modalities
-from pipeline.plots.predictions import EPISODE_LINES, episodes, horizon, scatter, timeline
+from pipeline.plots.evaluation.chunks import chunks
+from pipeline.plots.evaluation.curves import curves
+from pipeline.plots.evaluation.errors import dimension_horizon, dimensions
+from pipeline.plots.evaluation.experiments import comparison_of_experiments
+from pipeline.plots.evaluation.modalities import modalities
+from pipeline.plots.evaluation.predictions import (
+    EPISODE_LINES,
+    episodes,
+    horizon,
+    scatter,
+    timeline,
+)
 from pipeline.plots.style import LABELS
 
 __all__ = [

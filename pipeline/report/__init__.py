@@ -1,10 +1,10 @@
 """Pictures, tables and words -> one page that needs nothing beside itself.
 
-`blocks` says what a page is made of, `page` writes it; `recording`, `store` and `evaluation` build
-the pages of this project, each apart from these: they know other rooms.
+`page` says what one is made of and writes it; `evaluation` and `inspection` build those of this
+project, each apart from these: they know other rooms.
 """
 
-from pipeline.report.blocks import (
+from pipeline.report.page.blocks import (
     Block,
     Chart,
     Document,
@@ -19,7 +19,7 @@ from pipeline.report.blocks import (
     Text,
     Tokens,
 )
-from pipeline.report.page import PAGE, write_report
+from pipeline.report.page.writing import PAGE, write_report
 
 __all__ = [
     "PAGE",

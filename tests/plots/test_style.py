@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from pipeline.evaluation import Curve, Curves
 from pipeline.inspection.facts import Clock
 from pipeline.plots import style
-from pipeline.plots.curves import curves
+from pipeline.plots.evaluation.curves import curves
 from pipeline.plots.recording import clock_steps
 
 

@@ -2,8 +2,8 @@
 
 import pytest
 
-from pipeline.report.cells import breakable, columns_of, number
-from pipeline.report.page import document_lines
+from pipeline.report.page.cells import breakable, columns_of, number
+from pipeline.report.page.writing import document_lines
 
 
 @pytest.mark.parametrize(

@@ -27,9 +27,9 @@ from pipeline.evaluation.footage import Footage
 from pipeline.models import Policy
 from pipeline.normalization import ChannelStatistics, Normalization
 from pipeline.report import PAGE, Document, Picture, Report, Section, Table, write_report
-from pipeline.report import episodes as episode_sections
-from pipeline.report.comparison import comparison_report
-from pipeline.report.evaluation import evaluation_report
+from pipeline.report.evaluation import episodes as episode_sections
+from pipeline.report.evaluation.comparison import comparison_report
+from pipeline.report.evaluation.evaluation import evaluation_report
 from pipeline.store import FeatureStore
 
 Sound = Callable[[Path], None]

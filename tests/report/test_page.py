@@ -25,8 +25,8 @@ from pipeline.report import (
     Text,
     write_report,
 )
-from pipeline.report.page import MOST_PLACES
-from pipeline.report.svg import inline_svg
+from pipeline.report.page.svg import inline_svg
+from pipeline.report.page.writing import MOST_PLACES
 
 
 def words(*said: str) -> Report:

@@ -20,11 +20,11 @@ from pipeline.report import (
     Tokens,
     write_report,
 )
-from pipeline.report.flaws import notices
-from pipeline.report.model_input import runs, stretched
-from pipeline.report.recording import recordings_report
-from pipeline.report.recording_episode import jitter_unit
-from pipeline.report.statistics_table import statistics_table
+from pipeline.report.inspection.flaws import notices
+from pipeline.report.inspection.model_input import runs, stretched
+from pipeline.report.inspection.recording import recordings_report
+from pipeline.report.inspection.recording_episode import jitter_unit
+from pipeline.report.inspection.statistics_table import statistics_table
 
 PARAMS = Path(__file__).resolve().parents[2] / "params.yaml"
 

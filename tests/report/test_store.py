@@ -9,7 +9,7 @@ import pytest
 from pipeline.config import InspectParams
 from pipeline.inspection.store import StoreView, inspect_store
 from pipeline.report import Document, Notices, Report, Table, write_report
-from pipeline.report.store import store_report
+from pipeline.report.inspection.store import store_report
 from pipeline.store import FeatureStore
 
 ROWS = 10

@@ -8,7 +8,7 @@ from pipeline.batches import Ticks
 from pipeline.digests import file_digest
 from pipeline.evaluation import HEADINGS, Judgement, Predictions, best_baseline
 from pipeline.evaluation.footage import footage, shown_ticks
-from pipeline.report.blocks import Block, Picture, Section, Table, Text
+from pipeline.report.page.blocks import Block, Picture, Section, Table, Text
 from pipeline.store import episode_name
 
 _INSTANTS = 5

@@ -7,7 +7,7 @@ import numpy as np
 
 from pipeline.channels import PROFILE_CHANNELS, unnumbered
 from pipeline.inspection.facts import ChannelStatistics
-from pipeline.report.blocks import Table
+from pipeline.report.page.blocks import Table
 
 HEADS = (
     "stream", "channel", "unit", "count", "min", "1 %", "median", "99 %", "max", "mean", "std",

@@ -15,8 +15,8 @@ from pipeline.inspection.prompt import view_prompt
 from pipeline.inspection.samples import samples
 from pipeline.inspection.spec import remembered_spec
 from pipeline.plots import recording as plots
-from pipeline.report.blocks import Block, Document, Picture, Run, Section, Table, Text, Tokens
-from pipeline.report.recording_episode import Viewer
+from pipeline.report.inspection.recording_episode import Viewer
+from pipeline.report.page.blocks import Block, Document, Picture, Run, Section, Table, Text, Tokens
 
 _STRETCHED = 0.05
 """A change of width over height that is said."""

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure, SubFigure
 from numpy.typing import NDArray
 
 from pipeline.evaluation import Comparison, Predictions, with_unit
-from pipeline.plots.predictions import short_name
+from pipeline.plots.evaluation.predictions import short_name
 from pipeline.plots.style import INK, PALETTE, RECORDED, STYLES, canvas
 from pipeline.store import Episode, FeatureStore
 

@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from pipeline.durable import disk_full_named, sync
 from pipeline.plots.style import NO_FONT, RC, boxes, write
-from pipeline.report.blocks import (
+from pipeline.report.page.blocks import (
     Block,
     Chart,
     Document,
@@ -32,10 +32,10 @@ from pipeline.report.blocks import (
     Text,
     Tokens,
 )
-from pipeline.report.cells import breakable, columns_of, prose
-from pipeline.report.charts import chart_json, plotly_script
-from pipeline.report.findings import FINDINGS, findings_csv
-from pipeline.report.svg import inline_svg
+from pipeline.report.page.cells import breakable, columns_of, prose
+from pipeline.report.page.charts import chart_json, plotly_script
+from pipeline.report.page.findings import FINDINGS, findings_csv
+from pipeline.report.page.svg import inline_svg
 
 PAGE = "report.html"
 OPEN_NOTICES = 12

@@ -8,7 +8,7 @@ from pipeline.inspection.store import StoreView, Twins
 from pipeline.plots import store_features as pictures
 from pipeline.plots import store_interactive as interactive
 from pipeline.plots.style import PALETTE
-from pipeline.report.blocks import Block, Chart, Picture, Table, Text
+from pipeline.report.page.blocks import Block, Chart, Picture, Table, Text
 
 _TWINS = 20
 

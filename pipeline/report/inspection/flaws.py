@@ -4,7 +4,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 
 from pipeline.inspection.facts import Flaw
-from pipeline.report.blocks import Notice, Place
+from pipeline.report.page.blocks import Notice, Place
 
 
 def notices(flaws: Sequence[Flaw], zeros: Mapping[tuple[str, str], float]) -> list[Notice]:

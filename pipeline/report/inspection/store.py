@@ -12,7 +12,10 @@ from pipeline.amounts import duration, size
 from pipeline.inspection.facts import ChannelStatistics
 from pipeline.inspection.store import EpisodeCoverage, StoreView
 from pipeline.plots import store as pictures
-from pipeline.report.blocks import (
+from pipeline.report.inspection.flaws import notices
+from pipeline.report.inspection.statistics_table import statistics_table
+from pipeline.report.inspection.store_features import duplicates, features
+from pipeline.report.page.blocks import (
     Block,
     Document,
     Notices,
@@ -22,9 +25,6 @@ from pipeline.report.blocks import (
     Table,
     Text,
 )
-from pipeline.report.flaws import notices
-from pipeline.report.statistics_table import statistics_table
-from pipeline.report.store_features import duplicates, features
 
 ROWS = 100
 """Episodes in the table of all; of more, the first."""

@@ -20,9 +20,9 @@ from pipeline.evaluation import (
     still_dimensions,
     with_unit,
 )
-from pipeline.report.blocks import Block, Document, Picture, Report, Section, Table, Text
-from pipeline.report.cells import sentence
-from pipeline.report.episodes import episodes, extremes
+from pipeline.report.evaluation.episodes import episodes, extremes
+from pipeline.report.page.blocks import Block, Document, Picture, Report, Section, Table, Text
+from pipeline.report.page.cells import sentence
 
 _NAMES = 8
 """Channels of a stream named in the params; an A-scan has a thousand."""

@@ -5,8 +5,8 @@ from functools import partial
 
 from pipeline import plots
 from pipeline.evaluation import FOOTNOTE, Experiment, experiment_errors
-from pipeline.report.blocks import Picture, Report, Section, Table
-from pipeline.report.cells import sentence
+from pipeline.report.page.blocks import Picture, Report, Section, Table
+from pipeline.report.page.cells import sentence
 
 
 def comparison_report(experiments: Sequence[Experiment]) -> Report:

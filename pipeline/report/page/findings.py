@@ -3,7 +3,7 @@
 import csv
 import io
 
-from pipeline.report.blocks import Notices, Place
+from pipeline.report.page.blocks import Notices, Place
 
 FINDINGS = "findings.csv"
 _HEADS = ("severity", "kind", "stream", "episode", "start_s", "stop_s", "message")

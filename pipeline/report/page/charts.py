@@ -9,7 +9,7 @@ from typing import Any
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
-from pipeline.report.svg import COLOURS
+from pipeline.report.page.svg import COLOURS
 
 
 def plotly_script() -> Markup:

@@ -16,9 +16,9 @@ from pipeline.inspection.overview import EpisodeSummary
 from pipeline.inspection.statistics import channel_statistics
 from pipeline.plots import interactive
 from pipeline.plots.recording import camera_views, clock_lanes, clock_steps, motion, sensor
-from pipeline.report.blocks import Block, Chart, Notices, Picture, Section, Table, Text
-from pipeline.report.flaws import notices
-from pipeline.report.statistics_table import statistics_table
+from pipeline.report.inspection.flaws import notices
+from pipeline.report.inspection.statistics_table import statistics_table
+from pipeline.report.page.blocks import Block, Chart, Notices, Picture, Section, Table, Text
 
 NOTHING_WRONG = "Nothing looks wrong in this episode."
 Viewer = Callable[[int], EpisodeView]

@@ -8,10 +8,10 @@ from pipeline.config import Params
 from pipeline.inspection.episodes import view_episode
 from pipeline.inspection.overview import EpisodeSummary, RecordingsOverview, survey_recordings
 from pipeline.recordings import Opened
-from pipeline.report.blocks import Block, Notices, Report, Section, Table, Text
-from pipeline.report.flaws import notices
-from pipeline.report.model_input import model_input
-from pipeline.report.recording_episode import Viewer, episode_section
+from pipeline.report.inspection.flaws import notices
+from pipeline.report.inspection.model_input import model_input
+from pipeline.report.inspection.recording_episode import Viewer, episode_section
+from pipeline.report.page.blocks import Block, Notices, Report, Section, Table, Text
 
 ROWS = 100
 """Episodes that the table of all shows at most: those with findings, then the first."""

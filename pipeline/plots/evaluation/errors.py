@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from pipeline.evaluation import METHODS, Comparison, with_unit
-from pipeline.plots.predictions import marked
+from pipeline.plots.evaluation.predictions import marked
 from pipeline.plots.style import LABELS, canvas, legend_below
 
 _NUMBERED_STEPS = 16

@@ -1,0 +1,1 @@
+"""The pages of an evaluation and of several beside each other."""
