@@ -17,7 +17,12 @@ IN_FULL = {
     "models": ("expert", "policy"),
     "store": ("schema", "reader", "batch"),
     "plots": ("interactive", "recording.lanes", "store", "store_features"),
-    "report": ("comparison", "evaluation", "recording", "store"),
+    "report": (
+        "evaluation.comparison",
+        "evaluation.evaluation",
+        "inspection.recording",
+        "inspection.store",
+    ),
 }
 """Modules of a package that are shown in full, beside what its `__all__` offers."""
 

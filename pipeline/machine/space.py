@@ -64,17 +64,16 @@ def check_space(params: Params) -> list[Finding]:
         findings.append(unusable("episodes", said, params.data.on_bad_episode))
     if estimate is None:
         return [*findings, note("size", "not known: no episode could be read; see above")]
-    links = links_here()
     begun, finished = used_bytes(part_path(target)), used_bytes(target)
+    free = free_bytes(target)
+    findings.append(check_disk(estimate, target, free, begun, finished=finished > 0))
+    if links_here() == "copy":
+        findings.append(check_cached_copy(estimate, free, begun, finished))
+    findings.append(check_page_cache(estimate, memory_bytes()))
     limit = Path("/proc/sys/vm/max_map_count")
-    maps = int(limit.read_text(encoding="ascii")) if limit.exists() else None
-    return [
-        *findings,
-        check_disk(estimate, target, free_bytes(target), begun, finished=finished > 0),
-        *([check_cached_copy(estimate, free_bytes(target), begun, finished)] * (links == "copy")),
-        check_page_cache(estimate, memory_bytes()),
-        *([] if maps is None else [check_maps(estimate, maps)]),
-    ]
+    if limit.exists():
+        findings.append(check_maps(estimate, int(limit.read_text(encoding="ascii"))))
+    return findings
 
 
 def check_disk(

@@ -59,10 +59,12 @@ def project(tmp_path: Path) -> Path:
 
 def passed(project: Path, *arguments: str) -> int:
     """How many tests pass, none of which may fail."""
+    # Without what this run was told, such as in how many processes.
+    own = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *arguments],
         cwd=project,
-        env=os.environ | {"PYTHONPATH": str(project), "PYTHONDONTWRITEBYTECODE": "1"},
+        env=own | {"PYTHONPATH": str(project), "PYTHONDONTWRITEBYTECODE": "1"},
         capture_output=True,
         text=True,
     )
