@@ -3,7 +3,7 @@
 import random
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -62,15 +62,6 @@ def kill_after(fork) -> Callable[..., None]:
     return kill
 
 
-@pytest.fixture
-def one_thread() -> Iterator[None]:
-    """Sums of tensors go by the number of threads; all processes of a test have to agree."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 @pytest.mark.parametrize(
     ("kills", "seed"), [(3, 0), *(pytest.param(8, n, marks=pytest.mark.slow) for n in range(1, 4))]
 )
@@ -81,7 +72,10 @@ def test_a_training_killed_again_and_again(
     """Between checkpoints, while one is written, while it is judged: wherever the kill falls."""
     chance = random.Random(seed)
     path = tiny_store(tmp_path)
-    killed, whole = head_params(path, "killed"), head_params(path, "whole")
+    # So long that no kill can come too late.
+    killed, whole = (
+        head_params(path, name, train_head={"max_steps": 120}) for name in ("killed", "whole")
+    )
     for _ in range(kills):
         kill_after(chance.randint(1, 12), chance.uniform(0.0, 0.02), train, killed)
     for params in (killed, whole):
