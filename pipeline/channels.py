@@ -44,7 +44,7 @@ def hardly_moving(
     for column in np.flatnonzero(std > 0).tolist():
         kinds[unnumbered(names[column]), units[column]].append(column)
     usual = {
-        column: float(np.percentile(std[alike], 75))
+        column: float(np.percentile(std[alike], 75, method="higher"))
         for alike in kinds.values()
         if len(alike) >= _ALIKE
         for column in alike

@@ -118,7 +118,7 @@ def training_seconds(logs: Path) -> float | None:
 
 
 def _is_evaluation(folder: Path) -> bool:
-    """Whether stages.evaluate wrote to it, be it that one of its files is gone."""
+    """Whether stages.evaluate wrote to it, even if one of its files is gone."""
     return any((folder / name).exists() for name in (JUDGED, ERRORS))
 
 

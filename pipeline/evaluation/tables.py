@@ -4,6 +4,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from pipeline.channels import named
 from pipeline.durable import write_document
 from pipeline.evaluation.cells import aligned, cell, numbers, ratio, write_rows
 from pipeline.evaluation.modalities import ModalityStudy
@@ -74,7 +75,7 @@ def still_dimensions(comparison: Comparison) -> str:
     still = comparison.still()
     if not still:
         return ""
-    names = ", ".join(comparison.names[index] for index in still)
+    names = named(comparison.names, list(still))
     largest = max(still, key=lambda index: comparison.scale[index] / still[index])
     moving = comparison.without_still()
     relative, best = moving.relative(), HEADINGS[best_baseline(moving)]

@@ -1,6 +1,7 @@
 """What looks wrong in the clocks: gaps, jumps, rates, frames lost, ticks lost, frames too old."""
 
 from collections.abc import Iterator, Mapping
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,16 +48,17 @@ def clock_flaws(view: EpisodeView, said: Nominal) -> Iterator[Flaw]:
 def _gaps(view: EpisodeView, names: str, time: NDArray[np.float64]) -> Iterator[Flaw]:
     step = usual_step(time)
     tick = _TICK_S if view.timeline is None else usual_step(view.timeline.time)
-    ends = _ends(view)
+    jumps = _jumps(_ends(view), time)
     for gap in gaps(time):
         length = gap.stop_s - gap.start_s
         if length <= tick:
             continue
-        why = _set_there(ends, time, gap)
-        kind = "clock jump" if why else "gap"
+        jump = jumps.get(gap.start_s)
+        kind = "clock jump" if jump else "gap"
         said = (
-            f"the clock jumps by {length - step:.2f} s at {gap.start_s - view.zero:.2f} s: {why}"
-            if why
+            f"the clock jumps by {length - step:.2f} s at {gap.start_s - view.zero:.2f} s: "
+            f"{jump.why}"
+            if jump
             else f"no entry for {length:.2f} s from {gap.start_s - view.zero:.2f} s, expected one "
             f"every {step:.3g} s"
         )
@@ -69,25 +71,39 @@ def _ends(view: EpisodeView) -> list[tuple[float, float]]:
     return [(float(np.diff(time).max(initial=0)), float(time[-1])) for time in view.clocks.values()]
 
 
-def _set_there(ends: list[tuple[float, float]], time: NDArray[np.float64], gap: Gap) -> str:
-    """Why the clock was set there, empty where entries lack.
+class _Jump(NamedTuple):
+    why: str
+    apart_s: float
+    """By how much it takes the clock apart from others; 0 where none can tell."""
+
+
+def _jumps(ends: list[tuple[float, float]], time: NDArray[np.float64]) -> dict[float, _Jump]:
+    """Where a clock was set, the longest jump first, rather than lacks entries.
 
     A clock that was set ends apart from those without such a step, and near them less the step; one
     that lacks entries ends with them. Where all have such a step, it was set if the step is longer
     than all its others.
     """
-    length = gap.stop_s - gap.start_s
-    others = [end for longest, end in ends if longest < length / 2]
-    if not others:
-        rest = float(time[-1] - time[0]) - length
-        return f"all its other steps together make {rest:.2f} s" if length > rest else ""
-    end = float(time[-1])
-    apart, left = (min(abs(end - moved - other) for other in others) for moved in (0, length))
-    return (
-        f"it ends {apart:.2f} s from the nearest other clock, {left:.2f} s without the jump"
-        if apart >= LOST_S and left < apart / 2
-        else ""
-    )
+    found: dict[float, _Jump] = {}
+    end, step = float(time[-1]), usual_step(time)
+    for gap in sorted(gaps(time), key=lambda gap: gap.start_s - gap.stop_s):
+        length = gap.stop_s - gap.start_s
+        others = [other for longest, other in ends if longest < length / 2]
+        if not others:
+            rest = float(time[-1] - time[0]) - length
+            if length > rest:
+                why = f"all its other steps together make {rest:.2f} s"
+                found[gap.start_s] = _Jump(why, 0.0)
+            continue
+        moved = length - step
+        apart, left = (min(abs(end - less - other) for other in others) for less in (0, moved))
+        if apart >= LOST_S and left < apart / 2:
+            why = (
+                f"it ends {apart:.2f} s from the nearest other clock, {left:.2f} s without the jump"
+            )
+            found[gap.start_s] = _Jump(why, moved)
+            end -= moved
+    return found
 
 
 def _age_there(view: EpisodeView, names: str, gap: Gap) -> str:
@@ -185,7 +201,10 @@ def _lost_ticks(view: EpisodeView) -> Iterator[Flaw]:
     middle = (len(clocks) - 1) // 2
     starts = {name: float(time[0]) for name, time in clocks.items()}
     ends = _ends(view)
-    stops = {name: float(time[-1]) - _set_by(ends, time) for name, time in clocks.items()}
+    stops = {
+        name: float(time[-1]) - sum(jump.apart_s for jump in _jumps(ends, time).values())
+        for name, time in clocks.items()
+    }
     begun = sorted(starts.values())[middle]
     ended = sorted(stops.values(), reverse=True)[middle]
     for time, limit, said in (
@@ -204,12 +223,6 @@ def _lost_ticks(view: EpisodeView) -> Iterator[Flaw]:
             min(time, limit),
             max(time, limit),
         )
-
-
-def _set_by(ends: list[tuple[float, float]], time: NDArray[np.float64]) -> float:
-    """Seconds by which a clock was set in all."""
-    found = [gap.stop_s - gap.start_s for gap in gaps(time) if _set_there(ends, time, gap)]
-    return sum(found) - len(found) * usual_step(time) if found else 0.0
 
 
 def _share(view: EpisodeView, lost_s: float) -> str:

@@ -30,7 +30,7 @@ from pipeline.recordings import CameraStream
 
 MOST_FRAMES, RUNS = 120, 12
 ONE_COLOUR = 2.0
-"""Standard deviation of a frame's values, of 255, up to which it shows nothing."""
+"""Standard deviation of the colour that varies most, of 255, up to which a frame shows nothing."""
 DUPLICATES, DUPLICATE_SHARE = 3, 0.1
 """Equal pairs in a row that are a freeze of a camera with noise, and the share of all pairs from
 which single ones are told."""
@@ -51,7 +51,7 @@ class _Looked:
     equal: NDArray[np.bool_]
     """(frame - 1,) whether a frame is that before."""
     levels: dict[int, tuple[float, float]]
-    """Mean and standard deviation by frame, of those that were looked at for one colour."""
+    """`_level` by frame, of those that were looked at for one colour."""
     noisy: bool
     sizes: dict[int, tuple[int, ...]]
     """(height, width) by frame, of those that were decoded or that a VL row sees."""

@@ -46,9 +46,11 @@ def check_checkpoint(params: Params) -> list[Finding]:
     here = f"{vlm.checkpoint}, whole, {count:,} parameters"
     if str(folder) != vlm.checkpoint:
         here += " (in the hub's cache)"
-    findings = [ok("vlm.checkpoint", here)]
-    if (folder / MARKER).exists():
-        findings = [note("vlm.checkpoint", f"{here}; {_RANDOM}", f"{_EXAMPLE}; docs/real-model.md")]
+    findings = [
+        note("vlm.checkpoint", f"{here}; {_RANDOM}", f"{_EXAMPLE}; docs/real-model.md")
+        if (folder / MARKER).exists()
+        else ok("vlm.checkpoint", here)
+    ]
     if vlm.adapter is not None:
         findings.append(check_adapter(vlm.adapter))
     device = usable_device(params.extract.device)

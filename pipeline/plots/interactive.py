@@ -36,7 +36,7 @@ def clock_lanes(view: EpisodeView, clocks: Sequence[Clock]) -> go.Figure:
     Hovering tells time and index, of a VL row also which frame of each view it took and how old
     that was, of a tick the VL row that it reuses. Lines lead from frames to VL rows.
     """
-    shown = [replace(clock, name=_plain(clock.name)) for clock in in_reading_order(clocks)]
+    shown = [replace(clock, name=plain(clock.name)) for clock in in_reading_order(clocks)]
     figure = go.Figure(layout=layout())
     lanes = {clock.name: len(shown) - 1 - index for index, clock in enumerate(shown)}
     _served(figure, view, lanes)
@@ -118,7 +118,7 @@ def _told(view: EpisodeView, clock: Clock, chosen: NDArray[np.int64]) -> list[st
                 [
                     f"VL row {row}",
                     *(
-                        f"{_plain(name)}: frame {line.frames[name][row]}, "
+                        f"{plain(name)}: frame {line.frames[name][row]}, "
                         f"{1000 * (line.vl_time[row] - time[row]):.0f} ms old"
                         for name, time in line.frame_time.items()
                     ),
@@ -129,7 +129,7 @@ def _told(view: EpisodeView, clock: Clock, chosen: NDArray[np.int64]) -> list[st
     return [f"{clock.name}, frame {index}" for index in chosen.tolist()]
 
 
-def _plain(name: str) -> str:
+def plain(name: str) -> str:
     """A recording's name for plotly, which reads texts as HTML."""
     return html.escape(name, quote=False)
 
@@ -141,7 +141,7 @@ def _served(figure: go.Figure, view: EpisodeView, lanes: dict[str, int]) -> None
         return
     rows = slice(None, None, -(-len(line.vl_time) // SINGLE) or 1)
     for view_name, time in line.frame_time.items():
-        name = _plain(view_name)
+        name = plain(view_name)
         if name not in lanes:
             continue
         # A NaN after each pair ends its line.

@@ -8,7 +8,7 @@ import plotly.graph_objects as go
 from numpy.typing import NDArray
 
 from pipeline.inspection.store import StoreView
-from pipeline.plots.interactive import layout
+from pipeline.plots.interactive import layout, plain
 from pipeline.plots.store_features import PROGRESS
 from pipeline.plots.style import PALETTE
 
@@ -72,7 +72,7 @@ def _values(view: StoreView, kind: Trait) -> NDArray[Any]:
 
 def _label(value: str) -> str:
     """The end of a long name, which tells it from its neighbours."""
-    return value if len(value) <= _LABEL else f"…{value[1 - _LABEL :]}"
+    return plain(value if len(value) <= _LABEL else f"…{value[1 - _LABEL :]}")
 
 
 def _dots(
@@ -90,7 +90,7 @@ def _dots(
             mode="markers",
             name=name,
             marker={"size": 5, "opacity": 0.8, **marker},
-            text=np.array(found.episodes, dtype=object)[found.episode[own]].tolist(),
+            text=[plain(found.episodes[episode]) for episode in found.episode[own].tolist()],
             customdata=np.column_stack([found.rows, found.time, found.progress])[own],
             hovertemplate=(
                 "%{text}<br>VL row %{customdata[0]:d}, %{customdata[1]:.2f} s"

@@ -67,7 +67,7 @@ def families() -> list[str]:
         # Matplotlib remembers its list, which may be older than a font.
         listed = {font.fname for font in font_manager.fontManager.ttflist}
         for path in sorted(set(font_manager.findSystemFonts()) - listed):
-            with suppress(OSError, RuntimeError):
+            with suppress(OSError, RuntimeError, ValueError, KeyError):
                 font_manager.fontManager.addfont(path)
     here = set(font_manager.get_font_names())
     return ["DejaVu Sans", *(name for name in _CJK if name in here)]

@@ -125,10 +125,11 @@ def joints(comparison: Comparison, scale: list[float]) -> Comparison:
 def test_what_hardly_moves_beside_its_like_is_told_and_can_be_left_out(
     recorded: Recorded, compared: Compared
 ) -> None:
-    """By the yardstick of `stages.inspect`: a hundredth of the median of three or more."""
+    """By the yardstick of `stages.inspect`: a hundredth of the upper quartile of three or more."""
     error = np.array([0.1, 0.1, 0.1, 0.001, 0.001])
     found = joints(compared(recorded(np.arange(60), error)), [1.0, 1.0, 1.0, 0.0099, 0.0101])
     assert found.still() == {3: 1.0}
+    assert joints(found, [1.0, 1.0, 0.001, 0.001, 0.001]).still().keys() == {2, 3, 4}
     assert found.overall("policy") == pytest.approx((0.3 + 1 / 9.9 + 1 / 10.1) / 5, rel=1e-4)
     moving = found.without_still()
     assert moving.overall("policy") == pytest.approx((0.3 + 1 / 10.1) / 4, rel=1e-4)

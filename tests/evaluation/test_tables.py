@@ -76,7 +76,7 @@ def test_dimensions_that_hardly_move_are_said_below_the_table(comparison: Compar
     *_, footnote, line = table(still).splitlines()
     assert footnote == FOOTNOTE
     assert line == (
-        "hardly moving: joint_3 (training std at most 1e-09, where 0.062 is usual for such "
+        "hardly moving: joint_3 (training std at most 1e-09, where 0.07 is usual for such "
         "dimensions), 1 of the 4 dimensions in the overall error; without, it is "
         f"{error} ({best})"
     )

@@ -57,6 +57,17 @@ def test_a_clock_that_was_set_is_a_jump_of_that_clock_alone(find: Find, seconds:
     assert f"the clock jumps by {seconds:.2f} s at 30.00 s" in flaw.message
 
 
+def test_a_clock_that_was_set_twice_jumps_twice(find: Find) -> None:
+    found = find({"sensor": set_by(set_by(FAST, 10), 3, at=50), "state": SLOW})
+    assert [(flaw.kind, flaw.stream) for flaw in found] == [("clock jump", "sensor")] * 2
+    assert "3.01 s from the nearest other clock, 0.01 s without" in found[1].message
+
+
+def test_where_all_clocks_pause_none_loses_ticks_by_it(find: Find) -> None:
+    asleep = {"sensor": set_by(FAST[:9685], 15, at=10), "state": set_by(SLOW[:1510], 15, at=10)}
+    assert {flaw.kind for flaw in find(asleep)} == {"clock jump", "gap"}
+
+
 def test_clocks_that_were_set_together_are_no_witness_of_each_other(find: Find) -> None:
     late = {f"view View{place}": set_by(CAMERA + 0.03 * place, 5) for place in (1, 2, 5)}
     found = find({"sensor": FAST, "state": SLOW, **late})
