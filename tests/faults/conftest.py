@@ -36,20 +36,15 @@ write_episode = _extraction.write_episode
 recorded_once = _extraction.recorded_once
 make_document = _extraction.make_document
 
-SMALL_HEAD: dict[str, Any] = {
-    "sensor_encoder": {"channels": [8], "layers": 0, "heads": 1, "output_dim": 8},
-    "state_encoder": {"dim": 8, "layers": 0, "heads": 1, "output_dim": 8},
-    "expert": {"dim": 8, "layers": 1, "heads": 1},
+PACE: dict[str, Any] = {
     "horizon": 3,
-    "sensor_window": 6,
-    "state_window": 5,
-    "batch_size": 8,
     "max_steps": 30,
     "warmup_steps": 3,
     "eval_every": 10,
     "checkpoint_every": 4,
-    "device": "cpu",
 }
+"""Of a training that is cut short: long enough for several checkpoints."""
+TinyHead = Callable[..., dict[str, Any]]
 
 
 @pytest.fixture(scope="session")
@@ -64,7 +59,9 @@ def extracted(
 
 
 @pytest.fixture
-def document(extracted: tuple[Path, dict[str, Any]], tmp_path: Path) -> dict[str, Any]:
+def document(
+    extracted: tuple[Path, dict[str, Any]], tiny_head: TinyHead, tmp_path: Path
+) -> dict[str, Any]:
     """The params of a copy of those recordings and of that store, and of a small head."""
     folder, document = extracted
     shutil.copytree(folder / "recordings", tmp_path / "recordings")
@@ -72,8 +69,7 @@ def document(extracted: tuple[Path, dict[str, Any]], tmp_path: Path) -> dict[str
     return document | {
         "data": document["data"] | {"root": str(tmp_path / "recordings")},
         "extract": document["extract"] | {"store": str(tmp_path / "stores" / "made.zarr")},
-        "train_head": SMALL_HEAD
-        | {"output": str(tmp_path / "head"), "logs": str(tmp_path / "logs")},
+        "train_head": tiny_head(tmp_path, **PACE),
         "evaluate": {
             "checkpoint": str(tmp_path / "head"),
             "output": str(tmp_path / "report"),
@@ -107,18 +103,17 @@ def write_params(document: dict[str, Any], folder: Path) -> Path:
 
 
 @pytest.fixture
-def head_params(tmp_path: Path) -> Callable[..., Path]:
+def head_params(tiny_head: TinyHead, tmp_path: Path) -> Callable[..., Path]:
     """`head_params(store, name, ...)`: params.yaml of a small head on a store."""
 
     def write(store: Path, name: str = "run", **sections: dict[str, Any]) -> Path:
         folder = tmp_path / name
         folder.mkdir()
-        head = SMALL_HEAD | {"output": str(folder / "head"), "logs": str(folder / "logs")}
         document: dict[str, dict[str, Any]] = {
             "data": {"sources": [{"name": "left", "path": "a"}, {"name": "right", "path": "b"}]},
             "vlm": {"checkpoint": "unused"},
             "extract": {"store": str(store)},
-            "train_head": head,
+            "train_head": tiny_head(folder, **PACE),
             "evaluate": {
                 "checkpoint": str(folder / "head"),
                 "output": str(folder / "report"),
