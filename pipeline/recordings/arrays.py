@@ -112,7 +112,8 @@ def csv_header(path: Path) -> list[str]:
 def read_csv(path: Path, columns: Sequence[str]) -> NDArray[np.float64]:
     """The named columns (row, column) of a CSV with a header line, found by name.
 
-    Raises `RecordingError` naming missing columns, or the line and column of a bad cell.
+    Raises `RecordingError` naming missing columns, the line of a row that is longer or shorter than
+    the header, or the line and column of a bad cell.
     """
     header = csv_header(path)
     missing = [name for name in columns if name not in header]
@@ -128,25 +129,37 @@ def read_csv(path: Path, columns: Sequence[str]) -> NDArray[np.float64]:
             lines = [(reader.line_num, row) for row in reader if row]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise RecordingError(f"{path}: cannot be read as CSV: {error}") from None
+    _check_widths(path, lines, len(header))
     try:
         table = np.array([[row[place] for place in places] for _, row in lines], np.float64)
-    except (ValueError, IndexError):
+    except ValueError:
         raise _bad_cell(path, lines, places, columns) from None
     return table.reshape(len(lines), len(columns))
 
 
+_Lines = Sequence[tuple[int, Sequence[str]]]
+
+
+def _check_widths(path: Path, lines: _Lines, expected: int) -> None:
+    """Raise `RecordingError` for a row of more or fewer cells than the header names.
+
+    Which cell is missing or too many cannot be known, so every channel may be a neighbour's.
+    """
+    wrong = [(line, len(row)) for line, row in lines if len(row) != expected]
+    if wrong:
+        line, cells = wrong[0]
+        why = "the line is cut off" if cells < expected else "its channels would be shifted"
+        raise RecordingError(
+            f"{path}, line {line}: expected {expected} cells as in the header, found {cells}; "
+            f"{why} ({len(wrong)} such line(s) of {len(lines)}). Mend or delete the line"
+        )
+
+
 def _bad_cell(
-    path: Path,
-    lines: Sequence[tuple[int, Sequence[str]]],
-    places: Sequence[int],
-    columns: Sequence[str],
+    path: Path, lines: _Lines, places: Sequence[int], columns: Sequence[str]
 ) -> RecordingError:
     for line, row in lines:
         for place, name in zip(places, columns, strict=True):
-            if place >= len(row):
-                return RecordingError(
-                    f"{path}, line {line}: {len(row)} cells, so no {name!r}; the line is cut off"
-                )
             try:
                 float(row[place])
             except ValueError:
