@@ -27,6 +27,9 @@ SENSOR = Channels(
     ("N", *[""] * ALINE_BINS),
 )
 CLOCK = "origin_timestamp"
+_CLOCK_TOLERANCE_S, _CLOCK_TOLERANCE = 0.5, 0.02
+"""By how much a clock made of start and rate may miss the recording's end: in seconds, or as a
+share of the recording where that is more."""
 
 
 class InsertionRecording(FileRecording):
@@ -78,13 +81,37 @@ def robot_state_file(folder: Path) -> Path | None:
     return None
 
 
-def read_robot_states(path: Path, start: float | None, rate_hz: float | None) -> Stream:
-    """Joints and poses; without a clock of its own, row i is at `start + i / rate_hz`."""
-    if path.suffix == ".npz":
-        return _clocked(_states_of_npz(path), start, rate_hz, path)
-    if CLOCK in csv_header(path):
+def read_robot_states(
+    path: Path, start: float | None, rate_hz: float | None, end: float | None = None
+) -> Stream:
+    """Joints and poses; without a clock of its own, row i is at `start + i / rate_hz`.
+
+    Such a clock has to reach `end`, if the recording names one; raises `RecordingError` otherwise.
+    """
+    if path.suffix == ".csv" and CLOCK in csv_header(path):
         return read_state_csv(path)
-    return _clocked(read_csv(path, STATE.names), start, rate_hz, path)
+    values = _states_of_npz(path) if path.suffix == ".npz" else read_csv(path, STATE.names)
+    if start is None or rate_hz is None:
+        raise RecordingError(
+            f"{path}: has no clock, and the episode's metadata gives no start_time and robot_hz "
+            f"to make one; add them, or a column {CLOCK}"
+        )
+    if end is not None and len(values):
+        _check_end(path, len(values), start, rate_hz, end)
+    time = start + np.arange(len(values), dtype=np.float64) / rate_hz
+    return checked_stream(STATE, time, values.astype(np.float32), str(path))
+
+
+def _check_end(path: Path, rows: int, start: float, rate_hz: float, end: float) -> None:
+    """Raise `RecordingError` where rows from `start` at `rate_hz` do not last until `end`."""
+    last_s, span_s = (rows - 1) / rate_hz, end - start
+    if abs(last_s - span_s) > max(_CLOCK_TOLERANCE_S, _CLOCK_TOLERANCE * span_s):
+        fitting = f" (robot_hz {(rows - 1) / span_s:.4g} would fit)" if span_s > 0 else ""
+        raise RecordingError(
+            f"{path}: {rows} rows without a clock at robot_hz {rate_hz:g} last {last_s:.2f} s, but "
+            f"from start_time {start:.3f} to end_time {end:.3f} are {span_s:.2f} s{fitting}; they "
+            f"must agree: correct the metadata, or add a column {CLOCK}"
+        )
 
 
 def read_state_csv(path: Path) -> Stream:
@@ -124,13 +151,3 @@ def _states_of_npz(path: Path) -> Numbers:
             f"{path}: expected joints and poses (M, 6), found {[half.shape for half in halves]}"
         )
     return np.concatenate(halves, axis=1)
-
-
-def _clocked(values: Numbers, start: float | None, rate_hz: float | None, path: Path) -> Stream:
-    if start is None or rate_hz is None:
-        raise RecordingError(
-            f"{path}: has no clock, and the episode's metadata gives no start_time and robot_hz "
-            f"to make one; add them, or a column {CLOCK}"
-        )
-    time = start + np.arange(len(values), dtype=np.float64) / rate_hz
-    return checked_stream(STATE, time, values.astype(np.float32), str(path))

@@ -48,7 +48,8 @@ class WindowedRecording(InsertionRecording):
         path = robot_state_file(self.path)
         if path is None:
             return None
-        stream = read_robot_states(path, self._start, self._robot_hz)
+        end = self._number("end_time")
+        stream = read_robot_states(path, self._start, self._robot_hz, end)
         self._check_count("robot_states_count", len(stream.time), path)
         return stream
 

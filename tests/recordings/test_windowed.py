@@ -34,6 +34,45 @@ def test_joints_and_poses_make_a_state(folder, truth, only):
     np.testing.assert_array_equal(only(folder).state().values, truth.state)
 
 
+@pytest.mark.parametrize("format", ["npz", "csv"])
+@pytest.mark.parametrize(
+    ("start_s", "end_s", "robot_hz"),
+    [(0, 0.5, 20), (-3600, 0.5, 100), (3600, 0.5, 100), (0, 1.2, 100)],
+)
+def test_a_made_clock_that_misses_the_end_is_refused(
+    folder, truth, write, only, format, start_s, end_s, robot_hz
+):
+    """Every row would be dated otherwise than it was recorded, and pair with other frames."""
+    if format == "csv":
+        (folder / "robot_states.npz").unlink()
+        write.csv(folder / "robot_states.csv", write.STATE_NAMES, truth.state.tolist())
+    start, end = write.START + start_s, write.START + end_s
+    write.edit_json(folder / "metadata.json", start_time=start, end_time=end, robot_hz=robot_hz)
+    with pytest.raises(RecordingError) as refused:
+        only(folder).state()
+    for part in (
+        f"robot_states.{format}: 50 rows",
+        f"start_time {start:.3f}",
+        f"end_time {end:.3f}",
+        f"robot_hz {robot_hz}",
+    ):
+        assert part in str(refused.value)
+
+
+@pytest.mark.parametrize("end_s", [0.1, 0.49, 0.9])
+def test_a_made_clock_that_nearly_reaches_the_end_is_taken(folder, write, only, end_s):
+    write.edit_json(folder / "metadata.json", end_time=write.START + end_s)
+    assert len(only(folder).state().time) == 50
+
+
+def test_a_recorded_clock_needs_no_other(folder, truth, write, only):
+    (folder / "robot_states.npz").unlink()
+    rows = np.column_stack([truth.state_time, truth.state.astype(np.float64)]).tolist()
+    write.csv(folder / "robot_states.csv", ["origin_timestamp", *write.STATE_NAMES], rows)
+    write.edit_json(folder / "metadata.json", end_time=write.START + 60, robot_hz=7)
+    np.testing.assert_array_equal(only(folder).state().time, truth.state_time)
+
+
 @pytest.mark.parametrize("clocked", [True, False])
 def test_states_may_come_as_csv(folder, truth, write, only, clocked):
     (folder / "robot_states.npz").unlink()
