@@ -11,6 +11,7 @@ from pathlib import Path
 from pipeline.config import InspectParams, Params, Source
 from pipeline.errors import ConfigError, RecordingError
 from pipeline.recordings import Opened, open_recordings
+from pipeline.recordings.finding import hub_hint, meant
 
 ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".zst", ".rar")
 STORE = (".zarr", ".zarr.part")
@@ -77,15 +78,18 @@ def _check(place: str, root: Path) -> None:
     if path.is_dir() or glob.has_magic(place):
         return
     if not path.exists():
-        raise ConfigError(f"inspect.path: {path} is not there. {_meant(path, root)}")
+        raise ConfigError(f"inspect.path: {path} is not there. {_there_is(place, root)}")
     if path.suffix.lower() in ARCHIVES:
         raise ConfigError(
             f"inspect.path: expected a folder, found the packed file {path}. Unpack it, then look "
             "at the folder that comes out."
         )
     raise ConfigError(
-        "inspect.path: expected a folder of recordings or a store, found the file "
-        f"{path}. Name the folder of the whole recording: of LeRobot's, the one that holds meta/"
+        f"inspect.path: expected a folder of recordings or a store, found the file {path}. "
+        + (
+            meant(path.absolute())
+            or "Name the folder of the whole recording: of LeRobot's, the one that holds meta/"
+        )
     )
 
 
@@ -105,8 +109,9 @@ def _check_output(folder: Path) -> None:
     raise ConfigError(f"inspect.output: {wrong}. Name another: --set inspect.output=FOLDER")
 
 
-def _meant(path: Path, root: Path) -> str:
-    """What is there instead: below `data.root`, of nearly that name, or in the same folder."""
+def _there_is(place: str, root: Path) -> str:
+    """What is there instead: below `data.root`, of nearly that name, on the hub, or beside it."""
+    path = Path(place)
     if (root / path).exists():
         return f"It is under data.root: python -m stages.inspect '{root / path}'"
     parent = next(folder for folder in path.absolute().parents if folder.is_dir())
@@ -115,6 +120,9 @@ def _meant(path: Path, root: Path) -> str:
     close = get_close_matches(below, names, n=3)
     if close:
         return f"Did you mean {' or '.join(str(parent / name) for name in close)}?"
+    hint = hub_hint(place, Path())
+    if hint and path.parts[:1] != root.parts[:1]:  # data/demo, before the demo is written
+        return hint
     listed = ", ".join(names[:8]) + (" …" if len(names) > 8 else "")
     return f"In {parent} there is {listed or 'nothing'}"
 
@@ -124,7 +132,10 @@ def _matches(place: str) -> list[str]:
 
 
 def _is_store(path: Path) -> bool:
-    return (path / "zarr.json").is_file() or (path.is_dir() and path.name.endswith(STORE))
+    """Whether it is a store by its content, or by its name and not of zarr v2, as none is."""
+    if (path / "zarr.json").is_file():
+        return True
+    return path.is_dir() and path.name.endswith(STORE) and not (path / ".zgroup").exists()
 
 
 def _stores_below(sources: Sequence[Source], root: Path) -> str:

@@ -2,8 +2,10 @@
 
 import glob
 import os
+import re
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
+from fnmatch import filter as matching
 from pathlib import Path
 
 from pipeline.config import Source
@@ -38,6 +40,24 @@ READERS = {
 }
 """In the order of detection."""
 
+_FOREIGN = {
+    "*.tfrecord* *.tfrecords*": "RLDS, the TFRecord files of Open X-Embodiment",
+    ".zgroup .zarray": "a zarr replay buffer, as UMI and Diffusion Policy write them",
+    "*.hdf5 *.h5": "HDF5, as robomimic and ALOHA write it",
+    "*.bag *.mcap *.db3": "a ROS bag",
+    "*.parquet": "LeRobot without its meta/info.json, or other parquet files",
+    "*.npz *.npy": "numpy arrays of another recorder",
+    "*.csv *.tsv": "CSV tables of another recorder",
+    "*.pkl *.pickle *.pt": "pickles of another recorder",
+    "*.mp4 *.avi *.mkv *.mov *.webm": "videos alone, without states or actions",
+    "*.jpg *.jpeg *.png": "images alone, without states or actions",
+}
+"""What recordings that no reader knows look like, by names in them; the first that fits decides."""
+
+_HUB_ID = re.compile(
+    r"(?:https://huggingface\.co/datasets/|hf://datasets/)?(\w[\w.-]*/(\w[\w.-]*))/?"
+)
+
 _DEEPEST = 4
 """Levels below a LeRobot root at which its files lie: videos/chunk-000/view/episode.mp4."""
 
@@ -54,17 +74,19 @@ def episode_folders(source: Source, root: Path) -> list[tuple[Path, Reader]]:
         matches = _matches(full)
         if not matches:
             lost = "" if root.is_dir() else f": {root} is no folder; see python -m stages.doctor"
+            files = glob.glob(str(full), recursive=True)  # noqa: PTH207
+            hint = meant(Path(files[0]) if files else full) or hub_hint(pattern, root)
             raise RecordingError(
                 f"source {source.name!r}: {pattern!r} matches nothing; looked for folders {full}. "
-                f"Mend data.root or the source's path{lost}{_around(full)}"
+                f"Mend data.root or the source's path{lost}{hint and f'. {hint}'}"
             )
         episodes = [pair for match in matches for pair in _episodes(match, source)]
         if not episodes:
+            hint = meant(matches[0])
             raise RecordingError(
                 f"source {source.name!r}: {pattern!r} matches {len(matches)} folder(s), none with "
                 f"an episode in it; looked under {full} for folders with "
-                f"{_wanted_markers(source)}. Mend the path or format"
-                f"{_around(matches[0])}"
+                f"{_wanted_markers(source)}. {hint or 'Mend the path or format'}"
             )
         for folder, reader in episodes:
             _check_name(source, folder)
@@ -112,16 +134,52 @@ def _detect(folder: Path, names: Collection[str], source: Source) -> str | None:
     return format
 
 
-def _around(path: Path) -> str:
-    """A question about the episode or data set that a path lies in, if it lies in one."""
+def meant(path: Path) -> str:
+    """What a path without an episode lies in or looks like, and what to do; '' if unknown."""
     for folder in path.parents[:_DEEPEST]:
         if not (folder.is_dir() and os.access(folder, os.R_OK)):
             continue
         format = _format(folder, listing(folder))
         if format is not None:
             what = "a LeRobot data set" if format == "lerobot" else f"an episode ({format!r})"
-            return f". Did you mean {folder}, which is {what}?"
+            return f"Did you mean {folder}, which is {what}?"
+    return _foreign(path)
+
+
+def _foreign(path: Path) -> str:
+    """What a folder or file that no reader knows looks like, and the way from there; '' if unknown.
+
+    Zarr v3 groups, as this project's stores are, are passed over.
+    """
+    names = {path.name.lower()} if path.exists() else set[str]()
+    for _, below, files in os.walk(path):
+        if "zarr.json" in files:
+            below.clear()
+        else:
+            names |= {name.lower() for name in (*below, *files)}
+    for patterns, what in _FOREIGN.items():
+        fitting = sorted(name for one in patterns.split() for name in matching(names, one))
+        if fitting:
+            return (
+                f"It looks like {what} ({fitting[0]}), which this project does not read. Convert "
+                "it to LeRobot, or write a reader: docs/recipes/reader.md"
+            )
     return ""
+
+
+def hub_hint(place: str, base: Path) -> str:
+    """What to do with a path that may be the id of a data set on the hub; '' where it is none.
+
+    A path whose parent folder is in `base` is a path.
+    """
+    match = _HUB_ID.fullmatch(place)
+    if match is None or (base / place).parent.exists():
+        return ""
+    return (
+        "It looks like the id of a data set on the Hugging Face hub, but this project reads local "
+        f"folders. Download it, then name its folder: hf download --repo-type dataset {match[1]} "
+        f"--local-dir {base / match[2]}"
+    )
 
 
 def _check_name(source: Source, folder: Path) -> None:

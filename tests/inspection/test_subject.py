@@ -58,6 +58,28 @@ def test_a_file_is_no_recording(tmp_path: Path, name: str, said: str) -> None:
     assert str(tmp_path / name) in refused(tmp_path / name)
 
 
+def test_a_foreign_file_or_folder_is_told_what_it_looks_like(tmp_path: Path) -> None:
+    buffer = tmp_path / "umi.zarr"
+    buffer.mkdir()
+    (buffer / ".zgroup").write_text("{}")
+    (tmp_path / "demo.hdf5").write_bytes(b"")
+    for path, what in ((buffer, "a zarr replay buffer"), (tmp_path / "demo.hdf5", "HDF5")):
+        assert f"looks like {what}" in refused(path)
+        assert refused(path).endswith("docs/recipes/reader.md")
+
+
+def test_the_id_of_a_data_set_on_the_hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "secrets.txt").write_bytes(b"")
+    said = refused("lerobot/pusht")
+    assert "Hugging Face hub" in said and "reads local folders" in said
+    assert said.endswith("hf download --repo-type dataset lerobot/pusht --local-dir pusht")
+    assert "secrets.txt" not in said
+    assert "hf download" not in refused("data/demo")  # the demo's, before it is written
+    (tmp_path / "lerobot").mkdir()
+    assert "hf download" not in refused("lerobot/pusht")
+
+
 def test_a_folder_with_nothing_in_it_names_the_markers(tmp_path: Path) -> None:
     said = refused(tmp_path)
     assert str(tmp_path) in said

@@ -142,6 +142,60 @@ def test_a_path_that_lies_in_no_episode_is_asked_nothing(root):
         open_recordings([Source(name="s", path="raw/empty")], root)
 
 
+FOREIGN = {
+    "bridge-train.tfrecord-00000-of-00001": "RLDS",
+    "umi.zarr/.zgroup": "zarr replay buffer",
+    "low_dim.hdf5": "HDF5",
+    "run/episode_0.H5": "HDF5",
+    "run.bag": "ROS bag",
+    "run/run_0.db3": "ROS bag",
+    "run_0.mcap": "ROS bag",
+    "data/chunk-000/file-000.parquet": "LeRobot without its meta/info.json",
+    "1565077733.npz": "numpy arrays",
+    "wrench.csv": "CSV tables",
+    "steps.pkl": "pickles",
+    "day 1/front.mp4": "videos alone",
+    "day 1/0001.jpg": "images alone",
+}
+
+
+@pytest.mark.parametrize("file", FOREIGN)
+def test_a_foreign_folder_is_told_what_it_looks_like(tmp_path: Path, file: str) -> None:
+    path = tmp_path / "theirs" / file
+    path.parent.mkdir(parents=True)
+    path.write_bytes(b"")
+    (tmp_path / "theirs" / "preview.jpg").write_bytes(b"")
+    (tmp_path / "theirs" / "README.md").write_bytes(b"")
+    with pytest.raises(RecordingError) as refused:
+        open_recordings([Source(name="s", path="theirs")], tmp_path)
+    said = str(refused.value)
+    assert FOREIGN[file] in said and "does not read" in said
+    assert "LeRobot" in said and "docs/recipes/reader.md" in said
+
+
+def test_a_foreign_file_is_told_what_it_looks_like(tmp_path: Path) -> None:
+    (tmp_path / "demo.hdf5").write_bytes(b"")
+    for path in ("demo.hdf5", "*.hdf5"):
+        with pytest.raises(RecordingError, match=r"HDF5.* \(demo\.hdf5\).*reader\.md$"):
+            open_recordings([Source(name="s", path=path)], tmp_path)
+
+
+@pytest.mark.parametrize(
+    "place", ["lerobot/pusht", "https://huggingface.co/datasets/lerobot/pusht"]
+)
+def test_the_id_of_a_data_set_on_the_hub_is_told_how_to_download_it(root, place):
+    with pytest.raises(RecordingError) as refused:
+        open_recordings([Source(name="s", path=place)], root)
+    command = f"hf download --repo-type dataset lerobot/pusht --local-dir {root}/pusht"
+    assert str(refused.value).endswith(command) and "reads local folders" in str(refused.value)
+
+
+@pytest.mark.parametrize("place", ["raw/Blue_pont", "rawest", "./org/name", "org/name/data"])
+def test_a_misspelt_path_is_no_hub_id(root, place):
+    with pytest.raises(RecordingError, match=r"source's path$"):
+        open_recordings([Source(name="s", path=place)], root)
+
+
 def test_a_name_that_is_not_utf_8_is_refused(root):
     try:
         (root / "raw/Red_point/e9").rename(root / os.fsdecode(b"raw/Red_point/e\xff9"))
