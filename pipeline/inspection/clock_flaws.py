@@ -1,6 +1,6 @@
 """What looks wrong in the clocks: gaps, jumps, rates, frames lost, ticks lost, frames too old."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -17,15 +17,16 @@ DROPPED_STEP = 1.5
 DROPPED, DROPPED_SHARE = 5, 0.05
 """How many such steps there are at least, and what share of the steps they have to exceed, as have
 the frames that there was time for: jitter alone leaves no time, as steps get shorter too."""
-LOST_S = 0.5
-"""Seconds by which a stream may begin after the others, or end before them."""
+LOST_S, LOST_SHARE, LOST_TICKS = 0.5, 0.05, 2.5
+"""By how much a stream may begin after the others, or end before them: in seconds, or as a share of
+a short episode, there by so many ticks and `DROPPED_STEP` of its own steps in any case."""
 REPEATED = 0.05
 """Share of entries that may have the time of the entry before."""
 OLD = 2.0
 """Times the span that a VL row serves which its frames may usually be old."""
 
 _TICK_S = 0.1
-"""Of an episode without ticks."""
+"""Of an episode without two ticks."""
 _FEWEST = 20
 """Steps below which nothing is said of how a clock runs."""
 
@@ -47,7 +48,7 @@ def clock_flaws(view: EpisodeView, said: Nominal) -> Iterator[Flaw]:
 
 def _gaps(view: EpisodeView, names: str, time: NDArray[np.float64]) -> Iterator[Flaw]:
     step = usual_step(time)
-    tick = _TICK_S if view.timeline is None else usual_step(view.timeline.time)
+    tick = _tick_s(view)
     jumps = _jumps(_ends(view), time)
     for gap in gaps(time):
         length = gap.stop_s - gap.start_s
@@ -207,26 +208,38 @@ def _lost_ticks(view: EpisodeView) -> Iterator[Flaw]:
     }
     begun = sorted(starts.values())[middle]
     ended = sorted(stops.values(), reverse=True)[middle]
-    for time, limit, said in (
-        (max(starts.values()), begun, f"begins {{:.2f}} s after {most} {have}"),
-        (min(stops.values()), ended, f"ends {{:.2f}} s before {most} {do}"),
+    for edge, time, limit, said in (
+        (starts, max(starts.values()), begun, f"begins {{:.2f}} s after {most} {have}"),
+        (stops, min(stops.values()), ended, f"ends {{:.2f}} s before {most} {do}"),
     ):
         lost = abs(time - limit)
-        if lost < LOST_S:
+        names = [name for name, at in edge.items() if abs(at - time) <= min(LOST_S, lost) / 2]
+        if lost < LOST_S and not _costs_much(view, names, lost):
             continue
-        edge = starts if time > limit else stops
-        names = ", ".join(name for name, at in edge.items() if abs(at - time) < LOST_S / 2)
         yield view.flaw(
             "lost ticks",
-            names,
+            ", ".join(names),
             f"{said.format(lost)}; no tick can stand there ({_share(view, lost)})",
             min(time, limit),
             max(time, limit),
         )
 
 
+def _costs_much(view: EpisodeView, names: Iterable[str], lost_s: float) -> bool:
+    """Whether streams that lack less than `LOST_S` cost much of a short episode by it."""
+    own_s = max(usual_step(view.clocks[name]) for name in names)
+    allowed = (LOST_SHARE * view.duration_s, LOST_TICKS * _tick_s(view), DROPPED_STEP * own_s)
+    return all(lost_s > limit for limit in allowed)
+
+
+def _tick_s(view: EpisodeView) -> float:
+    line = view.timeline
+    return _TICK_S if line is None or len(line.time) < 2 else usual_step(line.time)
+
+
 def _share(view: EpisodeView, lost_s: float) -> str:
-    return f"{100 * lost_s / view.duration_s:.0f} % of the episode's {view.duration_s:.2f} s"
+    ticks = f"about {lost_s / _tick_s(view):.0f} ticks, "
+    return f"{ticks}{100 * lost_s / view.duration_s:.0f} % of the episode's {view.duration_s:.2f} s"
 
 
 def _old_frames(view: EpisodeView) -> Iterator[Flaw]:

@@ -100,6 +100,26 @@ def test_a_stream_that_ends_early(find: Find) -> None:
     assert "ends 19.91 s before most streams do" in found[1].message
 
 
+@pytest.mark.parametrize("start", [0.3, -0.3])
+def test_what_a_late_or_early_stream_costs_is_judged_by_the_episode(
+    find: Find, start: float
+) -> None:
+    """Three of 32 ticks are a tenth of what there is to learn from."""
+    short = {name: time[time < 3.2] for name, time in (("sensor", FAST), ("state", SLOW))}
+    time = short["sensor"]
+    kept = time >= start if start > 0 else time < 3.2 + start
+    (flaw,) = find(short | {"sensor": time[kept]})
+    assert (flaw.kind, flaw.stream) == ("lost ticks", "sensor")
+    assert "about 3 ticks, 9 %" in flaw.message
+    long = {"sensor": FAST[200:], "state": SLOW}
+    assert find(long) == ()
+
+
+def test_a_slow_camera_of_a_short_episode_loses_nothing(find: Find) -> None:
+    time = np.arange(16) / 5 + 0.1
+    assert find({"sensor": FAST[:2080], "state": SLOW[:320], "view View1": time[time < 2.95]}) == ()
+
+
 def test_frames_that_are_lost_have_a_place(find: Find) -> None:
     burst = np.arange(200, 240, 2)
     (flaw,) = find({"view View1": np.delete(CAMERA, [5, *burst, *range(300, 600, 30)])})
