@@ -1,4 +1,4 @@
-"""What is not there: cameras, views, frames."""
+"""What is not there: streams, cameras, views, frames."""
 
 from collections.abc import Iterator
 
@@ -15,6 +15,11 @@ OTHER_RATE = 1.8
 
 def count_flaws(view: EpisodeView, said: Nominal) -> Iterator[Flaw]:
     """Flaws of kind missing and frame count; `said` is what the recording says of itself."""
+    unread = {name for flaw in view.flaws for name in flaw.stream.split(", ")}
+    for name, entry in said.streams.items():
+        if name not in view.streams and name not in unread:
+            message = f"no file holds it, but {said.where} says {entry}: copy the file, too"
+            yield view.flaw("missing", name, message)
     frames = {name: len(camera.time) for name, camera in view.cameras.items()}
     recorded = _recorded_views(view)
     if recorded is not None and not frames:

@@ -28,7 +28,11 @@ def _said(view: EpisodeView) -> Iterator[Flaw]:
         said = view.recording.nominal()
     except RecordingError as error:
         said = Nominal()
-        yield view.flaw("unreadable", "metadata", str(error))
+        # What keeps a stream from being read, too, has been told with it.
+        if str(error) not in {flaw.message for flaw in view.flaws}:
+            yield view.flaw("unreadable", "metadata", str(error))
+    for mistake in said.mistakes:
+        yield view.flaw("wrong metadata", "episode", mistake)
     yield from clock_flaws(view, said)
     yield from count_flaws(view, said)
 

@@ -6,6 +6,7 @@ Channels, the task folder's name as instruction, JPEG views, robot states and se
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,6 +72,12 @@ class InsertionRecording(FileRecording):
     @abstractmethod
     def _data_files(self) -> Sequence[Path]:
         """The files that are not frames."""
+
+
+def promised(metadata: Mapping[str, Any], *keys: str) -> str:
+    """The first of these entries that there is, as text; '' where none is, or it says nothing."""
+    said = next(((key, metadata[key]) for key in keys if metadata.get(key) is not None), None)
+    return f"{said[0]} {said[1]}" if said and said[1] else ""
 
 
 def robot_state_file(folder: Path) -> Path | None:

@@ -143,7 +143,21 @@ class LeRobotRecording(FileRecording):
 
     def nominal(self) -> Nominal:
         clocks = ["state", "action", *(f"view {view}" for view in self.all_views())]
-        return Nominal(dict.fromkeys(clocks, self._layout.fps), where=MARKER)
+        mistakes = self._misplaced_rows()
+        return Nominal(dict.fromkeys(clocks, self._layout.fps), where=MARKER, mistakes=mistakes)
+
+    def _misplaced_rows(self) -> tuple[str, ...]:
+        """What `meta/` says wrongly of the file of v3.0 that holds the rows."""
+        rows, named = find_rows(self._layout, self._entry).path, self._entry.data
+        if rows == named:
+            return ()
+        told, there = (path.relative_to(self.path).as_posix() for path in (named, rows))
+        return (
+            f"meta/episodes says that the rows of {self._entry.id} lie in {told}, they lie in "
+            f"{there} and were read there; other readers may miss them. Correct its "
+            "data/chunk_index and data/file_index, or convert the data set again with lerobot "
+            "0.5.0 or later (up to 0.4.4 it wrote such entries)",
+        )
 
     def all_views(self) -> Sequence[str]:
         return sorted(self._layout.views)

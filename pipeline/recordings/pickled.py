@@ -17,6 +17,7 @@ from pipeline.recordings.arrays import Numbers, number, numeric, read_npy
 from pipeline.recordings.insertion import (
     SENSOR,
     InsertionRecording,
+    promised,
     read_robot_states,
     robot_state_file,
     sensor_rows,
@@ -25,6 +26,7 @@ from pipeline.recordings.jpeg import frame_time, name_views, split_eye
 from pipeline.recordings.plain_pickle import load_plain
 from pipeline.recordings.recording import (
     Channels,
+    Nominal,
     RecordedAction,
     Stream,
     checked_stream,
@@ -84,6 +86,15 @@ class PickledRecording(InsertionRecording):
         rate_hz = self._rate(self._document(), "robot_hz", _ROBOT_HZ)
         return read_robot_states(path, self._start, rate_hz)
 
+    def nominal(self) -> Nominal:
+        """The streams that the pickle's metadata count; its rates are those of the clocks made."""
+        metadata = self._metadata(self._document())
+        told = {
+            "sensor": promised(metadata, "has_sensor"),
+            "state": promised(metadata, "num_robot_states"),
+        }
+        return Nominal(streams={k: v for k, v in told.items() if v}, where=f"{MARKER}'s metadata")
+
     def _document(self) -> Mapping[str, Any]:
         # Not kept: thousands of episodes stay open, and each pickle carries its sensor rows.
         document = load_plain(self._pickle)
@@ -113,10 +124,14 @@ class PickledRecording(InsertionRecording):
         return self._matrix(document, "sensor_data", len(SENSOR.names)), where
 
     def _rate(self, document: Mapping[str, Any], key: str, default: float) -> float:
+        metadata = self._metadata(document)
+        return number(metadata, key, f"{self._pickle}, 'metadata'", positive=True) or default
+
+    def _metadata(self, document: Mapping[str, Any]) -> Mapping[str, Any]:
         metadata = document.get("metadata") or {}
         if not isinstance(metadata, dict):
             raise RecordingError(f"{self._pickle}: 'metadata' is a {type(metadata).__name__}")
-        return number(metadata, key, f"{self._pickle}, 'metadata'", positive=True) or default
+        return metadata
 
     def _recorded_instruction(self) -> str:
         told = self._document().get("instruction")

@@ -57,11 +57,15 @@ class Nominal:
 
     rates_hz: Mapping[str, float] = field(default_factory=dict[str, float])
     """By clock: `sensor`, `state`, `action`, `view View1`, …"""
+    streams: Mapping[str, str] = field(default_factory=dict[str, str])
+    """What says that a stream was recorded, by its name: `state`: `robot_states_count 300`."""
     views: tuple[str, ...] = ()
     frames: int | None = None
     """Of the view that has most."""
     where: str = ""
     """The file that says so."""
+    mistakes: tuple[str, ...] = ()
+    """What it says that is not so and was read in spite of it, each with its mend."""
 
 
 class CameraStream(ABC):

@@ -12,6 +12,7 @@ from pipeline.recordings.arrays import member, number, read_json, read_npz
 from pipeline.recordings.insertion import (
     SENSOR,
     InsertionRecording,
+    promised,
     read_robot_states,
     robot_state_file,
 )
@@ -80,11 +81,16 @@ class WindowedRecording(InsertionRecording):
 
     def nominal(self) -> Nominal:
         """Raises `RecordingError` where `metadata.json` counts frames in anything but a number."""
-        told = {"sensor": self._sensor_hz, "state": self._robot_hz}
+        rates = {"sensor": self._sensor_hz, "state": self._robot_hz}
+        told = {
+            "sensor": promised(self._metadata, "sensor_windows_count", "sensor_hz"),
+            "state": promised(self._metadata, "robot_states_count", "robot_hz"),
+        }
         frames = self._number("camera_frames_count")
         listed = self._metadata.get("camera_views")
         return Nominal(
-            {name: rate for name, rate in told.items() if rate is not None},
+            {name: rate for name, rate in rates.items() if rate is not None},
+            {name: entry for name, entry in told.items() if entry},
             tuple(map(str, listed)) if isinstance(listed, list) else (),
             None if frames is None else int(frames),
             MARKER,

@@ -8,9 +8,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from pipeline.config import Source
+from pipeline.config import DataParams, Source
 from pipeline.digests import file_digest
 from pipeline.errors import RecordingError
+from pipeline.inspection.episodes import view_episode
+from pipeline.inspection.flaws import find_flaws
 from pipeline.recordings import content_digest, open_recording, open_recordings
 from pipeline.recordings.lerobot import action_kind
 
@@ -345,9 +347,21 @@ def test_a_stale_file_index_is_seen_through(tmp_path, write):
     for recording, values in zip(recordings, good, strict=True):
         np.testing.assert_array_equal(recording.state().values, values)
     assert root / "data/chunk-000/file-001.parquet" in recordings[2].files()
+    assert [recording.nominal().mistakes for recording in recordings[:2]] == [(), ()]
+    params = DataParams(sources=(Source(name="s", path=str(root)),), action_hz=None)
+    (flaw,) = [
+        flaw
+        for flaw in find_flaws(view_episode(recordings[2], params, "rotvec"))
+        if flaw.kind == "wrong metadata"
+    ]
+    assert flaw.episode == "episode_000002" and flaw.severity == "warning"
+    named, there = (flaw.message.index(f"data/chunk-000/file-00{file}.parquet") for file in (0, 1))
+    assert named < there < flaw.message.index("Correct")
     (root / "data/chunk-000/file-001.parquet").unlink()
     with pytest.raises(RecordingError, match=r"file-000.*no row of episode 2"):
         opened(root).recordings[2].state()
+    lost = find_flaws(view_episode(opened(root).recordings[2], params, "rotvec"))
+    assert [flaw.kind for flaw in lost] == ["unreadable"]
 
 
 def test_stale_global_indices_do_not_matter(tmp_path, write):
