@@ -91,6 +91,17 @@ def test_what_is_refused(minimal, override, message):
     assert message in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    "override",
+    ["train_head.mixture={other: 1}", "train_head.diffusion={timesteps: 20, sampling_steps: 50}"],
+)
+def test_a_rule_over_a_section_does_not_print_the_section(minimal, override):
+    with pytest.raises(ConfigError) as caught:
+        load_params(minimal, [override])
+    _, line = str(caught.value).splitlines()
+    assert "{" not in line and len(line) < 120
+
+
 def test_a_missing_and_a_broken_file(tmp_path):
     with pytest.raises(ConfigError, match=r"nowhere\.yaml: no such file.*--params"):
         load_params(tmp_path / "nowhere.yaml")

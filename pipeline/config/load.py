@@ -74,8 +74,10 @@ def _all_problems(error: ValidationError, where: str) -> str:
             case "tuple_type":
                 said = f"expected a list, such as [{problem['input']}]"
             case _:
-                reason = problem["msg"].removeprefix("Value error, ")
-                said = f"{reason} (found {problem['input']!r:.200})"
+                said = problem["msg"].removeprefix("Value error, ")
+                # A rule over a whole section names what it found; the section would bury it.
+                if not (problem["type"] == "value_error" and isinstance(problem["input"], dict)):
+                    said += f" (found {problem['input']!r:.200})"
         lines.append(f"  {place}: {said}")
     return "\n".join(lines)
 
