@@ -133,10 +133,12 @@ class UnifiedVLADataset(Dataset[Sample]):
         same where sources and episodes have the names that they have in the store: the side
         follows from the hash of "source/id". Use `unified_collate_fn`.
         """
+        keys = None
         if self._frames is not None:
-            rows, keys = self._frames.first_keys()
-            self.store.array("vl/key")[rows] = keys
-        split = split_by_episode(self.store, val_fraction, self.windows.horizon)
+            rows, of_frames = self._frames.first_keys()
+            keys = self.store.array("vl/key").copy()
+            keys[rows] = of_frames
+        split = split_by_episode(self.store, val_fraction, self.windows.horizon, keys)
         train, held_out = (
             Subset(self, np.flatnonzero(np.isin(self.ticks, side)).tolist())
             for side in (split.train, split.held_out)

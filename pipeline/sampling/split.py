@@ -28,7 +28,12 @@ class Split:
     """What the reader of a metric has to know about this split, or None."""
 
 
-def split_by_episode(store: FeatureStore, val_fraction: float, horizon: int = 8) -> Split:
+def split_by_episode(
+    store: FeatureStore,
+    val_fraction: float,
+    horizon: int = 8,
+    keys: NDArray[np.uint8] | None = None,
+) -> Split:
     """Whole episodes on either side, by a hash of "source/id".
 
     Episodes whose first VL keys are equal are one recording in several formats and share a side,
@@ -38,9 +43,10 @@ def split_by_episode(store: FeatureStore, val_fraction: float, horizon: int = 8)
     A single recording is cut at one instant for all of its formats: the earliest at which the last
     20 % of a format's ticks begin. Ticks from there on are held out; ticks before it whose chunk
     of `horizon` actions is not over by then belong to neither side. Raises `ConfigError` where that
-    leaves nothing to train on, `StoreMismatch` where the store has no tick.
+    leaves nothing to train on, `StoreMismatch` where the store has no tick. `keys` (vl_row, 16)
+    stand in for the VL keys of a store that has none.
     """
-    recordings = episodes_by_recording(store)
+    recordings = episodes_by_recording(store, keys)
     if not recordings:
         raise StoreMismatch(
             f"{store.path}: expected ticks to train on, found none. Look at data.sources and run "
@@ -64,12 +70,15 @@ def split_by_episode(store: FeatureStore, val_fraction: float, horizon: int = 8)
     return Split(_ticks(train), _ticks(held_out), _names(held_out), note)
 
 
-def episodes_by_recording(store: FeatureStore) -> dict[str, list[Episode]]:
+def episodes_by_recording(
+    store: FeatureStore, keys: NDArray[np.uint8] | None = None
+) -> dict[str, list[Episode]]:
     """Episodes that have ticks, by the first name among those with the same first VL key.
 
     Those are one recording in several formats: what is learnt from one is known of the others.
+    `keys` (vl_row, 16) stand in for the store's own.
     """
-    keys = store.array("vl/key")
+    keys = store.array("vl/key") if keys is None else keys
     frame_time = store.array("vl/frame_time")
     by_key: dict[bytes, list[Episode]] = {}
     for episode in store.episodes:

@@ -338,6 +338,17 @@ class TestSplit:
             trained = split_by_episode(extracted, val_fraction)
             assert sides[1] == [trained.train.tolist(), trained.held_out.tolist()]
 
+    def test_nothing_is_written_into_the_store(
+        self, recordings: Path, extracted: FeatureStore
+    ) -> None:
+        for data in (UnifiedVLADataset(recordings / "new"), UnifiedVLADataset(store=extracted)):
+            arrays = {name: data.store.array(name) for name in ("vl/key", "tick/vl_row")}
+            before = {name: array.copy() for name, array in arrays.items()}
+            data.split(0.3)
+            for name, array in arrays.items():
+                assert data.store.array(name) is array
+                np.testing.assert_array_equal(array, before[name])
+
     def test_one_recording_in_two_places_is_on_one_side(self, recordings: Path) -> None:
         new = str(recordings / "new")
         twice = [Source(name="a", path=new), Source(name="b", path=new)]
