@@ -213,11 +213,9 @@ def _row_ms(store: FeatureStore) -> float:
 
 
 def _tick_s(store: FeatureStore) -> float:
-    """Time between ticks; where the recorded rows are the ticks, its median."""
-    if store.action_hz is not None:
-        return 1 / store.action_hz
-    steps = np.diff(store.array("tick/time"))
-    return float(np.median(steps[steps > 0]))
+    """Time between ticks of an episode; where the recorded rows are the ticks, its median."""
+    step_s = store.tick_step() if store.action_hz is None else 1 / store.action_hz
+    return step_s if step_s > 0 else np.inf  # no episode has two ticks: none can be delayed
 
 
 def _settled(store: FeatureStore, ticks: Ticks) -> Ticks:

@@ -62,15 +62,7 @@ def ages(store: FeatureStore) -> Ages:
         ticks = np.arange(start, min(start + _BLOCK_TICKS, store.ticks))
         newest[ticks] = store.feature_age(ticks)
         by_view[ticks] = time[ticks, None] - shown[row_of[ticks]]
-    return Ages(newest, by_view, views, store.vlm_reuse_count * tick_step(store))
-
-
-def tick_step(store: FeatureStore) -> float:
-    """The median time from a tick to the next of its episode, in s; NaN where there is none."""
-    starts = store.array("episode/tick_start")
-    between = np.unique(starts[(starts > 0) & (starts < store.ticks)]) - 1
-    steps = np.delete(np.diff(store.array("tick/time")), between)
-    return float(np.median(steps)) if len(steps) else float("nan")
+    return Ages(newest, by_view, views, store.vlm_reuse_count * store.tick_step())
 
 
 def _covered(store: FeatureStore, episode: Episode) -> EpisodeCoverage:

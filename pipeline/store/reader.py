@@ -139,6 +139,14 @@ class FeatureStore:
         """The index of the episode of each of these store-global ticks."""
         return episode_of(self._arrays, ticks)
 
+    def tick_step(self) -> float:
+        """The median time from a tick to the next of its episode, in s; NaN where there is none."""
+        steps = np.diff(self._arrays["tick/time"])
+        starts = self._arrays["episode/tick_start"]
+        between = np.unique(starts[(starts > 0) & (starts < self.ticks)]) - 1
+        steps = np.delete(steps, between)
+        return float(np.median(steps)) if len(steps) else float("nan")
+
     def feature_age(self, ticks: NDArray[np.int64]) -> NDArray[np.float64]:
         """(tick,) s since the newest frame that the features of these ticks have seen."""
         return self._gatherer.feature_age(ticks, self._arrays["tick/vl_row"][ticks])

@@ -246,6 +246,20 @@ def test_features_go_back_whole_rows_and_say_the_true_time(
     assert found.notes[-1].endswith("judged 100 ms, 200 ms; 50 ms end within a row")
 
 
+@pytest.mark.parametrize(("ticks", "how"), [(2, "delayed 330 ms"), (1, "delayed inf ms")])
+def test_the_time_between_episodes_is_no_step_of_ticks(
+    tiny_store: Callable[..., Path], tmp_path: Path, ticks: int, how: str
+) -> None:
+    """Where recorded rows are the ticks, their median step says how long a delay is."""
+    store = FeatureStore.open(tiny_store(tmp_path, ticks=ticks))
+    store.attrs["action_hz"] = None
+    time = store.array("tick/time")
+    starts = 45.0 * np.arange(6)
+    time[::ticks] = starts
+    time[ticks - 1 :: ticks] = starts + (ticks - 1) * np.tile([0.1, 0.12], 3)
+    assert list(delays(store, "features")) == [how]
+
+
 @pytest.mark.parametrize(("asked", "judged"), [(1, 1), (16, 4)])
 def test_a_study_of_a_sampling_policy_is_of_few_samples(
     tiny_store: Callable[..., Path], tmp_path: Path, asked: int, judged: int
