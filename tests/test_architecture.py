@@ -154,15 +154,6 @@ def test_stage_two_knows_nothing_of_stage_one():
         assert rooms & {"vlm", "recordings", "extraction", "timeline", "simulation"} == known
 
 
-def test_source_files_stay_readable():
-    long = {
-        str(path.relative_to(ROOT)): count
-        for path in MODULES.values()
-        if (count := len(path.read_text(encoding="utf-8").splitlines())) > 260
-    }
-    assert not long
-
-
 def test_the_pictures_rooms_exist():
     names = {room(name) for name in MODULES if name.startswith("pipeline.")}
     assert names == set().union(*TIERS), names ^ set().union(*TIERS)
