@@ -2,10 +2,10 @@
 
 All times are float64 seconds on the recording's own clock. Ticks begin when every stream that the
 episode has has begun, and end when one ends. Everything that a tick sees is at or before it; only
-its action lies ahead.
+its action lies ahead. What is stored later than a tick by no more than `rounding` is at it.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -20,6 +20,10 @@ ActionRotation = Literal["rotvec", "euler_delta"]
 
 RATE_TOLERANCE = 0.1
 """Recorded rows are the ticks when `action_hz` differs from their rate by no more than this."""
+
+FINEST_S, COARSEST_S = 1e-9, 1e-3
+"""Bounds of `rounding`: float64 seconds that are sums of steps are off by more than their last
+digit, and a reading more than a millisecond after a tick was not there, however it is stored."""
 
 _MOST_TICKS = 1_000_000  # of an episode: 28 hours at 10 Hz
 _SLOWEST_HZ = 0.66  # of an episode's fastest stream: 650 Hz in milliseconds looks like 0.65
@@ -98,7 +102,8 @@ def build_timeline(
     else:
         raise RecordingError(f"{recording.path}: neither actions nor poses to derive them from")
     vl_time = time[::vlm_reuse_count]
-    frames = {view: last_at(camera.time, vl_time) for view, camera in cameras.items()}
+    slack = _slack(clocks)
+    frames = {view: last_at(camera.time, vl_time, slack) for view, camera in cameras.items()}
     none = np.zeros(len(time), np.int64)
     return Timeline(
         time=time,
@@ -111,8 +116,8 @@ def build_timeline(
         vl_time=vl_time,
         frames=frames,
         frame_time={view: cameras[view].time[rows] for view, rows in frames.items()},
-        sensor_end=none if sensor is None else last_at(sensor.time, time) + 1,
-        state_end=none if state is None else last_at(state.time, time) + 1,
+        sensor_end=none if sensor is None else last_at(sensor.time, time, slack) + 1,
+        state_end=none if state is None else last_at(state.time, time, slack) + 1,
     )
 
 
@@ -125,9 +130,49 @@ def choose_action_rotation(
     return "rotvec" if all(one.has_poses for one in recordings) else "euler_delta"
 
 
-def last_at(clock: NDArray[np.float64], times: NDArray[np.float64]) -> NDArray[np.int64]:
-    """For each time, the index of the last entry of a sorted clock at or before it (-1: none)."""
-    return np.searchsorted(clock, times, side="right") - 1
+def last_at(
+    clock: NDArray[np.float64], times: NDArray[np.float64], slack_s: float = 0.0
+) -> NDArray[np.int64]:
+    """For each time, the index of the last entry of a sorted clock at or before it (-1: none).
+
+    An entry up to `slack_s` later is at it.
+    """
+    return np.searchsorted(clock, times + slack_s, side="right") - 1
+
+
+def rounding(clock: NDArray[np.float64]) -> float:
+    """Seconds by which two times on a clock may differ and be the same time, by how it was stored.
+
+    That of float32 where all entries are numbers of that type. In float64 a nanosecond, which is
+    nothing beside seconds since 1970: those are compared as they are.
+    """
+    narrow = clock.astype(np.float32)
+    if not np.array_equal(clock, narrow):
+        return FINEST_S
+    return float(np.clip(2 * float(np.spacing(np.abs(narrow).max())), FINEST_S, COARSEST_S))
+
+
+def rate_notes(
+    rates: Iterable[tuple[str, float | None, float]], action_hz: float | None
+) -> dict[str, str]:
+    """By source: what it means that its ticks come at another rate than what was recorded.
+
+    `rates` are source, `recorded_hz` and `fastest_hz` of each episode's timeline.
+    """
+    if action_hz is None:
+        return {}
+    fastest: dict[str, float] = {}
+    recorded: dict[str, set[float]] = {}
+    for source, recorded_hz, fastest_hz in rates:
+        fastest[source] = max(fastest.get(source, 0.0), fastest_hz)
+        of_source = recorded.setdefault(source, set())
+        if recorded_hz is not None:
+            of_source.add(recorded_hz)
+    notes = {
+        source: _rate_note(action_hz, sorted(recorded[source]), rate)
+        for source, rate in fastest.items()
+    }
+    return {source: note for source, note in notes.items() if note}
 
 
 def wrapped(degrees: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -160,7 +205,8 @@ def _recorded_ticks(
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     start, stop = _covered(recording, clocks)
     if action_hz is None or abs(action_hz - rate) <= RATE_TOLERANCE * rate:
-        kept = (recorded.time >= start) & (recorded.time <= stop)
+        slack = _slack(clocks)
+        kept = (recorded.time >= start - slack) & (recorded.time <= stop + slack)
         return _some(recording, recorded.time[kept]), recorded.values[kept]
     if recorded.kind == "delta":
         raise RecordingError(
@@ -168,7 +214,7 @@ def _recorded_ticks(
             f"held at data.action_hz={action_hz:g}. Set data.action_hz to {rate:g} or null."
         )
     time = _some(recording, _grid(recording, clocks, start, stop, action_hz))
-    return time, recorded.values[last_at(recorded.time, time)]
+    return time, recorded.values[last_at(recorded.time, time, _slack(clocks))]
 
 
 def _pose_ticks(
@@ -222,7 +268,7 @@ def _covered(recording: Recording, clocks: _Clocks) -> tuple[float, float]:
     late = max(clocks, key=lambda name: float(clocks[name][0]))
     early = min(clocks, key=lambda name: float(clocks[name][-1]))
     start, stop = float(clocks[late][0]), float(clocks[early][-1])
-    if start > stop:
+    if start > stop + _slack(clocks):
         raise RecordingError(
             f"{recording.path}: no instant is covered by every stream: {late} begins at "
             f"{start:.3f} s, after {early} has ended at {stop:.3f} s"
@@ -230,11 +276,16 @@ def _covered(recording: Recording, clocks: _Clocks) -> tuple[float, float]:
     return start, stop
 
 
+def _slack(clocks: _Clocks) -> float:
+    """Seconds by which an entry may lie after an instant and still be at it."""
+    return max(map(rounding, clocks.values()))
+
+
 def _grid(
     recording: Recording, clocks: _Clocks, start: float, stop: float, rate_hz: float
 ) -> NDArray[np.float64]:
-    """start, start + 1/rate, … up to `stop`; a microsecond of slack for rounding."""
-    count = int(np.floor((stop - start) * rate_hz + 1e-6 * rate_hz)) + 1
+    """start, start + 1/rate, … up to `stop`, or to a microsecond or the clocks' slack beyond."""
+    count = int(np.floor((stop - start) * rate_hz + max(1e-6, _slack(clocks)) * rate_hz)) + 1
     fastest = max(map(_hz, clocks.values()))
     if count > _MOST_TICKS or 0 < fastest < _SLOWEST_HZ:
         raise RecordingError(
@@ -251,6 +302,18 @@ def _some(recording: Recording, time: NDArray[np.float64]) -> NDArray[np.float64
             f"{recording.path}: too short: no tick has every stream and a following action"
         )
     return time
+
+
+def _rate_note(action_hz: float, recorded: Sequence[float], fastest: float) -> str | None:
+    said: list[str] = []
+    others = [rate for rate in recorded if abs(action_hz - rate) > RATE_TOLERANCE * rate]
+    if others:
+        rates = f"{others[0]:.3g}" + (f" to {others[-1]:.3g}" if len(others) > 1 else "")
+        fate = "held" if action_hz > others[0] else "left out between ticks"
+        said.append(f"recorded at {rates} Hz: actions are {fate}")
+    if action_hz > (1 + RATE_TOLERANCE) * fastest:
+        said.append(f"no stream is faster than {fastest:.3g} Hz: check data.action_hz")
+    return f"ticks at {action_hz:g} Hz, {', '.join(said)}" if said else None
 
 
 def _hz(clock: NDArray[np.float64]) -> float:

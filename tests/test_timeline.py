@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 
 from pipeline.errors import ConfigError, RecordingError
 from pipeline.recordings import CameraStream, Channels, RecordedAction, Recording, Stream
-from pipeline.timeline import build_timeline, choose_action_rotation, last_at, wrapped
+from pipeline.timeline import (
+    build_timeline,
+    choose_action_rotation,
+    last_at,
+    rounding,
+    wrapped,
+)
 
 POSE = Channels(("x", "y", "z", "a", "b", "r"), ("mm",) * 3 + ("deg",) * 3)
 EULER = Channels(
@@ -137,6 +143,58 @@ class TestRecordedTicks:
             build_timeline(Made(recorded=recorded), 10.0, 3, "euler_delta")
 
 
+def regular(offset_s: float, rate_hz: float, entries: int, dtype: str) -> NDArray[np.float64]:
+    """A clock of equal steps as a recorder of that type stores it."""
+    return (offset_s + np.arange(entries) / rate_hz).astype(dtype).astype(np.float64)
+
+
+@st.composite
+def clocks(draw) -> tuple[str, float]:
+    """A stored type, and an offset at which it still tells milliseconds apart."""
+    dtype = draw(st.sampled_from(["float32", "float64"]))
+    return dtype, draw(st.floats(-500, 500 if dtype == "float32" else 100_000))
+
+
+class TestRegularRecordings:
+    @given(
+        clock=clocks(),
+        action_hz=st.sampled_from([1, 2, 3, 5, 7.5, 10, 15, 20, 25, 30, 50]),
+        factor=st.integers(2, 10),
+        fast=st.integers(1, 4),
+        ticks=st.integers(1, 200),
+        reuse=st.integers(1, 5),
+    )
+    def test_resampled_by_a_whole_factor_give_the_exact_rows(
+        self, clock, action_hz, factor, fast, ticks, reuse
+    ):
+        dtype, offset = clock
+        rows = (ticks - 1) * factor + 1
+        time = regular(offset, action_hz * factor, rows, dtype)
+        readings = regular(offset, action_hz * factor * fast, (rows - 1) * fast + 1, dtype)
+        sensor = Stream(JOINTS, readings, np.zeros((len(readings), 2), np.float32))
+        recorded = recorded_at(time, "absolute", action_hz * factor)
+        made = Made(camera_times={"View1": time}, recorded=recorded)
+        state = Stream(JOINTS, time, recorded.values)
+        line = build_timeline(made, action_hz, reuse, "euler_delta", state, sensor)
+        expected = np.arange(ticks) * factor
+        assert np.array_equal(line.action, recorded.values[expected])
+        assert np.array_equal(line.frames["View1"], expected[::reuse])
+        assert np.array_equal(line.state_end, expected + 1)
+        assert np.array_equal(line.sensor_end, expected * fast + 1)
+
+    @given(clock=clocks(), rate=st.sampled_from([10, 30, 100]), rows=st.integers(1, 300))
+    def test_at_their_own_rate_see_streams_that_were_stored_otherwise(self, clock, rate, rows):
+        dtype, offset = clock
+        stored = regular(offset, rate, rows, dtype)
+        exact = regular(offset, rate, rows, "float64")
+        sensor = Stream(JOINTS, exact, np.zeros((rows, 2), np.float32))
+        line = build_timeline(
+            Made(recorded=recorded_at(stored, rate=rate)), None, 3, "euler_delta", sensor=sensor
+        )
+        assert np.array_equal(line.time, stored)
+        assert np.array_equal(line.sensor_end, np.arange(rows) + 1)
+
+
 class TestCoverage:
     def test_begins_when_the_last_stream_begins_and_ends_when_the_first_ends(self):
         made = Made(
@@ -185,8 +243,8 @@ class TestReuse:
         assert len(line.vl_time) == -(-ticks // reuse)
         assert np.array_equal(line.vl_row, np.arange(ticks) // reuse)
         assert np.array_equal(line.vl_time, line.time[::reuse])
-        shown = line.frames["View1"]
-        assert (camera[shown] <= line.vl_time).all()
+        shown, slack = line.frames["View1"], max(rounding(camera), rounding(line.time))
+        assert (camera[shown] <= line.vl_time + slack).all()
         assert (camera[shown + 1] > line.vl_time).all()
         assert np.array_equal(line.frame_time["View1"], camera[shown])
 
@@ -275,6 +333,33 @@ def test_wrapped_is_the_same_angle(degrees):
     inside = wrapped(np.array([degrees]))[0]
     assert -180 <= inside < 180
     assert np.isclose(np.cos(np.radians(inside)), np.cos(np.radians(degrees)), atol=1e-6)
+
+
+def test_times_since_1970_are_compared_as_they_are():
+    """Or stores of recordings on such clocks would be others than those that are there."""
+    time = 1762581333.4 + np.arange(20) / 10
+    late = np.nextafter(time, np.inf)
+    recorded = recorded_at(time)
+    line = build_timeline(
+        Made(camera_times={"View1": np.append(time[0], late)}, recorded=recorded),
+        10.0,
+        1,
+        "euler_delta",
+    )
+    assert np.array_equal(line.frames["View1"], np.arange(20))
+
+
+@pytest.mark.parametrize(
+    ("clock", "slack"),
+    [
+        ([1762581333.1, 1762581333.2], 1e-9),
+        ([0.1, 0.2], 1e-9),
+        (np.float32([0.1, 8.1]), 2 * 2.0**-20),  # two of a float32
+        ([0.0, 2.0**40], 1e-3),
+    ],
+)
+def test_times_are_the_same_within_the_rounding_of_what_stored_them(clock, slack):
+    assert rounding(np.array(clock, np.float64)) == slack
 
 
 def test_last_at_counts_an_equal_time_as_past():

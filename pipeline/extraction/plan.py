@@ -8,7 +8,6 @@ from pipeline.extraction.check import CheckedEpisode
 from pipeline.extraction.survey import Survey
 from pipeline.store import FEATURES, Donor
 from pipeline.store.schema import ArraySpec
-from pipeline.timeline import RATE_TOLERANCE
 from pipeline.vlm.feature_spec import differences
 
 
@@ -69,7 +68,7 @@ def reasons(survey: Survey, store: Donor | None, specs: dict[str, ArraySpec]) ->
     changed = [one for one in survey.episodes if one.digest not in before]
     new = sum(one.content not in contents for one in changed)
     if new:
-        why.append(f"{new} episode(s) are new or their files changed")
+        why.append(f"{new} episode(s) are new or their files changed, or how these are read")
     if len(changed) > new:
         why.append(
             f"{len(changed) - new} episode(s) have another instruction, name, place, action_hz or "
@@ -87,37 +86,6 @@ def reasons(survey: Survey, store: Donor | None, specs: dict[str, ArraySpec]) ->
         if name != FEATURES and store.specs[name].dtype != spec.dtype:
             why.append(f"{name} was {store.specs[name].dtype}, is to be {spec.dtype}")
     return tuple(why) or ("the order of episodes, or how actions are derived, changed",)
-
-
-def rate_notes(checked: Sequence[CheckedEpisode], action_hz: float | None) -> list[str]:
-    """A line a source whose ticks come at another rate than what was recorded."""
-    if action_hz is None:
-        return []
-    fastest: dict[str, float] = {}
-    recorded: dict[str, set[float]] = {}
-    for one in checked:
-        source, line = one.surveyed.recording.source, one.timeline
-        fastest[source] = max(fastest.get(source, 0.0), line.fastest_hz)
-        rates = recorded.setdefault(source, set())
-        if line.recorded_hz is not None:
-            rates.add(line.recorded_hz)
-    notes = {
-        source: _rate_note(action_hz, sorted(recorded[source]), rate)
-        for source, rate in fastest.items()
-    }
-    return [f"source {source!r}: {note}" for source, note in notes.items() if note]
-
-
-def _rate_note(action_hz: float, recorded: Sequence[float], fastest: float) -> str | None:
-    said: list[str] = []
-    others = [rate for rate in recorded if abs(action_hz - rate) > RATE_TOLERANCE * rate]
-    if others:
-        rates = f"{others[0]:.3g}" + (f" to {others[-1]:.3g}" if len(others) > 1 else "")
-        fate = "held" if action_hz > others[0] else "left out between ticks"
-        said.append(f"recorded at {rates} Hz: actions are {fate}")
-    if action_hz > (1 + RATE_TOLERANCE) * fastest:
-        said.append(f"no stream is faster than {fastest:.3g} Hz: check data.action_hz")
-    return f"ticks at {action_hz:g} Hz, {', '.join(said)}" if said else None
 
 
 def known_rows(

@@ -27,7 +27,6 @@ from pipeline.extraction.places import (
 from pipeline.extraction.plan import (
     ExtractionPlan,
     known_rows,
-    rate_notes,
     reasons,
     store_bytes,
 )
@@ -43,6 +42,7 @@ from pipeline.store import (
 )
 from pipeline.store.metadata import check_metadata
 from pipeline.store.schema import read_specs
+from pipeline.timeline import rate_notes
 
 
 def extract(params: Params, say: Say) -> ExtractionReport | None:
@@ -148,8 +148,12 @@ def _begin(
     build = StoreBuild(target, build_arrays(checked, surveyed, params), surveyed.plan)
     if any(one.recording.has_poses for one in surveyed.episodes):
         say(f"actions: rotations as {surveyed.action_rotation}")
-    for line in rate_notes(checked, params.data.action_hz):
-        say(line)
+    rates = [
+        (one.surveyed.recording.source, one.timeline.recorded_hz, one.timeline.fastest_hz)
+        for one in checked
+    ]
+    for source, note in rate_notes(rates, params.data.action_hz).items():
+        say(f"source {source!r}: {note}")
     with closing(build):
         with donors_at([part, *known_places(target)], surveyed) as donors:
             plan = _new_plan(build, checked, surveyed, donors, params, digests)

@@ -16,7 +16,7 @@ from pipeline.inspection.facts import EpisodeView, Flaw
 from pipeline.inspection.flaws import find_flaws
 from pipeline.recordings import Opened, Recording
 from pipeline.recordings.embodiment import Embodiment, common_embodiment
-from pipeline.timeline import ActionRotation, choose_action_rotation
+from pipeline.timeline import ActionRotation, choose_action_rotation, rate_notes
 
 
 @dataclass(frozen=True)
@@ -88,6 +88,7 @@ def survey_recordings(opened: Opened, params: Params) -> RecordingsOverview:
     embodiments: list[tuple[Recording, Embodiment]] = []
     held: list[frozenset[str]] = []
     digests: list[dict[str, str]] = []
+    rates: list[tuple[str, float | None, float]] = []
     for recording in tqdm(opened.recordings, "inspecting", unit="episode", disable=None):
         view = view_episode(recording, params.data, rotation)
         flaws.append(find_flaws(view))
@@ -98,6 +99,7 @@ def survey_recordings(opened: Opened, params: Params) -> RecordingsOverview:
             line = view.timeline
             found = Embodiment.of(line.action_channels, line.action_kind, view.sensor, view.state)
             embodiments.append((recording, found))
+            rates.append((recording.source, line.recorded_hz, line.fastest_hz))
     for place, lacking in _lacking(summaries, held):
         flaws[place] = (*flaws[place], *_missing(summaries[place], lacking, flaws[place]))
     for place, flaw in _duplicates(summaries, digests):
@@ -108,6 +110,7 @@ def survey_recordings(opened: Opened, params: Params) -> RecordingsOverview:
         flaws=(
             *_not_opened(opened),
             *_apart(embodiments),
+            *_other_rate(rates, params.data.action_hz),
             *(one for each in flaws for one in each),
         ),
         rotation=rotation,
@@ -238,6 +241,15 @@ def _not_opened(opened: Opened) -> Iterator[Flaw]:
         more = f" ({len(lines)} such episodes in all)" if len(lines) > 1 else ""
         said = f"{lines[0]}{more}"
         yield Flaw("missing", "warning", source, "", "episode", None, None, said)
+
+
+def _other_rate(
+    rates: Sequence[tuple[str, float | None, float]], action_hz: float | None
+) -> Iterator[Flaw]:
+    """A flaw a source whose ticks are not the recorded rows."""
+    for source, note in rate_notes(rates, action_hz).items():
+        said = f"{note}; with data.action_hz null the recorded rows are the ticks"
+        yield Flaw("tick rate", "warning", source, "", "ticks", None, None, said)
 
 
 def _apart(embodiments: Sequence[tuple[Recording, Embodiment]]) -> Iterator[Flaw]:

@@ -10,12 +10,12 @@ from pipeline.inspection.facts import ChannelStatistics, Flaw
 from pipeline.inspection.store_coverage import Ages, EpisodeCoverage
 from pipeline.inspection.store_statistics import StreamStatistics
 from pipeline.store import FeatureStore
+from pipeline.timeline import COARSEST_S
 
 FEW_TICKS = 10
 _STALE_PERIODS = 2
 _GAP_STEPS = 5
 _RARE, _USUAL = 0.05, 0.8
-_FUTURE_S = 1e-6
 _NAMED = 4
 _NOISE = 0.01
 """Of the median standard deviation of the channels of a unit: what varies less is noise."""
@@ -85,7 +85,7 @@ def _clock(one: EpisodeCoverage, time: NDArray[np.float64]) -> Iterator[Flaw]:
 def _age(
     one: EpisodeCoverage, time: NDArray[np.float64], age: NDArray[np.float32], period_s: float
 ) -> Iterator[Flaw]:
-    ahead = np.flatnonzero(age < -_FUTURE_S)
+    ahead = np.flatnonzero(age < -COARSEST_S)
     if len(ahead):
         found = f"{len(ahead)} ticks see a frame taken after them, by up to {-age.min():.3f} s"
         span = (float(time[ahead[0]]), float(time[ahead[-1]]))

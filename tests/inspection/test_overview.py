@@ -5,6 +5,7 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,9 +15,9 @@ from pipeline.inspection.overview import RecordingsOverview, survey_recordings
 from pipeline.recordings import open_recordings
 
 
-def survey(*sources: Source, views: Sequence[str] | None = None) -> RecordingsOverview:
+def survey(*sources: Source, views: Sequence[str] | None = None, **data: Any) -> RecordingsOverview:
     document = {
-        "data": {"sources": [source.model_dump() for source in sources]},
+        "data": {"sources": [source.model_dump() for source in sources], **data},
         "vlm": {"checkpoint": "none"},
     }
     params = Params.model_validate(document)
@@ -152,6 +153,18 @@ def test_episodes_that_meta_lists_and_are_not_there(healthy: Path, tmp_path: Pat
     (flaw,) = found.flaws
     assert (flaw.kind, flaw.severity, flaw.source) == ("missing", "warning", "s")
     assert "episode_000001" in flaw.message and "(2 such episodes in all)" in flaw.message
+
+
+def test_ticks_at_another_rate_than_the_recorded_rows(healthy: Path) -> None:
+    sources = [
+        Source(name="held", path=str(healthy / "lerobot"), action_kind="absolute"),
+        Source(name="poses", path=str(healthy / "raw")),
+    ]
+    assert survey(*sources[:1]).flaws == survey(*sources[:1], action_hz=None).flaws == ()
+    for action_hz, fate in ((5, "left out between ticks"), (20, "held")):
+        (flaw,) = [f for f in survey(*sources, action_hz=action_hz).flaws if f.kind == "tick rate"]
+        assert (flaw.severity, flaw.source, flaw.episode) == ("warning", "held", "")
+        assert f"ticks at {action_hz} Hz, recorded at 10 Hz: actions are {fate}" in flaw.message
 
 
 def test_recordings_of_two_robots(healthy: Path, tmp_path: Path) -> None:
