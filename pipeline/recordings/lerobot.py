@@ -1,6 +1,6 @@
 """LeRobot data sets v2.0, v2.1 and v3.0: state and action from parquet, frames from video.
 
-Rows and frames pair by number; the `timestamp` column is the clock and is kept as it is. A
+Rows and frames pair by number; the `timestamp` column is the clock, as `lerobot_clock` reads it. A
 high-rate sensor has no home in LeRobot: this project's sidecar is `sensor/episode_000003.npz`.
 """
 
@@ -18,6 +18,7 @@ from pipeline.config import Source
 from pipeline.errors import RecordingError
 from pipeline.recordings.arrays import member, read_npz
 from pipeline.recordings.insertion import SENSOR
+from pipeline.recordings.lerobot_clock import NUMBERS, check_numbers, read_clock, stored_clock
 from pipeline.recordings.lerobot_layout import Entry, Layout, read_layout
 from pipeline.recordings.lerobot_rows import ParquetCamera, find_rows, matrix
 from pipeline.recordings.reader import FileRecording
@@ -28,7 +29,6 @@ from pipeline.recordings.recording import (
     Nominal,
     RecordedAction,
     Stream,
-    check_rising_clock,
     checked_stream,
 )
 from pipeline.recordings.video import VideoClip
@@ -36,7 +36,6 @@ from pipeline.recordings.video import VideoClip
 MARKER = "meta/info.json"
 STATE = "observation.state"
 ACTION = "action"
-CLOCK = "timestamp"
 _DESCRIBING = ("dtype", "names", "units")
 _DELTA = re.compile(r"delta.*|d(x|y|z|a|b|r|rx|ry|rz|alpha|beta|gamma|roll|pitch|yaw)")
 
@@ -51,9 +50,15 @@ def open_data_set(
 ) -> tuple[list["LeRobotRecording"], list[str]]:
     """The episodes whose files are there, and a line for each that `meta/` lists and has none.
 
-    Raises `RecordingError` where `meta/` is broken.
+    Raises `RecordingError` where `meta/` is broken, and where `views` names a depth map.
     """
     layout, entries = read_layout(root)
+    if asked := [view for view in layout.depth if view in (views or ())]:
+        raise RecordingError(
+            f"{root / MARKER}: data.views asks for {', '.join(asked)}, but is_depth_map is true "
+            "there: a depth map is no picture that the model can be shown. Leave it out of "
+            "data.views"
+        )
     there: dict[Path, bool] = {}
     recordings: list[LeRobotRecording] = []
     missing: list[str] = []
@@ -106,6 +111,11 @@ class LeRobotRecording(FileRecording):
         described = json.dumps(
             {"fps": self._layout.fps, "features": features}, sort_keys=True, separators=(",", ":")
         )
+        self._check_spans()
+        where, table = self._numbers(())
+        if not np.array_equal(self._clock(where, table), stored_clock(table, where)):
+            # Stores from before clocks were made exact hold other times of the same files.
+            described += " clock=frame_index/fps"
         if not self._entry.shared:
             return described
         spans = {view: self._entry.videos.get(key) for view, key in self._layout.views.items()}
@@ -162,6 +172,9 @@ class LeRobotRecording(FileRecording):
     def all_views(self) -> Sequence[str]:
         return sorted(self._layout.views)
 
+    def depth_views(self) -> Sequence[str]:
+        return sorted(view for view in self._layout.depth if self._wants(view))
+
     def _recorded_instruction(self) -> str:
         if len(self._entry.tasks) == 1:
             return self._entry.tasks[0]
@@ -181,7 +194,8 @@ class LeRobotRecording(FileRecording):
         wanted = {v: key for v, key in self._layout.views.items() if self._wants(v)}
         if not wanted:
             return {}
-        time = self._clock(*self._rows((CLOCK, STATE, ACTION)))
+        self._check_spans()
+        time = self._clock(*self._numbers())
         rows = find_rows(self._layout, self._entry)
         videos, fps = self._entry.videos, self._layout.fps
         return {
@@ -192,18 +206,32 @@ class LeRobotRecording(FileRecording):
         }
 
     def _stream(self, name: str) -> Stream:
-        where, table = self._rows((CLOCK, STATE, ACTION))
+        where, table = self._numbers()
         channels = _channels(name, self._layout.features[name], f"{self.path / MARKER}, {name!r}")
         values = matrix(_column(table, name, where), len(channels.names), f"{where}, {name!r}")
         return checked_stream(
             channels, self._clock(where, table), values.astype(np.float32), f"{where}, {name!r}"
         )
 
+    def _check_spans(self) -> None:
+        for view, key in self._layout.views.items():
+            span = self._entry.videos.get(key)
+            if span is not None and span.rival and self._wants(view):
+                raise RecordingError(
+                    f"{span.path}: meta/ gives frames of {key!r} from {span.first} on to "
+                    f"{self._entry.id} and to {span.rival} too, so file_index or from_timestamp of "
+                    "one is wrong. Correct meta/episodes, write the data set again, or leave both "
+                    "episodes or the view out (data.on_bad_episode: skip, data.views)"
+                )
+
     def _clock(self, where: str, table: pa.Table) -> NDArray[np.float64]:
-        time = matrix(_column(table, CLOCK, where), 1, f"{where}, {CLOCK!r}")[:, 0]
-        # Rows are chosen by time: of two at one time, the earlier would show the later's frame.
-        check_rising_clock(time, f"{where}, {CLOCK!r}")
-        return time
+        return read_clock(table, self._layout.fps, where)
+
+    def _numbers(self, streams: Sequence[str] = (STATE, ACTION)) -> tuple[str, pa.Table]:
+        """The episode's rows of these streams with their clock, known to be its own."""
+        where, table = self._rows((*NUMBERS, *streams))
+        check_numbers(table, find_rows(self._layout, self._entry), self._entry)
+        return where, table
 
     def _rows(self, columns: Sequence[str]) -> tuple[str, pa.Table]:
         rows = find_rows(self._layout, self._entry)

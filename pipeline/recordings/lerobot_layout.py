@@ -5,8 +5,10 @@ v2.0 and v2.1 keep a file an episode, v3.0 many episodes a file. Only `meta/` is
 
 import json
 import math
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -56,14 +58,19 @@ class Layout:
     @property
     def views(self) -> Mapping[str, str]:
         """Feature keys of the cameras, by view name."""
-        cameras = (k for k, f in self.features.items() if f.get("dtype") in ("video", "image"))
-        return {_view_name(key): key for key in cameras}
+        return {_view_name(key): key for key in _cameras(self.features, depth=False)}
+
+    @property
+    def depth(self) -> Mapping[str, str]:
+        """Feature keys of the depth maps, which are no views, by view name."""
+        return {_view_name(key): key for key in _cameras(self.features, depth=True)}
 
 
 def read_layout(root: Path) -> tuple[Layout, tuple[Entry, ...]]:
     """The data set's layout, and its episodes by index.
 
-    Raises `RecordingError` naming the file of `meta/` that is wrong, and the place in it.
+    Raises `RecordingError` naming the file of `meta/` that is wrong, and the place in it: also
+    where two cameras would be one view, or an episode is listed twice.
     """
     path = root / "meta" / "info.json"
     info = read_json(path)
@@ -79,13 +86,79 @@ def read_layout(root: Path) -> tuple[Layout, tuple[Entry, ...]]:
         raise RecordingError(f"{path}: expected fps and features, found {', '.join(info)}")
     try:
         read = _entries_v3(root, info, fps) if version == "v3.0" else _entries_v2(root, info)
-        entries = tuple(sorted(read, key=lambda entry: entry.index))
+        entries = _apart(sorted(read, key=lambda entry: entry.index), root)
+        _check_view_names(features, path)
         tasks = _tasks_v3(root) if version == "v3.0" else _tasks_v2(root)
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         if isinstance(error, RecordingError):
             raise
         raise RecordingError(f"{root / 'meta'}: cannot be understood: {error!r}") from None
     return Layout(root, version, fps, features, tasks), entries
+
+
+def _apart(entries: Sequence[Entry], root: Path) -> tuple[Entry, ...]:
+    """Entries in the order of their index with their rivals for frames, none of them twice."""
+    for one, other in pairwise(entries):
+        if one.index == other.index:
+            place = root / "meta" / ("episodes" if one.shared else "episodes.jsonl")
+            raise RecordingError(
+                f"{place}: expected each episode once, found {one.id} twice. Remove one of the "
+                "two entries, or write the data set again"
+            )
+    rivals = _rivals(entries)
+    return tuple(
+        replace(
+            entry,
+            videos={
+                key: replace(span, rival=rivals.get((entry.index, key), ""))
+                for key, span in entry.videos.items()
+            },
+        )
+        for entry in entries
+    )
+
+
+def _rivals(entries: Sequence[Entry]) -> dict[tuple[int, str], str]:
+    """Of each span that overlaps another episode's, by index and feature key: that episode."""
+    by_file: dict[Path, list[tuple[int, int, str, Entry]]] = defaultdict(list)
+    for entry in entries:
+        for key, span in entry.videos.items():
+            if span.first is not None:
+                by_file[span.path].append((span.first, entry.index, key, entry))
+    rivals: dict[tuple[int, str], str] = {}
+    for spans in by_file.values():
+        until, last = 0, None
+        for first, index, key, entry in sorted(spans, key=lambda span: span[:2]):
+            if last is not None and first < until:
+                rivals[index, key], rivals[last.index, key] = last.id, entry.id
+            if last is None or first + entry.length > until:
+                until, last = first + entry.length, entry
+    return rivals
+
+
+def _cameras(features: Mapping[str, Mapping[str, Any]], depth: bool) -> list[str]:
+    """Feature keys of cameras that are depth maps, or of the others."""
+    return [
+        key
+        for key, feature in features.items()
+        if feature.get("dtype") in ("video", "image") and _is_depth(feature) == depth
+    ]
+
+
+def _is_depth(feature: Mapping[str, Any]) -> bool:
+    """`video_info` is what sets migrated from v1 call `info`."""
+    told = [info for name in ("info", "video_info") if isinstance(info := feature.get(name), dict)]
+    return any(info.get(name) for info in told for name in ("is_depth_map", "video.is_depth_map"))
+
+
+def _check_view_names(features: Mapping[str, Mapping[str, Any]], path: Path) -> None:
+    keys: dict[str, str] = {}
+    for key in _cameras(features, depth=False):
+        if (other := keys.setdefault(_view_name(key), key)) != key:
+            raise RecordingError(
+                f"{path}: features {other!r} and {key!r} are both the view {_view_name(key)!r}, "
+                "and only one can be. Rename one of them there and in the data set's files"
+            )
 
 
 def _view_name(key: str) -> str:

@@ -128,6 +128,10 @@ class Recording(ABC):
         """Views that have a place in the recording and no frame there."""
         return []
 
+    def depth_views(self) -> Sequence[str]:
+        """Cameras whose pictures are depth maps: no views, the model is not shown them."""
+        return []
+
     def nominal(self) -> Nominal:
         """What the recording says of its rates and counts."""
         return Nominal()

@@ -33,6 +33,8 @@ class VideoSpan:
     first: int | None = None
     count: int | None = None
     """How many the metadata says there are; None where it does not say."""
+    rival: str = ""
+    """Another episode to which the metadata gives some of these frames too."""
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,10 @@ from PIL import Image
 from pipeline.errors import DiskFull, NumericsError, RecordingError, StoreLocked, StoreMismatch
 from pipeline.extraction import extract
 from pipeline.recordings import Channels, RecordedAction, Stream, open_recordings
+from pipeline.recordings.lerobot_clock import stored_clock
 from pipeline.recordings.windowed import WindowedRecording
+from pipeline.simulation.lerobot_format import write_lerobot
+from pipeline.simulation.recorder import simulate_episode
 from pipeline.store import FeatureStore, StoreBuild, build_lock
 from pipeline.timeline import build_timeline
 from pipeline.vlm.feature_spec import feature_spec
@@ -51,6 +54,64 @@ def no_model_later(monkeypatch):
             monkeypatch.setattr(Image, "open", refuse)
 
     return begin
+
+
+@pytest.fixture
+def rounded_clocks(changed, tmp_path, monkeypatch):
+    """`rounded_clocks(action_hz)`: params of a LeRobot set whose store was made by a reader that
+    kept clocks as stored, with ticks that saw no rounding."""
+    write_lerobot(tmp_path / "set", iter([simulate_episode(4, 0.0)]))
+    source = {"name": "made", "path": str(tmp_path / "set"), "action_kind": "absolute"}
+
+    def extracted(action_hz: float):
+        data = {"sources": [source], "action_hz": action_hz, "views": ["View1"]}
+        params = changed(data={**data, "vlm_reuse_count": 1}, vlm={"pooling": ["mean"]})
+        with monkeypatch.context() as before:
+            as_stored = lambda table, fps, where: stored_clock(table, where)  # noqa: E731
+            before.setattr("pipeline.recordings.lerobot.read_clock", as_stored)
+            before.setattr("pipeline.timeline.rounding", lambda clock: 0.0)
+            run(params)
+        return params
+
+    return extracted
+
+
+class TestRoundedClocks:
+    def test_of_the_recorded_rows_are_all_that_changes(self, rounded_clocks, no_model_later):
+        params = rounded_clocks(10)
+        before = FeatureStore.open(params.extract.store)
+        no_model_later(images=False)
+        report, said = run(params)
+        store = FeatureStore.open(params.extract.store)
+        assert (report.taken, report.computed) == (report.rows, 0)
+        assert any("or how these are read" in line for line in said)
+        exact = np.arange(len(store.array("tick/time"))) / 10
+        for name in ("tick/time", "vl/time", "state/time"):
+            assert np.array_equal(store.array(name), exact)
+            assert np.array_equal(before.array(name), exact.astype(np.float32))
+        assert np.array_equal(store.array("vl/frame_time")[:, 0], exact)
+        others = {"vl/features", "vl/key", "vl/checksum", "vl/slot_valid", "tick/vl_row"}
+        others |= {"tick/action", "tick/state_end", "tick/sensor_end"}
+        others |= {"state/values", "sensor/values", "sensor/time"}
+        for name in others:
+            assert np.array_equal(store.array(name), before.array(name)), name
+
+    def test_of_resampled_rows_cost_the_rows_of_other_frames(self, rounded_clocks, counted):
+        params = rounded_clocks(5)
+        before = FeatureStore.open(params.extract.store)
+        known = {key.tobytes(): row for row, key in enumerate(before.array("vl/key"))}
+        counted.clear()
+        report, _ = run(params)
+        store = FeatureStore.open(params.extract.store)
+        (episode,) = store.episodes
+        assert np.array_equal(store.array("tick/state_end"), 2 * np.arange(len(episode.ticks)) + 1)
+        assert not np.array_equal(before.array("tick/state_end"), store.array("tick/state_end"))
+        assert sum(counted) == report.computed == report.rows - report.taken
+        assert 0 < report.taken < report.rows
+        for row, key in enumerate(store.array("vl/key")):
+            if key.tobytes() in known:
+                old = before.array("vl/features")[known[key.tobytes()]]
+                assert np.array_equal(store.array("vl/features")[row], old)
 
 
 class TestWhatItWrites:

@@ -7,6 +7,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from pipeline.config import DataParams, Source
 from pipeline.digests import file_digest
@@ -15,6 +17,8 @@ from pipeline.inspection.episodes import view_episode
 from pipeline.inspection.flaws import find_flaws
 from pipeline.recordings import content_digest, open_recording, open_recordings
 from pipeline.recordings.lerobot import action_kind
+from pipeline.recordings.lerobot_clock import read_clock
+from pipeline.timeline import build_timeline
 
 VERSIONS = ["v2.0", "v2.1", "v3.0"]
 LENGTHS = (7, 5, 9)
@@ -69,6 +73,85 @@ def test_the_clock_keeps_its_jitter(root):
     time = opened(root).recordings[2].action().time
     assert np.ptp(np.diff(time)) > 0.01 and time.dtype == np.float64
     assert np.array_equal(time, time.astype(np.float32))
+
+
+@given(
+    fps=st.sampled_from([1, 5, 8, 10, 15, 25, 29.97, 30, 50, 60, 100]),
+    dtype=st.sampled_from(["float16", "float32", "float64"]),
+    frames=st.integers(-200, 2000),
+    decimal=st.none() | st.integers(0, 3000).map(lambda number: number / 100),
+    rows=st.integers(1, 300),
+)
+def test_a_rounded_clock_is_that_of_the_frame_numbers(fps, dtype, frames, decimal, rows):
+    """Beginning with any frame, or at any time in hundredths of a second."""
+    if dtype == "float16":  # tells frames apart in the first seconds alone
+        frames, decimal, rows = max(0, min(frames, 10)), None, min(rows, int(fps))
+    numbers = np.arange(rows)
+    exact = (frames + numbers) / fps if decimal is None else decimal + numbers / fps
+    stored = exact.astype(dtype)
+    table = pa.table({"timestamp": stored, "frame_index": numbers + 7})
+    np.testing.assert_allclose(read_clock(table, fps, "set"), exact, rtol=0, atol=1e-12)
+    without_numbers = read_clock(pa.table({"timestamp": stored}), fps, "set")
+    np.testing.assert_array_equal(without_numbers, read_clock(table, fps, "set"))
+
+
+def test_a_clock_that_leaves_frames_out_goes_by_their_numbers():
+    numbers = np.array([4, 5, 6, 9, 10, 30])
+    table = pa.table({"timestamp": (numbers / 30).astype(np.float32), "frame_index": numbers})
+    np.testing.assert_array_equal(read_clock(table, 30, "set"), numbers / 30)
+
+
+@pytest.mark.parametrize("spoilt", [0.001, 0.00001])
+def test_a_clock_of_which_one_time_is_off_stays_as_stored(spoilt):
+    times = (np.arange(60) / 30).astype(np.float32)
+    times[40] += spoilt
+    table = pa.table({"timestamp": times, "frame_index": np.arange(60)})
+    np.testing.assert_array_equal(read_clock(table, 30, "set"), times)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize(
+    ("fps", "action_hz"), [(30, 10), (30, 15), (10, 5), (50, 10), (15, 5), (30, 1)]
+)
+def test_a_set_resampled_by_a_whole_factor_gives_the_exact_rows(
+    tmp_path, write, fps, action_hz, dtype
+):
+    rows, reuse, factor = 92, 3, fps // action_hz
+    times = (np.arange(rows) / fps).astype(dtype)
+    root = write.lerobot(tmp_path / "set", image=True, lengths=(rows,), timestamp=times)
+    write.edit_json(root / "meta/info.json", fps=fps)
+    (recording,) = opened(root).recordings
+    state = recording.state()
+    line = build_timeline(recording, action_hz, reuse, "euler_delta", state)
+    exact = np.arange(0, rows, factor)
+    np.testing.assert_array_equal(line.action, recording.action().values[exact])
+    np.testing.assert_array_equal(line.state_end, exact + 1)
+    np.testing.assert_array_equal(line.frames["top"], exact[::reuse])
+    shown = recording.cameras()["top"].read(line.frames["top"].tolist())
+    assert shades(shown) == [write.shade_of(row) for row in exact[::reuse]]
+
+
+@pytest.mark.parametrize(
+    ("factor", "unit"), [(1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds")]
+)
+def test_a_clock_that_is_not_in_seconds_is_refused(tmp_path, write, factor, unit):
+    times = np.arange(7) / 10 * factor
+    for dtype in (np.float32, np.int64):
+        root = write.lerobot(tmp_path / dtype.__name__, lengths=(7,), timestamp=times.astype(dtype))
+        message = rf"timestamp.*0\.1 s apart.*found 1?.*{unit}.*Divide the column by 1e"
+        with pytest.raises(RecordingError, match=message.replace("1e", "1(000|e)")):
+            opened(root).recordings[0].action()
+
+
+def test_the_clock_that_is_computed_is_part_of_the_identity(tmp_path, write):
+    """Or a store from before would lend its times; a clock that stays as stored changes nothing."""
+    times = np.arange(7) / 10
+    sets = [
+        write.lerobot(tmp_path / name, lengths=(7,), timestamp=stored)
+        for name, stored in (("exact", times.astype(np.float32)), ("as stored", times))
+    ]
+    exact, stored = (opened(root).recordings[0].identity() for root in sets)
+    assert exact == f"{stored} clock=frame_index/fps"
 
 
 def test_streams_are_described(root):
@@ -337,6 +420,119 @@ def edit_v3(root: Path, **columns) -> None:
         place = table.column_names.index(name)
         table = table.set_column(place, name, pa.array(values))
     pq.write_table(table, path)
+
+
+def test_swapped_data_files_are_refused(tmp_path, write):
+    root = write.lerobot(tmp_path / "set", lengths=(7, 7, 7))
+    one, other = (root / f"data/chunk-000/episode_00000{index}.parquet" for index in (0, 1))
+    one.rename(root / "aside"), other.rename(one), (root / "aside").rename(other)
+    swapped, _, whole = opened(root).recordings
+    for read in (swapped.state, swapped.action, swapped.cameras, swapped.identity):
+        with pytest.raises(
+            RecordingError,
+            match=r"000000\.parquet, row 0: expected episode_index 0, found 1 \(7 such rows",
+        ):
+            read()
+    assert whole.state() is not None
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_rows_out_of_order_are_refused(tmp_path, write, version):
+    numbers = [0, 1, 2, 4, 3, 5, 6]
+    root = write.lerobot(tmp_path / "set", version, lengths=(7, 7), frame_index=numbers)
+    row = 11 if version == "v3.0" else 4
+    with pytest.raises(RecordingError, match=rf"row {row}: expected frame_index above 4, found 3"):
+        opened(root).recordings[1].action()
+
+
+@pytest.mark.parametrize("numbers", [np.arange(5, 12), [0, 1, 2, 5, 6, 7, 9], None])
+def test_rows_that_were_taken_away_are_no_mistake(tmp_path, write, numbers):
+    root = write.lerobot(
+        tmp_path / "set",
+        lengths=(7,),
+        frame_index=numbers,
+        **({} if numbers is not None else {"episode_index": None}),
+    )
+    assert len(opened(root).recordings[0].action().time) == 7
+
+
+@pytest.mark.parametrize(
+    ("columns", "refused"),
+    [
+        ({f"videos/{KEY}/file_index": [0, 0, 0]}, [0, 1, 2]),
+        ({f"videos/{KEY}/file_index": [1, 0, 1]}, [0, 2]),
+        ({f"videos/{KEY}/from_timestamp": [0.0, 0.6, 0.0]}, [0, 1]),
+    ],
+)
+def test_frames_that_meta_gives_to_two_episodes_are_refused(tmp_path, write, columns, refused):
+    root = write.lerobot(tmp_path / "set", "v3.0", file_of=[0, 0, 1])
+    edit_v3(root, **columns)
+    for index, recording in enumerate(opened(root).recordings):
+        for read in (recording.cameras, recording.identity):
+            if index not in refused:
+                read()
+                continue
+            with pytest.raises(
+                RecordingError, match=rf"file-00\d\.mp4: .*to episode_00000{index} and to episode_"
+            ):
+                read()
+    without = open_recordings([Source(name="s", path=str(root))], root, []).recordings
+    assert [one.cameras() for one in without] == [{}] * 3
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_an_episode_that_is_listed_twice_is_refused(tmp_path, write, version):
+    root = write.lerobot(tmp_path / "set", version)
+    if version == "v3.0":
+        edit_v3(root, episode_index=[0, 1, 1])
+    else:
+        path = root / "meta/episodes.jsonl"
+        path.write_text(path.read_text() + path.read_text().splitlines()[1] + "\n")
+    with pytest.raises(RecordingError, match=r"meta/episodes.*once, found episode_000001 twice"):
+        opened(root)
+
+
+def test_two_cameras_that_would_be_one_view_are_refused(tmp_path, write):
+    camera = {"dtype": "image", "shape": [48, 64, 3], "names": None}
+    root = write.lerobot(tmp_path / "set", features={"observation.top": camera})
+    with pytest.raises(
+        RecordingError, match=rf"info\.json: features '{KEY}' and 'observation\.top'.*view 'top'"
+    ):
+        opened(root)
+    # A depth map is no view and takes no name.
+    depth = {**camera, "info": {"is_depth_map": True}}
+    root = write.lerobot(tmp_path / "other", features={"observation.top": depth})
+    assert opened(root).recordings[0].view_names() == ["top"]
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+@pytest.mark.parametrize(
+    "told",
+    [
+        {"info": {"is_depth_map": True}},
+        {"info": {"video.is_depth_map": True}},
+        {"video_info": {"video.is_depth_map": True}},
+        {"info": None, "video_info": {"is_depth_map": True}},
+    ],
+)
+def test_a_depth_map_is_no_view(tmp_path, write, version, told):
+    key = "observation.images.depth"
+    camera = {"dtype": "image", "shape": [48, 64, 3], "names": None}
+    root = write.lerobot(tmp_path / "set", version, features={key: {**camera, **told}})
+    for recording in opened(root).recordings:
+        assert recording.depth_views() == ["depth"]
+        assert recording.view_names() == list(recording.cameras()) == ["top"]
+    source = [Source(name="s", path=str(root))]
+    (first, *_) = open_recordings(source, root, ["top"]).recordings
+    assert first.depth_views() == []
+    with pytest.raises(
+        RecordingError, match=r"info\.json.*data\.views asks for depth.*is_depth_map"
+    ):
+        open_recordings(source, root, ["top", "depth"])
+    plain = write.lerobot(
+        tmp_path / "plain", features={key: {**camera, "info": {"is_depth_map": False}}}
+    )
+    assert opened(plain).recordings[0].view_names() == ["depth", "top"]
 
 
 def test_a_stale_file_index_is_seen_through(tmp_path, write):
