@@ -207,5 +207,9 @@ def _say_survey(surveyed: Survey, params: Params, say: Say) -> None:
                 say(f"source {source.name!r}: {path} is absolute, so DVC does not watch it")
     for line in surveyed.missing:
         say(f"not there: {line}")
+    recordings = [one.recording for one in surveyed.episodes]
+    depth = {(one.source, view) for one in recordings for view in one.depth_views()}
+    for source, view in sorted(depth):
+        say(f"source {source!r}: view {view} is a depth map, no picture, and is left out")
     for bad in surveyed.bad:
         say(f"skipped {bad.source}: {bad.reason}")

@@ -14,7 +14,10 @@ OTHER_RATE = 1.8
 
 
 def count_flaws(view: EpisodeView, said: Nominal) -> Iterator[Flaw]:
-    """Flaws of kind missing and frame count; `said` is what the recording says of itself."""
+    """Flaws of kind missing, depth view and frame count.
+
+    `said` is what the recording says of itself.
+    """
     unread = {name for flaw in view.flaws for name in flaw.stream.split(", ")}
     for name, entry in said.streams.items():
         if name not in view.streams and name not in unread:
@@ -29,6 +32,9 @@ def count_flaws(view: EpisodeView, said: Nominal) -> Iterator[Flaw]:
     empty = [] if recorded is None else view.recording.empty_views()
     for name in empty:
         yield view.flaw("missing", f"view {name}", "its folder is there and holds no frame")
+    for name in view.recording.depth_views():
+        message = "a depth map by the metadata, no picture: it is no view, the VLM is not shown it"
+        yield view.flaw("depth view", f"view {name}", message)
     for name in said.views:
         if name in empty:
             continue

@@ -278,6 +278,15 @@ class TestCameras:
         (folder / "sensor_data.npz").write_bytes(b"")
         assert [flaw.kind for flaw in flaws_of(folder)] == ["unreadable"]
 
+    def test_a_depth_map_is_no_view(self, copied: Copied, flaws_of: Find) -> None:
+        root = copied("lerobot")
+        info = json.loads((root / "meta/info.json").read_text())
+        info["features"]["observation.images.View2"]["info"]["video.is_depth_map"] = True
+        (root / "meta/info.json").write_text(json.dumps(info))
+        (flaw,) = flaws_of(root)
+        assert (flaw.kind, flaw.severity, flaw.stream) == ("depth view", "warning", "view View2")
+        assert flaws_of(root, views=["View1"]) == ()
+
     def test_frames_counted_in_words(self, copied: Copied, flaws_of: Find) -> None:
         folder = copied("new")
         metadata(folder, camera_frames_count="many")

@@ -1,10 +1,13 @@
 """`stages.extract` as a user meets it: exit codes and messages."""
 
+import json
 from pathlib import Path
 
 import pytest
 import yaml
 
+from pipeline.simulation.lerobot_format import write_lerobot
+from pipeline.simulation.recorder import simulate_episode
 from stages.command import run
 from stages.extract import main
 
@@ -50,6 +53,18 @@ def test_an_unknown_codebase_version(capsys, params_file, tmp_path):
     meta.mkdir(parents=True)
     (meta / "info.json").write_text('{"codebase_version": "v9.0", "fps": 10, "features": {}}')
     assert "v9.0" in said(capsys, params_file)
+
+
+def test_a_depth_map_that_is_asked_for_as_a_view(capsys, params_file, tmp_path):
+    write_lerobot(tmp_path / "day1/run", iter([simulate_episode(4, 0.0)]))
+    info = tmp_path / "day1/run/meta/info.json"
+    document = json.loads(info.read_text())
+    document["features"]["observation.images.View2"]["info"]["video.is_depth_map"] = True
+    info.write_text(json.dumps(document))
+    assert "data.views asks for View2" in said(capsys, params_file, "data.views=[View1, View2]")
+    options = ["--params", str(params_file), "--set", "extract.plan=true"]
+    assert run("", main, options) == 0
+    assert "source 'lab': view View2 is a depth map" in capsys.readouterr().out
 
 
 def test_a_checkpoint_that_is_not_there(capsys, params_file, tmp_path, request):
