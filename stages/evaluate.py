@@ -1,5 +1,6 @@
 """Judge a trained policy on the episodes it has not seen, beside three baselines.
 
+Judged is what stages.train_head wrote to train_head.output, or evaluate.checkpoint if it is given.
 Writes metrics.json, tables (CSV) and a page with its pictures (report.html, PNG) into
 `evaluate.output`, and judged.json, which says what was judged on what. With `evaluate.modalities`,
 judges again with each stream spoilt. The page shows the frames of the best and the worst episode
@@ -35,11 +36,12 @@ from pipeline.store import FeatureStore, check_trailers
 
 
 def main(params: Params) -> None:
-    """Judge the checkpoint that `evaluate` names."""
-    checkpoint = load_policy(find_policy(params.evaluate.checkpoint))
+    """Judge the checkpoint that `evaluate` names, else what `train_head` wrote."""
+    folder = params.evaluate.checkpoint or params.train_head.output
+    checkpoint = load_policy(find_policy(folder))
     store = _store_for(checkpoint, params)
     device, say = resolve_device(params.evaluate.device), partial(print, flush=True)
-    found = judgement(checkpoint, store, params.evaluate, device, params.data.root, say)
+    found = judgement(folder, checkpoint, store, params.evaluate, device, params.data.root, say)
     files = _write(params.evaluate.output, found)
     print(table(found.comparison))
     if found.study is not None:

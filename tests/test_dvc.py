@@ -83,6 +83,13 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
     return made
 
 
+def test_what_is_judged_is_what_was_trained():
+    """An older head, named by a key of its own, would be judged when `train_head.output` moves."""
+    evaluate = yaml.safe_load((ROOT / "dvc.yaml").read_text())["stages"]["evaluate"]
+    assert "${train_head.output}" in evaluate["deps"]
+    assert yaml.safe_load((ROOT / "params.yaml").read_text())["evaluate"]["checkpoint"] is None
+
+
 def test_a_second_run_does_nothing(project):
     assert "Data and pipelines are up to date." in project.dvc("repro")
 

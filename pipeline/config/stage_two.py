@@ -150,8 +150,9 @@ class TrainHeadParams(Section):
 class EvaluateParams(Section):
     """Which policy is judged, and where the report goes."""
 
-    checkpoint: Path = Path("models/head")
-    """A training run's folder, or one checkpoint in it."""
+    checkpoint: Path | None = None
+    """A training run's folder, or one checkpoint in it; `train_head.output` where null. Another one
+    DVC does not watch."""
     output: Path = Path("reports/evaluate")
     """Folder of metrics, tables and pictures."""
     batch_size: int = Field(default=64, ge=1)

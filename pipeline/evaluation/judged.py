@@ -41,6 +41,7 @@ class Judgement:
 
 
 def judgement(
+    folder: Path,
     checkpoint: PolicyCheckpoint,
     store: FeatureStore,
     wanted: EvaluateParams,
@@ -48,7 +49,7 @@ def judgement(
     recordings: Path,
     say: Callable[[str], None],
 ) -> Judgement:
-    """The policy of this checkpoint judged on its held-out ticks of a store that it fits.
+    """The policy of the checkpoint in `folder`, judged on its held-out ticks of a store it fits.
 
     What is judged on what is said first. Raises `CheckpointMismatch` as `held_out_ticks` does, and
     `NumericsError` as `predict`.
@@ -57,7 +58,7 @@ def judgement(
     policy = checkpoint.policy(device)
     judged = judged_document(checkpoint, policy, store, wanted.samples, wanted.batch_size)
     say(
-        f"{wanted.checkpoint} (step {checkpoint.step}) on {len(ticks)} held-out ticks of "
+        f"{folder} (step {checkpoint.step}) on {len(ticks)} held-out ticks of "
         f"{len(checkpoint.held_out_ticks)} episode(s) in {store.path}, device {device}, "
         f"{judged['policy']['samples']} chunk(s) a tick"
     )
@@ -77,7 +78,7 @@ def judgement(
             checkpoint, policy, store, ticks, wanted.batch_size, wanted.samples, progress=True
         )
     return Judgement(
-        name=str(wanted.checkpoint),
+        name=str(folder),
         checkpoint=checkpoint,
         store=store,
         comparison=comparison,

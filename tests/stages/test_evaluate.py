@@ -141,6 +141,24 @@ def test_a_missing_checkpoint_says_what_to_run(
 
 
 @pytest.mark.usefixtures("reports")
+def test_without_a_checkpoint_it_judges_what_train_head_wrote(
+    trained: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """And not an older head that lies where heads lie by default."""
+    shutil.copytree(trained.parent / "head", tmp_path / "models/head")
+    monkeypatch.chdir(tmp_path)
+    document = yaml.safe_load(trained.read_text())
+    del document["evaluate"]["checkpoint"]
+    params = tmp_path / "params.yaml"
+    params.write_text(yaml.safe_dump(document))
+    assert run("", evaluate.main, arguments(params, tmp_path / "report")) == 0
+    assert f"{trained.parent / 'head'} (step 3)" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("reports")
 def test_last_can_be_judged_too(trained: Path, tmp_path: Path) -> None:
     last = f"evaluate.checkpoint={trained.parent / 'head/last'}"
     assert run("", evaluate.main, arguments(trained, tmp_path / "report", last)) == 0
