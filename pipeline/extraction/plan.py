@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from pipeline.amounts import duration, size
+from pipeline.config import Params
 from pipeline.extraction.check import CheckedEpisode
 from pipeline.extraction.survey import Survey
 from pipeline.store import FEATURES, Donor
@@ -28,6 +29,8 @@ class ExtractionPlan:
     rows_per_s: float | None
     """As measured in the last session with this model, resolution and device."""
     reasons: tuple[str, ...]
+    warnings: tuple[str, ...] = ()
+    """On how the missing rows would be computed."""
 
     def lines(self) -> list[str]:
         """For people."""
@@ -47,6 +50,7 @@ class ExtractionPlan:
             + (" (fewer where a key turns out to be known)" if left and self.known else ""),
             f"disk: {size(self.bytes)} for the whole store, {size(self.free)} free",
             f"time: {time}",
+            *(f"warning: {warning}" for warning in self.warnings if left),
         ]
 
 
@@ -86,6 +90,22 @@ def reasons(survey: Survey, store: Donor | None, specs: dict[str, ArraySpec]) ->
         if name != FEATURES and store.specs[name].dtype != spec.dtype:
             why.append(f"{name} was {store.specs[name].dtype}, is to be {spec.dtype}")
     return tuple(why) or ("the order of episodes, or how actions are derived, changed",)
+
+
+def dtype_warnings(params: Params) -> tuple[str, ...]:
+    """Whether a half-precision model would run on a CPU; what a dask scheduler has is not known."""
+    from pipeline.device import resolve_device  # torch takes a second to import
+
+    narrow, workers = params.vlm.dtype, params.extract.workers
+    if narrow == "float32" or isinstance(workers, str):
+        return ()
+    if resolve_device(params.extract.device).type != "cpu":
+        return ()
+    return (
+        f"the model will run on the CPU in vlm.dtype {narrow}, which many CPUs only emulate, "
+        "slowly. Set vlm.dtype=float32, or extract on a GPU; decide before the first long run: a "
+        "feature's dtype is part of its identity, and no row is taken over by another dtype",
+    )
 
 
 def known_rows(

@@ -26,6 +26,7 @@ from pipeline.extraction.places import (
 )
 from pipeline.extraction.plan import (
     ExtractionPlan,
+    dtype_warnings,
     known_rows,
     reasons,
     store_bytes,
@@ -124,6 +125,7 @@ def _resume(
             free=free_bytes(build.part),
             rows_per_s=digests.rate(rate_name(surveyed, params)),
             reasons=(f"{reason} {build.part}",),
+            warnings=dtype_warnings(params),
         )
         for line in plan.lines():
             say(line)
@@ -197,6 +199,7 @@ def _new_plan(
         free=free_bytes(build.part),
         rows_per_s=digests.rate(rate_name(surveyed, params)),
         reasons=reasons(surveyed, store, build.specs),
+        warnings=dtype_warnings(params),
     )
 
 
