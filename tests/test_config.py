@@ -28,6 +28,38 @@ def test_the_projects_own_params_are_valid():
     assert [source.name for source in params.data.sources] == ["raw", "new", "old", "lerobot"]
 
 
+DEMO_ONLY = {
+    "data.sources",
+    # The demo's model is small and computes in float32 on a CPU, its frames are small.
+    "vlm.dtype",
+    "vlm.image_resize_height",
+    "vlm.image_resize_width",
+    # Its weights are random and must move further; a backward pass through it takes little memory.
+    "finetune.lr",
+    "finetune.tuning.gradient_checkpointing",
+}
+"""Keys that params.yaml sets otherwise than by default."""
+
+
+def test_a_minimal_file_means_what_the_projects_own_says(minimal):
+    """So that who begins with three lines gets the model, steps and slots of the documentation."""
+    ours, theirs = (
+        _flat(load_params(path).model_dump()) for path in (ROOT / "params.yaml", minimal)
+    )
+    assert {key for key in ours | theirs if ours.get(key) != theirs.get(key)} == DEMO_ONLY
+
+
+def _flat(section, above=""):
+    """Values by their full keys."""
+    if not isinstance(section, dict):
+        return {above: section}
+    return {
+        key: value
+        for name, inner in section.items()
+        for key, value in _flat(inner, f"{above}.{name}" if above else name).items()
+    }
+
+
 def test_overrides_are_yaml_and_reach_any_depth(minimal):
     params = load_params(
         minimal,

@@ -37,17 +37,17 @@ class FinetuneParams(Section):
     tuning: TuningParams = TuningParams()
     lr: float = Field(default=1e-4, gt=0)
     """Peak learning rate of the vision-language model; the policy has `train_head.lr`."""
-    batch_size: int = Field(default=32, ge=1)
+    batch_size: int = Field(default=16, ge=1)
     """Ticks a step."""
     grad_accumulation: int = Field(default=1, ge=1)
     """Parts that a step's ticks are computed in, one after the other."""
-    max_steps: int = Field(default=500, ge=1)
+    max_steps: int = Field(default=200, ge=1)
     """Steps of the run."""
-    warmup_steps: int = Field(default=50, ge=0)
+    warmup_steps: int = Field(default=20, ge=0)
     """Steps of linear warm-up."""
-    eval_every: int = Field(default=100, ge=1)
+    eval_every: int = Field(default=50, ge=1)
     """Steps between evaluations on held-out ticks."""
-    eval_ticks: int = Field(default=200, ge=1)
+    eval_ticks: int = Field(default=100, ge=1)
     """Held-out ticks judged in them at most: each costs a pass through the whole model."""
     checkpoint_every: int = Field(default=50, ge=1)
     """Steps between checkpoints."""

@@ -13,27 +13,27 @@ class SensorEncoderParams(Section):
     kind: Literal["joint", "force_aware"] = "joint"
     """One branch for all channels, or one of its own for force, so that it is not drowned."""
     channels: tuple[Annotated[int, Field(ge=1)], ...] = Field(
-        default=(128, 256, 256, 256), min_length=1
+        default=(64, 128, 128, 128), min_length=1
     )
     """Of each residual convolution block; every block halves the length."""
-    layers: int = Field(default=2, ge=0)
+    layers: int = Field(default=1, ge=0)
     """Transformer layers after the convolutions."""
-    heads: int = Field(default=8, ge=1)
+    heads: int = Field(default=4, ge=1)
     """Must divide the last of `channels`."""
-    output_dim: int = Field(default=256, ge=1)
+    output_dim: int = Field(default=128, ge=1)
     """Width of the encoded window."""
 
 
 class StateEncoderParams(Section):
     """Widths of the robot-state encoder."""
 
-    dim: int = Field(default=256, ge=1)
+    dim: int = Field(default=64, ge=1)
     """Width of its transformer."""
-    layers: int = Field(default=2, ge=0)
+    layers: int = Field(default=1, ge=0)
     """Transformer layers."""
-    heads: int = Field(default=8, ge=1)
+    heads: int = Field(default=4, ge=1)
     """Must divide `dim`."""
-    output_dim: int = Field(default=512, ge=1)
+    output_dim: int = Field(default=64, ge=1)
     """Width of the encoded window."""
     patch: int = Field(default=10, ge=1)
     """Readings a token."""
@@ -42,11 +42,11 @@ class StateEncoderParams(Section):
 class ExpertParams(Section):
     """Widths of the action expert, whichever it is."""
 
-    dim: int = Field(default=512, ge=1)
+    dim: int = Field(default=128, ge=1)
     """Width of its transformer, and of the context it attends to."""
-    layers: int = Field(default=4, ge=1)
+    layers: int = Field(default=2, ge=1)
     """Transformer layers."""
-    heads: int = Field(default=8, ge=1)
+    heads: int = Field(default=4, ge=1)
     """Must divide `dim`."""
     dropout: Annotated[float, Field(ge=0, lt=1)] = 0.1
     """While training."""
@@ -66,8 +66,9 @@ class DiffusionParams(Section):
     """Steps of the noise schedule."""
     schedule: Literal["cosine", "linear"] = "cosine"
     """How the noise grows over them."""
-    prediction: Literal["epsilon", "sample", "v"] = "epsilon"
-    """What the network predicts: the noise, the clean chunk, or the velocity between them."""
+    prediction: Literal["epsilon", "sample", "v"] = "v"
+    """What the network predicts: the noise, the clean chunk, or the velocity between them, which
+    learns fastest on the demo."""
     sampler: Literal["ddpm", "ddim"] = "ddim"
     """`ddpm` takes every step of the schedule, `ddim` as many as `sampling_steps`."""
     sampling_steps: int = Field(default=10, ge=1)

@@ -115,7 +115,7 @@ class VLMParams(Section):
     """Decoder layers whose output is taken; 0 is the first, -1 the last."""
     norms: tuple[bool, ...] = Field(default=(True,), min_length=1)
     """Whether the model's final norm is applied to what a layer gives; both may be asked for."""
-    pooling: tuple[Pooling, ...] = Field(default=("mean",), min_length=1)
+    pooling: tuple[Pooling, ...] = Field(default=("mean", "grid"), min_length=1)
     """Over which tokens: all, of images, of text, of each view, of 4 x 4 cells a view, the last."""
     variants: int = Field(default=1, ge=1)
     """Views of each row that are encoded and stored: the frames as they are, and variants - 1

@@ -60,7 +60,7 @@ class TrainHeadParams(Section):
     """Ticks a step, over all accumulated parts and all processes."""
     grad_accumulation: int = Field(default=1, ge=1)
     """Parts that a step's ticks are computed in on each process, one after the other."""
-    max_steps: int = Field(default=2000, ge=1)
+    max_steps: int = Field(default=500, ge=1)
     """Steps of the run; the learning rate's decay ends there."""
     lr_schedule: Literal["cosine", "trapezoid", "constant"] = "cosine"
     """After the warm-up: half a cosine to the floor, flat and then linear to it, or flat."""
@@ -68,7 +68,7 @@ class TrainHeadParams(Section):
     """Of `trapezoid`: the share of all steps that its final decay takes."""
     warmup_steps: int = Field(default=100, ge=0)
     """Steps of linear warm-up."""
-    lr: float = Field(default=3e-4, gt=0)
+    lr: float = Field(default=5e-4, gt=0)
     """Peak learning rate of AdamW."""
     sensor_lr: float | None = Field(default=None, gt=0)
     """Peak learning rate of the sensor encoder; `lr` where null."""
@@ -78,7 +78,7 @@ class TrainHeadParams(Section):
     """On matrices; norms, biases and embeddings are not decayed."""
     grad_clip: float = Field(default=1.0, gt=0)
     """Largest norm of the gradient."""
-    ema_decay: float = Field(default=0.999, ge=0, lt=1)
+    ema_decay: float = Field(default=0.995, ge=0, lt=1)
     """Of the average of weights that is evaluated and kept."""
     amp: Literal["auto", "off", "bfloat16"] = "auto"
     """bfloat16 autocast; `auto` where a CUDA device has it."""
@@ -88,7 +88,7 @@ class TrainHeadParams(Section):
         default_factory=dict
     )
     """Weight of each action group in the loss, 1 where not named."""
-    val_fraction: Fraction = 0.1
+    val_fraction: Fraction = 0.15
     """Share of episodes held out."""
     mixture: dict[str, Weight] = Field(default_factory=dict)
     """Weight of each tick of a source; 1 where not named.
@@ -97,7 +97,7 @@ class TrainHeadParams(Section):
     three times as often. (The weights of `create_unified_dataloader` are shares, whatever the
     sizes.)
     """
-    eval_every: int = Field(default=200, ge=1)
+    eval_every: int = Field(default=50, ge=1)
     """Steps between evaluations on held-out ticks."""
     eval_samples: int = Field(default=4, ge=1)
     """Chunks sampled a tick, whose mean is judged; experts that do not sample give one."""

@@ -126,7 +126,7 @@ class UnifiedVLADataset(Dataset[Sample]):
         of_item = np.repeat(names, [len(one.ticks) for one in self.episodes])
         return {name: np.flatnonzero(of_item == name) for name in dict.fromkeys(names.tolist())}
 
-    def split(self, val_fraction: float = 0.1) -> tuple[Subset[Sample], Subset[Sample]]:
+    def split(self, val_fraction: float = 0.15) -> tuple[Subset[Sample], Subset[Sample]]:
         """Items to train on and items held out: whole episodes, by `split_by_episode`.
 
         Over a store these are the sides that `stages.train_head` has. Over frames they are the

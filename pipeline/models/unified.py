@@ -38,10 +38,18 @@ else:  # a model that only ever sees cached features needs no transformers
     Frames = PreparedRow = Preparer = Any
     LiveVLM = nn.Module
 
-_SEED_WIDTHS: Mapping[str, Any] = {
-    "sensor_encoder": {"channels": (512, 1024, 1024, 1024), "output_dim": 1024},
+_SEED_PARTS: Mapping[str, Mapping[str, Any]] = {
+    "sensor_encoder": {
+        "channels": (512, 1024, 1024, 1024),
+        "layers": 2,
+        "heads": 8,
+        "output_dim": 1024,
+    },
+    "state_encoder": {"dim": 256, "layers": 2, "heads": 8, "output_dim": 512},
+    "expert": {"dim": 512, "layers": 4, "heads": 8},
+    "diffusion": {"prediction": "epsilon"},
 }
-"""Of the encoders this class has always had, where params.yaml has leaner defaults."""
+"""Of the parts this class has always had, where params.yaml has leaner defaults."""
 
 _ACTION_GROUPS = ("translation",) * 3 + ("rotation",) * 3 + ("gripper",)
 
@@ -85,6 +93,9 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
     ) -> None:
         """Build the policy; `vlm`, `tuning` and `head` are more params of those sections.
 
+        Of a part of the policy, such as `sensor_encoder`, what `head` does not name stays as this
+        class has always had it.
+
         `feature_dim` is the width of the checkpoint's hidden states: by default what a checkpoint
         folder says of itself, and 2048 (that of Qwen2.5-VL-3B) for a hub id. Of seven action
         channels three are translations, three rotations and one the gripper; of any other number
@@ -111,8 +122,7 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
                 "horizon": horizon,
                 "sensor_window": sensor_window,
                 "state_window": state_window,
-                **_SEED_WIDTHS,
-                **head,
+                **_with_seed_parts(head),
             }
         )
         slots, width = feature_shape(vlm_params, names)
@@ -210,6 +220,13 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
         from pipeline.vlm.preparation import Preparer
 
         return Preparer(self.vlm_params, self.load_vlm().spec)
+
+
+def _with_seed_parts(head: Mapping[str, Any]) -> dict[str, Any]:
+    """Params of `head`, where a part of which it names only some keys keeps this class's others."""
+    named = {name: head[name] for name in _SEED_PARTS if isinstance(head.get(name), Mapping)}
+    merged = {name: {**_SEED_PARTS[name], **part} for name, part in named.items()}
+    return {**_SEED_PARTS, **head, **merged}
 
 
 def _load(

@@ -40,6 +40,7 @@ def extracted(recordings: Path, demo_checkpoint: Path) -> FeatureStore:
             "image_resize_height": 56,
             "image_resize_width": 56,
             "dtype": "float32",
+            "pooling": ["mean"],
         },
         "extract": {"store": str(target)},
     }

@@ -242,6 +242,6 @@ def test_the_best_network_has_the_smallest_loss_there_is(
 def test_the_section_of_params_is_the_constructor() -> None:
     expert = DiffusionActionExpert(dim=8, layers=1, heads=1, **DiffusionParams().model_dump())
     assert expert.schedule.timesteps == 100
-    assert expert.prediction == "epsilon"
+    assert expert.prediction == DiffusionParams().prediction
     assert expert.steps == expert.schedule.steps(10)
     torch.testing.assert_close(expert.schedule.alpha_bar, NoiseSchedule(100, "cosine").alpha_bar)

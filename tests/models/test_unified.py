@@ -428,8 +428,13 @@ def test_the_arguments_it_has_always_had() -> None:
     params, shape = model.policy.params, model.policy.shape
     assert (params.model_type, params.fusion_strategy) == ("flow_matching", "concat")
     assert (params.horizon, params.sensor_window) == (8, 65)
-    assert params.sensor_encoder.channels == (512, 1024, 1024, 1024)
+    sensor, state, expert = params.sensor_encoder, params.state_encoder, params.expert
+    assert sensor.channels == (512, 1024, 1024, 1024)
+    assert (sensor.layers, sensor.heads, sensor.output_dim) == (2, 8, 1024)
+    assert (state.dim, state.layers, state.heads, state.output_dim) == (256, 2, 8, 512)
+    assert (expert.dim, expert.layers, expert.heads) == (512, 4, 8)
     assert (params.diffusion.timesteps, params.diffusion.schedule) == (100, "cosine")
+    assert params.diffusion.prediction == "epsilon"
     assert shape == PolicyShape(
         1, 2048, 1026, 12, 7, ("translation",) * 3 + ("rotation",) * 3 + ("gripper",)
     )
@@ -440,6 +445,16 @@ def test_the_arguments_it_has_always_had() -> None:
     assert (vlm.image_resize_height, vlm.image_resize_width) == (360, 640)
     chunk = model.eval()(features=torch.randn(2, 1, 2048), sensor=torch.randn(2, 650, 1026))
     assert chunk.shape == (2, 8, 7)
+
+
+def test_a_part_that_is_named_in_part_keeps_the_rest_of_it(
+    build: Callable[..., QwenVLAUnified],
+) -> None:
+    params = build(expert={"dim": 32, "heads": 2}, state_encoder={"dim": 16}).policy.params
+    assert (params.expert.dim, params.expert.heads, params.expert.layers) == (32, 2, 4)
+    assert (params.state_encoder.dim, params.state_encoder.output_dim) == (16, 512)
+    with pytest.raises(ValidationError):
+        build(expert=None)
 
 
 @pytest.mark.parametrize("fusion", ["concat", "cross_attention", "gated", "none"])
