@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator
 from itertools import islice
-from typing import NoReturn
 
 import torch
 from torch import nn
@@ -24,6 +23,7 @@ from pipeline.training.learner import Learner
 from pipeline.training.log import Row, TrainingLog, open_log
 from pipeline.training.optimizer import schedule
 from pipeline.training.plan import Plan
+from pipeline.training.progress import Progress
 from pipeline.training.run import Run
 from pipeline.training.speed import Speed
 from pipeline.training.state import TrainerState
@@ -105,14 +105,14 @@ class Trainer:
             deferred_interrupt() as interrupted,
             open_log(self.params, resumed, self._earlier, self.world) as log,
             self.front.feed(self.plan.draws(steps), windows, self.device) as feed,
-            self._open_bar() as bar,
+            Progress(self.step, self.params.max_steps, self.world.first) as progress,
         ):
             self.world.shared(self.run.begin)
             batches, speed = iter(feed), Speed(feed, self.device, self.step, self._trained_s)
             while not self._over:
                 stopped = self._train_step(batches, interrupted)
-                bar.update()
-                self._after_step(log, speed, bar, stopped)
+                progress.advance(self._loss)
+                self._after_step(log, speed, progress, stopped)
                 if stopped and not self._over:
                     raise KeyboardInterrupt
         self.world.shared(self.run.finish)
@@ -135,11 +135,6 @@ class Trainer:
     def _over(self) -> bool:
         return self.step == self.params.max_steps or self.standing.exhausted
 
-    def _open_bar(self) -> "tqdm[NoReturn]":
-        hidden = None if self.world.first else True
-        total = self.params.max_steps
-        return tqdm(initial=self.step, total=total, unit="step", disable=hidden)
-
     def _train_step(
         self, batches: Iterator[tuple[Draw, Batch]], interrupted: Callable[[], bool]
     ) -> bool:
@@ -151,16 +146,16 @@ class Trainer:
         return stopped
 
     def _after_step(
-        self, log: TrainingLog | None, speed: Speed, bar: "tqdm[NoReturn]", stopped: bool
+        self, log: TrainingLog | None, speed: Speed, progress: Progress, stopped: bool
     ) -> None:
         if self.step % self.params.eval_every == 0 or self._over:
             self._evaluate(log, speed)
         if self.step % LOG_EVERY == 0 or self._over:
-            self._write_down(log, speed, bar)
+            self._write_down(log, speed, progress)
         if self.step % self.params.checkpoint_every == 0 or self._over or stopped:
             self._save_last(log, speed)
 
-    def _write_down(self, log: TrainingLog | None, speed: Speed, bar: "tqdm[NoReturn]") -> None:
+    def _write_down(self, log: TrainingLog | None, speed: Speed, progress: Progress) -> None:
         self._check_finite()
         means = self.history.mean((self.step - 1) // LOG_EVERY * LOG_EVERY, self.step)
         rate = self.params.lr * schedule(self.step - 1, self.params)
@@ -171,7 +166,8 @@ class Trainer:
             log.write(self.step, {f"train/{k}": v for k, v in means.items()} | {"lr": rate})
             log.write_speed(self.step, pace)
             memory, waited = f"{pace.peak_memory / 2**30:.1f}G", f"{pace.data_wait_share:.0%}"
-            bar.set_postfix(loss=f"{means['loss']:.4f}", lr=f"{rate:.1e}", wait=waited, mem=memory)
+            loss = f"{means['loss']:.4f}"
+            progress.note(loss=loss, lr=f"{rate:.1e}", wait=waited, mem=memory)
 
         self.world.shared(write)
 
@@ -202,6 +198,11 @@ class Trainer:
             + (" (best so far)" if self.standing.improves(error) else "")
         )
         return metrics
+
+    def _loss(self) -> float:
+        """The loss of the newest step."""
+        self._check_finite()
+        return self.history.last("loss")
 
     def _check_finite(self) -> None:
         bad = self.history.settle()
