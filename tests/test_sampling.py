@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from pipeline.errors import ConfigError, StoreMismatch
 from pipeline.sampling import TickSampler, split_by_episode, ticks_by_source
+from pipeline.sampling.split import hash64
 from pipeline.store import FeatureStore
 
 
@@ -128,6 +129,32 @@ class TestSplit:
     def test_the_fraction_is_about_kept(self) -> None:
         held_out = split_by_episode(FakeStore([3] * 2000), 0.1).held_out_episodes
         assert 150 < len(held_out) < 250
+
+    @given(st.integers(2, 30), st.integers(1, 4), st.floats(0.01, 0.99))
+    @settings(deadline=None)
+    def test_a_source_of_two_recordings_keeps_one_to_train_on(
+        self, episodes: int, sources: int, fraction: float
+    ) -> None:
+        """And where all have one by the hash of names, nothing else decides."""
+        store = FakeStore([6] * episodes, sources="abcd"[:sources])
+        split = split_by_episode(store, fraction)
+        names = {source: set[str]() for source in store.sources}
+        for episode in store.episodes:
+            names[episode.source].add(f"{episode.source}/{episode.id}")
+        trained = store.names(split.train)
+        assert all(trained & own for own in names.values() if len(own) > 1)
+
+        drawn = {n for own in names.values() for n in own if hash64(n) / 2**64 < fraction}
+        if drawn and all(own - drawn for own in names.values()):
+            assert set(split.held_out_episodes) == drawn
+            assert split.note is None
+
+    def test_what_a_source_keeps_to_train_on_is_said(self) -> None:
+        """At 0.6 both recordings of a are drawn, by 0.37 and 0.60; b has one on either side."""
+        split = split_by_episode(FakeStore([6] * 4, sources="ab"), 0.6)
+        assert split.held_out_episodes == ("a/episode_0", "b/episode_3")
+        assert split.note is not None
+        assert "source 'a'" in split.note
 
     @pytest.mark.parametrize("fraction", [1e-9, 1.0])
     def test_of_two_one_is_held_out_and_one_trained_on(self, fraction: float) -> None:

@@ -1,7 +1,7 @@
 """Which ticks are trained on and which are held out."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,7 +38,8 @@ def split_by_episode(
 
     Episodes whose first VL keys are equal are one recording in several formats and share a side,
     by the hash of the first of their names. So an added episode moves none but other formats of
-    itself, save where a side would be empty: of two recordings one is held out, one trained on.
+    itself, save where a side would be empty: of two recordings one is held out, one trained on. And
+    of two or more recordings of a source one is trained on.
 
     A single recording is cut at one instant for all of its formats: the earliest at which the last
     20 % of a format's ticks begin. Ticks from there on are held out; ticks before it whose chunk
@@ -58,16 +59,21 @@ def split_by_episode(
         return _split_tail(store, next(iter(recordings.values())), horizon)
     ranks = {name: hash64(name) / 2**64 for name in recordings}
     chosen = {name for name, rank in ranks.items() if rank < val_fraction}
-    note = None
+    notes: list[str] = []
+    part = f"val_fraction {val_fraction} of {len(ranks)} recordings"
     if not chosen:
         chosen = {min(ranks, key=lambda name: ranks[name])}
-        note = f"val_fraction {val_fraction} of {len(ranks)} recordings is none; one is held out"
+        notes.append(f"{part} is none; one is held out")
     elif len(chosen) == len(ranks):
         chosen.remove(max(ranks, key=lambda name: ranks[name]))
-        note = f"val_fraction {val_fraction} of {len(ranks)} recordings is all; one is trained on"
+        notes.append(f"{part} is all; one is trained on")
+    for source, names in sorted(_recordings_by_source(recordings).items()):
+        if len(names) > 1 and names <= chosen:
+            chosen.remove(max(names, key=lambda name: ranks[name]))
+            notes.append(f"{part} is all of source {source!r}; one of it is trained on")
     train = [e for name, episodes in recordings.items() if name not in chosen for e in episodes]
     held_out = [e for name in chosen for e in recordings[name]]
-    return Split(_ticks(train), _ticks(held_out), _names(held_out), note)
+    return Split(_ticks(train), _ticks(held_out), _names(held_out), "; ".join(notes) or None)
 
 
 def episodes_by_recording(
@@ -92,6 +98,14 @@ def episodes_by_recording(
             )
             by_key.setdefault(key, []).append(episode)
     return {min(_names(episodes)): episodes for episodes in by_key.values()}
+
+
+def _recordings_by_source(recordings: Mapping[str, Sequence[Episode]]) -> dict[str, set[str]]:
+    names: dict[str, set[str]] = {}
+    for name, episodes in recordings.items():
+        for episode in episodes:
+            names.setdefault(episode.source, set()).add(name)
+    return names
 
 
 def _split_tail(store: FeatureStore, episodes: list[Episode], horizon: int) -> Split:

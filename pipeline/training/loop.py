@@ -28,7 +28,7 @@ from pipeline.training.run import Run
 from pipeline.training.speed import Speed
 from pipeline.training.state import TrainerState
 from pipeline.training.statistics import fit_normalization
-from pipeline.training.summary import closing, describe_data, describe_learner
+from pipeline.training.summary import closing, data_warnings, describe_data, describe_learner
 from pipeline.training.world import World, process_device
 
 LOG_EVERY = 10
@@ -129,6 +129,7 @@ class Trainer:
             f"device {self.device}{several}, {precision}"
             f"{', compiled' if self.params.compile else ''}; "
             f"steps {self.step} to {self.params.max_steps}",
+            *data_warnings(self.store, self.shape, self.params, self.split),
         ]
 
     @property

@@ -1,12 +1,13 @@
 """What a run trains, from what, and what it took, in words."""
 
+import numpy as np
 import torch
 
 from pipeline.amounts import duration, size
 from pipeline.config import TrainHeadParams
 from pipeline.models import Policy, PolicyShape
 from pipeline.models.cost import describe_cost
-from pipeline.sampling import Split
+from pipeline.sampling import Split, ticks_by_source
 from pipeline.store import FeatureStore
 from pipeline.training.judging import Standing
 from pipeline.training.learner import Learner
@@ -26,18 +27,49 @@ def describe_data(
     ]
     if split.note:
         lines.append(f"split: {split.note}")
-    streams = {
+    for stream, (stored, _, switch) in _streams(store, shape).items():
+        if not stored:
+            lines.append(f"{stream}: absent from the store, its encoder is disabled")
+        elif not getattr(params, switch):
+            lines.append(f"{stream}: disabled by train_head.{switch}")
+    return lines
+
+
+def data_warnings(
+    store: FeatureStore, shape: PolicyShape, params: TrainHeadParams, split: Split
+) -> list[str]:
+    """Lines on what the store has and the training episodes have not: a source, a stream."""
+    trained, whole = (
+        ticks_by_source(store, ticks) for ticks in (split.train, np.arange(store.ticks))
+    )
+    lost = [
+        f"source {source!r}: all of its episodes are held out. The policy is judged on them and "
+        "learns nothing from them"
+        for source, ticks in whole.items()
+        if len(ticks) and not len(trained[source]) and params.mixture.get(source, 1) > 0
+    ]
+    lost += [
+        f"{stream}: in the store, but absent from the training episodes. The policy learns without "
+        "it"
+        for stream, (stored, known, switch) in _streams(store, shape).items()
+        if stored and not known and getattr(params, switch)
+    ]
+    return [
+        f"warning: {what}. Episodes are held out by the hash of their names, "
+        f"train_head.val_fraction {params.val_fraction:g} of them: set a smaller one (0 holds none "
+        "out), or extract more episodes with it"
+        for what in lost
+    ]
+
+
+def _streams(store: FeatureStore, shape: PolicyShape) -> dict[str, tuple[int, int, str]]:
+    """Of each stream its width in the store and in training, and the key that disables it."""
+    slots, dim = store.feature_shape
+    return {
         "sensor": (store.sensor_channels, shape.sensor_channels, "sensor_enabled"),
         "state": (store.state_dim, shape.state_dim, "robot_state_enabled"),
         "features": (slots * dim, slots * dim, "features_enabled"),
     }
-    for stream, (stored, trained, switch) in streams.items():
-        if not trained:
-            lacking = "the training episodes" if stored else "the store"
-            lines.append(f"{stream}: absent from {lacking}, its encoder is disabled")
-        elif not getattr(params, switch):
-            lines.append(f"{stream}: disabled by train_head.{switch}")
-    return lines
 
 
 def describe_learner(learner: Learner, policy: Policy) -> list[str]:
