@@ -1,15 +1,41 @@
 """What every command shares: its options, its exit codes, a clean stop."""
 
-import argparse
-import json
+import os
 import signal
 import sys
+from types import FrameType
+
+STOPPED = "stopped; run the same command again"
+
+
+def _stop_at_once(signum: int, frame: FrameType | None) -> None:
+    """End without a traceback: while a command imports, it has begun nothing."""
+    os.write(2, f"{STOPPED}\n".encode())
+    os._exit(1)
+
+
+def _stop_without_traceback() -> None:
+    """Where this process is a command: until its work begins, which `_catch_signals` says.
+
+    What a shell or nohup has told to be ignored stays so.
+    """
+    running = getattr(sys.modules["__main__"], "__spec__", None)
+    if running is not None and running.name.startswith("stages."):
+        for number in (signal.SIGINT, signal.SIGTERM):
+            if signal.getsignal(number) in (signal.default_int_handler, signal.SIG_DFL):
+                signal.signal(number, _stop_at_once)
+
+
+_stop_without_traceback()  # here, for what is imported below takes a while
+
+import argparse
+import json
+import select
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from pipeline.config import Params, described_keys, load_params
@@ -62,10 +88,28 @@ def run(
     """Parse the options, do the work, return the exit code.
 
     0 done; 2 something the user can mend, said in one message without a traceback; 1 stopped by
-    Ctrl-C or SIGTERM, or a bug, which keeps its traceback. `work` may name a module whose `main` it
-    is: it is imported, which takes seconds, once options and params are known to be good.
-    `sections` are those of params.yaml that `--keys` lists.
+    Ctrl-C or SIGTERM, by a reader of the output that has gone (`| head`), or by a bug, which keeps
+    its traceback. `work` may name a module whose `main` it is: it is imported, which takes seconds,
+    once options and params are known to be good. `sections` are those of params.yaml that `--keys`
+    lists.
     """
+    try:
+        code = _run(summary, work, arguments, shorthands, sections)
+        sys.stdout.flush()  # not at the interpreter's exit, where an error is said in any case
+    except BrokenPipeError:
+        _write_to_nobody()
+        return 1
+    return code
+
+
+def _run(
+    summary: str,
+    work: Callable[[Params], None] | str,
+    arguments: Sequence[str] | None,
+    shorthands: Sequence[Shorthand],
+    sections: Sequence[str],
+) -> int:
+    """`run`, which raises `BrokenPipeError` where nobody reads the output any more."""
     parser = argparse.ArgumentParser(
         description=summary, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -90,27 +134,32 @@ def run(
         known = ["--params", "--set", "--keys", *(one.name for one in shorthands)]
         parser.error(f"unrecognized arguments: {' '.join(unknown)}{_meant(unknown, known)}")
     if options.keys:
-        print("\n".join(described_keys(sections or tuple(Params.model_fields))))
+        try:
+            print("\n".join(described_keys(sections or tuple(Params.model_fields))), flush=True)
+        except BrokenPipeError:  # who reads has read enough
+            _write_to_nobody()
         return 0
     overrides = [
         *options.overrides,
         *(one for each in shorthands for one in each.override(options)),
     ]
-    signal.signal(signal.SIGTERM, _terminate)
     try:
         params = load_params(options.params, overrides)
         main = import_module(work).main if isinstance(work, str) else work
+        _catch_signals()
         main(params)
     except PipelineError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except OSError as error:
+        if isinstance(error, BrokenPipeError) and _is_unread():
+            raise
         place = f"{error.filename}: " if error.filename else ""
         said = f"{place}{error.strerror or error}. Look at that path, then run the same again."
         print(f"error: {said}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("stopped; run the same command again", file=sys.stderr)
+        print(STOPPED, file=sys.stderr)
         return 1
     return 0
 
@@ -127,6 +176,26 @@ def _meant(unknown: Sequence[str], known: Sequence[str]) -> str:
     else:
         meant = f"--set {first}" if equals else ""
     return f"; did you mean {meant}?" if meant else ""
+
+
+def _is_unread() -> bool:
+    """Whether what reads stdout or stderr has gone; other pipes break for reasons of their own."""
+    poll = select.poll()
+    for stream in (sys.stdout, sys.stderr):
+        poll.register(stream, 0)
+    return bool(poll.poll(0))
+
+
+def _write_to_nobody() -> None:
+    """What stdout still holds must not fail again when the interpreter exits."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _catch_signals() -> None:
+    """From here on Ctrl-C and SIGTERM stop through every `finally`."""
+    if signal.getsignal(signal.SIGINT) is _stop_at_once:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, _terminate)
 
 
 def _terminate(signum: int, frame: FrameType | None) -> None:

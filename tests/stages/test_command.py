@@ -144,6 +144,67 @@ def test_one_and_a_word_when_stopped(capsys, sent):
     assert "run the same command again" in capsys.readouterr().err
 
 
+def in_a_process(arguments, stdout, folder):
+    """Exit code and stderr of a Python of its own, started in this folder."""
+    done = subprocess.run(
+        [sys.executable, *arguments],
+        cwd=folder,
+        stdout=stdout,
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
+    return done.returncode, done.stderr
+
+
+@pytest.fixture
+def nobody():
+    """The end to write to of a pipe from which nobody reads."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    yield writing
+    os.close(writing)
+
+
+def test_keys_for_a_reader_that_has_gone(nobody, tmp_path):
+    """Such as `| head -1`."""
+    assert in_a_process(["-m", "stages.train_head", "--keys"], nobody, tmp_path) == (0, "")
+
+
+WORK = """
+import sys
+from stages.command import run
+raise SystemExit(run("", {work}, ["--params", {params!r}]))
+"""
+
+
+@pytest.mark.parametrize("work", ["print", "lambda params: print('x' * 100_000)"])
+def test_one_and_no_word_where_nobody_reads_what_work_prints(nobody, tmp_path, work):
+    code = WORK.format(work=work, params=PARAMS)
+    assert in_a_process(["-c", code], nobody, tmp_path) == (1, "")
+
+
+def test_another_broken_pipe_is_said(capfd):
+    def work(params):
+        raise BrokenPipeError(32, "Broken pipe")
+
+    assert run("Summary.", work, ["--params", PARAMS]) == 2
+    assert "Broken pipe" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("sent", ["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize("module", ["yaml", "torch"])
+def test_one_and_a_word_when_stopped_while_it_imports(tmp_path, module, sent):
+    """Of its own options, and of its work."""
+    (tmp_path / f"{module}.py").write_text(
+        f"import os, signal\nos.kill(os.getpid(), signal.{sent})\n"
+    )
+    arguments = ["-m", "stages.demo", "--params", PARAMS]
+    ended = in_a_process(arguments, subprocess.DEVNULL, tmp_path)
+    assert ended == (1, "stopped; run the same command again\n")
+
+
 def test_work_that_is_named_is_imported_when_the_params_are_good(monkeypatch, tmp_path):
     (tmp_path / "named_work.py").write_text("seen = []\nmain = seen.append\n")
     monkeypatch.syspath_prepend(tmp_path)

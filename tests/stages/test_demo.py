@@ -47,6 +47,26 @@ def test_writes_recordings_and_checkpoint(
     assert "2 episodes" in capsys.readouterr().out
 
 
+def test_stopped_while_it_writes_the_same_command_goes_on(
+    params: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def stopped(folder: Path, seed: int) -> None:
+        write_weights(folder, seed)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(demo, "write_demo_recordings", lambda *given: None)
+    monkeypatch.setattr(demo, "write_demo_checkpoint", stopped)
+    assert command.run("", demo.main, ["--params", str(params)]) == 1
+    assert capsys.readouterr().err == "stopped; run the same command again\n"
+    assert not (tmp_path / "vlm").exists()
+    monkeypatch.setattr(demo, "write_demo_checkpoint", write_weights)
+    assert command.run("", demo.main, ["--params", str(params)]) == 0
+    assert (tmp_path / "vlm/weights").exists()
+
+
 def test_a_checkpoint_that_the_demo_did_not_write_is_left_alone(
     params: Path,
     tmp_path: Path,
