@@ -45,6 +45,7 @@ def vlm_params(demo_checkpoint: Path) -> Callable[..., VLMParams]:
             "dtype": "float32",
             "image_resize_height": 112,
             "image_resize_width": 140,
+            "pooling": ["mean"],
         }
         return VLMParams.model_validate(small | changes)
 
