@@ -61,4 +61,5 @@ def whole_model(case: Case, params: Params) -> Any:
         whole = load_whole(params.vlm, torch.device(case.device))
         return whole.eval().requires_grad_(False)
     torch.manual_seed(0)
-    return random_model(Qwen2_5_VLConfig.from_pretrained(params.vlm.checkpoint), case.device)
+    config = Qwen2_5_VLConfig.from_pretrained(params.vlm.checkpoint, trust_remote_code=False)
+    return random_model(config, case.device)

@@ -78,7 +78,7 @@ def measure(case: Case, folder: Path, options: Namespace) -> Findings:
         best = _best_batch(ways, case)
         deviation = _deviation(case, ways, ours)
         cost = RowCost.of(
-            Qwen2_5_VLConfig.from_pretrained(params.vlm.checkpoint),
+            Qwen2_5_VLConfig.from_pretrained(params.vlm.checkpoint, trust_remote_code=False),
             workload.survey.spec.image_size,
             images=case.views,
             text_tokens=workload.text_tokens(),

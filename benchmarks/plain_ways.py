@@ -38,8 +38,12 @@ class PlainWays:
         self._whole, self._workload, self._folder = whole, workload, folder
         self._device = whole.device
         self._renderer = PromptRenderer(Path(vlm.checkpoint), vlm.prompt)
-        self._processor: Any = AutoImageProcessor.from_pretrained(vlm.checkpoint)
-        self._tokenizer: Any = AutoTokenizer.from_pretrained(vlm.checkpoint, padding_side="right")
+        self._processor: Any = AutoImageProcessor.from_pretrained(
+            vlm.checkpoint, trust_remote_code=False
+        )
+        self._tokenizer: Any = AutoTokenizer.from_pretrained(
+            vlm.checkpoint, padding_side="right", trust_remote_code=False
+        )
         self._image_token = self._tokenizer.convert_ids_to_tokens(self._renderer.image_token_id)
         self.preparing_s = 0.0
         folder.mkdir(parents=True, exist_ok=True)

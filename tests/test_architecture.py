@@ -94,6 +94,17 @@ def test_heavy_libraries_stay_in_their_rooms(module):
             assert top != "torch", f"{module} imports torch"
 
 
+@pytest.mark.parametrize("folder", ["pipeline", "stages", "benchmarks"])
+def test_nothing_is_loaded_that_could_run_its_own_code(folder):
+    """peft's loaders know no `trust_remote_code` and run nothing of an adapter's folder."""
+    for path in (ROOT / folder).rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and ast.unparse(node.func).endswith(".from_pretrained"):
+                said = {word.arg: ast.unparse(word.value) for word in node.keywords}
+                from_peft = ast.unparse(node.func).startswith("Peft")
+                assert from_peft or said.get("trust_remote_code") == "False", (path, node.lineno)
+
+
 def reached(module: str) -> set[str]:
     """The project's modules that importing this one runs, packages on the way included."""
     found: set[str] = set()

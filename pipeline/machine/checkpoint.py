@@ -5,8 +5,6 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from safetensors import SafetensorError, safe_open
-
 from pipeline.amounts import size
 from pipeline.config import Params, VLMParams
 from pipeline.errors import VLMError
@@ -18,6 +16,7 @@ from pipeline.vlm.checkpoint_folder import (
     adapter_files,
     cached_checkpoint,
     could_be_hub_id,
+    tensor_headers,
     tokenizer_files,
     weight_files,
 )
@@ -118,12 +117,6 @@ def parameter_count(files: Sequence[Path]) -> int:
 
     Raises `VLMError` where one is cut off.
     """
-    count = 0
-    for path in (path for path in files if path.suffix == ".safetensors"):
-        try:
-            with safe_open(path, "numpy") as file:
-                shapes = [file.get_slice(name).get_shape() for name in file.keys()]  # noqa: SIM118
-        except SafetensorError as error:
-            raise VLMError(f"{path}: cut off or damaged: {error}") from None
-        count += sum(map(math.prod, shapes))
-    return count
+    weights = (path for path in files if path.suffix == ".safetensors")
+    shapes = (shape for path in weights for _, shape in tensor_headers(path).values())
+    return sum(map(math.prod, shapes))

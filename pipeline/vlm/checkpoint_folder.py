@@ -1,13 +1,19 @@
 """Where a checkpoint or an adapter lies on disk, and which of its files decide what it says."""
 
 import json
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
+
+from safetensors import SafetensorError, safe_open
 
 from pipeline.errors import VLMError
 
 _WANTED = ["*.json", "*.safetensors", "*.txt", "*.jinja"]
 """What is fetched from the hub: never a pickle."""
+
+_DTYPES = {"F32", "F16", "BF16"}
+"""What safetensors calls the dtypes that weights may have."""
 
 
 def resolve_checkpoint(
@@ -54,14 +60,12 @@ def cached_checkpoint(checkpoint: str, revision: str | None) -> Path | None:
 def _is_complete(folder: Path) -> bool:
     try:
         if (folder / "adapter_config.json").exists():
-            adapter_files(folder)
-        else:
-            _present_weights(folder)
-            tokenizer_files(folder)
-            return (folder / "preprocessor_config.json").exists()
+            return (folder / "adapter_model.safetensors").exists()
+        _present_weights(folder)
+        tokenizer_files(folder)
+        return (folder / "preprocessor_config.json").exists()
     except VLMError:
         return False
-    return True
 
 
 def _downloaded(checkpoint: str, revision: str | None, setting: str) -> Path:
@@ -102,21 +106,82 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_config(folder: Path) -> dict[str, Any]:
-    """The checkpoint's config.json; `VLMError` unless it is a Qwen2.5-VL."""
+    """The checkpoint's config.json.
+
+    Raises `VLMError` unless it is a Qwen2.5-VL without code of its own and without quantization.
+    """
     config = read_json(folder / "config.json")
     if config.get("model_type") != "qwen2_5_vl":
         raise VLMError(
             f"{folder / 'config.json'}: expected model_type 'qwen2_5_vl', found "
             f"{config.get('model_type')!r}. Set vlm.checkpoint to a Qwen2.5-VL checkpoint."
         )
+    _refuse_code(folder)
+    for quantization in _entries(config, "quantization_config"):
+        raise VLMError(
+            f"{folder / 'config.json'}: expected weights of float32, float16 or bfloat16, found "
+            f"a quantization_config: {json.dumps(quantization):.200}. Set vlm.checkpoint to the "
+            "checkpoint that was quantized, or save this one dequantized."
+        )
     return config
+
+
+def _refuse_code(folder: Path) -> None:
+    """Raise `VLMError` where a checkpoint or an adapter names Python code of its own."""
+    for path in sorted(folder.glob("*config.json")):
+        for code in _entries(read_json(path), "auto_map"):
+            raise VLMError(
+                f"{path}: the checkpoint carries code of its own, which this project never runs: "
+                f"its auto_map names {json.dumps(code):.200}. Expected a checkpoint that "
+                "transformers' own classes read: set vlm.checkpoint (or vlm.adapter) to such a "
+                "checkpoint. If you know that the code changes no feature, remove auto_map from "
+                "that file and name transformers' own class."
+            )
+
+
+def _entries(document: Any, key: str) -> Iterator[Any]:
+    """What stands under this key at any depth of a JSON document, if it is not empty."""
+    if isinstance(document, dict):
+        for name, value in document.items():
+            if name == key and value:
+                yield value
+            else:
+                yield from _entries(value, key)
+
+
+def tensor_headers(path: Path) -> dict[str, tuple[str, list[int]]]:
+    """Dtype, as safetensors calls it, and shape of each tensor of a file; no weight is read.
+
+    Raises `VLMError` where the file is cut off or damaged.
+    """
+    try:
+        with safe_open(path, "numpy") as file:
+            tensors = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118
+            return {name: (one.get_dtype(), one.get_shape()) for name, one in tensors.items()}
+    except SafetensorError as error:
+        raise VLMError(f"{path}: cut off or damaged: {error}. Copy or download it again.") from None
+
+
+def _refuse_other_dtypes(files: Sequence[Path]) -> None:
+    """Raise `VLMError` where a weight is no float, which would be loaded as if it were one."""
+    for path in (path for path in files if path.suffix == ".safetensors"):
+        dtypes = {name: dtype for name, (dtype, _) in tensor_headers(path).items()}
+        other = [f"{name} of {dtype}" for name, dtype in dtypes.items() if dtype not in _DTYPES]
+        if other:
+            raise VLMError(
+                f"{path}: expected weights of float32, float16 or bfloat16 (F32, F16, BF16), "
+                f"found {len(other)} of {len(dtypes)} tensors of another dtype, such as "
+                f"{other[0]}. A quantized checkpoint gives other features: take the one that it "
+                "was made from, or save it dequantized."
+            )
 
 
 def weight_files(folder: Path) -> list[Path]:
     """Every file that decides the weights, sorted: config.json, safetensors and their index.
 
-    Raises `VLMError` where there is none, where the index names a file that is missing, and where
-    transformers would load other files than these.
+    Raises `VLMError` where there is none, where the index names a file that is missing, where
+    transformers would load other files than these, where a file is damaged, and where weights are
+    not float32, float16 or bfloat16.
     """
     if (folder / "adapter_config.json").exists():
         raise VLMError(
@@ -134,6 +199,8 @@ def weight_files(folder: Path) -> list[Path]:
             f"{len(shards)} weight file(s). Remove {whole.name} if the shards are the checkpoint, "
             f"else {index.name} and the shards."
         )
+    read_config(folder)
+    _refuse_other_dtypes(files)
     return files
 
 
@@ -155,7 +222,7 @@ def _present_weights(folder: Path) -> list[Path]:
             "weights (*.bin, *.pt) are not opened."
         )
     config = folder / "config.json"
-    read_config(folder)
+    read_json(config)
     return sorted([config, *shards])
 
 
@@ -174,7 +241,10 @@ def tokenizer_files(folder: Path) -> list[Path]:
 
 
 def adapter_files(folder: Path) -> list[Path]:
-    """The files that decide what an adapter adds, sorted; `VLMError` where one is missing."""
+    """The files that decide what an adapter adds, sorted.
+
+    Raises `VLMError` where one is missing or damaged, or its weights are no floats.
+    """
     files = [folder / "adapter_config.json", folder / "adapter_model.safetensors"]
     for path in files:
         if not path.exists():
@@ -182,5 +252,6 @@ def adapter_files(folder: Path) -> list[Path]:
                 f"{path}: no such file. Expected a peft adapter folder with adapter_config.json "
                 "and adapter_model.safetensors (save it with `save_pretrained`)."
             )
-    read_json(files[0])
+    _refuse_code(folder)
+    _refuse_other_dtypes(files)
     return files

@@ -120,6 +120,7 @@ def load_checkpoint(vlm: VLMParams, device: torch.device, dtype: str | None = No
                 dtype=dtype or vlm.dtype,
                 attn_implementation=attention,
                 local_files_only=True,
+                trust_remote_code=False,
                 output_loading_info=True,
             )
     except (OSError, ValueError, RuntimeError, ImportError, TypeError, SafetensorError) as error:

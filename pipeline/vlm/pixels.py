@@ -56,7 +56,9 @@ class PixelSettings:
         from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import smart_resize
 
         try:
-            processor: Any = AutoImageProcessor.from_pretrained(folder, local_files_only=True)
+            processor: Any = AutoImageProcessor.from_pretrained(
+                folder, local_files_only=True, trust_remote_code=False
+            )
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise VLMError(
                 f"{folder}: preprocessor_config.json is missing or cannot be read: {error}"

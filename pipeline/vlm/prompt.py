@@ -31,7 +31,9 @@ class PromptRenderer:
         config = read_config(folder)
         tokenizer_files(folder)
         try:
-            self._tokenizer: Any = AutoTokenizer.from_pretrained(folder, local_files_only=True)
+            self._tokenizer: Any = AutoTokenizer.from_pretrained(
+                folder, local_files_only=True, trust_remote_code=False
+            )
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise VLMError(f"{folder}: the tokenizer cannot be read: {error}") from error
         self._folder = folder

@@ -5,6 +5,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
+from safetensors.torch import save_file
 
 from pipeline.config import Params
 from pipeline.machine.checkpoint import check_adapter, check_checkpoint, check_fit
@@ -96,7 +98,11 @@ def test_an_adapter(tmp_path: Path) -> None:
     (tmp_path / "adapter_config.json").write_text("{}")
     half = check_adapter(str(tmp_path))
     assert half.level == "missing" and "adapter_model.safetensors" in half.found
-    (tmp_path / "adapter_model.safetensors").write_bytes(b"")
+    weights = tmp_path / "adapter_model.safetensors"
+    weights.write_bytes(b"")
+    damaged = check_adapter(str(tmp_path))
+    assert damaged.level == "missing" and "cut off or damaged" in damaged.found
+    save_file({"lora_A.weight": torch.zeros(2, 2)}, weights)
     assert check_adapter(str(tmp_path)).level == "ok"
 
 

@@ -1,8 +1,10 @@
 """Every weight is accounted for, whatever the checkpoint's naming, with an adapter or without."""
 
+import io
 import json
 import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,11 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 from transformers import Qwen2_5_VLForConditionalGeneration
 
+from pipeline.config import VLMParams
 from pipeline.errors import ConfigError, VLMError
+from pipeline.vlm.loading import load_model
+from pipeline.vlm.pixels import PixelSettings
+from pipeline.vlm.prompt import PromptRenderer
 
 # peft 0.21 reads an attribute that transformers 5.23 calls deprecated.
 pytestmark = pytest.mark.filterwarnings("ignore:`is_gradient_checkpointing`:FutureWarning")
@@ -146,7 +152,7 @@ def test_no_weight_is_ever_random(
 def test_damaged_folders_are_named(encode: Encode, copy: Path) -> None:
     weights = (copy / "model.safetensors").read_bytes()
     (copy / "model.safetensors").write_bytes(weights[:-1000])
-    with pytest.raises(VLMError, match="cannot be loaded"):
+    with pytest.raises(VLMError, match=r"model\.safetensors: cut off or damaged"):
         encode(checkpoint=str(copy))
     (copy / "model.safetensors").rename(copy / "pytorch_model.bin")
     with pytest.raises(VLMError, match=r"no \*\.safetensors"):
@@ -160,6 +166,93 @@ def test_damaged_folders_are_named(encode: Encode, copy: Path) -> None:
     (copy / "config.json").write_text("{")
     with pytest.raises(VLMError, match="cannot be read as JSON"):
         encode(checkpoint=str(copy))
+
+
+def _add(path: Path, entries: dict[str, Any]) -> None:
+    document = json.loads(path.read_text()) if path.exists() else {}
+    path.write_text(json.dumps(document | entries))
+
+
+EVIL = """
+from pathlib import Path
+Path({marker!r}).touch()
+raise SystemExit("code of the checkpoint ran")
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "entries"),
+    [
+        (
+            "preprocessor_config.json",
+            {"image_processor_type": "Own", "auto_map": {"AutoImageProcessor": "evil.Own"}},
+        ),
+        ("config.json", {"auto_map": {"AutoConfig": "evil.Own", "AutoModel": "evil.Own"}}),
+        (
+            "tokenizer_config.json",
+            {"tokenizer_class": "Own", "auto_map": {"AutoTokenizer": ["evil.Own", "evil.Own"]}},
+        ),
+        (
+            "processor_config.json",
+            {
+                "image_processor": {
+                    "image_processor_type": "Own",
+                    "auto_map": {"AutoImageProcessor": "evil.Own"},
+                }
+            },
+        ),
+    ],
+)
+def test_code_of_a_checkpoint_never_runs_whatever_is_answered(
+    encode: Encode,
+    copy: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    name: str,
+    entries: dict[str, Any],
+) -> None:
+    marker = tmp_path / "ran"
+    (copy / "evil.py").write_text(EVIL.format(marker=str(marker)))
+    _add(copy / name, entries)
+    # Where transformers puts the code that it runs.
+    monkeypatch.setattr("transformers.dynamic_module_utils.HF_MODULES_CACHE", str(tmp_path / "hf"))
+    doors: list[Callable[[], object]] = [
+        lambda: PixelSettings.read(copy, (56, 56)),
+        lambda: PromptRenderer(copy, "{instruction}"),
+        lambda: load_model(VLMParams(checkpoint=str(copy)), 1, torch.device("cpu")),
+        lambda: encode(checkpoint=str(copy)),
+    ]
+    for door in doors:
+        monkeypatch.setattr("sys.stdin", io.StringIO("y\n" * 100))
+        with suppress(VLMError):
+            door()
+        assert not marker.exists(), "code of the checkpoint ran"
+    with pytest.raises(
+        VLMError, match=rf"{name}: the checkpoint carries code of its own.*evil\.Own"
+    ):
+        encode(checkpoint=str(copy))
+
+
+def _as_integers(weights: dict[str, Tensor]) -> dict[str, Tensor]:
+    name = "model.layers.1.mlp.down_proj.weight"
+    return weights | {name: (weights[name] * 100).to(torch.int8)}
+
+
+@pytest.mark.parametrize("quantization", [{"quant_method": "zip"}, {"load_in_8bit": True}])
+def test_a_quantized_checkpoint_is_refused_before_it_is_loaded(
+    encode: Encode, copy: Path, quantization: dict[str, Any]
+) -> None:
+    _add(copy / "config.json", {"quantization_config": quantization})
+    with pytest.raises(VLMError, match=rf"config\.json.*bfloat16.*{next(iter(quantization))}"):
+        encode(checkpoint=str(copy))
+
+
+def test_weights_that_are_no_floats_are_refused(encode: Encode, copy: Path) -> None:
+    _rewrite(copy, _as_integers)
+    with pytest.raises(VLMError, match=r"model\.safetensors.*1 of .*layers\.1\.mlp.*of I8"):
+        encode(checkpoint=str(copy))
+    _rewrite(copy, lambda weights: {name: one.half() for name, one in weights.items()})
+    encode(checkpoint=str(copy))
 
 
 def test_what_this_machine_cannot_do_is_said(extractor: Callable[..., Any], encode: Encode) -> None:
