@@ -9,6 +9,7 @@
 `digests`      content digests of files, remembered
 `durable`      files that survive a kill
 `device`       which device does the tensor maths
+`scheduler`    dask processes that nobody else reaches, or the user's own scheduler
 `recordings`   files on disk -> Recording
 `vlm`          the frozen Qwen2.5-VL, and what a feature is
 `store`        the seam: a zarr store that is also a set of flat files

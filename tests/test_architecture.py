@@ -11,7 +11,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 TIERS = (
     {"errors"},
-    {"amounts", "channels", "config", "digests", "device", "durable"},
+    {"amounts", "channels", "config", "digests", "device", "durable", "scheduler"},
     {"recordings", "vlm", "store", "normalization", "models"},
     {"timeline", "simulation", "sampling", "checkpoint"},
     {"batches", "extraction"},

@@ -1,5 +1,6 @@
 """Stage one on dask workers: the same store, whatever dies on the way."""
 
+import asyncio
 import json
 import math
 import os
@@ -11,21 +12,24 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from urllib.error import HTTPError
+from urllib.request import urlopen
 
 import dask
 import numpy as np
 import pytest
-from distributed import LocalCluster
+from distributed import LocalCluster, Security, rpc
 
 from pipeline import errors
 from pipeline.config import Params
 from pipeline.digests import ContentDigests, file_digest
 from pipeline.errors import ConfigError, PipelineError, RecordingError, StoreIncomplete, VLMError
 from pipeline.extraction import extract
-from pipeline.extraction.connection import check_scheduler
+from pipeline.extraction.connection import check_scheduler, connected
 from pipeline.extraction.fill import rate_name
 from pipeline.extraction.job import Job
 from pipeline.extraction.places import ledger_path
@@ -192,6 +196,19 @@ def assert_same(store: Path, expected: FeatureStore) -> None:
     assert np.allclose(found.array("vl/features"), expected.array("vl/features"), atol=2e-5)
 
 
+def reached_by_others(address: str) -> bool:
+    """Whether dask at this address answers someone with a certificate of their own."""
+
+    async def answered() -> bool:
+        own = Security.temporary().get_connection_args("client") | {"require_encryption": False}
+        async with rpc(address, timeout=2, connection_args=own) as other:
+            return bool(await other.identity())
+
+    with suppress(OSError):
+        return asyncio.run(asyncio.wait_for(answered(), 2))
+    return False
+
+
 def missing_of(store: Path) -> set[int]:
     part = part_path(store)
     plan = read_plan(part)
@@ -345,9 +362,11 @@ class TestRefusals:
             run(params)
         assert max(workers.tried().values()) <= 4, "no range is tried again"
 
-    @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense://here"])
+    @pytest.mark.parametrize(
+        "address", ["tcp://127.0.0.1:9", "nonsense://here", "tls://127.0.0.1:9"]
+    )
     def test_a_wrong_address(self, changed, monkeypatch, address):
-        monkeypatch.setattr("pipeline.extraction.connection._TIMEOUT_S", 1)
+        monkeypatch.setattr("pipeline.scheduler.TIMEOUT_S", 1)
         wrong = changed(extract={"workers": address})
         for reach in (run, lambda params: check_scheduler(params.extract)):
             with pytest.raises(ConfigError, match="no dask scheduler answers at"):
@@ -430,6 +449,21 @@ class TestScheduler:
 
 
 class TestLocalProcesses:
+    def test_nobody_else_reaches_them(self, params):
+        extract = params.extract.model_copy(update={"workers": 1, "decode_threads": 1})
+        with connected(extract) as client:
+            assert client.submit(abs, -1).result() == 1
+            known = client.scheduler_info(n_workers=-1)
+            (worker, told), scheduler = next(iter(known["workers"].items())), known["address"]
+            pages = [known["services"]["dashboard"], told["services"]["dashboard"]]
+            for address in (scheduler, worker, told["nanny"]):
+                port = address.rpartition(":")[2]
+                for way in (f"tcp://127.0.0.1:{port}", address):
+                    assert not reached_by_others(way), f"code of others runs at {way}"
+            for port in pages:
+                with pytest.raises(HTTPError, match="404"):
+                    urlopen(f"http://127.0.0.1:{port}/json/identity.json")
+
     def test_ctrl_c_leaves_no_process_and_the_next_run_with_two_completes(
         self, changed, params_file, begin, here, tmp_path
     ):

@@ -52,6 +52,15 @@ def test_a_sound_store(verified, store, capsys):
     assert said.out.endswith(f"{store}: sound\n")
 
 
+@pytest.mark.parametrize("address", ["nonsense://here", "tcp://127.0.0.1:9", "tls://127.0.0.1:9"])
+def test_an_address_where_no_scheduler_answers(verified, capsys, monkeypatch, address):
+    monkeypatch.setattr("pipeline.scheduler.TIMEOUT_S", 0.5)
+    assert verified("--set", f"verify.workers={address}") == 2
+    said = capsys.readouterr().err
+    assert f"verify.workers: no dask scheduler answers at {address}" in said
+    assert "dask scheduler" in said and "path" not in said
+
+
 def test_the_store_of_extract_where_none_is_named(verified, store, capsys):
     assert verified(section="extract") == 0
     assert f"{store}: sound" in capsys.readouterr().out

@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import distributed
 import google_crc32c
 import numpy as np
 import pytest
@@ -113,12 +114,21 @@ class TestSound:
         assert "rows 4096 (episode 'episode_002') to 8191 (episode 'episode_004')" in damage.what
 
     @pytest.mark.slow
-    def test_workers_find_what_threads_find(self, store):
+    def test_workers_find_what_threads_find_and_nobody_else_reaches_them(self, store, monkeypatch):
+        addresses = []
+
+        class Noting(distributed.Client):
+            def __init__(self, *where, **settings):
+                super().__init__(*where, **settings)
+                addresses.append(self.scheduler.address)
+
+        monkeypatch.setattr("distributed.Client", Noting)
         flip(chunk_file(store, "vl/features"), 17 * 3 * 8 * 4)
         overwrite(store, "tick/vl_row", 31, 9)
         here, there = verify(store, threads=2), verify(store, threads=1, workers=2)
         assert there.lines() == here.lines()
         assert here.bad_rows.tolist() == [17]
+        assert addresses and all(one.startswith("tls://") for one in addresses)
 
 
 class TestFeatureRows:

@@ -6,6 +6,7 @@ by dask workers on hosts that see the store.
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, cast
 
@@ -41,7 +42,8 @@ def verify(path: Path, threads: int, workers: int | str = 0) -> Findings:
 
     `workers` is 0 for `threads` of this process, a number of local dask processes, or the address
     of a scheduler whose workers see the store under the same path. Raises `StoreIncomplete` where
-    there is no finished store, `StoreMismatch` where it is an archive, or was replaced meanwhile.
+    there is no finished store, `StoreMismatch` where it is an archive, or was replaced meanwhile,
+    `ConfigError` where no scheduler answers at the address.
     """
     begun = time.monotonic()
     _refuse_other_things(path)
@@ -118,16 +120,19 @@ def _on_cluster(
 ) -> Iterator[Report]:
     from distributed import Client, as_completed
 
-    # Local workers are processes of one thread each: checksums hold the interpreter's lock.
-    where = (
-        Client(workers)
-        if isinstance(workers, str)
-        else Client(n_workers=workers, threads_per_worker=1, dashboard_address=None)
-    )
-    with where as client:
+    from pipeline.scheduler import client_of, private_cluster, quiet
+
+    with ExitStack() as stack:
+        stack.enter_context(quiet())
+        if isinstance(workers, str):
+            client = stack.enter_context(client_of(workers, "verify.workers"))
+        else:
+            # Of one thread each: checksums hold the interpreter's lock.
+            cluster = stack.enter_context(private_cluster(workers, threads=1))
+            client = stack.enter_context(Client(cluster, set_as_default=False))
         futures = client.map(_call, tasks, pure=False)
         sizes = {future.key: task.bytes for future, task in zip(futures, tasks, strict=True)}
-        for future in as_completed(futures):
+        for future in as_completed(futures, loop=client.loop):
             progress.update(sizes[future.key])
         yield from cast("list[Report]", client.gather(futures))
 

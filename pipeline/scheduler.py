@@ -1,0 +1,76 @@
+"""dask schedulers: one for the processes of a single command, or the one at a user's address.
+
+Whoever reaches a dask scheduler can have its workers run any code, as the user who started them.
+"""
+
+import logging
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import dask
+from distributed import Client, LocalCluster
+from distributed.security import Security
+
+from pipeline.errors import ConfigError
+
+TIMEOUT_S = 10
+"""For reaching a scheduler, and for reaching it again when the connection is lost."""
+
+
+def private_cluster(
+    workers: int, threads: int, allowed_failures: int = 3, env: Mapping[str, str] | None = None
+) -> LocalCluster:
+    """Worker processes of this machine that only this process can talk to.
+
+    Every user of a machine reaches the ports of its loopback, so both ends of each connection show
+    a certificate that is made here and never leaves these processes; no web page is served. No
+    worker is restarted for its memory (a model may take most of it).
+    """
+    no_pages = {f"distributed.{who}.http.routes": [] for who in ("scheduler", "worker")}
+    with dask.config.set(no_pages):
+        return LocalCluster(
+            n_workers=workers,
+            threads_per_worker=threads,
+            processes=True,
+            security=Security.temporary(),
+            memory_limit=0,
+            dashboard_address="127.0.0.1:0",
+            scheduler_kwargs={"allowed_failures": allowed_failures, "dashboard": False},
+            silence_logs=logging.CRITICAL,
+            env=dict(env or {}),
+        )
+
+
+def client_of(address: str, setting: str) -> Client:
+    """A client of the scheduler at `address`, which `setting` of params.yaml names.
+
+    Raises `ConfigError` where none answers.
+    """
+    try:
+        return Client(address, timeout=TIMEOUT_S, set_as_default=False)
+    # Without certificates tls:// is a TypeError; where dask's config demands them, tcp:// is a
+    # RuntimeError.
+    except (OSError, ValueError, TypeError, RuntimeError) as error:
+        raise ConfigError(
+            f"{setting}: no dask scheduler answers at {address}: {error}. Start one with "
+            f"`dask scheduler` and workers with `dask worker`, or set {setting} to a number of "
+            "processes on this machine. For a tls:// address see docs/machines.md."
+        ) from None
+
+
+@contextmanager
+def quiet() -> Generator[None]:
+    """Keep dask's log off stderr: what matters of it is raised, or said by us.
+
+    That of asyncio, too: dask leaves the failures of processes that never came up to it.
+    """
+    loggers: list[Any] = [logging.getLogger(name) for name in ("distributed", "tornado", "asyncio")]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
