@@ -13,7 +13,8 @@ from pipeline.errors import ConfigError
 from pipeline.store import FeatureStore
 from pipeline.store.archive import is_archive
 from pipeline.store.gather import WIDE
-from pipeline.store.mapping import available_bytes, fitting
+from pipeline.store.mapping import fitting
+from pipeline.store.memory import available_bytes
 from pipeline.store.mending import restore_command
 
 FeedName = Literal["auto", "mapped", "device", "compressed"]

@@ -11,7 +11,7 @@ from pipeline.errors import VLMError
 from pipeline.machine.findings import Finding, missing, note, ok
 from pipeline.machine.gpu import GPU, read_accelerator, usable_device
 from pipeline.simulation.demo_recordings import MARKER
-from pipeline.store.mapping import available_bytes
+from pipeline.store.memory import available_bytes
 from pipeline.vlm.checkpoint_folder import (
     adapter_files,
     cached_checkpoint,

@@ -9,6 +9,7 @@ from pathlib import Path
 from pipeline.amounts import size
 from pipeline.config import Params
 from pipeline.machine.findings import Finding, note, ok
+from pipeline.store.memory import memory_bytes
 
 _CGROUP = Path("/sys/fs/cgroup")
 _LEAST_FILES = 1024
@@ -58,13 +59,6 @@ def read_limits() -> Limits:
         open_files=resource.getrlimit(resource.RLIMIT_NOFILE)[0],
         shared=shutil.disk_usage(shared).total if shared.is_dir() else None,
     )
-
-
-def memory_bytes() -> int:
-    """Memory that this process may use: the machine's, or less where a container limits it."""
-    whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    said = _read(_CGROUP / "memory.max")
-    return min(whole, int(said)) if said.isdigit() else whole
 
 
 def _cores() -> float:

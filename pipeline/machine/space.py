@@ -18,11 +18,11 @@ from pipeline.extraction.survey import Survey, SurveyedEpisode
 from pipeline.machine.checkpoint import local_folder
 from pipeline.machine.data import unusable
 from pipeline.machine.findings import Finding, missing, note, ok
-from pipeline.machine.limits import memory_bytes
 from pipeline.machine.links import links_here
 from pipeline.recordings import Recording, open_recordings
 from pipeline.recordings.embodiment import Embodiment
 from pipeline.store import part_path
+from pipeline.store.memory import memory_bytes
 from pipeline.timeline import ActionRotation, build_timeline, choose_action_rotation
 from pipeline.vlm.feature_spec import feature_spec
 

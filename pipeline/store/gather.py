@@ -16,7 +16,8 @@ from torch import Tensor
 
 from pipeline.store.batch import Batch
 from pipeline.store.episodes import episode_of
-from pipeline.store.mapping import available_bytes, fitting, populate, read_at_random, will_need
+from pipeline.store.mapping import fitting, populate, read_at_random, will_need
+from pipeline.store.memory import available_bytes
 
 # OpenMP's threads do not survive a fork, and a forked process that waits for them waits for ever.
 os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))

@@ -93,14 +93,6 @@ def _mmap(address: int | None, length: int, protection: int, flags: int, descrip
     return int(mapped)
 
 
-def available_bytes() -> int:
-    """Memory that can be had without swapping; file pages that can be dropped count as free."""
-    for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
-        if line.startswith("MemAvailable:"):
-            return int(line.split()[1]) * 1024
-    raise OSError("/proc/meminfo has no MemAvailable; Linux since 3.14 has")
-
-
 class Sized(Protocol):
     """An array or a tensor."""
 

@@ -11,7 +11,7 @@ import yaml
 from pipeline.config import Params
 from pipeline.machine import space
 from pipeline.machine.data import check_data
-from pipeline.machine.limits import Limits, check_limits, memory_bytes, read_limits
+from pipeline.machine.limits import Limits, check_limits, read_limits
 from pipeline.machine.links import Cache, check_cache, check_links, links_here, read_cache
 from pipeline.machine.space import (
     Estimate,
@@ -257,4 +257,4 @@ def test_limits() -> None:
 def test_this_machines_limits_can_be_read() -> None:
     here = read_limits()
     assert here.cores > 0 and here.open_files > 0
-    assert 2**28 < here.memory == memory_bytes()
+    assert here.memory > 2**28

@@ -11,7 +11,6 @@ import pytest
 
 from pipeline.store import mapping
 from pipeline.store.mapping import (
-    available_bytes,
     fitting,
     map_flat,
     populate,
@@ -117,4 +116,3 @@ def test_what_fits_is_taken_the_smallest_first():
     assert fitting(arrays, 125) == ["b", "c", "a"]
     assert fitting(arrays, 100) == ["b", "c"]
     assert fitting(arrays, 12) == []
-    assert 0 < available_bytes() <= os.sysconf("SC_PHYS_PAGES") * PAGE
