@@ -7,8 +7,10 @@ A kill at any instant leaves the previous checkpoint or the new one.
 """
 
 import json
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +19,12 @@ from torch import Tensor
 
 from pipeline.config import TrainHeadParams
 from pipeline.durable import (
-    read_document,
+    DIGEST,
     read_tensors,
+    read_with_digest,
     replace_folder,
-    write_document,
     write_tensors,
+    write_with_digest,
 )
 from pipeline.errors import CheckpointIncomplete, CheckpointMismatch, PipelineError
 from pipeline.models import Policy, PolicyShape, action_groups
@@ -91,7 +94,7 @@ def save_policy(
 
     def write(temporary: Path) -> None:
         digest = write_tensors(temporary / WEIGHTS, checkpoint.weights)
-        write_document(temporary / DOCUMENT, checkpoint.document(digest))
+        write_with_digest(temporary / DOCUMENT, checkpoint.document(digest))
         beside(temporary)
 
     replace_folder(folder, write)
@@ -117,9 +120,12 @@ def find_policy(path: Path) -> Path:
 def load_policy(folder: Path) -> PolicyCheckpoint:
     """The checkpoint at `folder`.
 
-    Raises `CheckpointIncomplete` naming the file that is missing, truncated or altered.
+    Raises `CheckpointIncomplete` naming the file that is missing, truncated or altered. Says on
+    stderr where the description is of a version that wrote no digest of it.
     """
-    document = read_document(folder / DOCUMENT)
+    document, has_digest = read_with_digest(folder / DOCUMENT)
+    if not has_digest:
+        _note_without_digest(folder / DOCUMENT)
     if document.get("format") != FORMAT:
         raise CheckpointMismatch(
             f"{folder / DOCUMENT}: expected format {FORMAT}, found {document.get('format')!r}. "
@@ -149,6 +155,16 @@ def load_policy(folder: Path) -> PolicyCheckpoint:
             f"{folder / DOCUMENT}: not what a checkpoint's description must be "
             f"({type(error).__name__}: {error}). Train it again."
         ) from None
+
+
+@cache
+def _note_without_digest(path: Path) -> None:
+    """Say it once in a process: a checkpoint is read several times."""
+    print(
+        f"{path}: it has no {DIGEST}, for an earlier version wrote it, so that nobody can tell "
+        "whether it was altered; it is taken as it is. Train it again to have it checked.",
+        file=sys.stderr,
+    )
 
 
 def source_of(store: FeatureStore) -> dict[str, Any]:

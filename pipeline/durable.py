@@ -17,6 +17,8 @@ from torch import Tensor
 from pipeline.errors import CheckpointIncomplete, DiskFull
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
+DIGEST = "document_sha256"
+"""Under which key a document carries the digest of all its others."""
 
 
 @contextmanager
@@ -135,8 +137,21 @@ def write_document(path: Path, document: Mapping[str, Any]) -> None:
     temporary.rename(path)
 
 
+def write_with_digest(path: Path, document: Mapping[str, Any]) -> None:
+    """As `write_document`, with a digest of the document in it, which reading checks."""
+    write_document(path, {**document, DIGEST: _document_sha256(document)})
+
+
 def read_document(path: Path) -> dict[str, Any]:
-    """The JSON document at `path`; `CheckpointIncomplete` when it is missing or not one."""
+    """The JSON document at `path`; `CheckpointIncomplete` where it is not what was written."""
+    return read_with_digest(path)[0]
+
+
+def read_with_digest(path: Path) -> tuple[dict[str, Any], bool]:
+    """The JSON document at `path` and whether it carries a digest of itself, which is left out.
+
+    Raises `CheckpointIncomplete` where it is missing, is none, or is not what its digest is of.
+    """
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -147,7 +162,18 @@ def read_document(path: Path) -> dict[str, Any]:
         raise CheckpointIncomplete(damaged(path, error)) from None
     if not isinstance(document, dict):
         raise CheckpointIncomplete(damaged(path, "not a JSON object"))
-    return document
+    digest = document.pop(DIGEST, None)
+    if digest is not None and digest != _document_sha256(document):
+        why = f"it was altered since it was written: its {DIGEST} is of another content"
+        raise CheckpointIncomplete(damaged(path, why))
+    return document, digest is not None
+
+
+def _document_sha256(document: Mapping[str, Any]) -> str:
+    # As it is read, where tuples are lists and keys are strings, in whatever order.
+    read = json.loads(json.dumps(document, allow_nan=False))
+    canonical = json.dumps(read, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(canonical.encode()).hexdigest()
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor]) -> str:

@@ -20,6 +20,7 @@ from pipeline.checkpoint import (
     source_of,
 )
 from pipeline.config import TrainHeadParams
+from pipeline.durable import read_document, write_document, write_with_digest
 from pipeline.errors import CheckpointIncomplete, CheckpointMismatch
 from pipeline.models import Policy
 from pipeline.store import FeatureStore
@@ -128,9 +129,43 @@ def test_a_description_that_is_none_is_named(
 ) -> None:
     save_policy(tmp_path / "best", checkpoint)
     path = tmp_path / "best/policy.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    write_with_digest(path, read_document(path) | change)
     with pytest.raises((CheckpointIncomplete, CheckpointMismatch), match=said):
         load_policy(tmp_path / "best")
+
+
+def _ten_times(document: dict[str, Any]) -> None:
+    statistics = document["normalization"]["action"]
+    statistics["std"] = [10 * number for number in statistics["std"]]
+
+
+def _fewer_held_out(document: dict[str, Any]) -> None:
+    document["held_out_ticks"]["left/episode_004"] = [20, 30]
+
+
+@pytest.mark.parametrize("alter", [_ten_times, _fewer_held_out])
+def test_an_altered_description_is_refused(
+    checkpoint: PolicyCheckpoint, tmp_path: Path, alter: Callable[[dict[str, Any]], None]
+) -> None:
+    save_policy(tmp_path / "best", checkpoint)
+    path = tmp_path / "best/policy.json"
+    document = json.loads(path.read_text())
+    alter(document)
+    path.write_text(json.dumps(document))
+    with pytest.raises(CheckpointIncomplete, match=r"policy\.json: .*damaged: it was altered"):
+        load_policy(tmp_path / "best")
+
+
+def test_a_description_of_before_digests_is_taken_and_told(
+    checkpoint: PolicyCheckpoint, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_policy(tmp_path / "best", checkpoint)
+    path = tmp_path / "best/policy.json"
+    write_document(path, read_document(path))
+    for _ in range(2):
+        assert load_policy(tmp_path / "best").step == checkpoint.step
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{path}: it has no document_sha256" in line
 
 
 def test_weights_of_another_policy_are_refused(
@@ -138,9 +173,9 @@ def test_weights_of_another_policy_are_refused(
 ) -> None:
     save_policy(tmp_path / "best", checkpoint)
     path = tmp_path / "best/policy.json"
-    document = json.loads(path.read_text())
+    document = read_document(path)
     document["params"]["train_head"]["expert"]["dim"] = 16
-    path.write_text(json.dumps(document))
+    write_with_digest(path, document)
     with pytest.raises(CheckpointMismatch, match="does not fit the policy"):
         load_policy(tmp_path / "best").policy()
 

@@ -1,5 +1,6 @@
 """Whatever a kill leaves behind, there is one whole folder, the old or the new."""
 
+import json
 import os
 from pathlib import Path
 
@@ -10,10 +11,12 @@ from pipeline.durable import (
     fresh,
     read_document,
     read_tensors,
+    read_with_digest,
     recover_folder,
     replace_folder,
     write_document,
     write_tensors,
+    write_with_digest,
 )
 from pipeline.errors import CheckpointIncomplete, DiskFull
 
@@ -75,6 +78,22 @@ def test_a_document_comes_back_to_the_bit(tmp_path: Path) -> None:
     document = {"pi": 0.1 + 0.2, "tiny": 5e-324, "text": "µm", "none": None}
     write_document(tmp_path / "d.json", document)
     assert read_document(tmp_path / "d.json") == document
+
+
+def test_a_document_with_a_digest_says_when_it_was_altered(tmp_path: Path) -> None:
+    path = tmp_path / "d.json"
+    document = {"µ": 0.1 + 0.2, "ticks": (0, 30), "by number": {10: 1, 9: 2}, "none": None}
+    write_with_digest(path, document)
+    read = {**document, "ticks": [0, 30], "by number": {"10": 1, "9": 2}}
+    assert read_with_digest(path) == (read, True)
+    assert read_document(path) == read
+    path.write_text(json.dumps(json.loads(path.read_text()), sort_keys=True))
+    assert read_document(path) == read, "neither spaces nor the order of keys are content"
+    path.write_text(path.read_text().replace("30]", "31]"))
+    with pytest.raises(CheckpointIncomplete, match=r"d\.json: .*damaged: it was altered"):
+        read_document(path)
+    write_document(path, document)
+    assert read_with_digest(path) == (read, False)
 
 
 @pytest.mark.parametrize("content", ["", "{", "[1]", '{"a": \x00}'])

@@ -13,7 +13,7 @@ from pipeline.batches import Draw, Windows
 from pipeline.checkpoint import DOCUMENT
 from pipeline.config import FinetuneParams, Params, VLMParams
 from pipeline.digests import file_digest
-from pipeline.durable import read_document, write_document
+from pipeline.durable import read_document, write_with_digest
 from pipeline.errors import ConfigError
 from pipeline.finetuning.feed import LiveFeed
 from pipeline.finetuning.recordings import (
@@ -113,7 +113,7 @@ class Live:
         module.vlm.save(folder / learned_name(self._finetune))
         document = read_document(folder / DOCUMENT)
         document["feature_spec"] = self._tuned_spec(folder).attrs()
-        write_document(folder / DOCUMENT, document)
+        write_with_digest(folder / DOCUMENT, document)
 
     def summary(self) -> list[str]:
         """What learns and from which frames, as lines for the user."""

@@ -20,7 +20,7 @@ from pipeline.checkpoint import (
     source_differences,
 )
 from pipeline.config import TrainHeadParams
-from pipeline.durable import damaged, read_document, recover_folder, write_document
+from pipeline.durable import damaged, read_document, recover_folder, write_with_digest
 from pipeline.errors import CheckpointIncomplete, CheckpointMismatch, ConfigError
 from pipeline.store import FeatureStore
 from pipeline.training.identity import NOTHING, run_identity
@@ -72,7 +72,7 @@ class Run:
             else:
                 shutil.rmtree(self.part)
         self.part.mkdir(parents=True, exist_ok=True)
-        write_document(self.part / RUN, self.identity)
+        write_with_digest(self.part / RUN, self.identity)
 
     def finish(self) -> None:
         """Rename the part to the output, in place of an older run, and drop what only resuming

@@ -12,8 +12,8 @@ from pipeline.durable import (
     damaged,
     read_document,
     read_tensors,
-    write_document,
     write_tensors,
+    write_with_digest,
 )
 from pipeline.errors import CheckpointIncomplete, CheckpointMismatch, PipelineError
 from pipeline.training.log import Row
@@ -52,7 +52,7 @@ def write_trainer(folder: Path, state: TrainerState) -> None:
         f"{kind}:{name}": value for kind in KINDS for name, value in getattr(state, kind).items()
     }
     digest = write_tensors(folder / TRAINER_WEIGHTS, tensors | {"history:": state.history})
-    write_document(
+    write_with_digest(
         folder / TRAINER_DOCUMENT,
         {
             "step": state.step,

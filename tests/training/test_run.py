@@ -181,6 +181,30 @@ def test_a_truncated_checkpoint_is_named(
         trainer(store, params())
 
 
+@pytest.mark.parametrize(
+    ("file", "entry", "altered"),
+    [
+        ("last/trainer.json", '"step": 4', '"step": 2'),
+        ("last/policy.json", '"horizon": 3', '"horizon": 2'),
+        ("run.json", '"lr": 0.003', '"lr": 0.03'),
+    ],
+)
+def test_an_altered_document_of_a_run_is_named(
+    store: FeatureStore,
+    params: Make,
+    trainer: Make,
+    unfinished: Path,
+    file: str,
+    entry: str,
+    altered: str,
+) -> None:
+    path = unfinished / file
+    assert entry in path.read_text()
+    path.write_text(path.read_text().replace(entry, altered, 1))
+    with pytest.raises(CheckpointIncomplete, match=rf"{file}: .*damaged: it was altered"):
+        trainer(store, params())
+
+
 def test_a_finish_that_was_killed_is_recovered(
     store: FeatureStore, params: Make, finished: Path
 ) -> None:
