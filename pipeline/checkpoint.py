@@ -54,8 +54,9 @@ class PolicyCheckpoint:
     metrics: Mapping[str, float] = field(default_factory=dict)
 
     def policy(self, device: torch.device | str = "cpu") -> Policy:
-        """The policy with these weights, in evaluation mode."""
+        """The policy with these weights, in evaluation mode; it knows its feature spec."""
         policy = Policy(self.params, self.shape, self.normalization)
+        policy.feature_spec = self.source["feature_spec"]
         try:
             policy.load_state_dict(dict(self.weights))
         except RuntimeError as error:

@@ -1,7 +1,7 @@
 """The policy: encoders, fusion and action expert, from physical units to physical units."""
 
 from collections.abc import Mapping
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -54,6 +54,9 @@ class Policy(nn.Module):
     Raises `ConfigError` where no stream is left, `CheckpointMismatch` where the statistics do not
     fit the shape. The state dict holds weights and noise schedule; the statistics travel beside it.
     """
+
+    feature_spec: Mapping[str, Any] | None = None
+    """What the features are that it was trained on, where a checkpoint says so."""
 
     def __init__(
         self, params: TrainHeadParams, shape: PolicyShape, normalization: StreamStatistics

@@ -134,7 +134,12 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
 
     @classmethod
     def of(cls, policy: Policy, vlm: LiveVLM) -> "QwenVLAUnified":
-        """The model of two parts; `VLMError` where their features differ in number or width."""
+        """The model of two parts; `VLMError` where their features differ in number or width.
+
+        Raises `CheckpointMismatch` where a checkpoint's policy was trained on other features.
+        """
+        if policy.feature_spec is not None:
+            vlm.refuse_other_features(policy.feature_spec)
         model = cls.__new__(cls)
         model._assemble(policy, vlm.vlm, vlm.tuning, vlm.spec.views)
         model.vlm = _fitting(vlm, policy.shape)

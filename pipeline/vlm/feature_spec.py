@@ -33,6 +33,7 @@ __all__ = [
     "differences",
     "document_digest",
     "feature_spec",
+    "live_differences",
     "resolve_checkpoint",
     "row_key",
 ]
@@ -140,6 +141,21 @@ def differences(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[str]:
         if key != "digest":
             lines += _differing(key, a.get(key), b.get(key))
     return lines
+
+
+def live_differences(trained: Mapping[str, Any], live: Mapping[str, Any]) -> list[str]:
+    """`differences` between the spec that a policy was trained on and that of a live model.
+
+    How features are stored makes none, nor do augmented variants: a live model gives plain ones.
+    """
+    return differences(_as_live(trained), _as_live(live))
+
+
+def _as_live(spec: Mapping[str, Any]) -> dict[str, Any]:
+    plain = [slot for slot in spec.get("slots", []) if slot.get("variant", 0) == 0]
+    slots = [{name: said for name, said in slot.items() if name != "variant"} for slot in plain]
+    stored = {"storage_dtype", "variants", "augmentation"}
+    return {name: value for name, value in spec.items() if name not in stored} | {"slots": slots}
 
 
 def _differing(place: str, a: Any, b: Any) -> list[str]:

@@ -1,6 +1,6 @@
 """The Qwen2.5-VL that learns: features with gradients, and what it has learned on disk."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -12,16 +12,19 @@ from torch import Tensor, nn
 from pipeline.config import TuningParams, VLMParams
 from pipeline.device import resolve_device
 from pipeline.digests import file_digest
-from pipeline.errors import VLMError
+from pipeline.errors import CheckpointMismatch, VLMError
 from pipeline.vlm.extractor import Extractor, layers_needed
-from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
+from pipeline.vlm.feature_spec import FeatureSpec, feature_spec, live_differences
 from pipeline.vlm.loading import load_model, pixel_settings
 from pipeline.vlm.preparation import PreparedRow
 from pipeline.vlm.tuning import load_adapting, load_learning, save_adapter, save_checkpoint
 
 
 def live_spec(vlm: VLMParams, views: Sequence[str]) -> FeatureSpec:
-    """The spec of the features that a live model of `vlm` gives, every file digested anew."""
+    """The spec of the features that a live model of `vlm` gives, every file digested anew.
+
+    They are stored nowhere: compare it with that of stored ones by `live_differences`.
+    """
     return feature_spec(vlm, "float32", views, file_digest)
 
 
@@ -103,6 +106,19 @@ class LiveVLM(nn.Module):
         with self._precision():
             features, valid = self._extractor.extract(rows)
         return features, valid.to(features.device)
+
+    def refuse_other_features(self, trained: Mapping[str, Any]) -> None:
+        """Raise `CheckpointMismatch` where features of the spec `trained` are not what this gives.
+
+        As `live_differences` has it.
+        """
+        if lines := live_differences(trained, self.spec.document):
+            raise CheckpointMismatch(
+                f"{self.vlm.checkpoint}: the policy was trained on other features than this model "
+                "gives (trained -> live):\n  " + "\n  ".join(lines) + "\nLoad the model with the "
+                "vlm params and the views that the policy's store was extracted with, or train a "
+                "policy on the features of this model."
+            )
 
     def save(self, folder: Path) -> None:
         """Write what has been learned into `folder`, made if need be.

@@ -1,10 +1,12 @@
 """One model, live or cached: the same answer, the arguments it has always had, and it learns."""
 
 import copy
+import json
 import pickle
+import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +18,13 @@ from PIL import Image
 from pydantic import ValidationError
 from torch import Tensor
 
+from pipeline.checkpoint import PolicyCheckpoint
 from pipeline.config import TrainHeadParams, TuningParams, VLMParams
-from pipeline.errors import ObservationError, VLMError
+from pipeline.digests import file_digest
+from pipeline.errors import CheckpointMismatch, ObservationError, VLMError
 from pipeline.models import Policy, PolicyShape, Trainable
 from pipeline.models.live_observation import LiveObservation
+from pipeline.models.unchanged import Unchanged
 from pipeline.models.unified import (
     Not_freeze_QwenVLAWithSensor,
     QwenVLAUnified,
@@ -28,6 +33,7 @@ from pipeline.models.unified import (
 )
 from pipeline.normalization import Normalization
 from pipeline.vlm.distinct import distinct_rows
+from pipeline.vlm.feature_spec import feature_spec
 from pipeline.vlm.live import LiveVLM, live_spec
 from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.qwen import FrozenVLM
@@ -406,6 +412,89 @@ def test_of_two_parts(
         QwenVLAUnified.of(other, vlm)
     with pytest.raises(VLMError, match="feature_dim=128"):
         build(feature_dim=2048).load_vlm()
+
+
+SEEN = VLMParams(
+    checkpoint="of the test",
+    dtype="float32",
+    image_resize_height=56,
+    image_resize_width=84,
+    pooling=("mean", "view_mean"),
+)
+
+
+@pytest.fixture
+def trained(demo_checkpoint: Path, small_params: Callable[..., TrainHeadParams]) -> Any:
+    """`trained(storage_dtype, **vlm)`: a policy of a checkpoint, of features stored so."""
+
+    def policy(storage_dtype: str, **changed: Any) -> Policy:
+        vlm = SEEN.model_copy(update={"checkpoint": str(demo_checkpoint), **changed})
+        spec = feature_spec(vlm, storage_dtype, VIEWS, file_digest)
+        shape = PolicyShape(len(spec.slots), spec.dim, 9, 12, 7, ("other",) * 7)
+        fresh = Policy(small_params(), shape, Unchanged(shape))
+        source = {"feature_spec": json.loads(json.dumps(spec.attrs()))}
+        weights = fresh.state_dict()
+        return PolicyCheckpoint(
+            fresh.params, shape, Unchanged(shape), source, {}, {}, 1, weights
+        ).policy()
+
+    return policy
+
+
+def _live(vlm: VLMParams, views: Sequence[str] = VIEWS) -> LiveVLM:
+    """A model that says what it would compute."""
+    tuning = TuningParams(method="none")
+    return LiveVLM(torch.nn.Identity(), None, live_spec(vlm, views), vlm, tuning)  # type: ignore
+
+
+@pytest.mark.parametrize(
+    ("live", "views", "said"),
+    [
+        ({}, ("View1", "View3"), r"views: \['View1', 'View2'\] -> \['View1', 'View3'\]"),
+        ({}, ("View1",), "slots: 3 entries -> 2 entries"),
+        ({"image_resize_width": 56}, VIEWS, r"processor.image_size: \[56, 84\] -> \[56, 56\]"),
+        ({"prompt": "{images} {instruction}"}, VIEWS, "prompt: .* -> '{images} {instruction}'"),
+        ({"layers": (0,)}, VIEWS, r"slots\[0\].layer: 3 -> 0"),
+        ({"pooling": ("last", "view_mean")}, VIEWS, "slots.*: 'mean' -> 'last'"),
+        ({"dtype": "bfloat16"}, VIEWS, "compute_dtype: 'float32' -> 'bfloat16'"),
+    ],
+)
+def test_a_live_model_of_other_features_than_the_policy_s_is_refused(
+    trained: Callable[..., Policy],
+    demo_checkpoint: Path,
+    live: dict[str, Any],
+    views: tuple[str, ...],
+    said: str,
+) -> None:
+    vlm = SEEN.model_copy(update={"checkpoint": str(demo_checkpoint), **live})
+    with pytest.raises(CheckpointMismatch, match=said):
+        QwenVLAUnified.of(trained("float32"), _live(vlm, views))
+
+
+def test_a_live_model_of_other_weights_is_refused(
+    trained: Callable[..., Policy], demo_checkpoint: Path, tmp_path: Path
+) -> None:
+    other = shutil.copytree(demo_checkpoint, tmp_path / "other")
+    vlm = SEEN.model_copy(update={"checkpoint": str(other)})
+    policy = trained("float32")
+    assert QwenVLAUnified.of(policy, _live(vlm)).policy is policy, "a copy elsewhere is the same"
+    weights = other / "model.safetensors"
+    content = bytearray(weights.read_bytes())
+    content[-1] ^= 1
+    weights.write_bytes(content)
+    with pytest.raises(CheckpointMismatch, match=r"weights: '.*' -> '.*'") as refused:
+        QwenVLAUnified.of(policy, _live(vlm))
+    assert len(str(refused.value).splitlines()) == 3, "nothing else differs"
+
+
+@pytest.mark.parametrize("variants", [1, 2])
+@pytest.mark.parametrize("storage_dtype", ["float32", "float16", "bfloat16"])
+def test_how_features_were_stored_makes_no_live_ones_others(
+    trained: Callable[..., Policy], demo_checkpoint: Path, storage_dtype: str, variants: int
+) -> None:
+    vlm = SEEN.model_copy(update={"checkpoint": str(demo_checkpoint)})
+    policy = trained(storage_dtype, variants=variants)
+    assert QwenVLAUnified.of(policy, _live(vlm)).policy is policy
 
 
 def test_a_live_model_of_a_store_spec_is_the_one_built_by_name(
