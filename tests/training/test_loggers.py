@@ -1,7 +1,6 @@
 """The loggers: the same rows to each, a stop that leaves no step twice, and what is missing."""
 
 import errno
-import json
 import os
 import subprocess
 import sys
@@ -12,7 +11,7 @@ from typing import Any
 import pytest
 
 from pipeline.config import TrainHeadParams
-from pipeline.durable import read_document
+from pipeline.durable import read_document, write_document
 from pipeline.errors import ConfigError, DiskFull
 from pipeline.store import FeatureStore
 from pipeline.training import Trainer, check_loggers, loggers, open_run
@@ -169,10 +168,10 @@ def test_a_run_of_before_there_were_loggers_goes_on(
 ) -> None:
     stop_at(trainer(store, params()), 11)
     written = params().output.with_name("head.part") / "last" / "policy.json"
-    document = json.loads(written.read_text())
+    document = read_document(written)
     for key in ("loggers", "wandb_project"):
         del document["params"]["train_head"][key]
-    written.write_text(json.dumps(document))
+    write_document(written, document)
     resumed = trainer(store, params())
     assert (resumed.run.status, resumed.step) == ("resumed", 10)
 
