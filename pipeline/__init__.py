@@ -8,6 +8,7 @@
 `channels`     channels by name: which are alike, and which hardly move
 `digests`      content digests of files, remembered
 `durable`      files that survive a kill
+`ownership`    which folders may be replaced
 `device`       which device does the tensor maths
 `scheduler`    dask processes that nobody else reaches, or the user's own scheduler
 `recordings`   files on disk -> Recording

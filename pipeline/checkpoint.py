@@ -29,10 +29,12 @@ from pipeline.durable import (
 from pipeline.errors import CheckpointIncomplete, CheckpointMismatch, PipelineError
 from pipeline.models import Policy, PolicyShape, action_groups
 from pipeline.normalization import Normalization
+from pipeline.ownership import Kind
 from pipeline.store import FeatureStore
 
 FORMAT = 2
 WEIGHTS, DOCUMENT = "policy.safetensors", "policy.json"
+CHECKPOINT = Kind("a checkpoint of a policy", lambda folder: (folder / DOCUMENT).is_file())
 SOURCE_KEYS = ("feature_spec", "streams", "action_hz", "vlm_reuse_count")
 
 
@@ -98,7 +100,7 @@ def save_policy(
         write_with_digest(temporary / DOCUMENT, checkpoint.document(digest))
         beside(temporary)
 
-    replace_folder(folder, write)
+    replace_folder(folder, write, CHECKPOINT)
 
 
 def find_policy(path: Path) -> Path:

@@ -4,7 +4,6 @@ import errno
 import hashlib
 import json
 import os
-import shutil
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +14,15 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from pipeline.errors import CheckpointIncomplete, DiskFull
+from pipeline.ownership import (
+    Kind,
+    begin_folder,
+    mark,
+    refuse_foreign,
+    remove_folder,
+    there,
+    unmark,
+)
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
 DIGEST = "document_sha256"
@@ -57,65 +65,93 @@ def fresh(path: Path) -> Path:
     return path
 
 
-def replace_folder(folder: Path, write: Callable[[Path], None]) -> None:
+def replace_folder(folder: Path, write: Callable[[Path], None], kind: Kind) -> None:
     """Put what `write` writes into a temporary folder at `folder`, in place of what is there.
 
-    A kill leaves the old content or the new, for one instant under the name `<folder>.old`, from
-    where `recover_folder` brings it back. Raises `DiskFull` with the old in place.
+    A kill leaves the old content or the new, as `put_in_place` does. Raises `DiskFull` with the old
+    in place, and `ConfigError` where something that is not of this kind lies there.
     """
-    recover_folder(folder)
+    recover_folder(folder, kind)
     temporary = _beside(folder, "new")
     with disk_full_named(folder):
-        temporary.mkdir(parents=True)
         try:
+            begin_folder(temporary, kind)
             write(temporary)
             for file in temporary.iterdir():
                 sync(file)
             sync(temporary)
         except BaseException:
-            shutil.rmtree(temporary)
+            remove_folder(temporary, kind)
             raise
-    put_in_place(temporary, folder)
+    put_in_place(temporary, folder, kind)
 
 
-def recover_folder(folder: Path) -> None:
+def recover_folder(folder: Path, kind: Kind) -> None:
     """Undo or complete a `replace_folder` that a kill stopped."""
-    recover(folder)
-    temporary = _beside(folder, "new")
-    if temporary.exists():
-        shutil.rmtree(temporary)
+    recover(folder, kind)
+    remove_folder(_beside(folder, "new"), kind)
 
 
-def put_in_place(complete: Path, target: Path) -> None:
-    """Rename a complete folder to `target`; what was there is removed.
+def previous_path(target: Path) -> Path:
+    """Where `put_in_place` keeps what was at `target`."""
+    return _beside(target, "previous")
 
-    A kill leaves the old one or the new, for one instant under the name `<target>.old`, from where
-    `recover` brings it back.
+
+KEPT = Kind("a store of before, kept for its rows,", lambda path: False)
+"""Marked when it is kept: a copy that a user made under that name is not one."""
+
+_HELD = Kind("a folder that is being replaced,", lambda path: False)
+
+
+def put_in_place(complete: Path, target: Path, kind: Kind, *, keep: bool = False) -> None:
+    """Rename a complete folder to `target`; what was there is removed, or kept as `<name>.previous`
+    in place of what was kept before.
+
+    A kill leaves the old one or the new. For one instant the old one lies in `<target>.replaced`,
+    or in `<target>.keeping`, from where `recover` brings it back. Raises `ConfigError` where
+    something that is not of this kind lies in one of these places.
     """
-    old = _beside(target, "old")
-    if target.exists():
-        _discard(old)
-        target.rename(old)
+    recover(target, kind)
+    if keep:
+        refuse_foreign(previous_path(target), KEPT)
+    unmark(complete)
+    if there(target):
+        # Not `.old` itself: one that a user made is a copy that somebody wants.
+        held = _beside(target, "keeping" if keep else "replaced")
+        begin_folder(held, _HELD)
+        target.rename(held / target.name)
     complete.rename(target)
     sync(target.parent)
-    _discard(old)
+    recover(target, kind)
 
 
-def recover(target: Path) -> None:
-    """Undo or complete a `put_in_place` that a kill stopped."""
+def recover(target: Path, kind: Kind) -> None:
+    """Undo or complete a `put_in_place` that a kill stopped.
+
+    Raises `ConfigError` where something that is not of this kind lies in one of its places.
+    """
+    refuse_foreign(target, kind)
+    for suffix in ("replaced", "keeping"):
+        held = _beside(target, suffix)
+        refuse_foreign(held, _HELD)
+        old = held / target.name
+        if there(old) and not there(target):
+            old.rename(target)
+        elif there(old) and suffix == "keeping":
+            mark(old, KEPT)
+            remove_folder(previous_path(target), KEPT)
+            old.rename(previous_path(target))
+        remove_folder(held, _HELD)
+    _recover_unheld(target, kind)
+
+
+def _recover_unheld(target: Path, kind: Kind) -> None:
+    """Bring back what an earlier version, when it was killed, left as `<target>.old`."""
     old = _beside(target, "old")
-    if target.exists():
-        _discard(old)
-    elif old.exists():
-        old.rename(target)
-
-
-def _discard(old: Path) -> None:
-    """Remove a folder that was replaced; of one behind a symbolic link, the link alone."""
-    if old.is_symlink():
+    if old.is_symlink() and there(target):
         old.unlink()
-    elif old.exists():
-        shutil.rmtree(old)
+    elif old.exists() and not there(target) and kind.owns(old):
+        old.rename(target)
 
 
 def sync(path: Path) -> None:

@@ -17,18 +17,23 @@ if __name__ == "__main__":  # here, for --help waits for no import below
 from pipeline.config import Params
 from pipeline.durable import disk_full_named, fresh
 from pipeline.evaluation import experiment_rows, experiments_table, read_experiments, write_rows
+from pipeline.ownership import REPORT, Kind, begins_with, claim, refuse_foreign
 from pipeline.report import write_report
 from pipeline.report.evaluation.comparison import comparison_report
+
+_TABLE = Kind("a table of experiments", begins_with("| experiment |"))
 
 
 def main(params: Params) -> None:
     """Compare the evaluations in `compare.reports`."""
     output = params.compare.output
+    markdown = output.with_name(f"{output.name}.md")
+    refuse_foreign(markdown, _TABLE)
+    refuse_foreign(output, REPORT)
     experiments = read_experiments(params.compare.reports)
-    output.mkdir(parents=True, exist_ok=True)
+    claim(output, REPORT)
     files = [write_rows(output / "experiments.csv", experiment_rows(experiments))]
     files += write_report(output, comparison_report(experiments))
-    markdown = output.with_name(f"{output.name}.md")
     with disk_full_named(markdown):
         fresh(markdown).write_text(experiments_table(experiments, markdown=True), encoding="utf-8")
     print(experiments_table(experiments))

@@ -19,8 +19,8 @@ if __name__ == "__main__":  # here, for --help waits for no import below
 from pathlib import Path
 
 from pipeline.config import Params
-from pipeline.durable import replace_folder, write_document
-from pipeline.simulation.demo_recordings import MARKER, refuse_foreign, write_demo_recordings
+from pipeline.durable import recover_folder, replace_folder, write_document
+from pipeline.simulation.demo_recordings import DEMO, MARKER, refuse_foreign, write_demo_recordings
 from pipeline.vlm.demo_checkpoint import write_demo_checkpoint
 
 
@@ -28,11 +28,12 @@ def main(params: Params) -> None:
     """The recordings under `demo.recordings`, the checkpoint at `demo.checkpoint`."""
     demo = params.demo
     refuse_foreign(demo.checkpoint, "demo.checkpoint")
+    recover_folder(demo.checkpoint, DEMO)
     write_demo_recordings(demo.recordings, demo.episodes, demo.seed)
 
     def write_marked(folder: Path) -> None:
         write_demo_checkpoint(folder, demo.seed)
         write_document(folder / MARKER, {"seed": demo.seed})
 
-    replace_folder(demo.checkpoint, write_marked)
+    replace_folder(demo.checkpoint, write_marked, DEMO)
     print(f"{demo.episodes} episodes a format in {demo.recordings}, checkpoint {demo.checkpoint}")

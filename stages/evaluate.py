@@ -30,6 +30,7 @@ from pipeline.evaluation import (
     table,
     write_tables,
 )
+from pipeline.ownership import REPORT, claim, refuse_foreign
 from pipeline.report import write_report
 from pipeline.report.evaluation.evaluation import evaluation_report
 from pipeline.store import FeatureStore, check_trailers
@@ -37,6 +38,7 @@ from pipeline.store import FeatureStore, check_trailers
 
 def main(params: Params) -> None:
     """Judge the checkpoint that `evaluate` names, else what `train_head` wrote."""
+    refuse_foreign(params.evaluate.output, REPORT)
     folder = params.evaluate.checkpoint or params.train_head.output
     checkpoint = load_policy(find_policy(folder))
     store = _store_for(checkpoint, params)
@@ -63,7 +65,7 @@ def _store_for(checkpoint: PolicyCheckpoint, params: Params) -> FeatureStore:
 
 def _write(folder: Path, found: Judgement) -> list[Path]:
     """The tables, the page with its pictures, and what was judged; returns their paths."""
-    folder.mkdir(parents=True, exist_ok=True)
+    claim(folder, REPORT)
     files = write_tables(folder, found.comparison, found.predictions, found.store, found.study)
     write_document(folder / JUDGED, found.judged)
     return [*files, folder / JUDGED, *write_report(folder, evaluation_report(found))]

@@ -23,6 +23,7 @@ if __name__ == "__main__":  # here, for --help waits for no import below
 from functools import partial
 
 from pipeline.config import Params
+from pipeline.ownership import REPORT, claim, refuse_foreign
 from pipeline.plots.probe import write_probe_plots
 from pipeline.probing import advice, probe, table, write_tables
 from pipeline.store import FeatureStore, check_trailers
@@ -31,13 +32,14 @@ from pipeline.store import FeatureStore, check_trailers
 def main(params: Params) -> None:
     """Probe the store that `probe` names."""
     wanted = params.probe
+    refuse_foreign(wanted.output, REPORT)
     store = FeatureStore.open(wanted.store or params.extract.store)
     slots, dim = store.feature_shape
     print(f"{store.path}: {slots} slots of {dim} channels at {store.ticks} ticks", flush=True)
     if params.train_head.check_store:
         check_trailers(store.path)
     study = probe(store, wanted, partial(print, flush=True))
-    wanted.output.mkdir(parents=True, exist_ok=True)
+    claim(wanted.output, REPORT)
     files = [*write_tables(wanted.output, study), *write_probe_plots(wanted.output, study)]
     print(table(study))
     print(advice(study))

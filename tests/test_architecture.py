@@ -11,6 +11,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 TIERS = (
     {"errors"},
+    {"ownership"},
     {"amounts", "channels", "config", "digests", "device", "durable", "scheduler"},
     {"recordings", "vlm", "store", "normalization", "models"},
     {"timeline", "simulation", "sampling", "checkpoint"},

@@ -19,17 +19,20 @@ from pipeline.durable import (
     write_with_digest,
 )
 from pipeline.errors import CheckpointIncomplete, DiskFull
+from pipeline.ownership import Kind
+
+KIND = Kind("a folder of this test", lambda folder: (folder / "a").is_file())
 
 
 def put(folder: Path, text: str) -> None:
-    replace_folder(folder, lambda temporary: (temporary / "a").write_text(text) and None)
+    replace_folder(folder, lambda temporary: (temporary / "a").write_text(text) and None, KIND)
 
 
 class Killed(BaseException):
     """Stands for the end of the process: nothing after it runs, no clean-up either."""
 
 
-@pytest.mark.parametrize("survived", range(6))
+@pytest.mark.parametrize("survived", range(7))
 def test_a_kill_between_any_two_steps_leaves_the_old_or_the_new(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, survived: int
 ) -> None:
@@ -56,8 +59,8 @@ def test_a_kill_between_any_two_steps_leaves_the_old_or_the_new(
         patched.setattr("shutil.rmtree", gone)
         with pytest.raises(Killed):
             put(folder, "new")
-    recover_folder(folder)
-    assert (folder / "a").read_text() == ("new" if survived >= 4 else "old")
+    recover_folder(folder, KIND)
+    assert (folder / "a").read_text() == ("new" if survived >= 5 else "old")
     assert os.listdir(tmp_path) == ["last"]
 
 
@@ -69,7 +72,7 @@ def test_a_failed_write_keeps_the_old(tmp_path: Path) -> None:
         raise OSError(28, "No space left on device")
 
     with pytest.raises(DiskFull, match=f"{folder}: no space left"):
-        replace_folder(folder, full)
+        replace_folder(folder, full, KIND)
     assert (folder / "a").read_text() == "old"
     assert os.listdir(tmp_path) == ["last"]
 
@@ -128,7 +131,9 @@ def test_tensors_on_a_full_disk_are_named_and_the_old_stand(small_disk: Path) ->
 
     def write(megabytes: int) -> None:
         tensors = {"a": torch.zeros(megabytes * 2**18)}
-        replace_folder(folder, lambda temporary: write_tensors(temporary / "a", tensors) and None)
+        replace_folder(
+            folder, lambda temporary: write_tensors(temporary / "a", tensors) and None, KIND
+        )
 
     write(1)
     with pytest.raises(DiskFull, match="last: no space left"):
@@ -139,7 +144,7 @@ def test_tensors_on_a_full_disk_are_named_and_the_old_stand(small_disk: Path) ->
 
 def test_what_is_no_full_disk_keeps_its_error(tmp_path: Path) -> None:
     with pytest.raises(IsADirectoryError):
-        replace_folder(tmp_path / "a", lambda temporary: temporary.write_text("") and None)
+        replace_folder(tmp_path / "a", lambda temporary: temporary.write_text("") and None, KIND)
 
 
 def test_fresh_leaves_a_link_s_other_end_alone(tmp_path: Path) -> None:

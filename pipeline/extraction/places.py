@@ -1,14 +1,14 @@
 """What lies at the place of a store and beside it, and what of that an extraction may use."""
 
-import shutil
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 
 from pipeline.errors import StoreMismatch
 from pipeline.extraction.survey import Survey
+from pipeline.ownership import remove_folder
 from pipeline.store import Donor, part_path, read_plan
-from pipeline.store.writer import MERGED
+from pipeline.store.places import MERGED, STORE
 from pipeline.vlm.feature_spec import differences
 
 Say = Callable[[str], None]
@@ -84,7 +84,7 @@ def set_aside(target: Path) -> list[Path]:
 def remove(folders: Sequence[Path]) -> None:
     """Remove what has been taken over."""
     for folder in folders:
-        shutil.rmtree(folder)
+        remove_folder(folder, STORE)
 
 
 def ledger_path(target: Path) -> Path:

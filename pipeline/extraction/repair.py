@@ -1,7 +1,6 @@
 """Begin the repair of a damaged store: take over what is sound, lay out anew what is not."""
 
 import json
-import shutil
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -15,6 +14,7 @@ from pipeline.extraction.layout import build_arrays, check_space, lay_out
 from pipeline.extraction.places import ledger_path
 from pipeline.extraction.run import sound_episodes
 from pipeline.extraction.survey import survey
+from pipeline.ownership import remove_folder
 from pipeline.store import FEATURES, StoreBuild, build_lock, part_path, read_plan, recover
 from pipeline.store.integrity.findings import Damage, Findings
 from pipeline.store.integrity.repair import (
@@ -26,7 +26,7 @@ from pipeline.store.integrity.repair import (
 )
 from pipeline.store.integrity.structure import read_arrays
 from pipeline.store.mending import extract_command, gc_command, start_over
-from pipeline.store.writer import MERGED
+from pipeline.store.places import MERGED, STORE
 from pipeline.vlm.feature_spec import document_digest
 
 
@@ -79,7 +79,7 @@ def repair(findings: Findings, params: Params, say: Callable[[str], None]) -> Re
             with disk_full_named(store):
                 return _begin(findings, plan, params, say)
         except BaseException:
-            shutil.rmtree(part_path(repair_build(store)), ignore_errors=True)
+            remove_folder(part_path(repair_build(store)), STORE)
             raise
 
 

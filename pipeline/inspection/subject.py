@@ -10,6 +10,7 @@ from pathlib import Path
 
 from pipeline.config import InspectParams, Params, Source
 from pipeline.errors import ConfigError, RecordingError
+from pipeline.ownership import REPORT, refuse_foreign
 from pipeline.recordings import Opened, open_recordings
 from pipeline.recordings.finding import hub_hint, meant
 
@@ -55,6 +56,7 @@ def subject_of(params: Params) -> Subject:
     places = (wanted.path,) if isinstance(wanted.path, str) else wanted.path or ()
     _check_output(wanted.output)
     if not places:
+        refuse_foreign(wanted.output, REPORT)
         said = ", ".join(source.name for source in params.data.sources)
         return Subject(said, wanted.output, None, params.data.sources, params.data.root)
     for place in places:
@@ -68,8 +70,10 @@ def subject_of(params: Params) -> Subject:
             f"{stores[0]} among them. Look at it alone: python -m stages.inspect {stores[0]}"
         )
     store = stores[0] if stores else None
+    folder = _folder(wanted, places)
+    refuse_foreign(folder, REPORT)
     source = Source(name=_last(places), path=tuple(places), format=wanted.format)
-    return Subject(name, _folder(wanted, places), store, (source,), Path())
+    return Subject(name, folder, store, (source,), Path())
 
 
 def _check(place: str, root: Path) -> None:

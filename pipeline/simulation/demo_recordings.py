@@ -8,7 +8,6 @@ other params are replaced, and nothing that the demo did not write is ever touch
 
 import errno
 import json
-import shutil
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,6 +18,7 @@ from tqdm import tqdm
 
 from pipeline.durable import write_document
 from pipeline.errors import ConfigError, DiskFull
+from pipeline.ownership import Kind, remove_folder, there
 from pipeline.simulation.insertion_formats import (
     ABUTTING,
     OVERLAPPING,
@@ -32,6 +32,8 @@ from pipeline.simulation.recorder import SimulatedEpisode, simulate_episode
 DEMO_VERSION: Final = 1
 """Goes up whenever the same seed gives other recordings."""
 MARKER: Final = "demo.json"
+DEMO: Final = Kind("what the demo wrote", lambda folder: (folder / MARKER).is_file())
+_SET: Final = Kind("a set of the demo's", lambda folder: DEMO.is_one(folder.parent))
 TASK: Final = "Red_point"
 
 _FIRST_EPOCH_S = datetime(2026, 1, 5, 9, tzinfo=UTC).timestamp()
@@ -60,7 +62,7 @@ def write_demo_recordings(root: Path, episodes: int, seed: int) -> None:
                     progress.update(episodes)
                     continue
                 part = root / f".{name}.part"
-                shutil.rmtree(part, ignore_errors=True)
+                remove_folder(part, _SET)
                 write(part, _simulated(number, episodes, seed, progress))
                 part.rename(root / name)
                 finished.append(name)
@@ -123,14 +125,13 @@ def _finished_sets(root: Path, wanted: dict[str, int]) -> list[str]:
     if {key: marked.get(key) for key in wanted} == wanted:
         return written
     for name in written:
-        shutil.rmtree(root / name)
+        remove_folder(root / name, _SET)
     return []
 
 
 def refuse_foreign(folder: Path, setting: str) -> None:
     """Raise `ConfigError` naming `setting` where `folder` has content that is not the demo's."""
-    empty = not folder.exists() or (folder.is_dir() and not any(folder.iterdir()))
-    if not empty and not (folder / MARKER).is_file():
+    if there(folder) and not DEMO.owns(folder):
         raise ConfigError(
             f"{folder} is there and has no {MARKER}: the demo did not write it and leaves it "
             f"alone; move it away, or set {setting} to another folder"

@@ -3,6 +3,7 @@
 import errno
 import fcntl
 import os
+import re
 import socket
 import sys
 import threading
@@ -12,13 +13,15 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO
 
-from pipeline.errors import StoreLocked
+from pipeline.errors import ConfigError, StoreLocked
 
 _BEAT_S = 10.0
 """How often the holder shows that it lives."""
 
 _STALE_S = 60.0
 """Without a sign of life for so long, a holder on another host is dead."""
+
+_HELD = re.compile(r"process \d+ on ")
 
 _NO_FLOCK = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK)
 
@@ -94,6 +97,11 @@ def _refuse_removed(file: TextIO, path: Path) -> None:
 def _refuse_living(file: TextIO, target: Path, path: Path, alone_here: bool) -> None:
     """Raise where another host's process, or one that flock cannot see, gave a sign of life."""
     holder = _holder(file)
+    if holder and not _HELD.match(holder):
+        raise ConfigError(
+            f"{path}: expected the lock of {target}, found a file that this project did not write. "
+            f"It was left as it is: move it away, or name another place than {target}."
+        )
     ours = holder.endswith(f" on {socket.gethostname()}")
     if not holder or (ours and alone_here):
         return

@@ -6,9 +6,7 @@ row counts as done when its checksum is not 0. Sealing writes the trailers that 
 accept the chunks, and one rename puts the build in its place.
 """
 
-import json
 import os
-import shutil
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -20,19 +18,12 @@ from numpy.typing import NDArray
 
 from pipeline.durable import disk_full_named, put_in_place, sync
 from pipeline.errors import StoreIncomplete
+from pipeline.ownership import begin_folder
 from pipeline.store.chunks import ChunkFiles, row_checksums
 from pipeline.store.environments import EnvironmentLog
-from pipeline.store.mending import start_over
 from pipeline.store.metadata import note_metadata
+from pipeline.store.places import STORE, part_path
 from pipeline.store.schema import CHECKSUMS, FEATURES, INCREMENTAL, KEYS, ArraySpec
-
-MERGED = "merge-"
-"""How the plan of a store begins that was not extracted but merged."""
-
-
-def part_path(target: Path) -> Path:
-    """Where a store is built."""
-    return target.with_name(target.name + ".part")
 
 
 class StoreBuild:
@@ -51,10 +42,8 @@ class StoreBuild:
 
     def create(self) -> None:
         """Begin from nothing: metadata of every array, then the space for its rows."""
-        if self.part.exists():
-            shutil.rmtree(self.part)
         with disk_full_named(self.part):
-            self.part.mkdir(parents=True)
+            begin_folder(self.part, STORE)
             for spec in self.specs.values():
                 spec.create(self.part)
 
@@ -166,14 +155,14 @@ class StoreBuild:
         for run in runs:
             self.files(CHECKSUMS).write(int(rows[run[0]]), checksums[run])
 
-    def seal(self) -> None:
+    def seal(self, *, keep: bool = False) -> None:
         """Check every row, write the trailers and put the store in its place.
 
-        Idempotent: a kill in the middle is mended by running it again. Raises `StoreIncomplete`
-        when rows are missing.
+        What it replaces is removed, or kept as `<name>.zarr.previous`. Idempotent: a kill in the
+        middle is mended by running it again. Raises `StoreIncomplete` when rows are missing.
         """
         self.finish()
-        self.put_in_place()
+        self.put_in_place(keep=keep)
 
     def finish(self) -> None:
         """The first half of `seal`: all of the store is on the disk, still beside its place."""
@@ -195,9 +184,9 @@ class StoreBuild:
         self.close()
         _sync_folders(self.part)
 
-    def put_in_place(self) -> None:
+    def put_in_place(self, *, keep: bool = False) -> None:
         """The second half of `seal`: an instant."""
-        put_in_place(self.part, self.target)
+        put_in_place(self.part, self.target, STORE, keep=keep)
 
     def close(self) -> None:
         """Close every file."""
@@ -226,20 +215,6 @@ def _runs(rows: Sequence[int] | NDArray[np.int64]) -> list[NDArray[np.intp]]:
     order = np.argsort(rows, kind="stable")
     gaps = np.flatnonzero(np.diff(np.asarray(rows, np.int64)[order]) != 1) + 1
     return np.split(order, gaps)
-
-
-def read_plan(store: Path) -> str | None:
-    """The plan of a store or a laid-out build; None where there is neither."""
-    try:
-        attributes = json.loads((store / "zarr.json").read_text())["attributes"]
-    except (FileNotFoundError, NotADirectoryError):
-        return None
-    except (json.JSONDecodeError, KeyError, UnicodeDecodeError):
-        raise StoreIncomplete(
-            f"{store / 'zarr.json'}: not a zarr group's metadata. {start_over(store)}"
-        ) from None
-    plan = attributes.get("plan")
-    return plan if isinstance(plan, str) else None
 
 
 def _sync_folders(root: Path) -> None:

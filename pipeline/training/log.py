@@ -9,9 +9,12 @@ from typing import Self
 from pipeline.config import TrainHeadParams
 from pipeline.durable import disk_full_named, fresh
 from pipeline.evaluation.experiments import speed_file
+from pipeline.ownership import Kind, begins_with, refuse_foreign
 from pipeline.training.loggers import Logger, open_loggers
 from pipeline.training.speed import Pace
 from pipeline.training.world import World
+
+_SPEED = ("step", "steps_per_s", "data_wait_share", "peak_memory_mib", "trained_s")
 
 Row = tuple[int, Mapping[str, float]]
 """A step, counted from 1, and metrics by name."""
@@ -32,11 +35,10 @@ class TrainingLog:
         folder.mkdir(parents=True, exist_ok=True)
         self._folder, self._loggers = folder, loggers
         self.rows: list[Row] = []
+        refuse_foreign(speed_file(folder), Kind("a run's speed", begins_with("\t".join(_SPEED))))
         self._speed = fresh(speed_file(folder)).open("w", encoding="utf-8", newline="")
         self._writer = csv.writer(self._speed, delimiter="\t")
-        self._writer.writerow(
-            ["step", "steps_per_s", "data_wait_share", "peak_memory_mib", "trained_s"]
-        )
+        self._writer.writerow(_SPEED)
         for step, metrics in earlier:
             self.write(step, metrics)
 

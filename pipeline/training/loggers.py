@@ -14,6 +14,7 @@ from dvclive import Live
 
 from pipeline.config import TrainHeadParams
 from pipeline.errors import ConfigError
+from pipeline.ownership import REPORT, claim
 from pipeline.training.live_page import LivePage, Turns
 
 FINISH_TIMEOUT_S = 120.0
@@ -189,7 +190,7 @@ def check_loggers(params: TrainHeadParams) -> None:
 def open_loggers(params: TrainHeadParams, resumed: bool) -> list[Logger]:
     """The curves for DVC and the loggers of `params`. Raises `ConfigError`."""
     logs, chosen = params.logs, params.loggers
-    logs.mkdir(parents=True, exist_ok=True)
+    claim(logs, REPORT)
     report = beside(logs, "dvclive.html") if "dvclive" in chosen else None
     found: list[Logger] = [DVCCurves(logs, report)]
     if "report" in chosen:

@@ -5,13 +5,13 @@ is finished. DVC deletes an output before it runs a stage, but not the `.part` b
 stopped run goes on under `dvc repro` too.
 """
 
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from pipeline.checkpoint import (
+    CHECKPOINT,
     DOCUMENT,
     SOURCE_KEYS,
     describe,
@@ -20,8 +20,23 @@ from pipeline.checkpoint import (
     source_differences,
 )
 from pipeline.config import TrainHeadParams
-from pipeline.durable import damaged, read_document, recover_folder, write_with_digest
+from pipeline.durable import (
+    damaged,
+    put_in_place,
+    read_document,
+    recover,
+    recover_folder,
+    write_with_digest,
+)
 from pipeline.errors import CheckpointIncomplete, CheckpointMismatch, ConfigError
+from pipeline.ownership import (
+    Kind,
+    begin_folder,
+    refuse_foreign,
+    remove_folder,
+    there,
+    unmark,
+)
 from pipeline.store import FeatureStore
 from pipeline.training.identity import NOTHING, run_identity
 
@@ -65,24 +80,18 @@ class Run:
         """
         if self.status != "new":
             return
-        if (self.part / RUN).exists():
-            if _has_checkpoint(self.part) and read_document(self.part / RUN) != self.identity:
-                shutil.rmtree(_aside(self.part), ignore_errors=True)
-                self.part.rename(_aside(self.part))
-            else:
-                shutil.rmtree(self.part)
-        self.part.mkdir(parents=True, exist_ok=True)
+        begun = (self.part / RUN).exists() and _has_checkpoint(self.part)
+        if begun and read_document(self.part / RUN) != self.identity:
+            remove_folder(_aside(self.part), RUN_FOLDER)
+            self.part.rename(_aside(self.part))
+        begin_folder(self.part, RUN_FOLDER)
         write_with_digest(self.part / RUN, self.identity)
+        unmark(self.part)
 
     def finish(self) -> None:
         """Rename the part to the output, in place of an older run, and drop what only resuming
         takes: the optimizer's state and the weights before averaging, four times what learns."""
-        replaced = _replaced(self.output)
-        if self.output.exists():
-            self.output.rename(replaced)
-        self.part.rename(self.output)
-        if replaced.exists():
-            shutil.rmtree(replaced)
+        put_in_place(self.part, self.output, RUN_FOLDER)
         _drop_trainer_state(self.output)
 
 
@@ -105,10 +114,10 @@ def open_run(
     output, identity = params.output, run_identity(params, store, extra_identity)
     part = _part(output)
     notes = []
-    _recover(output)
-    if output.exists():
-        finished = _finished_identity(output, section)
-        if finished != identity:
+    _refuse_to_replace(output, section)
+    recover(output, RUN_FOLDER)
+    if (output / RUN).exists():
+        if read_document(output / RUN) != identity:
             notes.append(f"{output} holds another run; it is replaced when this one is finished")
         elif (why := _damage(output)) is None:
             _drop_trainer_state(output)
@@ -120,9 +129,10 @@ def open_run(
             f"{part} has checkpoints but no {RUN}, so it cannot be told what run they are of. "
             f"Move it away or choose another {section}.output."
         )
+    refuse_foreign(part, RUN_FOLDER)
     if (part / RUN).exists():
-        recover_folder(part / BEST)
-        recover_folder(part / LAST)
+        recover_folder(part / BEST, CHECKPOINT)
+        recover_folder(part / LAST, CHECKPOINT)
     if (part / RUN).exists() and _has_checkpoint(part):
         differing = _compare(part, identity, section)
         if differing:
@@ -136,15 +146,24 @@ def open_run(
     return Run(output, "new", tuple(notes), identity, section)
 
 
-def _finished_identity(output: Path, section: str) -> Mapping[str, Any] | None:
-    if (output / RUN).exists():
-        return read_document(output / RUN)
-    if output.is_dir() and not any(output.iterdir()):
-        return None
-    raise ConfigError(
-        f"{section}.output: {output} exists and is no training run (it has no {RUN}), and a "
-        "finished run would replace it. Choose another output or move it away."
-    )
+def _is_run(folder: Path) -> bool:
+    """Whether a training wrote it; a `run.json` that cannot be read is one that was damaged."""
+    try:
+        document = read_document(folder / RUN)
+    except CheckpointIncomplete:
+        return (folder / RUN).is_file()
+    return {"source", "decides"} <= document.keys() or _has_checkpoint(folder)
+
+
+RUN_FOLDER = Kind("a training run", _is_run)
+
+
+def _refuse_to_replace(output: Path, section: str) -> None:
+    if there(output) and not RUN_FOLDER.owns(output):
+        raise ConfigError(
+            f"{section}.output: {output} exists and is no training run (it has no {RUN} of one), "
+            "and a finished run would replace it. Choose another output or move it away."
+        )
 
 
 def _damage(output: Path) -> str | None:
@@ -189,19 +208,6 @@ def _has_checkpoint(part: Path) -> bool:
 def _drop_trainer_state(output: Path) -> None:
     for name in (TRAINER_WEIGHTS, TRAINER_DOCUMENT):
         (output / LAST / name).unlink(missing_ok=True)
-
-
-def _recover(output: Path) -> None:
-    """Undo or complete a `finish` that a kill stopped."""
-    replaced = _replaced(output)
-    if replaced.exists() and output.exists():
-        shutil.rmtree(replaced)
-    elif replaced.exists():
-        replaced.rename(output)
-
-
-def _replaced(output: Path) -> Path:
-    return output.with_name(f"{output.name}.part-replaced")
 
 
 def _part(output: Path) -> Path:

@@ -20,6 +20,7 @@ from tokenizers.models import BPE
 from transformers import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
 
 from pipeline.durable import replace_folder
+from pipeline.ownership import Kind
 from pipeline.vlm.loading import quiet_transformers
 
 _SPECIAL_TOKENS = (
@@ -88,9 +89,19 @@ _VOCABULARY = 1536
 def write_demo_checkpoint(folder: Path, seed: int = 0) -> None:
     """Write the demo's checkpoint to `folder`, whole or not at all; same seed, same bytes.
 
-    What stood there before is replaced. Raises `DiskFull`.
+    One that stood there before is replaced. Raises `DiskFull`, and `ConfigError` where something
+    else stands there.
     """
-    replace_folder(folder, partial(_write, seed=seed))
+    replace_folder(folder, partial(_write, seed=seed), DEMO_CHECKPOINT)
+
+
+def _is_demo(folder: Path) -> bool:
+    config = folder / "config.json"
+    return config.is_file() and f'"vocab_size": {_VOCABULARY}' in config.read_text("utf-8")
+
+
+DEMO_CHECKPOINT = Kind("what the demo wrote", _is_demo)
+"""Called as the demo's other outputs are: it is written into one that is in the making."""
 
 
 def _write(folder: Path, seed: int) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.store.mending import mend, restore_command, start_over
-from pipeline.store.writer import read_plan
+from pipeline.store.places import read_plan
 
 
 @pytest.mark.parametrize("inside", ["", "zarr.json", "vl/features/c/0/0/0"])

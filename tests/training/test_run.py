@@ -11,6 +11,7 @@ import pytest
 
 from pipeline.durable import read_document
 from pipeline.errors import CheckpointIncomplete, CheckpointMismatch, ConfigError
+from pipeline.ownership import MARKER
 from pipeline.store import FeatureStore
 from pipeline.training import Trainer, open_run
 
@@ -209,11 +210,15 @@ def test_a_finish_that_was_killed_is_recovered(
     store: FeatureStore, params: Make, finished: Path
 ) -> None:
     output = finished
-    output.rename(output.with_name("head.part-replaced"))
+    held = output.with_name("head.replaced")
+    held.mkdir()
+    (held / MARKER).write_text("a folder that is being replaced,\n")
+    output.rename(held / "head")
     assert open_run(params(), store).status == "finished"
-    output.with_name("head.part-replaced").mkdir()
+    shutil.copytree(output, held / "head")
+    (held / MARKER).write_text("a folder that is being replaced,\n")
     assert open_run(params(), store).status == "finished"
-    assert not output.with_name("head.part-replaced").exists()
+    assert not held.exists()
 
 
 def test_what_no_training_wrote_is_never_replaced(store: FeatureStore, params: Make) -> None:

@@ -6,7 +6,6 @@ security policy forbids the rest. The same report gives the same bytes.
 
 import json
 import re
-import shutil
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
@@ -19,6 +18,7 @@ from markupsafe import Markup
 from tqdm import tqdm
 
 from pipeline.durable import disk_full_named, sync
+from pipeline.ownership import REPORT, begin_folder, claim, remove_folder
 from pipeline.plots.style import NO_FONT, RC, boxes, write
 from pipeline.report.page.blocks import (
     Block,
@@ -55,17 +55,17 @@ def write_report(folder: Path, report: Report) -> list[Path]:
     A page that says what looks wrong has all of it in `findings.csv` beside it. Pictures are drawn
     one at a time. Each file is put in place whole, the page last, so that a kill leaves the old
     page. Pictures that the page of before had and this one has not are removed; of other files in
-    `folder` none is touched. Raises `DiskFull` with the old page in place, and `ValueError` for a
-    picture's name that is twice in the report or no plain file stem.
+    `folder` none is touched. Raises `DiskFull` with the old page in place, `ConfigError` for a
+    folder with content that is no report's, and `ValueError` for a picture's name that is twice in
+    the report or no plain file stem.
     """
     names = [picture.name for picture in _pictures(report)]
     _check_names(names)
-    folder.mkdir(parents=True, exist_ok=True)
     temporary = folder / f".{PAGE}.new"
-    shutil.rmtree(temporary, ignore_errors=True)
     with disk_full_named(folder):
-        temporary.mkdir()
+        claim(folder, REPORT)
         try:
+            begin_folder(temporary, REPORT)
             page = _Page(report, temporary, names).html()
             # A file's name need not be text: what is none is shown as \udcXX.
             texts = {**_findings(report), PAGE: page}
@@ -73,7 +73,7 @@ def write_report(folder: Path, report: Report) -> list[Path]:
                 (temporary / name).write_text(text, encoding="utf-8", errors="backslashreplace")
             return _put_in_place(temporary, folder, names, texts)
         finally:
-            shutil.rmtree(temporary)
+            remove_folder(temporary, REPORT)
 
 
 def _put_in_place(

@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,11 +12,13 @@ import zarr
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.durable import disk_full_named, sync
+from pipeline.durable import disk_full_named, put_in_place, sync
 from pipeline.errors import StoreIncomplete, StoreMismatch
+from pipeline.ownership import begin_folder, refuse_foreign, remove_folder
 from pipeline.store.archive.codecs import Choice, Codec, choose, codecs_for
 from pipeline.store.archive.layout import create_array, inner_rows, rows_of, shard_path, shards
 from pipeline.store.archive.manifest import (
+    ARCHIVE,
     ATTRIBUTE,
     ROOT,
     ArchivedArray,
@@ -39,10 +40,10 @@ from pipeline.store.chunks import check_row_checksums
 from pipeline.store.lock import build_lock
 from pipeline.store.metadata import ATTRIBUTE as METADATA_DIGEST
 from pipeline.store.metadata import check_metadata
+from pipeline.store.places import part_path
 from pipeline.store.reader import FeatureStore
 from pipeline.store.replacement import inode_of, refuse_replaced
 from pipeline.store.schema import CHECKSUMS, FEATURES, ArraySpec, chunk_paths, read_specs
-from pipeline.store.writer import part_path
 
 SAMPLES = 4
 """Inner chunks of an array that its codec is chosen by."""
@@ -61,37 +62,37 @@ def archive(store: Path, output: Path, level: int, threads: int) -> ArchiveRepor
     left alone.
 
     Raises `StoreIncomplete` where the store is not finished or is damaged (array, file and rows
-    named), `StoreMismatch` where something else lies at `output`, `StoreLocked` and `DiskFull`.
+    named), `StoreMismatch` where another archive lies at `output`, `ConfigError` where something
+    else does, `StoreLocked` and `DiskFull`.
     """
     begun = time.perf_counter()
     FeatureStore.open(store)  # says what is wrong with something that is no finished store
     check_metadata(store)
     with build_lock(output):
-        if output.exists():
+        refuse_foreign(output, ARCHIVE)
+        if is_archive(output):
             return ArchiveReport(output, _archived_already(store, output).arrays, None)
         part = part_path(output)
         try:
             with disk_full_named(output), zarr.config.set({"async.concurrency": threads}):
                 arrays = _write(store, part, level)
         except BaseException:
-            shutil.rmtree(part, ignore_errors=True)
+            remove_folder(part, ARCHIVE)
             raise
-        part.rename(output)
-        sync(output.parent)
+        put_in_place(part, output, ARCHIVE)
     return ArchiveReport(output, arrays, time.perf_counter() - begun)
 
 
 def _archived_already(store: Path, output: Path) -> Manifest:
     """The manifest at `output`, where it is of this store as it is now."""
-    if is_archive(output):
-        manifest = read_manifest(output)
-        trailers = {
-            name: tuple(trailer(path) for path in chunk_paths(store, spec))
-            for name, spec in read_specs(store).items()
-        }
-        archived = {name: array.crc32c for name, array in manifest.arrays.items()}
-        if manifest.metadata == read_metadata(store) and archived == trailers:
-            return manifest
+    manifest = read_manifest(output)
+    trailers = {
+        name: tuple(trailer(path) for path in chunk_paths(store, spec))
+        for name, spec in read_specs(store).items()
+    }
+    archived = {name: array.crc32c for name, array in manifest.arrays.items()}
+    if manifest.metadata == read_metadata(store) and archived == trailers:
+        return manifest
     raise StoreMismatch(
         f"{output}: there already, and not an archive of {store} as it is now. Remove it, or name "
         "another place with archive.output."
@@ -100,8 +101,7 @@ def _archived_already(store: Path, output: Path) -> Manifest:
 
 def _write(store: Path, part: Path, level: int) -> dict[str, ArchivedArray]:
     """Everything of an archive, its manifest last, all of it on the disk."""
-    if part.exists():
-        shutil.rmtree(part)
+    begin_folder(part, ARCHIVE)
     inode, metadata, specs = inode_of(store), read_metadata(store), read_specs(store)
     checksums = all_rows(store, specs[CHECKSUMS])
     total = sum(spec.data_bytes for spec in specs.values())

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import StoreIncomplete, StoreMismatch
+from pipeline.ownership import Kind
 
 ARCHIVE_SCHEMA = 1
 ATTRIBUTE = "archive"
@@ -74,6 +75,9 @@ class Manifest:
 def is_archive(path: Path) -> bool:
     """Whether a complete archive lies there; reads the group's metadata only."""
     return _document(path) is not None
+
+
+ARCHIVE = Kind("an archive of a store", is_archive)
 
 
 def read_manifest(path: Path) -> Manifest:

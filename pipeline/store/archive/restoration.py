@@ -1,6 +1,5 @@
 """An archive -> the store, to the byte."""
 
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,8 +9,9 @@ import zarr
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.durable import disk_full_named, recover, sync
+from pipeline.durable import disk_full_named, sync
 from pipeline.errors import StoreMismatch
+from pipeline.ownership import begin_folder, remove_folder
 from pipeline.store.archive.layout import open_array, rows_of, shard_path, shards
 from pipeline.store.archive.manifest import (
     ROOT,
@@ -25,8 +25,9 @@ from pipeline.store.archive.manifest import (
 from pipeline.store.archive.source import checked_rows, chunk_crcs
 from pipeline.store.lock import build_lock
 from pipeline.store.mending import extract_command, gc_command
+from pipeline.store.places import STORE, part_path, read_plan, recover
 from pipeline.store.schema import ArraySpec, chunk_paths, read_specs
-from pipeline.store.writer import StoreBuild, part_path, read_plan
+from pipeline.store.writer import StoreBuild
 
 
 def restore(archive: Path, target: Path, threads: int) -> None:
@@ -36,7 +37,8 @@ def restore(archive: Path, target: Path, threads: int) -> None:
     begun anew. Where that very store is there already, nothing is done.
 
     Raises `StoreIncomplete` naming file and array where the archive is damaged, `StoreMismatch`
-    where something else lies at `target` or is being built there, `StoreLocked` and `DiskFull`.
+    where another store lies at `target` or is being built there, `ConfigError` where something
+    else does, `StoreLocked` and `DiskFull`.
     """
     manifest = read_manifest(archive)
     with build_lock(target):
@@ -49,14 +51,13 @@ def restore(archive: Path, target: Path, threads: int) -> None:
             with disk_full_named(target), zarr.config.set({"async.concurrency": threads}):
                 _build(manifest, archive, target)
         except BaseException:
-            shutil.rmtree(part, ignore_errors=True)
+            remove_folder(part, STORE)
             raise
 
 
 def _build(manifest: Manifest, archive: Path, target: Path) -> None:
     part = part_path(target)
-    if part.exists():
-        shutil.rmtree(part)
+    begin_folder(part, STORE)
     for name, text in manifest.metadata.items():
         if name != ROOT:
             _write_text(part / name, text)

@@ -11,8 +11,8 @@ import zarr
 from pipeline.errors import StoreIncomplete
 from pipeline.store.archive.manifest import read_manifest
 from pipeline.store.chunks import read_rows
+from pipeline.store.places import read_plan
 from pipeline.store.schema import CHECKSUMS, FEATURES, ArraySpec, read_specs
-from pipeline.store.writer import read_plan
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ from pipeline.errors import ConfigError, PipelineError
 from pipeline.store.archive import is_archive
 from pipeline.store.housekeeping.contents import Contents, contents_of, contents_of_archive
 from pipeline.store.lock import lock_holder
+from pipeline.store.places import read_plan
 from pipeline.store.reader import FeatureStore
-from pipeline.store.writer import read_plan
 
 GROUPS: tuple[str, ...] = ("features", "sensor", "state", "rest")
 Kind = Literal[

@@ -15,7 +15,7 @@ from pipeline.store.housekeeping.inventory import Entry, Inventory, Kind
 from pipeline.store.housekeeping.listing import clause
 from pipeline.store.lock import build_lock
 from pipeline.store.mending import gc_command
-from pipeline.store.writer import MERGED
+from pipeline.store.places import MERGED
 
 _REMOVABLE: tuple[Kind, ...] = (
     "build",

@@ -15,9 +15,11 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from pipeline.durable import disk_full_named, sync
+from pipeline.ownership import begin_folder, remove_folder
 from pipeline.store.chunks import ChunkFiles, row_checksums
 from pipeline.store.environments import EnvironmentLog
 from pipeline.store.integrity.findings import Findings, runs_of
+from pipeline.store.places import STORE, part_path, read_plan
 from pipeline.store.replacement import refuse_replaced
 from pipeline.store.schema import (
     CHECKSUMS,
@@ -27,7 +29,7 @@ from pipeline.store.schema import (
     chunk_paths,
     read_specs,
 )
-from pipeline.store.writer import StoreBuild, part_path, read_plan
+from pipeline.store.writer import StoreBuild
 
 _BLOCK_BYTES = 2**26
 
@@ -46,8 +48,8 @@ def copy_layout(store: Path) -> StoreBuild:
     """A build with the metadata of a store, and its sound chunk files but those of features."""
     specs = read_specs(store)
     build = StoreBuild(repair_build(store), specs, read_plan(store) or "")
-    shutil.rmtree(build.part, ignore_errors=True)
     with disk_full_named(build.part):
+        begin_folder(build.part, STORE)
         for metadata in store.glob("**/zarr.json"):
             place = build.part / metadata.relative_to(store)
             place.parent.mkdir(parents=True, exist_ok=True)
@@ -87,7 +89,7 @@ def put_in_place(build: StoreBuild, store: Path) -> None:
         sync(folder)
         if (folder / "zarr.json").exists():
             sync(folder / "zarr.json")
-    shutil.rmtree(part_path(store), ignore_errors=True)  # what has no plan is no build
+    remove_folder(part_path(store), STORE)  # what has no plan is no build
     build.part.rename(part_path(store))
     sync(store.parent)
 

@@ -20,7 +20,7 @@ import zarr
 from tqdm import tqdm
 
 from pipeline.amounts import size
-from pipeline.durable import free_bytes, recover
+from pipeline.durable import free_bytes
 from pipeline.errors import ConfigError, DiskFull, StoreIncomplete, StoreMismatch
 from pipeline.store.integrity import verify
 from pipeline.store.lock import build_lock
@@ -28,6 +28,7 @@ from pipeline.store.mending import gc_command
 from pipeline.store.merging.copying import axis_kind, copy_features, copy_stream
 from pipeline.store.merging.joining import Joined, join
 from pipeline.store.metadata import ATTRIBUTE, check_metadata
+from pipeline.store.places import MERGED, part_path, read_plan, recover
 from pipeline.store.reader import FeatureStore
 from pipeline.store.replacement import Inode, inode_of, refuse_replaced
 from pipeline.store.schema import (
@@ -38,7 +39,7 @@ from pipeline.store.schema import (
     arrays,
     read_specs,
 )
-from pipeline.store.writer import MERGED, StoreBuild, part_path, read_plan
+from pipeline.store.writer import StoreBuild
 
 Say = Callable[[str], None]
 _THREADS = 4

@@ -1,0 +1,144 @@
+"""Which folders this project wrote: only those are ever replaced or removed.
+
+A complete folder is told by what it says of itself: a store by its attributes, a training run by
+its `run.json`. One in the making, and one of reports, holds `MARKER`, which is the first thing
+written into it, so that what a kill leaves behind is known too. An empty folder is anybody's.
+"""
+
+import shutil
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.errors import ConfigError
+
+MARKER = ".vla-feature-cache"
+_NAMED = 3
+"""Names that a message lists of a folder."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of output, and how a complete one is told from what somebody else wrote."""
+
+    name: str
+    """With its article, as an error calls it."""
+    is_one: Callable[[Path], bool]
+
+    def owns(self, path: Path) -> bool:
+        """Whether this project may replace what lies there as one of this kind."""
+        if self.is_one(path):
+            return True
+        return path.is_dir() and (_marked(path) == self.name or not any(path.iterdir()))
+
+
+def there(path: Path) -> bool:
+    """Whether anything has this name, a link to nothing too."""
+    return path.exists() or path.is_symlink()
+
+
+def refuse_foreign(path: Path, kind: Kind) -> None:
+    """Raise `ConfigError` where something lies at `path` that this project did not write."""
+    if there(path) and not kind.owns(path):
+        raise ConfigError(
+            f"{path}: expected nothing there or {kind.name} that this project wrote, found "
+            f"{_described(path)}. It was left as it is: move it away, or name another place."
+        )
+
+
+def remove_folder(path: Path, kind: Kind) -> None:
+    """Remove a folder of this kind, if there is one; of one behind a symbolic link, the link alone.
+
+    Raises `ConfigError` where it is not this project's.
+    """
+    refuse_foreign(path, kind)
+    if path.is_symlink():
+        path.unlink()
+    elif path.exists():
+        with suppress(OSError):  # on a full disk, where only a kill from here on would show
+            mark(path, kind)
+        for entry in path.iterdir():  # the marker last
+            if entry.is_dir() and not entry.is_symlink():
+                shutil.rmtree(entry)
+            elif entry.name != MARKER:
+                entry.unlink()
+        shutil.rmtree(path)
+
+
+def begin_folder(path: Path, kind: Kind) -> None:
+    """Make an empty, marked folder, in place of one of this kind that was begun before."""
+    remove_folder(path, kind)
+    claim(path, kind)
+
+
+def claim(folder: Path, kind: Kind) -> None:
+    """Make a folder, or take one of this kind as it is, and mark it.
+
+    Raises `ConfigError` where it is not this project's.
+    """
+    refuse_foreign(folder, kind)
+    folder.mkdir(parents=True, exist_ok=True)
+    mark(folder, kind)
+
+
+def mark(folder: Path, kind: Kind) -> None:
+    """Write down that a folder is of this kind, unless it says so already."""
+    if _marked(folder) != kind.name:
+        unmark(folder)  # DVC may have linked it into its cache
+        (folder / MARKER).write_text(f"{kind.name}\n", encoding="utf-8")
+
+
+def unmark(folder: Path) -> None:
+    """Take the marker away from a folder that says by itself what it is."""
+    (folder / MARKER).unlink(missing_ok=True)
+
+
+def begins_with(line: str) -> Callable[[Path], bool]:
+    """Tells a file by how its first line begins; an empty one is anybody's."""
+
+    def begins(path: Path) -> bool:
+        if not path.is_file():
+            return False
+        with path.open(encoding="utf-8", errors="replace") as file:
+            return not (first := file.readline().strip()) or first.startswith(line)
+
+    return begins
+
+
+def _is_report(folder: Path) -> bool:
+    """Whether a version that did not mark its reports wrote this one."""
+    if any((folder / sign).exists() for sign in (".report.html.new", ".files.sqlite")):
+        return True
+    if (folder / "judged.json").is_file() or (folder / "plots" / "metrics").is_dir():
+        return True
+    if all((folder / f"{table}.csv").is_file() for table in ("slots", "groups", "targets")):
+        return True
+    page = folder / "report.html"
+    if not page.exists() and folder.is_dir():  # of one command, each page in a folder of its own
+        parts = list(folder.iterdir())
+        return bool(parts) and all(part.is_dir() and REPORT.owns(part) for part in parts)
+    return page.is_file() and b'<meta name="pictures"' in page.read_bytes()[: 2**16]
+
+
+REPORT = Kind("a folder of reports", _is_report)
+"""What evaluations, inspections, probes, comparisons and trainings show; files are added to it."""
+
+
+def _marked(folder: Path) -> str | None:
+    """The kind that a folder is marked with."""
+    try:
+        return (folder / MARKER).read_text(encoding="utf-8", errors="replace").strip()
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+
+
+def _described(path: Path) -> str:
+    if not path.exists():
+        return "a link to nothing"
+    if not path.is_dir():
+        return "a file"
+    if any((path / name).is_file() for name in ("zarr.json", ".zgroup", ".zarray")):
+        return "a zarr group or array that it did not write"
+    names = sorted(entry.name for entry in path.iterdir())
+    return f"a folder with {', '.join(names[:_NAMED])}{' …' if len(names) > _NAMED else ''}"
