@@ -29,12 +29,12 @@ from pipeline.durable import (
 from pipeline.errors import CheckpointIncomplete, CheckpointMismatch, PipelineError
 from pipeline.models import Policy, PolicyShape, action_groups
 from pipeline.normalization import Normalization
-from pipeline.ownership import Kind
+from pipeline.ownership import OutputKind
 from pipeline.store import FeatureStore
 
 FORMAT = 2
 WEIGHTS, DOCUMENT = "policy.safetensors", "policy.json"
-CHECKPOINT = Kind("a checkpoint of a policy", lambda folder: (folder / DOCUMENT).is_file())
+CHECKPOINT = OutputKind("a checkpoint of a policy", lambda folder: (folder / DOCUMENT).is_file())
 SOURCE_KEYS = ("feature_spec", "streams", "action_hz", "vlm_reuse_count")
 
 

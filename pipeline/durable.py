@@ -15,7 +15,7 @@ from torch import Tensor
 
 from pipeline.errors import CheckpointIncomplete, DiskFull
 from pipeline.ownership import (
-    Kind,
+    OutputKind,
     begin_folder,
     mark,
     refuse_foreign,
@@ -65,7 +65,7 @@ def fresh(path: Path) -> Path:
     return path
 
 
-def replace_folder(folder: Path, write: Callable[[Path], None], kind: Kind) -> None:
+def replace_folder(folder: Path, write: Callable[[Path], None], kind: OutputKind) -> None:
     """Put what `write` writes into a temporary folder at `folder`, in place of what is there.
 
     A kill leaves the old content or the new, as `put_in_place` does. Raises `DiskFull` with the old
@@ -86,7 +86,7 @@ def replace_folder(folder: Path, write: Callable[[Path], None], kind: Kind) -> N
     put_in_place(temporary, folder, kind)
 
 
-def recover_folder(folder: Path, kind: Kind) -> None:
+def recover_folder(folder: Path, kind: OutputKind) -> None:
     """Undo or complete a `replace_folder` that a kill stopped."""
     recover(folder, kind)
     remove_folder(_beside(folder, "new"), kind)
@@ -97,13 +97,13 @@ def previous_path(target: Path) -> Path:
     return _beside(target, "previous")
 
 
-KEPT = Kind("a store of before, kept for its rows,", lambda path: False)
+KEPT = OutputKind("a store of before, kept for its rows,", lambda path: False)
 """Marked when it is kept: a copy that a user made under that name is not one."""
 
-_HELD = Kind("a folder that is being replaced,", lambda path: False)
+HELD = OutputKind("a folder that is being replaced,", lambda path: False)
 
 
-def put_in_place(complete: Path, target: Path, kind: Kind, *, keep: bool = False) -> None:
+def put_in_place(complete: Path, target: Path, kind: OutputKind, *, keep: bool = False) -> None:
     """Rename a complete folder to `target`; what was there is removed, or kept as `<name>.previous`
     in place of what was kept before.
 
@@ -118,14 +118,14 @@ def put_in_place(complete: Path, target: Path, kind: Kind, *, keep: bool = False
     if there(target):
         # Not `.old` itself: one that a user made is a copy that somebody wants.
         held = _beside(target, "keeping" if keep else "replaced")
-        begin_folder(held, _HELD)
+        begin_folder(held, HELD)
         target.rename(held / target.name)
     complete.rename(target)
     sync(target.parent)
     recover(target, kind)
 
 
-def recover(target: Path, kind: Kind) -> None:
+def recover(target: Path, kind: OutputKind) -> None:
     """Undo or complete a `put_in_place` that a kill stopped.
 
     Raises `ConfigError` where something that is not of this kind lies in one of its places.
@@ -133,7 +133,7 @@ def recover(target: Path, kind: Kind) -> None:
     refuse_foreign(target, kind)
     for suffix in ("replaced", "keeping"):
         held = _beside(target, suffix)
-        refuse_foreign(held, _HELD)
+        refuse_foreign(held, HELD)
         old = held / target.name
         if there(old) and not there(target):
             old.rename(target)
@@ -141,11 +141,11 @@ def recover(target: Path, kind: Kind) -> None:
             mark(old, KEPT)
             remove_folder(previous_path(target), KEPT)
             old.rename(previous_path(target))
-        remove_folder(held, _HELD)
+        remove_folder(held, HELD)
     _recover_unheld(target, kind)
 
 
-def _recover_unheld(target: Path, kind: Kind) -> None:
+def _recover_unheld(target: Path, kind: OutputKind) -> None:
     """Bring back what an earlier version, when it was killed, left as `<target>.old`."""
     old = _beside(target, "old")
     if old.is_symlink() and there(target):

@@ -19,7 +19,7 @@ _NAMED = 3
 
 
 @dataclass(frozen=True)
-class Kind:
+class OutputKind:
     """A kind of output, and how a complete one is told from what somebody else wrote."""
 
     name: str
@@ -38,7 +38,7 @@ def there(path: Path) -> bool:
     return path.exists() or path.is_symlink()
 
 
-def refuse_foreign(path: Path, kind: Kind) -> None:
+def refuse_foreign(path: Path, kind: OutputKind) -> None:
     """Raise `ConfigError` where something lies at `path` that this project did not write."""
     if there(path) and not kind.owns(path):
         raise ConfigError(
@@ -47,7 +47,7 @@ def refuse_foreign(path: Path, kind: Kind) -> None:
         )
 
 
-def remove_folder(path: Path, kind: Kind) -> None:
+def remove_folder(path: Path, kind: OutputKind) -> None:
     """Remove a folder of this kind, if there is one; of one behind a symbolic link, the link alone.
 
     Raises `ConfigError` where it is not this project's.
@@ -66,13 +66,13 @@ def remove_folder(path: Path, kind: Kind) -> None:
         shutil.rmtree(path)
 
 
-def begin_folder(path: Path, kind: Kind) -> None:
+def begin_folder(path: Path, kind: OutputKind) -> None:
     """Make an empty, marked folder, in place of one of this kind that was begun before."""
     remove_folder(path, kind)
     claim(path, kind)
 
 
-def claim(folder: Path, kind: Kind) -> None:
+def claim(folder: Path, kind: OutputKind) -> None:
     """Make a folder, or take one of this kind as it is, and mark it.
 
     Raises `ConfigError` where it is not this project's.
@@ -82,7 +82,7 @@ def claim(folder: Path, kind: Kind) -> None:
     mark(folder, kind)
 
 
-def mark(folder: Path, kind: Kind) -> None:
+def mark(folder: Path, kind: OutputKind) -> None:
     """Write down that a folder is of this kind, unless it says so already."""
     if _marked(folder) != kind.name:
         unmark(folder)  # DVC may have linked it into its cache
@@ -121,7 +121,7 @@ def _is_report(folder: Path) -> bool:
     return page.is_file() and b'<meta name="pictures"' in page.read_bytes()[: 2**16]
 
 
-REPORT = Kind("a folder of reports", _is_report)
+REPORT = OutputKind("a folder of reports", _is_report)
 """What evaluations, inspections, probes, comparisons and trainings show; files are added to it."""
 
 

@@ -17,11 +17,11 @@ if __name__ == "__main__":  # here, for --help waits for no import below
 from pipeline.config import Params
 from pipeline.durable import disk_full_named, fresh
 from pipeline.evaluation import experiment_rows, experiments_table, read_experiments, write_rows
-from pipeline.ownership import REPORT, Kind, begins_with, claim, refuse_foreign
+from pipeline.ownership import REPORT, OutputKind, begins_with, claim, refuse_foreign
 from pipeline.report import write_report
 from pipeline.report.evaluation.comparison import comparison_report
 
-_TABLE = Kind("a table of experiments", begins_with("| experiment |"))
+_TABLE = OutputKind("a table of experiments", begins_with("| experiment |"))
 
 
 def main(params: Params) -> None:

@@ -19,9 +19,9 @@ from pipeline.durable import (
     write_with_digest,
 )
 from pipeline.errors import CheckpointIncomplete, DiskFull
-from pipeline.ownership import Kind
+from pipeline.ownership import OutputKind
 
-KIND = Kind("a folder of this test", lambda folder: (folder / "a").is_file())
+KIND = OutputKind("a folder of this test", lambda folder: (folder / "a").is_file())
 
 
 def put(folder: Path, text: str) -> None:

@@ -1,17 +1,23 @@
 """What lies at the place of a store and beside it, and what of that an extraction may use."""
 
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import Any
 
-from pipeline.errors import StoreMismatch
+from pipeline.durable import KEPT, previous_path
+from pipeline.errors import StoreIncomplete, StoreMismatch
 from pipeline.extraction.survey import Survey
-from pipeline.ownership import remove_folder
-from pipeline.store import Donor, part_path, read_plan
-from pipeline.store.places import MERGED, STORE
+from pipeline.ownership import refuse_foreign, remove_folder
+from pipeline.recordings.embodiment import Embodiment
+from pipeline.store import Donor, StoreBuild, part_path, read_plan
+from pipeline.store.places import MERGED, STORE, is_store
+from pipeline.store.schema import read_specs
 from pipeline.vlm.feature_spec import differences
 
 Say = Callable[[str], None]
+_SHOWN = 6
+"""Channels that a message lists."""
 
 
 def plans(target: Path) -> tuple[str | None, str | None]:
@@ -19,14 +25,21 @@ def plans(target: Path) -> tuple[str | None, str | None]:
     return read_plan(part_path(target)), read_plan(target)
 
 
+def layout_damage(target: Path) -> str | None:
+    """What is wrong with all but the feature rows of the build of a store."""
+    part = part_path(target)
+    with closing(StoreBuild(target, read_specs(part), read_plan(part) or "")) as build:
+        return build.layout_damage()
+
+
 def known_places(target: Path) -> list[Path]:
-    """Builds that were set aside, and the store, unless a repair of it has begun.
+    """Builds that were set aside, the store, and the one before it, unless a repair has begun.
 
     A repair leaves out what is damaged: that must not come back from the store that it mends.
     """
     aside = set_aside(target)
     repairs = {read_plan(place) for place in [*aside, part_path(target)]} - {None}
-    return aside if read_plan(target) in repairs else [*aside, target]
+    return aside if read_plan(target) in repairs else [*aside, target, *_kept(target)]
 
 
 @contextmanager
@@ -40,23 +53,112 @@ def donors_at(places: Sequence[Path], surveyed: Survey) -> Generator[list[Donor]
             donor.close()
 
 
-def refuse_to_lose(target: Path, surveyed: Survey) -> None:
-    """Raise where a merged store, or one under repair, holds recordings that params do not name.
+def refuse_to_lose(target: Path, surveyed: Survey, embodiment: Embodiment) -> None:
+    """Raise `StoreMismatch` where rows would be lost that these params cannot give again.
 
-    Who follows the advice of a check may run under other params than that store's own.
+    Those of a merged store, or one under repair, with recordings that params do not name: who
+    follows the advice of a check may run under other params than that store's own. And those of a
+    store or build without an episode in common, of another embodiment or of other sources only.
     """
-    begun, there = plans(target)
-    if there is None or not (begun == there or there.startswith(MERGED)):
+    begun, finished = plans(target)
+    for place in (target, part_path(target)):
+        if read_plan(place) is not None:
+            with closing(Donor(place)) as donor:
+                _refuse_another(donor, surveyed, embodiment)
+    if finished is None or not (begun == finished or finished.startswith(MERGED)):
         return
-    with closing(Donor(part_path(target) if begun == there else target)) as donor:
+    with closing(Donor(part_path(target) if begun == finished else target)) as donor:
         lost = set(donor.episode_contents) - {one.content for one in surveyed.episodes}
     if lost:
-        what = "is under repair" if begun == there else "was merged of others"
+        what = "is under repair" if begun == finished else "was merged of others"
         raise StoreMismatch(
             f"{target}: {what} and holds {len(lost)} episode(s) that the params do not name; "
             "extraction would replace it. Give the --params it was made with (or run its merge "
             "again), name another extract.store, or move it away."
         )
+
+
+def _refuse_another(donor: Donor, surveyed: Survey, embodiment: Embodiment) -> None:
+    known, now = set(donor.episode_contents), {one.content for one in surveyed.episodes}
+    if not known or known & now or not donor.rows:
+        return
+    sources = donor.attrs["sources"], sorted({one.recording.source for one in surveyed.episodes})
+    before, now = donor.attrs["streams"], embodiment.document()
+    differing = [
+        f"{stream}: {_channels(before[stream])} there, {_channels(now[stream])} here"
+        for stream in ("action", "sensor", "state")
+        if before[stream]["names"] and now[stream]["names"]
+        if any(before[stream][key] != now[stream][key] for key in ("names", "units"))
+    ]
+    if differing or not set(sources[0]) & set(sources[1]):
+        why = [f"sources: {', '.join(sources[0])} there, {', '.join(sources[1])} here", *differing]
+        raise StoreMismatch(
+            f"{donor.path}: holds {len(donor.rows)} feature rows of {len(known)} episode(s), none "
+            "of which is in data.sources, and extraction would throw them away:\n"
+            + "\n".join(f"  {line}" for line in why)
+            + "\nName another store for these recordings, with --set extract.store=…, give the "
+            "--params it was made with, or move it away."
+        )
+
+
+def _channels(stream: Mapping[str, Any]) -> str:
+    pairs = zip(stream["names"], stream["units"], strict=True)
+    named = [f"{name} ({unit})" if unit else name for name, unit in pairs]
+    listed = ", ".join(named if len(named) <= _SHOWN else [*named[: _SHOWN - 1], "…"])
+    return f"{len(named)} channels [{listed}]"
+
+
+def keeping_note(target: Path, surveyed: Survey) -> list[str]:
+    """What a run says of episodes that it does not name: the store with them is kept once more.
+
+    Raises `ConfigError` where something else lies where it would be kept.
+    """
+    kept, contents = previous_path(target), {one.content for one in surveyed.episodes}
+    if lost := _lost(target, surveyed):
+        refuse_foreign(kept, KEPT)
+        return [
+            f"{target} holds {lost}: it is kept as {kept} until the next successful run, which "
+            "takes their rows from it where they are there again"
+        ]
+    for place in _kept(target):
+        with closing(Donor(place)) as donor:
+            gone = sum(content not in contents for content in donor.episode_contents)
+        return [f"{place} is removed when this run succeeds; {gone} episode(s) are only in there"]
+    return []
+
+
+def put_in_place(build: StoreBuild, surveyed: Survey, say: Say) -> None:
+    """Seal a build, keep the store before it where episodes would be lost, and tidy up."""
+    target = build.target
+    keep = _lost(target, surveyed) is not None
+    with closing(build):
+        build.seal(keep=keep)
+    for folder in set_aside(target):
+        remove_folder(folder, STORE)
+    if keep:
+        say(f"{previous_path(target)}: the store of before, kept until the next successful run")
+    else:
+        for place in _kept(target):
+            remove_folder(place, KEPT)
+
+
+def _lost(target: Path, surveyed: Survey) -> str | None:
+    """Which episodes of the store are not in the one that takes its place; None where all are."""
+    if read_plan(target) in (None, surveyed.plan):
+        return None
+    contents = {one.content for one in surveyed.episodes}
+    with closing(Donor(target)) as donor:
+        try:
+            lost = sum(content not in contents for content in donor.episode_contents)
+        except StoreIncomplete:
+            return "episodes that can no longer be told"
+    return f"{lost} episode(s) that are not in this run" if lost else None
+
+
+def _kept(target: Path) -> list[Path]:
+    """The store that a run kept, if there is one; a copy that a user made is not one."""
+    kept = previous_path(target)
+    return [kept] if KEPT.owns(kept) and read_plan(kept) is not None else []
 
 
 def make_room(target: Path, surveyed: Survey, say: Say) -> None:
@@ -78,13 +180,8 @@ def make_room(target: Path, surveyed: Survey, say: Say) -> None:
 
 def set_aside(target: Path) -> list[Path]:
     """Builds of other plans that were interrupted, kept for their rows."""
-    return sorted(target.parent.glob(f"{target.name}.known-*"))
-
-
-def remove(folders: Sequence[Path]) -> None:
-    """Remove what has been taken over."""
-    for folder in folders:
-        remove_folder(folder, STORE)
+    builds = sorted(target.parent.glob(f"{target.name}.known-*"))
+    return [path for path in builds if path.name.rpartition("-")[2].isdigit() and is_store(path)]
 
 
 def ledger_path(target: Path) -> Path:

@@ -9,7 +9,7 @@ from pathlib import Path
 from pipeline.config import Params
 from pipeline.digests import ContentDigests
 from pipeline.durable import disk_full_named
-from pipeline.errors import StoreIncomplete, StoreMismatch
+from pipeline.errors import StoreMismatch
 from pipeline.extraction.layout import build_arrays, check_space, lay_out
 from pipeline.extraction.places import ledger_path
 from pipeline.extraction.run import sound_episodes
@@ -25,7 +25,7 @@ from pipeline.store.integrity.repair import (
     repair_build,
 )
 from pipeline.store.integrity.structure import read_arrays
-from pipeline.store.mending import extract_command, gc_command, start_over
+from pipeline.store.mending import extract_command, gc_command
 from pipeline.store.places import MERGED, STORE
 from pipeline.vlm.feature_spec import document_digest
 
@@ -69,11 +69,7 @@ def repair(findings: Findings, params: Params, say: Callable[[str], None]) -> Re
     with build_lock(store):
         recover(store)
         plan = read_plan(store)
-        if plan is None:
-            raise StoreIncomplete(
-                f"{store / 'zarr.json'}: the metadata no longer say what the store was made of. "
-                f"{start_over(store)}"
-            )
+        assert plan is not None, "a store was checked there"
         _refuse_other_build(store, plan)
         try:
             with disk_full_named(store):

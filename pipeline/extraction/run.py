@@ -10,19 +10,20 @@ from pipeline.config import Params
 from pipeline.device import resolve_device
 from pipeline.digests import ContentDigests
 from pipeline.durable import free_bytes
-from pipeline.extraction.check import CheckedEpisode, check_episodes
+from pipeline.extraction.check import CheckedEpisode, check_episodes, embodiment_of
 from pipeline.extraction.fill import ExtractionReport, fill, rate_name
 from pipeline.extraction.layout import build_arrays, check_space, lay_out
 from pipeline.extraction.places import (
     Say,
     donors_at,
+    keeping_note,
     known_places,
+    layout_damage,
     ledger_path,
     make_room,
     plans,
+    put_in_place,
     refuse_to_lose,
-    remove,
-    set_aside,
 )
 from pipeline.extraction.plan import (
     ExtractionPlan,
@@ -42,6 +43,7 @@ from pipeline.store import (
     recover,
 )
 from pipeline.store.metadata import check_metadata
+from pipeline.store.places import refuse_foreign_store
 from pipeline.store.schema import read_specs
 from pipeline.timeline import rate_notes
 
@@ -55,20 +57,30 @@ def extract(params: Params, say: Say) -> ExtractionReport | None:
     target = params.extract.store
     resolve_device(params.extract.device)
     with ExitStack() as stack:
-        if not params.extract.plan:
+        if params.extract.plan:
+            refuse_foreign_store(target)
+        else:
             stack.enter_context(build_lock(target))
             recover(target)
         digests = stack.enter_context(closing(ContentDigests(ledger_path(target))))
         surveyed = survey(params, digests)
         if surveyed.bad and params.data.on_bad_episode == "stop":
             check_episodes(surveyed, params)  # lists them with whatever else is wrong
-        if surveyed.plan in plans(target):
+        if _can_go_on(surveyed, target):
             return _go_on(surveyed, params, digests, say)
         surveyed, checked = sound_episodes(surveyed, params, digests)
-        if surveyed.plan in plans(target):
+        if _can_go_on(surveyed, target):
             return _go_on(surveyed, params, digests, say)
         _say_survey(surveyed, params, say)
         return _begin(surveyed, checked, params, digests, say)
+
+
+def _can_go_on(surveyed: Survey, target: Path) -> bool:
+    """Whether a store or a build of this very plan is there; a build, as it was laid out."""
+    begun, finished = plans(target)
+    if begun == surveyed.plan:
+        return layout_damage(target) is None
+    return finished == surveyed.plan
 
 
 def _go_on(
@@ -127,13 +139,12 @@ def _resume(
             reasons=(f"{reason} {build.part}",),
             warnings=dtype_warnings(params),
         )
-        for line in plan.lines():
+        for line in [*plan.lines(), *keeping_note(target, surveyed)]:
             say(line)
         if params.extract.plan:
             return None
         report = fill(build, surveyed, donors, params, digests, missing)
-        build.seal()
-    remove(set_aside(target))
+    put_in_place(build, surveyed, say)
     return report
 
 
@@ -146,7 +157,8 @@ def _begin(
 ) -> ExtractionReport | None:
     """Begin a new build; what stood in its place is set aside only when nothing can refuse it."""
     target, part = params.extract.store, part_path(params.extract.store)
-    refuse_to_lose(target, surveyed)
+    refuse_to_lose(target, surveyed, embodiment_of(checked))
+    keeping = keeping_note(target, surveyed)
     build = StoreBuild(target, build_arrays(checked, surveyed, params), surveyed.plan)
     if any(one.recording.has_poses for one in surveyed.episodes):
         say(f"actions: rotations as {surveyed.action_rotation}")
@@ -159,7 +171,7 @@ def _begin(
     with closing(build):
         with donors_at([part, *known_places(target)], surveyed) as donors:
             plan = _new_plan(build, checked, surveyed, donors, params, digests)
-            for line in plan.lines():
+            for line in [*plan.lines(), *keeping]:
                 say(line)
             if params.extract.plan:
                 return None
@@ -173,8 +185,7 @@ def _begin(
             lay_out(build, checked, surveyed, params, donors)
             everything = np.arange(plan.rows)
             report = fill(build, surveyed, donors, params, digests, everything)
-            build.seal()
-    remove(set_aside(target))
+    put_in_place(build, surveyed, say)
     return report
 
 
@@ -198,9 +209,15 @@ def _new_plan(
         bytes=store_bytes(build.specs),
         free=free_bytes(build.part),
         rows_per_s=digests.rate(rate_name(surveyed, params)),
-        reasons=reasons(surveyed, store, build.specs),
+        reasons=_reasons(build, surveyed, store),
         warnings=dtype_warnings(params),
     )
+
+
+def _reasons(build: StoreBuild, surveyed: Survey, store: Donor | None) -> tuple[str, ...]:
+    if read_plan(build.part) == surveyed.plan and (damage := layout_damage(build.target)):
+        return (f"{damage}; streams are laid out again, the feature rows are kept",)
+    return reasons(surveyed, store, build.specs)
 
 
 def _say_survey(surveyed: Survey, params: Params, say: Say) -> None:

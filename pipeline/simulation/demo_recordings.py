@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from pipeline.durable import write_document
 from pipeline.errors import ConfigError, DiskFull
-from pipeline.ownership import Kind, remove_folder, there
+from pipeline.ownership import OutputKind, remove_folder, there
 from pipeline.simulation.insertion_formats import (
     ABUTTING,
     OVERLAPPING,
@@ -32,8 +32,8 @@ from pipeline.simulation.recorder import SimulatedEpisode, simulate_episode
 DEMO_VERSION: Final = 1
 """Goes up whenever the same seed gives other recordings."""
 MARKER: Final = "demo.json"
-DEMO: Final = Kind("what the demo wrote", lambda folder: (folder / MARKER).is_file())
-_SET: Final = Kind("a set of the demo's", lambda folder: DEMO.is_one(folder.parent))
+DEMO: Final = OutputKind("what the demo wrote", lambda folder: (folder / MARKER).is_file())
+_SET: Final = OutputKind("a set of the demo's", lambda folder: DEMO.is_one(folder.parent))
 TASK: Final = "Red_point"
 
 _FIRST_EPOCH_S = datetime(2026, 1, 5, 9, tzinfo=UTC).timestamp()

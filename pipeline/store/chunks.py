@@ -86,6 +86,7 @@ class ChunkFiles:
         self._owned = owned
         self._descriptors: dict[int, int] = {}
         self._unsynced: set[int] = set()
+        self._sums: dict[int, tuple[int, int]] = {}
 
     def allocate(self) -> None:
         """Reserve the space of every row; chunk files get their full size, without a trailer."""
@@ -129,9 +130,13 @@ class ChunkFiles:
                 if not self._owned:
                     continue
                 self._unlink(chunk)
-            lines = raw[first - start : first - start + count]
+            lines = raw[first - start : first - start + count].ravel()
             with disk_full_named(self.paths[chunk]):
-                _write_all(self._descriptor(chunk), lines.ravel().data, self._offset(first))
+                descriptor = self._descriptor(chunk)
+                if os.fstat(descriptor).st_size > self.spec.chunk_bytes:
+                    os.ftruncate(descriptor, self.spec.chunk_bytes)  # a trailer of other rows
+                _write_all(descriptor, lines.data, self._offset(first))
+            self._sum_up(chunk, self._offset(first), lines)
             self._unsynced.add(chunk)
 
     def read(self, start: int, count: int) -> NDArray[Any]:
@@ -172,8 +177,25 @@ class ChunkFiles:
                 os.fdatasync(self._descriptor(chunk))
         self._unsynced.clear()
 
+    def write_trailers(self) -> None:
+        """Write each chunk's trailer, of the rows as they were handed in; rows left out are zero.
+
+        For arrays that were written here from their first row on. Waits for the disk.
+        """
+        for chunk in range(len(self.paths)):
+            if not self.is_linked(chunk):
+                done, crc = self._sums.get(chunk, (0, 0))
+                assert done >= 0, f"{self.spec.name} was not written in order"
+                rest = self.spec.chunk_bytes - done
+                self._write_trailer(chunk, google_crc32c.extend(crc, bytes(rest)))
+        self.sync()
+
     def seal(self) -> None:
-        """Write each chunk's trailer; running it again changes nothing."""
+        """Compare each chunk with its trailer, or write it where there is none yet.
+
+        Running it again changes nothing. Raises `StoreIncomplete` where a trailer is not that of
+        the rows.
+        """
         sealed = self.spec.chunk_bytes + TRAILER_BYTES
         for chunk, path in enumerate(self.paths):
             if self.is_linked(chunk):
@@ -183,17 +205,31 @@ class ChunkFiles:
             data = self._passed(chunk)
             if not data.complete:
                 raise self._incomplete(chunk, "the file ends early")
-            trailer = data.crc.to_bytes(TRAILER_BYTES, "little")
+            if data.damage and path.stat().st_size == sealed:
+                raise self._incomplete(chunk, data.damage)
+            if data.damage:
+                self._write_trailer(chunk, data.crc)
             with disk_full_named(path):
-                descriptor = self._descriptor(chunk)
-                _write_all(descriptor, memoryview(trailer), self.spec.chunk_bytes)
-                os.fsync(descriptor)
+                os.fsync(self._descriptor(chunk))
 
     def close(self) -> None:
         """Close the files."""
         for descriptor in self._descriptors.values():
             os.close(descriptor)
         self._descriptors.clear()
+
+    def _sum_up(self, chunk: int, offset: int, lines: NDArray[np.uint8]) -> None:
+        """Go on with the checksum of a chunk that is written in order; -1 says that it was not."""
+        done, crc = self._sums.get(chunk, (0, 0))
+        in_order = offset == done
+        crc = google_crc32c.extend(crc, lines) if in_order else 0
+        self._sums[chunk] = (done + lines.nbytes if in_order else -1, crc)
+
+    def _write_trailer(self, chunk: int, crc: int) -> None:
+        trailer = memoryview(crc.to_bytes(TRAILER_BYTES, "little"))
+        with disk_full_named(self.paths[chunk]):
+            _write_all(self._descriptor(chunk), trailer, self.spec.chunk_bytes)
+        self._unsynced.add(chunk)
 
     def _unlink(self, chunk: int) -> None:
         """Put a copy in the place of a linked file."""

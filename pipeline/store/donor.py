@@ -114,6 +114,8 @@ class Donor:
 
     @cached_property
     def _said(self) -> list[dict[str, Any]]:
+        if not self._finished and self._index_is_damaged():
+            return []  # rows are known by their keys alone, frame by frame
         edges, text = self._read("episode/text_start"), self._read("episode/text").tobytes()
         return [json.loads(text[start:stop]) for start, stop in pairwise(edges)]
 
@@ -125,8 +127,21 @@ class Donor:
     def _keys(self) -> NDArray[np.uint8]:
         return self._read(KEYS)
 
+    @property
+    def _finished(self) -> bool:
+        """Whether every chunk has a trailer; those of feature rows in a build have none yet."""
+        return self.path.suffix in (".zarr", ".previous")
+
+    def _index_is_damaged(self) -> bool:
+        """Whether it cannot be relied on which rows of a build are of which episode and instant."""
+        for name in ("vl/frame_time", *(name for name in self.specs if name.startswith("episode"))):
+            with closing(ChunkFiles(self.path, self.specs[name], writable=False)) as files:
+                if any(files.damage(chunk) for chunk in range(len(files.paths))):
+                    return True
+        return False
+
     def _read(self, name: str) -> NDArray[Any]:
         with closing(ChunkFiles(self.path, self.specs[name], writable=False)) as files:
-            if self.path.suffix == ".zarr":  # a build has no trailers yet
+            if self._finished:
                 files.check()
             return files.read(0, self.specs[name].shape[0])

@@ -8,7 +8,9 @@ import re
 import shlex
 from pathlib import Path
 
-_STORE = re.compile(r"(?P<base>.+?\.zarr)(?P<unfinished>(?:\.repair)?\.part|\.known-\d+)?")
+_STORE = re.compile(
+    r"(?P<base>.+?\.zarr)(?P<unfinished>(?:\.repair)?\.part|\.known-\d+|\.previous)?"
+)
 
 
 def extract_command(store: Path) -> str:
@@ -34,8 +36,9 @@ def mend(path: Path) -> str:
     """What to do about a damaged store or build, of which `path` is the folder or a file in it."""
     folder, store = _owner(path)
     if folder != store:
+        what = "the store of before" if folder.suffix == ".previous" else "an unfinished build"
         return (
-            f"It lies in an unfinished build. Remove that with {gc_command(folder)}, then run "
+            f"It lies in {what}. Remove that with {gc_command(folder)}, then run "
             f"{extract_command(store)}."
         )
     return (

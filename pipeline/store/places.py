@@ -6,7 +6,7 @@ from typing import Any
 
 from pipeline.durable import recover as recover_replaced
 from pipeline.errors import StoreIncomplete
-from pipeline.ownership import Kind, refuse_foreign
+from pipeline.ownership import OutputKind, refuse_foreign
 from pipeline.store.mending import start_over
 
 MERGED = "merge-"
@@ -20,10 +20,11 @@ def part_path(target: Path) -> Path:
 
 def is_store(path: Path) -> bool:
     """Whether a store of this project, or a laid-out build of one, lies there."""
-    return isinstance(_attributes(path).get("schema"), int) and read_plan(path) is not None
+    attributes = _attributes(path)
+    return "schema" in attributes and bool({"plan", "feature_spec"} & attributes.keys())
 
 
-STORE = Kind("a feature store", is_store)
+STORE = OutputKind("a feature store", is_store)
 
 
 def refuse_foreign_store(target: Path) -> None:
@@ -42,8 +43,16 @@ def recover(target: Path) -> None:
 
 
 def read_plan(store: Path) -> str | None:
-    """The plan of a store or a laid-out build; None where there is neither."""
+    """The plan of a store or a laid-out build; None where there is neither.
+
+    Raises `StoreIncomplete` where there is one that has lost it.
+    """
     plan = _attributes(store).get("plan")
+    if not isinstance(plan, str) and is_store(store):
+        raise StoreIncomplete(
+            f"{store / 'zarr.json'}: the metadata no longer say what the store was made of. "
+            f"{start_over(store)}"
+        )
     return plan if isinstance(plan, str) else None
 
 

@@ -1,9 +1,10 @@
 """Build a store beside its target, row by row, so that a kill at any instant loses little.
 
 A build lives in `<name>.zarr.part`. What is known beforehand (streams, ticks, episodes) is written
-first; then feature rows with `pwrite` and `fdatasync`, and only then their keys and checksums. A
-row counts as done when its checksum is not 0. Sealing writes the trailers that make plain zarr
-accept the chunks, and one rename puts the build in its place.
+first, with its checksums; then feature rows with `pwrite` and `fdatasync`, and only then their keys
+and checksums. A row counts as done when its checksum is not 0. Sealing compares the streams with
+their trailers, writes those of the feature rows, which make plain zarr accept the chunks, and one
+rename puts the build in its place.
 """
 
 import os
@@ -21,7 +22,8 @@ from pipeline.errors import StoreIncomplete
 from pipeline.ownership import begin_folder
 from pipeline.store.chunks import ChunkFiles, row_checksums
 from pipeline.store.environments import EnvironmentLog
-from pipeline.store.metadata import note_metadata
+from pipeline.store.metadata import ATTRIBUTE as METADATA_DIGEST
+from pipeline.store.metadata import metadata_damage, note_metadata
 from pipeline.store.places import STORE, part_path
 from pipeline.store.schema import CHECKSUMS, FEATURES, INCREMENTAL, KEYS, ArraySpec
 
@@ -83,12 +85,31 @@ class StoreBuild:
     def finish_layout(
         self, attributes: Mapping[str, Any], vl_attributes: Mapping[str, Any]
     ) -> None:
-        """Note the attributes and, as the last thing, the plan: from here on the build resumes."""
-        for files in self._files.values():
-            files.sync()
+        """Write the checksums of streams, ticks and episodes, note the attributes and, as the last
+        thing, the plan: from here on the build resumes."""
+        for name, files in self._files.items():
+            if name in INCREMENTAL:
+                files.sync()
+            else:
+                files.write_trailers()
         with disk_full_named(self.part):
             zarr.open_group(self.part, path="vl", mode="r+").attrs.put(dict(vl_attributes))
             zarr.open_group(self.part, mode="r+").attrs.put({**attributes, "plan": self.plan})
+            note_metadata(self.part)
+
+    def layout_damage(self) -> str | None:
+        """What is wrong with streams, ticks, episodes or metadata of a laid-out build, and where.
+
+        None where they are as they were written. Reads all of them.
+        """
+        if what := metadata_damage(self.part):
+            return f"{self.part / 'zarr.json'}: {what}"
+        for name in (name for name in self.specs if name not in INCREMENTAL):
+            files = self.files(name)
+            for chunk, path in enumerate(files.paths):
+                if what := files.damage(chunk):
+                    return f"{path}: {what}"
+        return None
 
     def missing(self) -> NDArray[np.int64]:
         """The feature rows that are not there, in order.
@@ -173,8 +194,7 @@ class StoreBuild:
                 f"{self.part}: {missing.size} feature rows are missing, the first is {missing[0]}. "
                 "Run stages.extract again; it computes what is missing."
             )
-        for name in self.specs:
-            self.files(name).seal()
+        self._seal_arrays()
         with disk_full_named(self.part):
             self._note_environments()
             if (self.part / "zarr.json").exists():  # a restoration writes the archived one after
@@ -183,6 +203,18 @@ class StoreBuild:
             partial.unlink()
         self.close()
         _sync_folders(self.part)
+
+    def _seal_arrays(self) -> None:
+        try:
+            for name in self.specs:
+                self.files(name).seal()
+        except StoreIncomplete:
+            if (damage := self.layout_damage()) is None:
+                raise
+            raise StoreIncomplete(
+                f"{damage}: the disk did not keep what was written. Run the same command again: it "
+                "writes streams, ticks and episodes anew and keeps the feature rows."
+            ) from None
 
     def put_in_place(self, *, keep: bool = False) -> None:
         """The second half of `seal`: an instant."""
@@ -206,7 +238,9 @@ class StoreBuild:
         if self._environments.noted:
             group = zarr.open_group(self.part, mode="r+")
             ranges = self._environments.ranges()
-            group.attrs.put({**group.attrs.asdict(), "environment": ranges})
+            attributes = group.attrs.asdict()
+            attributes.pop(METADATA_DIGEST, None)  # noted again when this is in
+            group.attrs.put({**attributes, "environment": ranges})
         self._environments.remove()
 
 

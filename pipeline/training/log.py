@@ -9,7 +9,7 @@ from typing import Self
 from pipeline.config import TrainHeadParams
 from pipeline.durable import disk_full_named, fresh
 from pipeline.evaluation.experiments import speed_file
-from pipeline.ownership import Kind, begins_with, refuse_foreign
+from pipeline.ownership import OutputKind, begins_with, refuse_foreign
 from pipeline.training.loggers import Logger, open_loggers
 from pipeline.training.speed import Pace
 from pipeline.training.world import World
@@ -35,7 +35,9 @@ class TrainingLog:
         folder.mkdir(parents=True, exist_ok=True)
         self._folder, self._loggers = folder, loggers
         self.rows: list[Row] = []
-        refuse_foreign(speed_file(folder), Kind("a run's speed", begins_with("\t".join(_SPEED))))
+        refuse_foreign(
+            speed_file(folder), OutputKind("a run's speed", begins_with("\t".join(_SPEED)))
+        )
         self._speed = fresh(speed_file(folder)).open("w", encoding="utf-8", newline="")
         self._writer = csv.writer(self._speed, delimiter="\t")
         self._writer.writerow(_SPEED)

@@ -30,7 +30,8 @@ from pipeline.durable import (
 )
 from pipeline.errors import CheckpointIncomplete, CheckpointMismatch, ConfigError
 from pipeline.ownership import (
-    Kind,
+    REPORT,
+    OutputKind,
     begin_folder,
     refuse_foreign,
     remove_folder,
@@ -130,6 +131,7 @@ def open_run(
             f"Move it away or choose another {section}.output."
         )
     refuse_foreign(part, RUN_FOLDER)
+    refuse_foreign(params.logs, REPORT)
     if (part / RUN).exists():
         recover_folder(part / BEST, CHECKPOINT)
         recover_folder(part / LAST, CHECKPOINT)
@@ -155,7 +157,7 @@ def _is_run(folder: Path) -> bool:
     return {"source", "decides"} <= document.keys() or _has_checkpoint(folder)
 
 
-RUN_FOLDER = Kind("a training run", _is_run)
+RUN_FOLDER = OutputKind("a training run", _is_run)
 
 
 def _refuse_to_replace(output: Path, section: str) -> None:

@@ -20,7 +20,7 @@ from tokenizers.models import BPE
 from transformers import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
 
 from pipeline.durable import replace_folder
-from pipeline.ownership import Kind
+from pipeline.ownership import OutputKind
 from pipeline.vlm.loading import quiet_transformers
 
 _SPECIAL_TOKENS = (
@@ -100,7 +100,7 @@ def _is_demo(folder: Path) -> bool:
     return config.is_file() and f'"vocab_size": {_VOCABULARY}' in config.read_text("utf-8")
 
 
-DEMO_CHECKPOINT = Kind("what the demo wrote", _is_demo)
+DEMO_CHECKPOINT = OutputKind("what the demo wrote", _is_demo)
 """Called as the demo's other outputs are: it is written into one that is in the making."""
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import ConfigError, StoreLocked
+from pipeline.ownership import MARKER
 from pipeline.store import FeatureStore, StoreBuild, build_lock
 from pipeline.store.archive import archive
 from pipeline.store.housekeeping.inventory import Entry, Inventory, take_inventory
@@ -265,6 +266,7 @@ class TestLeftovers:
         assert "a symbolic link" in kept_back(inventory)[0]
         part = folder / "own.zarr.part"
         part.mkdir()
+        (part / MARKER).write_text("a feature store")
         (part / "inside").symlink_to(outside)
         for one in leftovers(take_inventory(folder)):
             remove(one)

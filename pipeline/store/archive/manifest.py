@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import StoreIncomplete, StoreMismatch
-from pipeline.ownership import Kind
+from pipeline.ownership import OutputKind
 
 ARCHIVE_SCHEMA = 1
 ATTRIBUTE = "archive"
@@ -77,7 +77,7 @@ def is_archive(path: Path) -> bool:
     return _document(path) is not None
 
 
-ARCHIVE = Kind("an archive of a store", is_archive)
+ARCHIVE = OutputKind("an archive of a store", is_archive)
 
 
 def read_manifest(path: Path) -> Manifest:

@@ -89,7 +89,7 @@ def _restore_array(
         crcs = record.crc32c[chunks.start : chunks.stop]
         build.write(name, rows.start, _checked_shard(array, path, spec, chunks, crcs))
         progress.update(len(rows) * spec.row_bytes)
-    build.files(name).sync()
+    build.files(name).write_trailers()
 
 
 def _checked_shard(

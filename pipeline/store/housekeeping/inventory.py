@@ -21,7 +21,16 @@ from pipeline.store.reader import FeatureStore
 
 GROUPS: tuple[str, ...] = ("features", "sensor", "state", "rest")
 Kind = Literal[
-    "store", "archive", "build", "repair", "set aside", "replaced", "lock", "ledger", "unknown"
+    "store",
+    "archive",
+    "build",
+    "repair",
+    "set aside",
+    "replaced",
+    "previous",
+    "lock",
+    "ledger",
+    "unknown",
 ]
 
 _SUFFIXES: Mapping[str, Kind] = {
@@ -30,6 +39,9 @@ _SUFFIXES: Mapping[str, Kind] = {
     ".repair.part": "repair",
     ".known": "set aside",
     ".old": "replaced",
+    ".replaced": "replaced",
+    ".keeping": "replaced",
+    ".previous": "previous",
     ".lock": "lock",
     ".wait": "lock",
     ".files.sqlite": "ledger",
@@ -148,7 +160,7 @@ def _entry(path: Path, kind: Kind, base: Path) -> Entry:
         elif kind == "store":
             FeatureStore.open(path)
             contents = contents_of(path)
-        elif kind in ("build", "set aside", "replaced") and read_plan(path) is not None:
+        elif kind in ("build", "set aside", "replaced", "previous") and read_plan(path) is not None:
             contents = contents_of(path)
     except _UNREADABLE as error:
         damage = str(error) if isinstance(error, PipelineError) else f"{path}: {error!r}"

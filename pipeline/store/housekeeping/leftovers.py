@@ -5,27 +5,43 @@ behind a symbolic link. An unfinished build that holds feature rows is work that
 resumes or takes over: it goes only where it is named.
 """
 
-import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.errors import ConfigError, StoreLocked
+from pipeline.durable import HELD, KEPT
+from pipeline.errors import ConfigError, StoreIncomplete, StoreLocked
+from pipeline.ownership import OutputKind, remove_folder
+from pipeline.store.archive.manifest import ARCHIVE
 from pipeline.store.housekeeping.inventory import Entry, Inventory, Kind
 from pipeline.store.housekeeping.listing import clause
 from pipeline.store.lock import build_lock
 from pipeline.store.mending import gc_command
-from pipeline.store.places import MERGED
+from pipeline.store.places import MERGED, STORE
 
 _REMOVABLE: tuple[Kind, ...] = (
     "build",
     "repair",
     "set aside",
     "replaced",
+    "previous",
     "ledger",
     "lock",
     "unknown",
 )
+
+
+_KINDS = (STORE, ARCHIVE, KEPT, HELD)
+
+
+def _is_leftover(path: Path) -> bool:
+    try:
+        return any(kind.owns(path) for kind in _KINDS)
+    except StoreIncomplete:  # a group's metadata, but damaged
+        return True
+
+
+_LEFTOVER = OutputKind("a leftover of a build", _is_leftover)
 
 
 @dataclass(frozen=True)
@@ -88,11 +104,12 @@ def remove(leftover: Leftover) -> None:
     try:
         with build_lock(leftover.base):
             # Looked at again under the lock: a killed replacement leaves the only copy as `.old`.
-            only_copy = leftover.path.suffix == ".old" and not leftover.base.exists()
+            held = leftover.path.suffix in (".old", ".replaced", ".keeping")
+            only_copy = held and not leftover.base.exists()
             if leftover.path.is_symlink() or only_copy:
                 return
             if leftover.path.is_dir():
-                shutil.rmtree(leftover.path)
+                remove_folder(leftover.path, _LEFTOVER)
             else:
                 leftover.path.unlink(missing_ok=True)
             if not there:
@@ -129,12 +146,16 @@ def _why(inventory: Inventory, entry: Entry) -> str | None:
 
 
 def _untouched(inventory: Inventory, entry: Entry) -> bool:
-    """Whether no living process builds there and it is no symbolic link."""
-    return entry.base not in inventory.holders and not entry.path.is_symlink()
+    """Whether no living process builds there, and it is no symbolic link and of this project."""
+    if entry.path.is_symlink() or (entry.path.is_dir() and not _LEFTOVER.owns(entry.path)):
+        return False
+    return entry.base not in inventory.holders
 
 
 def _work(entry: Entry) -> str | None:
-    """What would be lost with an unfinished build; None where it holds no row."""
+    """What would be lost with what may be removed; None where that holds no row."""
+    if entry.kind == "previous":
+        return "the store of before, kept for its rows until the next successful stages.extract"
     if entry.kind not in ("build", "set aside"):
         return None
     if entry.damage is not None:
@@ -165,6 +186,8 @@ def _in_use(inventory: Inventory, entry: Entry) -> Iterator[str]:
         yield f"{entry.path}: a finished {entry.kind}, which is never removed here"
     elif entry.path.is_symlink():
         yield f"{entry.path}: a symbolic link, left alone"
+    elif entry.path.is_dir() and not _LEFTOVER.owns(entry.path):
+        yield f"{entry.path}: a folder that this project did not write, left alone"
     elif entry.base in inventory.holders:
         yield f"{entry.path}: in use by {inventory.holders[entry.base]}"
     elif entry.kind == "replaced" and _why(inventory, entry) is None:

@@ -62,7 +62,7 @@ def _details(inventory: Inventory, entry: Entry, dependents: Iterable[str]) -> I
         yield _embodiment(entry.contents)
     if entry.path.is_symlink():
         yield f"a link to {entry.path.resolve()}"
-    if entry.kind in ("build", "repair", "set aside", "replaced"):
+    if entry.kind in ("build", "repair", "set aside", "replaced", "previous"):
         begun = entry.contents is not None or entry.damage is not None
         yield f"belongs to {entry.base.name}{'' if begun else '; of no use unfinished'}"
     holder = inventory.holders.get(entry.base)

@@ -86,7 +86,7 @@ def merge(inputs: Sequence[Path], output: Path, say: Say = print) -> MergeReport
             _check_sound(store.path)
         build = StoreBuild(output, _arrays(joined), plan)
         with closing(build):
-            if read_plan(build.part) == plan:
+            if read_plan(build.part) == plan and build.layout_damage() is None:
                 say(f"continuing the interrupted build {build.part}")
             else:
                 _lay_out(build, joined, inodes)

@@ -1,0 +1,88 @@
+"""What somebody else wrote lies where a command writes: nobody's work is replaced or removed."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import zarr
+
+from pipeline.store.archive import archive
+
+WRITERS: dict[str, tuple[str, str, tuple[str, ...]]] = {
+    "extract": ("stages.extract", "x.zarr", ("extract.store={}",)),
+    "plan": ("stages.extract", "x.zarr", ("extract.store={}", "extract.plan=true")),
+    "build": ("stages.extract", "stores/made.zarr.part", ()),
+    "replaced": ("stages.extract", "stores/made.zarr.replaced", ()),
+    "lost": ("stages.extract", "stores/made.zarr.previous", ("data.sources.0.path=Press",)),
+    "recordings": ("stages.demo", "demo", ("demo.recordings={}", "demo.episodes=1")),
+    "checkpoint": ("stages.demo", "vlm", ("demo.checkpoint={}",)),
+    "new": ("stages.demo", "vlm.new", ("demo.checkpoint={tmp}/vlm",)),
+    "merge": ("stages.store", "x.zarr", ("stores.output={}",)),
+    "merge build": ("stages.store", "x.zarr.part", ("stores.output={tmp}/x.zarr",)),
+    "archive": ("stages.archive", "x.zarr", ("archive.output={}",)),
+    "archive build": ("stages.archive", "x.zarr.part", ("archive.output={tmp}/x.zarr",)),
+    "restore": ("stages.archive", "x.zarr", ("archive.store={}",)),
+    "restore build": ("stages.archive", "x.zarr.part", ("archive.store={tmp}/x.zarr",)),
+    "repair": ("stages.verify", "stores/made.zarr.part", ("verify.repair=true",)),
+    "repair build": ("stages.verify", "stores/made.zarr.repair.part", ("verify.repair=true",)),
+    "head": ("stages.train_head", "x", ("train_head.output={}",)),
+    "head build": ("stages.train_head", "head.part", ()),
+    "head logs": ("stages.train_head", "x", ("train_head.logs={}",)),
+    "head lock": ("stages.train_head", "head.lock", ()),
+    "tuned": ("stages.finetune", "x", ("finetune.output={}",)),
+    "tuned logs": ("stages.finetune", "x", ("finetune.logs={}", "finetune.output={tmp}/tuned")),
+    "evaluate": ("stages.evaluate", "x", ("evaluate.output={}",)),
+    "inspect": (
+        "stages.inspect",
+        "x",
+        ("inspect.output={}", "inspect.path={tmp}/stores/made.zarr"),
+    ),
+    "probe": ("stages.probe", "x", ("probe.output={}",)),
+    "compare": ("stages.compare", "x", ("compare.output={}",)),
+    "table": ("stages.compare", "x.md", ("compare.output={tmp}/x",)),
+}
+"""By name: the command, where something foreign lies, and what sets the command to write there."""
+
+
+def plant(place: Path, foreign: str) -> None:
+    place.parent.mkdir(parents=True, exist_ok=True)
+    if foreign == "file":
+        place.write_text("years of work")
+    elif foreign == "zarr group":
+        zarr.create_array(place, name="data/action", shape=(3,), dtype="f4")
+    else:
+        (place / "chapters").mkdir(parents=True)
+        (place / "chapters" / "thesis.txt").write_text("years of work")
+
+
+def content(place: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in [place, *place.rglob("*")] if path.is_file()}
+
+
+@pytest.mark.parametrize("foreign", ["folder", "file", "zarr group"])
+@pytest.mark.parametrize("writer", WRITERS)
+def test_is_left_as_it_is(
+    writer: str, foreign: str, params: Path, here: Callable[..., tuple[int, str, str]], tmp_path
+) -> None:
+    command, below, settings = WRITERS[writer]
+    store, place = tmp_path / "stores" / "made.zarr", tmp_path / below
+    if foreign == "folder" and place.suffix == ".lock":
+        pytest.skip("no lock is opened there")
+    options = [setting.format(place, tmp=tmp_path) for setting in settings]
+    if writer.startswith("merge"):
+        copy = Path(shutil.copytree(store, tmp_path / "copy.zarr"))
+        options += ["stores.action=merge", f"stores.inputs=[{store}, {copy}]"]
+    if writer.startswith("restore"):
+        archive(store, tmp_path / "a.zarr", level=1, threads=1)
+        options += ["archive.restore=true", f"archive.output={tmp_path / 'a.zarr'}"]
+    if writer.startswith("repair"):
+        file = store / "tick" / "time" / "c" / "0"
+        file.write_bytes(bytes(8) + file.read_bytes()[8:])
+    plant(place, foreign)
+    before = content(place)
+    code, _, complained = here(command, params, *(w for one in options for w in ("--set", one)))
+    assert code == 2, complained
+    assert str(place) in complained
+    assert "Traceback" not in complained
+    assert content(place) == before
