@@ -1,6 +1,7 @@
 """One extraction: what it writes, what it takes over, what it refuses."""
 
 import shutil
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -8,14 +9,23 @@ import pytest
 import torch
 from PIL import Image
 
-from pipeline.errors import DiskFull, NumericsError, RecordingError, StoreLocked, StoreMismatch
+from pipeline.errors import (
+    ConfigError,
+    DiskFull,
+    NumericsError,
+    RecordingError,
+    StoreIncomplete,
+    StoreLocked,
+    StoreMismatch,
+)
 from pipeline.extraction import extract
 from pipeline.recordings import Channels, RecordedAction, Stream, open_recordings
 from pipeline.recordings.lerobot_clock import stored_clock
 from pipeline.recordings.windowed import WindowedRecording
 from pipeline.simulation.lerobot_format import write_lerobot
 from pipeline.simulation.recorder import simulate_episode
-from pipeline.store import FeatureStore, StoreBuild, build_lock
+from pipeline.store import FeatureStore, StoreBuild, build_lock, part_path
+from pipeline.store.schema import ARRAY_NAMES, INCREMENTAL
 from pipeline.timeline import build_timeline
 from pipeline.vlm.feature_spec import feature_spec
 from pipeline.vlm.preparation import Preparer
@@ -25,6 +35,12 @@ from pipeline.vlm.qwen import FrozenVLM
 def run(params) -> tuple[object, list[str]]:
     said: list[str] = []
     return extract(params, said.append), said
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    """Every file of a folder."""
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
 @pytest.fixture
@@ -323,6 +339,147 @@ class TestAbandonedBuilds:
         self.interrupted(params, monkeypatch, 8)
         _, said = run(changed(vlm={"prompt": "{images}"}))
         assert any("is given up: prompt:" in line for line in said)
+
+    @pytest.mark.parametrize(
+        "rotten", ["tick/action", "sensor/values", "vl/frame_time", "zarr.json"]
+    )
+    def test_bit_rot_is_not_sealed_as_right(
+        self, params, changed, monkeypatch, counted, extracted_once, rotten
+    ):
+        self.interrupted(params, monkeypatch, 8)
+        part = part_path(params.extract.store)
+        file = part / rotten
+        if file.is_dir():
+            (file,) = (path for path in (file / "c").rglob("*") if path.is_file())
+            content = bytearray(file.read_bytes())
+            content[content.index(next(byte for byte in content if byte))] ^= 1
+            file.write_bytes(content)
+        else:
+            file.write_text(file.read_text().replace('"action_hz": 10.0', '"action_hz": 20.0'))
+        _, said = run(changed(extract={"plan": True}))
+        assert any(str(file) in line and "laid out again" in line for line in said)
+        counted.clear()
+        report, _ = run(params)
+        assert sum(counted) == report.rows - 8, "the rows that were done are kept"
+        found, wanted = FeatureStore.open(params.extract.store), FeatureStore.open(extracted_once)
+        assert found.action_hz == wanted.action_hz
+        for name in ARRAY_NAMES:
+            if name not in INCREMENTAL:
+                assert found.array(name).tobytes() == wanted.array(name).tobytes(), name
+
+    def test_rot_while_the_model_works_is_not_sealed_either(self, params, monkeypatch):
+        real = StoreBuild.finish
+
+        def finish(self):
+            file = self.part / "tick/action/c/0/0"
+            content = file.read_bytes()
+            file.write_bytes(content[:8] + bytes([content[8] ^ 1]) + content[9:])
+            real(self)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(StoreBuild, "finish", finish)
+            with pytest.raises(StoreIncomplete, match=r"tick/action/c/0/0: .*crc32c.*same command"):
+                run(params)
+        assert not params.extract.store.exists()
+        report, _ = run(params)
+        assert report.computed == 0
+
+
+class TestWhatWouldBeLost:
+    """Rows that these params could not give again are kept, or the run is refused."""
+
+    @pytest.mark.usefixtures("extracted")
+    def test_another_robot_at_the_same_store_is_refused_naming_both(
+        self, params, changed, recordings, tmp_path, write_episode, no_model_later
+    ):
+        write_episode(tmp_path / "other" / "Task" / "episode_9", 9)
+        before = content(params.extract.store)
+        no_model_later(images=False)
+        for plan in (True, False):
+            other = {"sources": [{"name": "second", "path": str(tmp_path / "other")}]}
+            with pytest.raises(StoreMismatch, match=r"made there, second here.*\n.*extract\.store"):
+                run(changed(data=other, extract={"plan": plan}))
+        assert content(params.extract.store) == before
+
+    @pytest.mark.usefixtures("extracted")
+    def test_another_embodiment_of_the_same_source_is_refused(
+        self, params, changed, tmp_path, monkeypatch, write_episode, no_model_later
+    ):
+        write_episode(tmp_path / "other" / "Task" / "episode_9", 9)
+        real = WindowedRecording.sensor
+
+        def narrower(self):
+            stream = real(self)
+            channels = Channels(stream.channels.names[:7], stream.channels.units[:7])
+            return Stream(channels, stream.time, stream.values[:, :7])
+
+        monkeypatch.setattr(WindowedRecording, "sensor", narrower)
+        no_model_later(images=False)
+        other = {"sources": [{"name": "made", "path": str(tmp_path / "other")}]}
+        with pytest.raises(StoreMismatch, match=r"sensor: 1026 channels .* there, 7 channels"):
+            run(changed(data=other))
+
+    @pytest.mark.usefixtures("extracted")
+    def test_a_source_that_is_missing_for_a_moment_costs_no_row(
+        self, params, changed, recordings, counted
+    ):
+        store, previous = params.extract.store, params.extract.store.with_name("made.zarr.previous")
+        whole = content(store)
+        (recordings / "Press").rename(recordings.with_name("unmounted"))
+        for plan in (True, False):
+            _, said = run(changed(extract={"plan": plan}))
+            assert any("1 episode(s) that are not in this run" in line for line in said)
+            assert any(str(previous) in line for line in said)
+            assert previous.exists() != plan
+        assert len(FeatureStore.open(store).episodes) == 2
+        recordings.with_name("unmounted").rename(recordings / "Press")
+        _, said = run(changed(extract={"plan": True}))
+        assert any(line.startswith(f"{previous} is removed when") for line in said)
+        report, _ = run(params)
+        assert not counted, "its rows were there"
+        assert report.taken == report.rows
+        assert not previous.exists(), "until the next successful run"
+        assert content(store) == whole
+
+    @pytest.mark.usefixtures("extracted")
+    def test_a_copy_that_the_user_made_is_not_the_one_that_was_kept(self, params, recordings):
+        copies = [
+            shutil.copytree(params.extract.store, f"{params.extract.store}{suffix}")
+            for suffix in (".previous", ".old", ".known-good")
+        ]
+        before = [content(Path(copy)) for copy in copies]
+        run(params)
+        shutil.copytree(recordings / "Press/episode_3", recordings / "Press/episode_4")
+        run(params)
+        assert [content(Path(copy)) for copy in copies] == before
+        shutil.rmtree(recordings / "Press")
+        with pytest.raises(ConfigError, match=r"made\.zarr\.previous: .*left as it is|was left"):
+            run(params)
+        assert [content(Path(copy)) for copy in copies] == before
+
+    @pytest.mark.usefixtures("extracted")
+    @pytest.mark.parametrize("step", range(4))
+    def test_a_kill_while_it_is_kept_leaves_both(self, params, recordings, monkeypatch, step):
+        (recordings / "Press").rename(recordings.with_name("unmounted"))
+        steps = 0
+
+        def counting(real):
+            def call(*arguments, **keywords):
+                nonlocal steps
+                if "made.zarr" in arguments[0].parts[-1] and (steps := steps + 1) > step:
+                    raise KeyboardInterrupt
+                return real(*arguments, **keywords)
+
+            return call
+
+        with monkeypatch.context() as patch:
+            patch.setattr(Path, "rename", counting(Path.rename))
+            with suppress(KeyboardInterrupt):
+                run(params)
+        run(params)
+        assert len(FeatureStore.open(params.extract.store).episodes) == 2
+        kept = params.extract.store.with_name("made.zarr.previous")
+        assert len(FeatureStore.open(kept).episodes) == 3
 
 
 def test_recordings_without_a_camera(changed):
