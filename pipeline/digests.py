@@ -6,8 +6,10 @@ The ledger only saves reading: losing it costs time, never correctness.
 
 import hashlib
 import sqlite3
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from pipeline.errors import (
     ConfigError,
@@ -27,10 +29,12 @@ _TABLES = (
 
 
 class ContentDigests:
-    """Digests of files, kept in one SQLite file."""
+    """Digests of files, kept in one SQLite file, or where that is None only in memory."""
 
-    def __init__(self, ledger: Path) -> None:
+    def __init__(self, ledger: Path | None) -> None:
         self._ledger = ledger
+        if ledger is None:
+            return self._open()
         try:
             ledger.parent.mkdir(parents=True, exist_ok=True)
             self._open()
@@ -41,12 +45,36 @@ class ContentDigests:
                 ledger.with_name(ledger.name + suffix).unlink(missing_ok=True)
             self._open()
 
+    @classmethod
+    def to_read(cls, ledger: Path) -> "ContentDigests":
+        """The ledger; where it cannot be written, what it knows, and nothing new is remembered."""
+        try:
+            opened = cls(ledger)
+            opened._database.execute("BEGIN IMMEDIATE")
+            opened._database.execute("ROLLBACK")
+            return opened
+        except (ConfigError, OSError, sqlite3.OperationalError):
+            known = cls(None)
+            if ledger.is_file():
+                # Immutable: no file can be made beside it, as sqlite else would.
+                address = f"file:{quote(str(ledger.absolute()))}?immutable=1"
+                with (
+                    suppress(sqlite3.DatabaseError),  # it only saves reading
+                    closing(sqlite3.connect(address, uri=True)) as file,
+                ):
+                    file.backup(known._database)
+            return known
+
     def _open(self) -> None:
-        self._database = sqlite3.connect(self._ledger, isolation_level=None)
-        self._database.execute("PRAGMA journal_mode = WAL")
-        self._database.execute("PRAGMA synchronous = OFF")
-        for table in _TABLES:
-            self._database.execute(f"CREATE TABLE IF NOT EXISTS {table}")
+        self._database = sqlite3.connect(self._ledger or ":memory:", isolation_level=None)
+        try:
+            self._database.execute("PRAGMA journal_mode = WAL")
+            self._database.execute("PRAGMA synchronous = OFF")
+            for table in _TABLES:
+                self._database.execute(f"CREATE TABLE IF NOT EXISTS {table}")
+        except sqlite3.DatabaseError:
+            self._database.close()
+            raise
 
     def close(self) -> None:
         """Close the ledger."""

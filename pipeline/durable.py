@@ -192,7 +192,8 @@ def read_with_digest(path: Path) -> tuple[dict[str, Any], bool]:
         document = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise CheckpointIncomplete(
-            f"{path}: no such file. Run stages.train_head, or name another checkpoint."
+            f"{path}: no such file. Run the training that writes it (stages.train_head or "
+            "stages.finetune), or name another checkpoint."
         ) from None
     except ValueError as error:
         raise CheckpointIncomplete(damaged(path, error)) from None
@@ -235,8 +236,8 @@ def read_tensors(path: Path, sha256: str) -> dict[str, Tensor]:
 def damaged(path: Path, why: object) -> str:
     """What is said of a file of a run that is not as it was written."""
     return (
-        f"{path}: the checkpoint is damaged: {why}. Remove {path.parent} and run "
-        "stages.train_head again."
+        f"{path}: the checkpoint is damaged: {why}. Remove {path.parent} and run the training that "
+        "wrote it (stages.train_head or stages.finetune) again."
     )
 
 

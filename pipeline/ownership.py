@@ -43,7 +43,7 @@ def refuse_foreign(path: Path, kind: OutputKind) -> None:
     if there(path) and not kind.owns(path):
         raise ConfigError(
             f"{path}: expected nothing there or {kind.name} that this project wrote, found "
-            f"{_described(path)}. It was left as it is: move it away, or name another place."
+            f"{described(path)}. It was left as it is: move it away, or name another place."
         )
 
 
@@ -133,7 +133,8 @@ def _marked(folder: Path) -> str | None:
         return None
 
 
-def _described(path: Path) -> str:
+def described(path: Path) -> str:
+    """What lies there, for an error."""
     if not path.exists():
         return "a link to nothing"
     if not path.is_dir():

@@ -1,12 +1,13 @@
 """Content digests are remembered until a file's size or time changes."""
 
 import os
+import sqlite3
 from contextlib import closing
 
 import pytest
 
 from pipeline.digests import ContentDigests
-from pipeline.errors import RecordingError
+from pipeline.errors import ConfigError, RecordingError
 
 
 def test_reads_a_file_once_and_notices_a_change(tmp_path, monkeypatch):
@@ -41,6 +42,33 @@ def test_names_a_file_that_cannot_be_read(tmp_path):
         pytest.raises(RecordingError, match=r"gone: cannot be read: No such file"),
     ):
         digests.of(tmp_path / "gone")
+
+
+def test_what_only_reads_needs_no_write_access(tmp_path, monkeypatch):
+    (tmp_path / "file").write_bytes(b"one")
+    ledger = tmp_path / "ledger.sqlite"
+    with closing(ContentDigests(ledger)) as digests:
+        digests.note_rate("model", 12.5)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    real = sqlite3.connect
+
+    def read_only(place, **how):
+        if place == ledger:
+            how["uri"], place = True, f"file:{ledger}?mode=ro&immutable=1"
+        return real(place, **how)
+
+    monkeypatch.setattr("pipeline.digests.sqlite3.connect", read_only)
+    with (
+        closing(ContentDigests(ledger)) as digests,
+        pytest.raises(ConfigError, match="cannot be written"),
+    ):
+        digests.of(tmp_path / "file")
+    with closing(ContentDigests.to_read(ledger)) as digests:
+        assert digests.rate("model") == 12.5
+        assert len(digests.of(tmp_path / "file")) == 32
+    with closing(ContentDigests.to_read(tmp_path / "file" / "below")) as digests:
+        assert digests.rate("model") is None
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 def test_remembers_speeds(tmp_path):

@@ -1,6 +1,7 @@
 """Which ticks a policy is judged on, and the judgement."""
 
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -77,6 +78,39 @@ def held_out_ticks(
         for name, (first, stop) in ranges.items()
     ]
     return np.sort(np.concatenate(parts))
+
+
+def named_as_in(
+    store: FeatureStore, checkpoint: PolicyCheckpoint
+) -> tuple[PolicyCheckpoint, str | None]:
+    """The checkpoint with its held-out episodes under this store's names, and what to say of it.
+
+    An episode whose source or folder was renamed since is told by the digest of its files.
+    """
+    contents = checkpoint.held_out_content
+    ours = {episode_name(one): one.content for one in store.episodes}
+    same = {name for name in contents if ours.get(name) == contents[name]}
+    free: dict[str, list[str]] = {}
+    for name in sorted(ours.keys() - same, reverse=True):
+        free.setdefault(ours[name], []).append(name)
+    now = {
+        name: free[content].pop() if name not in same and free.get(content) else name
+        for name, content in contents.items()
+    }
+    renamed = [f"{name} is {now[name]}" for name in contents if now[name] != name]
+    if not renamed:
+        return checkpoint, None
+    ticks = {now.get(name, name): range_ for name, range_ in checkpoint.held_out_ticks.items()}
+    said = f"{', '.join(renamed[:3])}{' …' if len(renamed) > 3 else ''}"
+    return (
+        replace(
+            checkpoint,
+            held_out_ticks=ticks,
+            held_out_content={now[name]: content for name, content in contents.items()},
+        ),
+        f"{len(renamed)} held-out episode(s) were renamed since the training and are told by their "
+        f"content: {said}",
+    )
 
 
 def check_store(checkpoint: PolicyCheckpoint, store: FeatureStore) -> None:

@@ -11,7 +11,7 @@ from pipeline.batches import Windows
 from pipeline.checkpoint import PolicyCheckpoint, source_of
 from pipeline.config import EvaluateParams
 from pipeline.evaluation.curves import Curves, read_curves
-from pipeline.evaluation.held_out import held_out_ticks, judge
+from pipeline.evaluation.held_out import held_out_ticks, judge, named_as_in
 from pipeline.evaluation.modalities import ModalityStudy, judge_modalities
 from pipeline.evaluation.predictions import Predictions
 from pipeline.evaluation.scores import Comparison
@@ -54,6 +54,9 @@ def judgement(
     What is judged on what is said first. Raises `CheckpointMismatch` as `held_out_ticks` does, and
     `NumericsError` as `predict`.
     """
+    checkpoint, renamed = named_as_in(store, checkpoint)
+    if renamed:
+        say(renamed)
     ticks = held_out_ticks(store, checkpoint.held_out_ticks, checkpoint.held_out_content)
     policy = checkpoint.policy(device)
     judged = judged_document(checkpoint, policy, store, wanted.samples, wanted.batch_size)

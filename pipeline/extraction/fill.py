@@ -1,5 +1,6 @@
 """Fill a laid-out build with feature rows: taken over where they are known, else computed."""
 
+import json
 import time
 from collections.abc import Sequence
 from contextlib import closing
@@ -11,12 +12,14 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from pipeline.config import Params
-from pipeline.digests import ContentDigests
+from pipeline.digests import ContentDigests, joint_digest
 from pipeline.extraction.local import compute_here
 from pipeline.extraction.survey import Survey
 from pipeline.extraction.takeover import take_over
 from pipeline.extraction.work import Computed, Work
 from pipeline.store import Donor, StoreBuild
+
+_DECIDES_SPEED = ("weights", "adapter", "processor", "compute_dtype", "variants")
 
 
 @dataclass(frozen=True)
@@ -103,7 +106,11 @@ def _computed(work: Work) -> Computed:
 
 
 def rate_name(surveyed: Survey, params: Params) -> str:
-    """Under which name the speed of this model on these devices is remembered."""
-    extract = params.extract
+    """Under which name the speed of this model on these devices is remembered.
+
+    Whatever else of the spec changes, such as prompt, slots or names of views, costs little.
+    """
+    extract, spec = params.extract, surveyed.spec.attrs()
     by = f" on {extract.workers}" if extract.workers != 0 else ""
-    return f"{surveyed.spec.digest} {extract.device}{by}"
+    alike = {name: spec.get(name) for name in _DECIDES_SPEED} | {"views": len(spec["views"])}
+    return f"{joint_digest(json.dumps(alike, sort_keys=True))} {extract.device}{by}"

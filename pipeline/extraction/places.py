@@ -7,13 +7,13 @@ from typing import Any
 
 from pipeline.durable import KEPT, previous_path
 from pipeline.errors import StoreIncomplete, StoreMismatch
+from pipeline.extraction.plan import spec_differences
 from pipeline.extraction.survey import Survey
 from pipeline.ownership import refuse_foreign, remove_folder
 from pipeline.recordings.embodiment import Embodiment
 from pipeline.store import Donor, StoreBuild, part_path, read_plan
 from pipeline.store.places import MERGED, STORE, is_store
 from pipeline.store.schema import read_specs
-from pipeline.vlm.feature_spec import differences
 
 Say = Callable[[str], None]
 _SHOWN = 6
@@ -174,7 +174,7 @@ def make_room(target: Path, surveyed: Survey, say: Say) -> None:
             taken += 1
         part.rename(aside)
         return
-    for line in differences(abandoned.attrs["feature_spec"], surveyed.spec.attrs()):
+    for line in spec_differences(abandoned.attrs["feature_spec"], surveyed.spec.attrs()):
         say(f"the unfinished build {part} is given up: {line}")
 
 

@@ -1,15 +1,19 @@
 """What an extraction would do, and why; said before anything is done."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from pipeline.amounts import duration, size
-from pipeline.config import Params
+from pipeline.config import DataParams, Params
 from pipeline.extraction.check import CheckedEpisode
 from pipeline.extraction.survey import Survey
 from pipeline.store import FEATURES, Donor
 from pipeline.store.schema import ArraySpec
 from pipeline.vlm.feature_spec import differences
+
+_MOST_DIFFERENCES = 6
+"""Lines on how a feature spec changed."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +34,7 @@ class ExtractionPlan:
     """As measured in the last session with this model, resolution and device."""
     reasons: tuple[str, ...]
     warnings: tuple[str, ...] = ()
-    """On how the missing rows would be computed."""
+    """What costs more than it need, and the way out."""
 
     def lines(self) -> list[str]:
         """For people."""
@@ -43,6 +47,7 @@ class ExtractionPlan:
             seconds = left / self.rows_per_s
             time = f"about {duration(seconds)} at {self.rows_per_s:.1f} rows/s, as last measured"
         return [
+            *(f"WARNING: {warning}" for warning in self.warnings),
             *(f"why: {reason}" for reason in self.reasons),
             f"episodes: {self.episodes}, {self.unchanged} of them unchanged",
             f"rows: {self.rows}, {self.known} known, {left} to compute"
@@ -50,7 +55,6 @@ class ExtractionPlan:
             + (" (fewer where a key turns out to be known)" if left and self.known else ""),
             f"disk: {size(self.bytes)} for the whole store, {size(self.free)} free",
             f"time: {time}",
-            *(f"warning: {warning}" for warning in self.warnings if left),
         ]
 
 
@@ -63,10 +67,8 @@ def reasons(survey: Survey, store: Donor | None, specs: dict[str, ArraySpec]) ->
     """Why the store that is there, if any, will not do."""
     if store is None:
         return ("there is no store yet",)
-    why = [
-        f"feature spec, {line}"
-        for line in differences(store.attrs["feature_spec"], survey.spec.attrs())
-    ]
+    lines = spec_differences(store.attrs["feature_spec"], survey.spec.attrs())
+    why = [f"feature spec, {line}" for line in lines]
     before, now = set(store.episode_digests), {one.digest for one in survey.episodes}
     contents = set(store.episode_contents)
     changed = [one for one in survey.episodes if one.digest not in before]
@@ -92,12 +94,52 @@ def reasons(survey: Survey, store: Donor | None, specs: dict[str, ArraySpec]) ->
     return tuple(why) or ("the order of episodes, or how actions are derived, changed",)
 
 
-def dtype_warnings(params: Params) -> tuple[str, ...]:
-    """Whether a half-precision model would run on a CPU; what a dask scheduler has is not known."""
+def spec_differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """What differs between two feature specs, without all that follows from it."""
+    lines = differences(before, now)
+    follow = [line for line in lines if line.startswith(("slots", "example_prompt"))]
+    first = [line for line in lines if line not in follow] or follow
+    left = len(lines) - len(first[:_MOST_DIFFERENCES])
+    more = [f"{left} more entries, most of which follow from that"] if left else []
+    return [*first[:_MOST_DIFFERENCES], *more]
+
+
+def warnings(survey: Survey, store: Donor | None, data: DataParams) -> tuple[str, ...]:
+    """What makes every row or action another one, with the way out."""
+    found: list[str] = []
+    recordings = [one.recording for one in survey.episodes]
+    before: Sequence[str] = store.attrs["feature_spec"].get("views", ()) if store else ()
+    now = survey.spec.views
+    if before and (added := [view for view in now if view not in before]):
+        having = sum(not set(added).isdisjoint(one.view_names()) for one in recordings)
+        kept = ", ".join(view for view in before if view in now)
+        found.append(
+            f"{having} of {len(recordings)} episode(s) have {', '.join(added)}, which the store "
+            "does not have. The model sees all views of a store at a time, so that every row of every "
+            f"episode is computed again. To keep the rows: --set 'data.views=[{kept}]'"
+        )
+    without = [one for one in recordings if not one.has_poses]
+    if data.action_rotation == "auto" and 0 < len(without) < len(recordings):
+        sources = ", ".join(dict.fromkeys(one.source for one in without))
+        found.append(
+            f"{len(without)} of {len(recordings)} episode(s), of source(s) {sources}, have no "
+            "poses, so that the actions of all episodes are differences of Euler angles "
+            "(euler_delta) in place of rotation vectors (rotvec). To keep rotation vectors: leave "
+            "these out of data.sources, or give them a store of their own. To say that it is "
+            "meant: --set data.action_rotation=euler_delta"
+        )
+    return tuple(found)
+
+
+def dtype_warnings(params: Params, missing: int) -> tuple[str, ...]:
+    """Whether so many rows would be computed in half precision on a CPU.
+
+    What the workers of a dask scheduler have is not known.
+    """
     from pipeline.device import resolve_device  # torch takes a second to import
 
     narrow, workers = params.vlm.dtype, params.extract.workers
-    if narrow == "float32" or isinstance(workers, str):
+    if not missing or narrow == "float32" or isinstance(workers, str):
         return ()
     if resolve_device(params.extract.device).type != "cpu":
         return ()

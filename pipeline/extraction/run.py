@@ -31,6 +31,7 @@ from pipeline.extraction.plan import (
     known_rows,
     reasons,
     store_bytes,
+    warnings,
 )
 from pipeline.extraction.survey import Survey, survey
 from pipeline.store import (
@@ -59,10 +60,12 @@ def extract(params: Params, say: Say) -> ExtractionReport | None:
     with ExitStack() as stack:
         if params.extract.plan:
             refuse_foreign_store(target)
+            digests = ContentDigests.to_read(ledger_path(target))
         else:
             stack.enter_context(build_lock(target))
             recover(target)
-        digests = stack.enter_context(closing(ContentDigests(ledger_path(target))))
+            digests = ContentDigests(ledger_path(target))
+        stack.enter_context(closing(digests))
         surveyed = survey(params, digests)
         if surveyed.bad and params.data.on_bad_episode == "stop":
             check_episodes(surveyed, params)  # lists them with whatever else is wrong
@@ -137,7 +140,7 @@ def _resume(
             free=free_bytes(build.part),
             rows_per_s=digests.rate(rate_name(surveyed, params)),
             reasons=(f"{reason} {build.part}",),
-            warnings=dtype_warnings(params),
+            warnings=dtype_warnings(params, len(missing)),
         )
         for line in [*plan.lines(), *keeping_note(target, surveyed)]:
             say(line)
@@ -200,17 +203,19 @@ def _new_plan(
     before = {digest for donor in donors for digest in donor.episode_digests}
     before_it = build.target if build.target in known_places(build.target) else build.part
     store = Donor(before_it) if read_plan(before_it) is not None else None
+    rows = build.specs["vl/time"].shape[0]
+    known = known_rows(checked, surveyed.spec.views, donors)
     return ExtractionPlan(
         episodes=len(checked),
         unchanged=sum(one.surveyed.digest in before for one in checked),
-        rows=build.specs["vl/time"].shape[0],
-        known=known_rows(checked, surveyed.spec.views, donors),
+        rows=rows,
+        known=known,
         variants=surveyed.spec.variants,
         bytes=store_bytes(build.specs),
         free=free_bytes(build.part),
         rows_per_s=digests.rate(rate_name(surveyed, params)),
         reasons=_reasons(build, surveyed, store),
-        warnings=dtype_warnings(params),
+        warnings=(*warnings(surveyed, store, params.data), *dtype_warnings(params, rows - known)),
     )
 
 

@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pipeline.errors import StoreIncomplete, StoreMismatch
+from pipeline.ownership import described, there
 from pipeline.store.batch import Batch
 from pipeline.store.episodes import Episode, episode_of, read_episodes
 from pipeline.store.gather import Gatherer, Selection
 from pipeline.store.mapping import map_flat
 from pipeline.store.mending import extract_command, mend, restore_command, start_over
+from pipeline.store.places import STORE
 from pipeline.store.schema import SCHEMA, TRAILER_BYTES, ArraySpec, chunk_paths, read_specs
 
 
@@ -43,6 +45,8 @@ class FeatureStore:
         build = root.name.endswith(".part")  # which looks like a store until its files are read
         if build or not (root / "zarr.json").exists():
             part = root if build else root.with_name(root.name + ".part")
+            if not build and there(root) and not STORE.owns(root):
+                raise StoreMismatch(_foreign(root))
             found = f"only the unfinished build {part}" if part.exists() else "nothing there"
             base = root.name.removesuffix(".part").removesuffix(".repair")
             run = extract_command(root.with_name(base))
@@ -59,6 +63,8 @@ class FeatureStore:
                 "stages.evaluate restore it where train_head.feed is auto or compressed; to make "
                 f"the store of it: {restore_command(root)}"
             )
+        if "schema" not in attrs:
+            raise StoreMismatch(_foreign(root))
         if attrs.get("schema") != SCHEMA:
             raise StoreMismatch(
                 f"{root}: expected store schema {SCHEMA}, found {attrs.get('schema')!r}. "
@@ -264,3 +270,10 @@ def _mapped(root: Path, spec: ArraySpec) -> NDArray[Any]:
             said = f"{path}: expected {wanted} bytes, found {found}: the store is damaged"
             raise StoreIncomplete(f"{said}. {mend(root)}")
     return map_flat(paths, spec.chunk_bytes, spec.shape, spec.dtype)
+
+
+def _foreign(root: Path) -> str:
+    return (
+        f"{root}: expected a feature store that this project wrote, found {described(root)}. Name "
+        "a store that stages.extract made; it is never written into, or in place of, anything else."
+    )

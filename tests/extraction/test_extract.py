@@ -594,6 +594,33 @@ class TestPlan:
         _, said = run(changed(extract={"plan": True}, data={"vlm_reuse_count": 2}))
         assert any("rows/s, as last measured" in line for line in said)
 
+    @pytest.mark.usefixtures("extracted")
+    def test_warns_of_a_view_that_costs_every_row_and_says_the_way_out(
+        self, params, changed, recordings, counted, write_episode
+    ):
+        write_episode(recordings / "Press" / "episode_4", 4, views=("View1", "View2", "View7"))
+        _, said = run(changed(extract={"plan": True}))
+        (warning,) = (line for line in said if line.startswith("WARNING"))
+        assert "1 of 4 episode(s) have View7" in warning
+        assert "--set 'data.views=[View1, View2]'" in warning
+        assert len([line for line in said if line.startswith("why: feature spec")]) < 8
+        report, said = run(changed(data={"views": ["View1", "View2"]}))
+        assert not any(line.startswith("WARNING") for line in said)
+        assert sum(counted) == report.rows - 24
+
+    def test_warns_where_one_recording_without_poses_decides_for_all(self, changed, monkeypatch):
+        has_poses = property(lambda recording: "Press" not in str(recording.path))
+        monkeypatch.setattr(WindowedRecording, "has_poses", has_poses)
+        for rotation, count in (("auto", 1), ("euler_delta", 0)):
+            _, said = run(changed(extract={"plan": True}, data={"action_rotation": rotation}))
+            warnings = [line for line in said if line.startswith("WARNING: 1 of 3 episode(s)")]
+            assert len(warnings) == count
+
+    @pytest.mark.usefixtures("extracted")
+    def test_a_speed_is_known_under_another_prompt_too(self, params, changed):
+        _, said = run(changed(extract={"plan": True}, vlm={"prompt": "{images}"}))
+        assert any("rows/s, as last measured" in line for line in said)
+
 
 class TestRefusals:
     def test_too_little_disk_is_refused_before_the_model(self, params, monkeypatch, no_model_later):

@@ -14,6 +14,7 @@ import yaml
 
 from pipeline.report import Picture, Report, Text
 from pipeline.store.archive import archive
+from pipeline.store.metadata import note_metadata
 from stages import evaluate, train_head
 from stages.command import run
 
@@ -156,6 +157,28 @@ def test_without_a_checkpoint_it_judges_what_train_head_wrote(
     params.write_text(yaml.safe_dump(document))
     assert run("", evaluate.main, arguments(params, tmp_path / "report")) == 0
     assert f"{trained.parent / 'head'} (step 3)" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("reports")
+def test_a_policy_outlives_the_renaming_of_its_source(
+    trained: Path,
+    judged: tuple[Path, str],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    renamed = Path(shutil.copytree(trained.parent / "tiny.zarr", tmp_path / "renamed.zarr"))
+    document = json.loads((renamed / "zarr.json").read_text())
+    document["attributes"]["sources"] = ["gauche", "droite"]
+    (renamed / "zarr.json").write_text(json.dumps(document))
+    note_metadata(renamed)
+    told = arguments(trained, tmp_path / "report", f"evaluate.store={renamed}")
+    assert run("", evaluate.main, told) == 0
+    assert "renamed since the training and are told by their content" in capsys.readouterr().out
+    before, after = (
+        json.loads((folder / "metrics.json").read_text())
+        for folder in (judged[0], tmp_path / "report")
+    )
+    assert after == before
 
 
 @pytest.mark.usefixtures("reports")

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import zarr
 
 from pipeline.plots.style import RC
 from pipeline.report import Notice, Notices, Place, Report, Section
@@ -50,6 +51,18 @@ def test_recordings_and_a_damaged_one_are_a_page(
     assert out.splitlines()[-1].startswith(f"{page}: ")
     assert "error,unreadable," in page.with_name("findings.csv").read_text()
     assert page.is_file() and len(list(page.parent.glob("*.png"))) >= 4
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_a_zarr_group_of_somebody_else_is_told_and_not_to_be_replaced(
+    looked: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str], version: int
+) -> None:
+    group = zarr.create_group(tmp_path / "umi.zarr", zarr_format=version)
+    group.create_array("data/action", shape=(3,), dtype="f4")
+    assert looked("umi.zarr") == 2
+    said = capsys.readouterr().err
+    assert "umi.zarr: expected a feature store that this project wrote, found a zarr group" in said
+    assert "extract.store=" not in said
 
 
 @pytest.mark.parametrize("alone", [False, True])
