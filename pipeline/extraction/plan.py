@@ -115,8 +115,8 @@ def warnings(survey: Survey, store: Donor | None, data: DataParams) -> tuple[str
         kept = ", ".join(view for view in before if view in now)
         found.append(
             f"{having} of {len(recordings)} episode(s) have {', '.join(added)}, which the store "
-            "does not have. The model sees all views of a store at a time, so that every row of every "
-            f"episode is computed again. To keep the rows: --set 'data.views=[{kept}]'"
+            "does not have. The model sees all views of a store at a time, so that every row of "
+            f"every episode is computed again. To keep the rows: --set 'data.views=[{kept}]'"
         )
     without = [one for one in recordings if not one.has_poses]
     if data.action_rotation == "auto" and 0 < len(without) < len(recordings):
