@@ -1,8 +1,8 @@
 """Which folders this project wrote: only those are ever replaced or removed.
 
 A complete folder is told by what it says of itself: a store by its attributes, a training run by
-its `run.json`. One in the making, and one of reports, holds `MARKER`, which is the first thing
-written into it, so that what a kill leaves behind is known too. An empty folder is anybody's.
+its `run.json`. One in the making holds `MARKER`, which is the first thing written into it, so that
+what a kill leaves behind is known too. An empty folder is anybody's.
 """
 
 import shutil
@@ -94,6 +94,12 @@ def unmark(folder: Path) -> None:
     (folder / MARKER).unlink(missing_ok=True)
 
 
+def release(folder: Path, kind: OutputKind) -> None:
+    """Take the marker away where a folder by now says by itself what it is."""
+    if kind.is_one(folder):
+        unmark(folder)
+
+
 def begins_with(line: str) -> Callable[[Path], bool]:
     """Tells a file by how its first line begins; an empty one is anybody's."""
 
@@ -107,7 +113,7 @@ def begins_with(line: str) -> Callable[[Path], bool]:
 
 
 def _is_report(folder: Path) -> bool:
-    """Whether a version that did not mark its reports wrote this one."""
+    """Whether a command that shows something wrote this folder, or has begun to."""
     if any((folder / sign).exists() for sign in (".report.html.new", ".files.sqlite")):
         return True
     if (folder / "judged.json").is_file() or (folder / "plots" / "metrics").is_dir():

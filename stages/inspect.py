@@ -33,6 +33,7 @@ from collections.abc import Iterator
 from pipeline.config import Params
 from pipeline.inspection.store import inspect_store
 from pipeline.inspection.subject import Subject, subject_of
+from pipeline.ownership import REPORT, claim
 from pipeline.plots.style import boxes
 from pipeline.report import Notice, Notices, Report, write_report
 from pipeline.report.inspection.recording import recordings_report
@@ -47,6 +48,7 @@ def main(params: Params) -> None:
     """Write the page of what `inspect.path` names."""
     subject = subject_of(params)
     report = _report(subject, params)
+    claim(subject.folder, REPORT)
     with boxes() as said:
         page, *beside = write_report(subject.folder, report)
     print("\n".join([*summary(report), *said]))

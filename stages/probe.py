@@ -23,7 +23,7 @@ if __name__ == "__main__":  # here, for --help waits for no import below
 from functools import partial
 
 from pipeline.config import Params
-from pipeline.ownership import REPORT, claim, refuse_foreign
+from pipeline.ownership import REPORT, claim, refuse_foreign, release
 from pipeline.plots.probe import write_probe_plots
 from pipeline.probing import advice, probe, table, write_tables
 from pipeline.store import FeatureStore, check_trailers
@@ -41,6 +41,7 @@ def main(params: Params) -> None:
     study = probe(store, wanted, partial(print, flush=True))
     claim(wanted.output, REPORT)
     files = [*write_tables(wanted.output, study), *write_probe_plots(wanted.output, study)]
+    release(wanted.output, REPORT)
     print(table(study))
     print(advice(study))
     print(f"{wanted.output}: {', '.join(file.name for file in files)}")

@@ -130,12 +130,12 @@ def keeping_note(target: Path, surveyed: Survey) -> list[str]:
 def put_in_place(build: StoreBuild, surveyed: Survey, say: Say) -> None:
     """Seal a build, keep the store before it where episodes would be lost, and tidy up."""
     target = build.target
-    keep = _lost(target, surveyed) is not None
+    build.keeps_replaced = _lost(target, surveyed) is not None
     with closing(build):
-        build.seal(keep=keep)
+        build.seal()
     for folder in set_aside(target):
         remove_folder(folder, STORE)
-    if keep:
+    if build.keeps_replaced:
         say(f"{previous_path(target)}: the store of before, kept until the next successful run")
     else:
         for place in _kept(target):

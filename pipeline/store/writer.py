@@ -39,6 +39,8 @@ class StoreBuild:
         self.part = part_path(target)
         self.specs = dict(specs)
         self.plan = plan
+        self.keeps_replaced = False
+        """Whether the store whose place it takes is kept as `<name>.zarr.previous`."""
         self._files: dict[str, ChunkFiles] = {}
         self._environments = EnvironmentLog(self.part)
 
@@ -176,14 +178,14 @@ class StoreBuild:
         for run in runs:
             self.files(CHECKSUMS).write(int(rows[run[0]]), checksums[run])
 
-    def seal(self, *, keep: bool = False) -> None:
+    def seal(self) -> None:
         """Check every row, write the trailers and put the store in its place.
 
-        What it replaces is removed, or kept as `<name>.zarr.previous`. Idempotent: a kill in the
-        middle is mended by running it again. Raises `StoreIncomplete` when rows are missing.
+        Idempotent: a kill in the middle is mended by running it again. Raises `StoreIncomplete`
+        when rows are missing, or a file is not as it was written.
         """
         self.finish()
-        self.put_in_place(keep=keep)
+        self.put_in_place()
 
     def finish(self) -> None:
         """The first half of `seal`: all of the store is on the disk, still beside its place."""
@@ -216,9 +218,9 @@ class StoreBuild:
                 "writes streams, ticks and episodes anew and keeps the feature rows."
             ) from None
 
-    def put_in_place(self, *, keep: bool = False) -> None:
+    def put_in_place(self) -> None:
         """The second half of `seal`: an instant."""
-        put_in_place(self.part, self.target, STORE, keep=keep)
+        put_in_place(self.part, self.target, STORE, keep=self.keeps_replaced)
 
     def close(self) -> None:
         """Close every file."""

@@ -18,7 +18,7 @@ from markupsafe import Markup
 from tqdm import tqdm
 
 from pipeline.durable import disk_full_named, sync
-from pipeline.ownership import REPORT, begin_folder, claim, remove_folder
+from pipeline.ownership import REPORT, OutputKind, begin_folder, release, remove_folder
 from pipeline.plots.style import NO_FONT, RC, boxes, write
 from pipeline.report.page.blocks import (
     Block,
@@ -46,6 +46,7 @@ MOST_PLACES = 300
 """Of a notice, those that the page lists; more stand in `findings.csv` only."""
 _TEMPLATES = Path(__file__).parent / "templates"
 _WRITTEN = re.compile(r'<meta name="pictures" content="([^"]*)">')
+_TEMPORARY = OutputKind("a page in the making", Path.is_dir)
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 
 
@@ -55,17 +56,17 @@ def write_report(folder: Path, report: Report) -> list[Path]:
     A page that says what looks wrong has all of it in `findings.csv` beside it. Pictures are drawn
     one at a time. Each file is put in place whole, the page last, so that a kill leaves the old
     page. Pictures that the page of before had and this one has not are removed; of other files in
-    `folder` none is touched. Raises `DiskFull` with the old page in place, `ConfigError` for a
-    folder with content that is no report's, and `ValueError` for a picture's name that is twice in
-    the report or no plain file stem.
+    `folder` none is touched: whose that is, the caller has asked. Raises `DiskFull` with the old
+    page in place, and `ValueError` for a picture's name that is twice in the report or no plain
+    file stem.
     """
     names = [picture.name for picture in _pictures(report)]
     _check_names(names)
     temporary = folder / f".{PAGE}.new"
     with disk_full_named(folder):
-        claim(folder, REPORT)
+        folder.mkdir(parents=True, exist_ok=True)
         try:
-            begin_folder(temporary, REPORT)
+            begin_folder(temporary, _TEMPORARY)
             page = _Page(report, temporary, names).html()
             # A file's name need not be text: what is none is shown as \udcXX.
             texts = {**_findings(report), PAGE: page}
@@ -73,7 +74,8 @@ def write_report(folder: Path, report: Report) -> list[Path]:
                 (temporary / name).write_text(text, encoding="utf-8", errors="backslashreplace")
             return _put_in_place(temporary, folder, names, texts)
         finally:
-            remove_folder(temporary, REPORT)
+            remove_folder(temporary, _TEMPORARY)
+            release(folder, REPORT)
 
 
 def _put_in_place(
