@@ -105,6 +105,8 @@ def reseal() -> Callable[[Path], None]:
         np.memmap(file, np.uint32, "r+", shape=sums.shape)[:] = sums
         for spec in read_specs(path).values():
             with closing(ChunkFiles(path, spec)) as files:
+                for file in files.paths:
+                    os.truncate(file, spec.chunk_bytes)  # a trailer that is there is compared
                 files.seal()
         note_metadata(path)
 

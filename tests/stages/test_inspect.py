@@ -61,7 +61,9 @@ def test_a_zarr_group_of_somebody_else_is_told_and_not_to_be_replaced(
     group.create_array("data/action", shape=(3,), dtype="f4")
     assert looked("umi.zarr") == 2
     said = capsys.readouterr().err
-    assert "umi.zarr: expected a feature store that this project wrote, found a zarr group" in said
+    assert (
+        "umi.zarr: no finished store: expected what this project wrote, found a zarr group" in said
+    )
     assert "extract.store=" not in said
 
 

@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from pipeline.durable import disk_full_named, put_in_place, sync
 from pipeline.errors import StoreIncomplete, StoreMismatch
-from pipeline.ownership import begin_folder, refuse_foreign, remove_folder
+from pipeline.ownership import begin_folder, remove_folder
 from pipeline.store.archive.codecs import Choice, Codec, choose, codecs_for
 from pipeline.store.archive.layout import create_array, inner_rows, rows_of, shard_path, shards
 from pipeline.store.archive.manifest import (
@@ -62,15 +62,13 @@ def archive(store: Path, output: Path, level: int, threads: int) -> ArchiveRepor
     left alone.
 
     Raises `StoreIncomplete` where the store is not finished or is damaged (array, file and rows
-    named), `StoreMismatch` where another archive lies at `output`, `ConfigError` where something
-    else does, `StoreLocked` and `DiskFull`.
+    named), `StoreMismatch` where something else lies at `output`, `StoreLocked` and `DiskFull`.
     """
     begun = time.perf_counter()
     FeatureStore.open(store)  # says what is wrong with something that is no finished store
     check_metadata(store)
     with build_lock(output):
-        refuse_foreign(output, ARCHIVE)
-        if is_archive(output):
+        if output.exists():
             return ArchiveReport(output, _archived_already(store, output).arrays, None)
         part = part_path(output)
         try:
@@ -85,17 +83,18 @@ def archive(store: Path, output: Path, level: int, threads: int) -> ArchiveRepor
 
 def _archived_already(store: Path, output: Path) -> Manifest:
     """The manifest at `output`, where it is of this store as it is now."""
-    manifest = read_manifest(output)
-    trailers = {
-        name: tuple(trailer(path) for path in chunk_paths(store, spec))
-        for name, spec in read_specs(store).items()
-    }
-    archived = {name: array.crc32c for name, array in manifest.arrays.items()}
-    if manifest.metadata == read_metadata(store) and archived == trailers:
-        return manifest
+    if is_archive(output):
+        manifest = read_manifest(output)
+        trailers = {
+            name: tuple(trailer(path) for path in chunk_paths(store, spec))
+            for name, spec in read_specs(store).items()
+        }
+        archived = {name: array.crc32c for name, array in manifest.arrays.items()}
+        if manifest.metadata == read_metadata(store) and archived == trailers:
+            return manifest
     raise StoreMismatch(
-        f"{output}: there already, and not an archive of {store} as it is now. Remove it, or name "
-        "another place with archive.output."
+        f"{output}: there already, and not an archive of {store} as it is now. Move it away, or "
+        "name another place with archive.output."
     )
 
 
