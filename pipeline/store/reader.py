@@ -275,5 +275,5 @@ def _mapped(root: Path, spec: ArraySpec) -> NDArray[Any]:
 def _foreign(root: Path) -> str:
     return (
         f"{root}: no finished store: expected what this project wrote, found {described(root)}. "
-        "Name a store that stages.extract made; it is never written into, or in place of, anything else."
+        "Name a store that stages.extract made, which never writes in place of anything else."
     )

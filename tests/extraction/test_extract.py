@@ -585,7 +585,7 @@ class TestPlan:
     )
     def test_warns_of_half_precision_on_a_cpu(self, changed, dtype, extract, warned):
         _, said = run(changed(extract={"plan": True} | extract, vlm={"dtype": dtype}))
-        warnings = [line for line in said if line.startswith("warning: ")]
+        warnings = [line for line in said if line.startswith("WARNING: ")]
         assert len(warnings) == warned
         assert all(dtype in line and "vlm.dtype=float32" in line for line in warnings)
 
