@@ -1,17 +1,23 @@
-"""Which device does the tensor maths, and in which precision."""
+"""Which device does the tensor maths, and in which precision.
 
-from typing import Literal
+torch takes over a second to import: a command that finds nothing to do must not pay for it.
+"""
 
-import torch
+from typing import TYPE_CHECKING, Literal
 
 from pipeline.errors import ConfigError
 
+if TYPE_CHECKING:
+    import torch
 
-def resolve_device(name: str) -> torch.device:
+
+def resolve_device(name: str) -> "torch.device":
     """The device of a `device:` param; `auto` is the first CUDA device where there is one.
 
     Raises `ConfigError` for a device that this machine or this build of torch does not have.
     """
+    import torch
+
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
@@ -28,12 +34,14 @@ def resolve_device(name: str) -> torch.device:
     return device
 
 
-def use_bfloat16(amp: Literal["auto", "off", "bfloat16"], device: torch.device) -> bool:
+def use_bfloat16(amp: Literal["auto", "off", "bfloat16"], device: "torch.device") -> bool:
     """Whether the forward pass runs under bfloat16 autocast.
 
     `auto` is yes on a CUDA device with bfloat16 arithmetic and no elsewhere, where autocast
     seldom pays and float32 keeps a run reproducible to the bit.
     """
+    import torch
+
     if amp == "auto":
         return device.type == "cuda" and torch.cuda.is_bf16_supported(including_emulation=False)
     return amp == "bfloat16"

@@ -6,6 +6,7 @@ The ledger only saves reading: losing it costs time, never correctness.
 
 import hashlib
 import sqlite3
+from collections.abc import Callable
 from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ _TABLES = (
     "rate (what TEXT PRIMARY KEY, rows_per_s REAL)",
     "batch_size (what TEXT PRIMARY KEY, rows INTEGER)",
     "bad (episode TEXT PRIMARY KEY, reason TEXT)",
+    "text (what TEXT PRIMARY KEY, text TEXT)",
 )
 
 
@@ -122,6 +124,15 @@ class ContentDigests:
     def bad(self, episode: str) -> str | None:
         """Why the episode of this digest cannot be used; None where nothing is known."""
         return self._known("SELECT reason FROM bad WHERE episode = ?", (episode,))
+
+    def text(self, what: str, make: Callable[[], str]) -> str:
+        """What `make` gives, made once: `what` names everything that it depends on."""
+        known = self._known("SELECT text FROM text WHERE what = ?", (what,))
+        if known is not None:
+            return known
+        made = make()
+        self._write("INSERT OR REPLACE INTO text VALUES (?, ?)", (what, made))
+        return made
 
     def _known(self, query: str, values: tuple[object, ...]) -> Any:
         """The one value that a query finds; None where it finds nothing."""

@@ -7,11 +7,9 @@ import os
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
-from torch import Tensor
 
 from pipeline.errors import CheckpointIncomplete, DiskFull
 from pipeline.ownership import (
@@ -23,6 +21,9 @@ from pipeline.ownership import (
     there,
     unmark,
 )
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
 DIGEST = "document_sha256"
@@ -213,16 +214,20 @@ def _document_sha256(document: Mapping[str, Any]) -> str:
     return hashlib.sha256(canonical.encode()).hexdigest()
 
 
-def write_tensors(path: Path, tensors: Mapping[str, Tensor]) -> str:
+def write_tensors(path: Path, tensors: Mapping[str, "Tensor"]) -> str:
     """Write tensors as safetensors and return the sha256 of the file."""
+    from safetensors.torch import save_file  # torch: most that write files here hold no tensor
+
     save_file({name: value.detach().cpu().contiguous() for name, value in tensors.items()}, path)
     # safetensors writes for the owner alone; other files have what the umask leaves.
     path.chmod(path.parent.stat().st_mode & 0o666)
     return _sha256(path)
 
 
-def read_tensors(path: Path, sha256: str) -> dict[str, Tensor]:
+def read_tensors(path: Path, sha256: str) -> "dict[str, Tensor]":
     """The tensors at `path`; `CheckpointIncomplete` when they are not those that were written."""
+    from safetensors.torch import load_file
+
     try:
         if _sha256(path) != sha256:
             raise CheckpointIncomplete(damaged(path, "its sha256 is not the one written with it"))

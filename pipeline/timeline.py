@@ -11,7 +11,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
 
 from pipeline.errors import ConfigError, RecordingError
 from pipeline.recordings import Channels, RecordedAction, Recording, Stream
@@ -250,6 +249,8 @@ def _pose_actions(
     pose = poses.values[first].astype(np.float64)
     place = np.stack([np.interp(edges, clock, pose[:, axis]) for axis in range(3)], axis=1)
     if action_rotation == "rotvec":
+        from scipy.spatial.transform import Rotation, Slerp  # slow to import, and seldom needed
+
         # R = Rx(a)·Ry(b)·Rz(r), the arm's mobile XYZ convention.
         turned = Slerp(clock, Rotation.from_euler("XYZ", pose[:, 3:], degrees=True))(edges)
         # In the base frame: R(k+1)·R(k)ᵀ.

@@ -77,3 +77,11 @@ def test_remembers_speeds(tmp_path):
         digests.note_rate("model", 12.5)
     with closing(ContentDigests(tmp_path / "ledger.sqlite")) as digests:
         assert digests.rate("model") == 12.5
+
+
+def test_a_text_is_made_once(tmp_path):
+    for expected in (["made"], []):
+        calls: list[str] = []
+        with closing(ContentDigests(tmp_path / "ledger.sqlite")) as digests:
+            assert digests.text("name", lambda: calls.append("made") or "text") == "text"
+        assert calls == expected

@@ -13,7 +13,6 @@ from tqdm import tqdm
 
 from pipeline.config import Params
 from pipeline.digests import ContentDigests, joint_digest
-from pipeline.extraction.local import compute_here
 from pipeline.extraction.survey import Survey
 from pipeline.extraction.takeover import take_over
 from pipeline.extraction.work import Computed, Work
@@ -98,9 +97,12 @@ def fill(
 def _computed(work: Work) -> Computed:
     if not len(work.missing):
         return Computed()
+    # What holds the model takes seconds to import, dask one more: here alone they are needed.
     if work.params.extract.workers == 0:
+        from pipeline.extraction.local import compute_here
+
         return compute_here(work)
-    from pipeline.extraction.cluster import compute_on_cluster  # dask takes a second to import
+    from pipeline.extraction.cluster import compute_on_cluster
 
     return compute_on_cluster(work)
 

@@ -56,7 +56,6 @@ def extract(params: Params, say: Say) -> ExtractionReport | None:
     same feature spec, and computes the rest. With `extract.plan` it only says what it would do.
     """
     target = params.extract.store
-    resolve_device(params.extract.device)
     with ExitStack() as stack:
         if params.extract.plan:
             refuse_foreign_store(target)
@@ -71,6 +70,7 @@ def extract(params: Params, say: Say) -> ExtractionReport | None:
             check_episodes(surveyed, params)  # lists them with whatever else is wrong
         if _can_go_on(surveyed, target):
             return _go_on(surveyed, params, digests, say)
+        resolve_device(params.extract.device)
         surveyed, checked = sound_episodes(surveyed, params, digests)
         if _can_go_on(surveyed, target):
             return _go_on(surveyed, params, digests, say)
@@ -124,6 +124,7 @@ def _resume(
 ) -> ExtractionReport | None:
     """Go on with the build of this very plan."""
     target = params.extract.store
+    resolve_device(params.extract.device)
     build = StoreBuild(target, read_specs(part_path(target)), surveyed.plan)
     repairs = read_plan(target) == surveyed.plan
     reason = "completing the repair" if repairs else "continuing the interrupted build"

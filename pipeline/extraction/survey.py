@@ -69,7 +69,7 @@ def survey(params: Params, digests: ContentDigests) -> Survey:
         episodes.append(SurveyedEpisode(recording, content, digest))
     if not episodes:
         refuse_bad(bad, of=len(bad))
-    spec = feature_spec(params.vlm, params.extract.dtype, sorted(views), digests.of)
+    spec = feature_spec(params.vlm, params.extract.dtype, sorted(views), digests.of, digests.text)
     plan = joint_digest(
         spec.digest,
         params.extract.sensor_dtype,

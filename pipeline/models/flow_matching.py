@@ -5,7 +5,6 @@ from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
-from scipy.special import betaincinv
 from torch import Tensor, nn
 
 from pipeline.models.denoiser import Denoiser
@@ -48,6 +47,8 @@ class BetaTimes(nn.Module):
     quantiles: Tensor
 
     def __init__(self, alpha: float, beta: float) -> None:
+        from scipy.special import betaincinv  # slow to import, and of this one class
+
         super().__init__()
         grid = torch.linspace(0, 1, 4097, dtype=torch.float64, device="cpu")
         table = torch.from_numpy(betaincinv(alpha, beta, grid.numpy()))

@@ -2,9 +2,13 @@
 
 `schema` says what is in it, `writer` builds it so that a kill loses nothing, `donor` takes rows
 over from an older one, `reader` maps a finished one and gathers batches from it.
+
+`Batch` comes from `batch` when first asked for: it brings torch, which a store that is written,
+opened or checked does without.
 """
 
-from pipeline.store.batch import Batch
+from typing import TYPE_CHECKING, Any
+
 from pipeline.store.chunks import check_trailers
 from pipeline.store.donor import Donor
 from pipeline.store.lock import build_lock
@@ -13,6 +17,9 @@ from pipeline.store.places import part_path, read_plan, recover
 from pipeline.store.reader import Episode, FeatureStore
 from pipeline.store.schema import FEATURES, KEY_BYTES, SCHEMA, Sizes, arrays
 from pipeline.store.writer import StoreBuild
+
+if TYPE_CHECKING:
+    from pipeline.store.batch import Batch
 
 __all__ = [
     "FEATURES",
@@ -33,3 +40,11 @@ __all__ = [
     "read_plan",
     "recover",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "Batch":
+        from pipeline.store.batch import Batch
+
+        return Batch
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -4,7 +4,6 @@ Arithmetic on whole batches of indices, then one `index_select` a stream into it
 at the speed of a row gather in C; no sample is touched from Python.
 """
 
-import os
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -18,9 +17,6 @@ from pipeline.store.batch import Batch
 from pipeline.store.episodes import episode_of
 from pipeline.store.mapping import fitting, populate, read_at_random, will_need
 from pipeline.store.memory import available_bytes
-
-# OpenMP's threads do not survive a fork, and a forked process that waits for them waits for ever.
-os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
 
 WIDE = {
     "action": "tick/action",

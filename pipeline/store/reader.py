@@ -1,25 +1,42 @@
-"""Open a finished store and gather batches from it at memory speed."""
+"""Open a finished store and gather batches from it at memory speed.
 
+torch is imported with the first batch, not before: whoever only looks at a store needs none.
+"""
+
+import os
+import sys
 import threading
 from collections.abc import Collection, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import zarr
 from numpy.typing import NDArray
-from torch import Tensor
 
 from pipeline.errors import StoreIncomplete, StoreMismatch
 from pipeline.ownership import described, there
-from pipeline.store.batch import Batch
 from pipeline.store.episodes import Episode, episode_of, read_episodes
-from pipeline.store.gather import Gatherer, Selection
 from pipeline.store.mapping import map_flat
 from pipeline.store.mending import extract_command, mend, restore_command, start_over
 from pipeline.store.places import STORE
 from pipeline.store.schema import SCHEMA, TRAILER_BYTES, ArraySpec, chunk_paths, read_specs
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from pipeline.store.batch import Batch
+    from pipeline.store.gather import Gatherer, Selection
+
+
+def _one_thread() -> None:
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(1)
+
+
+# OpenMP's threads do not survive a fork, and a forked process that waits for them waits for ever.
+os.register_at_fork(after_in_child=_one_thread)
 
 
 class FeatureStore:
@@ -166,9 +183,9 @@ class FeatureStore:
         feature_lag: int = 0,
         sensor_lag_s: float = 0.0,
         state_lag_s: float = 0.0,
-        out: Batch | None = None,
+        out: "Batch | None" = None,
         variants: NDArray[np.int64] | None = None,
-    ) -> Batch:
+    ) -> "Batch":
         """The batch of these ticks (store-global), into the buffers of `out` where given.
 
         Windows end at the last reading at or before the tick less the lag; `feature_lag` goes back
@@ -191,9 +208,9 @@ class FeatureStore:
         ticks: Sequence[int] | NDArray[np.int64],
         windows: tuple[int, int, int],
         lags: tuple[int, float, float],
-        out: Batch | None,
+        out: "Batch | None",
         variants: NDArray[np.int64] | None,
-    ) -> tuple[Batch, Selection]:
+    ) -> "tuple[Batch, Selection]":
         """The first half of `gather`: all but the wide fields of a batch, and where those lie."""
         if min(lags) < 0:
             raise ValueError(
@@ -214,7 +231,7 @@ class FeatureStore:
             )
         return batch, self._gatherer.select(batch, tick, *lags, variants)
 
-    def copy(self, selection: Selection, batch: Batch, but: Collection[str] = ()) -> None:
+    def copy(self, selection: "Selection", batch: "Batch", but: Collection[str] = ()) -> None:
         """The second half of `gather`: the wide fields of `batch`, without those named in `but`."""
         self._gatherer.copy(selection, batch, but)
 
@@ -225,11 +242,11 @@ class FeatureStore:
         sensor_window: int,
         state_window: int,
         but: Collection[str] = (),
-    ) -> Batch:
+    ) -> "Batch":
         """Buffers for `gather(..., out=)`; those named in `but` have a shape, but no memory."""
         return self._gatherer.empty_batch(batch, horizon, sensor_window, state_window, but)
 
-    def tensor(self, field: str) -> Tensor:
+    def tensor(self, field: str) -> "Tensor":
         """The map that a wide field of a batch (`WIDE`) is gathered from, row by row."""
         return self._gatherer.tensor(field)
 
@@ -245,7 +262,9 @@ class FeatureStore:
             threading.Thread(target=read, args=(but,), name="warm", daemon=True).start()
 
     @cached_property
-    def _gatherer(self) -> Gatherer:
+    def _gatherer(self) -> "Gatherer":
+        from pipeline.store.gather import Gatherer
+
         return Gatherer(self._arrays, self.variants)
 
     def _check_variants(self, variants: NDArray[np.int64], batch: int) -> None:

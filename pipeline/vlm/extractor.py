@@ -9,7 +9,8 @@ from torch import Tensor
 from transformers.masking_utils import create_causal_mask, create_sliding_window_causal_mask
 
 from pipeline.vlm.collation import Batch, Collator
-from pipeline.vlm.pixels import PixelSettings, patchify
+from pipeline.vlm.patches import patchify
+from pipeline.vlm.pixels import PixelSettings
 from pipeline.vlm.pooling import pool
 from pipeline.vlm.preparation import PreparedRow
 from pipeline.vlm.slots import Slot

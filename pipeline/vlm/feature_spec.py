@@ -8,6 +8,7 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,8 @@ AUGMENTATION_VERSION = 1
 """Raised whenever this code changes what an augmented variant of a frame is."""
 
 _PLACEHOLDER_INSTRUCTION = "…"
+_READS_CHECKPOINTS = ("transformers", "tokenizers", "huggingface-hub", "jinja2")
+_READ_FROM_CHECKPOINTS = (".json", ".jinja", ".txt")
 
 
 @dataclass(frozen=True)
@@ -78,30 +81,35 @@ def feature_spec(
     storage_dtype: str,
     views: Sequence[str],
     digest_file: Callable[[Path], str],
+    remember: Callable[[str, Callable[[], str]], str] | None = None,
 ) -> FeatureSpec:
     """The spec of features that `vlm` gives for these views, stored as `storage_dtype`.
 
     Reads the checkpoint's small files; `digest_file` gives the content digest of one file and may
-    remember it. Raises `VLMError` where the checkpoint is incomplete or `vlm.layers` goes past it.
+    remember it. `remember` (`ContentDigests.text`) may remember what was read by the digest of all
+    it depends on: then transformers, which takes seconds to import, is not needed again. Raises
+    `VLMError` where the checkpoint is incomplete or `vlm.layers` goes past it.
     """
-    from pipeline.vlm.pixels import PixelSettings
-    from pipeline.vlm.prompt import PromptRenderer
-
     folder = resolve_checkpoint(vlm.checkpoint, vlm.revision)
     layer_count, dim = _model_shape(folder)
     ordered = tuple(sorted(set(views)))
     slots = slots_of(vlm, layer_count, ordered)
-    pixels = PixelSettings.read(folder, (vlm.image_resize_height, vlm.image_resize_width))
-    renderer = PromptRenderer(folder, vlm.prompt)
+
+    def read() -> str:
+        return json.dumps(_read(folder, vlm, len(ordered)))
+
+    what = _read_digest(folder, vlm, len(ordered), digest_file) if remember else ""
+    rendered = json.loads(remember(what, read) if remember else read())
+    processor = rendered["processor"]
     document = {
         "extractor_version": EXTRACTOR_VERSION,
         "weights": _files_digest(weight_files(folder), digest_file),
         "adapter": _adapter_digest(vlm.adapter, digest_file),
         "tokenizer": _files_digest(tokenizer_files(folder), digest_file),
-        "chat_template": renderer.chat_template,
+        "chat_template": rendered["chat_template"],
         "prompt": vlm.prompt,
-        "example_prompt": renderer.render(_PLACEHOLDER_INSTRUCTION, len(ordered)),
-        "processor": pixels.document(),
+        "example_prompt": rendered["example_prompt"],
+        "processor": processor,
         "views": list(ordered),
         "slots": slot_documents(slots, vlm.variants),
         "dim": dim,
@@ -110,7 +118,43 @@ def feature_spec(
         **_augmentation(vlm),
     }
     digest = _digest(document)
-    return FeatureSpec(document, digest, slots, ordered, dim, pixels.image_size, vlm.variants)
+    image_size = processor["image_size"][0], processor["image_size"][1]
+    return FeatureSpec(document, digest, slots, ordered, dim, image_size, vlm.variants)
+
+
+def _read(folder: Path, vlm: VLMParams, views: int) -> dict[str, Any]:
+    """The entries of the document that transformers has to read."""
+    from pipeline.vlm.pixels import PixelSettings
+    from pipeline.vlm.prompt import PromptRenderer
+
+    pixels = PixelSettings.read(folder, (vlm.image_resize_height, vlm.image_resize_width))
+    renderer = PromptRenderer(folder, vlm.prompt)
+    return {
+        "chat_template": renderer.chat_template,
+        "example_prompt": renderer.render(_PLACEHOLDER_INSTRUCTION, views),
+        "processor": pixels.document(),
+    }
+
+
+def _read_digest(
+    folder: Path, vlm: VLMParams, views: int, digest_file: Callable[[Path], str]
+) -> str:
+    """The digest of all that `_read` depends on: files, libraries, this code and its arguments."""
+    beside = folder.glob("additional_chat_templates/*")
+    files = [p for p in (*folder.glob("*"), *beside) if p.suffix in _READ_FROM_CHECKPOINTS]
+    code = [
+        Path(__file__).with_name(name) for name in ("feature_spec.py", "pixels.py", "prompt.py")
+    ]
+    return _digest(
+        {
+            "files": {str(path.relative_to(folder)): digest_file(path) for path in sorted(files)},
+            "libraries": {name: version(name) for name in _READS_CHECKPOINTS},
+            "code": [digest_file(path) for path in code],
+            "resize": (vlm.image_resize_height, vlm.image_resize_width),
+            "prompt": vlm.prompt,
+            "views": views,
+        }
+    )
 
 
 def document_digest(attrs: Mapping[str, Any]) -> str:

@@ -3,8 +3,6 @@
 from pathlib import Path
 from typing import Any, Literal
 
-from transformers import AutoTokenizer
-
 from pipeline.errors import VLMError
 from pipeline.vlm.checkpoint_folder import read_config, read_json, tokenizer_files
 
@@ -28,6 +26,8 @@ class PromptRenderer:
 
         Raises `VLMError` where they are missing or do not fit the model's config.
         """
+        from transformers import AutoTokenizer  # takes long: types and tokens alone do without
+
         config = read_config(folder)
         tokenizer_files(folder)
         try:

@@ -1,6 +1,8 @@
 """One extraction: what it writes, what it takes over, what it refuses."""
 
 import shutil
+import subprocess
+import sys
 from contextlib import suppress
 from pathlib import Path
 
@@ -216,6 +218,19 @@ class TestWhatItTakesOver:
         assert said == [
             f"{params.extract.store}: up to date, nothing to do (stages.verify reads what it holds)"
         ]
+
+    def test_nothing_changed_imports_nothing_that_takes_seconds(self, params_file, params):
+        run(params)
+        heavy = {"torch", "transformers", "dask", "distributed", "peft", "scipy", "matplotlib"}
+        code = (
+            "import sys\nfrom stages.command import run\n"
+            "assert run('', 'stages.extract', sys.argv[1:]) == 0\n"
+            f"print(sorted({heavy} & sys.modules.keys()))"
+        )
+        command = [sys.executable, "-c", code, "--params", str(params_file)]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        assert "nothing to do" in done.stdout
+        assert done.stdout.splitlines()[-1] == "[]"
 
     @pytest.mark.usefixtures("extracted")
     def test_an_added_episode_computes_only_its_rows(

@@ -366,3 +366,43 @@ def test_importing_the_spec_imports_neither_torch_nor_transformers() -> None:
     )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "[]"
+
+
+def test_what_transformers_read_is_remembered_by_all_it_depends_on(
+    vlm_params: Callable[..., VLMParams],
+    digest_file: Callable[[Path], str],
+    demo_checkpoint: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    folder = shutil.copytree(demo_checkpoint, tmp_path / "checkpoint")
+    kept: dict[str, str] = {}
+    made: list[str] = []
+
+    def remember(what: str, make: Callable[[], str]) -> str:
+        if what not in kept:
+            made.append(what)
+            kept[what] = make()
+        return kept[what]
+
+    def spec(views: tuple[str, ...] = VIEWS, **changes: object) -> FeatureSpec:
+        vlm = vlm_params(checkpoint=str(folder), **changes)
+        again = feature_spec(vlm, "float32", views, digest_file, remember)
+        assert again == feature_spec(vlm, "float32", views, digest_file)
+        assert json.dumps(again.document) == json.dumps(
+            feature_spec(vlm, "float32", views, digest_file).document
+        ), "in the same order, as a store keeps it"
+        return again
+
+    spec()
+    spec(layers=[0])
+    assert len(made) == 1, "no layer decides what is read"
+    spec(prompt="{images}")
+    spec(image_resize_height=168)
+    spec(views=("View1",))
+    template = json.loads((folder / "tokenizer_config.json").read_text())["chat_template"]
+    (folder / "chat_template.jinja").write_text(template + "{# another #}")
+    spec()
+    monkeypatch.setattr("pipeline.vlm.feature_spec.version", lambda name: "another")
+    spec()
+    assert len(made) == 6
