@@ -1,12 +1,22 @@
 """What tests of every room share: the real recordings, where present, and a small store."""
 
-import json
 import os
+
+# Before anything imports numpy or torch, and for every process that a test starts. Sums over
+# several threads are taken in another order, so that bits differ; and two processes of one thread
+# each do in half of the time what one of two threads does.
+THREADS = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+os.environ |= THREADS
+
+import json
+import re
 import shutil
 import signal
 import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import closing
+from multiprocessing import forkserver, get_context
+from multiprocessing.context import ForkServerContext
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +41,28 @@ install_import_hook("pipeline.models", "beartype.beartype")
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+# Where something has imported it before.
+torch.set_num_threads(1)
+
+MOST_WORKERS = 8
+"""Processes that run tests at a time: each of them may take two gigabytes."""
+
+
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """In how many processes `-n auto` runs tests: as many as this one may use cores.
+
+    None beside this one for the tests of one file, which would wait longer for the processes than
+    they take, and for those that share the one GPU.
+    """
+    named = {argument.partition("::")[0] for argument in config.option.file_or_dir}
+    on_gpu = re.search(r"(?<!not )\bgpu\b", config.option.markexpr) is not None
+    if on_gpu or (len(named) == 1 and all(name.endswith(".py") for name in named)):
+        return 0
+    return min(MOST_WORKERS, len(os.sched_getaffinity(0)))
+
+
 ROOT = Path(__file__).resolve().parents[1]
+MODEL = "transformers.models.qwen2_5_vl.modeling_qwen2_5_vl"
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
@@ -85,15 +116,6 @@ def tiny_head() -> Callable[..., dict[str, Any]]:
     return section
 
 
-@pytest.fixture(scope="module")
-def one_thread() -> Iterator[None]:
-    """Sums over several threads are taken in another order, so that bits differ."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 @pytest.fixture(scope="session")
 def reseal() -> Callable[[Path], None]:
     """`reseal(store)` gives what a test planted in a finished store its checksums."""
@@ -111,6 +133,17 @@ def reseal() -> Callable[[Path], None]:
         note_metadata(path)
 
     return seal
+
+
+@pytest.fixture(scope="session")
+def fork_server() -> ForkServerContext:
+    """Processes of a server that has imported what takes each seconds otherwise."""
+    server = get_context("forkserver")
+    stages = [f"stages.{name}" for name in ("evaluate", "extract", "store", "train_head")]
+    heavy = ["pipeline.extraction.local", "pipeline.extraction.cluster", MODEL]
+    server.set_forkserver_preload([*stages, *heavy])
+    forkserver.ensure_running()  # with these, whoever forks next
+    return server
 
 
 def write_tiny_store(

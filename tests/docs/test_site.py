@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.extra
 DESKTOP, PHONE = (1280, 900), (390, 844)
 PAGES = ("index", "concepts", "store", "params", "data/errors", "reference/store", "faq")
 

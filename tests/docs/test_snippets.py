@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 
@@ -42,12 +43,16 @@ def snippets(page: Path) -> Iterator[Snippet]:
         yield Snippet(text.count("\n", 0, match.start("code")) + 1, match["code"], marks)
 
 
-def with_snippets() -> list[Path]:
-    return [page for page in PAGES if any("no-run" not in one.marks for one in snippets(page))]
+def with_snippets() -> Iterator[Any]:
+    for page in PAGES:
+        marks = [one.marks for one in snippets(page) if "no-run" not in one.marks]
+        extra = [pytest.mark.extra] if any("needs" in one for one in marks) else []
+        if marks:
+            yield pytest.param(page, marks=extra, id=str(page.relative_to(ROOT)))
 
 
 @pytest.mark.filterwarnings("default")  # what a snippet's libraries warn of is not ours to mend
-@pytest.mark.parametrize("page", with_snippets(), ids=lambda page: str(page.relative_to(ROOT)))
+@pytest.mark.parametrize("page", with_snippets())
 def test_the_snippets_of_a_page_run(page, demo, monkeypatch):
     monkeypatch.chdir(demo)
     monkeypatch.setattr(sys, "dont_write_bytecode", True)

@@ -174,7 +174,7 @@ def laid_over(document: dict[str, Any], **sections: dict[str, Any]) -> Params:
 
 FORKING = """
 import json, os, signal, sys
-import distributed, stages.extract, pipeline.extraction.cluster
+import distributed, stages.extract, pipeline.extraction.cluster, pipeline.extraction.local
 import transformers.models.qwen2_5_vl.modeling_qwen2_5_vl
 
 running = set()

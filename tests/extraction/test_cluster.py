@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from multiprocessing.context import ForkServerContext
 from pathlib import Path
 from urllib.error import HTTPError
 from urllib.request import urlopen
@@ -149,7 +150,15 @@ class Workers:
 
 
 @pytest.fixture(scope="module")
-def two_workers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Workers]:
+def forked(fork_server: ForkServerContext) -> Iterator[None]:
+    """Local workers are forked: begun anew, each would import for seconds, as it does for users and
+    in the processes that `begin` begins."""
+    with dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"}):
+        yield
+
+
+@pytest.fixture(scope="module")
+def two_workers(forked: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Workers]:
     control = tmp_path_factory.mktemp("control")
     preload = tmp_path_factory.mktemp("preload") / "noting.py"
     preload.write_text(PRELOADED.format(control=str(control)))
@@ -448,6 +457,7 @@ class TestScheduler:
         assert_same(params.extract.store, here)
 
 
+@pytest.mark.usefixtures("forked")
 class TestLocalProcesses:
     def test_nobody_else_reaches_them(self, params):
         extract = params.extract.model_copy(update={"workers": 1, "decode_threads": 1})

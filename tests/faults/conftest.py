@@ -1,18 +1,17 @@
 """One extracted store for all faults, copied for each, and stages as processes of their own.
 
-Where a test needs a process and not an interpreter, `fork` makes one of a server that has imported
-what stages need: to import it takes longer than most tests.
+Where a test needs a process and not an interpreter, `fork` makes one of the `fork_server`.
 """
 
 import importlib
 import importlib.util
-import multiprocessing
 import os
 import shutil
 import subprocess
 import sys
 from collections.abc import Callable
 from multiprocessing.connection import Connection
+from multiprocessing.context import ForkServerContext
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
@@ -141,7 +140,7 @@ def start() -> Callable[..., Started]:
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
-            env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+            env=os.environ | {"PYTHONPATH": str(ROOT)},
         )
 
     return start
@@ -151,17 +150,15 @@ Fork = Callable[..., tuple[BaseProcess, Connection]]
 
 
 @pytest.fixture(scope="session")
-def fork() -> Fork:
+def fork(fork_server: ForkServerContext) -> Fork:
     """`fork(work, *arguments)`: a process that does `work(*arguments, told)`, and what it tells.
 
     `told.send` tells; `work` is a function of a module.
     """
-    server = multiprocessing.get_context("forkserver")
-    server.set_forkserver_preload(["stages.evaluate", "stages.extract", "stages.store"])
 
     def begin(work: Callable[..., None], *arguments: Any) -> tuple[BaseProcess, Connection]:
-        heard, told = server.Pipe(duplex=False)
-        process = server.Process(target=work, args=(*arguments, told))
+        heard, told = fork_server.Pipe(duplex=False)
+        process = fork_server.Process(target=work, args=(*arguments, told))
         process.start()
         told.close()  # so that its end is heard
         return process, heard

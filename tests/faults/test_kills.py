@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 
 from pipeline.store.chunks import ChunkFiles
 from pipeline.training import Trainer
@@ -28,7 +27,6 @@ def train(params: Path, told: Connection) -> None:
         return stopped
 
     Trainer._train_step = slow
-    torch.set_num_threads(1)
     run("", train_head.main, ["--params", str(params)])
 
 
@@ -65,7 +63,6 @@ def kill_after(fork) -> Callable[..., None]:
 @pytest.mark.parametrize(
     ("kills", "seed"), [(3, 0), *(pytest.param(8, n, marks=pytest.mark.slow) for n in range(1, 4))]
 )
-@pytest.mark.usefixtures("one_thread")
 def test_a_training_killed_again_and_again(
     tiny_store: Callable[..., Path], head_params, kill_after, here, tmp_path: Path, kills, seed
 ) -> None:

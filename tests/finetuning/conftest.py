@@ -38,11 +38,6 @@ SMALL_TUNING: dict[str, Any] = {
 }
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _bits_are_compared(one_thread: None) -> None:
-    """In every test of this room."""
-
-
 def _write_episode(folder: Path, seed: int, views: tuple[str, ...] = VIEWS) -> None:
     """Two seconds of the windowed format: the arm goes where a disc stands off the middle."""
     folder.mkdir(parents=True)

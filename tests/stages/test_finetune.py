@@ -14,7 +14,6 @@ from PIL import Image
 from stages import evaluate, extract, finetune, train_head
 from stages.command import run
 
-pytestmark = pytest.mark.usefixtures("one_thread")
 Start = Callable[..., "subprocess.Popen[str]"]
 HELD = """
 import sys, time

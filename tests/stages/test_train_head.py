@@ -15,7 +15,6 @@ import yaml
 from stages import evaluate, train_head
 from stages.command import run
 
-pytestmark = pytest.mark.usefixtures("one_thread")
 Start = Callable[..., "subprocess.Popen[str]"]
 WITHOUT_VLM = """
 import sys

@@ -38,11 +38,6 @@ def store(
     return FeatureStore.open(tiny_store(tmp_path_factory.mktemp("training")))
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _bits_are_compared(one_thread: None) -> None:
-    """In every test of this room."""
-
-
 @pytest.fixture(scope="session")
 def params_below() -> Callable[..., TrainHeadParams]:
     """`params_below(folder, key=value, ...)`: small params that work below this folder."""

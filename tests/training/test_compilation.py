@@ -41,7 +41,6 @@ from pipeline.sampling import split_by_episode
 from pipeline.store import FeatureStore
 from pipeline.training import Trainer, open_run
 
-torch.set_num_threads(1)
 store, params = FeatureStore.open(sys.argv[1]), TrainHeadParams.model_validate_json(sys.argv[2])
 split = split_by_episode(store, params.val_fraction, params.horizon)
 done = Trainer(store, params, split, open_run(params, store))
@@ -51,7 +50,7 @@ print(json.dumps(done.history.tensor().tolist()))
 
 
 def said(code: str, *arguments: object, **environment: str) -> str:
-    env = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"} | environment
+    env = os.environ | {"PYTHONPATH": str(ROOT)} | environment
     command = [sys.executable, "-c", code, *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, env=env, timeout=280)
     assert done.returncode == 0, done.stderr

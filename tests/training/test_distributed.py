@@ -133,7 +133,7 @@ def torchrun(script: Path, *arguments: object) -> "subprocess.Popen[str]":
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
     )
 
 
@@ -191,6 +191,7 @@ def same(one: Path, other: Path) -> bool:
     return all(torch.allclose(a[name], b[name], rtol=1e-3, atol=1e-5) for name in a)
 
 
+@pytest.mark.extra
 def test_two_processes_follow_the_curve_of_one_that_accumulates(
     store: FeatureStore,
     trainer: Make,
