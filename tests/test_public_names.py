@@ -54,7 +54,8 @@ NAMES = {
 
 IMPORTED = """
 import json, os, sys
-import dask.distributed, matplotlib.pyplot, peft, plotly, torch, transformers, zarr
+import dask.distributed, dvclive, matplotlib.pyplot, peft, plotly, scipy.special, torch, zarr
+import transformers.models.qwen2_5_vl.modeling_qwen2_5_vl
 for module, names in json.loads(sys.argv[1]).items():
     if os.fork():
         _, status = os.wait()
@@ -108,18 +109,12 @@ def test_packages_declare_what_people_import() -> None:
     assert "Policy" in DECLARED["pipeline.models"]
 
 
-@pytest.mark.parametrize(
-    "code",
-    [
-        "import pipeline.datasets; "
-        "from pipeline.models import Policy, DiffusionActionExpert, FlowMatchingActionExpert",
-        "import stages.train_head, stages.evaluate",
-    ],
-)
-def test_stage_two_runs_without_transformers(code: str) -> None:
-    done = python("-c", WITHOUT + code)
-    assert done.returncode == 0, done.stderr
-
-
-def test_the_block_blocks() -> None:
-    assert "ModuleNotFoundError" in python("-c", WITHOUT + "import transformers").stderr
+def test_stage_two_imports_without_transformers() -> None:
+    """The stages themselves run so in tests/stages/test_train_head.py."""
+    code = (
+        "import pipeline.datasets\n"
+        "from pipeline.models import Policy, DiffusionActionExpert, FlowMatchingActionExpert\n"
+        "import transformers  # which fails: the block blocks"
+    )
+    (*_, error) = python("-c", WITHOUT + code).stderr.splitlines()
+    assert error == "ModuleNotFoundError: import of transformers halted; None in sys.modules"

@@ -10,12 +10,22 @@ import re
 import shutil
 import subprocess
 import sys
+from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 RECIPES = ROOT / "docs" / "recipes"
+GOLDEN = Path("tests/vlm/golden_features.json")
+TESTS = (
+    "tests/recordings/test_contract.py",
+    "tests/models/test_expert.py",
+    "tests/vlm/test_golden_features.py",
+    "tests/vlm/test_pooling.py",
+)
 PART = re.compile(
     r"`(?P<file>(?:pipeline|tests)/[\w/]+\.py)`|^```(?P<kind>python|diff)\n(?P<code>.*?)^```$",
     re.DOTALL | re.MULTILINE,
@@ -46,51 +56,58 @@ def follow(page: Path, project: Path) -> None:
         place.write_text(text, encoding="utf-8")
 
 
-@pytest.fixture
-def project(tmp_path: Path) -> Path:
-    """A copy of the code and its tests."""
+@dataclass(frozen=True)
+class Followed:
+    """A copy of the project in which all recipes were followed."""
+
+    project: Path
+    passed: Counter[str]
+    """How many of their tests pass, by module; none of them fails."""
+
+
+@pytest.fixture(scope="module")
+def followed(tmp_path_factory: pytest.TempPathFactory) -> Followed:
+    """One copy and one run for all recipes: each is then also tried beside the others."""
+    project = tmp_path_factory.mktemp("project")
     without = shutil.ignore_patterns("__pycache__")
     for folder in ("pipeline", "stages", "tests"):
-        shutil.copytree(ROOT / folder, tmp_path / folder, ignore=without)
+        shutil.copytree(ROOT / folder, project / folder, ignore=without)
     for name in ("pyproject.toml", "params.yaml"):
-        shutil.copy(ROOT / name, tmp_path / name)
-    return tmp_path
-
-
-def passed(project: Path, *arguments: str) -> int:
-    """How many tests pass, none of which may fail."""
-    # Without what this run was told, such as in how many processes.
+        shutil.copy(ROOT / name, project / name)
+    for page in ("reader", "expert", "pooling"):
+        follow(RECIPES / f"{page}.md", project)
+    (project / GOLDEN).unlink()
+    # Without what this run was told, such as which of several processes it is.
     own = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
+    told = {"PYTHONPATH": str(project), "PYTHONDONTWRITEBYTECODE": "1"}
+    told |= {"WRITE_GOLDEN_FEATURES": "1"}
+    found = project / "found.xml"
     done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *arguments],
+        [sys.executable, "-m", "pytest", "-q", "-n0", "-p", "no:cacheprovider"]
+        + [f"--junitxml={found}", *TESTS, "-k", "trajectory or MLP or golden or pooling"],
         cwd=project,
-        env=own | {"PYTHONPATH": str(project), "PYTHONDONTWRITEBYTECODE": "1"},
+        env=own | told,
         capture_output=True,
         text=True,
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    count = re.search(r"(\d+) passed", done.stdout)
-    return int(count[1]) if count else 0
+    cases = [case for case in ElementTree.parse(found).iter("testcase") if not len(case)]
+    modules = [case.get("classname", "").rpartition("test_")[2].partition(".")[0] for case in cases]
+    return Followed(project, Counter(modules))
 
 
-def test_the_reader_of_the_recipe_keeps_the_contract(project):
-    follow(RECIPES / "reader.md", project)
-    assert passed(project, "tests/recordings/test_contract.py", "-k", "trajectory") >= 10
+def test_the_reader_of_the_recipe_keeps_the_contract(followed):
+    assert followed.passed["contract"] >= 10
 
 
-def test_the_expert_of_the_recipe_keeps_the_contract(project):
-    follow(RECIPES / "expert.md", project)
-    assert passed(project, "tests/models/test_expert.py", "-k", "MLP") >= 20
+def test_the_expert_of_the_recipe_keeps_the_contract(followed):
+    assert followed.passed["expert"] >= 20
 
 
-def test_the_pooling_of_the_recipe_changes_no_other(project, monkeypatch):
-    kept = project / "tests/vlm/golden_features.json"
-    before = json.loads(kept.read_text(encoding="utf-8"))["features"]
-    follow(RECIPES / "pooling.md", project)
-    kept.unlink()
-    monkeypatch.setenv("WRITE_GOLDEN_FEATURES", "1")
-    assert passed(project, "tests/vlm/test_golden_features.py", "tests/vlm/test_pooling.py") >= 5
-    after = json.loads(kept.read_text(encoding="utf-8"))["features"]
+def test_the_pooling_of_the_recipe_changes_no_other(followed):
+    assert followed.passed["golden_features"] + followed.passed["pooling"] >= 5
+    before = json.loads((ROOT / GOLDEN).read_text(encoding="utf-8"))["features"]
+    after = json.loads((followed.project / GOLDEN).read_text(encoding="utf-8"))["features"]
     new = after.keys() - before.keys()
     assert new
     assert all("pooling=view_centre" in name for name in new)

@@ -2,15 +2,18 @@
 
 import json
 import os
+import runpy
 import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from multiprocessing.context import ForkServerContext
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+import torch.distributed as dist
 import yaml
 
 from pipeline.checkpoint import load_policy
@@ -137,6 +140,43 @@ def torchrun(script: Path, *arguments: object) -> "subprocess.Popen[str]":
     )
 
 
+def ranked(rank: int, port: int, said: Path, script: Path, *arguments: object) -> None:
+    """Run a script as torchrun would, as one of two processes that meet at a store of another."""
+    os.environ |= {"RANK": str(rank), "LOCAL_RANK": str(rank), "WORLD_SIZE": "2"}
+    os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
+    os.environ["TORCHELASTIC_USE_AGENT_STORE"] = "True"
+    descriptor = os.open(said, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
+    for standard in (1, 2):
+        os.dup2(descriptor, standard)
+    sys.argv = [str(script), *map(str, arguments)]
+    runpy.run_path(str(script), run_name="__main__")
+
+
+@pytest.fixture
+def two_ranks(fork_server: ForkServerContext, tmp_path: Path) -> Callable[..., str]:
+    """`two_ranks(script, ...)`: what the two processes have said, which must end well.
+
+    Forked, and without torchrun, which imports for seconds and adds nothing to what they say to
+    each other.
+    """
+
+    def run(script: Path, *arguments: object) -> str:
+        meeting = dist.TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)
+        said = tmp_path / "said"
+        processes = [
+            fork_server.Process(target=ranked, args=(rank, meeting.port, said, script, *arguments))
+            for rank in range(2)
+        ]
+        for process in processes:
+            process.start()
+        for process in processes:
+            process.join()
+        assert [process.exitcode for process in processes] == [0, 0], said.read_text()
+        return said.read_text()
+
+    return run
+
+
 @pytest.fixture
 def script(tmp_path: Path) -> Path:
     path = tmp_path / "train.py"
@@ -254,7 +294,7 @@ def test_a_signal_to_torchrun_stops_all_after_one_step_and_one_process_can_go_on
 
 
 def test_what_goes_wrong_is_said_once_and_nobody_waits(
-    write: Make, script: Path, tmp_path: Path
+    write: Make, script: Path, two_ranks: Callable[..., str], tmp_path: Path
 ) -> None:
     """One case after the other between the same two processes, which must all end each."""
     cases = [
@@ -268,9 +308,7 @@ def test_what_goes_wrong_is_said_once_and_nobody_waits(
         ),
     ]
     with build_lock(tmp_path / "held"):
-        process = torchrun(script, json.dumps([one for one, _ in cases]), tmp_path / "found")
-        _, err = process.communicate()
-    assert process.returncode == 0, err
+        two_ranks(script, json.dumps([one for one, _ in cases]), tmp_path / "found")
     found = [json.loads((tmp_path / f"found{rank}").read_text()) for rank in range(2)]
     for (one, said), of_first, of_other in zip(cases, *found, strict=True):
         alone = one.get("fails", "").endswith("1")
@@ -292,12 +330,12 @@ def test_a_process_that_fails_alone_ends_torchrun(write: Make, script: Path) -> 
     assert "Connection closed" not in err
 
 
-def test_what_processes_tell_each_other(tmp_path: Path) -> None:
+def test_what_processes_tell_each_other(two_ranks: Callable[..., str], tmp_path: Path) -> None:
     script = tmp_path / "primitives.py"
     script.write_text(PRIMITIVES)
-    out, err = torchrun(script).communicate()
-    assert "done 0" in out, err
-    assert "done 1" in out, err
+    said = two_ranks(script)
+    assert "done 0" in said
+    assert "done 1" in said
 
 
 def test_a_process_alone_is_a_world() -> None:
