@@ -26,6 +26,7 @@ TESTS = (
     "tests/vlm/test_golden_features.py",
     "tests/vlm/test_pooling.py",
 )
+ASKED = "trajectory or MLP or golden or pooling"
 PART = re.compile(
     r"`(?P<file>(?:pipeline|tests)/[\w/]+\.py)`|^```(?P<kind>python|diff)\n(?P<code>.*?)^```$",
     re.DOTALL | re.MULTILINE,
@@ -82,9 +83,9 @@ def followed(tmp_path_factory: pytest.TempPathFactory) -> Followed:
     told = {"PYTHONPATH": str(project), "PYTHONDONTWRITEBYTECODE": "1"}
     told |= {"WRITE_GOLDEN_FEATURES": "1"}
     found = project / "found.xml"
+    options = ["-q", "-n0", "-p", "no:cacheprovider", f"--junitxml={found}"]
     done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-n0", "-p", "no:cacheprovider"]
-        + [f"--junitxml={found}", *TESTS, "-k", "trajectory or MLP or golden or pooling"],
+        [sys.executable, "-m", "pytest", *options, *TESTS, "-k", ASKED],
         cwd=project,
         env=own | told,
         capture_output=True,

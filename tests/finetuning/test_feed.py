@@ -1,7 +1,7 @@
 """A live feed hands out the store's batches with the rows of their ticks."""
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import fields
 from pathlib import Path
 
@@ -28,7 +28,7 @@ CPU = torch.device("cpu")
 def feed(store: FeatureStore, params: Callable[..., Params]) -> Callable[..., LiveFeed]:
     """`feed(plan)`, over rows of its own."""
 
-    def make(plan: list[Draw], threads: int = 2) -> LiveFeed:
+    def make(plan: Iterable[Draw], threads: int = 2) -> LiveFeed:
         with known_digests(store) as digests:
             spec = check_spec(store, params(), digests)
         rows = LiveRows(store, find_recordings(store, params()), Preparer(params().vlm, spec))
@@ -94,10 +94,13 @@ def test_a_frame_that_is_gone_comes_out_at_its_batch(
     store: FeatureStore, feed: Callable[..., LiveFeed], own_recordings: Path
 ) -> None:
     first, second = store.episodes[0].ticks, store.episodes[1].ticks
-    plan = [Draw(np.array(ticks[:3])) for ticks in (first, second, first)]
-    with feed(plan) as batches:
+
+    def plan() -> Iterator[Draw]:  # read once the recordings are open, before the first row
         for frame in (own_recordings / "Follow_disc" / "episode_1" / "images").rglob("*.jpg"):
             frame.write_bytes(b"")
+        yield from (Draw(np.array(ticks[:3])) for ticks in (first, second, first))
+
+    with feed(plan()) as batches:
         next(batches)
         with pytest.raises(RecordingError, match="episode_1"):
             next(batches)
