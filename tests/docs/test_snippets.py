@@ -52,7 +52,7 @@ def with_snippets() -> Iterator[Any]:
 
 
 @pytest.mark.filterwarnings("default")  # what a snippet's libraries warn of is not ours to mend
-@pytest.mark.parametrize("page", with_snippets())
+@pytest.mark.parametrize("page", list(with_snippets()))
 def test_the_snippets_of_a_page_run(page, demo, monkeypatch):
     monkeypatch.chdir(demo)
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
