@@ -12,14 +12,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any
-
-import torch
-from torch import Tensor
+from typing import TYPE_CHECKING, Any
 
 from pipeline.config import TrainHeadParams
 from pipeline.durable import (
     DIGEST,
+    check_digest,
     read_tensors,
     read_with_digest,
     replace_folder,
@@ -27,10 +25,16 @@ from pipeline.durable import (
     write_with_digest,
 )
 from pipeline.errors import CheckpointIncomplete, CheckpointMismatch, PipelineError
-from pipeline.models import Policy, PolicyShape, action_groups
 from pipeline.normalization import Normalization
 from pipeline.ownership import OutputKind
 from pipeline.store import FeatureStore
+
+# torch takes over a second to import, and what only asks whether a training is finished needs none.
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
+
+    from pipeline.models import Policy, PolicyShape
 
 FORMAT = 2
 WEIGHTS, DOCUMENT = "policy.safetensors", "policy.json"
@@ -43,7 +47,7 @@ class PolicyCheckpoint:
     """A trained policy and what it was trained from."""
 
     params: TrainHeadParams
-    shape: PolicyShape
+    shape: "PolicyShape"
     normalization: Normalization
     source: Mapping[str, Any]
     """What the store was: `feature_spec`, `streams`, `action_hz`, `vlm_reuse_count`."""
@@ -52,11 +56,13 @@ class PolicyCheckpoint:
     held_out_content: Mapping[str, str]
     """`source/id` of each of these episodes -> digest of its files."""
     step: int
-    weights: Mapping[str, Tensor]
+    weights: Mapping[str, "Tensor"]
     metrics: Mapping[str, float] = field(default_factory=dict)
 
-    def policy(self, device: torch.device | str = "cpu") -> Policy:
+    def policy(self, device: "torch.device | str" = "cpu") -> "Policy":
         """The policy with these weights, in evaluation mode; it knows its feature spec."""
+        from pipeline.models import Policy
+
         policy = Policy(self.params, self.shape, self.normalization)
         policy.feature_spec = self.source["feature_spec"]
         try:
@@ -126,19 +132,12 @@ def load_policy(folder: Path) -> PolicyCheckpoint:
     Raises `CheckpointIncomplete` naming the file that is missing, truncated or altered. Says on
     stderr where the description is of a version that wrote no digest of it.
     """
-    document, has_digest = read_with_digest(folder / DOCUMENT)
-    if not has_digest:
-        _note_without_digest(folder / DOCUMENT)
-    if document.get("format") != FORMAT:
-        raise CheckpointMismatch(
-            f"{folder / DOCUMENT}: expected format {FORMAT}, found {document.get('format')!r}. "
-            "Train it again with this version."
-        )
+    from pipeline.models import PolicyShape
+
+    document = _described(folder)
     try:
         return PolicyCheckpoint(
-            params=TrainHeadParams.model_validate_json(
-                json.dumps(document["params"]["train_head"])
-            ),
+            params=_params(document),
             shape=PolicyShape.from_document(document["shape"]),
             normalization=Normalization.from_document(document["normalization"]),
             source={key: document[key] for key in SOURCE_KEYS},
@@ -154,10 +153,46 @@ def load_policy(folder: Path) -> PolicyCheckpoint:
     except PipelineError:
         raise
     except (KeyError, TypeError, AttributeError, ValueError) as error:
-        raise CheckpointIncomplete(
-            f"{folder / DOCUMENT}: not what a checkpoint's description must be "
-            f"({type(error).__name__}: {error}). Train it again."
-        ) from None
+        raise _strange(folder, error) from None
+
+
+def check_policy(folder: Path) -> TrainHeadParams:
+    """The params of the checkpoint at `folder`, of which no weight is opened.
+
+    Raises `CheckpointIncomplete` and `CheckpointMismatch` as `load_policy`.
+    """
+    document = _described(folder)
+    try:
+        check_digest(folder / WEIGHTS, document["weights_sha256"])
+        Normalization.from_document(document["normalization"])
+        return _params(document)
+    except PipelineError:
+        raise
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        raise _strange(folder, error) from None
+
+
+def _described(folder: Path) -> dict[str, Any]:
+    document, has_digest = read_with_digest(folder / DOCUMENT)
+    if not has_digest:
+        _note_without_digest(folder / DOCUMENT)
+    if document.get("format") != FORMAT:
+        raise CheckpointMismatch(
+            f"{folder / DOCUMENT}: expected format {FORMAT}, found {document.get('format')!r}. "
+            "Train it again with this version."
+        )
+    return document
+
+
+def _params(document: Mapping[str, Any]) -> TrainHeadParams:
+    return TrainHeadParams.model_validate_json(json.dumps(document["params"]["train_head"]))
+
+
+def _strange(folder: Path, error: Exception) -> CheckpointIncomplete:
+    return CheckpointIncomplete(
+        f"{folder / DOCUMENT}: not what a checkpoint's description must be "
+        f"({type(error).__name__}: {error}). Train it again."
+    )
 
 
 @cache
@@ -175,11 +210,13 @@ def source_of(store: FeatureStore) -> dict[str, Any]:
     return {key: getattr(store, "spec" if key == "feature_spec" else key) for key in SOURCE_KEYS}
 
 
-def policy_shape(store: FeatureStore, normalization: Normalization) -> PolicyShape:
+def policy_shape(store: FeatureStore, normalization: Normalization) -> "PolicyShape":
     """The widths that this store gives to a policy.
 
     A stream without statistics is absent from what the policy is trained on, so it has width 0.
     """
+    from pipeline.models import PolicyShape, action_groups
+
     action = store.streams["action"]
     return PolicyShape(
         *store.feature_shape,

@@ -228,14 +228,21 @@ def read_tensors(path: Path, sha256: str) -> "dict[str, Tensor]":
     """The tensors at `path`; `CheckpointIncomplete` when they are not those that were written."""
     from safetensors.torch import load_file
 
+    check_digest(path, sha256)
     try:
-        if _sha256(path) != sha256:
-            raise CheckpointIncomplete(damaged(path, "its sha256 is not the one written with it"))
         return load_file(path)
-    except FileNotFoundError:
-        raise CheckpointIncomplete(damaged(path, "no such file")) from None
     except SafetensorError as error:
         raise CheckpointIncomplete(damaged(path, error)) from None
+
+
+def check_digest(path: Path, sha256: str) -> None:
+    """Raise `CheckpointIncomplete` where the file at `path` is not the one that was written."""
+    try:
+        found = _sha256(path)
+    except FileNotFoundError:
+        raise CheckpointIncomplete(damaged(path, "no such file")) from None
+    if found != sha256:
+        raise CheckpointIncomplete(damaged(path, "its sha256 is not the one written with it"))
 
 
 def damaged(path: Path, why: object) -> str:

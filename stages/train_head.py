@@ -24,15 +24,26 @@ from stages.command import run
 if __name__ == "__main__":  # here, for --help waits for no import below
     raise SystemExit(run(__doc__ or "", "stages.train_head", sections=("train_head",)))
 
-from pipeline.batches import open_store
 from pipeline.config import Params
 from pipeline.sampling import split_by_episode
 from pipeline.store import build_lock, check_trailers
-from pipeline.training import Trainer, check_loggers, open_run, process_group
+from pipeline.training.run import finished_run, open_run
 
 
 def main(params: Params) -> None:
     """Train the head that `train_head` describes."""
+    finished = finished_run(params.train_head, params.train_head.store or params.extract.store)
+    if finished is None:
+        _train(params)
+    else:
+        print(*finished.notes, "nothing to do", sep="\n")
+
+
+def _train(params: Params) -> None:
+    # With torch, which takes over a second to import.
+    from pipeline.batches import open_store
+    from pipeline.training import Trainer, check_loggers, process_group
+
     head = params.train_head
     with process_group(head.device) as world:
         world.shared(lambda: check_loggers(head))

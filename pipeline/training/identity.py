@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
@@ -9,7 +10,6 @@ from typing import Any
 from pipeline.checkpoint import source_of
 from pipeline.config import TrainHeadParams
 from pipeline.store import FeatureStore
-from pipeline.training.world import World
 
 TRAINER_VERSION = 2
 """Raised with every change of code that changes the numbers of a run: part of its identity, so
@@ -40,11 +40,20 @@ def run_identity(
     decides = {
         "trainer_version": TRAINER_VERSION,
         "train_head": params.model_dump(mode="json", exclude=FREE_PARAMS),
-        "parts": World.current().size * params.grad_accumulation,
+        "parts": _processes() * params.grad_accumulation,
         "front": dict(extra_identity),
         "recordings": recordings_of(store),
     }
     return json.loads(json.dumps({"source": source_of(store), "decides": decides}))
+
+
+def _processes() -> int:
+    """How many train together; torch is asked only where torchrun says that there are several."""
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+        return 1
+    from pipeline.training.world import World
+
+    return World.current().size
 
 
 def recordings_of(store: FeatureStore) -> dict[str, Any]:

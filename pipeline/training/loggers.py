@@ -13,7 +13,7 @@ from uuid import uuid4
 from pipeline.config import TrainHeadParams
 from pipeline.errors import ConfigError
 from pipeline.ownership import REPORT, claim
-from pipeline.training.live_page import LivePage, Turns
+from pipeline.training.live_page import LivePage
 
 FINISH_TIMEOUT_S = 120.0
 """How long a finished run waits for Weights & Biases to take what it has not sent yet."""

@@ -5,6 +5,7 @@ is finished. DVC deletes an output before it runs a stage, but not the `.part` b
 stopped run goes on under `dvc repro` too.
 """
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,9 +15,9 @@ from pipeline.checkpoint import (
     CHECKPOINT,
     DOCUMENT,
     SOURCE_KEYS,
+    check_policy,
     describe,
     differences,
-    load_policy,
     source_differences,
 )
 from pipeline.config import TrainHeadParams
@@ -38,7 +39,8 @@ from pipeline.ownership import (
     there,
     unmark,
 )
-from pipeline.store import FeatureStore
+from pipeline.store import FeatureStore, build_lock
+from pipeline.store.archive import is_archive
 from pipeline.training.identity import NOTHING, run_identity
 
 RUN, BEST, LAST = "run.json", "best", "last"
@@ -168,11 +170,25 @@ def _refuse_to_replace(output: Path, section: str) -> None:
         )
 
 
+def finished_run(params: TrainHeadParams, path: Path) -> Run | None:
+    """The run of these params on the store at `path` where it is finished, else None.
+
+    What `open_run` gives, without torch, which takes over a second to import; None where several
+    processes train together, or the store has to be restored first.
+    """
+    together = int(os.environ.get("WORLD_SIZE", "1")) > 1
+    if together or not (params.output / RUN).exists() or is_archive(path):
+        return None
+    with build_lock(params.output):
+        run = open_run(params, FeatureStore.open(path))
+    return run if run.status == "finished" else None
+
+
 def _damage(output: Path) -> str | None:
     """What is wrong with a finished run's checkpoints; None where both are whole."""
     try:
         for name in (BEST, LAST):
-            load_policy(output / name)
+            check_policy(output / name)
     except (CheckpointIncomplete, CheckpointMismatch) as error:
         return str(error)
     return None
@@ -180,7 +196,7 @@ def _damage(output: Path) -> str | None:
 
 def _finished_notes(params: TrainHeadParams) -> tuple[str, ...]:
     said = f"{params.output} is this very run, finished"
-    logs = load_policy(params.output / LAST).params.logs
+    logs = check_policy(params.output / LAST).logs
     if logs == params.logs:
         return (said,)
     return said, f"its curves are left where they were written, in {logs}, not in {params.logs}"

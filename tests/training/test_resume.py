@@ -96,6 +96,7 @@ def test_parts_may_be_shared_out_anew_but_not_cut_anew(
 ) -> None:
     """What one process of two parts did is the run of two processes of one part, and no other."""
     shutil.copytree(of_two_parts, params().output)
+    monkeypatch.setenv("WORLD_SIZE", str(size))
     monkeypatch.setattr(World, "current", lambda: World(0, size))
     given = params(grad_accumulation=accumulation, max_steps=2)
     assert open_run(given, store).status == status
