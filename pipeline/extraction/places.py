@@ -93,7 +93,7 @@ def _refuse_another(donor: Donor, surveyed: Survey, embodiment: Embodiment) -> N
     if differing or not set(sources[0]) & set(sources[1]):
         why = [f"sources: {', '.join(sources[0])} there, {', '.join(sources[1])} here", *differing]
         raise StoreMismatch(
-            f"{donor.path}: holds {len(donor.rows)} feature rows of {len(known)} episode(s), none "
+            f"{donor.path}: holds the feature rows of {len(known)} episode(s), none "
             "of which is in data.sources, and extraction would throw them away:\n"
             + "\n".join(f"  {line}" for line in why)
             + "\nName another store for these recordings, with --set extract.store=…, give the "
