@@ -169,3 +169,10 @@ def test_stage_two_knows_nothing_of_stage_one():
 def test_the_pictures_rooms_exist():
     names = {room(name) for name in MODULES if name.startswith("pipeline.")}
     assert names == set().union(*TIERS), names ^ set().union(*TIERS)
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_only_one_module_removes_folders(module):
+    """It asks whose they are."""
+    text = MODULES[module].read_text(encoding="utf-8")
+    assert module == "pipeline.ownership" or "rmtree" not in text
