@@ -65,7 +65,11 @@ def held_out_ticks(
     ]
     for what, names in (
         ("lacks {} of the {} episodes that the checkpoint holds out, or has shorter ones", missing),
-        ("has other recordings under the names of {} of the {} held-out episodes", altered),
+        (
+            "has other recordings, or the same ones read otherwise than then, under the names of "
+            "{} of the {} held-out episodes",
+            altered,
+        ),
     ):
         if names:
             raise CheckpointMismatch(
@@ -98,7 +102,7 @@ def named_as_in(
         for name, content in contents.items()
     }
     renamed = [f"{name} is {now[name]}" for name in contents if now[name] != name]
-    if not renamed:
+    if not renamed or len(set(now.values())) < len(now):  # one of two under one name is not there
         return checkpoint, None
     ticks = {now.get(name, name): range_ for name, range_ in checkpoint.held_out_ticks.items()}
     said = f"{', '.join(renamed[:3])}{' …' if len(renamed) > 3 else ''}"

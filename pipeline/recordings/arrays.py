@@ -129,7 +129,7 @@ def read_csv(path: Path, columns: Sequence[str]) -> NDArray[np.float64]:
             lines = [(reader.line_num, row) for row in reader if row]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise RecordingError(f"{path}: cannot be read as CSV: {error}") from None
-    _check_widths(path, lines, len(header))
+    _check_widths(path, lines, header)
     try:
         table = np.array([[row[place] for place in places] for _, row in lines], np.float64)
     except ValueError:
@@ -140,12 +140,18 @@ def read_csv(path: Path, columns: Sequence[str]) -> NDArray[np.float64]:
 _Lines = Sequence[tuple[int, Sequence[str]]]
 
 
-def _check_widths(path: Path, lines: _Lines, expected: int) -> None:
+def _check_widths(path: Path, lines: _Lines, header: Sequence[str]) -> None:
     """Raise `RecordingError` for a row of more or fewer cells than the header names.
 
-    Which cell is missing or too many cannot be known, so every channel may be a neighbour's.
+    Which cell is missing or too many cannot be known, so every channel may be a neighbour's. Empty
+    cells at the end, as a last comma makes them, shift nothing.
     """
-    wrong = [(line, len(row)) for line, row in lines if len(row) != expected]
+    expected = len(header)
+    wrong = [
+        (line, len(row))
+        for line, row in lines
+        if len(row) != expected and any((*row[expected:], *header[len(row) :]))
+    ]
     if wrong:
         line, cells = wrong[0]
         why = "the line is cut off" if cells < expected else "its channels would be shifted"

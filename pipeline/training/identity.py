@@ -11,7 +11,7 @@ from pipeline.checkpoint import source_of
 from pipeline.config import TrainHeadParams
 from pipeline.store import FeatureStore
 
-TRAINER_VERSION = 2
+TRAINER_VERSION = 3
 """Raised with every change of code that changes the numbers of a run: part of its identity, so
 that no run goes on under code other than it began with."""
 FREE_PARAMS = {

@@ -1,14 +1,16 @@
 """The ticks a checkpoint says it has not seen are found again, or refused by name."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from pipeline.errors import CheckpointMismatch
 from pipeline.evaluation import held_out_contents, held_out_ranges, held_out_ticks
-from pipeline.evaluation.held_out import groups_of
+from pipeline.evaluation.held_out import groups_of, named_as_in
 from pipeline.sampling import split_by_episode
 from pipeline.store import FeatureStore
 
@@ -44,9 +46,25 @@ def test_episodes_that_are_gone_or_shorter_are_named(store: FeatureStore) -> Non
 def test_other_recordings_of_the_same_names_and_lengths_are_refused(store: FeatureStore) -> None:
     ranges = {"left/episode_000": (0, 30), "right/episode_001": (0, 30)}
     contents = {"left/episode_000": "0-0", "right/episode_001": "another recording"}
-    said = r"other recordings under the names of 1 of the 2 held-out episodes: right/episode_001"
+    said = r"other recordings.* under the names of 1 of the 2 held-out episodes: right/episode_001"
     with pytest.raises(CheckpointMismatch, match=said):
         held_out_ticks(store, ranges, contents)
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """What a checkpoint says of the episodes that it holds out."""
+
+    held_out_ticks: dict[str, tuple[int, int]]
+    held_out_content: dict[str, str]
+
+
+def test_an_episode_that_is_gone_is_not_hidden_by_one_under_its_name(store: FeatureStore) -> None:
+    contents = {"left/episode_000": "removed since", "left/episode_009": "0-0"}
+    checkpoint: Any = HeldOut({"left/episode_000": (0, 7), "left/episode_009": (0, 9)}, contents)
+    assert named_as_in(store, checkpoint) == (checkpoint, None)
+    with pytest.raises(CheckpointMismatch, match="lacks 1 of the 2"):
+        held_out_ticks(store, checkpoint.held_out_ticks, contents)
 
 
 def test_groups_share_a_unit() -> None:

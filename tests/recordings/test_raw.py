@@ -88,6 +88,15 @@ def test_a_spoilt_csv_is_named_with_its_place(folder, only, edit, message):
             read()
 
 
+@pytest.mark.parametrize("last", [0, 1])
+def test_a_comma_at_the_end_of_lines_shifts_nothing(folder, only, last):
+    before = only(folder).state()
+    spoil_csv(folder, lambda ls: [*(f"{line}," for line in ls[:last]), *ls[last:]])
+    spoil_csv(folder, lambda ls: ls if last else [ls[0], *(f"{line}," for line in ls[1:])])
+    after = only(folder).state()
+    assert (after.values == before.values).all() and (after.time == before.time).all()
+
+
 def truncate(path: Path, truth) -> None:
     path.write_bytes(path.read_bytes()[:-5000])
 

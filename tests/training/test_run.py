@@ -14,6 +14,7 @@ from pipeline.errors import CheckpointIncomplete, CheckpointMismatch, ConfigErro
 from pipeline.ownership import MARKER
 from pipeline.store import FeatureStore
 from pipeline.training import Trainer, open_run
+from pipeline.training.identity import TRAINER_VERSION
 
 Make = Callable[..., Any]
 
@@ -290,4 +291,4 @@ def test_code_of_other_numbers_goes_on_with_no_run(
     monkeypatch.setattr("pipeline.training.identity.TRAINER_VERSION", 99)
     run = open_run(params(), store)
     assert run.status == "new"
-    assert "trainer_version: 2 (that run), 99 (now)" in run.notes[0]
+    assert f"trainer_version: {TRAINER_VERSION} (that run), 99 (now)" in run.notes[0]
