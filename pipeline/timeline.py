@@ -59,6 +59,8 @@ class Timeline:
     """(tick,) one past the last sensor reading at or before the tick; 0 without a sensor."""
     state_end: NDArray[np.int64]
     """(tick,) one past the last state at or before the tick; 0 without a state."""
+    slack_s: float
+    """By how much an entry of a clock may be later than a tick and still be at it."""
 
     def frame_times(self, views: Sequence[str]) -> NDArray[np.float64]:
         """(vl_row, view) s, NaN where the episode lacks the view."""
@@ -117,6 +119,7 @@ def build_timeline(
         frame_time={view: cameras[view].time[rows] for view, rows in frames.items()},
         sensor_end=none if sensor is None else last_at(sensor.time, time, slack) + 1,
         state_end=none if state is None else last_at(state.time, time, slack) + 1,
+        slack_s=slack,
     )
 
 

@@ -37,12 +37,12 @@ def read_frames(
     """
     if view.timeline is None:
         return {}, ()
-    times = view.timeline.time[np.asarray(ticks, np.int64)]
+    times, slack_s = view.timeline.time[np.asarray(ticks, np.int64)], view.timeline.slack_s
     found: dict[str, list[NDArray[np.uint8]]] = {}
     broken: list[Flaw] = []
     for name, camera in view.cameras.items():
         try:
-            found[name] = list(camera.read(last_at(camera.time, times).tolist()))
+            found[name] = list(camera.read(last_at(camera.time, times, slack_s).tolist()))
         except BROKEN as error:
             broken.append(view.flaw("unreadable", f"view {name}", str(error), severity="error"))
     return found, tuple(broken)

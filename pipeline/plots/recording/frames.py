@@ -76,7 +76,8 @@ def _ages(view: EpisodeView, name: str, time: NDArray[np.float64]) -> NDArray[np
     camera = view.cameras.get(name)
     if camera is None:
         return None
-    return time - camera.time[np.maximum(last_at(camera.time, time), 0)]
+    slack_s = 0.0 if view.timeline is None else view.timeline.slack_s
+    return time - camera.time[np.maximum(last_at(camera.time, time, slack_s), 0)]
 
 
 def _aspect(frames: Sequence[NDArray[np.uint8]]) -> float:
