@@ -98,15 +98,24 @@ def previous_path(target: Path) -> Path:
     return _beside(target, "previous")
 
 
-KEPT = OutputKind("a store of before, kept for its rows,", lambda path: False)
-"""Marked when it is kept: a copy that a user made under that name is not one."""
+_LINK_ENDS = "/."
+"""How a link that is kept ends: nothing is written into the folder behind it."""
+
+
+def _is_kept_link(path: Path) -> bool:
+    # A Path would leave the end out.
+    return path.is_symlink() and os.readlink(path).endswith(_LINK_ENDS)  # noqa: PTH115
+
+
+KEPT = OutputKind("a store of before, kept for its rows,", _is_kept_link)
+"""Marked when it is kept: a copy or a link that a user made under that name is not one."""
 
 HELD = OutputKind("a folder that is being replaced,", lambda path: False)
 
 
 def put_in_place(complete: Path, target: Path, kind: OutputKind, *, keep: bool = False) -> None:
     """Rename a complete folder to `target`; what was there is removed, or kept as `<name>.previous`
-    in place of what was kept before.
+    in place of what was kept before. Of a symbolic link the folder behind it stays as it is.
 
     A kill leaves the old one or the new. For one instant the old one lies in `<target>.replaced`,
     or in `<target>.keeping`, from where `recover` brings it back. Raises `ConfigError` where
@@ -139,19 +148,29 @@ def recover(target: Path, kind: OutputKind) -> None:
         if there(old) and not there(target):
             old.rename(target)
         elif there(old) and suffix == "keeping":
-            mark(old, KEPT)
-            remove_folder(previous_path(target), KEPT)
-            old.rename(previous_path(target))
+            _keep(old, target)
         remove_folder(held, HELD)
     _recover_unheld(target, kind)
+
+
+def _keep(old: Path, target: Path) -> None:
+    """Make what was at `target` the previous one; a kill leaves `old` until that is done."""
+    previous = previous_path(target)
+    if old.is_symlink():
+        # It may be relative to the folder of `target`, and `old` lies one deeper.
+        behind = os.path.realpath(target.parent / old.readlink())
+        remove_folder(previous, KEPT)
+        previous.symlink_to(behind + _LINK_ENDS)
+        return
+    mark(old, KEPT)
+    remove_folder(previous, KEPT)
+    old.rename(previous)
 
 
 def _recover_unheld(target: Path, kind: OutputKind) -> None:
     """Bring back what an earlier version, when it was killed, left as `<target>.old`."""
     old = _beside(target, "old")
-    if old.is_symlink() and there(target):
-        old.unlink()
-    elif old.exists() and not there(target) and kind.owns(old):
+    if old.exists() and not there(target) and kind.owns(old):
         old.rename(target)
 
 

@@ -2,23 +2,29 @@
 
 import json
 import os
+import shutil
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
 
 from pipeline.durable import (
+    KEPT,
     fresh,
+    put_in_place,
     read_document,
     read_tensors,
     read_with_digest,
+    recover,
     recover_folder,
     replace_folder,
     write_document,
     write_tensors,
     write_with_digest,
 )
-from pipeline.errors import CheckpointIncomplete, DiskFull
+from pipeline.errors import CheckpointIncomplete, ConfigError, DiskFull
 from pipeline.ownership import OutputKind
 
 KIND = OutputKind("a folder of this test", lambda folder: (folder / "a").is_file())
@@ -62,6 +68,103 @@ def test_a_kill_between_any_two_steps_leaves_the_old_or_the_new(
     recover_folder(folder, KIND)
     assert (folder / "a").read_text() == ("new" if survived >= 5 else "old")
     assert os.listdir(tmp_path) == ["last"]
+
+
+@pytest.mark.parametrize("relative", [False, True])
+def test_a_link_of_the_user_beside_it_stays(tmp_path: Path, relative: bool) -> None:
+    put(tmp_path / "kept", "mine")
+    put(tmp_path / "last", "old")
+    link = tmp_path / "last.old"
+    link.symlink_to("kept" if relative else tmp_path / "kept")
+    put(tmp_path / "last", "new")
+    assert link.is_symlink()
+    assert (link / "a").read_text() == "mine"
+    assert (tmp_path / "last" / "a").read_text() == "new"
+
+
+@pytest.mark.parametrize("relative", [False, True])
+def test_of_a_link_the_folder_behind_it_is_kept_as_it_is(tmp_path: Path, relative: bool) -> None:
+    target, previous = tmp_path / "here" / "last", tmp_path / "here" / "last.previous"
+    put(tmp_path / "big" / "last", "old")
+    target.parent.mkdir()
+    target.symlink_to("../big/last" if relative else tmp_path / "big" / "last")
+    for text in ("new", "newer"):
+        complete = tmp_path / "here" / "complete"
+        complete.mkdir()
+        (complete / "a").write_text(text)
+        put_in_place(complete, target, KIND, keep=True)
+        assert (target / "a").read_text() == text
+        assert (previous / "a").read_text() == ("old" if text == "new" else "new")
+        assert KEPT.owns(previous)
+        assert previous.is_symlink() == (text == "new")
+        assert os.listdir(tmp_path / "big" / "last") == ["a"]
+    assert sorted(os.listdir(tmp_path / "here")) == ["last", "last.previous"]
+
+
+@pytest.mark.parametrize("linked", [False, True])
+def test_a_kill_while_the_old_is_kept_leaves_it_or_the_new_with_the_one_before(
+    tmp_path: Path, linked: bool
+) -> None:
+    """Kill before the n-th change of the folder, for every n, until none is left."""
+    for kill_at in range(40):
+        here = tmp_path / str(kill_at)
+        target, previous, complete = (here / name for name in ("last", "last.previous", "complete"))
+        put(target, "older")
+        put(complete, "old")
+        put_in_place(complete, target, KIND, keep=True)
+        if linked:
+            target.rename(here / "big")
+            target.symlink_to("big")
+        put(complete, "new")
+        keeping = partial(put_in_place, complete, target, KIND, keep=True)
+        finished = not killed_before(kill_at, keeping)
+        recover(target, KIND)
+        now = (target / "a").read_text()
+        assert not finished or now == "new"
+        assert (previous / "a").read_text() == {"new": "old", "old": "older"}[now]
+        assert KEPT.owns(previous)
+        assert {path.name for path in here.iterdir()} <= {
+            "last",
+            "last.previous",
+            "complete",
+            "big",
+        }
+        if finished:
+            assert kill_at > 8
+            return
+    raise AssertionError("more steps than expected")
+
+
+def killed_before(step: int, act: Callable[[], None]) -> bool:
+    count = iter(range(10**6))
+
+    def counted(real):
+        def call(*arguments, **keywords):
+            if next(count) == step:
+                raise Killed
+            return real(*arguments, **keywords)
+
+        return call
+
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("rename", "mkdir", "write_text", "unlink", "symlink_to"):
+            patch.setattr(Path, name, counted(getattr(Path, name)))
+        patch.setattr(shutil, "rmtree", counted(shutil.rmtree))
+        try:
+            act()
+        except Killed:
+            return True
+    return False
+
+
+def test_a_link_of_the_user_is_not_the_one_that_was_kept(tmp_path: Path) -> None:
+    put(tmp_path / "mine", "mine")
+    put(tmp_path / "last", "old")
+    put(tmp_path / "complete", "new")
+    (tmp_path / "last.previous").symlink_to("mine")
+    with pytest.raises(ConfigError, match=r"last\.previous"):
+        put_in_place(tmp_path / "complete", tmp_path / "last", KIND, keep=True)
+    assert (tmp_path / "last" / "a").read_text() == "old"
 
 
 def test_a_failed_write_keeps_the_old(tmp_path: Path) -> None:

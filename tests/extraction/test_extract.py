@@ -1,5 +1,6 @@
 """One extraction: what it writes, what it takes over, what it refuses."""
 
+import os
 import shutil
 import subprocess
 import sys
@@ -455,6 +456,28 @@ class TestWhatWouldBeLost:
         assert report.taken == report.rows
         assert not previous.exists(), "until the next successful run"
         assert content(store) == whole
+
+    @pytest.mark.usefixtures("extracted")
+    def test_a_store_behind_a_link_is_kept_for_its_rows_as_it_is(
+        self, params, recordings, tmp_path, counted
+    ):
+        store, behind = params.extract.store, tmp_path / "big" / "made.zarr"
+        previous = store.with_name("made.zarr.previous")
+        behind.parent.mkdir()
+        store.rename(behind)
+        store.symlink_to(os.path.relpath(behind, store.parent))
+        whole = content(behind)
+        (recordings / "Press").rename(recordings.with_name("unmounted"))
+        run(params)
+        assert not store.is_symlink()
+        assert content(behind) == content(previous) == whole
+        assert run(params)[0] is None, "a later run goes on"
+        recordings.with_name("unmounted").rename(recordings / "Press")
+        report, _ = run(params)
+        assert not counted, "its rows were there"
+        assert report.taken == report.rows
+        assert not previous.is_symlink(), "until the next successful run"
+        assert content(behind) == content(store) == whole
 
     @pytest.mark.usefixtures("extracted")
     def test_a_copy_that_the_user_made_is_not_the_one_that_was_kept(self, params, recordings):
