@@ -73,7 +73,8 @@ class ChunkFiles:
 
     Those of a store that is only read from, which may lie where nothing can be written, are opened
     with `writable=False`. A linked chunk belongs to another store too and is never written: rows of
-    it count as there already or, `owned`, go into a copy that takes its place.
+    it count as there already or, `owned`, go into a copy that takes its place. Rows of an `owned`
+    array have checksums of their own, which the caller compares.
     """
 
     def __init__(
@@ -193,8 +194,9 @@ class ChunkFiles:
     def seal(self) -> None:
         """Compare each chunk with its trailer, or write it where there is none yet.
 
-        Running it again changes nothing. Raises `StoreIncomplete` where a trailer is not that of
-        the rows.
+        Running it again changes nothing. A trailer that is not that of the rows is written again
+        where they are `owned`: after a power loss a file may have its size without its end. Else
+        raises `StoreIncomplete`.
         """
         sealed = self.spec.chunk_bytes + TRAILER_BYTES
         for chunk, path in enumerate(self.paths):
@@ -205,7 +207,7 @@ class ChunkFiles:
             data = self._passed(chunk)
             if not data.complete:
                 raise self._incomplete(chunk, "the file ends early")
-            if data.damage and path.stat().st_size == sealed:
+            if data.damage and path.stat().st_size == sealed and not self._owned:
                 raise self._incomplete(chunk, data.damage)
             if data.damage:
                 self._write_trailer(chunk, data.crc)

@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 
 from pipeline.errors import DiskFull, StoreIncomplete, StoreLocked
 from pipeline.store import Donor, FeatureStore, Sizes, StoreBuild, arrays, build_lock, recover
-from pipeline.store.chunks import row_checksums
-from pipeline.store.schema import FEATURES, ArraySpec
+from pipeline.store.chunks import check_trailers, row_checksums
+from pipeline.store.schema import FEATURES, TRAILER_BYTES, ArraySpec
 
 ROWS = 12
 SIZES = Sizes(1, 24, ROWS, 0, 0, 2, 3, 8, 1, 2, 0, 0)
@@ -206,6 +206,19 @@ class TestSeal:
         (tmp_path / "s.zarr.old").symlink_to(behind.path)  # a user's own
         recover(tmp_path / "s.zarr")
         assert (tmp_path / "s.zarr.old").is_symlink()
+
+    @pytest.mark.parametrize("name", [FEATURES, "vl/key", "vl/checksum"])
+    def test_a_trailer_that_a_power_loss_left_out_costs_no_row(self, tmp_path, name):
+        build = self.full(tmp_path)
+        (path,) = build.files(name).paths
+        data = build.specs[name].chunk_bytes
+        os.truncate(path, data)
+        os.truncate(path, data + TRAILER_BYTES)  # its size reached the disk, its end did not
+        again = resumed(build)
+        assert not again.missing().size
+        again.seal()
+        check_trailers(build.target)
+        assert np.array_equal(FeatureStore.open(build.target).array(FEATURES), rows_of(0, ROWS))
 
 
 class TestLinks:
