@@ -113,18 +113,23 @@ def keeping_note(target: Path, surveyed: Survey) -> list[str]:
 
     Raises `ConfigError` where something else lies where it would be kept.
     """
-    kept, contents = previous_path(target), {one.content for one in surveyed.episodes}
+    kept, lines = previous_path(target), list[str]()
+    contents = {one.content for one in surveyed.episodes}
     if lost := _lost(target, surveyed):
         refuse_foreign(kept, KEPT)
-        return [
+        lines = [
             f"{target} holds {lost}: it is kept as {kept} until the next successful run, which "
             "takes their rows from it where they are there again"
         ]
+        contents |= set(_contents(target) or ())
     for place in _kept(target):
-        with closing(Donor(place)) as donor:
-            gone = sum(content not in contents for content in donor.episode_contents)
-        return [f"{place} is removed when this run succeeds; {gone} episode(s) are only in there"]
-    return []
+        known = _contents(place)
+        gone = "all its" if known is None else sum(content not in contents for content in known)
+        then = "replaced by it" if lost else "removed"
+        lines.append(
+            f"{place} is {then} when this run succeeds; {gone} episode(s) are only in there"
+        )
+    return lines
 
 
 def put_in_place(build: StoreBuild, surveyed: Survey, say: Say) -> None:
@@ -146,13 +151,21 @@ def _lost(target: Path, surveyed: Survey) -> str | None:
     """Which episodes of the store are not in the one that takes its place; None where all are."""
     if read_plan(target) in (None, surveyed.plan):
         return None
+    if (known := _contents(target)) is None:
+        return "episodes that can no longer be told"
     contents = {one.content for one in surveyed.episodes}
-    with closing(Donor(target)) as donor:
+    lost = sum(content not in contents for content in known)
+    named = f"{lost} episode(s) that are not in this run (or whose files are read otherwise now)"
+    return named if lost else None
+
+
+def _contents(store: Path) -> list[str] | None:
+    """The content digest of each episode; None where they can no longer be read."""
+    with closing(Donor(store)) as donor:
         try:
-            lost = sum(content not in contents for content in donor.episode_contents)
+            return donor.episode_contents
         except StoreIncomplete:
-            return "episodes that can no longer be told"
-    return f"{lost} episode(s) that are not in this run" if lost else None
+            return None
 
 
 def _kept(target: Path) -> list[Path]:

@@ -480,6 +480,18 @@ class TestWhatWouldBeLost:
         assert content(behind) == content(store) == whole
 
     @pytest.mark.usefixtures("extracted")
+    def test_says_what_only_the_store_kept_before_holds(self, params, recordings):
+        (recordings / "Press").rename(recordings.with_name("unmounted"))
+        run(params)
+        (lost, *_) = sorted(path for path in recordings.rglob("episode_*") if path.is_dir())
+        shutil.rmtree(lost)
+        _, said = run(params)
+        previous = params.extract.store.with_name("made.zarr.previous")
+        assert any(f"is kept as {previous}" in line for line in said)
+        (line,) = (line for line in said if line.startswith(f"{previous} is replaced"))
+        assert "1 episode(s) are only in there" in line
+
+    @pytest.mark.usefixtures("extracted")
     def test_a_copy_that_the_user_made_is_not_the_one_that_was_kept(self, params, recordings):
         copies = [
             shutil.copytree(params.extract.store, f"{params.extract.store}{suffix}")
