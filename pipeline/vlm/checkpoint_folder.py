@@ -147,6 +147,9 @@ def _entries(document: Any, key: str) -> Iterator[Any]:
                 yield value
             else:
                 yield from _entries(value, key)
+    elif isinstance(document, list):
+        for value in document:
+            yield from _entries(value, key)
 
 
 def tensor_headers(path: Path) -> dict[str, tuple[str, list[int]]]:

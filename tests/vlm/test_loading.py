@@ -201,6 +201,7 @@ raise SystemExit("code of the checkpoint ran")
                 }
             },
         ),
+        ("processor_config.json", {"steps": [{"auto_map": {"AutoImageProcessor": "evil.Own"}}]}),
     ],
 )
 def test_code_of_a_checkpoint_never_runs_whatever_is_answered(
