@@ -151,12 +151,14 @@ def open_run(
 
 
 def _is_run(folder: Path) -> bool:
-    """Whether a training wrote it; a `run.json` that cannot be read is one that was damaged."""
-    try:
-        document = read_document(folder / RUN)
-    except CheckpointIncomplete:
+    """Whether a training wrote it; a `run.json` that cannot be read is a damaged one of ours only
+    beside a checkpoint."""
+    if _has_checkpoint(folder):
         return (folder / RUN).is_file()
-    return {"source", "decides"} <= document.keys() or _has_checkpoint(folder)
+    try:
+        return {"source", "decides"} <= read_document(folder / RUN).keys()
+    except CheckpointIncomplete:
+        return False
 
 
 RUN_FOLDER = OutputKind("a training run", _is_run)
@@ -220,7 +222,8 @@ def _compare(part: Path, identity: Mapping[str, Any], section: str) -> dict[str,
 
 
 def _has_checkpoint(part: Path) -> bool:
-    return any(part.glob(f"*/{DOCUMENT}"))
+    """Whether there is a checkpoint; by its document, `<name>.old` and `<name>.new` too."""
+    return any(path.is_file() for name in (BEST, LAST) for path in part.glob(f"{name}*/{DOCUMENT}"))
 
 
 def _drop_trainer_state(output: Path) -> None:

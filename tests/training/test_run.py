@@ -15,6 +15,7 @@ from pipeline.ownership import MARKER
 from pipeline.store import FeatureStore
 from pipeline.training import Trainer, open_run
 from pipeline.training.identity import TRAINER_VERSION
+from pipeline.training.run import RUN_FOLDER
 
 Make = Callable[..., Any]
 
@@ -112,7 +113,7 @@ def test_a_run_put_aside_gives_way_to_the_next(
     store: FeatureStore, params: Make, trainer: Make, unfinished: Path
 ) -> None:
     aside = unfinished.with_name("head.part-old")
-    aside.mkdir()
+    shutil.copytree(unfinished, aside)
     (aside / "run.json").write_text("older")
     trainer(store, params(lr=0.5, max_steps=1)).fit()
     assert read_document(aside / "run.json")["decides"]["train_head"]["lr"] == 0.003
@@ -230,6 +231,25 @@ def test_what_no_training_wrote_is_never_replaced(store: FeatureStore, params: M
     with pytest.raises(ConfigError, match="no training run"):
         open_run(params(), store)
     assert (output / "thesis.tex").exists()
+
+
+@pytest.mark.parametrize("beside", [None, "best", "models"])
+@pytest.mark.parametrize("document", ["[1, 2]", "{", '{"sweep": 3}'])
+def test_a_run_json_of_another_program_makes_no_training_run(
+    store: FeatureStore, params: Make, document: str, beside: str | None
+) -> None:
+    output = params().output
+    output.mkdir()
+    (output / "run.json").write_text(document)
+    (output / "thesis.tex").write_text("years of work")
+    if beside:
+        (output / beside).mkdir()
+        (output / beside / "policy.json").write_text("{}")
+    if beside == "best":  # a run of ours whose run.json was damaged
+        assert RUN_FOLDER.owns(output)
+    else:
+        with pytest.raises(ConfigError, match="no training run"):
+            open_run(params(), store)
 
 
 def test_checkpoints_without_their_run_are_not_guessed_at(
