@@ -19,8 +19,13 @@ from pipeline.errors import (
     RecordingError,
     StoreLocked,
 )
+from pipeline.ownership import described
 
 _BLOCK = 4 * 2**20
+_HEADER, _HEADER_BYTES = b"SQLite format 3\0", 100
+_APPLICATION = 0x564C4146
+"""SQLite's `application_id` of a ledger, in its header at bytes 68 to 71, big-endian."""
+
 _TABLES = (
     "file (path TEXT PRIMARY KEY, size INTEGER, mtime_ns INTEGER, digest TEXT)",
     "rate (what TEXT PRIMARY KEY, rows_per_s REAL)",
@@ -31,12 +36,17 @@ _TABLES = (
 
 
 class ContentDigests:
-    """Digests of files, kept in one SQLite file, or where that is None only in memory."""
+    """Digests of files, kept in one SQLite file, or where that is None only in memory.
+
+    Raises `ConfigError` where something else lies there or it cannot be written. A damaged ledger
+    is begun anew.
+    """
 
     def __init__(self, ledger: Path | None) -> None:
         self._ledger = ledger
         if ledger is None:
             return self._open()
+        _refuse_foreign(ledger)
         try:
             ledger.parent.mkdir(parents=True, exist_ok=True)
             self._open()
@@ -49,19 +59,25 @@ class ContentDigests:
 
     @classmethod
     def to_read(cls, ledger: Path) -> "ContentDigests":
-        """The ledger; where it cannot be written, what it knows, and nothing new is remembered."""
+        """The ledger; where it cannot be written, what it knows, and nothing new is remembered.
+
+        Removes nothing. Raises `ConfigError` where something else lies there.
+        """
+        _refuse_foreign(ledger)
         try:
-            opened = cls(ledger)
+            opened = cls(None)
+            opened.close()
+            opened._ledger = ledger
+            ledger.parent.mkdir(parents=True, exist_ok=True)
+            opened._open()
             opened._database.execute("DELETE FROM bad WHERE 0")
             return opened
-        except (ConfigError, OSError, sqlite3.OperationalError):
+        except (OSError, sqlite3.DatabaseError):
             known = cls(None)
             if ledger.is_file():
-                # Immutable: no file can be made beside it, as sqlite else would.
-                address = f"file:{quote(str(ledger.absolute()))}?immutable=1"
                 with (
                     suppress(sqlite3.DatabaseError),  # it only saves reading
-                    closing(sqlite3.connect(address, uri=True)) as file,
+                    closing(_immutable(ledger)) as file,
                 ):
                     file.backup(known._database)
             return known
@@ -69,6 +85,8 @@ class ContentDigests:
     def _open(self) -> None:
         self._database = sqlite3.connect(self._ledger or ":memory:", isolation_level=None)
         try:
+            if self._known("PRAGMA application_id", ()) != _APPLICATION:
+                self._database.execute(f"PRAGMA application_id = {_APPLICATION}")
             self._database.execute("PRAGMA journal_mode = WAL")
             self._database.execute("PRAGMA synchronous = OFF")
             for table in _TABLES:
@@ -154,6 +172,44 @@ class ContentDigests:
             f"{self._ledger}: cannot be written: {error}. Set extract.store to a folder that "
             "can be written to."
         )
+
+
+def is_ledger(path: Path) -> bool:
+    """Whether content digests, a damaged file of them too, or nothing at all lies there.
+
+    Looks without SQLite's own files beside it. What cannot be read is left to who opens it.
+    """
+    if not path.is_file():
+        return not path.exists()
+    try:
+        with path.open("rb") as file:
+            header = file.read(_HEADER_BYTES)
+    except OSError:
+        return True
+    if not header.startswith(_HEADER):
+        return not header
+    if application := int.from_bytes(header[68:72], "big"):
+        return application == _APPLICATION
+    try:  # of an earlier version, which left no application's id
+        with closing(_immutable(path)) as file:
+            made = {row[0] for row in file.execute("SELECT sql FROM sqlite_master")}
+    except sqlite3.DatabaseError:
+        return True
+    return not made or f"CREATE TABLE {_TABLES[0]}" in made
+
+
+def _refuse_foreign(ledger: Path) -> None:
+    if not is_ledger(ledger):
+        raise ConfigError(
+            f"{ledger}: expected nothing there or the content digests that this project keeps "
+            f"there, found {described(ledger)} that it did not write. It was left as it is: move "
+            "it away, or name another extract.store."
+        )
+
+
+def _immutable(path: Path) -> sqlite3.Connection:
+    """A database to read, with no file made beside it, as sqlite else would."""
+    return sqlite3.connect(f"file:{quote(str(path.absolute()))}?immutable=1", uri=True)
 
 
 def file_digest(path: Path) -> str:

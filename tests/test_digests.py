@@ -30,10 +30,49 @@ def test_equal_content_has_an_equal_digest_wherever_it_lies(tmp_path):
 
 
 def test_a_damaged_ledger_is_begun_anew(tmp_path):
-    (tmp_path / "ledger.sqlite").write_bytes(b"no database" * 50)
+    ledger = tmp_path / "ledger.sqlite"
+    with closing(ContentDigests(ledger)) as digests:
+        digests.note_rate("model", 12.5)
+    ledger.write_bytes(damaged := ledger.read_bytes()[:100] + b"no database" * 50)
     (tmp_path / "file").write_bytes(b"one")
-    with closing(ContentDigests(tmp_path / "ledger.sqlite")) as digests:
+    with closing(ContentDigests.to_read(ledger)) as digests:
         assert len(digests.of(tmp_path / "file")) == 32
+    assert ledger.read_bytes() == damaged, "what only reads removes nothing"
+    with closing(ContentDigests(ledger)) as digests:
+        assert digests.rate("model") is None
+        assert len(digests.of(tmp_path / "file")) == 32
+    assert ledger.read_bytes() != damaged
+
+
+@pytest.mark.parametrize("kind", ["text", "tables", "another application", "folder"])
+@pytest.mark.parametrize("opened", [ContentDigests, ContentDigests.to_read])
+def test_what_is_no_ledger_is_left_as_it_is(tmp_path, kind, opened):
+    ledger = tmp_path / "ledger.sqlite"
+    if kind == "text":
+        ledger.write_text("years of work")
+    elif kind == "folder":
+        ledger.mkdir()
+    else:
+        with closing(sqlite3.connect(ledger)) as database:
+            if kind == "another application":
+                database.execute("PRAGMA application_id = 7")
+            database.execute("CREATE TABLE file (thesis TEXT)")
+    before = ledger.is_file() and ledger.read_bytes()
+    with pytest.raises(ConfigError, match="did not write"):
+        opened(ledger)
+    assert (ledger.is_file() and ledger.read_bytes()) == before
+    assert list(tmp_path.iterdir()) == [ledger]
+
+
+def test_a_ledger_of_an_earlier_version_is_gone_on_with(tmp_path):
+    ledger = tmp_path / "ledger.sqlite"
+    with closing(ContentDigests(ledger)) as digests:
+        digests.note_rate("model", 12.5)
+    with closing(sqlite3.connect(ledger)) as database:
+        database.execute("PRAGMA application_id = 0")
+    for _ in range(2):
+        with closing(ContentDigests(ledger)) as digests:
+            assert digests.rate("model") == 12.5
 
 
 def test_names_a_file_that_cannot_be_read(tmp_path):
