@@ -2,7 +2,8 @@
 
 A complete folder is told by what it says of itself: a store by its attributes, a training run by
 its `run.json`. One in the making holds `MARKER`, which is the first thing written into it, so that
-what a kill leaves behind is known too. An empty folder is anybody's.
+what a kill leaves behind is known too; logs without a page of ours keep it. An empty folder is
+anybody's.
 """
 
 import shutil
@@ -17,6 +18,9 @@ MARKER = ".vla-feature-cache"
 _NAMED = 3
 """Names that a message lists of a folder."""
 
+_SPEED = "step\tsteps_per_s\tdata_wait_share\t"
+"""How the speed begins that a training writes beside its logs (`pipeline.training.log`)."""
+
 
 @dataclass(frozen=True)
 class OutputKind:
@@ -30,7 +34,11 @@ class OutputKind:
         """Whether this project may replace what lies there as one of this kind."""
         if self.is_one(path):
             return True
-        return path.is_dir() and (_marked(path) == self.name or not any(path.iterdir()))
+        return path.is_dir() and (self.marks(path) or _is_empty(path))
+
+    def marks(self, path: Path) -> bool:
+        """Whether it is marked as one of this kind."""
+        return _marked(path) == self.name
 
 
 def there(path: Path) -> bool:
@@ -116,19 +124,31 @@ def _is_report(folder: Path) -> bool:
     """Whether a command that shows something wrote this folder, or has begun to."""
     if any((folder / sign).exists() for sign in (".report.html.new", ".files.sqlite")):
         return True
-    if (folder / "judged.json").is_file() or (folder / "plots" / "metrics").is_dir():
+    if (folder / "judged.json").is_file() or _has_speed(folder):
         return True
     if all((folder / f"{table}.csv").is_file() for table in ("slots", "groups", "targets")):
         return True
     page = folder / "report.html"
     if not page.exists() and folder.is_dir():  # of one command, each page in a folder of its own
         parts = list(folder.iterdir())
-        return bool(parts) and all(part.is_dir() and REPORT.owns(part) for part in parts)
+        ours = all(part.is_dir() and REPORT.owns(part) for part in parts)
+        return ours and not all(_is_empty(part) for part in parts)
     return page.is_file() and b'<meta name="pictures"' in page.read_bytes()[: 2**16]
 
 
 REPORT = OutputKind("a folder of reports", _is_report)
 """What evaluations, inspections, probes, comparisons and trainings show; files are added to it."""
+
+
+def _has_speed(logs: Path) -> bool:
+    """Whether a training's speed lies beside these logs: dvclive's files alone are anybody's."""
+    speed = logs.with_name(f"{logs.name}.speed.tsv")
+    return logs.is_dir() and begins_with(_SPEED)(speed) and speed.stat().st_size > 0
+
+
+def _is_empty(folder: Path) -> bool:
+    """Whether nothing is in it, or a marker alone that a kill cut off before its line."""
+    return all(entry.name == MARKER and not entry.stat().st_size for entry in folder.iterdir())
 
 
 def _marked(folder: Path) -> str | None:

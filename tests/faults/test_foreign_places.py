@@ -8,13 +8,22 @@ from pathlib import Path
 import pytest
 import zarr
 
+from pipeline.ownership import MARKER, REPORT
 from pipeline.store.archive import archive
+from pipeline.store.places import STORE
 
+SPEED = "step\tsteps_per_s\tdata_wait_share\tpeak_memory_mib\ttrained_s"
 PRESS = 'data.sources=[{"name": "made", "path": "Press"}]'
 WRITERS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "extract": ("stages.extract", "x.zarr", ("extract.store={}",)),
     "plan": ("stages.extract", "x.zarr", ("extract.store={}", "extract.plan=true")),
     "build": ("stages.extract", "stores/made.zarr.part", ()),
+    "ledger": ("stages.extract", "x.zarr.files.sqlite", ("extract.store={tmp}/x.zarr",)),
+    "planned ledger": (
+        "stages.extract",
+        "x.zarr.files.sqlite",
+        ("extract.store={tmp}/x.zarr", "extract.plan=true"),
+    ),
     "replaced": ("stages.extract", "stores/made.zarr.replaced", ()),
     "lost": (
         "stages.extract",
@@ -58,6 +67,11 @@ def plant(place: Path, foreign: str) -> None:
         os.utime(place, (0, 0))  # no living holder of a lock either
     elif foreign == "zarr group":
         zarr.create_array(place, name="data/action", shape=(3,), dtype="f4")
+    elif foreign == "dvclive":
+        (place / "plots" / "metrics").mkdir(parents=True)
+        for name in ("metrics.json", "plots/metrics/loss.tsv", "plots/custom/roc.json"):
+            (place / name).parent.mkdir(exist_ok=True)
+            (place / name).write_text("{}")
     else:
         (place / "chapters").mkdir(parents=True)
         (place / "chapters" / "thesis.txt").write_text("years of work")
@@ -67,8 +81,13 @@ def content(place: Path) -> dict[Path, bytes]:
     return {path: path.read_bytes() for path in [place, *place.rglob("*")] if path.is_file()}
 
 
-@pytest.mark.parametrize("foreign", ["folder", "file", "zarr group"])
-@pytest.mark.parametrize("writer", WRITERS)
+@pytest.mark.parametrize(
+    ("writer", "foreign"),
+    [
+        *((writer, foreign) for writer in WRITERS for foreign in ("folder", "file", "zarr group")),
+        *((writer, "dvclive") for writer in ("head logs", "tuned logs")),
+    ],
+)
 def test_is_left_as_it_is(
     writer: str, foreign: str, params: Path, here: Callable[..., tuple[int, str, str]], tmp_path
 ) -> None:
@@ -91,3 +110,25 @@ def test_is_left_as_it_is(
     assert str(place) in complained
     assert "Traceback" not in complained
     assert content(place) == before
+
+
+def test_a_marker_that_a_kill_cut_off_makes_no_folder_foreign(tmp_path: Path) -> None:
+    (tmp_path / MARKER).touch()
+    assert STORE.owns(tmp_path)
+    (tmp_path / "thesis.txt").write_text("years of work")
+    assert not STORE.owns(tmp_path)
+
+
+def test_folders_of_nothing_are_no_reports(tmp_path: Path) -> None:
+    (tmp_path / "chapters" / "drafts").mkdir(parents=True)
+    (tmp_path / "pictures").mkdir()
+    assert not REPORT.owns(tmp_path)
+
+
+def test_logs_of_earlier_versions_are_known_by_the_speed_beside_them(tmp_path: Path) -> None:
+    logs, speed = tmp_path / "logs", tmp_path / "logs.speed.tsv"
+    (logs / "plots" / "metrics").mkdir(parents=True)
+    assert not REPORT.owns(logs)
+    for beside, ours in (("", False), ("step\tloss\n", False), (SPEED + "\n", True)):
+        speed.write_text(beside)
+        assert REPORT.owns(logs) == ours
