@@ -10,13 +10,15 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.durable import KEPT, previous_path
 from pipeline.errors import ConfigError, StoreLocked
-from pipeline.ownership import MARKER
+from pipeline.ownership import MARKER, mark
 from pipeline.store import FeatureStore, StoreBuild, build_lock
 from pipeline.store.archive import archive
 from pipeline.store.housekeeping.inventory import Entry, Inventory, take_inventory
 from pipeline.store.housekeeping.leftovers import kept_back, leftovers, named, remove
 from pipeline.store.housekeeping.listing import table
+from pipeline.store.places import STORE
 from pipeline.store.schema import read_specs
 
 Make = Callable[..., Path]
@@ -253,6 +255,53 @@ class TestLeftovers:
                 remove(listed)
         assert part.exists()
 
+    @pytest.mark.parametrize("damaged", [False, True])
+    def test_a_removal_that_was_killed_leaves_what_the_next_build_takes(
+        self,
+        tiny_store: Make,
+        tmp_path: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        damaged: bool,
+    ) -> None:
+        part = unfinish(tiny_store(tmp_path / "stores"), 0)
+        (leftover,) = leftovers(take_inventory(part.parent))
+        if damaged:
+            (part / "zarr.json").write_text("{")
+
+        def killed(path: Path) -> None:
+            (part / "zarr.json").unlink(missing_ok=True)
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr("pipeline.ownership.shutil.rmtree", killed)
+        with pytest.raises(KeyboardInterrupt):
+            remove(leftover)
+        assert any(part.iterdir())
+        assert STORE.owns(part)
+
+    def test_what_was_kept_stays_known_as_that(
+        self, tiny_store: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        kept = previous_path(tmp_path / "stores" / "tiny.zarr")
+        tiny_store(tmp_path / "stores").rename(kept)
+        mark(kept, KEPT)
+        (leftover,) = named(take_inventory(kept.parent), [kept])
+
+        def killed(path: Path) -> None:
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr("pipeline.ownership.shutil.rmtree", killed)
+        with pytest.raises(KeyboardInterrupt):
+            remove(leftover)
+        assert KEPT.owns(kept)
+
+    def test_a_foreign_file_at_a_ledger_is_no_leftover(self, tmp_path: Path) -> None:
+        ledger = tmp_path / "gone.zarr.files.sqlite"
+        ledger.write_text("years of work")
+        inventory = take_inventory(tmp_path)
+        assert leftovers(inventory) == []
+        with pytest.raises(ConfigError, match="did not write"):
+            named(inventory, [ledger])
+
     def test_nothing_behind_a_symbolic_link_is_touched(
         self, tiny_store: Make, tmp_path: Path
     ) -> None:
@@ -266,7 +315,7 @@ class TestLeftovers:
         assert "a symbolic link" in kept_back(inventory)[0]
         part = folder / "own.zarr.part"
         part.mkdir()
-        (part / MARKER).write_text("a feature store")
+        (part / MARKER).write_text("a feature store\n")
         (part / "inside").symlink_to(outside)
         for one in leftovers(take_inventory(folder)):
             remove(one)

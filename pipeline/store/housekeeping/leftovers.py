@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipeline.digests import is_ledger
 from pipeline.durable import HELD, KEPT
 from pipeline.errors import ConfigError, StoreIncomplete, StoreLocked
 from pipeline.ownership import OutputKind, remove_folder
@@ -32,16 +33,19 @@ _REMOVABLE: tuple[Kind, ...] = (
 
 
 _KINDS = (STORE, ARCHIVE, KEPT, HELD)
+_SIGNS = (OutputKind.marks, OutputKind.owns)
 
 
-def _is_leftover(path: Path) -> bool:
+def _owner(path: Path) -> OutputKind | None:
+    """The kind that a folder is of, None where it is not ours.
+
+    The marker decides: removed as another kind and killed meanwhile, it would be foreign to the
+    command that looks for its own kind there.
+    """
     try:
-        return any(kind.owns(path) for kind in _KINDS)
+        return next((kind for owns in _SIGNS for kind in _KINDS if owns(kind, path)), None)
     except StoreIncomplete:  # a group's metadata, but damaged
-        return True
-
-
-_LEFTOVER = OutputKind("a leftover of a build", _is_leftover)
+        return OutputKind(STORE.name, lambda _: True)
 
 
 @dataclass(frozen=True)
@@ -109,7 +113,7 @@ def remove(leftover: Leftover) -> None:
             if leftover.path.is_symlink() or only_copy:
                 return
             if leftover.path.is_dir():
-                remove_folder(leftover.path, _LEFTOVER)
+                remove_folder(leftover.path, _owner(leftover.path) or STORE)
             else:
                 leftover.path.unlink(missing_ok=True)
             if not there:
@@ -147,9 +151,15 @@ def _why(inventory: Inventory, entry: Entry) -> str | None:
 
 def _untouched(inventory: Inventory, entry: Entry) -> bool:
     """Whether no living process builds there, and it is no symbolic link and of this project."""
-    if entry.path.is_symlink() or (entry.path.is_dir() and not _LEFTOVER.owns(entry.path)):
+    if entry.path.is_symlink() or _is_foreign(entry):
         return False
     return entry.base not in inventory.holders
+
+
+def _is_foreign(entry: Entry) -> bool:
+    if entry.path.name.endswith(".files.sqlite"):
+        return not is_ledger(entry.path)
+    return entry.path.is_dir() and _owner(entry.path) is None
 
 
 def _work(entry: Entry) -> str | None:
@@ -186,8 +196,8 @@ def _in_use(inventory: Inventory, entry: Entry) -> Iterator[str]:
         yield f"{entry.path}: a finished {entry.kind}, which is never removed here"
     elif entry.path.is_symlink():
         yield f"{entry.path}: a symbolic link, left alone"
-    elif entry.path.is_dir() and not _LEFTOVER.owns(entry.path):
-        yield f"{entry.path}: a folder that this project did not write, left alone"
+    elif _is_foreign(entry):
+        yield f"{entry.path}: this project did not write it, left alone"
     elif entry.base in inventory.holders:
         yield f"{entry.path}: in use by {inventory.holders[entry.base]}"
     elif entry.kind == "replaced" and _why(inventory, entry) is None:
