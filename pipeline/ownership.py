@@ -2,8 +2,7 @@
 
 A complete folder is told by what it says of itself: a store by its attributes, a training run by
 its `run.json`. One in the making holds `MARKER`, which is the first thing written into it, so that
-what a kill leaves behind is known too; logs without a page of ours keep it. An empty folder is
-anybody's.
+what a kill leaves behind is known too; logs keep it for good. An empty folder is anybody's.
 """
 
 import shutil

@@ -9,7 +9,7 @@ from typing import Self
 from pipeline.config import TrainHeadParams
 from pipeline.durable import disk_full_named, fresh
 from pipeline.evaluation.experiments import speed_file
-from pipeline.ownership import REPORT, OutputKind, begins_with, refuse_foreign, release
+from pipeline.ownership import OutputKind, begins_with, refuse_foreign
 from pipeline.training.loggers import Logger, open_loggers
 from pipeline.training.speed import Pace
 from pipeline.training.world import World
@@ -74,7 +74,6 @@ class TrainingLog:
             for logger in reversed(self._loggers):
                 closing.callback(logger.close, kind is None)
             closing.callback(self._speed.close)
-        release(self._folder, REPORT)
 
 
 @contextmanager

@@ -13,11 +13,13 @@ import pytest
 from pipeline.config import TrainHeadParams
 from pipeline.durable import read_document, write_document
 from pipeline.errors import ConfigError, DiskFull
+from pipeline.ownership import MARKER
 from pipeline.store import FeatureStore
 from pipeline.training import Trainer, check_loggers, loggers, open_run
 from pipeline.training.log import TrainingLog
 
 ROOT = Path(__file__).resolve().parents[2]
+LOGS = {MARKER, "plots", "metrics.json", "report.html"}
 Make = Callable[..., Any]
 WANDB = """
 import sys
@@ -129,7 +131,7 @@ def test_every_logger_has_the_curves_of_dvc_after_a_stop_too(
         assert [v for _, v in found[name]] == pytest.approx([v for _, v in points], rel=1e-6)
     said = (chosen.logs / "report.html").read_text()
     assert "step 20 of 20, finished" in said
-    assert {path.name for path in chosen.logs.iterdir()} == {"plots", "metrics.json", "report.html"}
+    assert {path.name for path in chosen.logs.iterdir()} == LOGS
 
 
 @pytest.mark.extra
@@ -212,7 +214,7 @@ def test_dvclives_own_report_lies_beside_the_logs(
     assert "vega" in said and "train/loss" in said and "0.05" in said
     assert [step for step, _ in curves(chosen.logs)["train/loss"]] == [10, 20], "none stands twice"
     assert (chosen.logs / "report.html").exists()
-    assert {path.name for path in chosen.logs.iterdir()} == {"plots", "metrics.json", "report.html"}
+    assert {path.name for path in chosen.logs.iterdir()} == LOGS
 
 
 def test_a_full_disk_is_named_and_every_logger_is_closed(

@@ -20,6 +20,7 @@ from pipeline.config import TrainHeadParams
 from pipeline.durable import read_document
 from pipeline.errors import NumericsError
 from pipeline.evaluation import judge
+from pipeline.evaluation.experiments import speed_file
 from pipeline.store import FeatureStore
 from pipeline.training import Trainer
 from pipeline.training.checkpoints import Checkpoints
@@ -289,6 +290,17 @@ def test_the_average_shares_what_never_changes(undisturbed: Trainer) -> None:
     assert held
     for name, value in undisturbed.policy.named_buffers():
         assert torch.equal(value, held[name]), name
+
+
+def test_logs_stay_known_where_no_speed_lies_beside_them(
+    store: FeatureStore, params: Make, trainer: Make
+) -> None:
+    """As DVC restores them in another checkout."""
+    short = {"max_steps": 1, "loggers": []}
+    trainer(store, params(**short)).fit()
+    speed_file(params().logs).unlink()
+    trainer(store, params(seed=3, **short)).fit()
+    assert (params().logs / "metrics.json").exists()
 
 
 def test_logs_never_write_through_a_link(
