@@ -66,8 +66,8 @@ def held_out_ticks(
     for what, names in (
         ("lacks {} of the {} episodes that the checkpoint holds out, or has shorter ones", missing),
         (
-            "has other recordings, or the same ones read otherwise than then, under the names of "
-            "{} of the {} held-out episodes",
+            "has other recordings under the names of {} of the {} held-out episodes, or the same "
+            "ones, read otherwise since",
             altered,
         ),
     ):
