@@ -178,7 +178,8 @@ class LeRobotRecording(FileRecording):
     def _recorded_instruction(self) -> str:
         if len(self._entry.tasks) == 1:
             return self._entry.tasks[0]
-        where, table = self._rows(("task_index",))
+        rows = find_rows(self._layout, self._entry)
+        where, table = f"{rows.path}, {self._entry.id}", rows.columns(("task_index",))
         if "task_index" not in table.column_names:
             raise RecordingError(f"{where}: no column task_index, and meta/ names no one task")
         asked = [int(index) for index in np.unique(table["task_index"].to_numpy())]
@@ -229,13 +230,10 @@ class LeRobotRecording(FileRecording):
 
     def _numbers(self, streams: Sequence[str] = (STATE, ACTION)) -> tuple[str, pa.Table]:
         """The episode's rows of these streams with their clock, known to be its own."""
-        where, table = self._rows((*NUMBERS, *streams))
-        check_numbers(table, find_rows(self._layout, self._entry), self._entry)
-        return where, table
-
-    def _rows(self, columns: Sequence[str]) -> tuple[str, pa.Table]:
         rows = find_rows(self._layout, self._entry)
-        return f"{rows.path}, {self._entry.id}", rows.columns(columns)
+        table = rows.columns((*NUMBERS, *streams))
+        check_numbers(table, rows, self._entry)
+        return f"{rows.path}, {self._entry.id}", table
 
     @property
     def _sidecar(self) -> Path:
