@@ -8,7 +8,7 @@ from transformers import Qwen2_5_VLConfig
 
 from benchmarks.real_shape import random_model
 from benchmarks.workload import Workload
-from pipeline.config import Params
+from pipeline.base.config import Params
 from pipeline.vlm.loading import load_whole, pixel_settings
 from pipeline.vlm.qwen import FrozenVLM
 

@@ -31,7 +31,7 @@ from zarr.codecs.numcodecs import Shuffle
 
 from benchmarks.timing import arguments, at_least, report
 from benchmarks.workload import ROWS_AN_EPISODE, write_recordings
-from pipeline.config import Source, load_params
+from pipeline.base.config import Source, load_params
 from pipeline.extraction import extract
 from pipeline.recordings import open_recordings
 from pipeline.store.archive.codecs import (

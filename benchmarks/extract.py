@@ -49,7 +49,7 @@ from benchmarks.real_shape import write_shell
 from benchmarks.stage_one import StageOne
 from benchmarks.timing import Work, arguments, at_least, race, report
 from benchmarks.workload import Workload, params_of, write_recordings
-from pipeline.digests import ContentDigests
+from pipeline.base.digests import ContentDigests
 from pipeline.vlm.demo_checkpoint import write_demo_checkpoint
 
 _NOISE = {"float32": 1e-4, "bfloat16": 0.1}

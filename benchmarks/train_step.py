@@ -20,8 +20,8 @@ import torch
 from benchmarks.flops import peak_flops
 from benchmarks.stores import write_store
 from benchmarks.timing import Work, arguments, at_least, at_most, race, report
+from pipeline.base.config import TrainHeadParams, load_params
 from pipeline.batches import Draw, Feed, Windows
-from pipeline.config import TrainHeadParams, load_params
 from pipeline.models.cost import flop_table
 from pipeline.sampling import split_by_episode
 from pipeline.store import Batch, FeatureStore

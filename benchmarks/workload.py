@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps
 from tqdm import tqdm
 
-from pipeline.config import Params
-from pipeline.digests import ContentDigests
+from pipeline.base.config import Params
+from pipeline.base.digests import ContentDigests
 from pipeline.extraction.check import CheckedEpisode, check_episodes
 from pipeline.extraction.layout import build_arrays, lay_out
 from pipeline.extraction.rows import Span, spans_of

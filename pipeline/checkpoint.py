@@ -14,8 +14,8 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.config import TrainHeadParams
-from pipeline.durable import (
+from pipeline.base.config import TrainHeadParams
+from pipeline.base.durable import (
     DIGEST,
     check_digest,
     read_tensors,
@@ -24,9 +24,9 @@ from pipeline.durable import (
     write_tensors,
     write_with_digest,
 )
-from pipeline.errors import CheckpointIncomplete, CheckpointMismatch, PipelineError
+from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch, PipelineError
+from pipeline.base.ownership import OutputKind
 from pipeline.normalization import Normalization
-from pipeline.ownership import OutputKind
 from pipeline.store import FeatureStore
 
 # torch takes over a second to import, and what only asks whether a training is finished needs none.

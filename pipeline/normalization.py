@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import CheckpointMismatch, NumericsError
+from pipeline.base.errors import CheckpointMismatch, NumericsError
 
 Block = NDArray[Any] | tuple[NDArray[Any], NDArray[np.bool_]]
 """Rows of values, or such rows and which of their values are valid."""

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import ConfigError, RecordingError
+from pipeline.base.errors import ConfigError, RecordingError
 from pipeline.recordings import Channels, RecordedAction, Recording, Stream
 
 ActionRotation = Literal["rotvec", "euler_delta"]

@@ -24,8 +24,8 @@ if __name__ == "__main__":  # here, for --help waits for no import below
 import time
 from pathlib import Path
 
-from pipeline.config import Params
-from pipeline.errors import ConfigError
+from pipeline.base.config import Params
+from pipeline.base.errors import ConfigError
 from pipeline.store.archive import archive, restore
 
 

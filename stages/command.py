@@ -38,8 +38,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from pipeline.config import Params, described_keys, load_params
-from pipeline.errors import PipelineError
+from pipeline.base.config import Params, described_keys, load_params
+from pipeline.base.errors import PipelineError
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,10 @@ from stages.command import run
 if __name__ == "__main__":  # here, for --help waits for no import below
     raise SystemExit(run(__doc__ or "", "stages.compare", sections=("compare",)))
 
-from pipeline.config import Params
-from pipeline.durable import disk_full_named, fresh
+from pipeline.base.config import Params
+from pipeline.base.durable import disk_full_named, fresh
+from pipeline.base.ownership import REPORT, OutputKind, begins_with, claim, refuse_foreign
 from pipeline.evaluation import experiment_rows, experiments_table, read_experiments, write_rows
-from pipeline.ownership import REPORT, OutputKind, begins_with, claim, refuse_foreign
 from pipeline.report import write_report
 from pipeline.report.evaluation.comparison import comparison_report
 

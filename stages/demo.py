@@ -18,8 +18,8 @@ if __name__ == "__main__":  # here, for --help waits for no import below
 
 from pathlib import Path
 
-from pipeline.config import Params
-from pipeline.durable import recover_folder, replace_folder, write_document
+from pipeline.base.config import Params
+from pipeline.base.durable import recover_folder, replace_folder, write_document
 from pipeline.simulation.demo_recordings import DEMO, MARKER, refuse_foreign, write_demo_recordings
 from pipeline.vlm.demo_checkpoint import write_demo_checkpoint
 

@@ -21,8 +21,8 @@ if __name__ == "__main__":  # here, for --help waits for no import below
         run(__doc__ or "", "stages.doctor", sections=("data", "vlm", "extract", "train_head"))
     )
 
-from pipeline.config import Params
-from pipeline.errors import PipelineError
+from pipeline.base.config import Params
+from pipeline.base.errors import PipelineError
 from pipeline.machine import Finding, described, examine
 
 

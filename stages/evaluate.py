@@ -16,11 +16,12 @@ if __name__ == "__main__":  # here, for --help waits for no import below
 from functools import partial
 from pathlib import Path
 
+from pipeline.base.config import Params
+from pipeline.base.device import resolve_device
+from pipeline.base.durable import write_document
+from pipeline.base.ownership import REPORT, claim, refuse_foreign
 from pipeline.batches import open_store
 from pipeline.checkpoint import PolicyCheckpoint, find_policy, load_policy
-from pipeline.config import Params
-from pipeline.device import resolve_device
-from pipeline.durable import write_document
 from pipeline.evaluation import (
     JUDGED,
     Judgement,
@@ -30,7 +31,6 @@ from pipeline.evaluation import (
     table,
     write_tables,
 )
-from pipeline.ownership import REPORT, claim, refuse_foreign
 from pipeline.report import write_report
 from pipeline.report.evaluation.evaluation import evaluation_report
 from pipeline.store import FeatureStore, check_trailers

@@ -28,7 +28,7 @@ from stages.command import run
 if __name__ == "__main__":  # here, for --help waits for no import below
     raise SystemExit(run(__doc__ or "", "stages.extract", sections=("data", "vlm", "extract")))
 
-from pipeline.config import Params
+from pipeline.base.config import Params
 from pipeline.extraction import extract
 
 

@@ -21,7 +21,7 @@ from stages.command import run
 if __name__ == "__main__":  # here, for --help waits for no import below
     raise SystemExit(run(__doc__ or "", "stages.finetune", sections=("finetune", "train_head")))
 
-from pipeline.config import Params
+from pipeline.base.config import Params
 from pipeline.finetuning import Live, head_params, next_steps, out_of_memory_named
 from pipeline.finetuning.params import left_out
 from pipeline.sampling import split_by_episode

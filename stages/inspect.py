@@ -30,10 +30,10 @@ if __name__ == "__main__":  # here, for --help waits for no import below
 
 from collections.abc import Iterator
 
-from pipeline.config import Params
+from pipeline.base.config import Params
+from pipeline.base.ownership import REPORT, claim
 from pipeline.inspection.store import inspect_store
 from pipeline.inspection.subject import Subject, subject_of
-from pipeline.ownership import REPORT, claim
 from pipeline.plots.style import boxes
 from pipeline.report import Notice, Notices, Report, write_report
 from pipeline.report.inspection.recording import recordings_report

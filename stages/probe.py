@@ -22,8 +22,8 @@ if __name__ == "__main__":  # here, for --help waits for no import below
 
 from functools import partial
 
-from pipeline.config import Params
-from pipeline.ownership import REPORT, claim, refuse_foreign, release
+from pipeline.base.config import Params
+from pipeline.base.ownership import REPORT, claim, refuse_foreign, release
 from pipeline.plots.probe import write_probe_plots
 from pipeline.probing import advice, probe, table, write_tables
 from pipeline.store import FeatureStore, check_trailers

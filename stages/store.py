@@ -35,9 +35,9 @@ if __name__ == "__main__":  # here, for --help waits for no import below
 import sys
 from pathlib import Path
 
-from pipeline.amounts import size
-from pipeline.config import Params, StoresParams
-from pipeline.errors import ConfigError, PipelineError, StoreLocked
+from pipeline.base.config import Params, StoresParams
+from pipeline.base.errors import ConfigError, PipelineError, StoreLocked
+from pipeline.base.format import size
 from pipeline.store import FeatureStore
 from pipeline.store.housekeeping import (
     Inventory,

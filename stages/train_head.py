@@ -24,7 +24,7 @@ from stages.command import run
 if __name__ == "__main__":  # here, for --help waits for no import below
     raise SystemExit(run(__doc__ or "", "stages.train_head", sections=("train_head",)))
 
-from pipeline.config import Params
+from pipeline.base.config import Params
 from pipeline.sampling import split_by_episode
 from pipeline.store import build_lock, check_trailers
 from pipeline.training.run import finished_run, open_run

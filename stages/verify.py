@@ -23,8 +23,8 @@ if __name__ == "__main__":  # here, for --help waits for no import below
         run(__doc__ or "", "stages.verify", shorthands=SHORTHANDS, sections=("verify",))
     )
 
-from pipeline.config import Params
-from pipeline.errors import NumericsError, StoreIncomplete
+from pipeline.base.config import Params
+from pipeline.base.errors import NumericsError, StoreIncomplete
 from pipeline.extraction.reextract import reextract
 from pipeline.extraction.repair import repair, with_identity
 from pipeline.store.integrity import verify

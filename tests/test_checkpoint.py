@@ -8,6 +8,9 @@ from typing import Any
 import pytest
 import torch
 
+from pipeline.base.config import TrainHeadParams
+from pipeline.base.durable import read_document, write_document, write_with_digest
+from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch
 from pipeline.checkpoint import (
     PolicyCheckpoint,
     describe,
@@ -19,9 +22,6 @@ from pipeline.checkpoint import (
     source_differences,
     source_of,
 )
-from pipeline.config import TrainHeadParams
-from pipeline.durable import read_document, write_document, write_with_digest
-from pipeline.errors import CheckpointIncomplete, CheckpointMismatch
 from pipeline.models import Policy
 from pipeline.store import FeatureStore
 from pipeline.training import fit_normalization

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import CheckpointMismatch, NumericsError
+from pipeline.base.errors import CheckpointMismatch, NumericsError
 from pipeline.normalization import ChannelStatistics, Normalization, fit_channels
 
 

@@ -16,11 +16,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from pipeline.base.config import Params, Source, TrainHeadParams, VLMParams
+from pipeline.base.digests import ContentDigests
+from pipeline.base.errors import RecordingError
 from pipeline.checkpoint import policy_shape
-from pipeline.config import Params, Source, TrainHeadParams, VLMParams
 from pipeline.datasets import UnifiedVLADataset
-from pipeline.digests import ContentDigests
-from pipeline.errors import RecordingError
 from pipeline.extraction import extract
 from pipeline.models import DiffusionActionExpert, Policy, RegressionActionExpert
 from pipeline.models.noise_schedule import NoiseSchedule

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.config import load_params
+from pipeline.base.config import load_params
 from pipeline.store import FeatureStore
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import ConfigError, StoreMismatch
+from pipeline.base.errors import ConfigError, StoreMismatch
 from pipeline.sampling import TickSampler, split_by_episode, ticks_by_source
 from pipeline.sampling.split import hash64
 from pipeline.store import FeatureStore

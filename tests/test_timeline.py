@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipeline.errors import ConfigError, RecordingError
+from pipeline.base.errors import ConfigError, RecordingError
 from pipeline.recordings import CameraStream, Channels, RecordedAction, Recording, Stream
 from pipeline.timeline import (
     build_timeline,

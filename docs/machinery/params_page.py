@@ -1,4 +1,4 @@
-"""The page of parameters, written from the models in `pipeline.config`.
+"""The page of parameters, written from the models in `pipeline.base.config`.
 
 It goes by their JSON schema, pydantic's own description of them, and refuses what it has no words
 for: a key is never left out or half described.
@@ -8,7 +8,7 @@ import json
 from collections.abc import Iterator
 from typing import Any
 
-from pipeline.config import Params
+from pipeline.base.config import Params
 
 Schema = dict[str, Any]
 

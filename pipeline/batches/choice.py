@@ -7,9 +7,9 @@ from typing import Literal
 
 import torch
 
-from pipeline.amounts import size
+from pipeline.base.errors import ConfigError
+from pipeline.base.format import size
 from pipeline.batches.scratch import restored
-from pipeline.errors import ConfigError
 from pipeline.store import FeatureStore
 from pipeline.store.archive import is_archive
 from pipeline.store.gather import WIDE

@@ -9,9 +9,9 @@ from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
 
-from pipeline.amounts import size
-from pipeline.durable import free_bytes
-from pipeline.errors import DiskFull
+from pipeline.base.durable import free_bytes
+from pipeline.base.errors import DiskFull
+from pipeline.base.format import size
 from pipeline.store.archive import restore
 from pipeline.store.archive.manifest import Manifest, read_manifest
 

@@ -10,7 +10,7 @@ from jaxtyping import Float64, Int64, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.errors import StoreMismatch
+from pipeline.base.errors import StoreMismatch
 from pipeline.store import Batch
 
 Images = Mapping[str, NDArray[np.uint8]]

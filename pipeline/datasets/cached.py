@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PurePath
 
-from pipeline.errors import StoreMismatch
+from pipeline.base.errors import StoreMismatch
 from pipeline.recordings import Recording
 from pipeline.recordings.reader import absolute
 from pipeline.store import Episode, FeatureStore

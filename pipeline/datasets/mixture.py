@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from torch.utils.data import DataLoader, Sampler
 
-from pipeline.config import Source
+from pipeline.base.config import Source
+from pipeline.base.errors import ConfigError
 from pipeline.datasets.batch import unified_collate_fn
 from pipeline.datasets.unified import UnifiedVLADataset
-from pipeline.errors import ConfigError
 from pipeline.sampling import TickSampler
 from pipeline.store import FeatureStore
 

@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from pipeline.durable import disk_full_named, fresh
+from pipeline.base.durable import disk_full_named, fresh
 
 
 def aligned(lines: Sequence[Sequence[str]], left: int = 1) -> list[str]:

@@ -9,9 +9,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, get_args
 
+from pipeline.base.config import FusionStrategy, ModelType
+from pipeline.base.errors import ConfigError
 from pipeline.checkpoint import describe, differences
-from pipeline.config import FusionStrategy, ModelType
-from pipeline.errors import ConfigError
 from pipeline.evaluation.judged import JUDGED
 from pipeline.evaluation.predictions import BASELINES, METHODS
 from pipeline.evaluation.scores import Group

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.base.digests import file_digest
+from pipeline.base.errors import RecordingError
 from pipeline.batches import Ticks
-from pipeline.digests import file_digest
-from pipeline.errors import RecordingError
 from pipeline.recordings import CameraStream, Recording, content_digest, open_recording
 from pipeline.store import Episode, FeatureStore
 

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from pipeline.base.errors import CheckpointMismatch
 from pipeline.batches import Ticks, Windows
 from pipeline.checkpoint import PolicyCheckpoint, describe, source_differences, source_of
-from pipeline.errors import CheckpointMismatch
 from pipeline.evaluation.predictions import FeedMaker, Predictions, baselines, predict
 from pipeline.evaluation.scores import Comparison, Group, compare
 from pipeline.models import Trainable, action_groups

@@ -7,9 +7,9 @@ from typing import Any
 
 import torch
 
+from pipeline.base.config import EvaluateParams
 from pipeline.batches import Windows
 from pipeline.checkpoint import PolicyCheckpoint, source_of
-from pipeline.config import EvaluateParams
 from pipeline.evaluation.curves import Curves, read_curves
 from pipeline.evaluation.held_out import held_out_ticks, judge, named_as_in
 from pipeline.evaluation.modalities import ModalityStudy, judge_modalities

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from tqdm import tqdm
 
+from pipeline.base.errors import NumericsError
 from pipeline.batches import Draw, Feed, Prefetch, Ticks, Windows, draws
-from pipeline.errors import NumericsError
 from pipeline.models import Observation, Trainable
 from pipeline.store import FeatureStore, place
 

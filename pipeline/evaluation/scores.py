@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.channels import hardly_moving
+from pipeline.base.channels import hardly_moving
 from pipeline.evaluation.predictions import BASELINES, Actions, Predictions
 
 Errors = NDArray[np.float64]

@@ -4,8 +4,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.channels import named
-from pipeline.durable import write_document
+from pipeline.base.channels import named
+from pipeline.base.durable import write_document
 from pipeline.evaluation.cells import aligned, cell, numbers, ratio, write_rows
 from pipeline.evaluation.modalities import ModalityStudy
 from pipeline.evaluation.modality_tables import best_baseline, modality_rows, stream_rows

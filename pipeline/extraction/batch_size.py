@@ -5,7 +5,7 @@ from typing import Literal
 
 import torch
 
-from pipeline.errors import VLMError
+from pipeline.base.errors import VLMError
 
 _FIRST = 8
 """Fewer are slower on any device; where they do not fit, memory running out says so."""

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from tqdm import tqdm
 
-from pipeline.config import Params
-from pipeline.errors import RecordingError, VLMError
+from pipeline.base.config import Params
+from pipeline.base.errors import RecordingError, VLMError
 from pipeline.extraction.survey import Survey, SurveyedEpisode, refuse_bad
 from pipeline.recordings import BadEpisode
 from pipeline.recordings.embodiment import Embodiment, common_embodiment

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from distributed import Client
 
-from pipeline.errors import ConfigError, PipelineError
+from pipeline.base.errors import ConfigError, PipelineError
 from pipeline.extraction.connection import connected
 from pipeline.extraction.handout import Handout, Task
 from pipeline.extraction.job import Job, Piece, WrittenRows

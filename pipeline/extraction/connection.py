@@ -12,9 +12,9 @@ from multiprocessing import active_children, resource_tracker
 import dask
 from distributed import Client, LocalCluster
 
-from pipeline.config import ExtractParams
-from pipeline.errors import PipelineError
-from pipeline.scheduler import client_of, private_cluster, quiet
+from pipeline.base.config import ExtractParams
+from pipeline.base.errors import PipelineError
+from pipeline.base.scheduler import client_of, private_cluster, quiet
 
 _SETTING = "extract.workers"
 _LOOK_EVERY_S = 0.05

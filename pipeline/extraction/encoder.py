@@ -8,7 +8,7 @@ from typing import Any, Literal, NoReturn
 import torch
 from numpy.typing import NDArray
 
-from pipeline.errors import NumericsError
+from pipeline.base.errors import NumericsError
 from pipeline.extraction.batch_size import BatchSize
 from pipeline.extraction.rows import ReadyRow
 from pipeline.vlm.preparation import Layout

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.config import Params
-from pipeline.digests import ContentDigests, joint_digest
+from pipeline.base.config import Params
+from pipeline.base.digests import ContentDigests, joint_digest
 from pipeline.extraction.survey import Survey
 from pipeline.extraction.takeover import take_over
 from pipeline.extraction.work import Computed, Work

@@ -19,7 +19,7 @@ import numpy as np
 from distributed import Client, Future, KilledWorker, as_completed
 from tqdm import tqdm
 
-from pipeline.errors import PipelineError, RecordingError
+from pipeline.base.errors import PipelineError, RecordingError
 from pipeline.extraction.job import Outcome, Piece, WrittenRows
 from pipeline.extraction.worker import compute_pieces
 

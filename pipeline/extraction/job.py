@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.config import Params
+from pipeline.base.config import Params
 from pipeline.recordings import Recording
 from pipeline.vlm.feature_spec import FeatureSpec
 

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.amounts import size
-from pipeline.config import Params
-from pipeline.durable import free_bytes
-from pipeline.errors import DiskFull, NumericsError
+from pipeline.base.config import Params
+from pipeline.base.durable import free_bytes
+from pipeline.base.errors import DiskFull, NumericsError
+from pipeline.base.format import size
 from pipeline.extraction.check import CheckedEpisode, embodiment_of
 from pipeline.extraction.plan import store_bytes
 from pipeline.extraction.survey import Survey, shown_path

@@ -5,11 +5,11 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-from pipeline.durable import KEPT, previous_path
-from pipeline.errors import StoreIncomplete, StoreMismatch
+from pipeline.base.durable import KEPT, previous_path
+from pipeline.base.errors import StoreIncomplete, StoreMismatch
+from pipeline.base.ownership import refuse_foreign, remove_folder
 from pipeline.extraction.plan import spec_differences
 from pipeline.extraction.survey import Survey
-from pipeline.ownership import refuse_foreign, remove_folder
 from pipeline.recordings.embodiment import Embodiment
 from pipeline.store import Donor, StoreBuild, part_path, read_plan
 from pipeline.store.places import MERGED, STORE, is_store

@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pipeline.amounts import duration, size
-from pipeline.config import DataParams, Params
+from pipeline.base.config import DataParams, Params
+from pipeline.base.format import duration, size
 from pipeline.extraction.check import CheckedEpisode
 from pipeline.extraction.survey import Survey
 from pipeline.store import FEATURES, Donor
@@ -136,7 +136,7 @@ def dtype_warnings(params: Params, missing: int) -> tuple[str, ...]:
 
     What the workers of a dask scheduler have is not known.
     """
-    from pipeline.device import resolve_device  # torch takes a second to import
+    from pipeline.base.device import resolve_device  # torch takes a second to import
 
     narrow, workers = params.vlm.dtype, params.extract.workers
     if not missing or narrow == "float32" or isinstance(workers, str):

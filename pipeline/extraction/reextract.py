@@ -11,9 +11,9 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.config import Params
-from pipeline.digests import ContentDigests
-from pipeline.errors import StoreMismatch
+from pipeline.base.config import Params
+from pipeline.base.digests import ContentDigests
+from pipeline.base.errors import StoreMismatch
 from pipeline.extraction.encoder import Encoder
 from pipeline.extraction.places import ledger_path
 from pipeline.extraction.rows import ReadyRow, RowPreparation, in_background, spans_of

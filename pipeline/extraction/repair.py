@@ -6,15 +6,15 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from pipeline.config import Params
-from pipeline.digests import ContentDigests
-from pipeline.durable import disk_full_named
-from pipeline.errors import StoreMismatch
+from pipeline.base.config import Params
+from pipeline.base.digests import ContentDigests
+from pipeline.base.durable import disk_full_named
+from pipeline.base.errors import StoreMismatch
+from pipeline.base.ownership import remove_folder
 from pipeline.extraction.layout import build_arrays, check_space, lay_out
 from pipeline.extraction.places import ledger_path
 from pipeline.extraction.run import sound_episodes
 from pipeline.extraction.survey import survey
-from pipeline.ownership import remove_folder
 from pipeline.store import FEATURES, StoreBuild, build_lock, part_path, read_plan, recover
 from pipeline.store.integrity.findings import Damage, Findings
 from pipeline.store.integrity.repair import (

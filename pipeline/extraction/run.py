@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.config import Params
-from pipeline.device import resolve_device
-from pipeline.digests import ContentDigests
-from pipeline.durable import free_bytes
+from pipeline.base.config import Params
+from pipeline.base.device import resolve_device
+from pipeline.base.digests import ContentDigests
+from pipeline.base.durable import free_bytes
 from pipeline.extraction.check import CheckedEpisode, check_episodes, embodiment_of
 from pipeline.extraction.fill import ExtractionReport, fill, rate_name
 from pipeline.extraction.layout import build_arrays, check_space, lay_out

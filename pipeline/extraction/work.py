@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.config import Params
-from pipeline.digests import ContentDigests
+from pipeline.base.config import Params
+from pipeline.base.digests import ContentDigests
 from pipeline.recordings import Recording
 from pipeline.store import Donor, StoreBuild
 from pipeline.vlm.feature_spec import FeatureSpec

@@ -17,8 +17,8 @@ import torch
 from distributed import Worker, WorkerPlugin, get_worker
 from numpy.typing import NDArray
 
-from pipeline.digests import file_digest
-from pipeline.errors import ConfigError, NumericsError, StoreIncomplete
+from pipeline.base.digests import file_digest
+from pipeline.base.errors import ConfigError, NumericsError, StoreIncomplete
 from pipeline.extraction.encoder import Encoder
 from pipeline.extraction.job import Came, Job, Outcome, Piece, WrittenRows
 from pipeline.extraction.rows import KnownRow, ReadyRow, RowPreparation, Span

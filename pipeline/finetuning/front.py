@@ -9,12 +9,12 @@ from typing import Any
 import torch
 from torch import nn
 
+from pipeline.base.config import FinetuneParams, Params, VLMParams
+from pipeline.base.digests import file_digest
+from pipeline.base.durable import read_document, write_with_digest
+from pipeline.base.errors import ConfigError
 from pipeline.batches import Draw, Windows
 from pipeline.checkpoint import DOCUMENT
-from pipeline.config import FinetuneParams, Params, VLMParams
-from pipeline.digests import file_digest
-from pipeline.durable import read_document, write_with_digest
-from pipeline.errors import ConfigError
 from pipeline.finetuning.feed import LiveFeed
 from pipeline.finetuning.recordings import (
     check_recordings,

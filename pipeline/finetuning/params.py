@@ -2,8 +2,8 @@
 
 from pydantic import ValidationError
 
-from pipeline.config import Params, TrainHeadParams
-from pipeline.errors import ConfigError
+from pipeline.base.config import Params, TrainHeadParams
+from pipeline.base.errors import ConfigError
 
 _REPLACED = (
     "batch_size",

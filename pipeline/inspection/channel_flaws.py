@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-from pipeline.channels import hardly_moving, named
+from pipeline.base.channels import hardly_moving, named
 from pipeline.inspection.clocks import usual_step
 from pipeline.inspection.contact import force_columns
 from pipeline.inspection.facts import EpisodeView, Flaw

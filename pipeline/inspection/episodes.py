@@ -8,8 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
-from pipeline.config import DataParams
-from pipeline.errors import RecordingError
+from pipeline.base.config import DataParams
+from pipeline.base.errors import RecordingError
 from pipeline.inspection.facts import EpisodeView, Flaw
 from pipeline.recordings import CameraStream, RecordedAction, Recording, Stream
 from pipeline.timeline import ActionRotation, Timeline, build_timeline

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from pipeline.errors import RecordingError
+from pipeline.base.errors import RecordingError
 from pipeline.inspection.channel_flaws import channel_flaws
 from pipeline.inspection.clock_flaws import clock_flaws
 from pipeline.inspection.count_flaws import count_flaws

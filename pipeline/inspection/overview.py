@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from pipeline.config import Params
-from pipeline.errors import StoreMismatch
+from pipeline.base.config import Params
+from pipeline.base.errors import StoreMismatch
 from pipeline.inspection.episodes import view_episode
 from pipeline.inspection.facts import EpisodeView, Flaw
 from pipeline.inspection.flaws import find_flaws

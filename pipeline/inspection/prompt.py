@@ -5,8 +5,8 @@ from collections import Counter
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.config import VLMParams
-from pipeline.errors import RecordingError
+from pipeline.base.config import VLMParams
+from pipeline.base.errors import RecordingError
 from pipeline.inspection.facts import EpisodeView, PromptToken, PromptView
 from pipeline.vlm.feature_spec import FeatureSpec
 from pipeline.vlm.preparation import PreparedRow, Preparer

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.config import Params
+from pipeline.base.config import Params
 from pipeline.datasets import UnifiedBatch, UnifiedVLADataset, unified_collate_fn
 from pipeline.inspection.facts import EpisodeView
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.channels import named
+from pipeline.base.channels import named
 from pipeline.inspection.contact import force_columns
 from pipeline.inspection.facts import EpisodeView, Flaw
 from pipeline.inspection.runs import runs

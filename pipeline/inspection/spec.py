@@ -7,8 +7,8 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from pipeline.config import Params
-from pipeline.digests import ContentDigests
+from pipeline.base.config import Params
+from pipeline.base.digests import ContentDigests
 from pipeline.extraction.places import ledger_path
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 

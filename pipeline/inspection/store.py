@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.config import InspectParams
+from pipeline.base.config import InspectParams
 from pipeline.inspection.facts import Flaw
 from pipeline.inspection.store_coverage import Ages, EpisodeCoverage, ages, coverage
 from pipeline.inspection.store_duplicates import Duplicates, Still, Twins, find_duplicates

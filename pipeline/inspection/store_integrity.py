@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import StoreIncomplete
+from pipeline.base.errors import StoreIncomplete
 from pipeline.store import FEATURES, FeatureStore, place
 from pipeline.store.chunks import ChunkFiles, row_checksums
 from pipeline.store.gather import WIDE

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 
-from pipeline.config import InspectParams, Params, Source
-from pipeline.errors import ConfigError, RecordingError
-from pipeline.ownership import REPORT, refuse_foreign
+from pipeline.base.config import InspectParams, Params, Source
+from pipeline.base.errors import ConfigError, RecordingError
+from pipeline.base.ownership import REPORT, refuse_foreign
 from pipeline.recordings import Opened, open_recordings
 from pipeline.recordings.finding import hub_hint, meant
 

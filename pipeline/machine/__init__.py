@@ -9,8 +9,8 @@ from importlib import import_module
 from queue import Empty, SimpleQueue
 from threading import Thread
 
-from pipeline.config import Params
-from pipeline.errors import PipelineError
+from pipeline.base.config import Params
+from pipeline.base.errors import PipelineError
 from pipeline.machine.findings import Finding, described, missing, note
 
 __all__ = ["GROUPS", "Finding", "described", "examine"]

@@ -4,7 +4,7 @@ from importlib import import_module
 
 import torch
 
-from pipeline.config import Params
+from pipeline.base.config import Params
 from pipeline.machine.findings import Finding, missing, note, ok
 from pipeline.machine.gpu import usable_device
 from pipeline.machine.packages import importable

@@ -5,9 +5,9 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from pipeline.amounts import size
-from pipeline.config import Params, VLMParams
-from pipeline.errors import VLMError
+from pipeline.base.config import Params, VLMParams
+from pipeline.base.errors import VLMError
+from pipeline.base.format import size
 from pipeline.machine.findings import Finding, missing, note, ok
 from pipeline.machine.gpu import GPU, read_accelerator, usable_device
 from pipeline.simulation.demo_recordings import MARKER

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import av
 
-from pipeline.config import Params, Source
-from pipeline.errors import RecordingError
+from pipeline.base.config import Params, Source
+from pipeline.base.errors import RecordingError
 from pipeline.machine.decoders import CLIPS, decoding_trouble
 from pipeline.machine.findings import Finding, missing, note, ok
 from pipeline.recordings import Opened, Recording, open_recordings

@@ -5,7 +5,7 @@ from base64 import b64decode
 
 import av
 
-from pipeline.config import Params
+from pipeline.base.config import Params
 from pipeline.machine.findings import Finding, note, ok
 
 CLIPS = {

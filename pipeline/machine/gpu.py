@@ -8,10 +8,10 @@ from pathlib import Path
 
 import torch
 
-from pipeline.amounts import size
-from pipeline.config import Params
-from pipeline.device import resolve_device
-from pipeline.errors import ConfigError
+from pipeline.base.config import Params
+from pipeline.base.device import resolve_device
+from pipeline.base.errors import ConfigError
+from pipeline.base.format import size
 from pipeline.machine.findings import Finding, missing, note, ok
 
 _WHEELS = ((13.0, "cu130"), (12.8, "cu128"), (12.0, "cu126"))

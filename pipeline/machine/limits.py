@@ -6,8 +6,8 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.amounts import size
-from pipeline.config import Params
+from pipeline.base.config import Params
+from pipeline.base.format import size
 from pipeline.machine.findings import Finding, note, ok
 from pipeline.store.memory import memory_bytes
 

@@ -9,7 +9,7 @@ from dvc.config import Config, ConfigError
 from dvc_objects.fs import LocalFileSystem
 from dvc_objects.fs.generic import test_links as try_links
 
-from pipeline.config import Params
+from pipeline.base.config import Params
 from pipeline.machine.findings import Finding, missing, note, ok
 
 LINKS = ("reflink", "hardlink", "symlink", "copy")

@@ -12,7 +12,7 @@ from typing import Any
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
-from pipeline.config import Params
+from pipeline.base.config import Params
 from pipeline.machine.findings import Finding, missing, ok
 
 PROJECT = "vla-feature-cache"

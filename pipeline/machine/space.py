@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from pipeline.amounts import size
-from pipeline.config import Params
-from pipeline.durable import free_bytes
-from pipeline.errors import RecordingError, StoreMismatch, VLMError
+from pipeline.base.config import Params
+from pipeline.base.durable import free_bytes
+from pipeline.base.errors import RecordingError, StoreMismatch, VLMError
+from pipeline.base.format import size
 from pipeline.extraction.check import CheckedEpisode
 from pipeline.extraction.layout import build_arrays
 from pipeline.extraction.plan import store_bytes

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from pipeline.errors import ConfigError
+from pipeline.base.errors import ConfigError
 
 Projected = tuple[
     Float[Tensor, "batch head source head_dim"], Float[Tensor, "batch head source head_dim"]

@@ -2,8 +2,8 @@
 
 from torch import nn
 
-from pipeline.config import TrainHeadParams
-from pipeline.errors import ConfigError
+from pipeline.base.config import TrainHeadParams
+from pipeline.base.errors import ConfigError
 from pipeline.models.diffusion import DiffusionActionExpert
 from pipeline.models.expert import ActionExpert
 from pipeline.models.feature_encoder import FeatureEncoder

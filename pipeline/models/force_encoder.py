@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from pipeline.errors import ConfigError
+from pipeline.base.errors import ConfigError
 from pipeline.models.sensor_encoder import SensorEncoder
 
 _FORCE_SHARE = 4

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int, Int64
 from torch import Tensor
 
-from pipeline.errors import ObservationError
+from pipeline.base.errors import ObservationError
 from pipeline.models.observation import STREAMS, Observation
 from pipeline.models.policy import Policy
 

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from pipeline.errors import ConfigError
+from pipeline.base.errors import ConfigError
 
 ScheduleKind = Literal["cosine", "linear"]
 Prediction = Literal["epsilon", "sample", "v"]

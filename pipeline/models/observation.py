@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pipeline.errors import CheckpointMismatch
+from pipeline.base.errors import CheckpointMismatch
 from pipeline.models.expert import uniform
 
 STREAMS = ("features", "sensor", "state")

@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from pipeline.config import TrainHeadParams
-from pipeline.errors import CheckpointMismatch
+from pipeline.base.config import TrainHeadParams
+from pipeline.base.errors import CheckpointMismatch
 from pipeline.models.building import build_encoders, build_expert
 from pipeline.models.fusion import build_fusion
 from pipeline.models.normalizer import Normalizer, Statistics, StreamStatistics

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from torch import Tensor, nn
 
-from pipeline.config import FusionStrategy, ModelType, TrainHeadParams, TuningParams, VLMParams
-from pipeline.errors import ObservationError, VLMError
+from pipeline.base.config import FusionStrategy, ModelType, TrainHeadParams, TuningParams, VLMParams
+from pipeline.base.errors import ObservationError, VLMError
 from pipeline.models.live_observation import LiveObservation, Seen, observation_of, target_of
 from pipeline.models.live_policy import LivePolicy
 from pipeline.models.normalizer import StreamStatistics

@@ -10,8 +10,8 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from pipeline.amounts import size
-from pipeline.channels import PROFILE_CHANNELS, unnumbered
+from pipeline.base.channels import PROFILE_CHANNELS, unnumbered
+from pipeline.base.format import size
 from pipeline.inspection.facts import ChannelStatistics
 from pipeline.inspection.store import Ages, ArraySize, EpisodeCoverage, StoreView
 from pipeline.plots.style import GRID, INK, PALETTE, canvas

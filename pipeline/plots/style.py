@@ -19,7 +19,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter, StrMethodFormatter
 
-from pipeline.durable import disk_full_named, fresh
+from pipeline.base.durable import disk_full_named, fresh
 
 LABELS = {
     "policy": "policy",

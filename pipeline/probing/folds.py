@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import StoreMismatch
+from pipeline.base.errors import StoreMismatch
 from pipeline.sampling import episodes_by_recording
 from pipeline.store import Episode, FeatureStore
 

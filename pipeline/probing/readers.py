@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.errors import NumericsError
+from pipeline.base.errors import NumericsError
 from pipeline.probing.projection import Projection
 from pipeline.store import FeatureStore, place
 

@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.errors import NumericsError
+from pipeline.base.errors import NumericsError
 from pipeline.probing.moments import Moments, total, variance
 from pipeline.probing.projection import STILL
 

@@ -9,8 +9,8 @@ from typing import NoReturn, TypeVar
 import torch
 from tqdm import tqdm
 
-from pipeline.config import ProbeParams
-from pipeline.errors import StoreMismatch
+from pipeline.base.config import ProbeParams
+from pipeline.base.errors import StoreMismatch
 from pipeline.probing.accumulation import Table
 from pipeline.probing.effort import foretold
 from pipeline.probing.folds import Folds, fold_by_recording

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
+from pipeline.base.errors import NumericsError
 from pipeline.batches import Prefetch, Windows, draws
-from pipeline.errors import NumericsError
 from pipeline.probing.projection import GroupedProjection
 from pipeline.store import Batch, FeatureStore, place
 

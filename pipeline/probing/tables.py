@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.durable import write_document
+from pipeline.base.durable import write_document
 from pipeline.evaluation.cells import aligned, cell, numbers, write_rows
 from pipeline.probing.ranking import gain_error, ranked, recommend
 from pipeline.probing.ridge import Score

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.config import Source
-from pipeline.errors import RecordingError
+from pipeline.base.config import Source
+from pipeline.base.errors import RecordingError
 from pipeline.recordings.content import content_digest
 from pipeline.recordings.finding import READERS, episode_folders, listing
 from pipeline.recordings.reader import FileRecording, absolute, natural_key

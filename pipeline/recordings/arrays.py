@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import RecordingError
+from pipeline.base.errors import RecordingError
 
 Numbers = NDArray[Any]
 """An array of real numbers of any width."""

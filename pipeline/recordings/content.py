@@ -5,7 +5,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from pipeline.digests import joint_digest
+from pipeline.base.digests import joint_digest
 from pipeline.recordings.recording import Recording
 
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pipeline.errors import StoreMismatch
+from pipeline.base.errors import StoreMismatch
 from pipeline.recordings.recording import Channels, Recording, Stream
 
 _NO_CHANNELS = Channels((), ())

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from fnmatch import filter as matching
 from pathlib import Path
 
-from pipeline.config import Source
-from pipeline.errors import RecordingError
+from pipeline.base.config import Source
+from pipeline.base.errors import RecordingError
 from pipeline.recordings import lerobot, pickled, raw, windowed
 from pipeline.recordings.reader import FileRecording, absolute, natural_key
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import RecordingError
+from pipeline.base.errors import RecordingError
 from pipeline.recordings.arrays import Numbers, csv_header, member, read_csv, read_npz
 from pipeline.recordings.jpeg import JpegCamera
 from pipeline.recordings.reader import FileRecording, absolute

@@ -14,8 +14,8 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from pipeline.config import Source
-from pipeline.errors import RecordingError
+from pipeline.base.config import Source
+from pipeline.base.errors import RecordingError
 from pipeline.recordings.arrays import member, read_npz
 from pipeline.recordings.insertion import SENSOR
 from pipeline.recordings.lerobot_clock import NUMBERS, check_numbers, read_clock, stored_clock

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from pipeline.errors import RecordingError
+from pipeline.base.errors import RecordingError
 from pipeline.recordings.lerobot_layout import Entry
 from pipeline.recordings.lerobot_rows import EpisodeRows, matrix
 from pipeline.recordings.recording import check_clock, check_rising_clock

@@ -15,7 +15,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipeline.errors import RecordingError
+from pipeline.base.errors import RecordingError
 from pipeline.recordings.arrays import number, read_json
 from pipeline.recordings.reader import natural_key
 from pipeline.recordings.video import VideoSpan

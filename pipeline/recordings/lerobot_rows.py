@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from pipeline.errors import RecordingError
+from pipeline.base.errors import RecordingError
 from pipeline.recordings.jpeg import check_image, read_image
 from pipeline.recordings.lerobot_layout import Entry, Layout
 from pipeline.recordings.reader import natural_key

@@ -7,8 +7,8 @@ from collections.abc import Collection, Mapping, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
 
-from pipeline.config import Source
-from pipeline.errors import RecordingError
+from pipeline.base.config import Source
+from pipeline.base.errors import RecordingError
 from pipeline.recordings.arrays import member, read_npz
 from pipeline.recordings.insertion import (
     SENSOR,

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 
-from pipeline.config import Source
+from pipeline.base.config import Source
 from pipeline.recordings.recording import CameraStream, Recording
 
 

@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import RecordingError
+from pipeline.base.errors import RecordingError
 
 ActionKind = Literal["absolute", "velocity", "delta"]
 

@@ -19,7 +19,7 @@ from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
-from pipeline.errors import RecordingError
+from pipeline.base.errors import RecordingError
 from pipeline.recordings.recording import CameraStream
 
 _AV1_DECODERS = frozenset({"libdav1d", "libaom-av1", "libgav1"})

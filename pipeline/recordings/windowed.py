@@ -6,8 +6,8 @@ The windows may overlap or abut; `sensor()` rebuilds the stream that they were c
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
-from pipeline.config import Source
-from pipeline.errors import RecordingError
+from pipeline.base.config import Source
+from pipeline.base.errors import RecordingError
 from pipeline.recordings.arrays import member, number, read_json, read_npz
 from pipeline.recordings.insertion import (
     SENSOR,

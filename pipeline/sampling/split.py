@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import ConfigError, StoreMismatch
+from pipeline.base.errors import ConfigError, StoreMismatch
 from pipeline.store import Episode, FeatureStore
 
 _TAIL = 0.2

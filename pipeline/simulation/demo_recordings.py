@@ -16,9 +16,9 @@ from typing import Any, Final
 import numpy as np
 from tqdm import tqdm
 
-from pipeline.durable import write_document
-from pipeline.errors import ConfigError, DiskFull
-from pipeline.ownership import OutputKind, remove_folder, there
+from pipeline.base.durable import write_document
+from pipeline.base.errors import ConfigError, DiskFull
+from pipeline.base.ownership import OutputKind, remove_folder, there
 from pipeline.simulation.insertion_formats import (
     ABUTTING,
     OVERLAPPING,

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.durable import disk_full_named, sync
-from pipeline.errors import StoreIncomplete
+from pipeline.base.durable import disk_full_named, sync
+from pipeline.base.errors import StoreIncomplete
 from pipeline.store.chunk_pass import ChunkPass
 from pipeline.store.mending import mend
 from pipeline.store.metadata import check_metadata

@@ -11,7 +11,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from pipeline.errors import StoreIncomplete
+from pipeline.base.errors import StoreIncomplete
 from pipeline.store.chunks import ChunkFiles, row_checksums
 from pipeline.store.environments import EnvironmentLog, environment_at
 from pipeline.store.schema import CHECKSUMS, FEATURES, KEYS, ArraySpec, read_specs

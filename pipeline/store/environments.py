@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.durable import sync
+from pipeline.base.durable import sync
 
 
 def environment_at(ranges: Sequence[Mapping[str, Any]], row: int) -> dict[str, Any]:

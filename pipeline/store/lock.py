@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO
 
-from pipeline.errors import ConfigError, StoreLocked
+from pipeline.base.errors import ConfigError, StoreLocked
 
 _BEAT_S = 10.0
 """How often the holder shows that it lives."""

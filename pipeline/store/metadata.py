@@ -11,7 +11,7 @@ from typing import Any, cast
 
 import zarr
 
-from pipeline.errors import StoreIncomplete
+from pipeline.base.errors import StoreIncomplete
 from pipeline.store.mending import mend
 from pipeline.store.schema import ARRAY_NAMES
 

@@ -4,9 +4,9 @@ import json
 from pathlib import Path
 from typing import Any
 
-from pipeline.durable import recover as recover_replaced
-from pipeline.errors import StoreIncomplete
-from pipeline.ownership import OutputKind, refuse_foreign
+from pipeline.base.durable import recover as recover_replaced
+from pipeline.base.errors import StoreIncomplete
+from pipeline.base.ownership import OutputKind, refuse_foreign
 from pipeline.store.mending import start_over
 
 MERGED = "merge-"

@@ -15,8 +15,8 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from pipeline.errors import StoreIncomplete, StoreMismatch
-from pipeline.ownership import described, there
+from pipeline.base.errors import StoreIncomplete, StoreMismatch
+from pipeline.base.ownership import described, there
 from pipeline.store.episodes import Episode, episode_of, read_episodes
 from pipeline.store.mapping import map_flat
 from pipeline.store.mending import extract_command, mend, restore_command, start_over

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from pipeline.errors import StoreMismatch
+from pipeline.base.errors import StoreMismatch
 
 Inode = tuple[int, int]
 

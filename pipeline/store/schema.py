@@ -16,7 +16,7 @@ import numpy as np
 import zarr
 from zarr.codecs import BytesCodec, Crc32cCodec
 
-from pipeline.errors import StoreIncomplete
+from pipeline.base.errors import StoreIncomplete
 from pipeline.store.mending import mend
 
 SCHEMA = 1

@@ -17,9 +17,9 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from pipeline.durable import disk_full_named, put_in_place, sync
-from pipeline.errors import StoreIncomplete
-from pipeline.ownership import begin_folder
+from pipeline.base.durable import disk_full_named, put_in_place, sync
+from pipeline.base.errors import StoreIncomplete
+from pipeline.base.ownership import begin_folder
 from pipeline.store.chunks import ChunkFiles, row_checksums
 from pipeline.store.environments import EnvironmentLog
 from pipeline.store.metadata import ATTRIBUTE as METADATA_DIGEST

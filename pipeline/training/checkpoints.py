@@ -6,9 +6,9 @@ from pathlib import Path
 
 from torch import nn
 
+from pipeline.base.config import TrainHeadParams
+from pipeline.base.durable import sync
 from pipeline.checkpoint import PolicyCheckpoint, load_policy, save_policy, source_of
-from pipeline.config import TrainHeadParams
-from pipeline.durable import sync
 from pipeline.evaluation import held_out_contents, held_out_ranges
 from pipeline.models import PolicyShape
 from pipeline.normalization import Normalization

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from pipeline.errors import ConfigError
+from pipeline.base.errors import ConfigError
 
 
 def compiled(loss: Callable[..., Any], device: torch.device) -> Callable[..., Any]:

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
+from pipeline.base.config import TrainHeadParams
 from pipeline.checkpoint import source_of
-from pipeline.config import TrainHeadParams
 from pipeline.store import FeatureStore
 
 TRAINER_VERSION = 3

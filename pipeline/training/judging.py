@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import nn
 
+from pipeline.base.config import TrainHeadParams
+from pipeline.base.errors import ConfigError
 from pipeline.batches import Windows
-from pipeline.config import TrainHeadParams
-from pipeline.errors import ConfigError
 from pipeline.evaluation import judge
 from pipeline.models.policy import Trainable
 from pipeline.normalization import Normalization

@@ -6,9 +6,9 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from pipeline.base.config import TrainHeadParams
+from pipeline.base.device import use_bfloat16
 from pipeline.batches import Draw
-from pipeline.config import TrainHeadParams
-from pipeline.device import use_bfloat16
 from pipeline.models import Policy
 from pipeline.store import Batch, FeatureStore
 from pipeline.training.compilation import compiled

@@ -6,10 +6,10 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Self
 
-from pipeline.config import TrainHeadParams
-from pipeline.durable import disk_full_named, fresh
+from pipeline.base.config import TrainHeadParams
+from pipeline.base.durable import disk_full_named, fresh
+from pipeline.base.ownership import OutputKind, begins_with, refuse_foreign
 from pipeline.evaluation.experiments import speed_file
-from pipeline.ownership import OutputKind, begins_with, refuse_foreign
 from pipeline.training.loggers import Logger, open_loggers
 from pipeline.training.speed import Pace
 from pipeline.training.world import World

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any, Protocol
 from uuid import uuid4
 
-from pipeline.config import TrainHeadParams
-from pipeline.errors import ConfigError
-from pipeline.ownership import REPORT, claim
+from pipeline.base.config import TrainHeadParams
+from pipeline.base.errors import ConfigError
+from pipeline.base.ownership import REPORT, claim
 from pipeline.training.live_page import LivePage
 
 FINISH_TIMEOUT_S = 120.0

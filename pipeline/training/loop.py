@@ -7,10 +7,10 @@ import torch
 from torch import nn
 from tqdm import tqdm
 
+from pipeline.base.config import TrainHeadParams
+from pipeline.base.errors import NumericsError
 from pipeline.batches import Draw, Windows, choose_feed
 from pipeline.checkpoint import policy_shape
-from pipeline.config import TrainHeadParams
-from pipeline.errors import NumericsError
 from pipeline.models import Policy
 from pipeline.sampling import Split
 from pipeline.store import Batch, FeatureStore

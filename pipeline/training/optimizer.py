@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
-from pipeline.config import TrainHeadParams
+from pipeline.base.config import TrainHeadParams
 from pipeline.training.ema import trainable
 from pipeline.training.front import Front
 

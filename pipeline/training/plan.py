@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.base.config import TrainHeadParams
+from pipeline.base.errors import ConfigError
 from pipeline.batches import Draw
-from pipeline.config import TrainHeadParams
-from pipeline.errors import ConfigError
 from pipeline.sampling import Split, TickSampler, ticks_by_source
 from pipeline.store import FeatureStore
 from pipeline.training.world import World

@@ -7,7 +7,7 @@ from typing import NoReturn, Self
 
 from tqdm import tqdm
 
-from pipeline.amounts import duration
+from pipeline.base.format import duration
 
 EVERY_S = 60.0
 """Between two lines."""

@@ -11,6 +11,25 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from pipeline.base.config import TrainHeadParams
+from pipeline.base.durable import (
+    damaged,
+    put_in_place,
+    read_document,
+    recover,
+    recover_folder,
+    write_with_digest,
+)
+from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch, ConfigError
+from pipeline.base.ownership import (
+    REPORT,
+    OutputKind,
+    begin_folder,
+    refuse_foreign,
+    remove_folder,
+    there,
+    unmark,
+)
 from pipeline.checkpoint import (
     CHECKPOINT,
     DOCUMENT,
@@ -19,25 +38,6 @@ from pipeline.checkpoint import (
     describe,
     differences,
     source_differences,
-)
-from pipeline.config import TrainHeadParams
-from pipeline.durable import (
-    damaged,
-    put_in_place,
-    read_document,
-    recover,
-    recover_folder,
-    write_with_digest,
-)
-from pipeline.errors import CheckpointIncomplete, CheckpointMismatch, ConfigError
-from pipeline.ownership import (
-    REPORT,
-    OutputKind,
-    begin_folder,
-    refuse_foreign,
-    remove_folder,
-    there,
-    unmark,
 )
 from pipeline.store import FeatureStore, build_lock
 from pipeline.store.archive import is_archive

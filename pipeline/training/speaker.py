@@ -6,7 +6,7 @@ from datetime import timedelta
 
 import torch.distributed as dist
 
-from pipeline.errors import PipelineError
+from pipeline.base.errors import PipelineError
 
 PRECEDENCE = timedelta(seconds=5)
 """How long a process that fails waits for rank 0, which mostly fails of the same, to say so."""

@@ -8,14 +8,14 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from pipeline.durable import (
+from pipeline.base.durable import (
     damaged,
     read_document,
     read_tensors,
     write_tensors,
     write_with_digest,
 )
-from pipeline.errors import CheckpointIncomplete, CheckpointMismatch, PipelineError
+from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch, PipelineError
 from pipeline.training.log import Row
 from pipeline.training.run import TRAINER_DOCUMENT, TRAINER_WEIGHTS
 

@@ -8,8 +8,8 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from pipeline.base.errors import NumericsError
 from pipeline.batches import Ticks
-from pipeline.errors import NumericsError
 from pipeline.normalization import Block, ChannelStatistics, Normalization, fit_channels
 from pipeline.store import FeatureStore, place
 

@@ -3,8 +3,8 @@
 import numpy as np
 import torch
 
-from pipeline.amounts import duration, size
-from pipeline.config import TrainHeadParams
+from pipeline.base.config import TrainHeadParams
+from pipeline.base.format import duration, size
 from pipeline.models import Policy, PolicyShape
 from pipeline.models.cost import describe_cost
 from pipeline.sampling import Split, ticks_by_source

@@ -11,8 +11,8 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from pipeline.device import resolve_device
-from pipeline.errors import ConfigError
+from pipeline.base.device import resolve_device
+from pipeline.base.errors import ConfigError
 from pipeline.training.speaker import SaidByFirst, one_speaker
 
 Outcome = TypeVar("Outcome")

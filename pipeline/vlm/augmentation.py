@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipeline.config import AugmentationParams
+from pipeline.base.config import AugmentationParams
 
 _LUMA = np.array([0.299, 0.587, 0.114])
 """Of ITU-R BT.601, as Pillow's grey."""

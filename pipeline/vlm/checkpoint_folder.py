@@ -7,7 +7,7 @@ from typing import Any
 
 from safetensors import SafetensorError, safe_open
 
-from pipeline.errors import VLMError
+from pipeline.base.errors import VLMError
 
 _WANTED = ["*.json", "*.safetensors", "*.txt", "*.jinja"]
 """What is fetched from the hub: never a pickle."""

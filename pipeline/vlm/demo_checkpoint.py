@@ -19,8 +19,8 @@ from tokenizers import AddedToken, Regex, Tokenizer, decoders, normalizers, pre_
 from tokenizers.models import BPE
 from transformers import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
 
-from pipeline.durable import replace_folder
-from pipeline.ownership import OutputKind
+from pipeline.base.durable import replace_folder
+from pipeline.base.ownership import OutputKind
 from pipeline.vlm.loading import quiet_transformers
 
 _SPECIAL_TOKENS = (

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.config import VLMParams
-from pipeline.errors import VLMError
+from pipeline.base.config import VLMParams
+from pipeline.base.errors import VLMError
 from pipeline.vlm.checkpoint_folder import (
     adapter_files,
     read_config,

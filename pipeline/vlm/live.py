@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from pipeline.config import TuningParams, VLMParams
-from pipeline.device import resolve_device
-from pipeline.digests import file_digest
-from pipeline.errors import CheckpointMismatch, VLMError
+from pipeline.base.config import TuningParams, VLMParams
+from pipeline.base.device import resolve_device
+from pipeline.base.digests import file_digest
+from pipeline.base.errors import CheckpointMismatch, VLMError
 from pipeline.vlm.extractor import Extractor, layers_needed
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec, live_differences
 from pipeline.vlm.loading import load_model, pixel_settings

@@ -15,8 +15,8 @@ from transformers import Qwen2_5_VLForConditionalGeneration
 from transformers.utils import is_flash_attn_2_available
 from transformers.utils import logging as transformers_logging
 
-from pipeline.config import VLMParams
-from pipeline.errors import VLMError
+from pipeline.base.config import VLMParams
+from pipeline.base.errors import VLMError
 from pipeline.vlm.checkpoint_folder import adapter_files, resolve_checkpoint, weight_files
 from pipeline.vlm.pixels import PixelSettings
 from pipeline.vlm.vision import tower_attention

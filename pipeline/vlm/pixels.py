@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipeline.errors import VLMError
+from pipeline.base.errors import VLMError
 
 
 @dataclass(frozen=True)

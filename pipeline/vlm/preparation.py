@@ -7,8 +7,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.config import VLMParams
-from pipeline.errors import VLMError
+from pipeline.base.config import VLMParams
+from pipeline.base.errors import VLMError
 from pipeline.vlm.augmentation import Augmentation
 from pipeline.vlm.checkpoint_folder import resolve_checkpoint
 from pipeline.vlm.feature_spec import FeatureSpec

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any, Literal
 
-from pipeline.errors import VLMError
+from pipeline.base.errors import VLMError
 from pipeline.vlm.checkpoint_folder import read_config, read_json, tokenizer_files
 
 _QWEN_IMAGE_TOKEN_ID = 151655

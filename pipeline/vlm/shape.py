@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from pipeline.config import VLMParams
-from pipeline.errors import VLMError
+from pipeline.base.config import VLMParams
+from pipeline.base.errors import VLMError
 from pipeline.vlm.checkpoint_folder import could_be_hub_id, read_config
 from pipeline.vlm.slots import slots_of
 

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pipeline.config import Pooling, VLMParams
-from pipeline.errors import VLMError
+from pipeline.base.config import Pooling, VLMParams
+from pipeline.base.errors import VLMError
 
 GRID_CELLS = 4
 """Rows, and columns, of the cells of the `grid` pooling."""

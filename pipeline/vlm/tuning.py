@@ -11,9 +11,9 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from pipeline.config import TuningParams, VLMParams
-from pipeline.durable import disk_full_named, sync, write_tensors
-from pipeline.errors import VLMError
+from pipeline.base.config import TuningParams, VLMParams
+from pipeline.base.durable import disk_full_named, sync, write_tensors
+from pipeline.base.errors import VLMError
 from pipeline.vlm.checkpoint_folder import resolve_checkpoint
 from pipeline.vlm.loading import adapted, cut, load_checkpoint, load_whole, quiet_transformers
 from pipeline.vlm.slots import Slot

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
+from pipeline.base.errors import ConfigError, DiskFull, StoreIncomplete, StoreMismatch
 from pipeline.batches import choose_feed, open_store
-from pipeline.errors import ConfigError, DiskFull, StoreIncomplete, StoreMismatch
 from pipeline.store import FeatureStore
 from pipeline.store.archive import archive
 from pipeline.store.schema import ARRAY_NAMES

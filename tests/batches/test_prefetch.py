@@ -10,8 +10,8 @@ import pytest
 import torch
 import zarr
 
+from pipeline.base.config import TrainHeadParams
 from pipeline.batches import Draw, Lags, Prefetch, Windows, draws
-from pipeline.config import TrainHeadParams
 from pipeline.store import Batch, FeatureStore
 
 CPU = torch.device("cpu")

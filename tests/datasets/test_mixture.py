@@ -9,13 +9,13 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.base.errors import ConfigError
 from pipeline.datasets import (
     MixtureBatches,
     UnifiedBatch,
     create_unified_dataloader,
     create_weighted_async_dataloader,
 )
-from pipeline.errors import ConfigError
 from pipeline.store import FeatureStore
 
 

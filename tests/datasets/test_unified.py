@@ -11,7 +11,8 @@ import pytest
 import torch
 from torch.utils.data import ConcatDataset, DataLoader
 
-from pipeline.config import Source, TrainHeadParams
+from pipeline.base.config import Source, TrainHeadParams
+from pipeline.base.errors import ConfigError, RecordingError, StoreIncomplete, StoreMismatch
 from pipeline.datasets import (
     AsyncInsertionMeca500DatasetWithSensor,
     NewAsyncInsertionDataset,
@@ -19,7 +20,6 @@ from pipeline.datasets import (
     async_collate_fn_with_sensor,
     unified_collate_fn,
 )
-from pipeline.errors import ConfigError, RecordingError, StoreIncomplete, StoreMismatch
 from pipeline.models import Observation, Policy, PolicyShape, QwenVLAUnified
 from pipeline.models.unchanged import Unchanged
 from pipeline.recordings import Channels, RecordedAction, open_recordings

@@ -14,7 +14,7 @@ import yaml
 import stages.demo
 import stages.extract
 import stages.train_head
-from pipeline.config import load_params
+from pipeline.base.config import load_params
 
 ROOT = Path(__file__).resolve().parents[2]
 MACHINERY = ROOT / "docs" / "machinery"

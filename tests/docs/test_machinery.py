@@ -6,7 +6,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from pipeline.config import described_keys
+from pipeline.base.config import described_keys
 
 ROOT = Path(__file__).resolve().parents[2]
 FIGURES = ROOT / "docs" / "figures"
@@ -47,7 +47,7 @@ class TestParamsPage:
         return machinery("params_page").params_page(kept)
 
     def test_has_every_key_that_the_commands_list(self, page):
-        from pipeline.config import Params
+        from pipeline.base.config import Params
 
         listed = [
             line.split(" = ")[0].strip()

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.config import Params
-from pipeline.config.section import Section
+from pipeline.base.config import Params
+from pipeline.base.config.section import Section
 
 ROOT = Path(__file__).resolve().parents[2]
 STAGES = {path.stem for path in (ROOT / "stages").glob("*.py")} - {"__init__", "command"}

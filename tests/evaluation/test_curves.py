@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from pipeline.config import TrainHeadParams
+from pipeline.base.config import TrainHeadParams
 from pipeline.evaluation import Curves
 from pipeline.evaluation import read_curves as curves_of
 

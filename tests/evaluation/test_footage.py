@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pipeline.config import Source
-from pipeline.digests import file_digest
+from pipeline.base.config import Source
+from pipeline.base.digests import file_digest
 from pipeline.evaluation.footage import Footage, footage, shown_ticks
 from pipeline.recordings import Recording, content_digest, open_recordings
 from pipeline.simulation.demo_recordings import write_demo_recordings

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.errors import CheckpointMismatch
+from pipeline.base.errors import CheckpointMismatch
 from pipeline.evaluation import held_out_contents, held_out_ranges, held_out_ticks
 from pipeline.evaluation.held_out import groups_of, named_as_in
 from pipeline.sampling import split_by_episode

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from pipeline.base.config import TrainHeadParams
 from pipeline.batches import Draw, Lags, Windows
 from pipeline.checkpoint import PolicyCheckpoint, policy_shape, source_of
-from pipeline.config import TrainHeadParams
 from pipeline.evaluation import (
     ModalityStudy,
     held_out_contents,

@@ -11,8 +11,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline.base.errors import NumericsError
 from pipeline.batches import Windows
-from pipeline.errors import NumericsError
 from pipeline.evaluation import Comparison, Group, Predictions, baselines, compare, predict
 from pipeline.store import FeatureStore
 

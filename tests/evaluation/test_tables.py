@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.errors import DiskFull
+from pipeline.base.errors import DiskFull
 from pipeline.evaluation import BASELINES, Comparison, Predictions, metrics, table, write_tables
 from pipeline.evaluation.tables import FOOTNOTE
 from pipeline.store import FeatureStore

@@ -16,7 +16,7 @@ import pytest
 import yaml
 from PIL import Image
 
-from pipeline.config import Params
+from pipeline.base.config import Params
 from pipeline.extraction import extract
 
 

@@ -5,7 +5,7 @@ import itertools
 import pytest
 import torch
 
-from pipeline.errors import VLMError
+from pipeline.base.errors import VLMError
 from pipeline.extraction.batch_size import BatchSize
 
 

@@ -25,10 +25,16 @@ import numpy as np
 import pytest
 from distributed import LocalCluster, Security, rpc
 
-from pipeline import errors
-from pipeline.config import Params
-from pipeline.digests import ContentDigests, file_digest
-from pipeline.errors import ConfigError, PipelineError, RecordingError, StoreIncomplete, VLMError
+from pipeline.base import errors
+from pipeline.base.config import Params
+from pipeline.base.digests import ContentDigests, file_digest
+from pipeline.base.errors import (
+    ConfigError,
+    PipelineError,
+    RecordingError,
+    StoreIncomplete,
+    VLMError,
+)
 from pipeline.extraction import extract
 from pipeline.extraction.connection import check_scheduler, connected
 from pipeline.extraction.fill import rate_name
@@ -48,7 +54,7 @@ import os, signal, threading, time
 from collections import defaultdict
 from contextlib import suppress
 from pathlib import Path
-from pipeline.errors import NumericsError
+from pipeline.base.errors import NumericsError
 from pipeline.extraction.encoder import Encoder
 from pipeline.extraction.worker import ExtractionPlugin, RangeComputer
 
@@ -375,7 +381,7 @@ class TestRefusals:
         "address", ["tcp://127.0.0.1:9", "nonsense://here", "tls://127.0.0.1:9"]
     )
     def test_a_wrong_address(self, changed, monkeypatch, address):
-        monkeypatch.setattr("pipeline.scheduler.TIMEOUT_S", 1)
+        monkeypatch.setattr("pipeline.base.scheduler.TIMEOUT_S", 1)
         wrong = changed(extract={"workers": address})
         for reach in (run, lambda params: check_scheduler(params.extract)):
             with pytest.raises(ConfigError, match="no dask scheduler answers at"):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.errors import NumericsError, VLMError
+from pipeline.base.errors import NumericsError, VLMError
 from pipeline.extraction.encoder import Encoder
 from pipeline.extraction.rows import ReadyRow
 from pipeline.vlm.preparation import Layout, PreparedRow

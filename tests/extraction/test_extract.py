@@ -12,7 +12,7 @@ import pytest
 import torch
 from PIL import Image
 
-from pipeline.errors import (
+from pipeline.base.errors import (
     ConfigError,
     DiskFull,
     NumericsError,

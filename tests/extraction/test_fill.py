@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.digests import ContentDigests
-from pipeline.errors import DiskFull
+from pipeline.base.digests import ContentDigests
+from pipeline.base.errors import DiskFull
 from pipeline.extraction import extract
 from pipeline.extraction.rows import in_background
 from pipeline.store import FeatureStore, StoreBuild

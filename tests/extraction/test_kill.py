@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.config import Params
+from pipeline.base.config import Params
 from pipeline.extraction import extract
 from pipeline.store import FeatureStore, StoreBuild, part_path, read_plan
 from pipeline.store.schema import ARRAY_NAMES, read_specs

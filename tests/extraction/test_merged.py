@@ -2,7 +2,7 @@
 
 import pytest
 
-from pipeline.errors import StoreMismatch
+from pipeline.base.errors import StoreMismatch
 from pipeline.extraction import extract
 from pipeline.store import FeatureStore
 from pipeline.store.merging import merge

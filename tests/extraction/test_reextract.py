@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.config import Params
-from pipeline.errors import StoreMismatch
+from pipeline.base.config import Params
+from pipeline.base.errors import StoreMismatch
 from pipeline.extraction import extract
 from pipeline.extraction.reextract import TOLERANCES, Deviation, Reextraction, reextract
 from pipeline.store.schema import chunk_paths, read_spec

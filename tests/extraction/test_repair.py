@@ -12,8 +12,8 @@ import google_crc32c
 import numpy as np
 import pytest
 
-from pipeline.config import Params
-from pipeline.errors import DiskFull, StoreIncomplete, StoreLocked, StoreMismatch
+from pipeline.base.config import Params
+from pipeline.base.errors import DiskFull, StoreIncomplete, StoreLocked, StoreMismatch
 from pipeline.extraction import extract
 from pipeline.extraction.repair import repair, with_identity
 from pipeline.store import FeatureStore, build_lock, part_path

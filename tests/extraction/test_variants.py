@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.amounts import size
-from pipeline.config import Params
-from pipeline.errors import DiskFull
+from pipeline.base.config import Params
+from pipeline.base.errors import DiskFull
+from pipeline.base.format import size
 from pipeline.extraction import extract
 from pipeline.store import FeatureStore, StoreBuild
 from pipeline.store.schema import ARRAY_NAMES

@@ -19,7 +19,7 @@ from typing import Any
 import pytest
 import yaml
 
-from pipeline.config import Params
+from pipeline.base.config import Params
 from pipeline.extraction import extract
 from stages.command import run
 

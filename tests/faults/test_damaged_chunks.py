@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.config import Params
-from pipeline.errors import StoreIncomplete
+from pipeline.base.config import Params
+from pipeline.base.errors import StoreIncomplete
 from pipeline.extraction import extract
 from pipeline.store import FeatureStore
 from pipeline.store.schema import ARRAY_NAMES

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import zarr
 
-from pipeline.ownership import MARKER, REPORT
+from pipeline.base.ownership import MARKER, REPORT
 from pipeline.store.archive import archive
 from pipeline.store.places import STORE
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageDraw
 
-from pipeline.config import Params
+from pipeline.base.config import Params
 from pipeline.extraction import extract
 from pipeline.store import FeatureStore
 

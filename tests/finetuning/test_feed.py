@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
+from pipeline.base.config import Params, TuningParams
+from pipeline.base.errors import RecordingError
 from pipeline.batches import Draw, Windows
-from pipeline.config import Params, TuningParams
-from pipeline.errors import RecordingError
 from pipeline.finetuning.feed import LiveFeed
 from pipeline.finetuning.recordings import check_spec, find_recordings, known_digests
 from pipeline.finetuning.rows import LiveRows

@@ -11,10 +11,10 @@ import torch
 from safetensors.torch import load_file
 from torch import nn
 
+from pipeline.base.config import Params
+from pipeline.base.errors import CheckpointMismatch, ConfigError
 from pipeline.batches import Draw, Windows
 from pipeline.checkpoint import find_policy, load_policy
-from pipeline.config import Params
-from pipeline.errors import CheckpointMismatch, ConfigError
 from pipeline.evaluation import check_store, held_out_ticks, judge
 from pipeline.extraction import extract
 from pipeline.finetuning import Live, head_params, out_of_memory_named

@@ -4,8 +4,8 @@ from collections.abc import Callable
 
 import pytest
 
-from pipeline.config import Params
-from pipeline.errors import ConfigError
+from pipeline.base.config import Params
+from pipeline.base.errors import ConfigError
 from pipeline.finetuning import head_params
 
 

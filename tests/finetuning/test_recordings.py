@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from pipeline.config import Params
-from pipeline.errors import StoreMismatch
+from pipeline.base.config import Params
+from pipeline.base.errors import StoreMismatch
 from pipeline.finetuning.recordings import (
     check_recordings,
     check_spec,

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.config import Params
-from pipeline.errors import RecordingError
+from pipeline.base.config import Params
+from pipeline.base.errors import RecordingError
 from pipeline.extraction import extract
 from pipeline.finetuning.recordings import check_spec, find_recordings, known_digests
 from pipeline.finetuning.rows import LiveRows

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.config import DataParams, Source
+from pipeline.base.config import DataParams, Source
 from pipeline.inspection.episodes import view_episode
 from pipeline.inspection.facts import EpisodeView, Flaw
 from pipeline.inspection.flaws import find_flaws

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.errors import RecordingError
+from pipeline.base.errors import RecordingError
 from pipeline.inspection.clocks import clocks
 from pipeline.inspection.facts import EpisodeView
 from pipeline.inspection.flaws import find_flaws

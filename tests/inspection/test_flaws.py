@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.channels import named
-from pipeline.config import DataParams, Source
+from pipeline.base.channels import named
+from pipeline.base.config import DataParams, Source
 from pipeline.inspection.channel_flaws import channel_flaws
 from pipeline.inspection.clock_flaws import clock_flaws
 from pipeline.inspection.episodes import view_episode

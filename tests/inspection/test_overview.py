@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.config import Params, Source
+from pipeline.base.config import Params, Source
 from pipeline.inspection.overview import RecordingsOverview, survey_recordings
 from pipeline.recordings import open_recordings
 

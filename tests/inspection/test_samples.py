@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.config import Params, VLMParams
+from pipeline.base.config import Params, VLMParams
+from pipeline.base.digests import ContentDigests
+from pipeline.base.errors import RecordingError, VLMError
 from pipeline.datasets import UnifiedVLADataset
-from pipeline.digests import ContentDigests
-from pipeline.errors import RecordingError, VLMError
 from pipeline.inspection.facts import EpisodeView
 from pipeline.inspection.prompt import view_prompt
 from pipeline.inspection.samples import samples

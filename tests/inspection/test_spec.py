@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline import digests
-from pipeline.config import Params, load_params
+from pipeline.base import digests
+from pipeline.base.config import Params, load_params
 from pipeline.inspection.spec import LEDGER, digest_ledger, remembered_spec
 
 PARAMS = Path(__file__).resolve().parents[2] / "params.yaml"

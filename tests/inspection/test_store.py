@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.config import InspectParams
-from pipeline.errors import StoreIncomplete, StoreMismatch
+from pipeline.base.config import InspectParams
+from pipeline.base.errors import StoreIncomplete, StoreMismatch
 from pipeline.inspection.store import StoreView, inspect_store
 from pipeline.inspection.store_coverage import Ages, EpisodeCoverage
 from pipeline.inspection.store_features import look_at_features, read_slot, sample_rows

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.config import Params, load_params
-from pipeline.errors import ConfigError, RecordingError
+from pipeline.base.config import Params, load_params
+from pipeline.base.errors import ConfigError, RecordingError
 from pipeline.inspection.subject import subject_of
 
 PARAMS = Path(__file__).resolve().parents[2] / "params.yaml"

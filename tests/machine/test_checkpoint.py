@@ -8,7 +8,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from pipeline.config import Params
+from pipeline.base.config import Params
 from pipeline.machine.checkpoint import check_adapter, check_checkpoint, check_fit
 from pipeline.machine.gpu import GPU
 from pipeline.simulation.demo_recordings import MARKER

@@ -8,7 +8,7 @@ import av
 import numpy as np
 import pytest
 
-from pipeline.config import Params, Source
+from pipeline.base.config import Params, Source
 from pipeline.machine.data import check_data, check_source, check_video
 from pipeline.recordings import BadEpisode, open_recordings
 

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from pipeline import machine
-from pipeline.config import Params
-from pipeline.errors import ConfigError
+from pipeline.base.config import Params
+from pipeline.base.errors import ConfigError
 from pipeline.machine.findings import WIDTH, described, missing, note, ok
 
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from pipeline.config import Params
+from pipeline.base.config import Params
 from pipeline.machine.attention import check_attention
 from pipeline.machine.gpu import (
     GPU,

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from pipeline.config import Params
+from pipeline.base.config import Params
 from pipeline.machine import space
 from pipeline.machine.data import check_data
 from pipeline.machine.limits import Limits, check_limits, read_limits

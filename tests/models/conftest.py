@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pipeline.config import TrainHeadParams
+from pipeline.base.config import TrainHeadParams
 from pipeline.models import Policy, PolicyShape
 from pipeline.normalization import ChannelStatistics, Normalization
 

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from pipeline.errors import ConfigError
+from pipeline.base.errors import ConfigError
 from pipeline.models.attention import TransformerLayer, masked_mean, right_aligned
 
 

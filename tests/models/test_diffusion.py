@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 from scipy.stats import norm
 from torch import Tensor, nn
 
-from pipeline.config import DiffusionParams
+from pipeline.base.config import DiffusionParams
 from pipeline.models import DiffusionActionExpert, NoiseSchedule
 
 PREDICTIONS = ("epsilon", "sample", "v")

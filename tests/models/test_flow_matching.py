@@ -14,7 +14,7 @@ from scipy.stats import beta as beta_distribution
 from scipy.stats import kstest, norm
 from torch import Tensor, nn
 
-from pipeline.config import FlowMatchingParams
+from pipeline.base.config import FlowMatchingParams
 from pipeline.models import FlowMatchingActionExpert
 from pipeline.models.flow_matching import BetaTimes, integrate
 

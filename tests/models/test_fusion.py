@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pipeline.errors import ConfigError
+from pipeline.base.errors import ConfigError
 from pipeline.models import (
     CrossAttentionFusion,
     FeatureEncoder,

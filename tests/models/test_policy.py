@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 import torch
 
-from pipeline.config import SensorEncoderParams, TrainHeadParams
-from pipeline.errors import CheckpointMismatch, ConfigError
+from pipeline.base.config import SensorEncoderParams, TrainHeadParams
+from pipeline.base.errors import CheckpointMismatch, ConfigError
 from pipeline.models import (
     Policy,
     PolicyShape,

@@ -18,10 +18,10 @@ from PIL import Image
 from pydantic import ValidationError
 from torch import Tensor
 
+from pipeline.base.config import TrainHeadParams, TuningParams, VLMParams
+from pipeline.base.digests import file_digest
+from pipeline.base.errors import CheckpointMismatch, ObservationError, VLMError
 from pipeline.checkpoint import PolicyCheckpoint
-from pipeline.config import TrainHeadParams, TuningParams, VLMParams
-from pipeline.digests import file_digest
-from pipeline.errors import CheckpointMismatch, ObservationError, VLMError
 from pipeline.models import Policy, PolicyShape, Trainable
 from pipeline.models.live_observation import LiveObservation
 from pipeline.models.unchanged import Unchanged

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from pipeline.errors import ConfigError
+from pipeline.base.errors import ConfigError
 from pipeline.models import ForceAwareSensorEncoder, RobotStateEncoder, SensorEncoder
 from pipeline.models.attention import right_aligned
 from pipeline.models.sensor_encoder import HalvingBlock, resampled

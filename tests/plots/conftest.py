@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from pipeline.config import Source
+from pipeline.base.config import Source
 from pipeline.inspection.facts import Clock, EpisodeView, Gap
 from pipeline.plots.style import RC
 from pipeline.recordings import Channels, Stream, open_recordings

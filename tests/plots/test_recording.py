@@ -10,7 +10,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from pipeline.channels import unnumbered
+from pipeline.base.channels import unnumbered
 from pipeline.inspection.facts import Clock, Contact, EpisodeView, Flaw, Gap
 from pipeline.plots import interactive, recording
 from pipeline.plots.recording.channels import groups

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from pipeline.config import InspectParams
+from pipeline.base.config import InspectParams
 from pipeline.inspection.store import StoreView, inspect_store
 from pipeline.plots import store as pictures
 from pipeline.plots import store_features as feature_pictures

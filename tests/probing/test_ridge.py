@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.errors import NumericsError
+from pipeline.base.errors import NumericsError
 from pipeline.probing.moments import Moments
 from pipeline.probing.ridge import Score, cross_validate
 

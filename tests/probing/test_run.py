@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.config import ProbeParams
-from pipeline.errors import NumericsError
+from pipeline.base.config import ProbeParams
+from pipeline.base.errors import NumericsError
 from pipeline.probing import (
     Finding,
     Folds,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.errors import NumericsError
+from pipeline.base.errors import NumericsError
 from pipeline.probing.projection import LIMIT, STILL, Projection, main_directions
 from pipeline.probing.summaries import summarize
 from pipeline.store import FeatureStore

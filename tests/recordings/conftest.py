@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 
-from pipeline.config import Source
+from pipeline.base.config import Source
 from pipeline.recordings import Recording, open_recordings
 
 START = 1762581333.25

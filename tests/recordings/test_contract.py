@@ -7,7 +7,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from pipeline.config import Source
+from pipeline.base.config import Source
 from pipeline.recordings import Recording, open_recordings
 
 FORMATS = {

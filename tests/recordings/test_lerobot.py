@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.config import DataParams, Source
-from pipeline.digests import file_digest
-from pipeline.errors import RecordingError
+from pipeline.base.config import DataParams, Source
+from pipeline.base.digests import file_digest
+from pipeline.base.errors import RecordingError
 from pipeline.inspection.episodes import view_episode
 from pipeline.inspection.flaws import find_flaws
 from pipeline.recordings import content_digest, open_recording, open_recordings

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.config import Source
-from pipeline.errors import RecordingError
+from pipeline.base.config import Source
+from pipeline.base.errors import RecordingError
 from pipeline.recordings import BadEpisode, open_recordings
 
 

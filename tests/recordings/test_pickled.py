@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.errors import RecordingError
+from pipeline.base.errors import RecordingError
 
 
 def expect(time: np.ndarray, start: float, rate_hz: float) -> None:

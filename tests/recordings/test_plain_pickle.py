@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.errors import RecordingError
+from pipeline.base.errors import RecordingError
 from pipeline.recordings.plain_pickle import load_plain
 
 

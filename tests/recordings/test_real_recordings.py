@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.config import Source
+from pipeline.base.config import Source
 from pipeline.recordings import Recording, open_recordings
 
 

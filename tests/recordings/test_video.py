@@ -4,7 +4,7 @@ import av
 import numpy as np
 import pytest
 
-from pipeline.errors import RecordingError
+from pipeline.base.errors import RecordingError
 from pipeline.recordings.video import VideoClip, VideoSpan
 
 ENCODINGS = [

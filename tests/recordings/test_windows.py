@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import RecordingError
+from pipeline.base.errors import RecordingError
 from pipeline.recordings.windows import rebuild
 
 

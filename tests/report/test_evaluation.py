@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pipeline.base.config import TrainHeadParams
 from pipeline.batches import Windows
 from pipeline.checkpoint import PolicyCheckpoint, policy_shape, source_of
-from pipeline.config import TrainHeadParams
 from pipeline.evaluation import (
     BASELINES,
     Curve,

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 from plotly.offline import get_plotlyjs
 
-from pipeline.errors import DiskFull
+from pipeline.base.errors import DiskFull
 from pipeline.plots.style import GRID, INK, canvas
 from pipeline.report import (
     PAGE,

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.config import Params, load_params
+from pipeline.base.config import Params, load_params
 from pipeline.inspection.facts import ChannelStatistics, Flaw, PromptToken
 from pipeline.inspection.subject import subject_of
 from pipeline.report import (

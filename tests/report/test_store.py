@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.config import InspectParams
+from pipeline.base.config import InspectParams
 from pipeline.inspection.store import StoreView, inspect_store
 from pipeline.report import Document, Notices, Report, Table, write_report
 from pipeline.report.inspection.store import store_report

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.config import Source
-from pipeline.errors import ConfigError, DiskFull
+from pipeline.base.config import Source
+from pipeline.base.errors import ConfigError, DiskFull
 from pipeline.recordings import Recording, open_recordings
 from pipeline.simulation import demo_recordings
 from pipeline.simulation.demo_recordings import MARKER, write_demo_recordings

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.errors import RecordingError
+from pipeline.base.errors import RecordingError
 from stages import command
 from stages.command import Shorthand, run
 

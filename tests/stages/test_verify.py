@@ -54,7 +54,7 @@ def test_a_sound_store(verified, store, capsys):
 
 @pytest.mark.parametrize("address", ["nonsense://here", "tcp://127.0.0.1:9", "tls://127.0.0.1:9"])
 def test_an_address_where_no_scheduler_answers(verified, capsys, monkeypatch, address):
-    monkeypatch.setattr("pipeline.scheduler.TIMEOUT_S", 0.5)
+    monkeypatch.setattr("pipeline.base.scheduler.TIMEOUT_S", 0.5)
     assert verified("--set", f"verify.workers={address}") == 2
     said = capsys.readouterr().err
     assert f"verify.workers: no dask scheduler answers at {address}" in said

@@ -18,7 +18,7 @@ import pytest
 import zarr
 from zarr.codecs.numcodecs import BitRound
 
-from pipeline.errors import ConfigError, DiskFull, StoreIncomplete, StoreLocked, StoreMismatch
+from pipeline.base.errors import ConfigError, DiskFull, StoreIncomplete, StoreLocked, StoreMismatch
 from pipeline.store import FeatureStore, Sizes, StoreBuild, arrays, build_lock, part_path
 from pipeline.store.archive import archive, copying, is_archive, layout, restore
 from pipeline.store.archive.codecs import Choice, Codec, outside_the_specification

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.durable import KEPT, previous_path
-from pipeline.errors import ConfigError, StoreLocked
-from pipeline.ownership import MARKER, mark
+from pipeline.base.durable import KEPT, previous_path
+from pipeline.base.errors import ConfigError, StoreLocked
+from pipeline.base.ownership import MARKER, mark
 from pipeline.store import FeatureStore, StoreBuild, build_lock
 from pipeline.store.archive import archive
 from pipeline.store.housekeeping.inventory import Entry, Inventory, take_inventory
@@ -272,7 +272,7 @@ class TestLeftovers:
             (part / "zarr.json").unlink(missing_ok=True)
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("pipeline.ownership.shutil.rmtree", killed)
+        monkeypatch.setattr("pipeline.base.ownership.shutil.rmtree", killed)
         with pytest.raises(KeyboardInterrupt):
             remove(leftover)
         assert any(part.iterdir())
@@ -289,7 +289,7 @@ class TestLeftovers:
         def killed(path: Path) -> None:
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("pipeline.ownership.shutil.rmtree", killed)
+        monkeypatch.setattr("pipeline.base.ownership.shutil.rmtree", killed)
         with pytest.raises(KeyboardInterrupt):
             remove(leftover)
         assert KEPT.owns(kept)

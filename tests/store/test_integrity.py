@@ -14,8 +14,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from pipeline.amounts import size
-from pipeline.errors import StoreIncomplete, StoreMismatch
+from pipeline.base.errors import StoreIncomplete, StoreMismatch
+from pipeline.base.format import size
 from pipeline.store import FeatureStore, check_trailers
 from pipeline.store.archive import archive
 from pipeline.store.integrity import verify

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import zarr
 
-from pipeline.errors import ConfigError, DiskFull, StoreIncomplete, StoreLocked, StoreMismatch
+from pipeline.base.errors import ConfigError, DiskFull, StoreIncomplete, StoreLocked, StoreMismatch
 from pipeline.store import FeatureStore, StoreBuild, build_lock, check_trailers
 from pipeline.store.integrity import verify
 from pipeline.store.integrity.repair import carry_rows, copy_layout, put_in_place

@@ -16,7 +16,7 @@ import zarr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import StoreIncomplete, StoreMismatch
+from pipeline.base.errors import StoreIncomplete, StoreMismatch
 from pipeline.store import FeatureStore
 from pipeline.store.schema import ARRAY_NAMES
 

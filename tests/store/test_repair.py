@@ -9,7 +9,7 @@ import google_crc32c
 import numpy as np
 import pytest
 
-from pipeline.errors import StoreMismatch
+from pipeline.base.errors import StoreMismatch
 from pipeline.store import FeatureStore, StoreBuild, part_path, read_plan
 from pipeline.store.integrity import verify
 from pipeline.store.integrity.repair import carry_rows, copy_layout, layout_is_sound, put_in_place

@@ -16,7 +16,7 @@ import zarr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import DiskFull, StoreIncomplete, StoreLocked
+from pipeline.base.errors import DiskFull, StoreIncomplete, StoreLocked
 from pipeline.store import Donor, FeatureStore, Sizes, StoreBuild, arrays, build_lock, recover
 from pipeline.store.chunks import check_trailers, row_checksums
 from pipeline.store.schema import FEATURES, TRAILER_BYTES, ArraySpec

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.config import TrainHeadParams
+from pipeline.base.config import TrainHeadParams
 from pipeline.sampling import split_by_episode
 from pipeline.store import FeatureStore
 from pipeline.training import Trainer, open_run

@@ -14,15 +14,15 @@ from typing import Any
 import pytest
 import torch
 
-from pipeline.config import TrainHeadParams
-from pipeline.errors import ConfigError
+from pipeline.base.config import TrainHeadParams
+from pipeline.base.errors import ConfigError
 from pipeline.store import FeatureStore
 from pipeline.training.compilation import compiled
 
 ROOT = Path(__file__).resolve().parents[2]
 PROBE = """
 import sys, torch
-from pipeline.errors import ConfigError
+from pipeline.base.errors import ConfigError
 from pipeline.training.compilation import compiled
 
 def loss(x):
@@ -36,7 +36,7 @@ except ConfigError as error:
 """
 TRAIN = """
 import json, sys, torch
-from pipeline.config import TrainHeadParams
+from pipeline.base.config import TrainHeadParams
 from pipeline.sampling import split_by_episode
 from pipeline.store import FeatureStore
 from pipeline.training import Trainer, open_run

@@ -16,9 +16,9 @@ import torch
 import torch.distributed as dist
 import yaml
 
+from pipeline.base.config import load_params
+from pipeline.base.errors import ConfigError
 from pipeline.checkpoint import load_policy
-from pipeline.config import load_params
-from pipeline.errors import ConfigError
 from pipeline.store import FeatureStore, build_lock
 from pipeline.training import Trainer, World, process_group
 from pipeline.training.world import process_device
@@ -34,7 +34,7 @@ from pathlib import Path
 import torch.distributed as dist
 import pipeline.batches
 import pipeline.training.loop as loop
-from pipeline.errors import StoreIncomplete
+from pipeline.base.errors import StoreIncomplete
 from pipeline.training import speaker
 from stages import train_head
 from stages.command import run
@@ -88,7 +88,7 @@ Path(sys.argv[2] + rank).write_text(json.dumps(found))
 PRIMITIVES = """
 import torch
 from torch import nn
-from pipeline.errors import StoreLocked
+from pipeline.base.errors import StoreLocked
 from pipeline.training import process_group
 from pipeline.training.gradients import sum_gradients
 from pipeline.training.speaker import SaidByFirst

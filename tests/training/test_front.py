@@ -8,10 +8,10 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from pipeline.base.config import TrainHeadParams
+from pipeline.base.durable import read_document
 from pipeline.batches import Draw, Feed, Prefetch, Windows
 from pipeline.checkpoint import load_policy
-from pipeline.config import TrainHeadParams
-from pipeline.durable import read_document
 from pipeline.models import Policy
 from pipeline.sampling import split_by_episode
 from pipeline.store import FeatureStore

@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
-from pipeline.config import TrainHeadParams
-from pipeline.durable import read_document, write_document
-from pipeline.errors import ConfigError, DiskFull
-from pipeline.ownership import MARKER
+from pipeline.base.config import TrainHeadParams
+from pipeline.base.durable import read_document, write_document
+from pipeline.base.errors import ConfigError, DiskFull
+from pipeline.base.ownership import MARKER
 from pipeline.store import FeatureStore
 from pipeline.training import Trainer, check_loggers, loggers, open_run
 from pipeline.training.log import TrainingLog
@@ -24,7 +24,7 @@ Make = Callable[..., Any]
 WANDB = """
 import sys
 from pathlib import Path
-from pipeline.config import TrainHeadParams
+from pipeline.base.config import TrainHeadParams
 from pipeline.training.loggers import WandB
 
 place = Path(sys.argv[1])

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 import torch
 
+from pipeline.base.config import TrainHeadParams
+from pipeline.base.durable import read_document
+from pipeline.base.errors import NumericsError
 from pipeline.batches import Windows
 from pipeline.checkpoint import load_policy
-from pipeline.config import TrainHeadParams
-from pipeline.durable import read_document
-from pipeline.errors import NumericsError
 from pipeline.evaluation import judge
 from pipeline.evaluation.experiments import speed_file
 from pipeline.store import FeatureStore

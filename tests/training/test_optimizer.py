@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import nn
 
-from pipeline.config import TrainHeadParams
+from pipeline.base.config import TrainHeadParams
 from pipeline.training.ema import WeightAverage, trainable
 from pipeline.training.history import History
 from pipeline.training.optimizer import (

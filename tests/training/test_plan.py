@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.errors import ConfigError
+from pipeline.base.errors import ConfigError
 from pipeline.sampling import split_by_episode
 from pipeline.store import FeatureStore
 from pipeline.training import Trainer, World

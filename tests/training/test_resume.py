@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from pipeline.errors import CheckpointMismatch
+from pipeline.base.errors import CheckpointMismatch
 from pipeline.store import FeatureStore
 from pipeline.training import Trainer, World, open_run
 from pipeline.training.state import read_trainer

@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from pipeline.durable import read_document
-from pipeline.errors import CheckpointIncomplete, CheckpointMismatch, ConfigError
-from pipeline.ownership import MARKER
+from pipeline.base.durable import read_document
+from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch, ConfigError
+from pipeline.base.ownership import MARKER
 from pipeline.store import FeatureStore
 from pipeline.training import Trainer, open_run
 from pipeline.training.identity import TRAINER_VERSION

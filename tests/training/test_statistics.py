@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import zarr
 
-from pipeline.errors import NumericsError
+from pipeline.base.errors import NumericsError
 from pipeline.store import FeatureStore
 from pipeline.training import fit_normalization
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from PIL import Image, ImageEnhance
 
-from pipeline.config import AugmentationParams
+from pipeline.base.config import AugmentationParams
 from pipeline.vlm.augmentation import Augmentation
 from pipeline.vlm.feature_spec import AUGMENTATION_VERSION, row_key
 
@@ -110,7 +110,7 @@ def test_what_a_draw_is_belongs_to_its_version() -> None:
 
 def test_another_process_draws_the_same() -> None:
     code = (
-        "from pipeline.config import AugmentationParams as P\n"
+        "from pipeline.base.config import AugmentationParams as P\n"
         "from pipeline.vlm.augmentation import Augmentation as A\n"
         "print(A.drawn(P(), bytes(range(16)), 'View1', 1))"
     )

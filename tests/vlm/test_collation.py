@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from pipeline.errors import VLMError
+from pipeline.base.errors import VLMError
 from pipeline.vlm.collation import Collator, unique
 from pipeline.vlm.qwen import FrozenVLM
 

@@ -12,7 +12,7 @@ from PIL import Image
 from torch import Tensor
 from transformers import AutoImageProcessor, AutoTokenizer, Qwen2_5_VLForConditionalGeneration
 
-from pipeline.errors import NumericsError, VLMError
+from pipeline.base.errors import NumericsError, VLMError
 
 POOLINGS = ("mean", "image_mean", "text_mean", "view_mean", "grid", "last")
 VIEWS = ("View1", "View2", "View3")

@@ -14,8 +14,8 @@ from huggingface_hub.errors import LocalEntryNotFoundError
 from numpy.typing import NDArray
 from safetensors.torch import load_file, save_file
 
-from pipeline.config import VLMParams
-from pipeline.errors import VLMError
+from pipeline.base.config import VLMParams
+from pipeline.base.errors import VLMError
 from pipeline.vlm.checkpoint_folder import weight_files
 from pipeline.vlm.feature_spec import (
     FeatureSpec,

@@ -15,8 +15,8 @@ from safetensors.torch import load_file
 from torch import Tensor
 from transformers import Qwen2_5_VLForConditionalGeneration
 
-from pipeline.config import TuningParams
-from pipeline.errors import VLMError
+from pipeline.base.config import TuningParams
+from pipeline.base.errors import VLMError
 from pipeline.vlm.live import LiveVLM
 from pipeline.vlm.preparation import PreparedRow
 

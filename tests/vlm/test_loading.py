@@ -17,8 +17,8 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 from transformers import Qwen2_5_VLForConditionalGeneration
 
-from pipeline.config import VLMParams
-from pipeline.errors import ConfigError, VLMError
+from pipeline.base.config import VLMParams
+from pipeline.base.errors import ConfigError, VLMError
 from pipeline.vlm.loading import load_model
 from pipeline.vlm.pixels import PixelSettings
 from pipeline.vlm.prompt import PromptRenderer

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from transformers import AutoImageProcessor
 
-from pipeline.errors import VLMError
+from pipeline.base.errors import VLMError
 from pipeline.vlm.patches import patchify
 from pipeline.vlm.pixels import PixelSettings, stretch
 

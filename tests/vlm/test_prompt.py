@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from transformers import AutoTokenizer
 
-from pipeline.errors import VLMError
+from pipeline.base.errors import VLMError
 from pipeline.vlm.prompt import PromptRenderer
 
 SYSTEM = "<|im_start|>system\nYou are a helpful assistant.<|im_end|>\n"

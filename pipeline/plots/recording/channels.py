@@ -4,7 +4,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pipeline.channels import PROFILE_CHANNELS, unnumbered
+from pipeline.base.channels import PROFILE_CHANNELS, unnumbered
 from pipeline.recordings import Channels
 
 

@@ -4,8 +4,8 @@ from collections.abc import Iterator
 from functools import cache, partial
 
 from pipeline import plots
+from pipeline.base.digests import file_digest
 from pipeline.batches import Ticks
-from pipeline.digests import file_digest
 from pipeline.evaluation import HEADINGS, Judgement, Predictions, best_baseline
 from pipeline.evaluation.footage import footage, shown_ticks
 from pipeline.report.page.blocks import Block, Picture, Section, Table, Text

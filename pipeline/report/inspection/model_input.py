@@ -5,9 +5,9 @@ from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from itertools import groupby
 
-from pipeline.config import Params
+from pipeline.base.config import Params
+from pipeline.base.errors import PipelineError
 from pipeline.datasets import UnifiedBatch, UnifiedVLADataset
-from pipeline.errors import PipelineError
 from pipeline.inspection.facts import EpisodeView, PromptToken, PromptView
 from pipeline.inspection.frames import frames_at
 from pipeline.inspection.overview import RecordingsOverview

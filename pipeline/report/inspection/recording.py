@@ -3,8 +3,8 @@
 from collections.abc import Mapping, Sequence
 from functools import lru_cache, partial
 
-from pipeline.amounts import duration
-from pipeline.config import Params
+from pipeline.base.config import Params
+from pipeline.base.format import duration
 from pipeline.inspection.episodes import view_episode
 from pipeline.inspection.overview import EpisodeSummary, RecordingsOverview, survey_recordings
 from pipeline.recordings import Opened

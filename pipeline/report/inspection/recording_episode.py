@@ -7,7 +7,7 @@ from functools import partial
 
 from matplotlib.figure import Figure
 
-from pipeline.config import InspectParams
+from pipeline.base.config import InspectParams
 from pipeline.inspection.clocks import GAP_FACTOR, clocks
 from pipeline.inspection.contact import RULE, contacts
 from pipeline.inspection.facts import Clock, EpisodeView, Flaw

@@ -5,7 +5,7 @@ from itertools import groupby
 
 import numpy as np
 
-from pipeline.channels import PROFILE_CHANNELS, unnumbered
+from pipeline.base.channels import PROFILE_CHANNELS, unnumbered
 from pipeline.inspection.facts import ChannelStatistics
 from pipeline.report.page.blocks import Table
 

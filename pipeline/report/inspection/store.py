@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.amounts import duration, size
+from pipeline.base.format import duration, size
 from pipeline.inspection.facts import ChannelStatistics
 from pipeline.inspection.store import EpisodeCoverage, StoreView
 from pipeline.plots import store as pictures

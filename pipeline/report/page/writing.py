@@ -17,8 +17,8 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 from tqdm import tqdm
 
-from pipeline.durable import disk_full_named, sync
-from pipeline.ownership import REPORT, OutputKind, begin_folder, release, remove_folder
+from pipeline.base.durable import disk_full_named, sync
+from pipeline.base.ownership import REPORT, OutputKind, begin_folder, release, remove_folder
 from pipeline.plots.style import NO_FONT, RC, boxes, write
 from pipeline.report.page.blocks import (
     Block,

@@ -12,9 +12,9 @@ import zarr
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.durable import disk_full_named, put_in_place, sync
-from pipeline.errors import StoreIncomplete, StoreMismatch
-from pipeline.ownership import begin_folder, remove_folder
+from pipeline.base.durable import disk_full_named, put_in_place, sync
+from pipeline.base.errors import StoreIncomplete, StoreMismatch
+from pipeline.base.ownership import begin_folder, remove_folder
 from pipeline.store.archive.codecs import Choice, Codec, choose, codecs_for
 from pipeline.store.archive.layout import create_array, inner_rows, rows_of, shard_path, shards
 from pipeline.store.archive.manifest import (

@@ -11,8 +11,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import StoreIncomplete, StoreMismatch
-from pipeline.ownership import OutputKind
+from pipeline.base.errors import StoreIncomplete, StoreMismatch
+from pipeline.base.ownership import OutputKind
 
 ARCHIVE_SCHEMA = 1
 ATTRIBUTE = "archive"

@@ -9,9 +9,9 @@ import zarr
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.durable import disk_full_named, sync
-from pipeline.errors import StoreMismatch
-from pipeline.ownership import begin_folder, remove_folder
+from pipeline.base.durable import disk_full_named, sync
+from pipeline.base.errors import StoreMismatch
+from pipeline.base.ownership import begin_folder, remove_folder
 from pipeline.store.archive.layout import open_array, rows_of, shard_path, shards
 from pipeline.store.archive.manifest import (
     ROOT,

@@ -14,7 +14,7 @@ import google_crc32c
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import StoreIncomplete
+from pipeline.base.errors import StoreIncomplete
 from pipeline.store.archive.layout import rows_of
 from pipeline.store.chunk_pass import ChunkPass
 from pipeline.store.mending import mend

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import zarr
 
-from pipeline.errors import StoreIncomplete
+from pipeline.base.errors import StoreIncomplete
 from pipeline.store.archive.manifest import read_manifest
 from pipeline.store.chunks import read_rows
 from pipeline.store.places import read_plan

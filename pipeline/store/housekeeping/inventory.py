@@ -12,7 +12,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
-from pipeline.errors import ConfigError, PipelineError
+from pipeline.base.errors import ConfigError, PipelineError
 from pipeline.store.archive import is_archive
 from pipeline.store.housekeeping.contents import Contents, contents_of, contents_of_archive
 from pipeline.store.lock import lock_holder

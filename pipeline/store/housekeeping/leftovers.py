@@ -9,10 +9,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.digests import is_ledger
-from pipeline.durable import HELD, KEPT
-from pipeline.errors import ConfigError, StoreIncomplete, StoreLocked
-from pipeline.ownership import OutputKind, remove_folder
+from pipeline.base.digests import is_ledger
+from pipeline.base.durable import HELD, KEPT
+from pipeline.base.errors import ConfigError, StoreIncomplete, StoreLocked
+from pipeline.base.ownership import OutputKind, remove_folder
 from pipeline.store.archive.manifest import ARCHIVE
 from pipeline.store.housekeeping.inventory import Entry, Inventory, Kind
 from pipeline.store.housekeeping.listing import clause

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.amounts import size
+from pipeline.base.format import size
 from pipeline.store.housekeeping.contents import Contents
 from pipeline.store.housekeeping.inventory import GROUPS, Entry, Inventory
 

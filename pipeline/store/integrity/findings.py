@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.amounts import size
+from pipeline.base.format import size
 from pipeline.store.mending import mend, start_over
 from pipeline.store.replacement import Inode
 

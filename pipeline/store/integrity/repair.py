@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.durable import disk_full_named, sync
-from pipeline.ownership import begin_folder, remove_folder
+from pipeline.base.durable import disk_full_named, sync
+from pipeline.base.ownership import begin_folder, remove_folder
 from pipeline.store.chunks import ChunkFiles, row_checksums
 from pipeline.store.environments import EnvironmentLog
 from pipeline.store.integrity.findings import Findings, runs_of

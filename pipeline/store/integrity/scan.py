@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import StoreIncomplete
+from pipeline.base.errors import StoreIncomplete
 from pipeline.store.chunk_pass import ChunkPass
 from pipeline.store.chunks import ChunkFiles, row_checksums
 from pipeline.store.schema import CHECKSUMS, FEATURES, TRAILER_BYTES, ArraySpec

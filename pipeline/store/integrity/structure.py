@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import StoreIncomplete
+from pipeline.base.errors import StoreIncomplete
 from pipeline.store.integrity.findings import Damage
 from pipeline.store.metadata import metadata_damage
 from pipeline.store.schema import (

@@ -16,7 +16,7 @@ from dask.threaded import get as run_in_threads
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.errors import StoreIncomplete, StoreMismatch
+from pipeline.base.errors import StoreIncomplete, StoreMismatch
 from pipeline.store.archive import is_archive
 from pipeline.store.integrity.findings import MOST_LINES, Damage, Findings, Places, runs_of
 from pipeline.store.integrity.relations import EpisodeTable, RelationTask, relation_tasks
@@ -120,7 +120,7 @@ def _on_cluster(
 ) -> Iterator[Report]:
     from distributed import Client, as_completed
 
-    from pipeline.scheduler import client_of, private_cluster, quiet
+    from pipeline.base.scheduler import client_of, private_cluster, quiet
 
     with ExitStack() as stack:
         stack.enter_context(quiet())

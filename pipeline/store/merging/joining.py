@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import StoreMismatch
+from pipeline.base.errors import StoreMismatch
 from pipeline.store.episodes import SAID
 from pipeline.store.reader import Episode, FeatureStore
 from pipeline.store.schema import FEATURES

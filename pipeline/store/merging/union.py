@@ -19,9 +19,9 @@ import numpy as np
 import zarr
 from tqdm import tqdm
 
-from pipeline.amounts import size
-from pipeline.durable import free_bytes
-from pipeline.errors import ConfigError, DiskFull, StoreIncomplete, StoreMismatch
+from pipeline.base.durable import free_bytes
+from pipeline.base.errors import ConfigError, DiskFull, StoreIncomplete, StoreMismatch
+from pipeline.base.format import size
 from pipeline.store.integrity import verify
 from pipeline.store.lock import build_lock
 from pipeline.store.mending import gc_command

@@ -7,11 +7,11 @@ policy's parts, `finetune` that of tuning the model itself, `stores` those of wh
 stores, `inspect` that of looking at both; `load` reads the file, `keys` describes it.
 """
 
-from pipeline.config.finetune import FinetuneParams, TuningParams
-from pipeline.config.inspect import InspectParams
-from pipeline.config.keys import described_keys
-from pipeline.config.load import load_params
-from pipeline.config.policy import (
+from pipeline.base.config.finetune import FinetuneParams, TuningParams
+from pipeline.base.config.inspect import InspectParams
+from pipeline.base.config.keys import described_keys
+from pipeline.base.config.load import load_params
+from pipeline.base.config.policy import (
     DiffusionParams,
     ExpertParams,
     FlowMatchingParams,
@@ -19,8 +19,8 @@ from pipeline.config.policy import (
     SensorEncoderParams,
     StateEncoderParams,
 )
-from pipeline.config.sections import Params
-from pipeline.config.stage_one import (
+from pipeline.base.config.sections import Params
+from pipeline.base.config.stage_one import (
     AugmentationParams,
     DataParams,
     DemoParams,
@@ -31,14 +31,14 @@ from pipeline.config.stage_one import (
     Source,
     VLMParams,
 )
-from pipeline.config.stage_two import (
+from pipeline.base.config.stage_two import (
     CompareParams,
     EvaluateParams,
     FusionStrategy,
     ModelType,
     TrainHeadParams,
 )
-from pipeline.config.stores import (
+from pipeline.base.config.stores import (
     ArchiveParams,
     ProbeParams,
     StoresParams,

@@ -8,8 +8,8 @@ from typing import Any, get_args
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from pipeline.config.sections import Params
-from pipeline.errors import ConfigError
+from pipeline.base.config.sections import Params
+from pipeline.base.errors import ConfigError
 
 
 def load_params(path: Path, overrides: Sequence[str] = ()) -> Params:

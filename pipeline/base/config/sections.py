@@ -2,12 +2,12 @@
 
 from pydantic import model_validator
 
-from pipeline.config.finetune import FinetuneParams
-from pipeline.config.inspect import InspectParams
-from pipeline.config.section import Section
-from pipeline.config.stage_one import DataParams, DemoParams, ExtractParams, VLMParams
-from pipeline.config.stage_two import CompareParams, EvaluateParams, TrainHeadParams
-from pipeline.config.stores import ArchiveParams, ProbeParams, StoresParams, VerifyParams
+from pipeline.base.config.finetune import FinetuneParams
+from pipeline.base.config.inspect import InspectParams
+from pipeline.base.config.section import Section
+from pipeline.base.config.stage_one import DataParams, DemoParams, ExtractParams, VLMParams
+from pipeline.base.config.stage_two import CompareParams, EvaluateParams, TrainHeadParams
+from pipeline.base.config.stores import ArchiveParams, ProbeParams, StoresParams, VerifyParams
 
 
 class Params(Section):

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from pipeline.durable import (
+from pipeline.base.durable import (
     KEPT,
     fresh,
     put_in_place,
@@ -24,8 +24,8 @@ from pipeline.durable import (
     write_tensors,
     write_with_digest,
 )
-from pipeline.errors import CheckpointIncomplete, ConfigError, DiskFull
-from pipeline.ownership import OutputKind
+from pipeline.base.errors import CheckpointIncomplete, ConfigError, DiskFull
+from pipeline.base.ownership import OutputKind
 
 KIND = OutputKind("a folder of this test", lambda folder: (folder / "a").is_file())
 
@@ -61,7 +61,7 @@ def test_a_kill_between_any_two_steps_leaves_the_old_or_the_new(
 
     with monkeypatch.context() as patched:
         patched.setattr(Path, "rename", counted(Path.rename))
-        patched.setattr("pipeline.durable.sync", counted(lambda path: None))
+        patched.setattr("pipeline.base.durable.sync", counted(lambda path: None))
         patched.setattr("shutil.rmtree", gone)
         with pytest.raises(Killed):
             put(folder, "new")

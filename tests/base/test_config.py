@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.config import load_params
-from pipeline.errors import ConfigError
+from pipeline.base.config import load_params
+from pipeline.base.errors import ConfigError
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 MINIMAL = """
 data: {sources: [{name: demo, path: raw}]}

@@ -5,7 +5,7 @@ torch takes over a second to import: a command that finds nothing to do must not
 
 from typing import TYPE_CHECKING, Literal
 
-from pipeline.errors import ConfigError
+from pipeline.base.errors import ConfigError
 
 if TYPE_CHECKING:
     import torch

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
-from pipeline.config.section import Section, Seed
+from pipeline.base.config.section import Section, Seed
 
 
 def _workers(value: Any) -> Any:

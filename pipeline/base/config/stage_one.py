@@ -5,8 +5,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator
 
-from pipeline.config.section import Section, Seed
-from pipeline.config.stores import Workers
+from pipeline.base.config.section import Section, Seed
+from pipeline.base.config.stores import Workers
 
 RecordingFormat = Literal["auto", "raw", "new", "old", "lerobot"]
 Pooling = Literal["mean", "image_mean", "text_mean", "view_mean", "grid", "last"]

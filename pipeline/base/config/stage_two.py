@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from pipeline.config.policy import (
+from pipeline.base.config.policy import (
     DiffusionParams,
     ExpertParams,
     FlowMatchingParams,
@@ -13,7 +13,7 @@ from pipeline.config.policy import (
     SensorEncoderParams,
     StateEncoderParams,
 )
-from pipeline.config.section import Fraction, Section, Seed
+from pipeline.base.config.section import Fraction, Section, Seed
 
 ModelType = Literal["regression", "diffusion", "flow_matching"]
 FusionStrategy = Literal["concat", "cross_attention", "gated", "none"]

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from pipeline.device import resolve_device, use_bfloat16
-from pipeline.errors import ConfigError
+from pipeline.base.device import resolve_device, use_bfloat16
+from pipeline.base.errors import ConfigError
 
 CPU, CUDA = torch.device("cpu"), torch.device("cuda")
 

@@ -12,7 +12,7 @@ import dask
 from distributed import Client, LocalCluster
 from distributed.security import Security
 
-from pipeline.errors import ConfigError
+from pipeline.base.errors import ConfigError
 
 TIMEOUT_S = 10
 """For reaching a scheduler, and for reaching it again when the connection is lost."""

@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from pipeline.errors import (
+from pipeline.base.errors import (
     ConfigError,
     DiskFull,
     PipelineError,
     RecordingError,
     StoreLocked,
 )
-from pipeline.ownership import described
+from pipeline.base.ownership import described
 
 _BLOCK = 4 * 2**20
 _HEADER, _HEADER_BYTES = b"SQLite format 3\0", 100

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from safetensors import SafetensorError
 
-from pipeline.errors import CheckpointIncomplete, DiskFull
-from pipeline.ownership import (
+from pipeline.base.errors import CheckpointIncomplete, DiskFull
+from pipeline.base.ownership import (
     OutputKind,
     begin_folder,
     mark,

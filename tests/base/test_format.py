@@ -2,7 +2,7 @@
 
 import pytest
 
-from pipeline.amounts import duration, size
+from pipeline.base.format import duration, size
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,8 @@ from typing import Any
 
 from pydantic.fields import FieldInfo
 
-from pipeline.config.section import Section
-from pipeline.config.sections import Params
+from pipeline.base.config.section import Section
+from pipeline.base.config.sections import Params
 
 
 def described_keys(sections: Sequence[str]) -> list[str]:

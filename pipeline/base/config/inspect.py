@@ -4,8 +4,8 @@ from pathlib import Path
 
 from pydantic import Field
 
-from pipeline.config.section import Section, Seed
-from pipeline.config.stage_one import RecordingFormat
+from pipeline.base.config.section import Section, Seed
+from pipeline.base.config.stage_one import RecordingFormat
 
 
 class InspectParams(Section):

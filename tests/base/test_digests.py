@@ -6,8 +6,8 @@ from contextlib import closing
 
 import pytest
 
-from pipeline.digests import ContentDigests
-from pipeline.errors import ConfigError, RecordingError
+from pipeline.base.digests import ContentDigests
+from pipeline.base.errors import ConfigError, RecordingError
 
 
 def test_reads_a_file_once_and_notices_a_change(tmp_path, monkeypatch):
@@ -15,7 +15,7 @@ def test_reads_a_file_once_and_notices_a_change(tmp_path, monkeypatch):
     file.write_bytes(b"one")
     with closing(ContentDigests(ledger)) as digests:
         first = digests.of(file)
-    monkeypatch.setattr("pipeline.digests.file_digest", lambda path: "read again")
+    monkeypatch.setattr("pipeline.base.digests.file_digest", lambda path: "read again")
     with closing(ContentDigests(ledger)) as digests:
         assert digests.of(file) == first
         os.utime(file, ns=(1, 1))
@@ -96,7 +96,7 @@ def test_what_only_reads_needs_no_write_access(tmp_path, monkeypatch):
             how["uri"], place = True, f"file:{ledger}?mode=ro&immutable=1"
         return real(place, **how)
 
-    monkeypatch.setattr("pipeline.digests.sqlite3.connect", read_only)
+    monkeypatch.setattr("pipeline.base.digests.sqlite3.connect", read_only)
     with (
         closing(ContentDigests(ledger)) as digests,
         pytest.raises(ConfigError, match="cannot be written"),
