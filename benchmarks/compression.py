@@ -32,8 +32,8 @@ from zarr.codecs.numcodecs import Shuffle
 from benchmarks.timing import arguments, at_least, report
 from benchmarks.workload import ROWS_AN_EPISODE, write_recordings
 from pipeline.base.config import Source, load_params
+from pipeline.data import open_recordings
 from pipeline.extraction import extract
-from pipeline.recordings import open_recordings
 from pipeline.store.archive.codecs import (
     Choice,
     Codec,

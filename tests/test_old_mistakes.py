@@ -20,11 +20,11 @@ from pipeline.base.config import Params, Source, TrainHeadParams, VLMParams
 from pipeline.base.digests import ContentDigests
 from pipeline.base.errors import RecordingError
 from pipeline.checkpoint import policy_shape
+from pipeline.data import Recording, open_recordings
 from pipeline.datasets import UnifiedVLADataset
 from pipeline.extraction import extract
 from pipeline.models import DiffusionActionExpert, Policy, RegressionActionExpert
 from pipeline.models.noise_schedule import NoiseSchedule
-from pipeline.recordings import Recording, open_recordings
 from pipeline.sampling import split_by_episode
 from pipeline.simulation.insertion_formats import ABUTTING, write_new
 from pipeline.simulation.recorder import simulate_episode

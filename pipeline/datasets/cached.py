@@ -5,8 +5,8 @@ from dataclasses import replace
 from pathlib import Path, PurePath
 
 from pipeline.base.errors import StoreMismatch
-from pipeline.recordings import Recording
-from pipeline.recordings.reader import absolute
+from pipeline.data import Recording
+from pipeline.data.reader import absolute
 from pipeline.store import Episode, FeatureStore
 
 

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.recordings import Recording, Stream
-from pipeline.recordings.embodiment import Embodiment, common_embodiment
+from pipeline.data import Recording, Stream
+from pipeline.data.embodiment import Embodiment, common_embodiment
+from pipeline.data.timeline import ActionRotation, Timeline, build_timeline
 from pipeline.store import KEY_BYTES, SCHEMA, FeatureStore
 from pipeline.store.episodes import EpisodeRows, episode_arrays
-from pipeline.timeline import ActionRotation, Timeline, build_timeline
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,10 @@ from tqdm import tqdm
 
 from pipeline.base.config import Params
 from pipeline.base.errors import RecordingError, VLMError
+from pipeline.data import BadEpisode
+from pipeline.data.embodiment import Embodiment, common_embodiment
+from pipeline.data.timeline import Timeline, build_timeline
 from pipeline.extraction.survey import Survey, SurveyedEpisode, refuse_bad
-from pipeline.recordings import BadEpisode
-from pipeline.recordings.embodiment import Embodiment, common_embodiment
-from pipeline.timeline import Timeline, build_timeline
 from pipeline.vlm.preparation import Preparer
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.config import Params
-from pipeline.recordings import Recording
+from pipeline.data import Recording
 from pipeline.vlm.feature_spec import FeatureSpec
 
 Came = Literal["computed", "known", "repeated"]

@@ -14,11 +14,11 @@ from tqdm import tqdm
 from pipeline.base.config import Params
 from pipeline.base.digests import ContentDigests
 from pipeline.base.errors import StoreMismatch
+from pipeline.data import Recording
 from pipeline.extraction.encoder import Encoder
 from pipeline.extraction.places import ledger_path
 from pipeline.extraction.rows import ReadyRow, RowPreparation, in_background, spans_of
 from pipeline.extraction.survey import Survey, survey
-from pipeline.recordings import Recording
 from pipeline.store import FEATURES, FeatureStore
 from pipeline.store.integrity.findings import capped
 from pipeline.store.reader import Episode

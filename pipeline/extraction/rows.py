@@ -11,9 +11,9 @@ from typing import Any, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.recordings import CameraStream, Recording
+from pipeline.data import CameraStream, Recording
+from pipeline.data.timeline import last_at
 from pipeline.store import Donor
-from pipeline.timeline import last_at
 from pipeline.vlm.feature_spec import FeatureSpec, row_key
 from pipeline.vlm.preparation import PreparedRow, Preparer
 

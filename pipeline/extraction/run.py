@@ -10,6 +10,7 @@ from pipeline.base.config import Params
 from pipeline.base.device import resolve_device
 from pipeline.base.digests import ContentDigests
 from pipeline.base.durable import free_bytes
+from pipeline.data.timeline import rate_notes
 from pipeline.extraction.check import CheckedEpisode, check_episodes, embodiment_of
 from pipeline.extraction.fill import ExtractionReport, fill, rate_name
 from pipeline.extraction.layout import build_arrays, check_space, lay_out
@@ -46,7 +47,6 @@ from pipeline.store import (
 from pipeline.store.metadata import check_metadata
 from pipeline.store.places import refuse_foreign_store
 from pipeline.store.schema import read_specs
-from pipeline.timeline import rate_notes
 
 
 def extract(params: Params, say: Say) -> ExtractionReport | None:

@@ -14,8 +14,8 @@ from tqdm import tqdm
 from pipeline.base.config import DataParams, Params
 from pipeline.base.digests import ContentDigests, joint_digest
 from pipeline.base.errors import RecordingError
-from pipeline.recordings import BadEpisode, Recording, content_digest, open_recordings
-from pipeline.timeline import ActionRotation, choose_action_rotation
+from pipeline.data import BadEpisode, Recording, content_digest, open_recordings
+from pipeline.data.timeline import ActionRotation, choose_action_rotation
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 
 

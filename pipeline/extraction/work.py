@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from pipeline.base.config import Params
 from pipeline.base.digests import ContentDigests
-from pipeline.recordings import Recording
+from pipeline.data import Recording
 from pipeline.store import Donor, StoreBuild
 from pipeline.vlm.feature_spec import FeatureSpec
 

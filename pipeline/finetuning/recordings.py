@@ -8,7 +8,7 @@ from tqdm import tqdm
 from pipeline.base.config import Params
 from pipeline.base.digests import ContentDigests
 from pipeline.base.errors import RecordingError, StoreMismatch
-from pipeline.recordings import Opened, Recording, content_digest, open_recordings
+from pipeline.data import Opened, Recording, content_digest, open_recordings
 from pipeline.store import Episode, FeatureStore
 from pipeline.vlm.feature_spec import FeatureSpec, differences, feature_spec
 

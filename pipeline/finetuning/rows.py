@@ -12,8 +12,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.data import CameraStream, Recording
 from pipeline.extraction.rows import Span
-from pipeline.recordings import CameraStream, Recording
 from pipeline.store import FeatureStore
 from pipeline.vlm.preparation import PreparedRow, Preparer
 

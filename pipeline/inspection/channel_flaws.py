@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from pipeline.base.channels import hardly_moving, named
+from pipeline.data import Channels, Stream
 from pipeline.inspection.clocks import usual_step
 from pipeline.inspection.contact import force_columns
 from pipeline.inspection.facts import EpisodeView, Flaw
 from pipeline.inspection.runs import runs
 from pipeline.inspection.saturation import saturated
-from pipeline.recordings import Channels, Stream
 
 FROZEN_S = 0.5
 """A sensor whose channels all repeat for as long stands still."""

@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.data.recording import Nominal
 from pipeline.inspection.clocks import distinct_clocks, gaps, shortest_gap, usual_step
 from pipeline.inspection.facts import EpisodeView, Flaw, Gap
-from pipeline.recordings.recording import Nominal
 
 RATE_TOLERANCE = 0.1
 """Share by which entries a second may differ from what the recording says."""

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
+from pipeline.data import Stream
 from pipeline.inspection.clocks import usual_step
 from pipeline.inspection.facts import Contact, EpisodeView
 from pipeline.inspection.runs import runs
-from pipeline.recordings import Stream
 
 _REST_S = 0.5
 _SMOOTHED_S = 0.02

@@ -2,10 +2,10 @@
 
 from collections.abc import Iterator
 
+from pipeline.data.reader import FileRecording
+from pipeline.data.recording import Nominal
 from pipeline.inspection.clocks import usual_step
 from pipeline.inspection.facts import EpisodeView, Flaw
-from pipeline.recordings.reader import FileRecording
-from pipeline.recordings.recording import Nominal
 
 COUNT_TOLERANCE = 0.1
 """Share of its frames that a view may lack; two frames are never too few."""

@@ -10,9 +10,9 @@ from typing import TypeVar
 
 from pipeline.base.config import DataParams
 from pipeline.base.errors import RecordingError
+from pipeline.data import CameraStream, RecordedAction, Recording, Stream
+from pipeline.data.timeline import ActionRotation, Timeline, build_timeline
 from pipeline.inspection.facts import EpisodeView, Flaw
-from pipeline.recordings import CameraStream, RecordedAction, Recording, Stream
-from pipeline.timeline import ActionRotation, Timeline, build_timeline
 
 Part = TypeVar("Part")
 

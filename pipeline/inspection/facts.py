@@ -11,8 +11,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.recordings import CameraStream, RecordedAction, Recording, Stream
-from pipeline.timeline import ActionRotation, Timeline
+from pipeline.data import CameraStream, RecordedAction, Recording, Stream
+from pipeline.data.timeline import ActionRotation, Timeline
 
 Severity = Literal["error", "warning"]
 ClockKind = Literal["camera", "stream", "tick", "vl_row"]

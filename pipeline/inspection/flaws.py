@@ -3,12 +3,12 @@
 from collections.abc import Iterator
 
 from pipeline.base.errors import RecordingError
+from pipeline.data.recording import Nominal
 from pipeline.inspection.channel_flaws import channel_flaws
 from pipeline.inspection.clock_flaws import clock_flaws
 from pipeline.inspection.count_flaws import count_flaws
 from pipeline.inspection.facts import EpisodeView, Flaw
 from pipeline.inspection.pixel_flaws import pixel_flaws
-from pipeline.recordings.recording import Nominal
 
 
 def find_flaws(view: EpisodeView) -> tuple[Flaw, ...]:

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.data.timeline import last_at
 from pipeline.inspection.episodes import BROKEN
 from pipeline.inspection.facts import EpisodeView, Flaw
-from pipeline.timeline import last_at
 
 
 def spread_ticks(view: EpisodeView, count: int) -> list[int]:

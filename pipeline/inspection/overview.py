@@ -11,12 +11,12 @@ from tqdm import tqdm
 
 from pipeline.base.config import Params
 from pipeline.base.errors import StoreMismatch
+from pipeline.data import Opened, Recording
+from pipeline.data.embodiment import Embodiment, common_embodiment
+from pipeline.data.timeline import ActionRotation, choose_action_rotation, rate_notes
 from pipeline.inspection.episodes import view_episode
 from pipeline.inspection.facts import EpisodeView, Flaw
 from pipeline.inspection.flaws import find_flaws
-from pipeline.recordings import Opened, Recording
-from pipeline.recordings.embodiment import Embodiment, common_embodiment
-from pipeline.timeline import ActionRotation, choose_action_rotation, rate_notes
 
 
 @dataclass(frozen=True)

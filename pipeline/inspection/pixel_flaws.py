@@ -23,10 +23,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.data import CameraStream
 from pipeline.inspection.episodes import BROKEN
 from pipeline.inspection.facts import EpisodeView, Flaw
 from pipeline.inspection.runs import runs
-from pipeline.recordings import CameraStream
 
 MOST_FRAMES, RUNS = 120, 12
 ONE_COLOUR = 2.0

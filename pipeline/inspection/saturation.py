@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.channels import named
+from pipeline.data import Stream
 from pipeline.inspection.contact import force_columns
 from pipeline.inspection.facts import EpisodeView, Flaw
 from pipeline.inspection.runs import runs
-from pipeline.recordings import Stream
 
 CLIPPED_SHARE, CLIPPED_RUN = 0.01, 5
 """Share of a channel's readings at the end of its range, and how many of them in a row."""

@@ -5,8 +5,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.data import Channels
 from pipeline.inspection.facts import ChannelStatistics, EpisodeView
-from pipeline.recordings import Channels
 
 _COLUMNS = 16
 """Channels worked on at a time: sorting copies what it looks at."""

@@ -6,11 +6,11 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.data.timeline import COARSEST_S
 from pipeline.inspection.facts import ChannelStatistics, Flaw
 from pipeline.inspection.store_coverage import Ages, EpisodeCoverage
 from pipeline.inspection.store_statistics import StreamStatistics
 from pipeline.store import FeatureStore
-from pipeline.timeline import COARSEST_S
 
 FEW_TICKS = 10
 _STALE_PERIODS = 2

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.data import Channels
 from pipeline.inspection.channel_flaws import still_channels
 from pipeline.inspection.facts import ChannelStatistics
 from pipeline.inspection.statistics import statistics_of
-from pipeline.recordings import Channels
 from pipeline.store import FeatureStore
 
 SAMPLE_BYTES = 64 * 2**20

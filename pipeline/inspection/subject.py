@@ -11,8 +11,8 @@ from pathlib import Path
 from pipeline.base.config import InspectParams, Params, Source
 from pipeline.base.errors import ConfigError, RecordingError
 from pipeline.base.ownership import REPORT, refuse_foreign
-from pipeline.recordings import Opened, open_recordings
-from pipeline.recordings.finding import hub_hint, meant
+from pipeline.data import Opened, open_recordings
+from pipeline.data.discovery import hub_hint, meant
 
 ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".zst", ".rar")
 STORE = (".zarr", ".zarr.part")

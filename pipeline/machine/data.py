@@ -8,9 +8,9 @@ import av
 
 from pipeline.base.config import Params, Source
 from pipeline.base.errors import RecordingError
+from pipeline.data import Opened, Recording, open_recordings
 from pipeline.machine.decoders import CLIPS, decoding_trouble
 from pipeline.machine.findings import Finding, missing, note, ok
-from pipeline.recordings import Opened, Recording, open_recordings
 
 _CODECS = {"av1": "AV1", "h264": "H.264", "hevc": "HEVC"}
 _VIDEOS = {".mp4", ".mkv", ".avi", ".mov", ".webm"}

@@ -11,6 +11,9 @@ from pipeline.base.config import Params
 from pipeline.base.durable import free_bytes
 from pipeline.base.errors import RecordingError, StoreMismatch, VLMError
 from pipeline.base.format import size
+from pipeline.data import Recording, open_recordings
+from pipeline.data.embodiment import Embodiment
+from pipeline.data.timeline import ActionRotation, build_timeline, choose_action_rotation
 from pipeline.extraction.check import CheckedEpisode
 from pipeline.extraction.layout import build_arrays
 from pipeline.extraction.plan import store_bytes
@@ -19,11 +22,8 @@ from pipeline.machine.checkpoint import local_folder
 from pipeline.machine.data import unusable
 from pipeline.machine.findings import Finding, missing, note, ok
 from pipeline.machine.links import links_here
-from pipeline.recordings import Recording, open_recordings
-from pipeline.recordings.embodiment import Embodiment
 from pipeline.store import part_path
 from pipeline.store.memory import memory_bytes
-from pipeline.timeline import ActionRotation, build_timeline, choose_action_rotation
 from pipeline.vlm.feature_spec import feature_spec
 
 BUDGET_S = 2.0

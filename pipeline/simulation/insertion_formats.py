@@ -14,7 +14,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipeline.recordings.insertion import CLOCK, STATE
+from pipeline.data.insertion import CLOCK, STATE
 from pipeline.simulation.arm import euler_actions
 from pipeline.simulation.insertion import STATE_HZ, TICK_HZ
 from pipeline.simulation.needle_sensor import READING_HZ

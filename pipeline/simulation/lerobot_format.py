@@ -15,8 +15,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from pipeline.recordings.insertion import SENSOR, STATE
-from pipeline.recordings.pickled import ACTION
+from pipeline.data.insertion import SENSOR, STATE
+from pipeline.data.pickled import ACTION
 from pipeline.simulation.arm import euler_actions
 from pipeline.simulation.insertion import TICK_HZ, TICK_S
 from pipeline.simulation.insertion_formats import INSTRUCTION

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.recordings.insertion import ALINE_BINS
+from pipeline.data.insertion import ALINE_BINS
 
 READING_HZ: Final = 650
 READINGS_PER_SCAN: Final = 5

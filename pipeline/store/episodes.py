@@ -63,7 +63,7 @@ def read_episodes(
 
 
 class Ticks(Protocol):
-    """An episode's ticks, with indices into its own streams; see `pipeline.timeline.Timeline`."""
+    """An episode's ticks, with indices into its own streams: `pipeline.data.timeline.Timeline`."""
 
     @property
     def time(self) -> NDArray[np.float64]: ...

@@ -13,6 +13,9 @@ from torch.utils.data import ConcatDataset, DataLoader
 
 from pipeline.base.config import Source, TrainHeadParams
 from pipeline.base.errors import ConfigError, RecordingError, StoreIncomplete, StoreMismatch
+from pipeline.data import Channels, RecordedAction, open_recordings
+from pipeline.data.timeline import build_timeline
+from pipeline.data.windowed import WindowedRecording
 from pipeline.datasets import (
     AsyncInsertionMeca500DatasetWithSensor,
     NewAsyncInsertionDataset,
@@ -22,11 +25,8 @@ from pipeline.datasets import (
 )
 from pipeline.models import Observation, Policy, PolicyShape, QwenVLAUnified
 from pipeline.models.unchanged import Unchanged
-from pipeline.recordings import Channels, RecordedAction, open_recordings
-from pipeline.recordings.windowed import WindowedRecording
 from pipeline.sampling import split_by_episode
 from pipeline.store import Batch, FeatureStore
-from pipeline.timeline import build_timeline
 
 SMALL = TrainHeadParams.model_validate(
     {

@@ -21,15 +21,15 @@ from pipeline.base.errors import (
     StoreLocked,
     StoreMismatch,
 )
+from pipeline.data import Channels, RecordedAction, Stream, open_recordings
+from pipeline.data.lerobot_clock import stored_clock
+from pipeline.data.timeline import build_timeline
+from pipeline.data.windowed import WindowedRecording
 from pipeline.extraction import extract
-from pipeline.recordings import Channels, RecordedAction, Stream, open_recordings
-from pipeline.recordings.lerobot_clock import stored_clock
-from pipeline.recordings.windowed import WindowedRecording
 from pipeline.simulation.lerobot_format import write_lerobot
 from pipeline.simulation.recorder import simulate_episode
 from pipeline.store import FeatureStore, StoreBuild, build_lock, part_path
 from pipeline.store.schema import ARRAY_NAMES, INCREMENTAL
-from pipeline.timeline import build_timeline
 from pipeline.vlm.feature_spec import feature_spec
 from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.qwen import FrozenVLM
@@ -87,8 +87,8 @@ def rounded_clocks(changed, tmp_path, monkeypatch):
         params = changed(data={**data, "vlm_reuse_count": 1}, vlm={"pooling": ["mean"]})
         with monkeypatch.context() as before:
             as_stored = lambda table, fps, where: stored_clock(table, where)  # noqa: E731
-            before.setattr("pipeline.recordings.lerobot.read_clock", as_stored)
-            before.setattr("pipeline.timeline.rounding", lambda clock: 0.0)
+            before.setattr("pipeline.data.lerobot.read_clock", as_stored)
+            before.setattr("pipeline.data.timeline.rounding", lambda clock: 0.0)
             run(params)
         return params
 

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from pipeline.base.config import DataParams, Source
+from pipeline.data import open_recordings
+from pipeline.data.timeline import choose_action_rotation
 from pipeline.inspection.episodes import view_episode
 from pipeline.inspection.facts import EpisodeView, Flaw
 from pipeline.inspection.flaws import find_flaws
-from pipeline.recordings import open_recordings
 from pipeline.simulation.insertion_formats import ABUTTING, write_new, write_old, write_raw
 from pipeline.simulation.lerobot_format import write_lerobot
 from pipeline.simulation.recorder import simulate_episode
-from pipeline.timeline import choose_action_rotation
 
 EPOCH_S = 1.767e9 + 0.25
 

@@ -8,9 +8,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from pipeline.data.recording import Nominal
 from pipeline.inspection.clock_flaws import clock_flaws
 from pipeline.inspection.facts import EpisodeView, Flaw
-from pipeline.recordings.recording import Nominal
 
 FAST = np.arange(39000) / 650
 SLOW = np.arange(6000) / 100

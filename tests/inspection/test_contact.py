@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.data import Channels, Stream
 from pipeline.inspection.contact import contacts, force_columns
 from pipeline.inspection.facts import Contact, EpisodeView
-from pipeline.recordings import Channels, Stream
 from pipeline.simulation.insertion import TICK_HZ
 from pipeline.simulation.recorder import SimulatedEpisode, simulate_episode
 

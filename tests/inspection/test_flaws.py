@@ -12,11 +12,11 @@ from PIL import Image
 
 from pipeline.base.channels import named
 from pipeline.base.config import DataParams, Source
+from pipeline.data import open_recordings
 from pipeline.inspection.channel_flaws import channel_flaws
 from pipeline.inspection.clock_flaws import clock_flaws
 from pipeline.inspection.episodes import view_episode
 from pipeline.inspection.facts import EpisodeView, Flaw
-from pipeline.recordings import open_recordings
 
 Find = Callable[..., tuple[Flaw, ...]]
 Copied = Callable[[str], Path]

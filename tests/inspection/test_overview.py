@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from pipeline.base.config import Params, Source
+from pipeline.data import open_recordings
 from pipeline.inspection.overview import RecordingsOverview, survey_recordings
-from pipeline.recordings import open_recordings
 
 
 def survey(*sources: Source, views: Sequence[str] | None = None, **data: Any) -> RecordingsOverview:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from pipeline.base.config import Params, Source
+from pipeline.data import BadEpisode, open_recordings
 from pipeline.machine.data import check_data, check_source, check_video
-from pipeline.recordings import BadEpisode, open_recordings
 
 
 def params(root: Path, *sources: dict[str, Any], **data: Any) -> Params:

@@ -9,6 +9,7 @@ import pytest
 import yaml
 
 from pipeline.base.config import Params
+from pipeline.data import open_recordings
 from pipeline.machine import space
 from pipeline.machine.data import check_data
 from pipeline.machine.limits import Limits, check_limits, read_limits
@@ -23,7 +24,6 @@ from pipeline.machine.space import (
     estimate_store,
     used_bytes,
 )
-from pipeline.recordings import open_recordings
 from stages import extract
 from stages.command import run
 

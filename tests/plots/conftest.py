@@ -11,12 +11,12 @@ import pytest
 from matplotlib.figure import Figure
 
 from pipeline.base.config import Source
+from pipeline.data import Channels, Stream, open_recordings
+from pipeline.data.timeline import build_timeline
 from pipeline.inspection.facts import Clock, EpisodeView, Gap
 from pipeline.plots.style import RC
-from pipeline.recordings import Channels, Stream, open_recordings
 from pipeline.simulation.insertion_formats import write_raw
 from pipeline.simulation.recorder import simulate_episode
-from pipeline.timeline import build_timeline
 
 
 @pytest.fixture(autouse=True)

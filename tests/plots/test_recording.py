@@ -11,12 +11,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from pipeline.base.channels import unnumbered
+from pipeline.data import Channels, Stream
 from pipeline.inspection.facts import Clock, Contact, EpisodeView, Flaw, Gap
 from pipeline.plots import interactive, recording
 from pipeline.plots.recording.channels import groups
 from pipeline.plots.recording.lanes import BAND
 from pipeline.plots.recording.thinning import columns, curve, worst_steps
-from pipeline.recordings import Channels, Stream
 
 Felt = Callable[..., EpisodeView]
 Words = Callable[[Figure], str]

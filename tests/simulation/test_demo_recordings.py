@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.base.config import Source
 from pipeline.base.errors import ConfigError, DiskFull
-from pipeline.recordings import Recording, open_recordings
+from pipeline.data import Recording, open_recordings
 from pipeline.simulation import demo_recordings
 from pipeline.simulation.demo_recordings import MARKER, write_demo_recordings
 from pipeline.simulation.recorder import SimulatedEpisode

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from pipeline.base.channels import PROFILE_CHANNELS, unnumbered
-from pipeline.recordings import Channels
+from pipeline.data import Channels
 
 
 @dataclass(frozen=True)

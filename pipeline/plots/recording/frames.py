@@ -7,10 +7,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from pipeline.data.timeline import last_at
 from pipeline.inspection.facts import EpisodeView
 from pipeline.plots.recording.drawing import centre, words
 from pipeline.plots.style import canvas
-from pipeline.timeline import last_at
 
 _COLUMN_IN = 2.3
 

@@ -6,9 +6,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
+from pipeline.data.timeline import Timeline
 from pipeline.inspection.facts import EpisodeView
 from pipeline.plots.style import PALETTE
-from pipeline.timeline import Timeline
 
 _ROW_LABELS = 12
 _TICK_LABELS = 60

@@ -10,12 +10,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from pipeline.data import Channels
 from pipeline.datasets import UnifiedBatch, UnifiedVLADataset
 from pipeline.plots.recording.channels import Group, groups, short_names
 from pipeline.plots.recording.drawing import absent, centre, curves, legend_beside, words
 from pipeline.plots.recording.masks import seen_views
 from pipeline.plots.style import canvas
-from pipeline.recordings import Channels
 
 _WIDTH_IN, _BESIDE_IN = 10.0, 1.6
 """Of the picture, as long as its columns are no narrower than the least; and what is beside them.

@@ -8,12 +8,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from pipeline.data import Stream
 from pipeline.inspection.facts import Contact, EpisodeView
 from pipeline.plots.recording.channels import Group, groups, short_names
 from pipeline.plots.recording.drawing import CONTACT, curves, legend_beside, words
 from pipeline.plots.recording.thinning import columns, curve
 from pipeline.plots.style import canvas
-from pipeline.recordings import Stream
 
 _TIME = "time since the recording began [s]"
 _WIDTH_IN, _PANEL_IN, _SMALL_IN, _IMAGE_IN = 10.0, 1.75, 1.0, 2.6

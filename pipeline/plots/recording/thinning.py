@@ -6,8 +6,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.data.timeline import last_at
 from pipeline.inspection.clocks import GAP_FACTOR, shortest_gap, usual_step
-from pipeline.timeline import last_at
 
 POINTS = 1200
 """Columns of a curve or an image; about the dots of a picture's width."""

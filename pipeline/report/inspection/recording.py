@@ -5,9 +5,9 @@ from functools import lru_cache, partial
 
 from pipeline.base.config import Params
 from pipeline.base.format import duration
+from pipeline.data import Opened
 from pipeline.inspection.episodes import view_episode
 from pipeline.inspection.overview import EpisodeSummary, RecordingsOverview, survey_recordings
-from pipeline.recordings import Opened
 from pipeline.report.inspection.flaws import notices
 from pipeline.report.inspection.model_input import model_input
 from pipeline.report.inspection.recording_episode import Viewer, episode_section

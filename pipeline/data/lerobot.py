@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from pipeline.base.config import Source
 from pipeline.base.errors import RecordingError
-from pipeline.recordings.arrays import member, read_npz
-from pipeline.recordings.insertion import SENSOR
-from pipeline.recordings.lerobot_clock import NUMBERS, check_numbers, read_clock, stored_clock
-from pipeline.recordings.lerobot_layout import Entry, Layout, read_layout
-from pipeline.recordings.lerobot_rows import ParquetCamera, find_rows, matrix
-from pipeline.recordings.reader import FileRecording
-from pipeline.recordings.recording import (
+from pipeline.data.arrays import member, read_npz
+from pipeline.data.insertion import SENSOR
+from pipeline.data.lerobot_clock import NUMBERS, check_numbers, read_clock, stored_clock
+from pipeline.data.lerobot_layout import Entry, Layout, read_layout
+from pipeline.data.lerobot_rows import ParquetCamera, find_rows, matrix
+from pipeline.data.reader import FileRecording
+from pipeline.data.recording import (
     ActionKind,
     CameraStream,
     Channels,
@@ -31,7 +31,7 @@ from pipeline.recordings.recording import (
     Stream,
     checked_stream,
 )
-from pipeline.recordings.video import VideoClip
+from pipeline.data.video import VideoClip
 
 MARKER = "meta/info.json"
 STATE = "observation.state"

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from pipeline.base.errors import RecordingError
-from pipeline.recordings.jpeg import (
+from pipeline.data.jpeg import (
     JpegCamera,
     check_image,
     frame_time,

@@ -8,17 +8,17 @@ from pathlib import Path
 
 from pipeline.base.config import Source
 from pipeline.base.errors import RecordingError
-from pipeline.recordings.arrays import member, number, read_json, read_npz
-from pipeline.recordings.insertion import (
+from pipeline.data.arrays import member, number, read_json, read_npz
+from pipeline.data.insertion import (
     SENSOR,
     InsertionRecording,
     promised,
     read_robot_states,
     robot_state_file,
 )
-from pipeline.recordings.jpeg import list_empty_views, list_views
-from pipeline.recordings.recording import Nominal, Stream, check_clock, checked_stream
-from pipeline.recordings.windows import rebuild
+from pipeline.data.jpeg import list_empty_views, list_views
+from pipeline.data.recording import Nominal, Stream, check_clock, checked_stream
+from pipeline.data.windows import rebuild
 
 MARKER = "metadata.json"
 _SENSOR_FILE = "sensor_data.npz"

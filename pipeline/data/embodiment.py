@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from pipeline.base.errors import StoreMismatch
-from pipeline.recordings.recording import Channels, Recording, Stream
+from pipeline.data.recording import Channels, Recording, Stream
 
 _NO_CHANNELS = Channels((), ())
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.base.errors import RecordingError
-from pipeline.recordings.reader import natural_key
-from pipeline.recordings.recording import CameraStream
+from pipeline.data.reader import natural_key
+from pipeline.data.recording import CameraStream
 
 THUMBNAIL = (32, 18)
 """Width and height of what is seen of a JPEG that is checked."""

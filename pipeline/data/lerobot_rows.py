@@ -12,10 +12,10 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from pipeline.base.errors import RecordingError
-from pipeline.recordings.jpeg import check_image, read_image
-from pipeline.recordings.lerobot_layout import Entry, Layout
-from pipeline.recordings.reader import natural_key
-from pipeline.recordings.recording import CameraStream
+from pipeline.data.jpeg import check_image, read_image
+from pipeline.data.lerobot_layout import Entry, Layout
+from pipeline.data.reader import natural_key
+from pipeline.data.recording import CameraStream
 
 _IMAGE_ROWS = 8
 """Rows of encoded images held at a time."""

@@ -16,7 +16,7 @@ import pytest
 from PIL import Image
 
 from pipeline.base.config import Source
-from pipeline.recordings import Recording, open_recordings
+from pipeline.data import Recording, open_recordings
 
 START = 1762581333.25
 STATE_NAMES = [f"joint_{i}" for i in range(1, 7)] + [f"pose_{axis}" for axis in "xyzabr"]

@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from pipeline.base.config import DataParams, Source
 from pipeline.base.digests import file_digest
 from pipeline.base.errors import RecordingError
+from pipeline.data import content_digest, open_recording, open_recordings
+from pipeline.data.lerobot import action_kind
+from pipeline.data.lerobot_clock import read_clock
+from pipeline.data.timeline import build_timeline
 from pipeline.inspection.episodes import view_episode
 from pipeline.inspection.flaws import find_flaws
-from pipeline.recordings import content_digest, open_recording, open_recordings
-from pipeline.recordings.lerobot import action_kind
-from pipeline.recordings.lerobot_clock import read_clock
-from pipeline.timeline import build_timeline
 
 VERSIONS = ["v2.0", "v2.1", "v3.0"]
 LENGTHS = (7, 5, 9)

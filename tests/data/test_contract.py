@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from pipeline.base.config import Source
-from pipeline.recordings import Recording, open_recordings
+from pipeline.data import Recording, open_recordings
 
 FORMATS = {
     "raw": lambda write, folder, truth: write.raw(folder / "Blue_point/data_collection_1", truth),
@@ -69,7 +69,7 @@ class TestRecordingContract:
             "jpeg.Image.open",
             "video.av.open",
         ):
-            monkeypatch.setattr(f"pipeline.recordings.{reading}", refuse)
+            monkeypatch.setattr(f"pipeline.data.{reading}", refuse)
         assert open_recordings([Source(name="s", path=str(folder))], folder).recordings
 
     def test_opening_again_gives_the_same(self, folder: Path, recordings):
@@ -90,7 +90,7 @@ class TestRecordingContract:
         kept = open_recordings([Source(name="s", path=str(folder))], folder, [first]).recordings
         monkeypatch.setattr(np, "load", None)
         monkeypatch.setattr(pq, "ParquetFile", None)
-        monkeypatch.setattr("pipeline.recordings.insertion.read_csv", None)
+        monkeypatch.setattr("pipeline.data.insertion.read_csv", None)
         assert [list(recording.view_names()) for recording in recordings] == expected
         assert all(recording.view_names() == [first] for recording in kept)
 

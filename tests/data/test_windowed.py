@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.base.config import Source
 from pipeline.base.errors import RecordingError
-from pipeline.recordings import open_recordings
+from pipeline.data import open_recordings
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from pipeline.base.errors import RecordingError
-from pipeline.recordings.video import VideoClip, VideoSpan
+from pipeline.data.video import VideoClip, VideoSpan
 
 ENCODINGS = [
     *((codec, group, 0) for codec in ("libx264", "mpeg4", "libsvtav1") for group in (1, 4, 40)),

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from pipeline.base.config import Source
 from pipeline.base.errors import RecordingError
-from pipeline.recordings import lerobot, pickled, raw, windowed
-from pipeline.recordings.reader import FileRecording, absolute, natural_key
+from pipeline.data import lerobot, pickled, raw, windowed
+from pipeline.data.reader import FileRecording, absolute, natural_key
 
 Found = tuple[Sequence[FileRecording], Sequence[str]]
 """Episodes, and lines about those that are not there."""

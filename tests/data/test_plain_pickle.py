@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from pipeline.base.errors import RecordingError
-from pipeline.recordings.plain_pickle import load_plain
+from pipeline.data.plain_pickle import load_plain
 
 
 def save(path: Path, content: object, protocol: int = 4) -> Path:

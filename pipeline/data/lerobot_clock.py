@@ -11,9 +11,9 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from pipeline.base.errors import RecordingError
-from pipeline.recordings.lerobot_layout import Entry
-from pipeline.recordings.lerobot_rows import EpisodeRows, matrix
-from pipeline.recordings.recording import check_clock, check_rising_clock
+from pipeline.data.lerobot_layout import Entry
+from pipeline.data.lerobot_rows import EpisodeRows, matrix
+from pipeline.data.recording import check_clock, check_rising_clock
 
 CLOCK = "timestamp"
 FRAME = "frame_index"

@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 
 from pipeline.base.config import Source
-from pipeline.recordings.recording import CameraStream, Recording
+from pipeline.data.recording import CameraStream, Recording
 
 
 class FileRecording(Recording):

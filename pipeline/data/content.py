@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from pipeline.base.digests import joint_digest
-from pipeline.recordings.recording import Recording
+from pipeline.data.recording import Recording
 
 
 def content_digest(recording: Recording, digest_of: Callable[[Path], str]) -> str:

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.errors import RecordingError
-from pipeline.recordings.arrays import Numbers, csv_header, member, read_csv, read_npz
-from pipeline.recordings.jpeg import JpegCamera
-from pipeline.recordings.reader import FileRecording, absolute
-from pipeline.recordings.recording import CameraStream, Channels, Stream, checked_stream
+from pipeline.data.arrays import Numbers, csv_header, member, read_csv, read_npz
+from pipeline.data.jpeg import JpegCamera
+from pipeline.data.reader import FileRecording, absolute
+from pipeline.data.recording import CameraStream, Channels, Stream, checked_stream
 
 _JOINTS = tuple(f"joint_{joint}" for joint in range(1, 7))
 _POSE = tuple(f"pose_{axis}" for axis in "xyzabr")

@@ -9,15 +9,15 @@ from pathlib import Path
 
 from pipeline.base.config import Source
 from pipeline.base.errors import RecordingError
-from pipeline.recordings.arrays import member, read_npz
-from pipeline.recordings.insertion import (
+from pipeline.data.arrays import member, read_npz
+from pipeline.data.insertion import (
     SENSOR,
     InsertionRecording,
     read_state_csv,
     sensor_rows,
 )
-from pipeline.recordings.jpeg import list_empty_views, list_views
-from pipeline.recordings.recording import Stream, checked_stream
+from pipeline.data.jpeg import list_empty_views, list_views
+from pipeline.data.recording import Stream, checked_stream
 
 _STATE_FILES = "robot_state_*.csv"
 _SENSOR_FILES = "sensor_data_*.npz"

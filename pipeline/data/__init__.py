@@ -11,10 +11,10 @@ from pathlib import Path
 
 from pipeline.base.config import Source
 from pipeline.base.errors import RecordingError
-from pipeline.recordings.content import content_digest
-from pipeline.recordings.finding import READERS, episode_folders, listing
-from pipeline.recordings.reader import FileRecording, absolute, natural_key
-from pipeline.recordings.recording import (
+from pipeline.data.content import content_digest
+from pipeline.data.discovery import READERS, episode_folders, listing
+from pipeline.data.reader import FileRecording, absolute, natural_key
+from pipeline.data.recording import (
     ActionKind,
     CameraStream,
     Channels,

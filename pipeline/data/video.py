@@ -20,7 +20,7 @@ from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from pipeline.base.errors import RecordingError
-from pipeline.recordings.recording import CameraStream
+from pipeline.data.recording import CameraStream
 
 _AV1_DECODERS = frozenset({"libdav1d", "libaom-av1", "libgav1"})
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.errors import RecordingError
-from pipeline.recordings.arrays import Numbers
+from pipeline.data.arrays import Numbers
 
 _OVERLAP = 0.75
 """Windows overlap for certain where the clock advances by less than this fraction of one."""

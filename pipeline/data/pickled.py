@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from pipeline.base.config import Source
 from pipeline.base.errors import RecordingError
-from pipeline.recordings.arrays import Numbers, number, numeric, read_npy
-from pipeline.recordings.insertion import (
+from pipeline.data.arrays import Numbers, number, numeric, read_npy
+from pipeline.data.insertion import (
     SENSOR,
     InsertionRecording,
     promised,
@@ -22,9 +22,9 @@ from pipeline.recordings.insertion import (
     robot_state_file,
     sensor_rows,
 )
-from pipeline.recordings.jpeg import frame_time, name_views, split_eye
-from pipeline.recordings.plain_pickle import load_plain
-from pipeline.recordings.recording import (
+from pipeline.data.jpeg import frame_time, name_views, split_eye
+from pipeline.data.plain_pickle import load_plain
+from pipeline.data.recording import (
     Channels,
     Nominal,
     RecordedAction,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.base.config import Source
-from pipeline.recordings import Recording, open_recordings
+from pipeline.data import Recording, open_recordings
 
 
 @pytest.fixture

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pipeline.base.errors import ConfigError, RecordingError
-from pipeline.recordings import CameraStream, Channels, RecordedAction, Recording, Stream
-from pipeline.timeline import (
+from pipeline.data import CameraStream, Channels, RecordedAction, Recording, Stream
+from pipeline.data.timeline import (
     build_timeline,
     choose_action_rotation,
     last_at,

@@ -16,9 +16,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipeline.base.errors import RecordingError
-from pipeline.recordings.arrays import number, read_json
-from pipeline.recordings.reader import natural_key
-from pipeline.recordings.video import VideoSpan
+from pipeline.data.arrays import number, read_json
+from pipeline.data.reader import natural_key
+from pipeline.data.video import VideoSpan
 
 VERSIONS = ("v2.0", "v2.1", "v3.0")
 _VIEW_PREFIXES = ("observation.images.", "observation.")
