@@ -15,7 +15,7 @@ from pipeline.store.archive import is_archive
 from pipeline.store.gather import WIDE
 from pipeline.store.mapping import fitting
 from pipeline.store.memory import available_bytes
-from pipeline.store.mending import restore_command
+from pipeline.store.repair_hints import restore_command
 
 FeedName = Literal["auto", "mapped", "device", "compressed"]
 _DEVICE_SHARE = 0.6

@@ -12,7 +12,7 @@ from pipeline.data.embodiment import Embodiment
 from pipeline.extraction.plan import spec_differences
 from pipeline.extraction.survey import Survey
 from pipeline.store import Donor, StoreBuild, part_path, read_plan
-from pipeline.store.places import MERGED, STORE, is_store
+from pipeline.store.paths import MERGED, STORE, is_store
 from pipeline.store.schema import read_specs
 
 Say = Callable[[str], None]

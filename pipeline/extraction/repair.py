@@ -25,8 +25,8 @@ from pipeline.store.integrity.repair import (
     repair_build,
 )
 from pipeline.store.integrity.structure import read_arrays
-from pipeline.store.mending import extract_command, gc_command
-from pipeline.store.places import MERGED, STORE
+from pipeline.store.paths import MERGED, STORE
+from pipeline.store.repair_hints import extract_command, gc_command
 from pipeline.vlm.feature_spec import document_digest
 
 

@@ -45,7 +45,7 @@ from pipeline.store import (
     recover,
 )
 from pipeline.store.metadata import check_metadata
-from pipeline.store.places import refuse_foreign_store
+from pipeline.store.paths import refuse_foreign_store
 from pipeline.store.schema import read_specs
 
 

@@ -11,8 +11,8 @@ from pipeline.base.errors import StoreIncomplete
 from pipeline.store import FEATURES, FeatureStore, place
 from pipeline.store.chunks import ChunkFiles, row_checksums
 from pipeline.store.gather import WIDE
-from pipeline.store.mending import extract_command, mend
 from pipeline.store.metadata import check_metadata
+from pipeline.store.repair_hints import extract_command, mend
 from pipeline.store.schema import read_specs
 
 _BLOCK_BYTES = 2**24

@@ -10,11 +10,11 @@ opened or checked does without.
 from typing import TYPE_CHECKING, Any
 
 from pipeline.store.chunks import check_trailers
-from pipeline.store.donor import Donor
 from pipeline.store.lock import build_lock
 from pipeline.store.names import episode_name, place
-from pipeline.store.places import part_path, read_plan, recover
+from pipeline.store.paths import part_path, read_plan, recover
 from pipeline.store.reader import Episode, FeatureStore
+from pipeline.store.row_source import Donor
 from pipeline.store.schema import FEATURES, KEY_BYTES, SCHEMA, Sizes, arrays
 from pipeline.store.writer import StoreBuild
 

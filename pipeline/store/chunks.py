@@ -19,8 +19,8 @@ from tqdm import tqdm
 from pipeline.base.durable import disk_full_named, sync
 from pipeline.base.errors import StoreIncomplete
 from pipeline.store.chunk_pass import ChunkPass
-from pipeline.store.mending import mend
 from pipeline.store.metadata import check_metadata
+from pipeline.store.repair_hints import mend
 from pipeline.store.schema import TRAILER_BYTES, ArraySpec, chunk_paths, read_specs
 
 _MOST_OPEN = 32

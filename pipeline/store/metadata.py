@@ -12,7 +12,7 @@ from typing import Any, cast
 import zarr
 
 from pipeline.base.errors import StoreIncomplete
-from pipeline.store.mending import mend
+from pipeline.store.repair_hints import mend
 from pipeline.store.schema import ARRAY_NAMES
 
 ATTRIBUTE = "metadata_digest"

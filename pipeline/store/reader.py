@@ -19,8 +19,8 @@ from pipeline.base.errors import StoreIncomplete, StoreMismatch
 from pipeline.base.ownership import described, there
 from pipeline.store.episodes import Episode, episode_of, read_episodes
 from pipeline.store.mapping import map_flat
-from pipeline.store.mending import extract_command, mend, restore_command, start_over
-from pipeline.store.places import STORE
+from pipeline.store.paths import STORE
+from pipeline.store.repair_hints import extract_command, mend, restore_command, start_over
 from pipeline.store.schema import SCHEMA, TRAILER_BYTES, ArraySpec, chunk_paths, read_specs
 
 if TYPE_CHECKING:

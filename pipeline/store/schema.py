@@ -17,7 +17,7 @@ import zarr
 from zarr.codecs import BytesCodec, Crc32cCodec
 
 from pipeline.base.errors import StoreIncomplete
-from pipeline.store.mending import mend
+from pipeline.store.repair_hints import mend
 
 SCHEMA = 1
 ROW_MULTIPLE = 4096

@@ -24,7 +24,7 @@ from pipeline.store.chunks import ChunkFiles, row_checksums
 from pipeline.store.environments import EnvironmentLog
 from pipeline.store.metadata import ATTRIBUTE as METADATA_DIGEST
 from pipeline.store.metadata import metadata_damage, note_metadata
-from pipeline.store.places import STORE, part_path
+from pipeline.store.paths import STORE, part_path
 from pipeline.store.schema import CHECKSUMS, FEATURES, INCREMENTAL, KEYS, ArraySpec
 
 

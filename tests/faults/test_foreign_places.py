@@ -10,7 +10,7 @@ import zarr
 
 from pipeline.base.ownership import MARKER, REPORT
 from pipeline.store.archive import archive
-from pipeline.store.places import STORE
+from pipeline.store.paths import STORE
 
 SPEED = "step\tsteps_per_s\tdata_wait_share\tpeak_memory_mib\ttrained_s"
 PRESS = 'data.sources=[{"name": "made", "path": "Press"}]'

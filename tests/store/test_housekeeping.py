@@ -18,7 +18,7 @@ from pipeline.store.archive import archive
 from pipeline.store.housekeeping.inventory import Entry, Inventory, take_inventory
 from pipeline.store.housekeeping.leftovers import kept_back, leftovers, named, remove
 from pipeline.store.housekeeping.listing import table
-from pipeline.store.places import STORE
+from pipeline.store.paths import STORE
 from pipeline.store.schema import read_specs
 
 Make = Callable[..., Path]

@@ -105,7 +105,7 @@ class TestSound:
     def test_over_several_chunks_and_blocks(self, tiny_store, tmp_path, monkeypatch):
         monkeypatch.setattr("pipeline.store.schema.CHUNK_BYTES", 4096)
         monkeypatch.setattr("pipeline.store.chunk_pass.BLOCK_BYTES", 10_000)
-        monkeypatch.setattr("pipeline.store.integrity.relations.BLOCK_ROWS", 7)
+        monkeypatch.setattr("pipeline.store.integrity.invariants.BLOCK_ROWS", 7)
         store = tiny_store(tmp_path, readings_a_tick=60)
         assert found_in(store).sound
         flip(chunk_file(store, "sensor/values", 1), 77)

@@ -24,8 +24,8 @@ from pipeline.store.archive.manifest import (
 )
 from pipeline.store.archive.source import checked_rows, chunk_crcs
 from pipeline.store.lock import build_lock
-from pipeline.store.mending import extract_command, gc_command
-from pipeline.store.places import STORE, part_path, read_plan, recover
+from pipeline.store.paths import STORE, part_path, read_plan, recover
+from pipeline.store.repair_hints import extract_command, gc_command
 from pipeline.store.schema import ArraySpec, chunk_paths, read_specs
 from pipeline.store.writer import StoreBuild
 

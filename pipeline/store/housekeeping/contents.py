@@ -11,7 +11,7 @@ import zarr
 from pipeline.base.errors import StoreIncomplete
 from pipeline.store.archive.manifest import read_manifest
 from pipeline.store.chunks import read_rows
-from pipeline.store.places import read_plan
+from pipeline.store.paths import read_plan
 from pipeline.store.schema import CHECKSUMS, FEATURES, ArraySpec, read_specs
 
 

@@ -16,7 +16,7 @@ from pipeline.base.errors import ConfigError, PipelineError
 from pipeline.store.archive import is_archive
 from pipeline.store.housekeeping.contents import Contents, contents_of, contents_of_archive
 from pipeline.store.lock import lock_holder
-from pipeline.store.places import read_plan
+from pipeline.store.paths import read_plan
 from pipeline.store.reader import FeatureStore
 
 GROUPS: tuple[str, ...] = ("features", "sensor", "state", "rest")

@@ -17,8 +17,8 @@ from pipeline.store.archive.manifest import ARCHIVE
 from pipeline.store.housekeeping.inventory import Entry, Inventory, Kind
 from pipeline.store.housekeeping.listing import clause
 from pipeline.store.lock import build_lock
-from pipeline.store.mending import gc_command
-from pipeline.store.places import MERGED, STORE
+from pipeline.store.paths import MERGED, STORE
+from pipeline.store.repair_hints import gc_command
 
 _REMOVABLE: tuple[Kind, ...] = (
     "build",

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.format import size
-from pipeline.store.mending import mend, start_over
+from pipeline.store.repair_hints import mend, start_over
 from pipeline.store.replacement import Inode
 
 MOST_LINES = 20

@@ -19,7 +19,7 @@ from pipeline.base.ownership import begin_folder, remove_folder
 from pipeline.store.chunks import ChunkFiles, row_checksums
 from pipeline.store.environments import EnvironmentLog
 from pipeline.store.integrity.findings import Findings, runs_of
-from pipeline.store.places import STORE, part_path, read_plan
+from pipeline.store.paths import STORE, part_path, read_plan
 from pipeline.store.replacement import refuse_replaced
 from pipeline.store.schema import (
     CHECKSUMS,

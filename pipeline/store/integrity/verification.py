@@ -19,7 +19,7 @@ from tqdm import tqdm
 from pipeline.base.errors import StoreIncomplete, StoreMismatch
 from pipeline.store.archive import is_archive
 from pipeline.store.integrity.findings import MOST_LINES, Damage, Findings, Places, runs_of
-from pipeline.store.integrity.relations import EpisodeTable, RelationTask, relation_tasks
+from pipeline.store.integrity.invariants import EpisodeTable, RelationTask, relation_tasks
 from pipeline.store.integrity.scan import CHANGED, UNREADABLE, UNWRITTEN, ChunkReport, ChunkTask
 from pipeline.store.integrity.structure import (
     GROUPS,
@@ -29,8 +29,8 @@ from pipeline.store.integrity.structure import (
     read_arrays,
     strange_files,
 )
-from pipeline.store.mending import extract_command, restore_command
 from pipeline.store.metadata import ATTRIBUTE
+from pipeline.store.repair_hints import extract_command, restore_command
 from pipeline.store.replacement import inode_of, refuse_replaced
 from pipeline.store.schema import CHECKSUMS, FEATURES, ArraySpec, chunk_paths
 

@@ -7,7 +7,7 @@ from typing import Any
 from pipeline.base.durable import recover as recover_replaced
 from pipeline.base.errors import StoreIncomplete
 from pipeline.base.ownership import OutputKind, refuse_foreign
-from pipeline.store.mending import start_over
+from pipeline.store.repair_hints import start_over
 
 MERGED = "merge-"
 """How the plan of a store begins that was not extracted but merged."""
