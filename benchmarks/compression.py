@@ -33,7 +33,7 @@ from benchmarks.timing import arguments, at_least, report
 from benchmarks.workload import ROWS_AN_EPISODE, write_recordings
 from pipeline.base.config import Source, load_params
 from pipeline.data import open_recordings
-from pipeline.extraction import extract
+from pipeline.extract import extract
 from pipeline.store.archive.codecs import (
     Choice,
     Codec,

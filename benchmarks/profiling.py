@@ -13,13 +13,13 @@ import torch
 from torch.profiler import ProfilerActivity, profile
 
 from benchmarks.timing import Work
-from pipeline.extraction.rows import Span
+from pipeline.extract.rows import Span
 from pipeline.store import StoreBuild
 from pipeline.vlm.extractor import Extractor
 from pipeline.vlm.vision import VisionTower
 
 _STEPS: tuple[tuple[str, Any, str], ...] = (
-    ("key", "pipeline.extraction.rows", "row_key"),
+    ("key", "pipeline.extract.rows", "row_key"),
     ("resize", "pipeline.vlm.preparation", "stretch"),
     ("collate", Extractor, "collate"),
     ("patchify", "pipeline.vlm.extractor", "patchify"),

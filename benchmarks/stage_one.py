@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.workload import Workload
-from pipeline.extraction.encoder import Encoder
-from pipeline.extraction.fill import fill
-from pipeline.extraction.rows import ReadyRow, RowPreparation, in_background
+from pipeline.extract.encoder import Encoder
+from pipeline.extract.fill import fill
+from pipeline.extract.rows import ReadyRow, RowPreparation, in_background
 from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.qwen import FrozenVLM
 

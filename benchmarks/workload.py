@@ -15,10 +15,10 @@ from tqdm import tqdm
 from pipeline.base.config import Params
 from pipeline.base.digests import ContentDigests
 from pipeline.data import Recording
-from pipeline.extraction.check import CheckedEpisode, check_episodes
-from pipeline.extraction.layout import build_arrays, lay_out
-from pipeline.extraction.rows import Span, spans_of
-from pipeline.extraction.survey import Survey, survey
+from pipeline.extract.check import CheckedEpisode, check_episodes
+from pipeline.extract.layout import build_arrays, lay_out
+from pipeline.extract.rows import Span, spans_of
+from pipeline.extract.survey import Survey, survey
 from pipeline.simulation.demo_recordings import TASK
 from pipeline.simulation.insertion_formats import write_raw
 from pipeline.simulation.recorder import simulate_episode

@@ -25,8 +25,8 @@ if __name__ == "__main__":  # here, for --help waits for no import below
 
 from pipeline.base.config import Params
 from pipeline.base.errors import NumericsError, StoreIncomplete
-from pipeline.extraction.reextract import reextract
-from pipeline.extraction.repair import repair, with_identity
+from pipeline.extract.reextract import reextract
+from pipeline.extract.repair import repair, with_identity
 from pipeline.store.integrity import verify
 
 

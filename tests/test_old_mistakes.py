@@ -22,7 +22,7 @@ from pipeline.base.errors import RecordingError
 from pipeline.checkpoint import policy_shape
 from pipeline.data import Recording, open_recordings
 from pipeline.datasets import UnifiedVLADataset
-from pipeline.extraction import extract
+from pipeline.extract import extract
 from pipeline.models import DiffusionActionExpert, Policy, RegressionActionExpert
 from pipeline.models.noise_schedule import NoiseSchedule
 from pipeline.sampling import split_by_episode

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data import CameraStream, Recording
-from pipeline.extraction.rows import Span
+from pipeline.extract.rows import Span
 from pipeline.store import FeatureStore
 from pipeline.vlm.preparation import PreparedRow, Preparer
 

@@ -9,7 +9,7 @@ from tqdm import tqdm
 
 from pipeline.base.config import Params
 from pipeline.base.digests import ContentDigests
-from pipeline.extraction.places import ledger_path
+from pipeline.extract.places import ledger_path
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 
 LEDGER = ".files.sqlite"

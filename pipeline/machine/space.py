@@ -14,10 +14,10 @@ from pipeline.base.format import size
 from pipeline.data import Recording, open_recordings
 from pipeline.data.embodiment import Embodiment
 from pipeline.data.timeline import ActionRotation, build_timeline, choose_action_rotation
-from pipeline.extraction.check import CheckedEpisode
-from pipeline.extraction.layout import build_arrays
-from pipeline.extraction.plan import store_bytes
-from pipeline.extraction.survey import Survey, SurveyedEpisode
+from pipeline.extract.check import CheckedEpisode
+from pipeline.extract.layout import build_arrays
+from pipeline.extract.plan import store_bytes
+from pipeline.extract.survey import Survey, SurveyedEpisode
 from pipeline.machine.checkpoint import local_folder
 from pipeline.machine.data import unusable
 from pipeline.machine.findings import Finding, missing, note, ok

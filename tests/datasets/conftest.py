@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.base.config import Params
-from pipeline.extraction import extract
+from pipeline.extract import extract
 from pipeline.simulation.insertion_formats import ABUTTING, write_new, write_old
 from pipeline.simulation.recorder import simulate_episode
 from pipeline.store import FeatureStore

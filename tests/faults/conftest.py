@@ -20,7 +20,7 @@ import pytest
 import yaml
 
 from pipeline.base.config import Params
-from pipeline.extraction import extract
+from pipeline.extract import extract
 from stages.command import run
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.base.config import Params
 from pipeline.base.errors import StoreIncomplete
-from pipeline.extraction import extract
+from pipeline.extract import extract
 from pipeline.store import FeatureStore
 from pipeline.store.schema import ARRAY_NAMES
 

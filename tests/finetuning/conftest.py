@@ -12,7 +12,7 @@ import pytest
 from PIL import Image, ImageDraw
 
 from pipeline.base.config import Params
-from pipeline.extraction import extract
+from pipeline.extract import extract
 from pipeline.store import FeatureStore
 
 VIEWS = ("View1", "View2")

@@ -16,7 +16,7 @@ from pipeline.base.errors import CheckpointMismatch, ConfigError
 from pipeline.batches import Draw, Windows
 from pipeline.checkpoint import find_policy, load_policy
 from pipeline.evaluation import check_store, held_out_ticks, judge
-from pipeline.extraction import extract
+from pipeline.extract import extract
 from pipeline.finetuning import Live, head_params, out_of_memory_named
 from pipeline.models.unified import QwenVLAUnified
 from pipeline.sampling import split_by_episode

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.base.config import Params
 from pipeline.base.errors import RecordingError
-from pipeline.extraction import extract
+from pipeline.extract import extract
 from pipeline.finetuning.recordings import check_spec, find_recordings, known_digests
 from pipeline.finetuning.rows import LiveRows
 from pipeline.simulation.lerobot_format import write_lerobot

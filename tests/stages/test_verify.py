@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.extraction.reextract import Deviation, Reextraction
+from pipeline.extract.reextract import Deviation, Reextraction
 from pipeline.store import part_path
 from stages.command import run
 from stages.verify import SHORTHANDS, main

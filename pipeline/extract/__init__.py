@@ -5,6 +5,6 @@ model, `rows` decodes, `encoder` encodes, `commits` writes behind it, all of whi
 together, `run` is the list of these steps.
 """
 
-from pipeline.extraction.run import ExtractionReport, extract
+from pipeline.extract.run import ExtractionReport, extract
 
 __all__ = ["ExtractionReport", "extract"]

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from pipeline.base.errors import NumericsError, VLMError
-from pipeline.extraction.encoder import Encoder
-from pipeline.extraction.rows import ReadyRow
+from pipeline.extract.encoder import Encoder
+from pipeline.extract.rows import ReadyRow
 from pipeline.vlm.preparation import Layout, PreparedRow
 
 K = 3

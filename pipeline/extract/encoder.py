@@ -9,8 +9,8 @@ import torch
 from numpy.typing import NDArray
 
 from pipeline.base.errors import NumericsError
-from pipeline.extraction.batch_size import BatchSize
-from pipeline.extraction.rows import ReadyRow
+from pipeline.extract.batch_size import BatchSize
+from pipeline.extract.rows import ReadyRow
 from pipeline.vlm.preparation import Layout
 from pipeline.vlm.qwen import FrozenVLM, Pending
 

@@ -13,9 +13,9 @@ from tqdm import tqdm
 
 from pipeline.base.config import Params
 from pipeline.base.digests import ContentDigests, joint_digest
-from pipeline.extraction.survey import Survey
-from pipeline.extraction.takeover import take_over
-from pipeline.extraction.work import Computed, Work
+from pipeline.extract.survey import Survey
+from pipeline.extract.takeover import take_over
+from pipeline.extract.work import Computed, Work
 from pipeline.store import Donor, StoreBuild
 
 _DECIDES_SPEED = ("weights", "adapter", "processor", "compute_dtype", "variants")
@@ -99,10 +99,10 @@ def _computed(work: Work) -> Computed:
         return Computed()
     # What holds the model takes seconds to import, dask one more: here alone they are needed.
     if work.params.extract.workers == 0:
-        from pipeline.extraction.local import compute_here
+        from pipeline.extract.local import compute_here
 
         return compute_here(work)
-    from pipeline.extraction.cluster import compute_on_cluster
+    from pipeline.extract.cluster import compute_on_cluster
 
     return compute_on_cluster(work)
 

@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.extraction.rows import KnownRow, ReadyRow, RepeatedRow
+from pipeline.extract.rows import KnownRow, ReadyRow, RepeatedRow
 from pipeline.store import StoreBuild
 from pipeline.store.schema import FEATURES
 

@@ -9,8 +9,8 @@ import pytest
 
 from pipeline.base.digests import ContentDigests
 from pipeline.base.errors import DiskFull
-from pipeline.extraction import extract
-from pipeline.extraction.rows import in_background
+from pipeline.extract import extract
+from pipeline.extract.rows import in_background
 from pipeline.store import FeatureStore, StoreBuild
 from pipeline.vlm.qwen import FrozenVLM
 
@@ -47,7 +47,7 @@ class TestEqualRows:
         assert report.repeated == len(keys) - len(set(keys))
         other = changed(extract={"store": str(params.extract.store.with_name("each.zarr"))})
         monkeypatch.setattr(
-            "pipeline.extraction.rows.RowPreparation.prepare_once",
+            "pipeline.extract.rows.RowPreparation.prepare_once",
             lambda self, span: self.prepare(span),
         )
         assert run(other).computed == len(keys)
@@ -120,8 +120,8 @@ def test_the_report_says_how_the_time_was_spent(params):
 
 
 def test_a_batch_size_that_was_found_is_not_searched_again(changed, asked, monkeypatch):
-    monkeypatch.setattr("pipeline.extraction.batch_size._FIRST", 1)
-    monkeypatch.setattr("pipeline.extraction.batch_size._MOST", {"cpu": 2})
+    monkeypatch.setattr("pipeline.extract.batch_size._FIRST", 1)
+    monkeypatch.setattr("pipeline.extract.batch_size._MOST", {"cpu": 2})
     params = changed(extract={"batch_size": "auto"})
     run(params)
     assert asked[0] == 1

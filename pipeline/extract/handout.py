@@ -20,8 +20,8 @@ from distributed import Client, Future, KilledWorker, as_completed
 from tqdm import tqdm
 
 from pipeline.base.errors import PipelineError, RecordingError
-from pipeline.extraction.job import Outcome, Piece, WrittenRows
-from pipeline.extraction.worker import compute_pieces
+from pipeline.extract.job import Outcome, Piece, WrittenRows
+from pipeline.extract.worker import compute_pieces
 
 _TASKS_A_THREAD = 2
 """Handed out ahead, so that no worker waits and a scheduler never holds millions."""

@@ -9,8 +9,8 @@ from pipeline.base.durable import KEPT, previous_path
 from pipeline.base.errors import StoreIncomplete, StoreMismatch
 from pipeline.base.ownership import refuse_foreign, remove_folder
 from pipeline.data.embodiment import Embodiment
-from pipeline.extraction.plan import spec_differences
-from pipeline.extraction.survey import Survey
+from pipeline.extract.plan import spec_differences
+from pipeline.extract.survey import Survey
 from pipeline.store import Donor, StoreBuild, part_path, read_plan
 from pipeline.store.paths import MERGED, STORE, is_store
 from pipeline.store.schema import read_specs

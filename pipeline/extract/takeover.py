@@ -6,9 +6,9 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.extraction.commits import TOGETHER, commit_known
-from pipeline.extraction.rows import KnownRow
-from pipeline.extraction.work import Work
+from pipeline.extract.commits import TOGETHER, commit_known
+from pipeline.extract.rows import KnownRow
+from pipeline.extract.work import Work
 from pipeline.store import Donor
 
 

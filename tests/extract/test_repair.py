@@ -14,8 +14,8 @@ import pytest
 
 from pipeline.base.config import Params
 from pipeline.base.errors import DiskFull, StoreIncomplete, StoreLocked, StoreMismatch
-from pipeline.extraction import extract
-from pipeline.extraction.repair import repair, with_identity
+from pipeline.extract import extract
+from pipeline.extract.repair import repair, with_identity
 from pipeline.store import FeatureStore, build_lock, part_path
 from pipeline.store.integrity import verify
 from pipeline.store.schema import chunk_paths, read_spec

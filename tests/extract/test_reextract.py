@@ -10,8 +10,8 @@ from PIL import Image
 
 from pipeline.base.config import Params
 from pipeline.base.errors import StoreMismatch
-from pipeline.extraction import extract
-from pipeline.extraction.reextract import TOLERANCES, Deviation, Reextraction, reextract
+from pipeline.extract import extract
+from pipeline.extract.reextract import TOLERANCES, Deviation, Reextraction, reextract
 from pipeline.store.schema import chunk_paths, read_spec
 
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.extraction.ranges import PAGE_BYTES, by_episode, ranges_of, rows_between_pages
+from pipeline.extract.ranges import PAGE_BYTES, by_episode, ranges_of, rows_between_pages
 
 
 @st.composite

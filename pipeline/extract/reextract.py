@@ -15,10 +15,10 @@ from pipeline.base.config import Params
 from pipeline.base.digests import ContentDigests
 from pipeline.base.errors import StoreMismatch
 from pipeline.data import Recording
-from pipeline.extraction.encoder import Encoder
-from pipeline.extraction.places import ledger_path
-from pipeline.extraction.rows import ReadyRow, RowPreparation, in_background, spans_of
-from pipeline.extraction.survey import Survey, survey
+from pipeline.extract.encoder import Encoder
+from pipeline.extract.places import ledger_path
+from pipeline.extract.rows import ReadyRow, RowPreparation, in_background, spans_of
+from pipeline.extract.survey import Survey, survey
 from pipeline.store import FEATURES, FeatureStore
 from pipeline.store.integrity.findings import capped
 from pipeline.store.reader import Episode

@@ -11,10 +11,10 @@ from pipeline.base.digests import ContentDigests
 from pipeline.base.durable import disk_full_named
 from pipeline.base.errors import StoreMismatch
 from pipeline.base.ownership import remove_folder
-from pipeline.extraction.layout import build_arrays, check_space, lay_out
-from pipeline.extraction.places import ledger_path
-from pipeline.extraction.run import sound_episodes
-from pipeline.extraction.survey import survey
+from pipeline.extract.layout import build_arrays, check_space, lay_out
+from pipeline.extract.places import ledger_path
+from pipeline.extract.run import sound_episodes
+from pipeline.extract.survey import survey
 from pipeline.store import FEATURES, StoreBuild, build_lock, part_path, read_plan, recover
 from pipeline.store.integrity.findings import Damage, Findings
 from pipeline.store.integrity.repair import (

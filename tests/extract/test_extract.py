@@ -25,7 +25,7 @@ from pipeline.data import Channels, RecordedAction, Stream, open_recordings
 from pipeline.data.lerobot_clock import stored_clock
 from pipeline.data.timeline import build_timeline
 from pipeline.data.windowed import WindowedRecording
-from pipeline.extraction import extract
+from pipeline.extract import extract
 from pipeline.simulation.lerobot_format import write_lerobot
 from pipeline.simulation.recorder import simulate_episode
 from pipeline.store import FeatureStore, StoreBuild, build_lock, part_path
@@ -674,7 +674,7 @@ class TestPlan:
 
 class TestRefusals:
     def test_too_little_disk_is_refused_before_the_model(self, params, monkeypatch, no_model_later):
-        monkeypatch.setattr("pipeline.extraction.layout.free_bytes", lambda path: 1000)
+        monkeypatch.setattr("pipeline.extract.layout.free_bytes", lambda path: 1000)
         no_model_later(images=False)
         with pytest.raises(DiskFull, match=r"needs \d.*B, .* has \d.*B free"):
             run(params)
@@ -688,7 +688,7 @@ class TestRefusals:
         store = {"store": str(small_disk / "made.zarr"), "sensor_dtype": "float16"}
         params = changed(extract=store)
         with monkeypatch.context() as patch:
-            patch.setattr("pipeline.extraction.layout.free_bytes", lambda path: 2**40)
+            patch.setattr("pipeline.extract.layout.free_bytes", lambda path: 2**40)
             with pytest.raises(DiskFull, match=r"no space left.*make room and run the same"):
                 run(params)
         assert not params.extract.store.exists()

@@ -11,10 +11,10 @@ from pipeline.base.device import resolve_device
 from pipeline.base.digests import ContentDigests
 from pipeline.base.durable import free_bytes
 from pipeline.data.timeline import rate_notes
-from pipeline.extraction.check import CheckedEpisode, check_episodes, embodiment_of
-from pipeline.extraction.fill import ExtractionReport, fill, rate_name
-from pipeline.extraction.layout import build_arrays, check_space, lay_out
-from pipeline.extraction.places import (
+from pipeline.extract.check import CheckedEpisode, check_episodes, embodiment_of
+from pipeline.extract.fill import ExtractionReport, fill, rate_name
+from pipeline.extract.layout import build_arrays, check_space, lay_out
+from pipeline.extract.places import (
     Say,
     donors_at,
     keeping_note,
@@ -26,7 +26,7 @@ from pipeline.extraction.places import (
     put_in_place,
     refuse_to_lose,
 )
-from pipeline.extraction.plan import (
+from pipeline.extract.plan import (
     ExtractionPlan,
     dtype_warnings,
     known_rows,
@@ -34,7 +34,7 @@ from pipeline.extraction.plan import (
     store_bytes,
     warnings,
 )
-from pipeline.extraction.survey import Survey, survey
+from pipeline.extract.survey import Survey, survey
 from pipeline.store import (
     Donor,
     FeatureStore,
@@ -181,7 +181,7 @@ def _begin(
                 return None
             check_space(build, checked, donors)
         if isinstance(params.extract.workers, str) and plan.known < plan.rows:
-            from pipeline.extraction.connection import check_scheduler  # dask: a second to import
+            from pipeline.extract.connection import check_scheduler  # dask: a second to import
 
             check_scheduler(params.extract)
         make_room(target, surveyed, say)

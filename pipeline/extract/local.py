@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from contextlib import closing
 from itertools import chain
 
-from pipeline.extraction.commits import Commits
-from pipeline.extraction.encoder import Encoder
-from pipeline.extraction.rows import (
+from pipeline.extract.commits import Commits
+from pipeline.extract.encoder import Encoder
+from pipeline.extract.rows import (
     SPAN_ROWS,
     KnownRow,
     ReadyRow,
@@ -17,7 +17,7 @@ from pipeline.extraction.rows import (
     in_background,
     spans_of,
 )
-from pipeline.extraction.work import Computed, Work
+from pipeline.extract.work import Computed, Work
 from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.qwen import FrozenVLM
 

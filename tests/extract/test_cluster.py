@@ -35,13 +35,13 @@ from pipeline.base.errors import (
     StoreIncomplete,
     VLMError,
 )
-from pipeline.extraction import extract
-from pipeline.extraction.connection import check_scheduler, connected
-from pipeline.extraction.fill import rate_name
-from pipeline.extraction.job import Job
-from pipeline.extraction.places import ledger_path
-from pipeline.extraction.survey import survey
-from pipeline.extraction.worker import check_place, device_of
+from pipeline.extract import extract
+from pipeline.extract.connection import check_scheduler, connected
+from pipeline.extract.fill import rate_name
+from pipeline.extract.job import Job
+from pipeline.extract.places import ledger_path
+from pipeline.extract.survey import survey
+from pipeline.extract.worker import check_place, device_of
 from pipeline.store import Donor, FeatureStore, StoreBuild, part_path, read_plan
 from pipeline.store.schema import ARRAY_NAMES, read_specs
 from pipeline.vlm.feature_spec import feature_spec
@@ -55,8 +55,8 @@ from collections import defaultdict
 from contextlib import suppress
 from pathlib import Path
 from pipeline.base.errors import NumericsError
-from pipeline.extraction.encoder import Encoder
-from pipeline.extraction.worker import ExtractionPlugin, RangeComputer
+from pipeline.extract.encoder import Encoder
+from pipeline.extract.worker import ExtractionPlugin, RangeComputer
 
 control = Path({control!r})
 prepare, encode, begin = RangeComputer.prepared, Encoder.encoded, ExtractionPlugin.setup
@@ -310,8 +310,8 @@ class TestDeaths:
         preload = str(workers.preload)
         monkeypatch.setattr(StoreBuild, "mark", joined_after_first)
         # Few ahead: of the twelve tasks some are left when the third is there.
-        monkeypatch.setattr("pipeline.extraction.handout._TASKS_A_THREAD", 1)
-        monkeypatch.setattr("pipeline.extraction.handout._COUNT_THREADS_EVERY_S", 0.0)
+        monkeypatch.setattr("pipeline.extract.handout._TASKS_A_THREAD", 1)
+        monkeypatch.setattr("pipeline.extract.handout._COUNT_THREADS_EVERY_S", 0.0)
         params = changed(extract={"workers": workers.address, "batch_size": 1})
         try:
             run(params)
@@ -392,7 +392,7 @@ class TestRefusals:
         job = Job(params.extract.store, "plan", spec, params, (), Path.cwd(), local=False)
         with pytest.raises(StoreIncomplete, match=r"does not see the build .*made\.zarr\.part"):
             check_place(job)
-        monkeypatch.setattr("pipeline.extraction.worker.read_plan", lambda part: "plan")
+        monkeypatch.setattr("pipeline.extract.worker.read_plan", lambda part: "plan")
         check_place(job)
         other = replace(job, params=changed(vlm={"layers": [0]}))
         with pytest.raises(ConfigError, match="would compute other features"):

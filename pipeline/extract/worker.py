@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from pipeline.base.digests import file_digest
 from pipeline.base.errors import ConfigError, NumericsError, StoreIncomplete
 from pipeline.data import CameraStream
-from pipeline.extraction.encoder import Encoder
-from pipeline.extraction.job import Came, Job, Outcome, Piece, WrittenRows
-from pipeline.extraction.rows import KnownRow, ReadyRow, RowPreparation, Span
+from pipeline.extract.encoder import Encoder
+from pipeline.extract.job import Came, Job, Outcome, Piece, WrittenRows
+from pipeline.extract.rows import KnownRow, ReadyRow, RowPreparation, Span
 from pipeline.store import Donor, StoreBuild, part_path, read_plan
 from pipeline.store.schema import read_specs
 from pipeline.vlm.feature_spec import differences, feature_spec

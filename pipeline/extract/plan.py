@@ -6,8 +6,8 @@ from typing import Any
 
 from pipeline.base.config import DataParams, Params
 from pipeline.base.format import duration, size
-from pipeline.extraction.check import CheckedEpisode
-from pipeline.extraction.survey import Survey
+from pipeline.extract.check import CheckedEpisode
+from pipeline.extract.survey import Survey
 from pipeline.store import FEATURES, Donor
 from pipeline.store.schema import ArraySpec
 from pipeline.vlm.feature_spec import differences

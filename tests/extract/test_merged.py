@@ -3,7 +3,7 @@
 import pytest
 
 from pipeline.base.errors import StoreMismatch
-from pipeline.extraction import extract
+from pipeline.extract import extract
 from pipeline.store import FeatureStore
 from pipeline.store.merging import merge
 from pipeline.vlm.qwen import FrozenVLM

@@ -17,7 +17,7 @@ import pytest
 import yaml
 
 from pipeline.base.config import Params
-from pipeline.extraction import extract
+from pipeline.extract import extract
 from pipeline.store import FeatureStore, StoreBuild, part_path, read_plan
 from pipeline.store.schema import ARRAY_NAMES, read_specs
 

@@ -14,7 +14,7 @@ from pipeline.base.errors import RecordingError, VLMError
 from pipeline.data import BadEpisode
 from pipeline.data.embodiment import Embodiment, common_embodiment
 from pipeline.data.timeline import Timeline, build_timeline
-from pipeline.extraction.survey import Survey, SurveyedEpisode, refuse_bad
+from pipeline.extract.survey import Survey, SurveyedEpisode, refuse_bad
 from pipeline.vlm.preparation import Preparer
 
 

@@ -13,9 +13,9 @@ from pipeline.base.errors import DiskFull, NumericsError
 from pipeline.base.format import size
 from pipeline.data import Stream
 from pipeline.data.timeline import Timeline
-from pipeline.extraction.check import CheckedEpisode, embodiment_of
-from pipeline.extraction.plan import store_bytes
-from pipeline.extraction.survey import Survey, shown_path
+from pipeline.extract.check import CheckedEpisode, embodiment_of
+from pipeline.extract.plan import store_bytes
+from pipeline.extract.survey import Survey, shown_path
 from pipeline.store import SCHEMA, Donor, Sizes, StoreBuild, arrays
 from pipeline.store.episodes import EpisodeRows, episode_arrays, episode_edges
 from pipeline.store.schema import ArraySpec

@@ -14,12 +14,12 @@ from pathlib import Path
 from distributed import Client
 
 from pipeline.base.errors import ConfigError, PipelineError
-from pipeline.extraction.connection import connected
-from pipeline.extraction.handout import Handout, Task
-from pipeline.extraction.job import Job, Piece, WrittenRows
-from pipeline.extraction.ranges import by_episode, ranges_of, rows_between_pages
-from pipeline.extraction.work import Computed, Work
-from pipeline.extraction.worker import ExtractionPlugin
+from pipeline.extract.connection import connected
+from pipeline.extract.handout import Handout, Task
+from pipeline.extract.job import Job, Piece, WrittenRows
+from pipeline.extract.ranges import by_episode, ranges_of, rows_between_pages
+from pipeline.extract.work import Computed, Work
+from pipeline.extract.worker import ExtractionPlugin
 from pipeline.store import FEATURES
 
 _AUTO_RANGE_ROWS = 32

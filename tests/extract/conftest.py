@@ -17,7 +17,7 @@ import yaml
 from PIL import Image
 
 from pipeline.base.config import Params
-from pipeline.extraction import extract
+from pipeline.extract import extract
 
 
 @pytest.fixture(scope="session")
@@ -174,7 +174,7 @@ def laid_over(document: dict[str, Any], **sections: dict[str, Any]) -> Params:
 
 FORKING = """
 import json, os, signal, sys
-import distributed, stages.extract, pipeline.extraction.cluster, pipeline.extraction.local
+import distributed, stages.extract, pipeline.extract.cluster, pipeline.extract.local
 import transformers.models.qwen2_5_vl.modeling_qwen2_5_vl
 
 running = set()
