@@ -22,7 +22,7 @@ from benchmarks.stores import write_store
 from benchmarks.timing import Work, arguments, at_least, at_most, race, report
 from pipeline.base.config import TrainHeadParams, load_params
 from pipeline.batches import Draw, Feed, Windows
-from pipeline.models.cost import flop_table
+from pipeline.policy.cost import flop_table
 from pipeline.sampling import split_by_episode
 from pipeline.store import Batch, FeatureStore
 from pipeline.store.gather import WIDE

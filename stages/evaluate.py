@@ -21,7 +21,6 @@ from pipeline.base.device import resolve_device
 from pipeline.base.durable import write_document
 from pipeline.base.ownership import REPORT, claim, refuse_foreign
 from pipeline.batches import open_store
-from pipeline.checkpoint import PolicyCheckpoint, find_policy, load_policy
 from pipeline.evaluation import (
     JUDGED,
     Judgement,
@@ -31,6 +30,7 @@ from pipeline.evaluation import (
     table,
     write_tables,
 )
+from pipeline.policy.checkpoint import PolicyCheckpoint, find_policy, load_policy
 from pipeline.report import write_report
 from pipeline.report.evaluation.evaluation import evaluation_report
 from pipeline.store import FeatureStore, check_trailers

@@ -34,7 +34,7 @@ from pipeline.store.schema import read_specs
 from pipeline.vlm.demo_checkpoint import write_demo_checkpoint
 
 # Before anything imports them: every shape annotation of the models is checked in tests.
-install_import_hook("pipeline.models", "beartype.beartype")
+install_import_hook("pipeline.policy", "beartype.beartype")
 
 # A shell that runs tests in the background has them ignore Ctrl-C, and so would every process that
 # they start to see it stop.

@@ -24,7 +24,7 @@ TIERS = (
 )
 """Rooms import from tiers above theirs in this list, and from themselves."""
 
-DOORS = {("pipeline.models.unified", "vlm")}
+DOORS = {("pipeline.compat.unified", "vlm")}
 """What may be imported within a tier all the same: the policy with a live model in front."""
 
 ONLY_IN = {

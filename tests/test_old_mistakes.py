@@ -19,12 +19,14 @@ from torch.nn import functional as F
 from pipeline.base.config import Params, Source, TrainHeadParams, VLMParams
 from pipeline.base.digests import ContentDigests
 from pipeline.base.errors import RecordingError
-from pipeline.checkpoint import policy_shape
 from pipeline.data import Recording, open_recordings
 from pipeline.datasets import UnifiedVLADataset
 from pipeline.extract import extract
-from pipeline.models import DiffusionActionExpert, Policy, RegressionActionExpert
-from pipeline.models.noise_schedule import NoiseSchedule
+from pipeline.policy.checkpoint import policy_shape
+from pipeline.policy.diffusion import DiffusionActionExpert
+from pipeline.policy.noise_schedule import NoiseSchedule
+from pipeline.policy.policy import Policy
+from pipeline.policy.regression import RegressionActionExpert
 from pipeline.sampling import split_by_episode
 from pipeline.simulation.insertion_formats import ABUTTING, write_new
 from pipeline.simulation.recorder import simulate_episode

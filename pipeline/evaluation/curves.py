@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.checkpoint import PolicyCheckpoint
+from pipeline.policy.checkpoint import PolicyCheckpoint
 
 
 @dataclass(frozen=True)

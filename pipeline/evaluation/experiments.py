@@ -11,11 +11,11 @@ from typing import Any, get_args
 
 from pipeline.base.config import FusionStrategy, ModelType
 from pipeline.base.errors import ConfigError
-from pipeline.checkpoint import describe, differences
 from pipeline.evaluation.judged import JUDGED
 from pipeline.evaluation.predictions import BASELINES, METHODS
 from pipeline.evaluation.scores import Group
 from pipeline.evaluation.tables import ERRORS, OVERALL
+from pipeline.policy.checkpoint import describe, differences
 
 _OVERALL = (OVERALL, "training std")
 _SAME = 1e-4

@@ -7,11 +7,12 @@ import numpy as np
 
 from pipeline.base.errors import CheckpointMismatch
 from pipeline.batches import Ticks, Windows
-from pipeline.checkpoint import PolicyCheckpoint, describe, source_differences, source_of
 from pipeline.evaluation.predictions import FeedMaker, Predictions, baselines, predict
 from pipeline.evaluation.scores import Comparison, Group, compare
-from pipeline.models import Trainable, action_groups
-from pipeline.normalization import Normalization
+from pipeline.policy.checkpoint import PolicyCheckpoint, describe, source_differences, source_of
+from pipeline.policy.normalization import Normalization
+from pipeline.policy.observation import action_groups
+from pipeline.policy.policy import Trainable
 from pipeline.store import FeatureStore, episode_name
 
 

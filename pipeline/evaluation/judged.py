@@ -9,13 +9,13 @@ import torch
 
 from pipeline.base.config import EvaluateParams
 from pipeline.batches import Windows
-from pipeline.checkpoint import PolicyCheckpoint, source_of
 from pipeline.evaluation.curves import Curves, read_curves
 from pipeline.evaluation.held_out import held_out_ticks, judge, named_as_in
 from pipeline.evaluation.modalities import ModalityStudy, judge_modalities
 from pipeline.evaluation.predictions import Predictions
 from pipeline.evaluation.scores import Comparison
-from pipeline.models import Trainable
+from pipeline.policy.checkpoint import PolicyCheckpoint, source_of
+from pipeline.policy.policy import Trainable
 from pipeline.store import FeatureStore
 
 JUDGED = "judged.json"

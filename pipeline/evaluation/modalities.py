@@ -10,7 +10,6 @@ import torch
 from tqdm import tqdm
 
 from pipeline.batches import Lags, Ticks, Windows
-from pipeline.checkpoint import PolicyCheckpoint
 from pipeline.evaluation.corruption import (
     FIELDS,
     Alter,
@@ -23,7 +22,8 @@ from pipeline.evaluation.corruption import (
 from pipeline.evaluation.held_out import judge
 from pipeline.evaluation.predictions import FeedMaker
 from pipeline.evaluation.scores import Comparison
-from pipeline.models import Policy
+from pipeline.policy.checkpoint import PolicyCheckpoint
+from pipeline.policy.policy import Policy
 from pipeline.store import FeatureStore, episode_name
 
 DELAYS_MS = (50, 100, 200)

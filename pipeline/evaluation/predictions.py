@@ -11,7 +11,8 @@ from tqdm import tqdm
 
 from pipeline.base.errors import NumericsError
 from pipeline.batches import Draw, Feed, Prefetch, Ticks, Windows, draws
-from pipeline.models import Observation, Trainable
+from pipeline.policy.observation import Observation
+from pipeline.policy.policy import Trainable
 from pipeline.store import FeatureStore, place
 
 Actions = NDArray[np.float32]

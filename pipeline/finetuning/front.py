@@ -14,7 +14,7 @@ from pipeline.base.digests import file_digest
 from pipeline.base.durable import read_document, write_with_digest
 from pipeline.base.errors import ConfigError
 from pipeline.batches import Draw, Windows
-from pipeline.checkpoint import DOCUMENT
+from pipeline.compat.unified import QwenVLAUnified
 from pipeline.finetuning.feed import LiveFeed
 from pipeline.finetuning.recordings import (
     check_recordings,
@@ -23,9 +23,8 @@ from pipeline.finetuning.recordings import (
     known_digests,
 )
 from pipeline.finetuning.rows import LiveRows
-from pipeline.models import Policy
-from pipeline.models.policy import Trainable
-from pipeline.models.unified import QwenVLAUnified
+from pipeline.policy.checkpoint import DOCUMENT
+from pipeline.policy.policy import Policy, Trainable
 from pipeline.store import FeatureStore
 from pipeline.training import World
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec

@@ -7,14 +7,14 @@ asked for: they bring a vision-language model, and training from a store needs n
 from importlib import import_module
 from typing import Any
 
-from pipeline.models.cost import describe_cost, flop_table
-from pipeline.models.denoiser import Denoiser
-from pipeline.models.diffusion import DiffusionActionExpert
-from pipeline.models.expert import ActionExpert, GroupedLoss
-from pipeline.models.feature_encoder import FeatureEncoder
-from pipeline.models.flow_matching import FlowMatchingActionExpert
-from pipeline.models.force_encoder import ForceAwareSensorEncoder
-from pipeline.models.fusion import (
+from pipeline.policy.cost import describe_cost, flop_table
+from pipeline.policy.denoiser import Denoiser
+from pipeline.policy.diffusion import DiffusionActionExpert
+from pipeline.policy.expert import ActionExpert, GroupedLoss
+from pipeline.policy.feature_encoder import FeatureEncoder
+from pipeline.policy.flow_matching import FlowMatchingActionExpert
+from pipeline.policy.force_encoder import ForceAwareSensorEncoder
+from pipeline.policy.fusion import (
     ConcatFusion,
     CrossAttentionFusion,
     Fusion,
@@ -22,13 +22,13 @@ from pipeline.models.fusion import (
     NoFusion,
     build_fusion,
 )
-from pipeline.models.noise_schedule import NoiseSchedule
-from pipeline.models.normalizer import Normalizer
-from pipeline.models.observation import Observation, PolicyShape, action_groups
-from pipeline.models.policy import Policy, Trainable
-from pipeline.models.regression import RegressionActionExpert
-from pipeline.models.sensor_encoder import SensorEncoder
-from pipeline.models.state_encoder import RobotStateEncoder
+from pipeline.policy.noise_schedule import NoiseSchedule
+from pipeline.policy.normalizer import Normalizer
+from pipeline.policy.observation import Observation, PolicyShape, action_groups
+from pipeline.policy.policy import Policy, Trainable
+from pipeline.policy.regression import RegressionActionExpert
+from pipeline.policy.sensor_encoder import SensorEncoder
+from pipeline.policy.state_encoder import RobotStateEncoder
 
 _LIVE = {
     "QwenVLAUnified",
@@ -68,5 +68,5 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name in _LIVE:
-        return getattr(import_module(f"{__name__}.unified"), name)
+        return getattr(import_module("pipeline.compat.unified"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.normalization import fit_channels
+from pipeline.policy.normalization import fit_channels
 from pipeline.probing.folds import Folds
 from pipeline.probing.moments import Moments
 from pipeline.probing.readers import Reader, check

@@ -8,10 +8,10 @@ from torch import nn
 
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.durable import sync
-from pipeline.checkpoint import PolicyCheckpoint, load_policy, save_policy, source_of
 from pipeline.evaluation import held_out_contents, held_out_ranges
-from pipeline.models import PolicyShape
-from pipeline.normalization import Normalization
+from pipeline.policy.checkpoint import PolicyCheckpoint, load_policy, save_policy, source_of
+from pipeline.policy.normalization import Normalization
+from pipeline.policy.observation import PolicyShape
 from pipeline.sampling import Split
 from pipeline.store import FeatureStore
 from pipeline.training.front import Front

@@ -7,7 +7,7 @@ from typing import Any
 
 from pipeline.base.durable import read_document
 from pipeline.base.errors import CheckpointIncomplete
-from pipeline.checkpoint import DOCUMENT, SOURCE_KEYS, source_differences, source_of
+from pipeline.policy.checkpoint import DOCUMENT, SOURCE_KEYS, source_differences, source_of
 from pipeline.store import FeatureStore
 from pipeline.training.identity import recordings_of
 from pipeline.training.run import RUN

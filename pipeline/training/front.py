@@ -8,8 +8,7 @@ import torch
 from torch import nn
 
 from pipeline.batches import Draw, Feed, Prefetch, Resident, Windows
-from pipeline.models import Policy
-from pipeline.models.policy import Trainable
+from pipeline.policy.policy import Policy, Trainable
 from pipeline.store import FeatureStore
 
 

@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import Any
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.checkpoint import source_of
+from pipeline.policy.checkpoint import source_of
 from pipeline.store import FeatureStore
 
 TRAINER_VERSION = 3

@@ -11,8 +11,8 @@ from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import ConfigError
 from pipeline.batches import Windows
 from pipeline.evaluation import judge
-from pipeline.models.policy import Trainable
-from pipeline.normalization import Normalization
+from pipeline.policy.normalization import Normalization
+from pipeline.policy.policy import Trainable
 from pipeline.sampling import Split
 from pipeline.store import FeatureStore
 from pipeline.training.front import Front

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.device import use_bfloat16
 from pipeline.batches import Draw
-from pipeline.models import Policy
+from pipeline.policy.policy import Policy
 from pipeline.store import Batch, FeatureStore
 from pipeline.training.compilation import compiled
 from pipeline.training.ema import WeightAverage, trainable

@@ -10,8 +10,8 @@ from tqdm import tqdm
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import NumericsError
 from pipeline.batches import Draw, Windows, choose_feed
-from pipeline.checkpoint import policy_shape
-from pipeline.models import Policy
+from pipeline.policy.checkpoint import policy_shape
+from pipeline.policy.policy import Policy
 from pipeline.sampling import Split
 from pipeline.store import Batch, FeatureStore
 from pipeline.training.checkpoints import Checkpoints, read_last

@@ -30,7 +30,7 @@ from pipeline.base.ownership import (
     there,
     unmark,
 )
-from pipeline.checkpoint import (
+from pipeline.policy.checkpoint import (
     CHECKPOINT,
     DOCUMENT,
     SOURCE_KEYS,

@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from pipeline.base.errors import NumericsError
 from pipeline.batches import Ticks
-from pipeline.normalization import Block, ChannelStatistics, Normalization, fit_channels
+from pipeline.policy.normalization import Block, ChannelStatistics, Normalization, fit_channels
 from pipeline.store import FeatureStore, place
 
 CHUNK_BYTES = 64 * 2**20

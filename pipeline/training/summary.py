@@ -5,8 +5,9 @@ import torch
 
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.format import duration, size
-from pipeline.models import Policy, PolicyShape
-from pipeline.models.cost import describe_cost
+from pipeline.policy.cost import describe_cost
+from pipeline.policy.observation import PolicyShape
+from pipeline.policy.policy import Policy
 from pipeline.sampling import Split, ticks_by_source
 from pipeline.store import FeatureStore
 from pipeline.training.judging import Standing

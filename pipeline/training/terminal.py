@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pipeline.models import action_groups
+from pipeline.policy.observation import action_groups
 from pipeline.store import FeatureStore
 
 

@@ -13,6 +13,7 @@ from torch.utils.data import ConcatDataset, DataLoader
 
 from pipeline.base.config import Source, TrainHeadParams
 from pipeline.base.errors import ConfigError, RecordingError, StoreIncomplete, StoreMismatch
+from pipeline.compat.unchanged import Unchanged
 from pipeline.data import Channels, RecordedAction, open_recordings
 from pipeline.data.timeline import build_timeline
 from pipeline.data.windowed import WindowedRecording
@@ -23,8 +24,9 @@ from pipeline.datasets import (
     async_collate_fn_with_sensor,
     unified_collate_fn,
 )
-from pipeline.models import Observation, Policy, PolicyShape, QwenVLAUnified
-from pipeline.models.unchanged import Unchanged
+from pipeline.models import QwenVLAUnified
+from pipeline.policy.observation import Observation, PolicyShape
+from pipeline.policy.policy import Policy
 from pipeline.sampling import split_by_episode
 from pipeline.store import Batch, FeatureStore
 

@@ -10,7 +10,6 @@ import torch
 
 from pipeline.base.config import TrainHeadParams
 from pipeline.batches import Draw, Lags, Windows
-from pipeline.checkpoint import PolicyCheckpoint, policy_shape, source_of
 from pipeline.evaluation import (
     ModalityStudy,
     held_out_contents,
@@ -22,8 +21,9 @@ from pipeline.evaluation import (
 from pipeline.evaluation.corruption import donors_of, exchanged, missing, zeroed
 from pipeline.evaluation.modalities import delays
 from pipeline.evaluation.modality_tables import modality_rows, stream_rows
-from pipeline.models import Policy
-from pipeline.normalization import ChannelStatistics, Normalization
+from pipeline.policy.checkpoint import PolicyCheckpoint, policy_shape, source_of
+from pipeline.policy.normalization import ChannelStatistics, Normalization
+from pipeline.policy.policy import Policy
 from pipeline.sampling import split_by_episode
 from pipeline.store import FeatureStore
 

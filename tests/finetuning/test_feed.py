@@ -15,7 +15,7 @@ from pipeline.batches import Draw, Windows
 from pipeline.finetuning.feed import LiveFeed
 from pipeline.finetuning.recordings import check_spec, find_recordings, known_digests
 from pipeline.finetuning.rows import LiveRows
-from pipeline.models.live_observation import LiveObservation
+from pipeline.policy.live_observation import LiveObservation
 from pipeline.store import Batch, FeatureStore
 from pipeline.vlm.live import LiveVLM
 from pipeline.vlm.preparation import Preparer

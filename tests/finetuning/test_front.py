@@ -14,11 +14,11 @@ from torch import nn
 from pipeline.base.config import Params
 from pipeline.base.errors import CheckpointMismatch, ConfigError
 from pipeline.batches import Draw, Windows
-from pipeline.checkpoint import find_policy, load_policy
+from pipeline.compat.unified import QwenVLAUnified
 from pipeline.evaluation import check_store, held_out_ticks, judge
 from pipeline.extract import extract
 from pipeline.finetuning import Live, head_params, out_of_memory_named
-from pipeline.models.unified import QwenVLAUnified
+from pipeline.policy.checkpoint import find_policy, load_policy
 from pipeline.sampling import split_by_episode
 from pipeline.store import FeatureStore
 from pipeline.training import Trainer, open_run

@@ -10,7 +10,6 @@ import pytest
 
 from pipeline.base.config import TrainHeadParams
 from pipeline.batches import Windows
-from pipeline.checkpoint import PolicyCheckpoint, policy_shape, source_of
 from pipeline.evaluation import (
     BASELINES,
     Curve,
@@ -24,8 +23,9 @@ from pipeline.evaluation import (
     judged_document,
 )
 from pipeline.evaluation.footage import Footage
-from pipeline.models import Policy
-from pipeline.normalization import ChannelStatistics, Normalization
+from pipeline.policy.checkpoint import PolicyCheckpoint, policy_shape, source_of
+from pipeline.policy.normalization import ChannelStatistics, Normalization
+from pipeline.policy.policy import Policy
 from pipeline.report import PAGE, Document, Picture, Report, Section, Table, write_report
 from pipeline.report.evaluation import episodes as episode_sections
 from pipeline.report.evaluation.comparison import comparison_report

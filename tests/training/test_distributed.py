@@ -18,7 +18,7 @@ import yaml
 
 from pipeline.base.config import load_params
 from pipeline.base.errors import ConfigError
-from pipeline.checkpoint import load_policy
+from pipeline.policy.checkpoint import load_policy
 from pipeline.store import FeatureStore, build_lock
 from pipeline.training import Trainer, World, process_group
 from pipeline.training.world import process_device

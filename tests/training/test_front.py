@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.durable import read_document
 from pipeline.batches import Draw, Feed, Prefetch, Windows
-from pipeline.checkpoint import load_policy
-from pipeline.models import Policy
+from pipeline.policy.checkpoint import load_policy
+from pipeline.policy.policy import Policy
 from pipeline.sampling import split_by_episode
 from pipeline.store import FeatureStore
 from pipeline.training import Trainer, open_run

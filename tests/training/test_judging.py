@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.base.errors import ConfigError
-from pipeline.checkpoint import load_policy
+from pipeline.policy.checkpoint import load_policy
 from pipeline.store import FeatureStore
 from pipeline.training import Cached, Trainer
 from pipeline.training.judging import EVALUATION_TICKS, Standing, judged_ticks

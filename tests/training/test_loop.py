@@ -18,9 +18,9 @@ from pipeline.base.config import TrainHeadParams
 from pipeline.base.durable import read_document
 from pipeline.base.errors import NumericsError
 from pipeline.batches import Windows
-from pipeline.checkpoint import load_policy
 from pipeline.evaluation import judge
 from pipeline.evaluation.experiments import speed_file
+from pipeline.policy.checkpoint import load_policy
 from pipeline.store import FeatureStore
 from pipeline.training import Trainer
 from pipeline.training.checkpoints import Checkpoints

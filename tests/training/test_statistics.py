@@ -117,7 +117,7 @@ def test_threads_change_no_bit(
 ) -> None:
     monkeypatch.setattr("pipeline.training.statistics.CHUNK_BYTES", chunk_bytes)
     monkeypatch.setattr("pipeline.training.statistics.THREAD_BYTES", 0)
-    monkeypatch.setattr("pipeline.normalization._PIECE_VALUES", 40)
+    monkeypatch.setattr("pipeline.policy.normalization._PIECE_VALUES", 40)
     store = FeatureStore.open(tiny_store(tmp_path))
     store.array("vl/slot_valid")[12, 1] = 0
     ticks = np.arange(20, 160)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.checkpoint import policy_shape
+from pipeline.policy.checkpoint import policy_shape
 from pipeline.sampling import Split, split_by_episode
 from pipeline.store import FeatureStore
 from pipeline.training import fit_normalization

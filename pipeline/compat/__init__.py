@@ -1,0 +1,1 @@
+"""The names that the research code had: thin doors, no second implementation."""

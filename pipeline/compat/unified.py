@@ -1,0 +1,276 @@
+"""A policy with a vision-language model in front, under the name and arguments it is known by.
+
+Features come from the model (images and an instruction), from a cache, or sample by sample from
+either. This is a door: `Policy` and `pipeline.vlm.live.LiveVLM` do the work. The only module of
+this package that knows of `pipeline.vlm`, and it asks for it when a model is loaded.
+"""
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any, Literal
+
+import torch
+from torch import Tensor, nn
+
+from pipeline.base.config import FusionStrategy, ModelType, TrainHeadParams, TuningParams, VLMParams
+from pipeline.base.errors import ObservationError, VLMError
+from pipeline.compat.unchanged import Unchanged
+from pipeline.policy.live_observation import LiveObservation, Seen, observation_of, target_of
+from pipeline.policy.live_policy import LivePolicy
+from pipeline.policy.normalizer import StreamStatistics
+from pipeline.policy.observation import PolicyShape
+from pipeline.policy.policy import Policy
+from pipeline.vlm.shape import feature_shape
+
+__all__ = [
+    "LiveObservation",
+    "Not_freeze_QwenVLAWithSensor",
+    "QwenVLAUnified",
+    "QwenVLAWithSensor",
+    "QwenVLAWithSensorDiffusion",
+]
+
+if TYPE_CHECKING:
+    from pipeline.vlm.distinct import Frames
+    from pipeline.vlm.live import LiveVLM
+    from pipeline.vlm.preparation import PreparedRow, Preparer
+else:  # a model that only ever sees cached features needs no transformers
+    Frames = PreparedRow = Preparer = Any
+    LiveVLM = nn.Module
+
+_SEED_PARTS: Mapping[str, Mapping[str, Any]] = {
+    "sensor_encoder": {
+        "channels": (512, 1024, 1024, 1024),
+        "layers": 2,
+        "heads": 8,
+        "output_dim": 1024,
+    },
+    "state_encoder": {"dim": 256, "layers": 2, "heads": 8, "output_dim": 512},
+    "expert": {"dim": 512, "layers": 4, "heads": 8},
+    "diffusion": {"prediction": "epsilon"},
+}
+"""Of the parts this class has always had, where params.yaml has leaner defaults."""
+
+_ACTION_GROUPS = ("translation",) * 3 + ("rotation",) * 3 + ("gripper",)
+
+
+class QwenVLAUnified(LivePolicy[LiveVLM]):
+    """Qwen2.5-VL, encoders, fusion and action expert as one `Trainable` module.
+
+    `vlm` is None until it is first needed or `load_vlm` is called: with cached features alone no
+    checkpoint is read. Asking a model whose `finetune_vl` is not none for its parameters loads it,
+    so that an optimizer sees them.
+    """
+
+    def __init__(
+        self,
+        model_type: ModelType = "flow_matching",
+        fusion_strategy: FusionStrategy = "concat",
+        *,
+        vl_model_name: str = "Qwen/Qwen2.5-VL-3B-Instruct",
+        sensor_enabled: bool = True,
+        robot_state_enabled: bool = True,
+        finetune_vl: Literal["none", "lora", "full"] = "none",
+        lora_r: int = 16,
+        lora_alpha: int = 32,
+        lora_dropout: float = 0.05,
+        image_resize_height: int = 360,
+        image_resize_width: int = 640,
+        horizon: int = 8,
+        action_dim: int = 7,
+        sensor_channels: int = 1026,
+        sensor_window: int = 65,
+        state_dim: int = 12,
+        state_window: int = 100,
+        views: Sequence[str] = ("View1", "View2", "View3", "View4", "View5"),
+        prompt: str = "{instruction}\n{images}\n{instruction}",
+        pooling: Sequence[str] = ("mean",),
+        feature_dim: int | None = None,
+        normalization: StreamStatistics | None = None,
+        vlm: Mapping[str, Any] | None = None,
+        tuning: Mapping[str, Any] | None = None,
+        **head: Any,
+    ) -> None:
+        """Build the policy; `vlm`, `tuning` and `head` are more params of those sections.
+
+        Of a part of the policy, such as `sensor_encoder`, what `head` does not name stays as this
+        class has always had it.
+
+        `feature_dim` is the width of the checkpoint's hidden states: by default what a checkpoint
+        folder says of itself, and 2048 (that of Qwen2.5-VL-3B) for a hub id. Of seven action
+        channels three are translations, three rotations and one the gripper; of any other number
+        all are `other`. Values are checked as the params of the same name are (`ValidationError`).
+
+        WARNING: without `normalization` every stream is taken as it is. Physical units (degrees,
+        millimetres, raw A-scans) train badly: give the `pipeline.policy.normalization` of the data.
+        """
+        said = {"checkpoint": vl_model_name, "prompt": prompt, "pooling": tuple(pooling)}
+        size = {
+            "image_resize_height": image_resize_height,
+            "image_resize_width": image_resize_width,
+        }
+        lora = {"lora_r": lora_r, "lora_alpha": lora_alpha, "lora_dropout": lora_dropout}
+        vlm_params = VLMParams.model_validate({**said, **size, **(vlm or {})})
+        tuned = TuningParams.model_validate({"method": finetune_vl, **lora, **(tuning or {})})
+        names = tuple(sorted(views))
+        params = TrainHeadParams.model_validate(
+            {
+                "model_type": model_type,
+                "fusion_strategy": fusion_strategy,
+                "sensor_enabled": sensor_enabled,
+                "robot_state_enabled": robot_state_enabled,
+                "horizon": horizon,
+                "sensor_window": sensor_window,
+                "state_window": state_window,
+                **_with_seed_parts(head),
+            }
+        )
+        slots, width = feature_shape(vlm_params, names)
+        groups = _ACTION_GROUPS if action_dim == len(_ACTION_GROUPS) else ("other",) * action_dim
+        sizes = (slots, feature_dim or width, sensor_channels, state_dim, action_dim)
+        shape = PolicyShape(*sizes, action_groups=groups)
+        policy = Policy(params, shape, normalization or Unchanged(shape))
+        self._assemble(policy, vlm_params, tuned, names)
+
+    @classmethod
+    def of(cls, policy: Policy, vlm: LiveVLM) -> "QwenVLAUnified":
+        """The model of two parts; `VLMError` where their features differ in number or width.
+
+        Raises `CheckpointMismatch` where a checkpoint's policy was trained on other features.
+        """
+        if policy.feature_spec is not None:
+            vlm.refuse_other_features(policy.feature_spec)
+        model = cls.__new__(cls)
+        model._assemble(policy, vlm.vlm, vlm.tuning, vlm.spec.views)
+        model.vlm = _fitting(vlm, policy.shape)
+        return model
+
+    def _assemble(
+        self, policy: Policy, vlm: VLMParams, tuning: TuningParams, views: Sequence[str]
+    ) -> None:
+        load = partial(_load, vlm, tuning, views, policy.shape)
+        super().__init__(policy, load, tuned=tuning.method != "none")
+        self.vlm_params, self.tuning = vlm, tuning
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the preparer, whose caches cannot be pickled and which is made again."""
+        return {name: value for name, value in self.__dict__.items() if name != "_preparer"}
+
+    def forward(
+        self,
+        images: Sequence[Frames | None] | None = None,
+        text: Sequence[str] | None = None,
+        features: Any = None,
+        sensor: Any = None,
+        state: Any = None,
+        actions: Any = None,
+        *,
+        slot_valid: Any = None,
+        feature_age: Any = None,
+        sensor_valid: Any = None,
+        state_valid: Any = None,
+        action_valid: Any = None,
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """The loss where `actions` are given, else an action chunk (batch, horizon, action).
+
+        `images` has the frames of each sample, with `text` its instruction; a sample whose frames
+        are None keeps its cached `features` (batch, slot, dim). `sensor` (batch, window, channel),
+        `state` (batch, window, dim) and `actions` (batch, horizon, action) are in physical units,
+        tensors or arrays; what is not given is missing. Of a stream is real what `slot_valid`
+        (batch, slot) marks and the last `sensor_valid`, `state_valid` (batch,) readings, without
+        them all; `feature_age` (batch,) is in s. A chunk is computed without dropout even in
+        `train()` mode, which stays as it is. Raises `ObservationError` for a shape that does not
+        fit and where there is nothing to look at.
+        """
+        known = {"slot_valid": slot_valid, "feature_age": feature_age}
+        known |= {"sensor_valid": sensor_valid, "state_valid": state_valid}
+        observation = self.observe(images, text, features, sensor, state, **known)
+        if actions is None:
+            return self.act(observation, generator)
+        action, valid = target_of(self.policy, observation, actions, action_valid)
+        return self.loss(observation, action, valid, generator)[0]
+
+    def observe(
+        self,
+        images: Sequence[Frames | None] | None = None,
+        text: Sequence[str] | None = None,
+        features: Any = None,
+        sensor: Any = None,
+        state: Any = None,
+        *,
+        slot_valid: Any = None,
+        feature_age: Any = None,
+        sensor_valid: Any = None,
+        state_valid: Any = None,
+    ) -> Seen:
+        """The observation of what `forward` takes; equal frames and text share a row."""
+        rows: list[PreparedRow] = []
+        row_of = [] if images is None else [-1] * len(images)
+        if images is not None and any(frames is not None for frames in images):
+            if text is None or isinstance(text, str) or len(text) != len(images):
+                wanted = f"expected {len(images)} instructions, one for each of images"
+                raise ObservationError(f"text: {wanted}, found {text!r}")
+            from pipeline.vlm.distinct import distinct_rows
+
+            spec = self.load_vlm().spec
+            rows, row_of = distinct_rows(self._preparer, spec, images, text)
+        streams = {"features": features, "slot_valid": slot_valid, "feature_age": feature_age}
+        streams |= {"sensor": sensor, "sensor_valid": sensor_valid}
+        streams |= {"state": state, "state_valid": state_valid}
+        return observation_of(self.policy, streams, rows, row_of)
+
+    @cached_property
+    def _preparer(self) -> Preparer:
+        from pipeline.vlm.preparation import Preparer
+
+        return Preparer(self.vlm_params, self.load_vlm().spec)
+
+
+def _with_seed_parts(head: Mapping[str, Any]) -> dict[str, Any]:
+    """Params of `head`, where a part of which it names only some keys keeps this class's others."""
+    named = {name: head[name] for name in _SEED_PARTS if isinstance(head.get(name), Mapping)}
+    merged = {name: {**_SEED_PARTS[name], **part} for name, part in named.items()}
+    return {**_SEED_PARTS, **head, **merged}
+
+
+def _load(
+    vlm: VLMParams, tuning: TuningParams, views: Sequence[str], shape: PolicyShape, device: str
+) -> LiveVLM:
+    """The model of a checkpoint; `VLMError` where it cannot be used or is of another width."""
+    from pipeline.vlm.live import LiveVLM, live_spec
+
+    return _fitting(LiveVLM.load(vlm, live_spec(vlm, views), tuning, device), shape)
+
+
+def _fitting(vlm: LiveVLM, shape: PolicyShape) -> LiveVLM:
+    found = (len(vlm.spec.slots), vlm.spec.dim)
+    if found != (shape.slots, shape.feature_dim):
+        raise VLMError(
+            f"{vlm.vlm.checkpoint}: gives {found[0]} feature slots of width {found[1]}, but "
+            f"the policy was built for {shape.slots} of width {shape.feature_dim}. Build it "
+            f"with feature_dim={found[1]} and with the views, layers and pooling of the model."
+        )
+    return vlm
+
+
+class QwenVLAWithSensorDiffusion(QwenVLAUnified):
+    """The unified model with the diffusion expert."""
+
+    def __init__(self, **arguments: Any) -> None:
+        super().__init__("diffusion", **arguments)
+
+
+class QwenVLAWithSensor(QwenVLAUnified):
+    """The unified model with the regression expert on a frozen vision-language model."""
+
+    def __init__(self, **arguments: Any) -> None:
+        super().__init__("regression", **arguments)
+
+
+class Not_freeze_QwenVLAWithSensor(QwenVLAUnified):  # noqa: N801 (the name it is known by)
+    """The unified model with the regression expert, every weight of the model learning."""
+
+    def __init__(self, **arguments: Any) -> None:
+        arguments.setdefault("finetune_vl", "full")
+        super().__init__("regression", **arguments)

@@ -1,0 +1,283 @@
+"""A policy on disk: `policy.safetensors` and a `policy.json` that says all it takes to use it.
+
+The JSON carries the feature spec of the store it was trained from, the streams with their names
+and units, the normalisation, the params and the ids of the episodes it has never seen. No pickle.
+
+A kill at any instant leaves the previous checkpoint or the new one.
+"""
+
+import json
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.base.config import TrainHeadParams
+from pipeline.base.durable import (
+    DIGEST,
+    check_digest,
+    read_tensors,
+    read_with_digest,
+    replace_folder,
+    write_tensors,
+    write_with_digest,
+)
+from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch, PipelineError
+from pipeline.base.ownership import OutputKind
+from pipeline.policy.normalization import Normalization
+from pipeline.store import FeatureStore
+
+# torch takes over a second to import, and what only asks whether a training is finished needs none.
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
+
+    from pipeline.policy.observation import PolicyShape
+    from pipeline.policy.policy import Policy
+
+FORMAT = 2
+WEIGHTS, DOCUMENT = "policy.safetensors", "policy.json"
+CHECKPOINT = OutputKind("a checkpoint of a policy", lambda folder: (folder / DOCUMENT).is_file())
+SOURCE_KEYS = ("feature_spec", "streams", "action_hz", "vlm_reuse_count")
+
+
+@dataclass(frozen=True)
+class PolicyCheckpoint:
+    """A trained policy and what it was trained from."""
+
+    params: TrainHeadParams
+    shape: "PolicyShape"
+    normalization: Normalization
+    source: Mapping[str, Any]
+    """What the store was: `feature_spec`, `streams`, `action_hz`, `vlm_reuse_count`."""
+    held_out_ticks: Mapping[str, tuple[int, int]]
+    """`source/id` of each episode with held-out ticks -> [first, stop), counted in the episode."""
+    held_out_content: Mapping[str, str]
+    """`source/id` of each of these episodes -> digest of its files."""
+    step: int
+    weights: Mapping[str, "Tensor"]
+    metrics: Mapping[str, float] = field(default_factory=dict)
+
+    def policy(self, device: "torch.device | str" = "cpu") -> "Policy":
+        """The policy with these weights, in evaluation mode; it knows its feature spec."""
+        from pipeline.policy.policy import Policy
+
+        policy = Policy(self.params, self.shape, self.normalization)
+        policy.feature_spec = self.source["feature_spec"]
+        try:
+            policy.load_state_dict(dict(self.weights))
+        except RuntimeError as error:
+            raise CheckpointMismatch(
+                f"{WEIGHTS} does not fit the policy that {DOCUMENT} describes: {error}. Train it "
+                "again, or use the version of this code that wrote it."
+            ) from None
+        return policy.to(device).eval()
+
+    def document(self, weights_sha256: str) -> dict[str, Any]:
+        """The content of `policy.json`."""
+        return {
+            "format": FORMAT,
+            "step": self.step,
+            "metrics": dict(self.metrics),
+            "params": {"train_head": self.params.model_dump(mode="json")},
+            "shape": self.shape.document(),
+            **self.source,
+            "held_out_episodes": list(self.held_out_ticks),
+            "held_out_ticks": {name: list(ticks) for name, ticks in self.held_out_ticks.items()},
+            "held_out_content": dict(self.held_out_content),
+            "weights_sha256": weights_sha256,
+            "normalization": self.normalization.document(),
+        }
+
+
+def save_policy(
+    folder: Path,
+    checkpoint: PolicyCheckpoint,
+    beside: Callable[[Path], None] = lambda folder: None,
+) -> None:
+    """Put a checkpoint at `folder`, in place of an older one there, atomically.
+
+    `beside` writes into the same folder what stands beside the policy. Raises `DiskFull`.
+    """
+
+    def write(temporary: Path) -> None:
+        digest = write_tensors(temporary / WEIGHTS, checkpoint.weights)
+        write_with_digest(temporary / DOCUMENT, checkpoint.document(digest))
+        beside(temporary)
+
+    replace_folder(folder, write, CHECKPOINT)
+
+
+def find_policy(path: Path) -> Path:
+    """The checkpoint folder that `path` means: itself, or the best of a training's output.
+
+    Raises `CheckpointIncomplete` where neither is one.
+    """
+    for folder in (path, path / "best"):
+        if (folder / DOCUMENT).exists():
+            return folder
+    part = path.with_name(f"{path.name}.part")
+    unfinished = f" There is an unfinished training in {part}." if part.exists() else ""
+    raise CheckpointIncomplete(
+        f"{path}: expected a checkpoint ({DOCUMENT} in it or in its folder best), found none."
+        f"{unfinished} Run stages.train_head (or stages.finetune) to its end, or name another "
+        "checkpoint."
+    )
+
+
+def load_policy(folder: Path) -> PolicyCheckpoint:
+    """The checkpoint at `folder`.
+
+    Raises `CheckpointIncomplete` naming the file that is missing, truncated or altered. Says on
+    stderr where the description is of a version that wrote no digest of it.
+    """
+    from pipeline.policy.observation import PolicyShape
+
+    document = _described(folder)
+    try:
+        return PolicyCheckpoint(
+            params=_params(document),
+            shape=PolicyShape.from_document(document["shape"]),
+            normalization=Normalization.from_document(document["normalization"]),
+            source={key: document[key] for key in SOURCE_KEYS},
+            held_out_ticks={
+                name: (int(first), int(stop))
+                for name, (first, stop) in document["held_out_ticks"].items()
+            },
+            held_out_content=dict(document["held_out_content"]),
+            step=document["step"],
+            metrics=document["metrics"],
+            weights=read_tensors(folder / WEIGHTS, document["weights_sha256"]),
+        )
+    except PipelineError:
+        raise
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        raise _strange(folder, error) from None
+
+
+def check_policy(folder: Path) -> TrainHeadParams:
+    """The params of the checkpoint at `folder`, of which no weight is opened.
+
+    Raises `CheckpointIncomplete` and `CheckpointMismatch` as `load_policy`.
+    """
+    document = _described(folder)
+    try:
+        check_digest(folder / WEIGHTS, document["weights_sha256"])
+        Normalization.from_document(document["normalization"])
+        return _params(document)
+    except PipelineError:
+        raise
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        raise _strange(folder, error) from None
+
+
+def _described(folder: Path) -> dict[str, Any]:
+    document, has_digest = read_with_digest(folder / DOCUMENT)
+    if not has_digest:
+        _note_without_digest(folder / DOCUMENT)
+    if document.get("format") != FORMAT:
+        raise CheckpointMismatch(
+            f"{folder / DOCUMENT}: expected format {FORMAT}, found {document.get('format')!r}. "
+            "Train it again with this version."
+        )
+    return document
+
+
+def _params(document: Mapping[str, Any]) -> TrainHeadParams:
+    return TrainHeadParams.model_validate_json(json.dumps(document["params"]["train_head"]))
+
+
+def _strange(folder: Path, error: Exception) -> CheckpointIncomplete:
+    return CheckpointIncomplete(
+        f"{folder / DOCUMENT}: not what a checkpoint's description must be "
+        f"({type(error).__name__}: {error}). Train it again."
+    )
+
+
+@cache
+def _note_without_digest(path: Path) -> None:
+    """Say it once in a process: a checkpoint is read several times."""
+    print(
+        f"{path}: it has no {DIGEST}, for an earlier version wrote it, so that nobody can tell "
+        "whether it was altered; it is taken as it is. Train it again to have it checked.",
+        file=sys.stderr,
+    )
+
+
+def source_of(store: FeatureStore) -> dict[str, Any]:
+    """What a checkpoint remembers of its store, and what another store must agree with."""
+    return {key: getattr(store, "spec" if key == "feature_spec" else key) for key in SOURCE_KEYS}
+
+
+def policy_shape(store: FeatureStore, normalization: Normalization) -> "PolicyShape":
+    """The widths that this store gives to a policy.
+
+    A stream without statistics is absent from what the policy is trained on, so it has width 0.
+    """
+    from pipeline.policy.observation import PolicyShape, action_groups
+
+    action = store.streams["action"]
+    return PolicyShape(
+        *store.feature_shape,
+        sensor_channels=store.sensor_channels if normalization.sensor else 0,
+        state_dim=store.state_dim if normalization.state else 0,
+        action_dim=store.action_dim,
+        action_groups=action_groups(action["names"], action["units"]),
+    )
+
+
+def differences(expected: Any, found: Any, place: str = "") -> dict[str, tuple[Any, Any]]:
+    """Where two JSON documents differ: dotted place -> (expected, found); None where absent."""
+    if isinstance(expected, Mapping) and isinstance(found, Mapping):
+        return {
+            where: pair
+            for key in [*expected, *(key for key in found if key not in expected)]
+            for where, pair in differences(
+                expected.get(key), found.get(key), f"{place}.{key}" if place else str(key)
+            ).items()
+        }
+    if isinstance(expected, tuple):
+        expected = list(expected)
+    if isinstance(found, tuple):
+        found = list(found)
+    return {} if expected == found else {place: (expected, found)}
+
+
+def describe(differing: Mapping[str, tuple[Any, Any]], expected: str, found: str) -> str:
+    """One indented line for each of `differences`, long values cut."""
+    return "\n".join(
+        f"  {place}: {_short(a)} ({expected}), {_short(b)} ({found})"
+        for place, (a, b) in differing.items()
+    )
+
+
+def source_differences(
+    expected: Mapping[str, Any], found: Mapping[str, Any]
+) -> dict[str, tuple[Any, Any]]:
+    """`differences` of what a checkpoint's store was and another store is.
+
+    Two feature specs of one digest are the same; of two digests, the entries that differ are
+    named, and the digest only where they all agree.
+    """
+    differing = {}
+    for key in SOURCE_KEYS:
+        a, b = expected[key], found[key]
+        if key == "feature_spec":
+            if a.get("digest") == b.get("digest"):
+                continue
+            entries = differences(_without_digest(a), _without_digest(b), key)
+            differing |= entries or differences(a, b, key)
+        else:
+            differing |= differences(a, b, key)
+    return differing
+
+
+def _without_digest(spec: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in spec.items() if key != "digest"}
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= 80 else f"{text[:50]} … {text[-25:]}"

@@ -1,0 +1,103 @@
+"""The action expert that removes noise step by step (Ho et al. 2020; Song et al. 2021)."""
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pipeline.policy.attention import Projected
+from pipeline.policy.denoiser import Denoiser
+from pipeline.policy.expert import ActionExpert, standard_normal, uniform
+from pipeline.policy.noise_schedule import NoiseSchedule, Prediction, ScheduleKind
+
+
+class DiffusionActionExpert(ActionExpert):
+    """A denoising diffusion model of the chunk given the context.
+
+    `sampler` ddpm visits every step of the schedule; ddim visits `sampling_steps` of them, with
+    `eta` from 0 (nothing random but the first noise) to 1 (as random as ddpm). In each the
+    predicted clean chunk is held within +-`clip`, and the step is taken from the chunk so held.
+    Raises `ConfigError` where ddim is to take more steps than there are.
+    """
+
+    stochastic = True
+
+    def __init__(
+        self,
+        *,
+        horizon: int = 8,
+        action_dim: int = 7,
+        dim: int = 512,
+        layers: int = 4,
+        heads: int = 8,
+        dropout: float = 0.1,
+        timesteps: int = 100,
+        schedule: ScheduleKind = "cosine",
+        prediction: Prediction = "epsilon",
+        sampler: Literal["ddpm", "ddim"] = "ddim",
+        sampling_steps: int = 10,
+        eta: float = 0.0,
+        clip: float | None = 5.0,
+        groups: Sequence[str] | None = None,
+        group_weights: Mapping[str, float] | None = None,
+    ) -> None:
+        super().__init__(horizon, action_dim, groups, group_weights, "mse")
+        self.prediction: Prediction = prediction
+        self.sampler, self.eta, self.clip = sampler, eta, clip
+        self.schedule = NoiseSchedule(timesteps, schedule)
+        self.steps = self.schedule.steps(timesteps if sampler == "ddpm" else sampling_steps)
+        self.denoiser = Denoiser(
+            horizon=horizon, action_dim=action_dim, dim=dim, layers=layers, heads=heads,
+            dropout=dropout,
+        )  # fmt: skip
+
+    def loss(
+        self,
+        context: Float[Tensor, "batch token dim"],
+        actions: Float[Tensor, "batch horizon action"],
+        valid: Bool[Tensor, "batch horizon"],
+        generator: torch.Generator | None = None,
+    ) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
+        """The grouped squared error of the prediction at a uniform step of the schedule."""
+        sample = actions.float().masked_fill(~valid.unsqueeze(-1), 0.0)
+        epsilon = standard_normal(sample.shape, sample.device, generator)
+        drawn = uniform(len(sample), sample.device, generator)
+        step = 1 + (drawn * self.schedule.timesteps).long()
+        noisy = self.schedule.add_noise(sample, epsilon, step)
+        predicted = self.denoiser(noisy, step / self.schedule.timesteps, context, valid)
+        target = self.schedule.target(self.prediction, sample, epsilon, step)
+        return self.grouped(predicted, target, valid)
+
+    @torch.no_grad()
+    def act(
+        self, context: Float[Tensor, "batch token dim"], generator: torch.Generator | None = None
+    ) -> Float[Tensor, "batch horizon action"]:
+        """A chunk drawn by the sampler, float32; from noise, the context and the generator."""
+        shape = (len(context), self.horizon, self.action_dim)
+        chunk = standard_normal(shape, context.device, generator)
+        prepared = self.denoiser.prepare(context)
+        for step, to in pairwise(self.steps):
+            sample = self.clean(chunk, step, prepared)
+            if self.sampler == "ddpm":
+                chunk, variance = self.schedule.posterior(sample, chunk, step)
+            else:
+                chunk, variance = self.schedule.ddim(sample, chunk, step, to, self.eta)
+            if self.sampler == "ddpm" or self.eta:
+                noise = standard_normal(shape, context.device, generator)
+                chunk = chunk + variance.sqrt() * noise
+        return chunk
+
+    def clean(
+        self,
+        noisy: Float[Tensor, "batch horizon action"],
+        step: int,
+        context: Float[Tensor, "batch token dim"] | Sequence[Projected],
+    ) -> Float[Tensor, "batch horizon action"]:
+        """The clean chunk that the network sees in a noisy one at this step, clipped."""
+        time = noisy.new_full((len(noisy),), step / self.schedule.timesteps)
+        predicted = self.denoiser(noisy, time, context)
+        sample = self.schedule.sample_of(self.prediction, predicted, noisy, step)
+        return sample if self.clip is None else sample.clamp(-self.clip, self.clip)

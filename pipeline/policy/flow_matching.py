@@ -1,0 +1,128 @@
+"""The action expert that follows a learned flow from noise to the chunk (Lipman et al. 2023)."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from pipeline.policy.denoiser import Denoiser
+from pipeline.policy.expert import ActionExpert, standard_normal, uniform
+
+Solver = Literal["euler", "midpoint", "rk4"]
+Velocity = Callable[[Tensor, float], Tensor]
+
+_STAGES: dict[Solver, tuple[tuple[float, ...], tuple[float, ...]]] = {
+    # Where in the step each stage stands, and its weight; each stage builds on the one before.
+    "euler": ((0.0,), (1.0,)),
+    "midpoint": ((0.0, 0.5), (0.0, 1.0)),
+    "rk4": ((0.0, 0.5, 0.5, 1.0), (1 / 6, 1 / 3, 1 / 3, 1 / 6)),
+}
+
+
+def integrate(velocity: Velocity, start: Tensor, steps: int, solver: Solver) -> Tensor:
+    """Where dx/dt = velocity(x, t) takes `start` from t = 0 to 1 in equal steps.
+
+    Explicit Runge-Kutta methods of order 1, 2 and 4 (Butcher 2016, section 23).
+    """
+    nodes, weights = _STAGES[solver]
+    x, width = start, 1 / steps
+    for index in range(steps):
+        slope, change = torch.zeros_like(x), torch.zeros_like(x)
+        for node, weight in zip(nodes, weights, strict=True):
+            slope = velocity(x + node * width * slope, (index + node) * width)
+            change = change + weight * slope
+        x = x + width * change
+    return x
+
+
+class BetaTimes(nn.Module):
+    """Times t in [0, 1] whose noise share 1 - t is beta-distributed.
+
+    From uniform numbers through a table of the distribution's quantiles (its distribution function
+    is met within 1/4096): `torch.distributions.Beta` takes no generator.
+    """
+
+    quantiles: Tensor
+
+    def __init__(self, alpha: float, beta: float) -> None:
+        from scipy.special import betaincinv  # slow to import, and of this one class
+
+        super().__init__()
+        grid = torch.linspace(0, 1, 4097, dtype=torch.float64, device="cpu")
+        table = torch.from_numpy(betaincinv(alpha, beta, grid.numpy()))
+        self.register_buffer("quantiles", table.float(), persistent=False)
+
+    def forward(self, drawn: Float[Tensor, " batch"]) -> Float[Tensor, " batch"]:
+        """The times that uniform numbers in [0, 1) stand for."""
+        place = drawn * (len(self.quantiles) - 1)
+        below = place.long()
+        return 1 - torch.lerp(self.quantiles[below], self.quantiles[below + 1], place - below)
+
+
+class FlowMatchingActionExpert(ActionExpert):
+    """Conditional flow matching of the chunk given the context, on straight paths.
+
+    Noise at t = 0 and the chunk at t = 1 are joined by x_t = (1 - t) noise + t chunk (Lipman et
+    al. 2023, eq. 22 with no noise left at the end); the network learns the velocity chunk - noise,
+    and `act` follows it in `sampling_steps` steps of `solver`. `time` says how t is drawn in the
+    loss: uniform, or with a noise share 1 - t of Beta(`alpha`, `beta`) (pi0, Black et al. 2024).
+    """
+
+    stochastic = True
+
+    def __init__(
+        self,
+        *,
+        horizon: int = 8,
+        action_dim: int = 7,
+        dim: int = 512,
+        layers: int = 4,
+        heads: int = 8,
+        dropout: float = 0.1,
+        sampling_steps: int = 10,
+        solver: Solver = "euler",
+        time: Literal["uniform", "beta"] = "uniform",
+        alpha: float = 1.5,
+        beta: float = 1.0,
+        groups: Sequence[str] | None = None,
+        group_weights: Mapping[str, float] | None = None,
+    ) -> None:
+        super().__init__(horizon, action_dim, groups, group_weights, "mse")
+        self.sampling_steps = sampling_steps
+        self.solver: Solver = solver
+        self.times = BetaTimes(alpha, beta) if time == "beta" else nn.Identity()
+        self.denoiser = Denoiser(
+            horizon=horizon, action_dim=action_dim, dim=dim, layers=layers, heads=heads,
+            dropout=dropout,
+        )  # fmt: skip
+
+    def loss(
+        self,
+        context: Float[Tensor, "batch token dim"],
+        actions: Float[Tensor, "batch horizon action"],
+        valid: Bool[Tensor, "batch horizon"],
+        generator: torch.Generator | None = None,
+    ) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
+        """The grouped squared error of the velocity at a drawn time."""
+        chunk = actions.float().masked_fill(~valid.unsqueeze(-1), 0.0)
+        noise = standard_normal(chunk.shape, chunk.device, generator)
+        time = self.times(uniform(len(chunk), chunk.device, generator))
+        share = time.view(-1, 1, 1)
+        noisy = (1 - share) * noise + share * chunk
+        return self.grouped(self.denoiser(noisy, time, context, valid), chunk - noise, valid)
+
+    @torch.no_grad()
+    def act(
+        self, context: Float[Tensor, "batch token dim"], generator: torch.Generator | None = None
+    ) -> Float[Tensor, "batch horizon action"]:
+        """Where the flow takes a drawn noise, float32."""
+        shape = (len(context), self.horizon, self.action_dim)
+        noise = standard_normal(shape, context.device, generator)
+        prepared = self.denoiser.prepare(context)
+
+        def velocity(x: Tensor, time: float) -> Tensor:
+            return self.denoiser(x, x.new_full((len(x),), time), prepared)
+
+        return integrate(velocity, noise, self.sampling_steps, self.solver)

@@ -1,0 +1,131 @@
+"""A policy whose features, of some samples or all, a model computes as it goes."""
+
+from collections.abc import Callable, Generator, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, Generic, TypeVar
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from pipeline.policy.live_observation import LiveObservation, with_features
+from pipeline.policy.observation import Observation
+from pipeline.policy.policy import Policy
+
+Model = TypeVar("Model", bound=nn.Module)
+
+
+class LivePolicy(nn.Module, Generic[Model]):
+    """A `Trainable` of a policy and, in front of it, a model `rows -> (features, valid)`.
+
+    A `LiveObservation` is looked at through the model, any other goes to the policy as it is.
+    """
+
+    policy: Policy
+    vlm: Model | None
+    """The model, or None while it is not loaded."""
+
+    def __init__(self, policy: Policy, load: Callable[[str], Model], tuned: bool) -> None:
+        """`load(device)` gives the model, should one be needed before `vlm` is set.
+
+        Of a `tuned` model something learns, so it is loaded before its weights are asked for.
+        """
+        super().__init__()
+        self.policy = policy
+        self.register_module("vlm", None)
+        self._load, self._tuned = load, tuned
+
+    def load_vlm(self) -> Model:
+        """The model; the first time it is loaded, onto the policy's device."""
+        if self.vlm is None:
+            self.vlm = self._load(str(next(self.policy.parameters()).device))
+            self.vlm.train(self.training)
+        return self.vlm
+
+    def named_parameters(
+        self, prefix: str = "", recurse: bool = True, remove_duplicate: bool = True
+    ) -> Iterator[tuple[str, nn.Parameter]]:
+        """All parameters, so that an optimizer sees those of a tuned model too."""
+        if self._tuned:
+            self.load_vlm()
+        return super().named_parameters(prefix, recurse, remove_duplicate)
+
+    def state_dict(self, *arguments: Any, **named: Any) -> dict[str, Any]:
+        """Weights of the policy and of a tuned model; a frozen one's stand in its checkpoint."""
+        if self._tuned:
+            self.load_vlm()
+        state = super().state_dict(*arguments, **named)
+        return {
+            name: value for name, value in state.items() if self._tuned or ".vlm." not in f".{name}"
+        }
+
+    def load_state_dict(
+        self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
+    ) -> Any:
+        """Take the weights of `state_dict()`, wherever a model was loaded, there or here."""
+        if self._tuned:
+            self.load_vlm()
+        elif self.vlm is not None:
+            frozen = {f"vlm.{name}": value for name, value in self.vlm.state_dict().items()}
+            state_dict = {**frozen, **state_dict}
+        return super().load_state_dict(state_dict, strict, assign)
+
+    def loss(
+        self,
+        observation: Observation,
+        action: Float[Tensor, "batch horizon action"],
+        action_valid: Bool[Tensor, "batch horizon"],
+        generator: torch.Generator | None = None,
+    ) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
+        """As `Policy.loss`; gradients reach the model where a sample is live and it learns."""
+        return self.policy.loss(self._seen(observation), action, action_valid, generator)
+
+    @torch.no_grad()
+    def sample(
+        self, observation: Observation, samples: int = 1, generator: torch.Generator | None = None
+    ) -> Float[Tensor, "sample batch horizon action"]:
+        """As `Policy.sample`, but never with dropout, whatever the mode; the model runs once.
+
+        Equal generators give equal samples. The mode of every part is afterwards what it was.
+        """
+        with self._evaluating():
+            return self.policy.sample(self._seen(observation), samples, generator)
+
+    def act(
+        self, observation: Observation, generator: torch.Generator | None = None
+    ) -> Float[Tensor, "batch horizon action"]:
+        """One sample: an action chunk in physical units, float32."""
+        return self.sample(observation, 1, generator)[0]
+
+    @property
+    def stochastic(self) -> bool:
+        """Whether two samples differ."""
+        return self.policy.stochastic
+
+    def parameter_table(self) -> list[tuple[str, int]]:
+        """The number of parameters of each part of the policy, and of the model where loaded."""
+        table = self.policy.parameter_table()
+        if self.vlm is not None:
+            sizes = [(p.numel(), p.requires_grad) for p in self.vlm.parameters()]
+            table += [
+                ("vlm, learning", sum(size for size, learns in sizes if learns)),
+                ("vlm, frozen", sum(size for size, learns in sizes if not learns)),
+            ]
+        return table
+
+    @contextmanager
+    def _evaluating(self) -> Generator[None]:
+        modes = {part: part.training for part in self.modules()}
+        self.eval()
+        try:
+            yield
+        finally:
+            for part in self.modules():
+                # A model that was loaded meanwhile goes the way of the whole.
+                part.training = modes.get(part, modes[self])
+
+    def _seen(self, observation: Observation) -> Observation:
+        """The observation with the features of its live samples computed."""
+        if not isinstance(observation, LiveObservation) or not observation.rows:
+            return observation
+        return with_features(observation, *self.load_vlm()(observation.rows))

@@ -1,0 +1,80 @@
+"""The action expert that predicts the chunk directly."""
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from pipeline.policy.attention import TransformerLayer, learned
+from pipeline.policy.expert import ActionExpert
+
+
+class RegressionActionExpert(ActionExpert):
+    """A transformer decoder from learned queries, one a step of the horizon.
+
+    The chunk is refined `refinements` times: each round reads the proposal of the round before,
+    the first one zeros, and adds to it. `predict` takes the context and nothing else, and both
+    `loss` and `act` go through it, so a target cannot become an input.
+    """
+
+    stochastic = False
+
+    def __init__(
+        self,
+        *,
+        horizon: int = 8,
+        action_dim: int = 7,
+        dim: int = 512,
+        layers: int = 4,
+        heads: int = 8,
+        dropout: float = 0.1,
+        refinements: int = 1,
+        groups: Sequence[str] | None = None,
+        group_weights: Mapping[str, float] | None = None,
+    ) -> None:
+        super().__init__(horizon, action_dim, groups, group_weights, "smooth_l1")
+        self.refinements = refinements
+        self.queries = learned(horizon, dim)
+        # The first proposal is zeros: with a single round there is nothing to read.
+        self.read = nn.Linear(action_dim, dim) if refinements > 1 else None
+        self.layers = nn.ModuleList(
+            TransformerLayer(dim, heads, dropout=dropout, cross=True) for _ in range(layers)
+        )
+        self.norm = nn.LayerNorm(dim)
+        self.head = nn.Linear(dim, action_dim)
+        nn.init.normal_(self.head.weight, std=0.02)
+        nn.init.zeros_(self.head.bias)
+
+    def predict(
+        self, context: Float[Tensor, "batch token dim"]
+    ) -> Float[Tensor, "batch horizon action"]:
+        """The chunk in normalised units, float32."""
+        chunk = context.new_zeros(len(context), self.horizon, self.action_dim, dtype=torch.float32)
+        for _ in range(self.refinements):
+            chunk = chunk + self._delta(context, chunk).float()
+        return chunk
+
+    def _delta(self, context: Tensor, proposal: Tensor) -> Tensor:
+        tokens = self.queries.expand(len(context), -1, -1)
+        if self.read is not None:
+            tokens = tokens + self.read(proposal)
+        for layer in self.layers:
+            tokens = layer(tokens, context=context)
+        return self.head(self.norm(tokens))
+
+    def loss(
+        self,
+        context: Float[Tensor, "batch token dim"],
+        actions: Float[Tensor, "batch horizon action"],
+        valid: Bool[Tensor, "batch horizon"],
+        generator: torch.Generator | None = None,
+    ) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
+        """The grouped smooth-L1 of `predict(context)`; `generator` is not needed."""
+        return self.grouped(self.predict(context), actions, valid)
+
+    def act(
+        self, context: Float[Tensor, "batch token dim"], generator: torch.Generator | None = None
+    ) -> Float[Tensor, "batch horizon action"]:
+        """`predict(context)`; `generator` is not needed."""
+        return self.predict(context)

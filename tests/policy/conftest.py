@@ -1,0 +1,163 @@
+"""Small policies and observations."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from pipeline.base.config import TrainHeadParams
+from pipeline.policy.normalization import ChannelStatistics, Normalization
+from pipeline.policy.observation import PolicyShape
+from pipeline.policy.policy import Policy
+
+
+@dataclass
+class Seen:
+    """An observation with the fields of the store's batch, and what was done."""
+
+    features: Tensor
+    slot_valid: Tensor
+    feature_age: Tensor
+    sensor: Tensor
+    sensor_valid: Tensor
+    state: Tensor
+    state_valid: Tensor
+    action: Tensor
+    action_valid: Tensor
+
+
+@pytest.fixture(autouse=True)
+def _seeded() -> None:
+    torch.manual_seed(0)
+
+
+@pytest.fixture
+def shape() -> PolicyShape:
+    """Of a needle insertion with a narrow sensor."""
+    groups = ("translation",) * 3 + ("rotation",) * 3 + ("gripper",)
+    return PolicyShape(5, 16, 9, 12, 7, groups)
+
+
+@pytest.fixture
+def observe(shape: PolicyShape) -> Callable[..., Seen]:
+    """`observe(batch=4, sensor_window=13, state_window=25)`: everything valid, random."""
+
+    def make(batch: int = 4, sensor_window: int = 13, state_window: int = 25) -> Seen:
+        return Seen(
+            features=torch.randn(batch, shape.slots, shape.feature_dim),
+            slot_valid=torch.ones(batch, shape.slots, dtype=torch.bool),
+            feature_age=torch.rand(batch),
+            sensor=torch.randn(batch, sensor_window, shape.sensor_channels),
+            sensor_valid=torch.full((batch,), sensor_window),
+            state=torch.randn(batch, state_window, shape.state_dim),
+            state_valid=torch.full((batch,), state_window),
+            action=torch.randn(batch, 8, shape.action_dim),
+            action_valid=torch.ones(batch, 8, dtype=torch.bool),
+        )
+
+    return make
+
+
+@pytest.fixture
+def normalization(shape: PolicyShape) -> Normalization:
+    """Statistics that are not the identity, so that a forgotten one shows."""
+    rng = np.random.default_rng(0)
+
+    def statistics(*widths: int) -> ChannelStatistics:
+        return ChannelStatistics(rng.normal(size=widths), rng.uniform(0.5, 2.0, widths), 100)
+
+    return Normalization(
+        action=statistics(shape.action_dim),
+        features=statistics(shape.slots, shape.feature_dim),
+        sensor=statistics(shape.sensor_channels),
+        state=statistics(shape.state_dim),
+    )
+
+
+@pytest.fixture
+def small_params() -> Callable[..., TrainHeadParams]:
+    """`small_params(**over)`: widths that run in milliseconds, no dropout."""
+
+    def make(**over: Any) -> TrainHeadParams:
+        document: dict[str, Any] = {
+            "sensor_window": 13,
+            "state_window": 25,
+            "sensor_encoder": {"channels": [16, 32], "layers": 1, "heads": 2, "output_dim": 24},
+            "state_encoder": {"dim": 16, "layers": 1, "heads": 2, "output_dim": 20},
+            "expert": {"dim": 32, "layers": 2, "heads": 2, "dropout": 0.0},
+        }
+        return TrainHeadParams.model_validate(document | over)
+
+    return make
+
+
+@pytest.fixture
+def build_policy(
+    shape: PolicyShape, normalization: Normalization, small_params: Callable[..., TrainHeadParams]
+) -> Callable[..., Policy]:
+    """`build_policy(**params)`: a small policy from a fixed seed."""
+
+    def make(**over: Any) -> Policy:
+        torch.manual_seed(1)
+        return Policy(small_params(**over), shape, normalization)
+
+    return make
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """Round Gaussians of one spread: `means` (mode, dim), `weights` (mode,); sums to 1."""
+
+    means: Tensor
+    weights: Tensor
+    spread: float
+
+    def draw(self, count: int, generator: torch.Generator | None = None) -> Tensor:
+        """(count, 1, dim): chunks of a single step."""
+        mode = torch.multinomial(self.weights, count, replacement=True, generator=generator)
+        noise = torch.randn(count, self.means.shape[1], generator=generator)
+        return (self.means[mode] + self.spread * noise).unsqueeze(1)
+
+    def expectations(self, noisy: Tensor, signal: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """What is left of sample and noise on average, given signal * sample + noise * epsilon."""
+        signal, noise = (x.view(-1, 1, 1).to(noisy) for x in (signal, noise))
+        variance = (signal * self.spread) ** 2 + noise**2
+        off = noisy - signal * self.means.to(noisy)
+        likelihood = self.weights.to(noisy).log() - (off**2).sum(-1) / (2 * variance.squeeze(-1))
+        share = likelihood.softmax(-1).unsqueeze(-1)
+        sample = self.means.to(noisy) + signal * self.spread**2 / variance * off
+        epsilon = noise / variance * off
+        return tuple((share * x).sum(1, keepdim=True) for x in (sample, epsilon))  # type: ignore
+
+    def judge(self, samples: Tensor) -> tuple[Tensor, Tensor, Tensor, float]:
+        """Weight, mean and spread of the samples nearest to each mode; the share within 4 spreads.
+
+        The spread is that of the samples within 4 spreads of the mode.
+        """
+        samples = samples[:, 0]
+        distance, mode = (samples[:, None] - self.means).norm(dim=-1).min(dim=1)
+        near = distance < 4 * self.spread
+        of = [mode == index for index in range(len(self.means))]
+        return (
+            torch.stack([x.float().mean() for x in of]),
+            torch.stack([samples[x].mean(0) for x in of]),
+            torch.stack([samples[x & near].std(0).mean() for x in of]),
+            near.float().mean().item(),
+        )
+
+
+@pytest.fixture(scope="session")
+def two_modes() -> Mixture:
+    """In 2-D, of unequal weight, far apart for their spread."""
+    means = torch.tensor([[-1.0, 0.5], [1.0, -0.5]])
+    return Mixture(means, torch.tensor([0.3, 0.7]), 0.1)
+
+
+@pytest.fixture(scope="session")
+def mixture() -> type[Mixture]:
+    """To make others."""
+    return Mixture

@@ -1,0 +1,207 @@
+"""A checkpoint comes back whole, or says what is wrong with it."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from pipeline.base.config import TrainHeadParams
+from pipeline.base.durable import read_document, write_document, write_with_digest
+from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch
+from pipeline.policy.checkpoint import (
+    PolicyCheckpoint,
+    describe,
+    differences,
+    find_policy,
+    load_policy,
+    policy_shape,
+    save_policy,
+    source_differences,
+    source_of,
+)
+from pipeline.policy.policy import Policy
+from pipeline.store import FeatureStore
+from pipeline.training import fit_normalization
+
+PARAMS = TrainHeadParams.model_validate(
+    {
+        "sensor_encoder": {"channels": [8], "layers": 0, "heads": 1, "output_dim": 8},
+        "state_encoder": {"dim": 8, "layers": 0, "heads": 1, "output_dim": 8},
+        "expert": {"dim": 8, "layers": 1, "heads": 1},
+        "horizon": 3,
+        "sensor_window": 6,
+        "state_window": 5,
+        "group_weights": {"rotation": 2.0},
+        "store": "some/where.zarr",
+    }
+)
+
+
+@pytest.fixture(scope="module")
+def store(
+    tiny_store: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory
+) -> FeatureStore:
+    return FeatureStore.open(tiny_store(tmp_path_factory.mktemp("checkpoint")))
+
+
+@pytest.fixture
+def checkpoint(store: FeatureStore) -> PolicyCheckpoint:
+    normalization = fit_normalization(store, torch.arange(60).numpy())
+    shape = policy_shape(store, normalization)
+    torch.manual_seed(3)
+    return PolicyCheckpoint(
+        params=PARAMS,
+        shape=shape,
+        normalization=normalization,
+        source=source_of(store),
+        held_out_ticks={"left/episode_004": (0, 30), "right/episode_005": (24, 30)},
+        held_out_content={"left/episode_004": "0-4", "right/episode_005": "0-5"},
+        step=7,
+        weights=Policy(PARAMS, shape, normalization).state_dict(),
+        metrics={"val/error": 1 / 3},
+    )
+
+
+def test_a_checkpoint_comes_back_to_the_bit(
+    checkpoint: PolicyCheckpoint, store: FeatureStore, tmp_path: Path
+) -> None:
+    save_policy(tmp_path / "best", checkpoint)
+    found = load_policy(tmp_path / "best")
+    assert found.params == PARAMS
+    assert found.shape == checkpoint.shape
+    assert found.source == checkpoint.source
+    assert found.held_out_ticks == checkpoint.held_out_ticks
+    assert found.held_out_content == checkpoint.held_out_content
+    assert (found.step, found.metrics) == (7, {"val/error": 1 / 3})
+    for name, value in checkpoint.weights.items():
+        assert torch.equal(found.weights[name], value), name
+    batch = store.gather([0, 31], horizon=3, sensor_window=6, state_window=5)
+    assert torch.equal(found.policy().act(batch), checkpoint.policy().act(batch))
+
+
+def test_its_description_is_what_serving_needs(
+    checkpoint: PolicyCheckpoint, tmp_path: Path
+) -> None:
+    save_policy(tmp_path / "best", checkpoint)
+    document = json.loads((tmp_path / "best/policy.json").read_text())
+    assert document["feature_spec"]["digest"] == "tiny-spec"
+    assert document["streams"]["action"]["units"] == ["mm", "mm", "mm", "deg", ""]
+    assert document["action_hz"] == 10.0
+    assert document["vlm_reuse_count"] == 3
+    assert document["params"]["train_head"]["horizon"] == 3
+    assert document["held_out_episodes"] == ["left/episode_004", "right/episode_005"]
+    assert document["normalization"]["action"]["count"] == 60
+
+
+def test_the_same_checkpoint_is_the_same_bytes(
+    checkpoint: PolicyCheckpoint, tmp_path: Path
+) -> None:
+    for name in ("one", "two"):
+        save_policy(tmp_path / name, checkpoint)
+    for file in ("policy.json", "policy.safetensors"):
+        assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes()
+
+
+def test_a_folder_or_a_run_is_found(checkpoint: PolicyCheckpoint, tmp_path: Path) -> None:
+    save_policy(tmp_path / "head" / "best", checkpoint)
+    assert find_policy(tmp_path / "head") == tmp_path / "head/best"
+    assert find_policy(tmp_path / "head/best") == tmp_path / "head/best"
+    (tmp_path / "other.part").mkdir()
+    with pytest.raises(CheckpointIncomplete, match=r"unfinished training in .*other\.part"):
+        find_policy(tmp_path / "other")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"format": 99}, "expected format 2, found 99"),
+        ({"shape": None}, "not what a checkpoint's description must be"),
+        ({"held_out_ticks": {"left/a": 3}}, "not what a checkpoint's description must be"),
+        ({"params": {"train_head": {"model_type": "oracle"}}}, "model_type"),
+        ({"normalization": {}}, "statistics of `action`"),
+    ],
+)
+def test_a_description_that_is_none_is_named(
+    checkpoint: PolicyCheckpoint, tmp_path: Path, change: dict[str, Any], said: str
+) -> None:
+    save_policy(tmp_path / "best", checkpoint)
+    path = tmp_path / "best/policy.json"
+    write_with_digest(path, read_document(path) | change)
+    with pytest.raises((CheckpointIncomplete, CheckpointMismatch), match=said):
+        load_policy(tmp_path / "best")
+
+
+def _ten_times(document: dict[str, Any]) -> None:
+    statistics = document["normalization"]["action"]
+    statistics["std"] = [10 * number for number in statistics["std"]]
+
+
+def _fewer_held_out(document: dict[str, Any]) -> None:
+    document["held_out_ticks"]["left/episode_004"] = [20, 30]
+
+
+@pytest.mark.parametrize("alter", [_ten_times, _fewer_held_out])
+def test_an_altered_description_is_refused(
+    checkpoint: PolicyCheckpoint, tmp_path: Path, alter: Callable[[dict[str, Any]], None]
+) -> None:
+    save_policy(tmp_path / "best", checkpoint)
+    path = tmp_path / "best/policy.json"
+    document = json.loads(path.read_text())
+    alter(document)
+    path.write_text(json.dumps(document))
+    with pytest.raises(CheckpointIncomplete, match=r"policy\.json: .*damaged: it was altered"):
+        load_policy(tmp_path / "best")
+
+
+def test_a_description_of_before_digests_is_taken_and_told(
+    checkpoint: PolicyCheckpoint, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_policy(tmp_path / "best", checkpoint)
+    path = tmp_path / "best/policy.json"
+    write_document(path, read_document(path))
+    for _ in range(2):
+        assert load_policy(tmp_path / "best").step == checkpoint.step
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{path}: it has no document_sha256" in line
+
+
+def test_weights_of_another_policy_are_refused(
+    checkpoint: PolicyCheckpoint, tmp_path: Path
+) -> None:
+    save_policy(tmp_path / "best", checkpoint)
+    path = tmp_path / "best/policy.json"
+    document = read_document(path)
+    document["params"]["train_head"]["expert"]["dim"] = 16
+    write_with_digest(path, document)
+    with pytest.raises(CheckpointMismatch, match="does not fit the policy"):
+        load_policy(tmp_path / "best").policy()
+
+
+def test_missing_weights_are_named(checkpoint: PolicyCheckpoint, tmp_path: Path) -> None:
+    save_policy(tmp_path / "best", checkpoint)
+    (tmp_path / "best/policy.safetensors").unlink()
+    with pytest.raises(CheckpointIncomplete, match=r"policy\.safetensors.*no such file"):
+        load_policy(tmp_path / "best")
+
+
+def test_differences_are_named_by_place() -> None:
+    left = {"a": {"b": 1, "c": [1, 2]}, "d": None}
+    right = {"a": {"b": 2, "c": (1, 2)}, "e": "x" * 200}
+    found = differences(left, right)
+    assert found == {"a.b": (1, 2), "e": (None, "x" * 200)}
+    said = describe(found, "before", "now")
+    assert "  a.b: 1 (before), 2 (now)" in said
+    assert max(map(len, said.splitlines())) < 140
+
+
+def test_specs_of_one_digest_are_the_same_whatever_else_they_say() -> None:
+    base = {"streams": {}, "action_hz": None, "vlm_reuse_count": 3}
+    one = base | {"feature_spec": {"digest": "a", "prompt": "x"}}
+    assert source_differences(one, base | {"feature_spec": {"digest": "a", "shown": 1}}) == {}
+    other = source_differences(one, base | {"feature_spec": {"digest": "b", "prompt": "y"}})
+    assert other == {"feature_spec.prompt": ("x", "y")}
+    only_digest = source_differences(one, base | {"feature_spec": {"digest": "b", "prompt": "x"}})
+    assert only_digest == {"feature_spec.digest": ("a", "b")}

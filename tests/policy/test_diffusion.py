@@ -1,0 +1,248 @@
+"""Sampling with the best possible network, against closed forms; nothing is trained here."""
+
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import brentq
+from scipy.stats import norm
+from torch import Tensor, nn
+
+from pipeline.base.config import DiffusionParams
+from pipeline.policy.diffusion import DiffusionActionExpert
+from pipeline.policy.noise_schedule import NoiseSchedule
+
+PREDICTIONS = ("epsilon", "sample", "v")
+
+
+class Optimal(nn.Module):
+    """What the best network says where the chunks are drawn from a mixture."""
+
+    def __init__(self, mixture: Any, schedule: NoiseSchedule, kind: Any) -> None:
+        super().__init__()
+        self.mixture, self.schedule, self.kind = mixture, schedule, kind
+
+    def prepare(self, context: Tensor) -> Tensor:
+        return context
+
+    def forward(self, noisy: Tensor, time: Tensor, context: Tensor, valid: Any = None) -> Tensor:
+        step = (time * self.schedule.timesteps).round().long()
+        signal, noise = self.schedule.signal[step], self.schedule.noise[step]
+        sample, epsilon = self.mixture.expectations(noisy.double(), signal, noise)
+        return self.schedule.target(self.kind, sample, epsilon, step).float()
+
+
+Make = Callable[..., DiffusionActionExpert]
+
+
+@pytest.fixture
+def optimal() -> Make:
+    """`optimal(mixture, **arguments)`: an expert of one-step chunks whose network is the best."""
+
+    def make(mixture: Any, **arguments: Any) -> DiffusionActionExpert:
+        width = mixture.means.shape[1]
+        expert = DiffusionActionExpert(
+            horizon=1, action_dim=width, dim=8, layers=1, heads=1, **arguments
+        )
+        expert.denoiser = Optimal(mixture, expert.schedule, expert.prediction)  # type: ignore
+        return expert
+
+    return make
+
+
+def drawn(expert: DiffusionActionExpert, count: int = 4000, seed: int = 0) -> Tensor:
+    return expert.act(torch.zeros(count, 1, 8), torch.Generator().manual_seed(seed))
+
+
+class TestTwoModes:
+    @pytest.mark.parametrize("prediction", PREDICTIONS)
+    @pytest.mark.parametrize(
+        "arguments",
+        [
+            {"sampler": "ddpm", "timesteps": 200},
+            {"sampler": "ddpm", "timesteps": 200, "schedule": "linear"},
+            {"timesteps": 200, "sampling_steps": 100, "eta": 0.0},
+            {"timesteps": 200, "sampling_steps": 100, "eta": 0.0, "schedule": "linear"},
+            {"timesteps": 200, "sampling_steps": 100, "eta": 0.5},
+        ],
+        ids=str,
+    )
+    def test_every_sampler_draws_them(
+        self, arguments: dict[str, Any], prediction: str, two_modes: Any, optimal: Make
+    ) -> None:
+        expert = optimal(two_modes, prediction=prediction, **arguments)
+        weights, means, spreads, near = two_modes.judge(drawn(expert))
+        torch.testing.assert_close(weights, two_modes.weights, rtol=0, atol=0.025)
+        torch.testing.assert_close(means, two_modes.means, rtol=0, atol=0.02)
+        assert ((spreads - two_modes.spread).abs() < 0.15 * two_modes.spread).all()
+        assert near > 0.99
+
+    def test_the_defaults_draw_them_roughly_in_ten_steps(
+        self, two_modes: Any, optimal: Make
+    ) -> None:
+        weights, means, spreads, near = two_modes.judge(drawn(optimal(two_modes)))
+        torch.testing.assert_close(weights, two_modes.weights, rtol=0, atol=0.025)
+        torch.testing.assert_close(means, two_modes.means, rtol=0, atol=0.06)
+        assert ((spreads - two_modes.spread).abs() < 0.4 * two_modes.spread).all()
+        assert near > 0.97
+
+
+@pytest.mark.parametrize("eta", [0.0, 0.6, 1.0])
+@pytest.mark.parametrize("count", [10, 100])
+def test_samples_of_a_gaussian_have_the_mean_and_spread_that_theory_gives(
+    eta: float, count: int, mixture: Any, optimal: Make
+) -> None:
+    """The best network is linear there, so each step maps mean and variance in closed form."""
+    gaussian = mixture(torch.tensor([[1.2]]), torch.ones(1), 0.4)
+    expert = optimal(gaussian, sampling_steps=count, eta=eta, clip=None)
+    alpha_bar = expert.schedule.alpha_bar.double().tolist()
+    mean, variance = 0.0, 1.0
+    for now, to in pairwise(expert.steps):
+        a, b = alpha_bar[now], alpha_bar[to]
+        random = eta**2 * (1 - b) / (1 - a) * (1 - a / b)
+        left = max(1 - b - random, 0.0)
+        kept = a**0.5 * 0.16 / (a * 0.16 + 1 - a)  # of x - mean, in the predicted sample
+        slope = b**0.5 * kept + left**0.5 * (1 - a**0.5 * kept) / (1 - a) ** 0.5
+        mean = b**0.5 * 1.2 + slope * (mean - a**0.5 * 1.2)
+        variance = slope**2 * variance + random
+    samples = drawn(expert, 20_000)
+    assert float(samples.mean()) == pytest.approx(mean, abs=0.012)
+    assert float(samples.std()) == pytest.approx(variance**0.5, rel=0.025)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 10])
+def test_few_steps_do_not_pull_the_mean_towards_the_noise(
+    count: int, mixture: Any, optimal: Make
+) -> None:
+    """As they do where the first step stands at a noise level that pure noise is not of."""
+    gaussian = mixture(torch.tensor([[1.0]]), torch.ones(1), 1.0)
+    samples = drawn(optimal(gaussian, sampling_steps=count), 20_000)
+    assert float(samples.mean()) == pytest.approx(1.0, abs=0.05)
+
+
+class TestFlow:
+    """DDIM with eta 0 follows the probability-flow ODE (Song et al. 2021, section 4.3).
+
+    On a line that flow keeps the order of points, so it takes a quantile of the noisy mixture to
+    the same quantile of the mixture.
+    """
+
+    @staticmethod
+    def quantile(mixture: Any, signal: float, noise: float, at: float) -> float:
+        width = np.sqrt((signal * mixture.spread) ** 2 + noise**2)
+        means, weights = signal * mixture.means[:, 0].double().numpy(), mixture.weights.numpy()
+        return brentq(lambda x: weights @ norm.cdf((x - means) / width) - at, -10, 10)
+
+    @pytest.mark.parametrize("schedule", ["cosine", "linear"])
+    def test_ddim_takes_quantiles_to_quantiles_as_steps_grow(
+        self, schedule: str, mixture: Any, optimal: Make
+    ) -> None:
+        line = mixture(torch.tensor([[-0.8], [0.6]]), torch.tensor([0.3, 0.7]), 0.3)
+        levels = torch.linspace(0.02, 0.98, 25)
+        expected = torch.tensor([self.quantile(line, 1.0, 0.0, float(x)) for x in levels])
+        errors = []
+        for count in (25, 100, 400):
+            expert = optimal(line, timesteps=1000, schedule=schedule, sampling_steps=count)
+            step = expert.steps[0]
+            signal, noise = (
+                float(x[step]) for x in (expert.schedule.signal, expert.schedule.noise)
+            )
+            chunk = torch.tensor([self.quantile(line, signal, noise, float(x)) for x in levels])
+            chunk = chunk.float().view(-1, 1, 1)
+            for now, to in pairwise(expert.steps):
+                sample = expert.clean(chunk, now, torch.zeros(25, 1, 8))
+                chunk, _ = expert.schedule.ddim(sample, chunk, now, to, 0.0)
+            errors.append(float((chunk.squeeze() - expected).abs().max()))
+        assert errors[1] < errors[0] / 2.5
+        assert errors[2] < errors[1] / 2.5
+        assert errors[2] < 0.01
+
+    def test_eta_zero_draws_its_first_noise_and_no_more(
+        self, two_modes: Any, optimal: Make
+    ) -> None:
+        generator, apart = torch.Generator().manual_seed(0), torch.Generator().manual_seed(0)
+        optimal(two_modes).act(torch.zeros(7, 1, 8), generator)
+        torch.randn(7, 1, 2, generator=apart)
+        assert torch.equal(generator.get_state(), apart.get_state())
+
+    def test_eta_one_through_all_steps_is_ddpm(self, two_modes: Any, optimal: Make) -> None:
+        ddim = optimal(two_modes, timesteps=50, sampling_steps=50, eta=1.0)
+        ddpm = optimal(two_modes, timesteps=50, sampler="ddpm")
+        torch.testing.assert_close(drawn(ddim, 200), drawn(ddpm, 200), rtol=0, atol=2e-3)
+
+
+class TestClip:
+    """The seeds clamped x0 and then took the step from the unclamped one."""
+
+    @pytest.mark.parametrize("sampler", ["ddpm", "ddim"])
+    @pytest.mark.parametrize("prediction", PREDICTIONS)
+    def test_a_network_gone_wild_stays_within(
+        self, prediction: str, sampler: str, two_modes: Any, optimal: Make
+    ) -> None:
+        expert = optimal(two_modes, prediction=prediction, sampler=sampler, clip=1.5)
+        expert.denoiser = Wild()  # type: ignore[assignment]
+        chunk = drawn(expert, 50)
+        torch.testing.assert_close(chunk.abs(), torch.full_like(chunk, 1.5), rtol=1e-3, atol=0)
+
+    def test_each_ddpm_step_is_taken_from_the_clipped_sample(
+        self, two_modes: Any, optimal: Make
+    ) -> None:
+        expert = optimal(two_modes, sampler="ddpm", timesteps=20, clip=0.7)
+        generator = torch.Generator().manual_seed(4)
+        schedule, chunk = expert.schedule, torch.randn(30, 1, 2, generator=generator)
+        for step in range(20, 0, -1):
+            time = torch.full((30,), step / 20)
+            epsilon = expert.denoiser(chunk, time, torch.zeros(30, 1, 8))
+            before, now = schedule.alpha_bar[step - 1], schedule.alpha_bar[step]
+            x0 = ((chunk - (1 - now).sqrt() * epsilon) / now.sqrt()).clamp(-0.7, 0.7)
+            beta = 1 - now / before
+            chunk = (before.sqrt() * beta * x0 + (1 - beta).sqrt() * (1 - before) * chunk) / (
+                1 - now
+            )
+            if step > 1:
+                noise = torch.randn(30, 1, 2, generator=generator)
+                chunk = chunk + (beta * (1 - before) / (1 - now)).sqrt() * noise
+        torch.testing.assert_close(drawn(expert, 30, 4), chunk, rtol=0, atol=2e-3)
+        assert two_modes.means.abs().max() > 0.7
+
+    def test_none_does_not_clip(self, mixture: Any, optimal: Make) -> None:
+        far = mixture(torch.tensor([[9.0, -9.0]]), torch.ones(1), 0.1)
+        assert drawn(optimal(far, sampling_steps=100), 500).abs().mean() < 6
+        free = drawn(optimal(far, sampling_steps=100, clip=None), 500)
+        torch.testing.assert_close(free.mean(0, keepdim=True), far.means[None], rtol=0, atol=0.05)
+
+
+class Wild(nn.Module):
+    def prepare(self, context: Tensor) -> Tensor:
+        return context
+
+    def forward(self, noisy: Tensor, time: Tensor, context: Tensor, valid: Any = None) -> Tensor:
+        return torch.full_like(noisy, 1e6)
+
+
+@pytest.mark.parametrize("schedule", ["cosine", "linear"])
+@pytest.mark.parametrize("prediction", PREDICTIONS)
+def test_the_best_network_has_the_smallest_loss_there_is(
+    prediction: str, schedule: str, mixture: Any, optimal: Make
+) -> None:
+    """The variance of the target given the noisy chunk, over uniform steps of the schedule."""
+    gaussian = mixture(torch.tensor([[0.5, -1.0]]), torch.ones(1), 0.6)
+    expert = optimal(gaussian, prediction=prediction, schedule=schedule)
+    generator, count = torch.Generator().manual_seed(0), 200_000
+    chunk, valid = gaussian.draw(count, generator), torch.ones(count, 1, dtype=torch.bool)
+    loss, _ = expert.loss(torch.zeros(count, 1, 8), chunk, valid, generator)
+    a, b = expert.schedule.signal[1:].double(), expert.schedule.noise[1:].double()
+    total = (a * 0.6) ** 2 + b**2
+    left = {"epsilon": (a * 0.6) ** 2, "sample": (b * 0.6) ** 2, "v": 0.6**2 * (a**2 + b**2) ** 2}
+    assert float(loss) == pytest.approx(float((left[prediction] / total).mean()), rel=0.02)
+
+
+def test_the_section_of_params_is_the_constructor() -> None:
+    expert = DiffusionActionExpert(dim=8, layers=1, heads=1, **DiffusionParams().model_dump())
+    assert expert.schedule.timesteps == 100
+    assert expert.prediction == DiffusionParams().prediction
+    assert expert.steps == expert.schedule.steps(10)
+    torch.testing.assert_close(expert.schedule.alpha_bar, NoiseSchedule(100, "cosine").alpha_bar)

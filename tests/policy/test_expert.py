@@ -1,0 +1,312 @@
+"""What every action expert guarantees, and the loss that they share."""
+
+import inspect
+from typing import Any
+
+import pytest
+import torch
+from torch.nn import functional as F
+
+from pipeline.base.errors import ConfigError
+from pipeline.policy.diffusion import DiffusionActionExpert
+from pipeline.policy.expert import ActionExpert, GroupedLoss
+from pipeline.policy.flow_matching import FlowMatchingActionExpert
+from pipeline.policy.regression import RegressionActionExpert
+
+GROUPS = ("translation", "translation", "rotation", "gripper")
+SMALL: dict[str, Any] = {
+    "horizon": 5, "action_dim": 4, "dim": 16, "layers": 2, "heads": 2, "dropout": 0.0,
+    "groups": GROUPS,
+}  # fmt: skip
+
+
+def regression(refinements: int) -> RegressionActionExpert:
+    return RegressionActionExpert(**SMALL | {"layers": 1}, refinements=refinements)
+
+
+def seeded(seed: int = 3) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def everything() -> torch.Tensor:
+    return torch.ones(3, 5, dtype=torch.bool)
+
+
+@pytest.fixture
+def context() -> torch.Tensor:
+    return torch.randn(3, 2, 16)
+
+
+class ActionExpertContract:
+    """Inherit it, name the class, and give each `variant` of its own arguments that must hold."""
+
+    kind: type[ActionExpert]
+
+    def build(self, **arguments: Any) -> ActionExpert:
+        torch.manual_seed(2)
+        return self.kind(**SMALL | arguments)
+
+    @pytest.fixture
+    def expert(self, variant: dict[str, Any]) -> ActionExpert:
+        return self.build(**variant)
+
+    def test_shapes(self, expert: ActionExpert, context: torch.Tensor) -> None:
+        assert (expert.horizon, expert.action_dim) == (5, 4)
+        chunk = expert.act(context)
+        assert chunk.shape == (3, 5, 4)
+        assert chunk.dtype == torch.float32
+        loss, parts = expert.loss(context, torch.randn(3, 5, 4), everything())
+        assert loss.shape == ()
+        assert set(parts) == set(GROUPS)
+        assert not any(part.requires_grad for part in parts.values())
+
+    @pytest.mark.parametrize("garbage", [float("nan"), float("inf"), 1e9])
+    def test_masked_steps_count_nothing(
+        self, garbage: float, expert: ActionExpert, context: torch.Tensor
+    ) -> None:
+        target, valid = torch.randn(3, 5, 4), everything()
+        valid[0, 3:] = False
+        changed = target.masked_fill(~valid.unsqueeze(-1), garbage)
+        loss, parts = expert.loss(context, target, valid, seeded())
+        again, same = expert.loss(context, changed, valid, seeded())
+        assert torch.equal(loss, again)
+        assert all(torch.equal(parts[name], same[name]) for name in parts)
+        again.backward()
+        assert all(torch.isfinite(p.grad).all() for p in expert.parameters())  # type: ignore
+
+    def test_no_valid_step_gives_a_finite_loss(
+        self, expert: ActionExpert, context: torch.Tensor
+    ) -> None:
+        loss, _ = expert.loss(context, torch.randn(3, 5, 4), ~everything())
+        loss.backward()
+        assert loss == 0
+        assert all(torch.isfinite(p.grad).all() for p in expert.parameters())  # type: ignore
+
+    def test_context_and_all_weights_get_gradient(
+        self, expert: ActionExpert, context: torch.Tensor
+    ) -> None:
+        context.requires_grad_()
+        expert.loss(context, 3 * torch.randn(3, 5, 4), everything())[0].backward()
+        assert context.grad is not None
+        assert (context.grad.abs().amax(dim=2) > 0).all()
+        for name, parameter in expert.named_parameters():
+            assert parameter.grad is not None, name
+            assert parameter.grad.abs().max() > 0, name
+
+    def test_the_generator_decides_everything_random(
+        self, expert: ActionExpert, context: torch.Tensor
+    ) -> None:
+        target = torch.randn(3, 5, 4)
+        first, again, other = (expert.act(context, seeded(seed)) for seed in (5, 5, 6))
+        assert torch.equal(first, again)
+        assert torch.equal(first, other) != expert.stochastic
+        losses = [expert.loss(context, target, everything(), seeded(s))[0] for s in (5, 5, 6)]
+        assert torch.equal(losses[0], losses[1])
+        assert torch.equal(losses[0], losses[2]) != expert.stochastic
+
+    def test_a_given_generator_leaves_the_global_one_alone(
+        self, expert: ActionExpert, context: torch.Tensor
+    ) -> None:
+        before = torch.get_rng_state()
+        expert.act(context, seeded())
+        expert.loss(context, torch.randn(3, 5, 4, generator=seeded()), everything(), seeded())
+        assert torch.equal(torch.get_rng_state(), before)
+
+    def test_without_one_the_global_generator_decides(
+        self, expert: ActionExpert, context: torch.Tensor
+    ) -> None:
+        chunks = []
+        for seed in (1, 1, 2):
+            torch.manual_seed(seed)
+            chunks.append(expert.act(context))
+        assert torch.equal(chunks[0], chunks[1])
+        assert torch.equal(chunks[0], chunks[2]) != expert.stochastic
+
+    def test_a_chunk_follows_from_its_own_row(
+        self, expert: ActionExpert, context: torch.Tensor
+    ) -> None:
+        changed = torch.cat([context[:2], torch.randn(1, 2, 16)])
+        chunk, other = expert.act(context, seeded()), expert.act(changed, seeded())
+        torch.testing.assert_close(chunk[:2], other[:2])
+        assert not torch.allclose(chunk[2], other[2])
+
+    def test_act_never_sees_the_target(self, expert: ActionExpert, context: torch.Tensor) -> None:
+        assert list(inspect.signature(expert.act).parameters) == ["context", "generator"]
+        before = expert.act(context, seeded())
+        expert.loss(context, 100 * torch.randn(3, 5, 4), everything(), seeded())
+        assert torch.equal(expert.act(context, seeded()), before)
+
+    def test_the_weights_are_all_that_act_needs(
+        self, variant: dict[str, Any], expert: ActionExpert, context: torch.Tensor
+    ) -> None:
+        torch.manual_seed(99)
+        restored = self.kind(**SMALL | variant)
+        restored.load_state_dict(expert.state_dict())
+        assert torch.equal(restored.act(context, seeded()), expert.act(context, seeded()))
+
+    def test_autocast_changes_it_by_its_noise(
+        self, expert: ActionExpert, context: torch.Tensor
+    ) -> None:
+        target = torch.randn(3, 5, 4)
+        exact, _ = expert.loss(context, target, everything(), seeded())
+        with torch.autocast("cpu", torch.bfloat16):
+            loss, _ = expert.loss(context, target, everything(), seeded())
+            chunk = expert.act(context.bfloat16(), seeded())
+        loss.backward()
+        assert (loss.dtype, chunk.dtype) == (torch.float32, torch.float32)
+        torch.testing.assert_close(loss, exact, rtol=0.02, atol=0)
+        assert torch.isfinite(chunk).all()
+        assert all(torch.isfinite(p.grad).all() for p in expert.parameters())  # type: ignore
+
+    def test_a_group_without_weight_moves_nothing(
+        self, variant: dict[str, Any], context: torch.Tensor
+    ) -> None:
+        expert = self.build(**variant, group_weights={"translation": 0.0, "rotation": 0.0})
+        target = torch.randn(3, 5, 4)
+        loss, parts = expert.loss(context, target, everything(), seeded())
+        torch.testing.assert_close(loss.detach(), parts["gripper"])
+
+
+class TestRegression(ActionExpertContract):
+    kind = RegressionActionExpert
+
+    @pytest.fixture(params=[{}, {"refinements": 3}], ids=str)
+    def variant(self, request: pytest.FixtureRequest) -> dict[str, Any]:
+        return request.param
+
+
+class SamplingExpertContract(ActionExpertContract):
+    """What an expert with a `Denoiser` guarantees besides."""
+
+    def test_masked_steps_are_not_attended_to(
+        self, expert: DiffusionActionExpert, context: torch.Tensor
+    ) -> None:
+        """What the chunk's end looks like would tell the others that the episode ends."""
+        valid = everything()
+        valid[:, 3:] = False
+        expert.loss(context, torch.randn(3, 5, 4), valid)[0].backward()
+        gradient = expert.denoiser.positions.grad
+        assert gradient is not None
+        assert (gradient[:3].abs().amax(dim=1) > 0).all()
+        assert (gradient[3:] == 0).all()
+
+    def test_act_keeps_no_graph(self, expert: ActionExpert, context: torch.Tensor) -> None:
+        assert not expert.act(context.requires_grad_()).requires_grad
+
+
+class TestDiffusion(SamplingExpertContract):
+    kind = DiffusionActionExpert
+
+    @pytest.fixture(
+        params=[
+            {},
+            {"prediction": "sample", "schedule": "linear", "clip": None, "sampling_steps": 3},
+            {"prediction": "v", "eta": 0.5},
+            {"sampler": "ddpm", "timesteps": 12},
+        ],
+        ids=str,
+    )
+    def variant(self, request: pytest.FixtureRequest) -> dict[str, Any]:
+        return request.param
+
+
+class TestFlowMatching(SamplingExpertContract):
+    kind = FlowMatchingActionExpert
+
+    @pytest.fixture(params=[{}, {"time": "beta", "solver": "rk4"}, {"solver": "midpoint"}], ids=str)
+    def variant(self, request: pytest.FixtureRequest) -> dict[str, Any]:
+        return request.param
+
+
+class TestTheAnswerIsNoInput:
+    """The seeds' regression was given the target chunk and added to it."""
+
+    def test_predict_takes_the_context_and_nothing_else(self) -> None:
+        parameters = list(inspect.signature(RegressionActionExpert.predict).parameters)
+        assert parameters == ["self", "context"]
+
+    @pytest.mark.parametrize("refinements", [1, 3])
+    def test_the_loss_is_that_of_what_act_says_whatever_the_target(
+        self, refinements: int, context: torch.Tensor
+    ) -> None:
+        expert = regression(refinements)
+        said = expert.act(context)
+        valid = torch.ones(3, 5, dtype=torch.bool)
+        for target in (torch.randn(3, 5, 4), 100 * torch.randn(3, 5, 4), said.detach()):
+            expected, _ = expert.grouped(said, target, valid)
+            assert torch.equal(expert.loss(context, target, valid)[0], expected)
+
+    @pytest.mark.parametrize("refinements", [1, 3])
+    def test_the_gradient_to_the_target_comes_from_the_error_alone(
+        self, refinements: int, context: torch.Tensor
+    ) -> None:
+        expert = regression(refinements)
+        target = torch.randn(3, 5, 4, requires_grad=True)
+        valid = torch.ones(3, 5, dtype=torch.bool)
+        loss, _ = expert.loss(context, target, valid)
+        through_loss = torch.autograd.grad(loss, target)[0]
+        apart = expert.grouped(expert.act(context).detach(), target, valid)[0]
+        assert torch.equal(through_loss, torch.autograd.grad(apart, target)[0])
+
+    def test_independent_targets_cannot_be_fitted(self) -> None:
+        """With the answer as an input, the loss on targets unrelated to the context would be 0."""
+        expert = regression(2)
+        optimizer = torch.optim.AdamW(expert.parameters(), lr=3e-3)
+        valid = torch.ones(64, 5, dtype=torch.bool)
+        for _ in range(60):
+            context = torch.zeros(64, 2, 16)
+            loss, _ = expert.loss(context, torch.randn(64, 5, 4), valid)
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+        unexplained = F.smooth_l1_loss(torch.zeros(10_000), torch.randn(10_000))
+        assert loss > 0.8 * unexplained
+
+
+class TestGroupedLoss:
+    def test_each_group_is_the_mean_of_its_valid_entries(self) -> None:
+        target, valid = 2 * torch.randn(3, 5, 4), torch.rand(3, 5) > 0.3
+        prediction = torch.randn(3, 5, 4)
+        loss, parts = GroupedLoss(GROUPS, {"rotation": 3.0})(prediction, target, valid)
+        translation = F.smooth_l1_loss(prediction[valid][:, :2], target[valid][:, :2])
+        rotation = F.smooth_l1_loss(prediction[valid][:, 2], target[valid][:, 2])
+        gripper = F.smooth_l1_loss(prediction[valid][:, 3], target[valid][:, 3])
+        torch.testing.assert_close(parts["translation"], translation)
+        torch.testing.assert_close(parts["rotation"], rotation)
+        torch.testing.assert_close(parts["gripper"], gripper)
+        torch.testing.assert_close(loss, (translation + 3 * rotation + gripper) / 5)
+
+    def test_the_squared_error_is_grouped_alike(self) -> None:
+        target, valid = 2 * torch.randn(3, 5, 4), torch.rand(3, 5) > 0.3
+        prediction = torch.randn(3, 5, 4)
+        loss, parts = GroupedLoss(GROUPS, {}, "mse")(prediction, target, valid)
+        squares = (prediction[valid] - target[valid]) ** 2
+        torch.testing.assert_close(parts["translation"], squares[:, :2].mean())
+        means = squares[:, :2].mean() + squares[:, 2].mean() + squares[:, 3].mean()
+        torch.testing.assert_close(loss, means / 3)
+
+    @pytest.mark.parametrize("weights", [{"other": 0.0}, {"other": -1.0}])
+    def test_a_loss_without_weight_is_refused(self, weights: dict[str, float]) -> None:
+        with pytest.raises(ConfigError, match="group_weights"):
+            GroupedLoss(("other", "other"), weights)
+
+
+@pytest.mark.parametrize(
+    ("kind", "parameters"),
+    [
+        (RegressionActionExpert, 16_824_839),
+        (DiffusionActionExpert, 19_271_175),
+        (FlowMatchingActionExpert, 19_271_175),
+    ],
+)
+def test_default_experts_are_the_seeds(kind: type[ActionExpert], parameters: int) -> None:
+    with torch.device("meta"):
+        expert = kind()
+    assert (expert.horizon, expert.action_dim) == (8, 7)
+    assert sum(p.numel() for p in expert.parameters()) == parameters
+
+
+def test_who_draws_says_so() -> None:
+    assert not RegressionActionExpert.stochastic
+    assert DiffusionActionExpert.stochastic
+    assert FlowMatchingActionExpert.stochastic

@@ -1,0 +1,173 @@
+"""Solvers, times and flows against closed forms; nothing is trained here."""
+
+import math
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import quad
+from scipy.optimize import brentq
+from scipy.stats import beta as beta_distribution
+from scipy.stats import kstest, norm
+from torch import Tensor, nn
+
+from pipeline.base.config import FlowMatchingParams
+from pipeline.policy.flow_matching import BetaTimes, FlowMatchingActionExpert, integrate
+
+
+class Optimal(nn.Module):
+    """The velocity of the straight-path flow to a mixture; counts how often it is asked."""
+
+    def __init__(self, mixture: Any) -> None:
+        super().__init__()
+        self.mixture, self.asked = mixture, 0
+
+    def prepare(self, context: Tensor) -> Tensor:
+        return context
+
+    def forward(self, noisy: Tensor, time: Tensor, context: Tensor, valid: Any = None) -> Tensor:
+        self.asked += 1
+        sample, noise = self.mixture.expectations(noisy.double(), time, 1 - time)
+        return (sample - noise).float()
+
+
+Make = Callable[..., FlowMatchingActionExpert]
+
+
+@pytest.fixture
+def optimal() -> Make:
+    """`optimal(mixture, **arguments)`: an expert of one-step chunks whose network is the best."""
+
+    def make(mixture: Any, **arguments: Any) -> FlowMatchingActionExpert:
+        width = mixture.means.shape[1]
+        expert = FlowMatchingActionExpert(
+            horizon=1, action_dim=width, dim=8, layers=1, heads=1, **arguments
+        )
+        expert.denoiser = Optimal(mixture)  # type: ignore[assignment]
+        return expert
+
+    return make
+
+
+def drawn(expert: FlowMatchingActionExpert, count: int = 4000) -> Tensor:
+    return expert.act(torch.zeros(count, 1, 8), torch.Generator().manual_seed(0))
+
+
+class TestSolvers:
+    @pytest.mark.parametrize(("solver", "order"), [("euler", 1), ("midpoint", 2), ("rk4", 4)])
+    def test_each_has_its_order(self, solver: str, order: int) -> None:
+        """dx/dt = -2 (t + 1) x^2 from x(0) ends at 1 / (1 / x(0) + 3)."""
+        start = torch.tensor([0.5, 1.0], dtype=torch.float64)
+        errors = []
+        for steps in (20, 40, 80):
+            end = integrate(lambda x, t: -2 * (t + 1) * x**2, start, steps, solver)  # type: ignore
+            errors.append(float((end - 1 / (1 / start + 3)).abs().max()))
+        for coarse, fine in pairwise(errors):
+            assert math.log2(coarse / fine) == pytest.approx(order, abs=0.15)
+
+    @pytest.mark.parametrize("solver", ["euler", "midpoint", "rk4"])
+    def test_a_straight_line_needs_one_step(self, solver: str) -> None:
+        end = integrate(lambda x, t: torch.full_like(x, 3.0), torch.ones(2), 1, solver)  # type: ignore
+        torch.testing.assert_close(end, torch.full((2,), 4.0))
+
+    @pytest.mark.parametrize(("solver", "stages"), [("euler", 1), ("midpoint", 2), ("rk4", 4)])
+    def test_the_network_is_asked_once_a_stage(
+        self, solver: str, stages: int, two_modes: Any, optimal: Make
+    ) -> None:
+        expert = optimal(two_modes, solver=solver, sampling_steps=6)
+        drawn(expert, 5)
+        assert expert.denoiser.asked == 6 * stages
+
+
+class TestFlow:
+    def test_to_a_gaussian_it_scales_and_shifts_the_noise(
+        self, mixture: Any, optimal: Make
+    ) -> None:
+        """x_t = t m + sqrt((1 - t)^2 + t^2 s^2) x_0: the noise goes to m + s noise."""
+        gaussian = mixture(torch.tensor([[1.2, -0.4]]), torch.ones(1), 0.3)
+        noise = torch.randn(500, 1, 2, generator=torch.Generator().manual_seed(0))
+        chunk = drawn(optimal(gaussian, solver="rk4", sampling_steps=40), 500)
+        expected = gaussian.means + gaussian.spread * noise
+        torch.testing.assert_close(chunk, expected, rtol=0, atol=2e-3)
+
+    def test_the_velocity_of_a_gaussian_is_the_change_of_that_map(self, mixture: Any) -> None:
+        gaussian = mixture(torch.tensor([[1.2]]), torch.ones(1), 0.3)
+        noise, t = torch.randn(50, 1, 1, dtype=torch.float64), torch.rand(50, dtype=torch.float64)
+
+        def path(t: Tensor) -> Tensor:
+            t = t.view(-1, 1, 1)
+            return t * 1.2 + ((1 - t) ** 2 + (t * 0.3) ** 2).sqrt() * noise
+
+        change = (path(t + 1e-5) - path(t - 1e-5)) / 2e-5
+        velocity = Optimal(gaussian)(path(t), t, torch.zeros(50, 1, 8))
+        torch.testing.assert_close(velocity, change.float(), rtol=1e-4, atol=1e-4)
+
+    def test_on_a_line_it_takes_quantiles_to_quantiles(self, mixture: Any, optimal: Make) -> None:
+        """It keeps the order of points, so this is its closed form for any mixture."""
+        line = mixture(torch.tensor([[-0.8], [0.6]]), torch.tensor([0.3, 0.7]), 0.3)
+        expert = optimal(line, solver="rk4", sampling_steps=100)
+        noise = torch.randn(50, generator=torch.Generator().manual_seed(0)).double().numpy()
+        means, weights = line.means[:, 0].double().numpy(), line.weights.double().numpy()
+
+        def quantile(level: float) -> float:
+            return brentq(lambda x: weights @ norm.cdf((x - means) / 0.3) - level, -5, 5)
+
+        expected = torch.tensor([quantile(level) for level in norm.cdf(noise)])
+        torch.testing.assert_close(drawn(expert, 50).squeeze(), expected.float(), rtol=0, atol=2e-3)
+
+    @pytest.mark.parametrize(("solver", "steps"), [("euler", 100), ("midpoint", 25), ("rk4", 12)])
+    def test_every_solver_draws_two_modes(
+        self, solver: str, steps: int, two_modes: Any, optimal: Make
+    ) -> None:
+        expert = optimal(two_modes, solver=solver, sampling_steps=steps)
+        weights, means, spreads, near = two_modes.judge(drawn(expert))
+        torch.testing.assert_close(weights, two_modes.weights, rtol=0, atol=0.025)
+        torch.testing.assert_close(means, two_modes.means, rtol=0, atol=0.02)
+        assert ((spreads - two_modes.spread).abs() < 0.15 * two_modes.spread).all()
+        assert near > 0.98
+
+
+class TestTimes:
+    @pytest.mark.parametrize(("alpha", "beta"), [(1.5, 1.0), (0.5, 0.5), (2.0, 5.0), (1.0, 1.0)])
+    def test_the_share_of_noise_is_beta_distributed(self, alpha: float, beta: float) -> None:
+        drawn = torch.rand(20_000, generator=torch.Generator().manual_seed(0))
+        times = BetaTimes(alpha, beta)(drawn)
+        assert times.min() >= 0
+        assert times.max() <= 1
+        expected = beta_distribution(alpha, beta).cdf
+        assert kstest((1 - times).numpy(), expected).statistic < 0.012
+
+    def test_the_defaults_draw_noisy_times_more_often(self) -> None:
+        """Beta(1.5, 1) of the share of noise: its mean is 0.6, as pi0's times have it."""
+        expert = FlowMatchingActionExpert(dim=8, layers=1, heads=1, time="beta")
+        times = expert.times(torch.linspace(0, 1 - 1e-6, 10_001))
+        assert float(times.mean()) == pytest.approx(0.4, abs=1e-3)
+
+    @pytest.mark.parametrize("time", ["uniform", "beta"])
+    def test_the_best_network_has_the_smallest_loss_there_is(
+        self, time: str, mixture: Any, optimal: Make
+    ) -> None:
+        """The variance of chunk - noise given x_t, over the times that are drawn."""
+        gaussian = mixture(torch.tensor([[0.5, -1.0]]), torch.ones(1), 0.6)
+        generator, count = torch.Generator().manual_seed(0), 100_000
+        chunk, valid = gaussian.draw(count, generator), torch.ones(count, 1, dtype=torch.bool)
+        expert = optimal(gaussian, time=time)
+        loss, _ = expert.loss(torch.zeros(count, 1, 8), chunk, valid, generator)
+        share = beta_distribution(1.5, 1.0) if time == "beta" else beta_distribution(1, 1)
+
+        def weighed(t: float) -> float:
+            return share.pdf(1 - t) * 0.36 / ((1 - t) ** 2 + 0.36 * t**2)
+
+        assert float(loss) == pytest.approx(quad(weighed, 0, 1)[0], rel=0.01)
+
+
+def test_the_section_of_params_is_the_constructor() -> None:
+    params = FlowMatchingParams().model_dump()
+    expert = FlowMatchingActionExpert(dim=8, layers=1, heads=1, **params)
+    assert (expert.sampling_steps, expert.solver) == (10, "euler")
+    drawn = torch.rand(10)
+    assert torch.equal(expert.times(drawn), drawn)
+    assert np.isfinite(expert.act(torch.zeros(2, 1, 8)).numpy()).all()

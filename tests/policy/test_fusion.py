@@ -1,0 +1,197 @@
+"""What every fusion guarantees for every subset of streams, and what each does on its own."""
+
+from collections.abc import Callable
+from itertools import combinations
+
+import pytest
+import torch
+from torch import Tensor
+
+from pipeline.base.errors import ConfigError
+from pipeline.policy.feature_encoder import FeatureEncoder
+from pipeline.policy.fusion import CrossAttentionFusion, Fusion, GatedFusion, NoFusion, build_fusion
+
+DIM, HEADS = 16, 2
+STRATEGIES = ("concat", "cross_attention", "gated", "none")
+SHAPES = {"features": (5, 12), "sensor": (1, 6), "state": (1, 8)}
+SUBSETS = [subset for count in (1, 2, 3) for subset in combinations(SHAPES, count)]
+Encode = Callable[..., dict[str, Tensor]]
+
+
+@pytest.fixture(params=SUBSETS, ids="+".join)
+def streams(request: pytest.FixtureRequest) -> tuple[str, ...]:
+    return request.param
+
+
+@pytest.fixture(params=STRATEGIES)
+def strategy(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+@pytest.fixture
+def fusion(strategy: str, streams: tuple[str, ...]) -> Fusion:
+    return build_fusion(strategy, {name: SHAPES[name] for name in streams}, DIM, HEADS)
+
+
+@pytest.fixture
+def encoded(streams: tuple[str, ...]) -> dict[str, Tensor]:
+    return {name: torch.randn(3, *SHAPES[name]) for name in streams}
+
+
+class TestFusionContract:
+    def test_shape(
+        self, fusion: Fusion, encoded: dict[str, Tensor], strategy: str, streams: tuple[str, ...]
+    ) -> None:
+        felt = len(set(streams) - {"features"})
+        tokens = {
+            "concat": 4,
+            "gated": 4,
+            "cross_attention": 4 + felt,
+            "none": felt + 5 * ("features" in streams),
+        }
+        context = fusion(encoded)
+        assert context.shape == (3, tokens[strategy], DIM)
+        assert context.dtype == torch.float32
+
+    def test_every_token_of_every_stream_reaches_the_context(
+        self, fusion: Fusion, encoded: dict[str, Tensor]
+    ) -> None:
+        context = fusion(encoded)
+        for name, tokens in encoded.items():
+            for token in range(tokens.shape[1]):
+                changed = tokens.clone()
+                changed[:, token] = torch.randn_like(changed[:, token])
+                moved = (fusion(encoded | {name: changed}) - context).abs()
+                assert moved.amax(dim=(1, 2)).min() > 1e-3, (name, token)
+
+    def test_gradient_reaches_every_weight_and_every_token(
+        self, fusion: Fusion, encoded: dict[str, Tensor]
+    ) -> None:
+        encoded = {name: tokens.requires_grad_() for name, tokens in encoded.items()}
+        context = fusion(encoded)
+        (context * torch.randn_like(context)).sum().backward()
+        for name, tensor in [*fusion.named_parameters(), *encoded.items()]:
+            assert tensor.grad is not None, name
+            assert tensor.grad.abs().max() > 0, name
+
+    def test_no_stream_drowns_the_others_by_its_scale(
+        self, fusion: Fusion, encoded: dict[str, Tensor], strategy: str
+    ) -> None:
+        """Where several tokens are projected together, what counts is their mean and bias."""
+        context = fusion(encoded)
+        for name, tokens in encoded.items():
+            loud = fusion(encoded | {name: 1e4 * tokens})
+            assert torch.isfinite(loud).all()
+            assert (loud - context).abs().max() < 2.0
+            if name != "features" or strategy in ("cross_attention", "none"):
+                torch.testing.assert_close(loud, context, atol=1e-3, rtol=1e-3)
+
+    def test_samples_do_not_mix(self, fusion: Fusion, encoded: dict[str, Tensor]) -> None:
+        together = fusion(encoded)
+        alone = [
+            fusion({name: t[row : row + 1] for name, t in encoded.items()}) for row in range(3)
+        ]
+        torch.testing.assert_close(together, torch.cat(alone), atol=1e-5, rtol=1e-4)
+
+    def test_bf16_autocast_is_near_float32(
+        self, fusion: Fusion, encoded: dict[str, Tensor]
+    ) -> None:
+        exact = fusion(encoded)
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            rough = fusion(encoded)
+        torch.testing.assert_close(rough.float(), exact, atol=0.06, rtol=0.06)
+
+
+@pytest.mark.parametrize("content", [7.0, float("nan")])
+def test_what_stands_in_an_invalid_slot_never_reaches_the_context(
+    strategy: str, content: float
+) -> None:
+    """The features' mask ends in the encoder, as an embedding that every fusion can see."""
+    encoder = FeatureEncoder(5, 16)
+    fusion = build_fusion(strategy, {"features": (5, encoder.width)}, DIM, HEADS)
+    features, age = torch.randn(2, 5, 16), torch.rand(2)
+    valid = torch.tensor([[True, False, True, False, True], [False] * 5])
+    changed = features.masked_fill(~valid.unsqueeze(-1), content)
+    context = fusion({"features": encoder(features, valid, age)})
+    assert torch.equal(fusion({"features": encoder(changed, valid, age)}), context)
+    seen = fusion({"features": encoder(features, torch.ones_like(valid), age)})
+    assert (seen - context).abs().amax(dim=(1, 2)).min() > 1e-2
+
+
+@pytest.mark.parametrize("strategy", ["cross_attention"])
+def test_heads_that_do_not_divide_the_width_are_refused(strategy: str) -> None:
+    with pytest.raises(ConfigError, match="16 wide cannot have 3 heads"):
+        build_fusion(strategy, SHAPES, DIM, 3)
+
+
+class TestGates:
+    @pytest.fixture
+    def fusion(self) -> GatedFusion:
+        return GatedFusion(SHAPES, DIM)
+
+    @pytest.fixture
+    def encoded(self) -> dict[str, Tensor]:
+        return {name: torch.randn(3, *shape) for name, shape in SHAPES.items()}
+
+    def test_they_lie_between_0_and_1(
+        self, fusion: GatedFusion, encoded: dict[str, Tensor]
+    ) -> None:
+        for scale in (1.0, 1e4):
+            gates = fusion.gates({name: scale * tokens for name, tokens in encoded.items()})
+            assert list(gates) == list(SHAPES)
+            for gate in gates.values():
+                assert gate.shape == (3, DIM)
+                assert gate.min() > 0
+                assert gate.max() < 1
+
+    def test_each_depends_on_every_stream(
+        self, fusion: GatedFusion, encoded: dict[str, Tensor]
+    ) -> None:
+        before = fusion.gates(encoded)
+        for name, tokens in encoded.items():
+            after = fusion.gates(encoded | {name: torch.randn_like(tokens)})
+            assert all((after[gate] - before[gate]).abs().max() > 1e-3 for gate in SHAPES)
+
+    def test_a_closed_gate_shuts_its_stream_out(
+        self, fusion: GatedFusion, encoded: dict[str, Tensor]
+    ) -> None:
+        torch.nn.init.zeros_(fusion.gate.weight)
+        with torch.no_grad():
+            fusion.gate.bias[DIM : 2 * DIM] = -200.0
+        context = fusion(encoded)
+        silent = fusion(encoded | {"sensor": torch.randn_like(encoded["sensor"])})
+        heard = fusion(encoded | {"state": torch.randn_like(encoded["state"])})
+        assert torch.equal(silent, context)
+        assert (heard - context).abs().max() > 1e-2
+
+    def test_the_unit_is_that_of_the_paper(
+        self, fusion: GatedFusion, encoded: dict[str, Tensor]
+    ) -> None:
+        seen = []
+        fusion.read_out.register_forward_pre_hook(lambda _, args: seen.append(args[0]))
+        fusion(encoded)
+        x, gates = fusion.vectors(encoded), fusion.gates(encoded)
+        expected = sum(gates[name] * fusion.content[name](x[name]).tanh() for name in SHAPES)
+        torch.testing.assert_close(seen[0], expected)
+
+
+def test_what_is_felt_asks_what_is_seen() -> None:
+    """Each of the context's tokens depends on every slot, and on what sensor and state said."""
+    fusion = CrossAttentionFusion(SHAPES, DIM, HEADS)
+    encoded = {name: torch.randn(1, *shape) for name, shape in SHAPES.items()}
+    context = fusion(encoded)
+    for name, tokens in encoded.items():
+        changed = fusion(encoded | {name: torch.randn_like(tokens)})
+        assert (changed - context).abs().amax(dim=-1).min() > 1e-4, name
+
+
+def test_without_fusion_a_token_stays_itself_and_knows_its_stream() -> None:
+    fusion = NoFusion({"sensor": (1, 6), "state": (1, 6)}, DIM)
+    one = torch.randn(1, 1, 6)
+    context = fusion({"sensor": one, "state": one})
+    changed = fusion({"sensor": one, "state": one + torch.randn(6)})
+    assert torch.equal(changed[:, 0], context[:, 0])
+    for project in fusion.tokens.projects.values():
+        torch.nn.init.ones_(project.weight)
+    same = fusion({"sensor": one, "state": one})
+    assert (same[:, 0] - same[:, 1]).abs().max() > 1e-3

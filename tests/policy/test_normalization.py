@@ -1,0 +1,124 @@
+import json
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.base.errors import CheckpointMismatch, NumericsError
+from pipeline.policy.normalization import ChannelStatistics, Normalization, fit_channels
+
+
+@given(st.lists(st.integers(0, 40), max_size=5), st.integers(0, 2**32 - 1))
+@settings(max_examples=50, deadline=None)
+def test_blocks_say_what_the_whole_says(cuts: list[int], seed: int) -> None:
+    values = np.random.default_rng(seed).normal(1e4, 3, (40, 3)).astype(np.float32)
+    edges = [0, *sorted(cuts), 40]
+    fitted = fit_channels((values[a:b] for a, b in pairwise(edges)), "x")
+    whole = values.astype(np.float64)
+    np.testing.assert_allclose(fitted.mean, whole.mean(axis=0), rtol=1e-12)
+    np.testing.assert_allclose(fitted.std, whole.std(axis=0), rtol=1e-9)
+    assert fitted.count == 40
+
+
+def test_large_blocks_are_taken_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.policy.normalization._PIECE_VALUES", 64)
+    values = np.random.default_rng(0).normal(size=(100, 3, 5)).astype(np.float32)
+    fitted = fit_channels([values], "features")
+    np.testing.assert_allclose(fitted.std, values.astype(np.float64).std(axis=0), rtol=1e-9)
+    values[77, 1, 2] = np.nan
+    with pytest.raises(NumericsError, match="row 77, channel 1, 2"):
+        fit_channels([values], "features")
+
+
+def test_what_is_not_valid_is_neither_counted_nor_checked() -> None:
+    rng = np.random.default_rng(0)
+    values = rng.normal(3, 2, (60, 2, 4)).astype(np.float32)
+    valid = np.ones((60, 2), bool)
+    valid[::3, 1] = False
+    values[~valid] = np.nan
+    fitted = fit_channels([(values[:7], valid[:7]), (values[7:], valid[7:])], "features")
+    np.testing.assert_allclose(fitted.mean[0], values[:, 0].mean(axis=0, dtype=float), rtol=1e-9)
+    seen = values[valid[:, 1], 1].astype(np.float64)
+    np.testing.assert_allclose(fitted.mean[1], seen.mean(axis=0), rtol=1e-9)
+    np.testing.assert_allclose(fitted.std[1], seen.std(axis=0), rtol=1e-9)
+
+
+def test_a_slot_that_is_never_valid_is_left_as_it_is() -> None:
+    values, valid = np.ones((5, 2, 3), np.float32), np.tile([True, False], (5, 1))
+    fitted = fit_channels([(values, valid)], "features")
+    assert not fitted.mean[1].any()
+    assert (fitted.scale == 1).all()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_bad_numbers_are_named(value: float) -> None:
+    good, bad = np.zeros((10, 2), np.float32), np.zeros((10, 2), np.float32)
+    bad[4, 1] = value
+    with pytest.raises(NumericsError, match=r"force trace: .* in row 14, channel 'torque'"):
+        fit_channels([good, bad], "force trace", ["force", "torque"])
+
+
+def test_float16_infinity_is_named() -> None:
+    with np.errstate(over="ignore"):
+        stored = np.array([[1.0], [7e4]]).astype(np.float16)
+    with pytest.raises(NumericsError, match="found inf in row 1, channel 0"):
+        fit_channels([stored], "sensor")
+
+
+def test_overflow_is_named() -> None:
+    with pytest.raises(NumericsError, match="variance overflows"):
+        fit_channels([np.array([[1e300], [-1e300]])], "sensor")
+
+
+@pytest.mark.parametrize("blocks", [[], [np.zeros((0, 3), np.float32)]])
+def test_no_rows_are_an_error(blocks: list[np.ndarray]) -> None:
+    with pytest.raises(NumericsError, match="actions: no rows"):
+        fit_channels(blocks, "actions")
+
+
+def test_bfloat16_bits_are_not_mistaken_for_numbers() -> None:
+    with pytest.raises(TypeError, match="uint16"):
+        fit_channels([np.zeros((3, 2), np.uint16)], "features")
+
+
+def test_scale_guards_channels_that_do_not_vary() -> None:
+    mean = np.array([1e6, 1e6, 0.0, 0.0])
+    std = np.array([0.01, 10.0, 0.0, 1e-9])
+    assert ChannelStatistics(mean, std, 9).scale.tolist() == [1.0, 10.0, 1.0, 1e-9]
+
+
+finite = st.floats(allow_nan=False, allow_infinity=False)
+
+
+@given(st.lists(st.tuples(finite, finite), min_size=1, max_size=6), st.integers(1, 2**40))
+def test_json_keeps_every_bit(pairs: list[tuple[float, float]], count: int) -> None:
+    mean, std = np.array(pairs).T
+    fitted = Normalization(
+        action=ChannelStatistics(mean, std, count),
+        features=ChannelStatistics(np.stack([mean, std]), np.stack([std, mean]), count),
+    )
+    read = Normalization.from_document(json.loads(json.dumps(fitted.document())))
+    assert read.action.mean.tobytes() == mean.tobytes()
+    assert read.action.std.tobytes() == std.tobytes()
+    assert read.features is not None
+    assert read.features.mean.tobytes() == np.stack([mean, std]).tobytes()
+    assert read.action.count == count
+    assert read.sensor is None
+    assert read.state is None
+
+
+@pytest.mark.parametrize(
+    "document",
+    [
+        {},
+        {"action": None},
+        {"action": {"mean": [1.0], "std": [1.0]}},
+        {"action": {"mean": [1.0], "std": [1.0, 2.0], "count": 3}},
+        {"action": {"mean": ["x"], "std": [1.0], "count": 3}},
+    ],
+)
+def test_a_damaged_document_is_refused(document: dict[str, object]) -> None:
+    with pytest.raises(CheckpointMismatch, match="normalisation"):
+        Normalization.from_document(document)

@@ -1,0 +1,425 @@
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+
+from pipeline.base.config import SensorEncoderParams, TrainHeadParams
+from pipeline.base.errors import CheckpointMismatch, ConfigError
+from pipeline.policy.cost import describe_cost, flop_table
+from pipeline.policy.normalization import Normalization
+from pipeline.policy.observation import PolicyShape, action_groups, drop_streams
+from pipeline.policy.policy import Policy, Trainable
+from pipeline.policy.sensor_encoder import SensorEncoder
+
+BuildPolicy = Callable[..., Policy]
+Observe = Callable[..., Any]
+
+EXPERTS = ("regression", "diffusion", "flow_matching")
+FUSIONS = ("concat", "cross_attention", "gated", "none")
+KINDS = [(expert, fusion) for expert in EXPERTS for fusion in FUSIONS]
+
+
+def seeded(seed: int = 5) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+@pytest.fixture(params=KINDS, ids="-".join)
+def any_policy(request: pytest.FixtureRequest, build_policy: BuildPolicy) -> Policy:
+    """Every expert on every fusion; the sensor's two encoders in turn."""
+    expert, fusion = request.param
+    kind = "joint" if KINDS.index(request.param) % 2 else "force_aware"
+    sensor = {"kind": kind, "channels": [16, 32], "layers": 1, "heads": 2, "output_dim": 24}
+    steps = {"sampling_steps": 3}
+    policy = build_policy(
+        model_type=expert,
+        fusion_strategy=fusion,
+        sensor_encoder=sensor,
+        diffusion=steps,
+        flow_matching=steps,
+    )
+    # Experts may begin with weights of zero; an answer that ignores the context tests nothing.
+    with torch.no_grad():
+        for parameter in policy.expert.parameters():
+            if not parameter.any():
+                parameter.normal_(std=0.02)
+    return policy
+
+
+class TestEveryKind:
+    def test_it_is_trainable_and_its_chunks_are_physical(
+        self, any_policy: Policy, observe: Observe
+    ) -> None:
+        assert isinstance(any_policy, Trainable)
+        chunks = any_policy.sample(observe(), 3, seeded())
+        assert chunks.shape == (3, 4, 8, 7)
+        assert chunks.dtype == torch.float32
+        assert not chunks.requires_grad
+        differ = bool((chunks[0] != chunks[1]).any())
+        assert differ == any_policy.stochastic
+
+    def test_act_is_the_first_sample_and_repeats_with_its_generator(
+        self, any_policy: Policy, observe: Observe
+    ) -> None:
+        seen = observe()
+        chunk = any_policy.act(seen, seeded())
+        assert torch.equal(chunk, any_policy.act(seen, seeded()))
+        assert torch.equal(chunk, any_policy.sample(seen, 1, seeded())[0])
+
+    def test_the_context_is_computed_once(self, any_policy: Policy, observe: Observe) -> None:
+        calls = []
+        any_policy.fusion.register_forward_hook(lambda *_: calls.append(1))
+        any_policy.sample(observe(), 5, seeded())
+        assert len(calls) == 1
+
+    def test_each_stream_and_the_age_are_heard(self, any_policy: Policy, observe: Observe) -> None:
+        seen = observe()
+        before = any_policy.act(seen, seeded())
+        for name in ("features", "sensor", "state"):
+            louder = getattr(seen, name).clone()
+            louder[:, -1] += 3.0
+            after = any_policy.act(replace(seen, **{name: louder}), seeded())
+            assert (after - before).abs().max() > 1e-4, name
+        older = replace(seen, feature_age=seen.feature_age + 0.3)
+        assert (any_policy.act(older, seeded()) - before).abs().max() > 1e-5
+
+    def test_padding_and_invalid_slots_change_nothing(
+        self, any_policy: Policy, observe: Observe
+    ) -> None:
+        seen = observe()
+        blank_some(seen)
+        before = any_policy.act(seen, seeded())
+        fill_what_is_blank(seen, float("nan"))
+        assert torch.equal(any_policy.act(seen, seeded()), before)
+
+    def test_gradient_reaches_every_weight_and_every_missing_embedding(
+        self, any_policy: Policy, observe: Observe
+    ) -> None:
+        seen = observe()
+        seen.sensor_valid[0] = seen.state_valid[1] = 0
+        seen.slot_valid[2] = False
+        any_policy.loss(seen, seen.action, seen.action_valid, seeded())[0].backward()
+        for name, parameter in any_policy.named_parameters():
+            assert parameter.grad is not None, name
+            assert parameter.grad.abs().max() > 0, name
+
+    def test_bf16_autocast_is_near_float32(self, any_policy: Policy, observe: Observe) -> None:
+        seen = observe()
+        blank_some(seen)
+        exact = any_policy.act(seen, seeded())
+        exact_loss, _ = any_policy.loss(seen, seen.action, seen.action_valid, seeded())
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            rough = any_policy.act(seen, seeded())
+            loss, parts = any_policy.loss(seen, seen.action, seen.action_valid, seeded())
+        assert rough.dtype == loss.dtype == torch.float32
+        # A predicted epsilon is divided by what is left of the chunk, little in the first steps.
+        torch.testing.assert_close(rough, exact, atol=0.1, rtol=0.05)
+        torch.testing.assert_close(loss, exact_loss, atol=0.02, rtol=0.02)
+        loss.backward()
+        assert all(torch.isfinite(part) for part in parts.values())
+        for name, parameter in any_policy.named_parameters():
+            assert parameter.grad is not None, name
+            assert torch.isfinite(parameter.grad).all(), name
+
+    def test_weights_alone_restore_it(
+        self, any_policy: Policy, observe: Observe, normalization: Normalization
+    ) -> None:
+        seen = observe()
+        restored = Policy(any_policy.params, any_policy.shape, normalization)
+        restored.load_state_dict(any_policy.state_dict())
+        assert torch.equal(restored.act(seen, seeded()), any_policy.act(seen, seeded()))
+        weights = {name for name, _ in any_policy.named_parameters()}
+        rest = set(any_policy.state_dict()) - weights
+        assert {name.rsplit(".", 1)[0] for name in rest} <= {"expert.schedule"}
+
+    def test_parameters_and_flops_are_told_by_part(
+        self, any_policy: Policy, observe: Observe
+    ) -> None:
+        parts = ["features", "sensor", "state", "fusion", "expert"]
+        parameters, flops = any_policy.parameter_table(), flop_table(any_policy)
+        assert [name for name, _ in parameters] == [name for name, _ in flops] == parts
+        total = sum(count for _, count in parameters)
+        assert total == sum(p.numel() for p in any_policy.parameters())
+        assert all(count > 0 for _, count in flops)
+        lines = describe_cost(any_policy)
+        assert f"{total:,}" in lines[0]
+        assert f"{sum(count for _, count in flops) / 1e6:,.1f} MFLOP" in lines[1]
+
+
+def blank_some(seen: Any) -> None:
+    """Leave out readings and slots, in the first sample but one every one."""
+    seen.sensor_valid = torch.tensor([0, 3, 8, 13])
+    seen.state_valid = torch.tensor([0, 3, 8, 25])
+    seen.slot_valid[1] = False
+    seen.slot_valid[2, 3] = False
+
+
+def fill_what_is_blank(seen: Any, value: float) -> None:
+    seen.features[~seen.slot_valid] = value
+    for row in range(4):
+        seen.sensor[row, : 13 - int(seen.sensor_valid[row])] = value
+        seen.state[row, : 25 - int(seen.state_valid[row])] = value
+
+
+def test_act_has_the_chunk_shape_in_physical_units(
+    build_policy: BuildPolicy, observe: Observe, normalization: Normalization
+) -> None:
+    policy = build_policy()
+    torch.nn.init.zeros_(policy.expert.head.weight)
+    chunk = policy.act(observe())
+    mean = torch.tensor(normalization.action.mean, dtype=torch.float32)
+    assert not chunk.requires_grad
+    torch.testing.assert_close(chunk, mean.expand(4, 8, 7))
+
+
+def test_loss_normalises_the_target(
+    build_policy: BuildPolicy, observe: Observe, normalization: Normalization
+) -> None:
+    policy, seen = build_policy(), observe()
+    torch.nn.init.zeros_(policy.expert.head.weight)
+    mean = torch.tensor(normalization.action.mean, dtype=torch.float32).expand(4, 8, 7)
+    loss, parts = policy.loss(seen, mean, seen.action_valid)
+    assert loss == 0
+    assert set(parts) == {"translation", "rotation", "gripper"}
+
+
+def test_the_target_changes_no_prediction(build_policy: BuildPolicy, observe: Observe) -> None:
+    policy, seen = build_policy(), observe()
+    predictions = []
+    policy.expert.grouped.register_forward_pre_hook(lambda _, args: predictions.append(args[0]))
+    policy.loss(seen, seen.action, seen.action_valid)
+    policy.loss(seen, 50 * seen.action + 3, ~seen.action_valid)
+    said = policy.action_normalizer.normalize(policy.act(seen))
+    assert torch.equal(predictions[0], predictions[1])
+    torch.testing.assert_close(predictions[0], said, atol=1e-5, rtol=1e-4)
+
+
+def test_a_constructed_batch_is_learned_to_near_zero(
+    build_policy: BuildPolicy, observe: Observe
+) -> None:
+    policy, seen = build_policy(), observe(batch=8)
+    action = policy.action_normalizer.invert(torch.randn(8, 8, 7))
+    optimizer = torch.optim.AdamW(policy.parameters(), lr=3e-3, weight_decay=0.0)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 200)
+    first = None
+    for _ in range(200):
+        loss, _ = policy.loss(seen, action, seen.action_valid)
+        first = first or loss.item()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+    assert loss < 1e-3 * first
+    assert (policy.act(seen) - action).abs().max() < 0.1
+
+
+def test_same_seed_same_policy_same_answer(build_policy: BuildPolicy, observe: Observe) -> None:
+    seen = observe()
+    assert torch.equal(build_policy().act(seen), build_policy().act(seen))
+
+
+def test_gradient_reaches_the_features_that_are_there(
+    build_policy: BuildPolicy, observe: Observe
+) -> None:
+    """What a model in front of the policy, live, learns from."""
+    policy, seen = build_policy(), observe()
+    seen.slot_valid[0, 2] = False
+    seen.features.requires_grad_()
+    policy.loss(seen, seen.action, seen.action_valid)[0].backward()
+    assert torch.equal(seen.features.grad.abs().sum(dim=-1) > 0, seen.slot_valid)
+
+
+def test_stored_dtypes_are_cast_inside(build_policy: BuildPolicy, observe: Observe) -> None:
+    policy, seen = build_policy(), observe()
+    exact = policy.act(seen)
+    seen.features, seen.sensor = seen.features.bfloat16(), seen.sensor.half()
+    torch.testing.assert_close(policy.act(seen), exact, atol=0.02, rtol=0.02)
+
+
+@pytest.mark.parametrize("kept", ["features", "sensor", "robot_state"])
+def test_disabled_streams_have_no_encoder_and_no_influence(
+    kept: str, build_policy: BuildPolicy, observe: Observe
+) -> None:
+    switches = {f"{n}_enabled": n == kept for n in ("features", "sensor", "robot_state")}
+    policy, seen = build_policy(**switches), observe()
+    own = kept.removeprefix("robot_")
+    assert [name for name, _ in policy.parameter_table()] == [own, "fusion", "expert"]
+    before = policy.act(seen)
+    for name in {"features", "sensor", "state"} - {own}:
+        setattr(seen, name, getattr(seen, name) + 5)
+    assert torch.equal(policy.act(seen), before)
+
+
+def test_streams_that_the_store_lacks_have_no_encoder(
+    shape: PolicyShape,
+    normalization: Normalization,
+    small_params: Callable[..., TrainHeadParams],
+    observe: Observe,
+) -> None:
+    lacking = replace(shape, sensor_channels=0, state_dim=0)
+    policy = Policy(small_params(), lacking, replace(normalization, sensor=None, state=None))
+    seen = observe()
+    seen.sensor, seen.sensor_valid = torch.zeros(4, 13, 0), torch.zeros(4, dtype=torch.int64)
+    seen.state, seen.state_valid = torch.zeros(4, 25, 0), torch.zeros(4, dtype=torch.int64)
+    assert list(policy.encoders) == ["features"]
+    assert policy.act(seen).shape == (4, 8, 7)
+
+
+def test_nothing_to_look_at_is_refused(build_policy: BuildPolicy) -> None:
+    with pytest.raises(ConfigError, match="5 feature slots, 9 sensor channels"):
+        build_policy(features_enabled=False, sensor_enabled=False, robot_state_enabled=False)
+
+
+def test_statistics_of_another_shape_are_refused(
+    shape: PolicyShape,
+    normalization: Normalization,
+    small_params: Callable[..., TrainHeadParams],
+) -> None:
+    wider = replace(shape, sensor_channels=10)
+    with pytest.raises(CheckpointMismatch, match=r"sensor: expected .* \(10,\), found \(9,\)"):
+        Policy(small_params(), wider, normalization)
+    with pytest.raises(CheckpointMismatch, match=r"state: .* found None"):
+        Policy(small_params(), shape, replace(normalization, state=None))
+
+
+def test_shape_survives_json(shape: PolicyShape) -> None:
+    assert PolicyShape.from_document(json.loads(json.dumps(shape.document()))) == shape
+    with pytest.raises(CheckpointMismatch, match="policy shape"):
+        PolicyShape.from_document({"slots": 3})
+
+
+def test_action_groups_go_by_name_and_unit() -> None:
+    names = ["dx", "dalpha", "joint1_velocity", "gripper", "Gripper_width", "mystery", "twist"]
+    units = ["mm", "deg", "rad/s", "", "m", "", "mm/s"]
+    assert action_groups(names, units) == (
+        "translation", "rotation", "other", "gripper", "gripper", "other", "other"
+    )  # fmt: skip
+
+
+def test_wrong_shapes_are_caught_by_the_annotations(
+    build_policy: BuildPolicy, observe: Observe
+) -> None:
+    policy, seen = build_policy(), observe()
+    with pytest.raises(Exception, match=r"(?i)type-?check"):
+        policy.loss(seen, seen.action[0], seen.action_valid)
+
+
+RATES = {"features": 0.5, "sensor": 0.3, "state": 0.0}
+
+
+class TestModalityDropout:
+    @staticmethod
+    def everything(batch: int) -> dict[str, torch.Tensor]:
+        return {
+            "features": torch.ones(batch, 5, dtype=torch.bool),
+            "sensor": torch.full((batch,), 13),
+            "state": torch.full((batch,), 25),
+        }
+
+    def test_streams_go_missing_at_their_rates_and_whole(self) -> None:
+        before = self.everything(4000)
+        after = drop_streams(before, RATES, seeded())
+        gone = {name: (valid == 0).reshape(4000, -1) for name, valid in after.items()}
+        for name, rate in RATES.items():
+            assert torch.equal(gone[name].any(1), gone[name].all(1))
+            assert gone[name].all(1).float().mean().item() == pytest.approx(rate, abs=0.03)
+            kept = ~gone[name].all(1)
+            assert torch.equal(after[name][kept], before[name][kept])
+            assert after[name].dtype == before[name].dtype
+
+    def test_a_sample_never_loses_all_that_it_has(self) -> None:
+        before = self.everything(3000)
+        before["features"][:1000], before["state"][:2000] = False, 0
+        before["sensor"][0], before["state"][1] = 0, 0
+        rates = {"features": 1.0, "sensor": 1.0, "state": 0.9}
+        after = drop_streams(before, rates, seeded())
+        left = torch.stack([(v.reshape(3000, -1) > 0).any(1) for v in after.values()], 1)
+        had = torch.stack([(v.reshape(3000, -1) > 0).any(1) for v in before.values()], 1)
+        assert torch.equal(left.any(1), had.any(1))
+        assert not left[0].any()
+        assert not (left & ~had).any()
+        # Of two that would both go, each is kept as often.
+        assert left[1000:2000, 0].float().mean().item() == pytest.approx(0.5, abs=0.06)
+
+    def test_two_streams_share_what_one_of_them_must_keep(self) -> None:
+        """At rates p and q both would go from pq of the samples; each stays in half of these."""
+        before = self.everything(8000)
+        del before["state"]
+        after = drop_streams(before, {"features": 0.8, "sensor": 0.6}, seeded())
+        missing = [(v.reshape(8000, -1) == 0).all(1).float().mean().item() for v in after.values()]
+        assert missing == pytest.approx([0.8 - 0.24, 0.6 - 0.24], abs=0.02)
+
+    def test_it_repeats_with_its_generator(self) -> None:
+        first, second = (drop_streams(self.everything(64), RATES, seeded()) for _ in range(2))
+        assert all(torch.equal(first[name], second[name]) for name in first)
+
+    def test_a_dropped_stream_is_one_that_is_missing(
+        self, build_policy: BuildPolicy, observe: Observe
+    ) -> None:
+        policy, seen = build_policy(drop_features=1.0, drop_sensor=1.0).train(), observe()
+        trained, _ = policy.loss(seen, seen.action, seen.action_valid)
+        whole, _ = policy.eval().loss(seen, seen.action, seen.action_valid)
+        seen.slot_valid[:] = False
+        seen.sensor_valid[:] = 0
+        absent, _ = policy.loss(seen, seen.action, seen.action_valid)
+        assert torch.equal(trained, absent)
+        assert not torch.equal(trained, whole)
+
+    def test_only_training_drops(self, build_policy: BuildPolicy, observe: Observe) -> None:
+        dropping, plain = build_policy(drop_state=0.9).train(), build_policy().train()
+        seen = observe()
+        assert torch.equal(dropping.act(seen), plain.act(seen))
+        losses = [p.eval().loss(seen, seen.action, seen.action_valid)[0] for p in (dropping, plain)]
+        assert torch.equal(*losses)
+
+    def test_rates_of_zero_draw_nothing(self, build_policy: BuildPolicy, observe: Observe) -> None:
+        policy, seen, generator = build_policy().train(), observe(), seeded()
+        policy.loss(seen, seen.action, seen.action_valid, generator)
+        assert torch.equal(generator.get_state(), seeded().get_state())
+
+    def test_a_disabled_stream_is_nothing_to_lean_on(
+        self, build_policy: BuildPolicy, observe: Observe
+    ) -> None:
+        policy = build_policy(drop_sensor=1.0, features_enabled=False, robot_state_enabled=False)
+        seen = observe()
+        trained, _ = policy.train().loss(seen, seen.action, seen.action_valid)
+        assert torch.equal(trained, policy.eval().loss(seen, seen.action, seen.action_valid)[0])
+
+
+class TestCost:
+    def test_flops_of_a_fusion_are_those_on_paper(self, build_policy: BuildPolicy) -> None:
+        """A product of (1, a) and (a, b) takes 2ab; slots are 5 x 16 wide, the expert 32."""
+        streams = 2 * (5 * 16 * 32)
+        mixed = 2 * ((32 + 24 + 20) * 32 + 32 * 4 * 32)
+        assert dict(flop_table(build_policy()))["fusion"] == streams + mixed
+
+    def test_sampling_ten_steps_costs_ten_times_one(self, build_policy: BuildPolicy) -> None:
+        one, ten = (
+            dict(flop_table(build_policy(model_type="diffusion", diffusion={"sampling_steps": n})))
+            for n in (1, 10)
+        )
+        assert ten["expert"] == pytest.approx(10 * one["expert"], rel=0.3)
+        assert ten["sensor"] == one["sensor"]
+
+    def test_counting_changes_neither_policy_nor_generator(self, build_policy: BuildPolicy) -> None:
+        policy = build_policy(model_type="flow_matching").train()
+        policy.encoders["sensor"].requires_grad_(False)
+        weights = {name: value.clone() for name, value in policy.state_dict().items()}
+        learns = [p.requires_grad for p in policy.parameters()]
+        state = torch.get_rng_state()
+        describe_cost(policy)
+        assert torch.equal(torch.get_rng_state(), state)
+        assert policy.training
+        assert [p.requires_grad for p in policy.parameters()] == learns
+        assert all(torch.equal(v, weights[name]) for name, v in policy.state_dict().items())
+
+    def test_the_default_sensor_encoder_costs_a_tenth_of_the_seeds(self) -> None:
+        efficient = SensorEncoderParams().model_dump(exclude={"kind"})
+        with torch.device("meta"):
+            sizes = [
+                sum(p.numel() for p in encoder.parameters())
+                for encoder in (SensorEncoder(**efficient), SensorEncoder())
+            ]
+        assert sizes[0] < 0.1 * sizes[1]

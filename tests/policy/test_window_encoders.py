@@ -1,0 +1,259 @@
+"""What all window encoders guarantee, and what each of them does on its own."""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from pipeline.base.errors import ConfigError
+from pipeline.policy.attention import right_aligned
+from pipeline.policy.force_encoder import ForceAwareSensorEncoder
+from pipeline.policy.sensor_encoder import HalvingBlock, SensorEncoder, resampled
+from pipeline.policy.state_encoder import RobotStateEncoder
+
+CHANNELS, WINDOW, OUTPUT = 9, 13, 24
+ENCODERS: dict[str, Callable[[], nn.Module]] = {
+    "sensor": lambda: SensorEncoder(CHANNELS, WINDOW, (16, 32), 1, 2, OUTPUT),
+    "force-aware sensor": lambda: ForceAwareSensorEncoder(CHANNELS, WINDOW, (16, 32), 1, 2, OUTPUT),
+    "state": lambda: RobotStateEncoder(CHANNELS, WINDOW, 16, 1, 2, OUTPUT, patch=4),
+}
+
+SENSOR_ENCODERS = [name for name in ENCODERS if "sensor" in name]
+
+
+@pytest.fixture(params=ENCODERS)
+def encoder(request: pytest.FixtureRequest) -> nn.Module:
+    return ENCODERS[request.param]()
+
+
+@pytest.fixture(params=SENSOR_ENCODERS)
+def sensor_encoder(request: pytest.FixtureRequest) -> nn.Module:
+    return ENCODERS[request.param]()
+
+
+def learned(encoder: nn.Module, name: str) -> list[nn.Parameter]:
+    """The parameters of this name in every branch, in the order in which branches are joined."""
+    return [p for path, p in encoder.named_parameters() if path.split(".")[-1] == name]
+
+
+def windows(batch: int = 14) -> Tensor:
+    return torch.randn(batch, WINDOW, CHANNELS)
+
+
+class TestWindowEncoderContract:
+    def test_shape(self, encoder: nn.Module) -> None:
+        assert encoder(windows(3), torch.tensor([0, 5, 13])).shape == (3, OUTPUT)
+
+    @pytest.mark.parametrize("padding", [7.0, float("nan"), float("inf")])
+    def test_padding_never_reaches_the_output(self, encoder: nn.Module, padding: float) -> None:
+        values, valid = windows(), torch.arange(14)
+        changed = values.clone()
+        for row, real in enumerate(valid.tolist()):
+            changed[row, : WINDOW - real] = padding
+        assert torch.equal(encoder(values, valid), encoder(changed, valid))
+
+    def test_padding_never_reaches_a_gradient(self, encoder: nn.Module) -> None:
+        values = windows().requires_grad_()
+        encoder(values, torch.arange(14)).square().sum().backward()
+        assert values.grad is not None
+        reached = values.grad.abs().sum(dim=-1) > 0
+        expected = torch.arange(WINDOW) >= WINDOW - torch.arange(14).unsqueeze(-1)
+        assert torch.equal(reached, expected)
+
+    def test_tokens_of_padding_alone_are_never_attended_to(self, encoder: nn.Module) -> None:
+        values, valid = windows(3), torch.tensor([1, 2, 4])
+        before = encoder(values, valid)
+        with torch.no_grad():
+            for position in learned(encoder, "position"):
+                position[:-1] += 3.0
+        assert torch.equal(encoder(values, valid), before)
+
+    def test_every_real_reading_counts_but_the_number_of_batch_mates_does_not(
+        self, encoder: nn.Module
+    ) -> None:
+        values, valid = windows(), torch.arange(14)
+        together = encoder(values, valid)
+        # The reading of this age is real in the rows that have so many.
+        for age in range(1, WINDOW + 1):
+            changed = values.clone()
+            changed[:, WINDOW - age] += 1.0
+            differs = (encoder(changed, valid) != together).any(dim=-1)
+            assert torch.equal(differs, valid >= age)
+        alone = torch.cat([encoder(values[i : i + 1], valid[i : i + 1]) for i in range(14)])
+        torch.testing.assert_close(together, alone, atol=1e-5, rtol=1e-4)
+
+    def test_a_missing_stream_is_a_learned_embedding(self, encoder: nn.Module) -> None:
+        encoded = encoder(windows(3), torch.tensor([0, 13, 0]))
+        missing = learned(encoder, "missing")
+        assert torch.equal(encoded[0], torch.cat(missing))
+        assert torch.equal(encoded[0], encoded[2])
+        encoded.square().sum().backward()
+        for embedding in missing:
+            assert embedding.grad is not None
+            assert embedding.grad.abs().min() > 0
+
+    def test_all_missing_gives_finite_gradients(self, encoder: nn.Module) -> None:
+        encoder(windows(2), torch.tensor([0, 0])).square().sum().backward()
+        gradients = [p.grad for p in encoder.parameters() if p.grad is not None]
+        assert gradients
+        assert all(torch.isfinite(gradient).all() for gradient in gradients)
+
+    def test_valid_defaults_to_all(self, encoder: nn.Module) -> None:
+        values = windows(2)
+        assert torch.equal(encoder(values), encoder(values, torch.tensor([13, 13])))
+
+    def test_bf16_autocast_is_finite_and_near_float32(self, encoder: nn.Module) -> None:
+        values, valid = windows(), torch.arange(14)
+        exact = encoder(values, valid)
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            rough = encoder(values, valid)
+            rough.float().sum().backward()
+        assert torch.isfinite(rough).all()
+        torch.testing.assert_close(rough.float(), exact, atol=0.05, rtol=0.05)
+        assert all(torch.isfinite(p.grad).all() for p in encoder.parameters() if p.grad is not None)
+
+    def test_time_order_matters(self, encoder: nn.Module) -> None:
+        values = windows(2)
+        assert (encoder(values) - encoder(values.flip(1))).abs().max() > 1e-3
+
+
+@pytest.mark.parametrize("real", [1, 2, 5, 8])
+def test_a_halving_block_sees_padding_as_the_end_of_the_signal(real: int) -> None:
+    block = HalvingBlock(CHANNELS, 16)
+    values = torch.randn(2, WINDOW, CHANNELS)
+    short, _ = block(values[:, -real:], torch.ones(2, real, dtype=torch.bool))
+    mask = right_aligned(torch.tensor([real, real]), WINDOW)
+    padded, valid = block(values.masked_fill(~mask.unsqueeze(-1), 0.0), mask)
+    torch.testing.assert_close(padded[:, -short.shape[1] :], short)
+    assert not padded[~valid].any()
+
+
+@pytest.mark.parametrize("window", [1, 2, 3, 16, 65])
+@pytest.mark.parametrize("channels", [1, 6])
+def test_sensor_encoder_takes_any_window_and_channel_count(window: int, channels: int) -> None:
+    encoder = SensorEncoder(channels, window, (8, 8), 1, 2, 5)
+    assert encoder(torch.randn(2, window, channels)).shape == (2, 5)
+
+
+@pytest.mark.parametrize("length", [5, 26, 130])
+def test_sensor_windows_of_another_length_are_resampled_without_leaks(
+    length: int, sensor_encoder: nn.Module
+) -> None:
+    encoder = sensor_encoder
+    values, valid = torch.randn(3, length, CHANNELS), torch.tensor([0, length // 2, length])
+    changed = values.clone()
+    changed[0] = float("nan")
+    changed[1, : length - length // 2] = float("nan")
+    assert torch.equal(encoder(values, valid), encoder(changed, valid))
+
+
+def test_resampling_keeps_a_constant_constant_beside_padding() -> None:
+    values = torch.full((1, 26, 2), 5.0)
+    values[0, :11] = 0.0
+    valid = torch.arange(26).unsqueeze(0) >= 11
+    for window in (13, 40):
+        resized, known = resampled(values, valid, window)
+        torch.testing.assert_close(resized[known], torch.full_like(resized[known], 5.0))
+        assert known[0, -1]
+        assert not known[0, 0]
+
+
+def test_a_ten_times_longer_window_encodes_what_its_averages_encode(
+    sensor_encoder: nn.Module,
+) -> None:
+    encoder = sensor_encoder
+    values = torch.randn(2, 10 * WINDOW, CHANNELS)
+    averaged = values.unflatten(1, (WINDOW, 10)).mean(dim=2)
+    torch.testing.assert_close(encoder(values), encoder(averaged), atol=1e-5, rtol=1e-4)
+
+
+def test_state_patches_know_which_readings_are_real() -> None:
+    """A reading of zeros is the mean state, not padding."""
+    encoder = RobotStateEncoder(CHANNELS, WINDOW, 16, 1, 2, OUTPUT, patch=4)
+    zeros = torch.zeros(2, WINDOW, CHANNELS)
+    encoded = encoder(zeros, torch.tensor([1, 3]))
+    assert (encoded[0] - encoded[1]).abs().max() > 1e-3
+
+
+def test_default_sizes_are_the_seeds() -> None:
+    with torch.device("meta"):
+        sensor, state = SensorEncoder(), RobotStateEncoder()
+    assert [tuple(block.down.weight.shape) for block in sensor.blocks] == [
+        (512, 2 * 1026),
+        (1024, 2 * 512),
+        (1024, 2 * 1024),
+        (1024, 2 * 1024),
+    ]
+    assert sum(p.numel() for p in sensor.parameters()) == 34_388_992
+    assert sum(p.numel() for p in state.parameters()) == 1_748_224
+
+
+@pytest.mark.parametrize("configured", [65, 650])
+@pytest.mark.parametrize("length", [65, 100, 650])
+@pytest.mark.parametrize("kind", [SensorEncoder, ForceAwareSensorEncoder])
+def test_windows_of_the_needle_sensor(kind: type[nn.Module], configured: int, length: int) -> None:
+    encoder = kind(1026, configured, (8, 8, 16), 1, 2, 12)
+    values, valid = torch.randn(2, length, 1026), torch.tensor([length, length // 2])
+    encoded = encoder(values, valid)
+    assert encoded.shape == (2, 12)
+    values[1, : length - length // 2] = 100.0
+    assert torch.equal(encoder(values, valid), encoded)
+
+
+class TestForce:
+    """Channel 0, one of 1,026."""
+
+    def test_its_branch_hears_nothing_else_and_the_other_never_hears_it(self) -> None:
+        encoder = ForceAwareSensorEncoder(CHANNELS, WINDOW, (16, 32), 1, 2, OUTPUT)
+        values = windows(2)
+        before = encoder(values)
+        force, scan = values.clone(), values.clone()
+        force[..., 0] += 1.0
+        scan[..., 1:] += torch.randn_like(scan[..., 1:])
+        own = OUTPUT // 4
+        assert torch.equal(encoder(force)[:, own:], before[:, own:])
+        assert torch.equal(encoder(scan)[:, :own], before[:, :own])
+        assert (encoder(force)[:, :own] - before[:, :own]).abs().max() > 1e-2
+        assert (encoder(scan)[:, own:] - before[:, own:]).abs().max() > 1e-2
+
+    @pytest.mark.parametrize("seed", [0, 1])
+    def test_a_target_of_force_alone_is_fitted_faster_with_a_branch_of_its_own(
+        self, seed: int
+    ) -> None:
+        """Among 256 channels of noise, on windows never seen, after equally many steps."""
+        joint = self.unexplained_after(80, SensorEncoder, seed)
+        aware = self.unexplained_after(80, ForceAwareSensorEncoder, seed)
+        assert aware < 0.4 * joint
+
+    @staticmethod
+    def unexplained_after(steps: int, kind: type[nn.Module], seed: int) -> float:
+        """The share of the target's variance, that of the last four readings' mean force."""
+        torch.manual_seed(seed)
+        encoder = nn.Sequential(kind(257, 16, (32, 32), 1, 4, 16), nn.Linear(16, 1))
+        optimizer = torch.optim.AdamW(encoder.parameters(), lr=3e-3)
+
+        def error(batch: int) -> Tensor:
+            values = torch.randn(batch, 16, 257)
+            return (encoder(values) - values[:, -4:, :1].mean(dim=1)).square().mean()
+
+        for _ in range(steps):
+            optimizer.zero_grad()
+            error(64).backward()
+            optimizer.step()
+        with torch.no_grad():
+            return 4 * error(256).item()
+
+    @pytest.mark.parametrize(("channels", "output"), [(1, 8), (9, 1)])
+    def test_no_room_for_two_branches_is_refused(self, channels: int, output: int) -> None:
+        with pytest.raises(ConfigError, match=r"force_aware.*kind: joint"):
+            ForceAwareSensorEncoder(channels, WINDOW, (16, 32), 1, 2, output)
+
+    def test_default_sizes_are_the_seeds_and_a_quarter_for_force(self) -> None:
+        with torch.device("meta"):
+            encoder = ForceAwareSensorEncoder()
+        assert encoder.scan.blocks[0].down.weight.shape == (512, 2 * 1025)
+        assert encoder.force.blocks[0].down.weight.shape == (128, 2)
+        assert encoder.force.missing.shape == (256,)
+        assert encoder.scan.missing.shape == (768,)
+        assert sum(p.numel() for p in encoder.parameters()) == 36_217_856
