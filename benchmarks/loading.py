@@ -10,8 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import DataLoader, Dataset
 
-from pipeline.batches import Draw, Prefetch, Windows
 from pipeline.store import FeatureStore
+from pipeline.train.batches import Draw, Prefetch, Windows
 
 _BATCH = 64
 _SKIPPED = 4

@@ -21,14 +21,14 @@ from benchmarks.flops import peak_flops
 from benchmarks.stores import write_store
 from benchmarks.timing import Work, arguments, at_least, at_most, race, report
 from pipeline.base.config import TrainHeadParams, load_params
-from pipeline.batches import Draw, Feed, Windows
 from pipeline.policy.cost import flop_table
-from pipeline.sampling import split_by_episode
 from pipeline.store import Batch, FeatureStore
 from pipeline.store.gather import WIDE
-from pipeline.training import Trainer
-from pipeline.training.front import Cached
-from pipeline.training.run import Run
+from pipeline.train.batches import Draw, Feed, Windows
+from pipeline.train.feature_source import Cached
+from pipeline.train.loop import Trainer
+from pipeline.train.run import Run
+from pipeline.train.split import split_by_episode
 
 RAM = "batches in RAM"
 FULL = {"episodes": 20, "ticks": 600, "readings": 4_800, "states": 1_200, "steps": 10}

@@ -20,20 +20,15 @@ from pipeline.base.config import Params
 from pipeline.base.device import resolve_device
 from pipeline.base.durable import write_document
 from pipeline.base.ownership import REPORT, claim, refuse_foreign
-from pipeline.batches import open_store
-from pipeline.evaluation import (
-    JUDGED,
-    Judgement,
-    check_store,
-    judgement,
-    modality_table,
-    table,
-    write_tables,
-)
+from pipeline.evaluation.judged import JUDGED, Judgement, judgement
+from pipeline.evaluation.modality_tables import modality_table
+from pipeline.evaluation.tables import table, write_tables
 from pipeline.policy.checkpoint import PolicyCheckpoint, find_policy, load_policy
 from pipeline.report import write_report
 from pipeline.report.evaluation.evaluation import evaluation_report
 from pipeline.store import FeatureStore, check_trailers
+from pipeline.train.batches import open_store
+from pipeline.train.held_out import check_store
 
 
 def main(params: Params) -> None:

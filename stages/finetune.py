@@ -22,12 +22,14 @@ if __name__ == "__main__":  # here, for --help waits for no import below
     raise SystemExit(run(__doc__ or "", "stages.finetune", sections=("finetune", "train_head")))
 
 from pipeline.base.config import Params
-from pipeline.finetuning import Live, head_params, next_steps, out_of_memory_named
-from pipeline.finetuning.params import left_out
-from pipeline.sampling import split_by_episode
 from pipeline.store import FeatureStore, build_lock, check_trailers
-from pipeline.training import Trainer, check_loggers, open_run, process_group
-from pipeline.training.world import process_device
+from pipeline.train.finetuning import Live, head_params, next_steps, out_of_memory_named
+from pipeline.train.finetuning.params import left_out
+from pipeline.train.loggers import check_loggers
+from pipeline.train.loop import Trainer
+from pipeline.train.run import open_run
+from pipeline.train.split import split_by_episode
+from pipeline.train.world import process_device, process_group
 
 
 def main(params: Params) -> None:

@@ -25,9 +25,9 @@ if __name__ == "__main__":  # here, for --help waits for no import below
     raise SystemExit(run(__doc__ or "", "stages.train_head", sections=("train_head",)))
 
 from pipeline.base.config import Params
-from pipeline.sampling import split_by_episode
 from pipeline.store import build_lock, check_trailers
-from pipeline.training.run import finished_run, open_run
+from pipeline.train.run import finished_run, open_run
+from pipeline.train.split import split_by_episode
 
 
 def main(params: Params) -> None:
@@ -41,8 +41,10 @@ def main(params: Params) -> None:
 
 def _train(params: Params) -> None:
     # With torch, which takes over a second to import.
-    from pipeline.batches import open_store
-    from pipeline.training import Trainer, check_loggers, process_group
+    from pipeline.train.batches import open_store
+    from pipeline.train.loggers import check_loggers
+    from pipeline.train.loop import Trainer
+    from pipeline.train.world import process_group
 
     head = params.train_head
     with process_group(head.device) as world:

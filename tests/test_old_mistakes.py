@@ -22,16 +22,16 @@ from pipeline.base.errors import RecordingError
 from pipeline.data import Recording, open_recordings
 from pipeline.datasets import UnifiedVLADataset
 from pipeline.extract import extract
-from pipeline.policy.checkpoint import policy_shape
 from pipeline.policy.diffusion import DiffusionActionExpert
 from pipeline.policy.noise_schedule import NoiseSchedule
 from pipeline.policy.policy import Policy
 from pipeline.policy.regression import RegressionActionExpert
-from pipeline.sampling import split_by_episode
 from pipeline.simulation.insertion_formats import ABUTTING, write_new
 from pipeline.simulation.recorder import simulate_episode
 from pipeline.store import FeatureStore
-from pipeline.training import fit_normalization
+from pipeline.train.identity import policy_shape
+from pipeline.train.split import split_by_episode
+from pipeline.train.statistics import fit_normalization
 from pipeline.vlm.feature_spec import FeatureSpec, Slot, feature_spec, row_key
 from pipeline.vlm.pooling import batch_weights, pool
 from pipeline.vlm.preparation import Layout

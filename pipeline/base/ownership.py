@@ -18,7 +18,7 @@ _NAMED = 3
 """Names that a message lists of a folder."""
 
 _SPEED = "step\tsteps_per_s\tdata_wait_share\t"
-"""How the speed begins that a training writes beside its logs (`pipeline.training.log`)."""
+"""How the speed begins that a training writes beside its logs (`pipeline.train.log`)."""
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """A policy with a vision-language model in front, under the name and arguments it is known by.
 
 Features come from the model (images and an instruction), from a cache, or sample by sample from
-either. This is a door: `Policy` and `pipeline.vlm.live.LiveVLM` do the work. The only module of
-this package that knows of `pipeline.vlm`, and it asks for it when a model is loaded.
+either. This is a door: `Policy` and `pipeline.vlm.live.LiveVLM` do the work, and the latter is
+asked for when a model is loaded.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from pipeline.base.config import FusionStrategy, ModelType, TrainHeadParams, TuningParams, VLMParams
-from pipeline.base.errors import ObservationError, VLMError
+from pipeline.base.errors import ObservationError
 from pipeline.compat.unchanged import Unchanged
 from pipeline.policy.live_observation import LiveObservation, Seen, observation_of, target_of
 from pipeline.policy.live_policy import LivePolicy
@@ -142,7 +142,8 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
             vlm.refuse_other_features(policy.feature_spec)
         model = cls.__new__(cls)
         model._assemble(policy, vlm.vlm, vlm.tuning, vlm.spec.views)
-        model.vlm = _fitting(vlm, policy.shape)
+        vlm.check_shape(policy.shape.slots, policy.shape.feature_dim)
+        model.vlm = vlm
         return model
 
     def _assemble(
@@ -240,18 +241,9 @@ def _load(
     """The model of a checkpoint; `VLMError` where it cannot be used or is of another width."""
     from pipeline.vlm.live import LiveVLM, live_spec
 
-    return _fitting(LiveVLM.load(vlm, live_spec(vlm, views), tuning, device), shape)
-
-
-def _fitting(vlm: LiveVLM, shape: PolicyShape) -> LiveVLM:
-    found = (len(vlm.spec.slots), vlm.spec.dim)
-    if found != (shape.slots, shape.feature_dim):
-        raise VLMError(
-            f"{vlm.vlm.checkpoint}: gives {found[0]} feature slots of width {found[1]}, but "
-            f"the policy was built for {shape.slots} of width {shape.feature_dim}. Build it "
-            f"with feature_dim={found[1]} and with the views, layers and pooling of the model."
-        )
-    return vlm
+    model = LiveVLM.load(vlm, live_spec(vlm, views), tuning, device)
+    model.check_shape(shape.slots, shape.feature_dim)
+    return model
 
 
 class QwenVLAWithSensorDiffusion(QwenVLAUnified):

@@ -13,8 +13,8 @@ from pipeline.base.config import Source
 from pipeline.base.errors import ConfigError
 from pipeline.datasets.batch import unified_collate_fn
 from pipeline.datasets.unified import UnifiedVLADataset
-from pipeline.sampling import TickSampler
 from pipeline.store import FeatureStore
+from pipeline.train.mixture import TickSampler
 
 
 class MixtureBatches(Sampler[list[int]]):

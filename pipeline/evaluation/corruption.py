@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pipeline.batches import NO_LAGS, Draw, Feed, Lags, Prefetch, Ticks, Windows
-from pipeline.evaluation.predictions import FeedMaker
 from pipeline.store import Batch, FeatureStore
+from pipeline.train.batches import NO_LAGS, Draw, Feed, Lags, Prefetch, Ticks, Windows
+from pipeline.train.predictions import FeedMaker
 
 Alter = Callable[[Draw, Batch], Batch]
 """A batch as the policy is to see it; the one it is given stays as it is."""

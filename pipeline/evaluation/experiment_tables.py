@@ -6,8 +6,8 @@ from typing import Any
 from pipeline.evaluation.cells import aligned, cell, ratio
 from pipeline.evaluation.experiments import Experiment
 from pipeline.evaluation.names import with_unit
-from pipeline.evaluation.predictions import BASELINES
 from pipeline.evaluation.tables import HEADINGS
+from pipeline.train.predictions import BASELINES
 
 
 def experiment_errors(

@@ -12,10 +12,11 @@ from typing import Any, get_args
 from pipeline.base.config import FusionStrategy, ModelType
 from pipeline.base.errors import ConfigError
 from pipeline.evaluation.judged import JUDGED
-from pipeline.evaluation.predictions import BASELINES, METHODS
-from pipeline.evaluation.scores import Group
 from pipeline.evaluation.tables import ERRORS, OVERALL
 from pipeline.policy.checkpoint import describe, differences
+from pipeline.train.log import speed_file
+from pipeline.train.predictions import BASELINES, METHODS
+from pipeline.train.scores import Group
 
 _OVERALL = (OVERALL, "training std")
 _SAME = 1e-4
@@ -101,11 +102,6 @@ def read_experiments(reports: Path) -> tuple[Experiment, ...]:
     for one, other in pairwise(found):
         _check_baselines(reports, one, other)
     return tuple(sorted(found, key=_order))
-
-
-def speed_file(logs: Path) -> Path:
-    """Where a training writes its speed: beside its logs, for DVC tracks all that is in them."""
-    return logs.with_name(f"{logs.name}.speed.tsv")
 
 
 def training_seconds(logs: Path) -> float | None:

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from pipeline.base.digests import file_digest
 from pipeline.base.errors import RecordingError
-from pipeline.batches import Ticks
 from pipeline.data import CameraStream, Recording, content_digest, open_recording
 from pipeline.store import Episode, FeatureStore
+from pipeline.train.batches import Ticks
 
 Frame = NDArray[np.uint8]
 

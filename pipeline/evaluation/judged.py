@@ -8,15 +8,16 @@ from typing import Any
 import torch
 
 from pipeline.base.config import EvaluateParams
-from pipeline.batches import Windows
 from pipeline.evaluation.curves import Curves, read_curves
-from pipeline.evaluation.held_out import held_out_ticks, judge, named_as_in
 from pipeline.evaluation.modalities import ModalityStudy, judge_modalities
-from pipeline.evaluation.predictions import Predictions
-from pipeline.evaluation.scores import Comparison
-from pipeline.policy.checkpoint import PolicyCheckpoint, source_of
+from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.policy import Trainable
 from pipeline.store import FeatureStore
+from pipeline.train.batches import Windows
+from pipeline.train.held_out import held_out_ticks, judge, named_as_in
+from pipeline.train.identity import source_of
+from pipeline.train.predictions import Predictions
+from pipeline.train.scores import Comparison
 
 JUDGED = "judged.json"
 """Its name in the folder of an evaluation, beside metrics.json."""

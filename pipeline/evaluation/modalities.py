@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from pipeline.batches import Lags, Ticks, Windows
 from pipeline.evaluation.corruption import (
     FIELDS,
     Alter,
@@ -19,12 +18,13 @@ from pipeline.evaluation.corruption import (
     missing,
     zeroed,
 )
-from pipeline.evaluation.held_out import judge
-from pipeline.evaluation.predictions import FeedMaker
-from pipeline.evaluation.scores import Comparison
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.policy import Policy
 from pipeline.store import FeatureStore, episode_name
+from pipeline.train.batches import Lags, Ticks, Windows
+from pipeline.train.held_out import judge
+from pipeline.train.predictions import FeedMaker
+from pipeline.train.scores import Comparison
 
 DELAYS_MS = (50, 100, 200)
 MOST_TICKS = 1000

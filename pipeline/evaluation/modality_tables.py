@@ -6,8 +6,8 @@ from typing import Any
 from pipeline.evaluation.cells import aligned, cell, ratio
 from pipeline.evaluation.modalities import ModalityStudy
 from pipeline.evaluation.names import with_unit
-from pipeline.evaluation.predictions import BASELINES
-from pipeline.evaluation.scores import Comparison
+from pipeline.train.predictions import BASELINES
+from pipeline.train.scores import Comparison
 
 FOOTNOTE = "zeroed: every value at its training mean, which the policy sees as zeros"
 

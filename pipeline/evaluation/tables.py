@@ -10,9 +10,9 @@ from pipeline.evaluation.cells import aligned, cell, numbers, ratio, write_rows
 from pipeline.evaluation.modalities import ModalityStudy
 from pipeline.evaluation.modality_tables import best_baseline, modality_rows, stream_rows
 from pipeline.evaluation.names import with_unit
-from pipeline.evaluation.predictions import METHODS, Predictions
-from pipeline.evaluation.scores import Comparison
 from pipeline.store import FeatureStore
+from pipeline.train.predictions import METHODS, Predictions
+from pipeline.train.scores import Comparison
 
 FOOTNOTE = (
     "repeat last: at an episode's first tick, which has none before it, it does nothing; where "

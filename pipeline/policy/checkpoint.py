@@ -27,7 +27,6 @@ from pipeline.base.durable import (
 from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch, PipelineError
 from pipeline.base.ownership import OutputKind
 from pipeline.policy.normalization import Normalization
-from pipeline.store import FeatureStore
 
 # torch takes over a second to import, and what only asks whether a training is finished needs none.
 if TYPE_CHECKING:
@@ -203,28 +202,6 @@ def _note_without_digest(path: Path) -> None:
         f"{path}: it has no {DIGEST}, for an earlier version wrote it, so that nobody can tell "
         "whether it was altered; it is taken as it is. Train it again to have it checked.",
         file=sys.stderr,
-    )
-
-
-def source_of(store: FeatureStore) -> dict[str, Any]:
-    """What a checkpoint remembers of its store, and what another store must agree with."""
-    return {key: getattr(store, "spec" if key == "feature_spec" else key) for key in SOURCE_KEYS}
-
-
-def policy_shape(store: FeatureStore, normalization: Normalization) -> "PolicyShape":
-    """The widths that this store gives to a policy.
-
-    A stream without statistics is absent from what the policy is trained on, so it has width 0.
-    """
-    from pipeline.policy.observation import PolicyShape, action_groups
-
-    action = store.streams["action"]
-    return PolicyShape(
-        *store.feature_shape,
-        sensor_channels=store.sensor_channels if normalization.sensor else 0,
-        state_dim=store.state_dim if normalization.state else 0,
-        action_dim=store.action_dim,
-        action_groups=action_groups(action["names"], action["units"]),
     )
 
 

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.errors import StoreMismatch
-from pipeline.sampling import episodes_by_recording
 from pipeline.store import Episode, FeatureStore
+from pipeline.train.split import episodes_by_recording
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,9 +10,9 @@ from torch import Tensor
 from tqdm import tqdm
 
 from pipeline.base.errors import NumericsError
-from pipeline.batches import Prefetch, Windows, draws
 from pipeline.probing.projection import GroupedProjection
 from pipeline.store import Batch, FeatureStore, place
+from pipeline.train.batches import Prefetch, Windows, draws
 
 GROUP_WIDTH = 64
 """Directions at most of each summary of channels that share a unit."""

@@ -120,6 +120,16 @@ class LiveVLM(nn.Module):
                 "policy on the features of this model."
             )
 
+    def check_shape(self, slots: int, feature_dim: int) -> None:
+        """Raise `VLMError` where a policy was built for another number or width of features."""
+        if (len(self.spec.slots), self.spec.dim) != (slots, feature_dim):
+            raise VLMError(
+                f"{self.vlm.checkpoint}: gives {len(self.spec.slots)} feature slots of width "
+                f"{self.spec.dim}, but the policy was built for {slots} of width {feature_dim}. "
+                f"Build it with feature_dim={self.spec.dim} and with the views, layers and pooling "
+                "of the model."
+            )
+
     def save(self, folder: Path) -> None:
         """Write what has been learned into `folder`, made if need be.
 

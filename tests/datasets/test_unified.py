@@ -27,8 +27,8 @@ from pipeline.datasets import (
 from pipeline.models import QwenVLAUnified
 from pipeline.policy.observation import Observation, PolicyShape
 from pipeline.policy.policy import Policy
-from pipeline.sampling import split_by_episode
 from pipeline.store import Batch, FeatureStore
+from pipeline.train.split import split_by_episode
 
 SMALL = TrainHeadParams.model_validate(
     {

@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.evaluation import Comparison, Group, Predictions, baselines, compare
 from pipeline.store import FeatureStore
+from pipeline.train.predictions import Predictions, baselines
+from pipeline.train.scores import Comparison, Group, compare
 
 GROUPS = (
     Group("translation", "mm", (0, 1, 2)),

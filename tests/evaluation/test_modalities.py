@@ -9,23 +9,18 @@ import pytest
 import torch
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.batches import Draw, Lags, Windows
-from pipeline.evaluation import (
-    ModalityStudy,
-    held_out_contents,
-    held_out_ranges,
-    judge_modalities,
-    modality_table,
-    write_rows,
-)
+from pipeline.evaluation.cells import write_rows
 from pipeline.evaluation.corruption import donors_of, exchanged, missing, zeroed
-from pipeline.evaluation.modalities import delays
-from pipeline.evaluation.modality_tables import modality_rows, stream_rows
-from pipeline.policy.checkpoint import PolicyCheckpoint, policy_shape, source_of
+from pipeline.evaluation.modalities import ModalityStudy, delays, judge_modalities
+from pipeline.evaluation.modality_tables import modality_rows, modality_table, stream_rows
+from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.normalization import ChannelStatistics, Normalization
 from pipeline.policy.policy import Policy
-from pipeline.sampling import split_by_episode
 from pipeline.store import FeatureStore
+from pipeline.train.batches import Draw, Lags, Windows
+from pipeline.train.held_out import held_out_contents, held_out_ranges
+from pipeline.train.identity import policy_shape, source_of
+from pipeline.train.split import split_by_episode
 
 PARAMS = {
     "sensor_encoder": {"channels": [16], "layers": 0, "heads": 1, "output_dim": 16},

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.batches import NO_LAGS, Lags, Windows
-from pipeline.evaluation import Predictions, predict, predictions
 from pipeline.evaluation.corruption import feed_maker
 from pipeline.store import FeatureStore
+from pipeline.train import predictions
+from pipeline.train.batches import NO_LAGS, Lags, Windows
+from pipeline.train.predictions import Predictions, predict
 
 WINDOWS = Windows(horizon=4, sensor_window=2, state_window=2)
 TICKS = np.arange(30, 51)

@@ -12,9 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.base.errors import NumericsError
-from pipeline.batches import Windows
-from pipeline.evaluation import Comparison, Group, Predictions, baselines, compare, predict
 from pipeline.store import FeatureStore
+from pipeline.train.batches import Windows
+from pipeline.train.predictions import Predictions, baselines, predict
+from pipeline.train.scores import Comparison, Group, compare
 
 Recorded = Callable[..., Predictions]
 Compared = Callable[[Predictions], Comparison]

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from pipeline.base.errors import DiskFull
-from pipeline.evaluation import BASELINES, Comparison, Predictions, metrics, table, write_tables
-from pipeline.evaluation.tables import FOOTNOTE
+from pipeline.evaluation.tables import FOOTNOTE, metrics, table, write_tables
 from pipeline.store import FeatureStore
+from pipeline.train.predictions import BASELINES, Predictions
+from pipeline.train.scores import Comparison
 
 TICKS = np.arange(30, 90)
 

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from pipeline.store.chunks import ChunkFiles
-from pipeline.training import Trainer
+from pipeline.train.loop import Trainer
 from stages import store, train_head
 from stages.command import run
 

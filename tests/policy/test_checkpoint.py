@@ -17,14 +17,13 @@ from pipeline.policy.checkpoint import (
     differences,
     find_policy,
     load_policy,
-    policy_shape,
     save_policy,
     source_differences,
-    source_of,
 )
 from pipeline.policy.policy import Policy
 from pipeline.store import FeatureStore
-from pipeline.training import fit_normalization
+from pipeline.train.identity import policy_shape, source_of
+from pipeline.train.statistics import fit_normalization
 
 PARAMS = TrainHeadParams.model_validate(
     {

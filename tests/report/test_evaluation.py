@@ -9,21 +9,12 @@ import numpy as np
 import pytest
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.batches import Windows
-from pipeline.evaluation import (
-    BASELINES,
-    Curve,
-    Curves,
-    Experiment,
-    Judgement,
-    held_out_contents,
-    held_out_ranges,
-    judge,
-    judge_modalities,
-    judged_document,
-)
+from pipeline.evaluation.curves import Curve, Curves
+from pipeline.evaluation.experiments import Experiment
 from pipeline.evaluation.footage import Footage
-from pipeline.policy.checkpoint import PolicyCheckpoint, policy_shape, source_of
+from pipeline.evaluation.judged import Judgement, judged_document
+from pipeline.evaluation.modalities import judge_modalities
+from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.normalization import ChannelStatistics, Normalization
 from pipeline.policy.policy import Policy
 from pipeline.report import PAGE, Document, Picture, Report, Section, Table, write_report
@@ -31,6 +22,10 @@ from pipeline.report.evaluation import episodes as episode_sections
 from pipeline.report.evaluation.comparison import comparison_report
 from pipeline.report.evaluation.evaluation import evaluation_report
 from pipeline.store import FeatureStore
+from pipeline.train.batches import Windows
+from pipeline.train.held_out import held_out_contents, held_out_ranges, judge
+from pipeline.train.identity import policy_shape, source_of
+from pipeline.train.predictions import BASELINES
 
 Sound = Callable[[Path], None]
 PARAMS = TrainHeadParams.model_validate(

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.training.live_page import LivePage
+from pipeline.train.live_page import LivePage
 
 
 @pytest.mark.parametrize(

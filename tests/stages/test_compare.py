@@ -10,7 +10,9 @@ from typing import Any
 import pytest
 import yaml
 
-from pipeline.evaluation import BASELINES, JUDGED, read_experiments
+from pipeline.evaluation.experiments import read_experiments
+from pipeline.evaluation.judged import JUDGED
+from pipeline.train.predictions import BASELINES
 from stages import compare, evaluate, train_head
 from stages.command import run
 

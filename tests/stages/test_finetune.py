@@ -17,7 +17,7 @@ from stages.command import run
 Start = Callable[..., "subprocess.Popen[str]"]
 HELD = """
 import sys, time
-from pipeline.training import Trainer
+from pipeline.train.loop import Trainer
 from stages import finetune
 from stages.command import run
 

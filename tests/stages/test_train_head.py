@@ -42,7 +42,7 @@ print(sorted(set(heavy.split()) & sys.modules.keys()))
 """A finished training, which says what it imported of what takes long."""
 HELD = """
 import sys, time
-from pipeline.training import Trainer
+from pipeline.train.loop import Trainer
 from stages import train_head
 from stages.command import run
 
@@ -102,7 +102,7 @@ def test_a_logger_that_is_not_installed_is_named_before_the_store_is_opened(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr("pipeline.training.loggers._MODULES", {"wandb": "no_such_module"})
+    monkeypatch.setattr("pipeline.train.loggers._MODULES", {"wandb": "no_such_module"})
     path = write_params(loggers=["report", "wandb"])
     arguments = ["--params", str(path), "--set", "extract.store=/no/such.zarr"]
     assert run("", train_head.main, arguments) == 2

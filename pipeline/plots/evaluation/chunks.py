@@ -8,10 +8,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from numpy.typing import NDArray
 
-from pipeline.evaluation import Comparison, Predictions, with_unit
+from pipeline.evaluation.names import with_unit
 from pipeline.plots.evaluation.predictions import short_name
 from pipeline.plots.style import INK, PALETTE, RECORDED, STYLES, canvas
 from pipeline.store import Episode, FeatureStore
+from pipeline.train.predictions import Predictions
+from pipeline.train.scores import Comparison
 
 _WIDTH = 11.0
 _MADE = PALETTE[5]

@@ -7,9 +7,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from pipeline.evaluation import METHODS, Comparison, with_unit
+from pipeline.evaluation.names import with_unit
 from pipeline.plots.evaluation.predictions import marked
 from pipeline.plots.style import LABELS, canvas, legend_below
+from pipeline.train.predictions import METHODS
+from pipeline.train.scores import Comparison
 
 _NUMBERED_STEPS = 16
 """Steps of a chunk up to which a cell has room for its number."""

@@ -5,8 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from pipeline.evaluation import BASELINES, Experiment
+from pipeline.evaluation.experiments import Experiment
 from pipeline.plots.style import LABELS, STYLES, canvas
+from pipeline.train.predictions import BASELINES
 
 COLOURS = ("#0072B2", "#D55E00", "#56B4E9", "#F0E442", "#999999")
 """Of the experts, in the order in which they come."""

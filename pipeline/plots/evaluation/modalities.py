@@ -3,7 +3,9 @@
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from pipeline.evaluation import MODALITY_FOOTNOTE, ModalityStudy, Spoilt, best_baseline
+from pipeline.evaluation.modalities import ModalityStudy, Spoilt
+from pipeline.evaluation.modality_tables import FOOTNOTE as MODALITY_FOOTNOTE
+from pipeline.evaluation.modality_tables import best_baseline
 from pipeline.plots.style import GRID, INK, LABELS, STYLES, canvas, legend_below
 
 COLOURS = {

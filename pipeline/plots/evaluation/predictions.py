@@ -9,15 +9,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from pipeline.evaluation import (
-    METHODS,
-    Comparison,
-    Group,
-    Predictions,
-    with_unit,
-)
+from pipeline.evaluation.names import with_unit
 from pipeline.plots.style import LABELS, RECORDED, STYLES, canvas, legend_below
 from pipeline.store import Episode, FeatureStore, episode_name
+from pipeline.train.predictions import METHODS, Predictions
+from pipeline.train.scores import Comparison, Group
 
 SCATTER_POINTS = 4000
 EPISODE_LINES = 40

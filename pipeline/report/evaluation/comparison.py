@@ -4,7 +4,9 @@ from collections.abc import Sequence
 from functools import partial
 
 from pipeline import plots
-from pipeline.evaluation import FOOTNOTE, Experiment, experiment_errors
+from pipeline.evaluation.experiment_tables import experiment_errors
+from pipeline.evaluation.experiments import Experiment
+from pipeline.evaluation.tables import FOOTNOTE
 from pipeline.report.page.blocks import Picture, Report, Section, Table
 from pipeline.report.page.cells import sentence
 

@@ -5,11 +5,14 @@ from functools import cache, partial
 
 from pipeline import plots
 from pipeline.base.digests import file_digest
-from pipeline.batches import Ticks
-from pipeline.evaluation import HEADINGS, Judgement, Predictions, best_baseline
 from pipeline.evaluation.footage import footage, shown_ticks
+from pipeline.evaluation.judged import Judgement
+from pipeline.evaluation.modality_tables import best_baseline
+from pipeline.evaluation.tables import HEADINGS
 from pipeline.report.page.blocks import Block, Picture, Section, Table, Text
 from pipeline.store import episode_name
+from pipeline.train.batches import Ticks
+from pipeline.train.predictions import Predictions
 
 _INSTANTS = 5
 """Ticks of an episode at which its frames are shown."""

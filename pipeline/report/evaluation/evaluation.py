@@ -5,24 +5,17 @@ from functools import partial
 from typing import Any
 
 from pipeline import plots
-from pipeline.evaluation import (
-    FOOTNOTE,
-    HEADINGS,
-    METHODS,
-    MODALITY_FOOTNOTE,
-    Comparison,
-    Judgement,
-    ModalityStudy,
-    best_baseline,
-    error_rows,
-    judged_on,
-    modality_errors,
-    still_dimensions,
-    with_unit,
-)
+from pipeline.evaluation.judged import Judgement
+from pipeline.evaluation.modalities import ModalityStudy
+from pipeline.evaluation.modality_tables import FOOTNOTE as MODALITY_FOOTNOTE
+from pipeline.evaluation.modality_tables import best_baseline, judged_on, modality_errors
+from pipeline.evaluation.names import with_unit
+from pipeline.evaluation.tables import FOOTNOTE, HEADINGS, error_rows, still_dimensions
 from pipeline.report.evaluation.episodes import episodes, extremes
 from pipeline.report.page.blocks import Block, Document, Picture, Report, Section, Table, Text
 from pipeline.report.page.cells import sentence
+from pipeline.train.predictions import METHODS
+from pipeline.train.scores import Comparison
 
 _NAMES = 8
 """Channels of a stream named in the params; an A-scan has a thousand."""

@@ -1,0 +1,27 @@
+"""Batches of a store on their way to a policy.
+
+`draw` says what a batch is made of; `prefetch` gathers ahead of time; `resident` holds streams on
+the device; `choice` opens a store or an archive and picks between these ways; `scratch` is where an
+archive is restored to.
+"""
+
+from pipeline.train.batches.batch_indices import NO_LAGS, Draw, Feed, Lags, Ticks, Windows, draws
+from pipeline.train.batches.choice import Choice, FeedName, choose_feed, open_store
+from pipeline.train.batches.device_store import Resident
+from pipeline.train.batches.prefetch import Prefetch
+
+__all__ = [
+    "NO_LAGS",
+    "Choice",
+    "Draw",
+    "Feed",
+    "FeedName",
+    "Lags",
+    "Prefetch",
+    "Resident",
+    "Ticks",
+    "Windows",
+    "choose_feed",
+    "draws",
+    "open_store",
+]

@@ -1,0 +1,188 @@
+"""What stands before the policy when the model itself learns."""
+
+from collections.abc import Generator, Iterable, Mapping
+from contextlib import contextmanager
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from pipeline.base.config import FinetuneParams, Params, VLMParams
+from pipeline.base.digests import file_digest
+from pipeline.base.durable import read_document, write_with_digest
+from pipeline.base.errors import ConfigError
+from pipeline.policy.checkpoint import DOCUMENT
+from pipeline.policy.live_policy import LivePolicy
+from pipeline.policy.policy import Policy, Trainable
+from pipeline.store import FeatureStore
+from pipeline.train.batches import Draw, Windows
+from pipeline.train.finetuning.feed import LiveFeed
+from pipeline.train.finetuning.recordings import (
+    check_recordings,
+    check_spec,
+    find_recordings,
+    known_digests,
+)
+from pipeline.train.finetuning.rows import LiveRows
+from pipeline.train.world import World
+from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
+from pipeline.vlm.live import LiveVLM
+from pipeline.vlm.preparation import Preparer
+
+ADAPTER, CHECKPOINT = "adapter", "checkpoint"
+_FREE_TUNING = {"gradient_checkpointing"}
+"""What of the tuning decides no number."""
+
+
+class Live:
+    """A `Front` whose features come from a model that learns, over the recordings of a store."""
+
+    identity: Mapping[str, Any]
+    eval_ticks: int | None
+
+    def __init__(
+        self,
+        store: FeatureStore,
+        rows: LiveRows,
+        spec: FeatureSpec,
+        vlm: VLMParams,
+        finetune: FinetuneParams,
+        device: torch.device,
+    ) -> None:
+        self._store, self._rows, self._spec, self._vlm = store, rows, spec, vlm
+        self._finetune, self._device = finetune, device
+        self._base_digest = lru_cache(file_digest)
+        self.eval_ticks = finetune.eval_ticks
+        self.identity = {
+            "spec": spec.digest,
+            "tuning": finetune.tuning.model_dump(mode="json", exclude=_FREE_TUNING),
+            "lr": finetune.lr,
+            "eval_ticks": finetune.eval_ticks,
+        }
+
+    @classmethod
+    def open(cls, store: FeatureStore, params: Params, device: torch.device) -> "Live":
+        """The front of `params` over a store; the model is loaded when a policy is attached.
+
+        Raises `StoreMismatch` where `vlm` does not give the store's features, or a recording is
+        missing or not what it was at extraction.
+        """
+
+        def checked() -> FeatureSpec:
+            with known_digests(store) as digests:
+                spec = check_spec(store, params, digests)
+                check_recordings(store, find_recordings(store, params), digests)
+            return spec
+
+        # Once for all processes: they would read the same files and say the same.
+        spec = World.current().shared(checked)
+        recordings = find_recordings(store, params)
+        rows = LiveRows(store, recordings, Preparer(params.vlm, spec))
+        return cls(store, rows, spec, params.vlm, params.finetune, device)
+
+    def attach(self, policy: Policy) -> Trainable:
+        """The policy with the model in front."""
+        vlm = LiveVLM.load(self._vlm, self._spec, self._finetune.tuning, str(self._device))
+        vlm.check_shape(policy.shape.slots, policy.shape.feature_dim)
+        load = partial(LiveVLM.load, self._vlm, self._spec, self._finetune.tuning)
+        live = LivePolicy(policy, load, tuned=True)
+        live.vlm = vlm
+        return live
+
+    def policy_of(self, module: nn.Module) -> Policy:
+        """The policy behind the model."""
+        assert isinstance(module, LivePolicy)
+        return module.policy
+
+    def parameter_lr(self, name: str) -> float | None:
+        """`finetune.lr` for what is the model's."""
+        return self._finetune.lr if name.startswith("vlm.") else None
+
+    def feed(self, plan: Iterable[Draw], windows: Windows, device: torch.device) -> LiveFeed:
+        """Batches of the store with the rows of their ticks, decoded ahead of time."""
+        threads = self._finetune.decode_threads
+        return LiveFeed(self._store, self._rows, plan, windows, device, threads)
+
+    def save(self, folder: Path, module: nn.Module) -> None:
+        """Write what the model has learned, and into `policy.json` whose features the policy takes.
+
+        It is judged on a store that was extracted with this adapter or checkpoint, and refused on
+        the one whose ticks it was trained on. Raises `DiskFull`.
+        """
+        assert isinstance(module, LivePolicy)
+        assert module.vlm is not None
+        module.vlm.save(folder / learned_name(self._finetune))
+        document = read_document(folder / DOCUMENT)
+        document["feature_spec"] = self._tuned_spec(folder).attrs()
+        write_with_digest(folder / DOCUMENT, document)
+
+    def summary(self) -> list[str]:
+        """What learns and from which frames, as lines for the user."""
+        tuning, rows = self._finetune.tuning, len(self._store.array("vl/time"))
+        how = f"full, {' and '.join(tuning.towers)} tower"
+        if tuning.method == "lora":
+            how = f"lora of rank {tuning.lora_r} on the {' and '.join(tuning.towers)} tower"
+        lines = [
+            f"tuning: {how}, peak learning rate {self._finetune.lr:g}; {rows} VL rows of "
+            f"{len(self._store.episodes)} recordings"
+        ]
+        if self._store.variants > 1:
+            lines.append(
+                f"tuning: the store's {self._store.variants - 1} augmented variant(s) of each row "
+                "are not used, the model sees the plain frames"
+            )
+        return lines
+
+    def _tuned_spec(self, folder: Path) -> FeatureSpec:
+        """What `extract` will name the features of the model in this checkpoint."""
+        learned = str(folder / learned_name(self._finetune))
+        given = {"adapter": learned}
+        if self._finetune.tuning.method == "full":
+            given = {"checkpoint": learned, "revision": None, "adapter": None}
+        vlm = self._vlm.model_copy(update=given)
+        storage = self._spec.document["storage_dtype"]
+
+        def digest(path: Path) -> str:
+            # The base's files are read once; what learns is another at every checkpoint.
+            return file_digest(path) if path.is_relative_to(folder) else self._base_digest(path)
+
+        return feature_spec(vlm, storage, self._spec.views, digest)
+
+
+@contextmanager
+def out_of_memory_named() -> Generator[None]:
+    """Turn a GPU that is too small into `ConfigError` saying what takes less."""
+    try:
+        yield
+    except torch.cuda.OutOfMemoryError as error:
+        raise ConfigError(
+            f"the GPU's memory does not hold a step of tuning: {error}. Raise "
+            "finetune.grad_accumulation or lower finetune.batch_size, set "
+            "finetune.tuning.gradient_checkpointing=true, tune with lora, or lower "
+            "vlm.image_resize_height and vlm.image_resize_width."
+        ) from None
+
+
+def learned_name(finetune: FinetuneParams) -> str:
+    """The folder, within a checkpoint's, of what the model has learned."""
+    return ADAPTER if finetune.tuning.method == "lora" else CHECKPOINT
+
+
+def next_steps(finetune: FinetuneParams, store: FeatureStore) -> list[str]:
+    """What to run with a tuned model, as lines for the user."""
+    learned = finetune.output / "best" / learned_name(finetune)
+    tuned = store.path.with_name(f"{store.path.stem}_tuned.zarr")
+    setting = f"--set vlm.adapter={learned}"
+    if finetune.tuning.method == "full":
+        setting = f"--set vlm.checkpoint={learned} --set vlm.adapter=null"
+    name = tuned.stem
+    return [
+        "next, extract the tuned model's features, train a head on them and judge it:",
+        f"  python -m stages.extract {setting} --set extract.store={tuned}",
+        f"  python -m stages.train_head --set train_head.store={tuned} "
+        f"--set train_head.output=models/{name} --set train_head.logs=reports/{name}_training",
+        f"  python -m stages.evaluate --set evaluate.store={tuned} "
+        f"--set evaluate.checkpoint=models/{name} --set evaluate.output=reports/{name}",
+    ]

@@ -1,0 +1,115 @@
+"""A live feed hands out the store's batches with the rows of their ticks."""
+
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.base.config import Params, TuningParams
+from pipeline.base.errors import RecordingError
+from pipeline.policy.live_observation import LiveObservation
+from pipeline.store import Batch, FeatureStore
+from pipeline.train.batches import Draw, Windows
+from pipeline.train.finetuning.feed import LiveFeed
+from pipeline.train.finetuning.recordings import check_spec, find_recordings, known_digests
+from pipeline.train.finetuning.rows import LiveRows
+from pipeline.vlm.live import LiveVLM
+from pipeline.vlm.preparation import Preparer
+
+WINDOWS = Windows(2, 1, 3)
+CPU = torch.device("cpu")
+
+
+@pytest.fixture
+def feed(store: FeatureStore, params: Callable[..., Params]) -> Callable[..., LiveFeed]:
+    """`feed(plan)`, over rows of its own."""
+
+    def make(plan: Iterable[Draw], threads: int = 2) -> LiveFeed:
+        with known_digests(store) as digests:
+            spec = check_spec(store, params(), digests)
+        rows = LiveRows(store, find_recordings(store, params()), Preparer(params().vlm, spec))
+        return LiveFeed(store, rows, plan, WINDOWS, CPU, threads)
+
+    return make
+
+
+def plan_of(store: FeatureStore, draws: int, batch: int) -> list[Draw]:
+    rng = np.random.default_rng(1)
+    return [Draw(rng.integers(0, store.ticks, batch)) for _ in range(draws)]
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_batches_are_the_stores_and_rows_those_of_their_ticks(
+    store: FeatureStore, feed: Callable[..., LiveFeed], threads: int
+) -> None:
+    plan = plan_of(store, 7, 9)
+    seen = 0
+    with feed(plan, threads) as batches:
+        for wanted, (draw, batch) in zip(plan, batches, strict=True):
+            assert draw is wanted
+            expected = store.gather(draw.ticks, 2, 1, 3)
+            for field in fields(Batch):
+                stream = getattr(expected, field.name)
+                torch.testing.assert_close(getattr(batch, field.name), stream, rtol=0, atol=0)
+            vl_row = store.array("tick/vl_row")[draw.ticks]
+            assert len(batch.rows) == len(np.unique(vl_row)), "each distinct row once"
+            same = batch.row_of[:, None] == batch.row_of
+            assert (same.numpy() == (vl_row[:, None] == vl_row)).all()
+            seen += 1
+        assert batches.waited_s > 0
+    assert seen == len(plan)
+
+
+def test_an_untuned_model_gives_the_cached_features(
+    store: FeatureStore, feed: Callable[..., LiveFeed], params: Callable[..., Params]
+) -> None:
+    with known_digests(store) as digests:
+        spec = check_spec(store, params(), digests)
+    vlm = LiveVLM.load(params().vlm, spec, TuningParams(method="none"), "cpu").eval()
+    with feed([Draw(np.arange(0, store.ticks, 5))]) as batches, torch.no_grad():
+        _, batch = next(batches)
+        features, valid = vlm(batch.rows)
+    assert isinstance(batch, LiveObservation)
+    assert torch.equal(valid[batch.row_of], batch.slot_valid)
+    assert not batch.slot_valid.all(), "one recording lacks a view"
+    torch.testing.assert_close(features[batch.row_of], batch.features, atol=2e-5, rtol=1e-4)
+
+
+def test_another_device_takes_the_tensors_and_leaves_the_rows(
+    store: FeatureStore, feed: Callable[..., LiveFeed]
+) -> None:
+    with feed(plan_of(store, 1, 4)) as batches:
+        _, batch = next(batches)
+    moved = batch.to("meta")
+    assert moved.features.is_meta
+    assert moved.row_of.is_meta
+    assert moved.rows is batch.rows
+
+
+def test_a_frame_that_is_gone_comes_out_at_its_batch(
+    store: FeatureStore, feed: Callable[..., LiveFeed], own_recordings: Path
+) -> None:
+    first, second = store.episodes[0].ticks, store.episodes[1].ticks
+
+    def plan() -> Iterator[Draw]:  # read once the recordings are open, before the first row
+        for frame in (own_recordings / "Follow_disc" / "episode_1" / "images").rglob("*.jpg"):
+            frame.write_bytes(b"")
+        yield from (Draw(np.array(ticks[:3])) for ticks in (first, second, first))
+
+    with feed(plan()) as batches:
+        next(batches)
+        with pytest.raises(RecordingError, match="episode_1"):
+            next(batches)
+
+
+def test_threads_end_with_the_feed(store: FeatureStore, feed: Callable[..., LiveFeed]) -> None:
+    before = threading.active_count()
+    with feed(plan_of(store, 50, 16)) as batches:
+        next(batches)
+    assert threading.active_count() == before
+    with pytest.raises(StopIteration):
+        next(batches)

@@ -1,0 +1,34 @@
+"""Which of two sections a training follows."""
+
+from collections.abc import Callable
+
+import pytest
+
+from pipeline.base.config import Params
+from pipeline.base.errors import ConfigError
+from pipeline.train.finetuning import head_params
+
+
+def test_finetune_is_laid_over_train_head(params: Callable[..., Params]) -> None:
+    given = params(train_head={"batch_size": 99, "seed": 3, "drop_features": 0.2, "compile": True})
+    head = head_params(given)
+    assert (head.batch_size, head.max_steps, head.eval_every) == (6, 5, 3)
+    assert (head.output, head.logs) == (given.finetune.output, given.finetune.logs)
+    assert (head.seed, head.drop_features, head.lr) == (3, 0.2, given.train_head.lr)
+    assert not head.compile, "rows are no tensors"
+
+
+@pytest.mark.parametrize(
+    ("section", "values", "said"),
+    [
+        ("finetune", {"tuning": {"method": "none"}}, "python -m stages.train_head"),
+        ("train_head", {"features_enabled": False}, "would not see the model that is tuned"),
+        ("finetune", {"grad_accumulation": 7}, "finetune: .*grad_accumulation 7"),
+        ("finetune", {"output": "."}, "finetune: .*folder of its own"),
+    ],
+)
+def test_what_cannot_be_tuned_is_refused(
+    params: Callable[..., Params], section: str, values: dict[str, object], said: str
+) -> None:
+    with pytest.raises(ConfigError, match=said):
+        head_params(params(**{section: values}))

@@ -1,0 +1,117 @@
+"""A row of the store shows the very frames that extraction saw."""
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipeline.base.config import Params
+from pipeline.base.errors import RecordingError
+from pipeline.extract import extract
+from pipeline.simulation.lerobot_format import write_lerobot
+from pipeline.simulation.recorder import simulate_episode
+from pipeline.store import FeatureStore
+from pipeline.train.finetuning.recordings import check_spec, find_recordings, known_digests
+from pipeline.train.finetuning.rows import LiveRows
+from pipeline.vlm.feature_spec import FeatureSpec, row_key
+from pipeline.vlm.preparation import PreparedRow, Preparer
+
+
+class Watched(Preparer):
+    """Notes the key of each row it makes."""
+
+    def __init__(self, params: Params, spec: FeatureSpec) -> None:
+        super().__init__(params.vlm, spec)
+        self.spec = spec
+        self.keys: Counter[bytes] = Counter()
+
+    def prepare(self, instruction: str, frames: Mapping[str, NDArray[np.uint8]]) -> PreparedRow:
+        prompt = self.render(instruction, list(frames))
+        self.keys[row_key(self.spec, prompt, frames)] += 1
+        return super().prepare(instruction, frames)
+
+
+def live_rows(store: FeatureStore, params: Params, **arguments: Any) -> tuple[LiveRows, Watched]:
+    with known_digests(store) as digests:
+        watched = Watched(params, check_spec(store, params, digests))
+    return LiveRows(store, find_recordings(store, params), watched, **arguments), watched
+
+
+def keys(store: FeatureStore, rows: NDArray[np.int64]) -> Counter[bytes]:
+    return Counter(store.array("vl/key")[row].tobytes() for row in np.unique(rows))
+
+
+def prepare_all(rows: LiveRows, wanted: NDArray[np.int64]) -> dict[int, PreparedRow]:
+    return {
+        row: prepared
+        for piece in rows.by_episode(wanted)
+        for row, prepared in zip(piece.tolist(), rows.prepare(piece), strict=True)
+    }
+
+
+def test_rows_show_what_extraction_saw_and_are_decoded_once(
+    store: FeatureStore, params: Callable[..., Params]
+) -> None:
+    rows, watched = live_rows(store, params())
+    wanted = np.random.default_rng(0).integers(0, len(store.array("vl/time")), 200)
+    first = prepare_all(rows, wanted[:10])
+    again = prepare_all(rows, wanted)
+    assert watched.keys == keys(store, wanted)
+    assert all(again[row] is prepared for row, prepared in first.items())
+
+
+def test_rows_of_a_video_are_read_in_one_pass(
+    document: dict[str, Any], params: Callable[..., Params], tmp_path: Path
+) -> None:
+    write_lerobot(tmp_path / "videos", [simulate_episode(5, 1.7e9)])
+    document["data"] = {
+        "root": str(tmp_path),
+        "sources": [{"name": "video", "path": "videos"}],
+        "views": ["View1", "View5"],
+        "vlm_reuse_count": 10,
+    }
+    document["extract"]["store"] = str(tmp_path / "video.zarr")
+    extract(params(), say=lambda _: None)
+    store = FeatureStore.open(tmp_path / "video.zarr")
+    rows, watched = live_rows(store, params())
+    wanted = np.array([3, 0, 4, 3])
+    prepare_all(rows, wanted)
+    assert watched.keys == keys(store, wanted)
+
+
+def test_kept_rows_stay_within_their_bytes(
+    store: FeatureStore, params: Callable[..., Params]
+) -> None:
+    last = store.episodes[-1].vl_rows
+    size = 2 * 56 * 84 * 3
+    rows, watched = live_rows(store, params(), cache_bytes=3 * size)
+    for row in (*range(last.start, last.start + 4), last.start + 3, last.start):
+        rows.prepare(np.array([row]))
+    assert watched.keys.total() == 5, "the first row has made room, the newest has not"
+    none, watched = live_rows(store, params(), cache_bytes=0)
+    for _ in range(2):
+        none.prepare(np.array([last.start]))
+    assert watched.keys.total() == 2
+
+
+def test_pieces_are_of_one_episode_each(store: FeatureStore, params: Callable[..., Params]) -> None:
+    rows, _ = live_rows(store, params())
+    starts = store.array("episode/vl_start")
+    wanted = np.array([starts[2] + 1, 0, starts[1] - 1, starts[2], 0])
+    pieces = [piece.tolist() for piece in rows.by_episode(wanted)]
+    assert pieces == [[0, starts[1] - 1], [starts[2], starts[2] + 1]]
+
+
+def test_a_frame_that_is_gone_is_named(
+    store: FeatureStore, params: Callable[..., Params], own_recordings: Path
+) -> None:
+    rows, _ = live_rows(store, params())
+    rows.prepare(np.array([0]))
+    for frame in (own_recordings / "Follow_disc" / "episode_0" / "images" / "View1").iterdir():
+        frame.unlink()
+    with pytest.raises(RecordingError, match=r"episode_0/images/View1/.*\.jpg"):
+        rows.prepare(np.array([1]))

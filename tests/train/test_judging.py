@@ -1,0 +1,104 @@
+"""A run ends when it has stopped getting better, wherever it is stopped on the way."""
+
+import csv
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.base.errors import ConfigError
+from pipeline.policy.checkpoint import load_policy
+from pipeline.store import FeatureStore
+from pipeline.train.feature_source import Cached
+from pipeline.train.judging import EVALUATION_TICKS, Standing, judged_ticks
+from pipeline.train.loop import Trainer
+
+Make = Callable[..., Any]
+
+
+class Stop(Exception):
+    """Stands for the end of the process."""
+
+
+def test_the_standing_counts_since_the_best() -> None:
+    standing = Standing(patience=2)
+    assert [standing.take(error) for error in (3.0, 2.0, 2.0, 1.0)] == [True, True, False, True]
+    assert (standing.best_error, standing.stalled, standing.exhausted) == (1.0, 0, False)
+    standing.take(5.0)
+    assert not standing.exhausted
+    standing.take(1.5)
+    assert standing.exhausted
+    assert not Standing(None, 1.0, stalled=10**6).exhausted
+
+
+def test_judged_ticks_are_spread_and_limited_by_the_front(store: FeatureStore) -> None:
+    ticks = np.arange(5000)
+    front = Cached(store)
+    found = judged_ticks(ticks, front)
+    assert (len(found), found[0], found[-1]) == (EVALUATION_TICKS, 0, 4999)
+    front.eval_ticks = 3
+    assert judged_ticks(ticks, front).tolist() == [0, 2500, 4999]
+    assert judged_ticks(ticks[:2], front).tolist() == [0, 1]
+    assert judged_ticks(ticks[:0], front).tolist() == []
+
+
+def test_stopping_early_needs_something_held_out(
+    store: FeatureStore, params: Make, trainer: Make
+) -> None:
+    with pytest.raises(ConfigError, match="early_stopping is 3, but nothing is held out") as caught:
+        trainer(store, params(early_stopping=3, val_fraction=0))
+    assert "train_head.val_fraction is 0. Set it above 0" in str(caught.value)
+    assert not params().output.with_name("head.part").exists()
+
+
+@pytest.fixture
+def errors(monkeypatch: pytest.MonkeyPatch) -> dict[int, float]:
+    """What evaluations find, by step; the best is at step 4."""
+    found = {2: 0.9, 4: 0.5, 6: 0.8, 8: 0.6, 10: 0.7, 12: 0.1}
+    monkeypatch.setattr(
+        Trainer,
+        "_judge",
+        lambda self, log: (
+            log.write(self.step, {"val/error": found[self.step]}) or {"val/error": found[self.step]}
+        ),
+    )
+    return found
+
+
+@pytest.mark.parametrize("stopped", [None, 5, 7, 9, "finish"])
+def test_it_stops_early_also_when_it_was_interrupted(
+    store: FeatureStore,
+    params: Make,
+    trainer: Make,
+    errors: dict[int, float],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    stopped: int | str | None,
+) -> None:
+    chosen = params(early_stopping=3, eval_every=2, checkpoint_every=1, max_steps=100)
+    real = Trainer._train_step
+
+    def killed(self: Trainer, *rest: Any) -> bool:
+        if self.step == stopped:
+            raise Stop
+        return real(self, *rest)
+
+    def killed_at_the_end(*rest: Any) -> None:
+        raise Stop
+
+    if stopped is not None:
+        with monkeypatch.context() as patched:
+            patched.setattr(Trainer, "_train_step", killed)
+            if stopped == "finish":
+                patched.setattr("pipeline.train.run.Run.finish", killed_at_the_end)
+            with pytest.raises(Stop):
+                trainer(store, chosen).fit()
+    done = trainer(store, chosen)
+    done.fit()
+    assert done.step == 10
+    assert "stopped early at step 10: 3 evaluations without a better one" in capsys.readouterr().out
+    assert load_policy(done.run.output / "best").step == 4
+    assert load_policy(done.run.output / "last").step == 10
+    with (chosen.logs / "plots/metrics/train/loss.tsv").open() as file:
+        assert [row["step"] for row in csv.DictReader(file, delimiter="\t")] == ["10"]

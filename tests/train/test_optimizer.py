@@ -1,0 +1,208 @@
+"""Learning rate, decay groups, averaging, history."""
+
+import math
+from itertools import pairwise
+
+import pytest
+import torch
+from torch import nn
+
+from pipeline.base.config import TrainHeadParams
+from pipeline.train.ema import WeightAverage, trainable
+from pipeline.train.history import History
+from pipeline.train.optimizer import (
+    decay_groups,
+    make_optimizer,
+    optimizer_tensors,
+    restore_optimizer,
+    schedule,
+    set_learning_rates,
+)
+
+
+class Toy(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.linear = nn.Linear(3, 3)
+        self.conv = nn.Conv1d(3, 3, 1)
+        self.norm = nn.LayerNorm(3)
+        self.embedding = nn.Embedding(4, 3)
+        self.query = nn.Parameter(torch.ones(2, 3))
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return self.norm(self.linear(x)).sum()
+
+
+def test_the_rate_warms_up_peaks_and_ends_at_its_floor() -> None:
+    params = TrainHeadParams(warmup_steps=10, max_steps=111, min_lr_fraction=0.1)
+    rates = [schedule(step, params) for step in range(111)]
+    assert rates[:10] == pytest.approx([0.1 * step for step in range(1, 11)])
+    assert rates[10] == 1.0
+    assert rates[60] == pytest.approx(0.1 + 0.9 / 2)
+    assert rates[110] == pytest.approx(0.1)
+    assert all(a >= b for a, b in pairwise(rates[10:]))
+
+
+@pytest.mark.parametrize(("warmup", "steps"), [(0, 1), (0, 5), (5, 5), (100, 3), (1, 2)])
+def test_the_rate_is_sane_at_the_extremes(warmup: int, steps: int) -> None:
+    params = TrainHeadParams(warmup_steps=warmup, max_steps=steps, min_lr_fraction=0)
+    rates = [schedule(step, params) for step in range(steps)]
+    assert all(0 <= rate <= 1.0 and math.isfinite(rate) for rate in rates)
+    assert max(rates) == 1.0
+
+
+def test_a_trapezoid_stays_and_then_falls_in_a_line() -> None:
+    params = TrainHeadParams(
+        lr_schedule="trapezoid",
+        warmup_steps=10,
+        max_steps=100,
+        decay_fraction=0.2,
+        min_lr_fraction=0.1,
+    )
+    rates = [schedule(step, params) for step in range(100)]
+    assert rates[:10] == pytest.approx([0.1 * step for step in range(1, 11)])
+    assert set(rates[10:80]) == {1.0}
+    assert rates[89] == pytest.approx(0.55)
+    assert rates[99] == pytest.approx(0.1)
+    falls = [a - b for a, b in pairwise(rates[79:])]
+    assert falls == pytest.approx([0.9 / 20] * 20)
+
+
+def test_a_constant_rate_only_warms_up() -> None:
+    params = TrainHeadParams(lr_schedule="constant", warmup_steps=4, max_steps=50)
+    rates = [schedule(step, params) for step in range(50)]
+    assert rates[:4] == [0.25, 0.5, 0.75, 1.0]
+    assert set(rates[4:]) == {1.0}
+
+
+@pytest.mark.parametrize("kind", ["cosine", "trapezoid", "constant"])
+@pytest.mark.parametrize("decay", [0.0, 0.5, 1.0])
+def test_every_schedule_is_sane_at_the_extremes(kind: str, decay: float) -> None:
+    for warmup, steps in ((0, 1), (0, 2), (5, 5), (100, 3), (1, 2), (3, 40)):
+        params = TrainHeadParams.model_validate(
+            {
+                "lr_schedule": kind,
+                "decay_fraction": decay,
+                "warmup_steps": warmup,
+                "max_steps": steps,
+                "min_lr_fraction": 0,
+            }
+        )
+        rates = [schedule(step, params) for step in range(steps)]
+        assert all(0 <= rate <= 1 for rate in rates)
+        assert max(rates) == 1.0
+
+
+def test_every_group_follows_the_schedule_from_its_own_peak() -> None:
+    params = TrainHeadParams(lr=1e-3, weight_decay=0.1)
+    toy = Toy()
+    toy.embedding.requires_grad_(False)
+    optimizer = make_optimizer(toy, params, {"linear.weight": 0.5, "linear.bias": 0.5})
+    set_learning_rates(optimizer, 0.5)
+    found = {
+        name: (group["lr"], group["weight_decay"])
+        for group in optimizer.param_groups
+        for name, value in toy.named_parameters()
+        if any(value is member for member in group["params"])
+    }
+    assert found == {
+        "linear.weight": (0.25, 0.1),
+        "linear.bias": (0.25, 0.0),
+        "conv.weight": (5e-4, 0.1),
+        "conv.bias": (5e-4, 0.0),
+        "norm.weight": (5e-4, 0.0),
+        "norm.bias": (5e-4, 0.0),
+        "query": (5e-4, 0.0),
+    }
+
+
+def test_only_matrices_and_kernels_decay() -> None:
+    decayed, kept = decay_groups(Toy())
+    assert decayed == ["linear.weight", "conv.weight"]
+    assert set(kept) == {
+        "query",
+        "linear.bias",
+        "conv.bias",
+        "norm.weight",
+        "norm.bias",
+        "embedding.weight",
+    }
+
+
+def test_the_optimizer_goes_on_where_it_was() -> None:
+    params = TrainHeadParams(lr=0.1)
+
+    def steps(toy: nn.Module, optimizer: torch.optim.Optimizer, count: int) -> None:
+        for _ in range(count):
+            optimizer.zero_grad()
+            toy(torch.ones(2, 3)).backward()
+            optimizer.step()
+
+    torch.manual_seed(0)
+    through = Toy()
+    optimizer = make_optimizer(through, params, {})
+    steps(through, optimizer, 3)
+    stopped = Toy()
+    stopped.load_state_dict(through.state_dict())
+    resumed = make_optimizer(stopped, params, {})
+    restore_optimizer(resumed, stopped, optimizer_tensors(optimizer, through))
+    steps(through, optimizer, 4)
+    steps(stopped, resumed, 4)
+    for name, value in through.state_dict().items():
+        assert torch.equal(stopped.state_dict()[name], value), name
+
+
+def test_the_average_follows_its_formula() -> None:
+    policy = nn.Linear(1, 1, bias=False)
+    nn.init.constant_(policy.weight, 0.0)
+    average = WeightAverage(policy, decay=0.5)
+    expected = 0.0
+    for update in range(1, 30):
+        nn.init.constant_(policy.weight, float(update))
+        average.update(update)
+        decay = min(0.5, update / (update + 9))
+        expected = decay * expected + (1 - decay) * update
+        assert average.module.weight.item() == pytest.approx(expected, rel=1e-5)
+    assert not average.module.training
+    assert not average.module.weight.requires_grad
+
+
+def test_what_does_not_learn_is_shared_and_left_alone() -> None:
+    toy = Toy()
+    toy.linear.requires_grad_(False)
+    toy.register_buffer("statistics", torch.ones(3))
+    average = WeightAverage(toy, decay=0.5)
+    assert average.module.linear.weight is toy.linear.weight
+    assert average.module.statistics is toy.statistics
+    assert average.module.conv.weight is not toy.conv.weight
+    assert set(average.weights) == set(trainable(toy))
+    before = toy.linear.weight.clone()
+    nn.init.constant_(toy.conv.weight, 3.0)
+    average.update(1)
+    assert torch.equal(toy.linear.weight, before)
+    assert toy.conv.weight.requires_grad
+    assert not average.module.conv.weight.requires_grad
+
+
+def test_without_decay_the_average_is_the_policy() -> None:
+    policy = nn.Linear(2, 2)
+    average = WeightAverage(policy, decay=0.0)
+    nn.init.normal_(policy.weight)
+    average.update(1)
+    assert torch.equal(average.module.weight, policy.weight)
+
+
+def test_history_settles_late_and_names_the_first_bad_step() -> None:
+    history = History()
+    for step in range(5):
+        loss = torch.tensor(float("nan") if step >= 3 else float(step))
+        history.add({"loss": loss, "grad_norm": torch.tensor(1.0)})
+        if step == 1:
+            assert history.settle() is None
+    assert history.settle() == 3
+    assert history.settle() is None
+    assert history.tensor().shape == (5, 2)
+    assert history.mean(0, 3) == {"loss": 1.0, "grad_norm": 1.0}
+    assert history.describe(3) == "loss nan, grad_norm 1"
+    again = History.of(history.columns, history.tensor()[:3])
+    assert again.last("loss") == 2.0

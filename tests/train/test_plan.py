@@ -1,0 +1,134 @@
+"""Every step is cut into parts that together are the whole, whoever computes them."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.base.errors import ConfigError
+from pipeline.store import FeatureStore
+from pipeline.train.loop import Trainer
+from pipeline.train.plan import Part, Plan
+from pipeline.train.split import split_by_episode
+from pipeline.train.world import World
+
+Make = Callable[..., Any]
+ALONE = World()
+
+
+@pytest.fixture
+def plan(store: FeatureStore, params: Make) -> Make:
+    """`plan(world, key=value, ...)`: the plan of small params."""
+
+    def make(world: World = ALONE, store: FeatureStore = store, **changed: Any) -> Plan:
+        made = params(**changed)
+        return Plan(store, made, split_by_episode(store, 0.1, made.horizon), world)
+
+    return make
+
+
+def described(parts: list[Part]) -> list[tuple[Any, ...]]:
+    return [(part.ticks.tolist(), part.share, part.seed) for part in parts]
+
+
+@pytest.mark.parametrize("parts", [1, 2, 3, 8])
+def test_parts_are_the_whole(store: FeatureStore, plan: Make, parts: int) -> None:
+    whole, cut = plan(), plan(grad_accumulation=parts)
+    for step in range(30):
+        found = cut.step(step)
+        assert len(found) == parts
+        assert np.concatenate([part.ticks for part in found]).tolist() == whole.ticks(step).tolist()
+        assert sum(part.share for part in found) == pytest.approx(1)
+        valid = store.gather(whole.ticks(step), 3, 1, 1).action_valid.sum()
+        for part in found:
+            here = store.gather(part.ticks, 3, 1, 1).action_valid.sum()
+            assert part.share == pytest.approx(float(here / valid))
+
+
+@pytest.mark.parametrize("size", [2, 4])
+def test_processes_share_the_parts_of_one_that_accumulates(plan: Make, size: int) -> None:
+    alone = plan(grad_accumulation=4)
+    together = [plan(World(rank, size), grad_accumulation=4 // size) for rank in range(size)]
+    for step in (0, 1, 17):
+        apart = [part for each in together for part in each.step(step)]
+        assert described(apart) == described(alone.step(step))
+
+
+def test_seeds_differ_by_step_and_part(plan: Make) -> None:
+    cut = plan(grad_accumulation=4)
+    seeds = [part.seed for step in range(20) for part in cut.step(step)]
+    assert len(set(seeds)) == 80
+    assert {part.seed for part in plan(grad_accumulation=4, seed=1).step(0)}.isdisjoint(seeds)
+
+
+def test_the_feed_takes_the_parts_in_their_order(plan: Make) -> None:
+    cut = plan(grad_accumulation=2)
+    expected = [part for step in (5, 6) for part in cut.step(step)]
+    assert described(list(cut.draws(range(5, 7)))) == described(expected)
+
+
+def test_with_a_terminal_stop_every_step_counts(plan: Make) -> None:
+    for part in plan(grad_accumulation=4, terminal_stop=True, horizon=20).step(3):
+        assert part.share == pytest.approx(1 / 4)
+
+
+def test_fewer_ticks_than_parts_are_refused(store: FeatureStore, params: Make, plan: Make) -> None:
+    with pytest.raises(ConfigError, match=r"8 parts of a step \(4 process\(es\) x"):
+        plan(World(0, 4), batch_size=7, grad_accumulation=2)
+    made = params(batch_size=7, grad_accumulation=2)
+    split = split_by_episode(store, 0.1, made.horizon)
+    with pytest.raises(ConfigError, match=r"^finetune\.batch_size is 7"):
+        Plan(store, made, split, World(0, 4), "finetune")
+
+
+def test_variants_are_drawn_from_seed_and_step(
+    store: FeatureStore, plan: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert plan().step(0)[0].variants is None
+    monkeypatch.setattr(FeatureStore, "variants", 3)
+    whole = [part.variants for step in range(40) for part in plan().step(step)]
+    cut = [part.variants for step in range(40) for part in plan(grad_accumulation=2).step(step)]
+    assert np.concatenate(whole).tolist() == np.concatenate(cut).tolist()
+    assert np.bincount(np.concatenate(whole)).min() > 320 / 3 * 0.7
+    assert any(a.tolist() != whole[0].tolist() for a in whole[1:])
+    other = plan(seed=1).step(0)[0].variants
+    assert other.tolist() != whole[0].tolist()
+
+
+def test_variants_share_no_random_numbers_with_a_part(
+    plan: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(FeatureStore, "variants", 2**30)
+    found = plan(seed=5).step(3)[0].variants.tolist()
+    for part in range(8):
+        for entropy in ((5, 3), (5, 3, part), (5, 3, part, 0)):
+            rng = np.random.default_rng(entropy)
+            assert rng.integers(2**30, size=8).tolist() != found
+
+
+@pytest.mark.parametrize("parts", [2, 3, 8])
+def test_accumulated_gradients_are_those_of_the_whole_batch(
+    store: FeatureStore, params: Make, trainer: Make, tmp_path: Path, parts: int
+) -> None:
+    """Without dropout; ticks near an episode's end give the parts unequal weight."""
+    still = {"expert": {"dim": 16, "layers": 1, "heads": 2, "dropout": 0.0}, "horizon": 12}
+    runs: list[Trainer] = []
+    for accumulation in (1, parts):
+        run = trainer(
+            store,
+            params(
+                **still,
+                max_steps=8,
+                grad_accumulation=accumulation,
+                output=tmp_path / f"by_{accumulation}",
+            ),
+        )
+        run.fit()
+        runs.append(run)
+    whole, cut = (run.history.tensor() for run in runs)
+    assert torch.allclose(whole, cut, rtol=1e-4)
+    for a, b in zip(runs[0].policy.parameters(), runs[1].policy.parameters(), strict=True):
+        assert torch.allclose(a, b, atol=1e-4)

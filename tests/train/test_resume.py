@@ -1,0 +1,121 @@
+"""From whichever step a run goes on, it does what it would have done."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from pipeline.base.errors import CheckpointMismatch
+from pipeline.store import FeatureStore
+from pipeline.train.loop import Trainer
+from pipeline.train.run import open_run
+from pipeline.train.state import read_trainer
+from pipeline.train.world import World
+
+Make = Callable[..., Any]
+STEPS = 5
+
+
+def weights(trainer: Trainer) -> list[torch.Tensor]:
+    both = (trainer.policy.state_dict(), trainer.averaged.state_dict())
+    return [value.clone() for state in both for value in state.values()]
+
+
+@pytest.mark.parametrize("model_type", ["regression", "diffusion", "flow_matching"])
+@pytest.mark.parametrize("accumulation", [1, 3])
+def test_every_step_can_be_gone_on_from(
+    store: FeatureStore,
+    params: Make,
+    trainer: Make,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    model_type: str,
+    accumulation: int,
+) -> None:
+    chosen = {
+        "model_type": model_type,
+        "grad_accumulation": accumulation,
+        "max_steps": STEPS,
+        "warmup_steps": 2,
+        "eval_every": 2,
+        "checkpoint_every": 1,
+        "drop_sensor": 0.3,
+        "sensor_lr": 1e-3,
+        "diffusion": {"sampling_steps": 2},
+        "flow_matching": {"sampling_steps": 2},
+    }
+    kept = tmp_path / "kept"
+    real = Trainer._save_last
+
+    def keeping(self: Trainer, *rest: Any) -> None:
+        real(self, *rest)
+        shutil.copytree(self.run.part, kept / str(self.step))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Trainer, "_save_last", keeping)
+        whole = trainer(store, params(**chosen))
+        whole.fit()
+    for step in range(1, STEPS + 1):
+        output = tmp_path / f"from_{step}"
+        shutil.copytree(kept / str(step), output.with_name(f"{output.name}.part"))
+        resumed = trainer(store, params(**chosen, output=output, logs=tmp_path / f"logs_{step}"))
+        assert (resumed.run.status, resumed.step) == ("resumed", step)
+        resumed.fit()
+        assert torch.equal(resumed.history.tensor(), whole.history.tensor())
+        for a, b in zip(weights(resumed), weights(whole), strict=True):
+            assert torch.equal(a, b)
+        assert resumed.standing == whole.standing
+
+
+@pytest.fixture(scope="module")
+def of_two_parts(
+    store: FeatureStore,
+    params_below: Make,
+    trainer: Make,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Path:
+    """A finished run of two parts a step, to be copied."""
+    chosen = params_below(tmp_path_factory.mktemp("parts"), grad_accumulation=2, max_steps=2)
+    trainer(store, chosen).fit()
+    return chosen.output
+
+
+@pytest.mark.parametrize(
+    ("size", "accumulation", "status"),
+    [(1, 2, "finished"), (2, 1, "finished"), (1, 4, "new"), (1, 1, "new"), (2, 2, "new")],
+)
+def test_parts_may_be_shared_out_anew_but_not_cut_anew(
+    store: FeatureStore,
+    params: Make,
+    monkeypatch: pytest.MonkeyPatch,
+    of_two_parts: Path,
+    size: int,
+    accumulation: int,
+    status: str,
+) -> None:
+    """What one process of two parts did is the run of two processes of one part, and no other."""
+    shutil.copytree(of_two_parts, params().output)
+    monkeypatch.setenv("WORLD_SIZE", str(size))
+    monkeypatch.setattr(World, "current", lambda: World(0, size))
+    given = params(grad_accumulation=accumulation, max_steps=2)
+    assert open_run(given, store).status == status
+    assert open_run(given, store, {"adapter": "another"}).status == "new"
+
+
+def test_weights_of_another_module_are_refused(
+    store: FeatureStore, params: Make, trainer: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun = trainer(store, params())
+    begun.run.begin()
+    begun.step = 1
+    begun.history.add({"loss": torch.tensor(1.0)})
+    begun.history.settle()
+    begun._checkpoints.save_last(begun.averaged, {}, begun._state((), 0.0))
+    state = read_trainer(begun.run.last)
+    name = next(iter(state.weights))
+    begun.learner.learning.pop(name)
+    with pytest.raises(CheckpointMismatch, match="expected what learns in this run"):
+        begun.learner.restore(state, begun.run.last)

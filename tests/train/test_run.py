@@ -1,0 +1,314 @@
+"""What a start finds at its output decides what it does, and nothing of another's is lost."""
+
+import os
+import shutil
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.base.durable import read_document
+from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch, ConfigError
+from pipeline.base.ownership import MARKER
+from pipeline.store import FeatureStore
+from pipeline.train.identity import TRAINER_VERSION
+from pipeline.train.loop import Trainer
+from pipeline.train.run import RUN_FOLDER, open_run
+
+Make = Callable[..., Any]
+
+
+class Stop(Exception):
+    """Stands for the end of the process."""
+
+
+@pytest.fixture(scope="session")
+def params_below(params_below: Make) -> Make:
+    """Of few steps: what is asked here is not how well it learns."""
+    return partial(params_below, max_steps=6, warmup_steps=2, eval_every=3, checkpoint_every=2)
+
+
+@pytest.fixture(scope="module")
+def runs(
+    store: FeatureStore,
+    params_below: Make,
+    trainer: Make,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Path:
+    """`head`, which is finished, and `stopped.part`, stopped at step 5; both to be copied."""
+    folder = tmp_path_factory.mktemp("runs")
+    trainer(store, params_below(folder)).fit()
+    real = Trainer._train_step
+
+    def killed(self: Trainer, *rest: Any) -> bool:
+        if self.step == 5:
+            raise Stop
+        return real(self, *rest)
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(Trainer, "_train_step", killed)
+        with pytest.raises(Stop):
+            trainer(store, params_below(folder, output=folder / "stopped")).fit()
+    return folder
+
+
+@pytest.fixture
+def finished(runs: Path, params: Make) -> Path:
+    """The output of a run that has come to its end."""
+    return shutil.copytree(runs / "head", params().output)
+
+
+@pytest.fixture
+def unfinished(runs: Path, params: Make) -> Path:
+    """The folder of a run stopped at step 5, its last checkpoint at step 4."""
+    return shutil.copytree(runs / "stopped.part", params().output.with_name("head.part"))
+
+
+def test_a_finished_run_is_left_alone(store: FeatureStore, params: Make, trainer: Make) -> None:
+    trainer(store, params()).fit()
+    leftover = params().output / "last" / "trainer.json"
+    leftover.touch()  # killed between renaming and tidying
+    assert len(open_run(params(), store).notes) == 1
+    run = open_run(params(device="cpu", logs="elsewhere", checkpoint_every=1), store)
+    assert run.status == "finished"
+    assert f"left where they were written, in {params().logs}, not in elsewhere" in run.notes[1]
+    assert not leftover.exists()
+
+
+def test_another_run_replaces_a_finished_one_when_it_is_finished(
+    store: FeatureStore, params: Make, trainer: Make, finished: Path
+) -> None:
+    other = trainer(store, params(seed=5))
+    assert other.run.status == "new"
+    assert "holds another run" in other.run.notes[0]
+    assert read_document(params().output / "run.json")["decides"]["train_head"]["seed"] == 0
+    other.fit()
+    assert read_document(params().output / "run.json")["decides"]["train_head"]["seed"] == 5
+    assert sorted(p.name for p in params().output.parent.glob("head*")) == ["head"]
+
+
+def test_other_params_move_an_unfinished_run_aside(
+    store: FeatureStore, params: Make, unfinished: Path
+) -> None:
+    aside = unfinished.with_name("head.part-old")
+    run = open_run(params(lr=0.5, expert={"dim": 16, "heads": 4}), store)
+    assert run.status == "new"
+    assert not aside.exists()
+    run.begin()
+    assert "train_head.lr: 0.003 (that run), 0.5 (now)" in run.notes[0]
+    assert "train_head.expert.heads: 2 (that run), 4 (now)" in run.notes[0]
+    assert (aside / "last" / "policy.json").exists()
+    assert os.listdir(unfinished) == ["run.json"]
+    # One that has only begun does not replace what was put aside before.
+    run = open_run(params(lr=0.25), store)
+    assert run.notes == ()
+    run.begin()
+    assert read_document(unfinished / "run.json")["decides"]["train_head"]["lr"] == 0.25
+    assert read_document(aside / "run.json")["decides"]["train_head"]["lr"] == 0.003
+
+
+def test_a_run_put_aside_gives_way_to_the_next(
+    store: FeatureStore, params: Make, trainer: Make, unfinished: Path
+) -> None:
+    aside = unfinished.with_name("head.part-old")
+    shutil.copytree(unfinished, aside)
+    (aside / "run.json").write_text("older")
+    trainer(store, params(lr=0.5, max_steps=1)).fit()
+    assert read_document(aside / "run.json")["decides"]["train_head"]["lr"] == 0.003
+
+
+def test_nothing_is_written_before_the_params_are_known_to_be_good(
+    store: FeatureStore, params: Make, trainer: Make, unfinished: Path
+) -> None:
+    before = sorted(unfinished.rglob("*"))
+    with pytest.raises(ConfigError):
+        trainer(store, params(mixture={"middle": 1.0}))
+    assert sorted(unfinished.rglob("*")) == before
+    assert not unfinished.with_name("head.part-old").exists()
+
+
+def test_other_features_or_streams_are_refused(
+    store: FeatureStore,
+    params: Make,
+    unfinished: Path,
+    tiny_store: Callable[..., Path],
+    tmp_path: Path,
+) -> None:
+    other = FeatureStore.open(
+        tiny_store(tmp_path, name="other", spec_digest="another", state_dim=0, reuse=5)
+    )
+    with pytest.raises(CheckpointMismatch) as caught:
+        open_run(params(), other)
+    said = str(caught.value)
+    assert 'feature_spec.digest: "tiny-spec" (the run), "another" (the store now)' in said
+    assert "streams.state.names" in said
+    assert "vlm_reuse_count: 3 (the run), 5 (the store now)" in said
+    assert f"Remove {unfinished}" in said
+    assert (unfinished / "last").exists()
+
+
+def test_other_recordings_of_the_same_kind_begin_anew(
+    store: FeatureStore,
+    params: Make,
+    unfinished: Path,
+    tiny_store: Callable[..., Path],
+    tmp_path: Path,
+) -> None:
+    more = FeatureStore.open(tiny_store(tmp_path, name="more", episodes=7))
+    run = open_run(params(), more)
+    assert run.status == "new"
+    assert "recordings.episodes: 6 (that run), 7 (now)" in run.notes[0]
+
+
+@pytest.mark.parametrize("half", ["new", "old"])
+def test_a_checkpoint_swap_that_was_killed_is_recovered(
+    store: FeatureStore, params: Make, trainer: Make, unfinished: Path, half: str
+) -> None:
+    last = unfinished / "last"
+    if half == "new":  # killed while writing: the old one still stands
+        (unfinished / "last.new").mkdir()
+    else:  # killed between the two renames
+        last.rename(unfinished / "last.old")
+    assert trainer(store, params()).step == 4
+
+
+@pytest.mark.parametrize("file", ["trainer.safetensors", "policy.safetensors", "trainer.json"])
+def test_a_truncated_checkpoint_is_named(
+    store: FeatureStore, params: Make, trainer: Make, unfinished: Path, file: str
+) -> None:
+    path = unfinished / "last" / file
+    path.write_bytes(path.read_bytes()[:-20])
+    with pytest.raises(CheckpointIncomplete, match=f"{file}: the checkpoint is damaged"):
+        trainer(store, params())
+
+
+@pytest.mark.parametrize(
+    ("file", "entry", "altered"),
+    [
+        ("last/trainer.json", '"step": 4', '"step": 2'),
+        ("last/policy.json", '"horizon": 3', '"horizon": 2'),
+        ("run.json", '"lr": 0.003', '"lr": 0.03'),
+    ],
+)
+def test_an_altered_document_of_a_run_is_named(
+    store: FeatureStore,
+    params: Make,
+    trainer: Make,
+    unfinished: Path,
+    file: str,
+    entry: str,
+    altered: str,
+) -> None:
+    path = unfinished / file
+    assert entry in path.read_text()
+    path.write_text(path.read_text().replace(entry, altered, 1))
+    with pytest.raises(CheckpointIncomplete, match=rf"{file}: .*damaged: it was altered"):
+        trainer(store, params())
+
+
+def test_a_finish_that_was_killed_is_recovered(
+    store: FeatureStore, params: Make, finished: Path
+) -> None:
+    output = finished
+    held = output.with_name("head.replaced")
+    held.mkdir()
+    (held / MARKER).write_text("a folder that is being replaced,\n")
+    output.rename(held / "head")
+    assert open_run(params(), store).status == "finished"
+    shutil.copytree(output, held / "head")
+    (held / MARKER).write_text("a folder that is being replaced,\n")
+    assert open_run(params(), store).status == "finished"
+    assert not held.exists()
+
+
+def test_what_no_training_wrote_is_never_replaced(store: FeatureStore, params: Make) -> None:
+    output = params().output
+    output.mkdir()
+    assert open_run(params(), store).status == "new"
+    (output / "thesis.tex").write_text("years of work")
+    with pytest.raises(ConfigError, match="no training run"):
+        open_run(params(), store)
+    assert (output / "thesis.tex").exists()
+
+
+@pytest.mark.parametrize("beside", [None, "best", "models"])
+@pytest.mark.parametrize("document", ["[1, 2]", "{", '{"sweep": 3}'])
+def test_a_run_json_of_another_program_makes_no_training_run(
+    store: FeatureStore, params: Make, document: str, beside: str | None
+) -> None:
+    output = params().output
+    output.mkdir()
+    (output / "run.json").write_text(document)
+    (output / "thesis.tex").write_text("years of work")
+    if beside:
+        (output / beside).mkdir()
+        (output / beside / "policy.json").write_text("{}")
+    if beside == "best":  # a run of ours whose run.json was damaged
+        assert RUN_FOLDER.owns(output)
+    else:
+        with pytest.raises(ConfigError, match="no training run"):
+            open_run(params(), store)
+
+
+def test_checkpoints_without_their_run_are_not_guessed_at(
+    store: FeatureStore, params: Make, unfinished: Path
+) -> None:
+    (unfinished / "run.json").unlink()
+    with pytest.raises(ConfigError, match=r"no run\.json"):
+        open_run(params(), store)
+
+
+@pytest.mark.parametrize("harm", ["remove", "truncate"])
+@pytest.mark.parametrize(
+    "file", ["best/policy.json", "best/policy.safetensors", "last/policy.json", "best"]
+)
+def test_a_damaged_finished_run_is_trained_again(
+    store: FeatureStore, params: Make, trainer: Make, finished: Path, harm: str, file: str
+) -> None:
+    path = finished / file
+    if path.is_dir():
+        shutil.rmtree(path)
+    elif harm == "remove":
+        path.unlink()
+    else:
+        path.write_bytes(path.read_bytes()[:-20])
+    again = trainer(store, params())
+    assert again.run.status == "new"
+    assert "this very run, but damaged; it is trained again" in again.run.notes[0]
+    again.fit()
+    assert open_run(params(), store).status == "finished"
+
+
+@pytest.mark.parametrize("file", ["last/trainer.json", "last/policy.json", "run.json"])
+def test_the_advice_of_a_damaged_unfinished_run_leads_out(
+    store: FeatureStore, params: Make, trainer: Make, unfinished: Path, file: str
+) -> None:
+    (unfinished / file).write_text("{}")
+    with pytest.raises((CheckpointIncomplete, CheckpointMismatch)) as caught:
+        trainer(store, params())
+    if file != "last/policy.json":  # an empty one says another format
+        assert f"{unfinished / file}: the checkpoint is damaged" in str(caught.value)
+        assert f"Remove {(unfinished / file).parent} and run" in str(caught.value)
+    shutil.rmtree((unfinished / file).parent)
+    trainer(store, params()).fit()
+    assert open_run(params(), store).status == "finished"
+
+
+def test_a_run_without_a_checkpoint_refuses_no_other_store(
+    store: FeatureStore, params: Make, tiny_store: Callable[..., Path], tmp_path: Path
+) -> None:
+    open_run(params(), store).begin()
+    other = FeatureStore.open(tiny_store(tmp_path, name="other", spec_digest="another"))
+    run = open_run(params(), other)
+    assert (run.status, run.notes) == ("new", ())
+
+
+def test_code_of_other_numbers_goes_on_with_no_run(
+    store: FeatureStore, params: Make, unfinished: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipeline.train.identity.TRAINER_VERSION", 99)
+    run = open_run(params(), store)
+    assert run.status == "new"
+    assert f"trainer_version: {TRAINER_VERSION} (that run), 99 (now)" in run.notes[0]

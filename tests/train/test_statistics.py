@@ -1,0 +1,129 @@
+"""The normalisation sees what training may see, once, and nothing else."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+
+from pipeline.base.errors import NumericsError
+from pipeline.store import FeatureStore
+from pipeline.train.statistics import fit_normalization
+
+
+@pytest.mark.parametrize("chunk_bytes", [1, 500, 2**26])
+def test_statistics_are_those_of_the_training_ticks(
+    store: FeatureStore, monkeypatch: pytest.MonkeyPatch, chunk_bytes: int
+) -> None:
+    monkeypatch.setattr("pipeline.train.statistics.CHUNK_BYTES", chunk_bytes)
+    # All of episode 1, and of episode 4 the first 7 ticks: a tail is held out.
+    ticks = np.concatenate([np.arange(30, 60), np.arange(120, 127)])
+    found = fit_normalization(store, ticks)
+
+    action = store.array("tick/action")[ticks]
+    rows = [*range(10, 20), 40, 41, 42]
+    features = store.array("vl/features")[rows]
+    sensor = store.array("sensor/values")[[*range(240, 480), *range(960, 960 + 7 * 8)]]
+    state = store.array("state/values")[[*range(120, 240), *range(480, 480 + 7 * 4)]]
+    for name, values in (
+        ("action", action),
+        ("features", features),
+        ("sensor", sensor),
+        ("state", state),
+    ):
+        statistics = getattr(found, name)
+        assert statistics.count == len(values), name
+        assert statistics.mean == pytest.approx(values.mean(0, np.float64), abs=1e-6), name
+        assert statistics.std == pytest.approx(values.std(0, np.float64), abs=1e-6), name
+
+
+@pytest.mark.parametrize("chunk_bytes", [1, 2**26])
+def test_features_are_counted_over_all_variants(
+    tiny_store: Callable[..., Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    chunk_bytes: int,
+) -> None:
+    monkeypatch.setattr("pipeline.train.statistics.CHUNK_BYTES", chunk_bytes)
+    path = tiny_store(tmp_path, slots=6)
+    zarr.open_group(path, mode="r+").attrs["feature_spec"] = {"digest": "x", "variants": 3}
+    store = FeatureStore.open(path)
+    store.array("vl/slot_valid")[10:13, [1, 3, 5]] = 0
+    found = fit_normalization(store, np.arange(30, 60)).features
+    assert found is not None
+    assert found.mean.shape == (2, 8)
+    assert found.count == 3 * 10
+    for slot, rows in ((0, range(10, 20)), (1, range(13, 20))):
+        values = store.array("vl/features")[rows, slot::2].reshape(-1, 8)
+        assert found.mean[slot] == pytest.approx(values.mean(0, np.float64), abs=1e-6)
+        assert found.std[slot] == pytest.approx(values.std(0, np.float64), abs=1e-6)
+
+    store.array("vl/features")[12, 5, 3] = np.nan
+    fit_normalization(store, np.arange(30, 60))  # there, that slot is not valid
+    store.array("vl/features")[14, 5, 3] = np.nan
+    with pytest.raises(
+        NumericsError, match=r"episode_001, VL row 4 .*, channel 1, 3 of variant 2, in "
+    ):
+        fit_normalization(store, np.arange(30, 60))
+
+
+def test_absent_streams_have_none_and_bfloat16_is_read(
+    tiny_store: Callable[..., Path], tmp_path: Path
+) -> None:
+    store = FeatureStore.open(
+        tiny_store(tmp_path, sensor_channels=0, state_dim=0, dtype="bfloat16")
+    )
+    found = fit_normalization(store, np.arange(store.ticks))
+    assert found.sensor is None
+    assert found.state is None
+    assert found.features is not None
+    batch = store.gather(np.arange(0, store.ticks, store.vlm_reuse_count))
+    expected = batch.features.double().numpy()
+    assert found.features.mean == pytest.approx(expected.mean(0), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("array", "row", "said"),
+    [
+        ("tick/action", (37, 3), "right/episode_001, tick 7 (at 0.700 s), channel 'da'"),
+        ("vl/features", (12, 1, 4), "right/episode_001, VL row 2 (at 0.600 s), channel 1, 4"),
+        ("sensor/values", (245, 2), "right/episode_001, sensor reading 5 (at 0.062 s)"),
+        ("state/values", (121, 0), "right/episode_001, state reading 1 (at 0.025 s)"),
+    ],
+)
+def test_a_number_that_is_none_is_named_by_episode_and_time(
+    tiny_store: Callable[..., Path], tmp_path: Path, array: str, row: tuple[int, ...], said: str
+) -> None:
+    store = FeatureStore.open(tiny_store(tmp_path))
+    store.array(array)[row] = np.nan
+    with pytest.raises(NumericsError) as caught:
+        fit_normalization(store, np.arange(30, 60))
+    assert said in str(caught.value)
+    assert "found nan" in str(caught.value)
+
+
+def test_no_ticks_are_no_statistics(tiny_store: Callable[..., Path], tmp_path: Path) -> None:
+    with pytest.raises(NumericsError, match="no rows"):
+        fit_normalization(FeatureStore.open(tiny_store(tmp_path)), np.arange(0))
+
+
+@pytest.mark.parametrize("chunk_bytes", [300, 2**26])
+def test_threads_change_no_bit(
+    tiny_store: Callable[..., Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    chunk_bytes: int,
+) -> None:
+    monkeypatch.setattr("pipeline.train.statistics.CHUNK_BYTES", chunk_bytes)
+    monkeypatch.setattr("pipeline.train.statistics.THREAD_BYTES", 0)
+    monkeypatch.setattr("pipeline.policy.normalization._PIECE_VALUES", 40)
+    store = FeatureStore.open(tiny_store(tmp_path))
+    store.array("vl/slot_valid")[12, 1] = 0
+    ticks = np.arange(20, 160)
+    alone = fit_normalization(store, ticks, threads=1).document()
+    assert fit_normalization(store, ticks, threads=3).document() == alone
+
+    store.array("state/values")[121, 0] = np.inf
+    with pytest.raises(NumericsError, match=r"episode_001, state reading 1 \(at 0.025 s\)"):
+        fit_normalization(store, ticks, threads=3)
