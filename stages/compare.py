@@ -17,9 +17,9 @@ if __name__ == "__main__":  # here, for --help waits for no import below
 from pipeline.base.config import Params
 from pipeline.base.durable import disk_full_named, fresh
 from pipeline.base.ownership import REPORT, OutputKind, begins_with, claim, refuse_foreign
-from pipeline.evaluation.cells import write_rows
-from pipeline.evaluation.experiment_tables import experiment_rows, experiments_table
-from pipeline.evaluation.experiments import read_experiments
+from pipeline.evaluate.cells import write_rows
+from pipeline.evaluate.experiment_tables import experiment_rows, experiments_table
+from pipeline.evaluate.experiments import read_experiments
 from pipeline.report import write_report
 from pipeline.report.evaluation.comparison import comparison_report
 

@@ -20,9 +20,9 @@ from pipeline.base.config import Params
 from pipeline.base.device import resolve_device
 from pipeline.base.durable import write_document
 from pipeline.base.ownership import REPORT, claim, refuse_foreign
-from pipeline.evaluation.judged import JUDGED, Judgement, judgement
-from pipeline.evaluation.modality_tables import modality_table
-from pipeline.evaluation.tables import table, write_tables
+from pipeline.evaluate.ablation_tables import modality_table
+from pipeline.evaluate.evaluation import JUDGED, Judgement, judgement
+from pipeline.evaluate.tables import table, write_tables
 from pipeline.policy.checkpoint import PolicyCheckpoint, find_policy, load_policy
 from pipeline.report import write_report
 from pipeline.report.evaluation.evaluation import evaluation_report

@@ -12,12 +12,12 @@ import pytest
 from matplotlib.figure import Figure
 
 from pipeline import plots
-from pipeline.evaluation.curves import Curve, Curves
-from pipeline.evaluation.experiments import Experiment
-from pipeline.evaluation.modalities import ModalityStudy, Spoilt
+from pipeline.evaluate.ablation import ModalityStudy, Spoilt
+from pipeline.evaluate.curves import Curve, Curves
+from pipeline.evaluate.experiments import Experiment
+from pipeline.evaluate.probe import Finding, Folds, Score, SlotName, Study
 from pipeline.plots import probe
 from pipeline.plots.style import write
-from pipeline.probing import Finding, Folds, Score, SlotName, Study
 from pipeline.train.predictions import Predictions, baselines
 from pipeline.train.scores import Comparison, Group, compare
 

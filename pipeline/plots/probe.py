@@ -9,8 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
+from pipeline.evaluate.probe import Finding, SlotName, Study, ranked
 from pipeline.plots.style import RECORDED, canvas, legend_below, write
-from pipeline.probing import Finding, SlotName, Study, ranked
 
 _BARS = 20
 """Choices that a picture still shows legibly."""

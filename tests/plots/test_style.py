@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from pipeline.evaluation.curves import Curve, Curves
+from pipeline.evaluate.curves import Curve, Curves
 from pipeline.inspection.facts import Clock
 from pipeline.plots import style
 from pipeline.plots.evaluation.curves import curves

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.evaluation.curves import Curve, Curves
-from pipeline.evaluation.experiments import Experiment
-from pipeline.evaluation.footage import Footage
-from pipeline.evaluation.judged import Judgement, judged_document
-from pipeline.evaluation.modalities import judge_modalities
+from pipeline.evaluate.ablation import judge_modalities
+from pipeline.evaluate.curves import Curve, Curves
+from pipeline.evaluate.episode_frames import Footage
+from pipeline.evaluate.evaluation import Judgement, judged_document
+from pipeline.evaluate.experiments import Experiment
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.normalization import ChannelStatistics, Normalization
 from pipeline.policy.policy import Policy

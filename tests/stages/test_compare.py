@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 import yaml
 
-from pipeline.evaluation.experiments import read_experiments
-from pipeline.evaluation.judged import JUDGED
+from pipeline.evaluate.evaluation import JUDGED
+from pipeline.evaluate.experiments import read_experiments
 from pipeline.train.predictions import BASELINES
 from stages import compare, evaluate, train_head
 from stages.command import run

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from numpy.typing import NDArray
 
-from pipeline.evaluation.names import with_unit
+from pipeline.evaluate.names import with_unit
 from pipeline.plots.evaluation.predictions import short_name
 from pipeline.plots.style import INK, PALETTE, RECORDED, STYLES, canvas
 from pipeline.store import Episode, FeatureStore

@@ -3,7 +3,7 @@
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from pipeline.evaluation.curves import Curve, Curves
+from pipeline.evaluate.curves import Curve, Curves
 from pipeline.plots.style import INK, PALETTE, canvas, logarithmic
 
 _PANELS = {

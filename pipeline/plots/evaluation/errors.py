@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from pipeline.evaluation.names import with_unit
+from pipeline.evaluate.names import with_unit
 from pipeline.plots.evaluation.predictions import marked
 from pipeline.plots.style import LABELS, canvas, legend_below
 from pipeline.train.predictions import METHODS

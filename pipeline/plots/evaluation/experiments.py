@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from pipeline.evaluation.experiments import Experiment
+from pipeline.evaluate.experiments import Experiment
 from pipeline.plots.style import LABELS, STYLES, canvas
 from pipeline.train.predictions import BASELINES
 

@@ -3,9 +3,9 @@
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from pipeline.evaluation.modalities import ModalityStudy, Spoilt
-from pipeline.evaluation.modality_tables import FOOTNOTE as MODALITY_FOOTNOTE
-from pipeline.evaluation.modality_tables import best_baseline
+from pipeline.evaluate.ablation import ModalityStudy, Spoilt
+from pipeline.evaluate.ablation_tables import FOOTNOTE as MODALITY_FOOTNOTE
+from pipeline.evaluate.ablation_tables import best_baseline
 from pipeline.plots.style import GRID, INK, LABELS, STYLES, canvas, legend_below
 
 COLOURS = {

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from pipeline.evaluation.names import with_unit
+from pipeline.evaluate.names import with_unit
 from pipeline.plots.style import LABELS, RECORDED, STYLES, canvas, legend_below
 from pipeline.store import Episode, FeatureStore, episode_name
 from pipeline.train.predictions import METHODS, Predictions

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from functools import partial
 
 from pipeline import plots
-from pipeline.evaluation.experiment_tables import experiment_errors
-from pipeline.evaluation.experiments import Experiment
-from pipeline.evaluation.tables import FOOTNOTE
+from pipeline.evaluate.experiment_tables import experiment_errors
+from pipeline.evaluate.experiments import Experiment
+from pipeline.evaluate.tables import FOOTNOTE
 from pipeline.report.page.blocks import Picture, Report, Section, Table
 from pipeline.report.page.cells import sentence
 

@@ -5,10 +5,10 @@ from functools import cache, partial
 
 from pipeline import plots
 from pipeline.base.digests import file_digest
-from pipeline.evaluation.footage import footage, shown_ticks
-from pipeline.evaluation.judged import Judgement
-from pipeline.evaluation.modality_tables import best_baseline
-from pipeline.evaluation.tables import HEADINGS
+from pipeline.evaluate.ablation_tables import best_baseline
+from pipeline.evaluate.episode_frames import footage, shown_ticks
+from pipeline.evaluate.evaluation import Judgement
+from pipeline.evaluate.tables import HEADINGS
 from pipeline.report.page.blocks import Block, Picture, Section, Table, Text
 from pipeline.store import episode_name
 from pipeline.train.batches import Ticks

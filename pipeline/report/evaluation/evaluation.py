@@ -5,12 +5,12 @@ from functools import partial
 from typing import Any
 
 from pipeline import plots
-from pipeline.evaluation.judged import Judgement
-from pipeline.evaluation.modalities import ModalityStudy
-from pipeline.evaluation.modality_tables import FOOTNOTE as MODALITY_FOOTNOTE
-from pipeline.evaluation.modality_tables import best_baseline, judged_on, modality_errors
-from pipeline.evaluation.names import with_unit
-from pipeline.evaluation.tables import FOOTNOTE, HEADINGS, error_rows, still_dimensions
+from pipeline.evaluate.ablation import ModalityStudy
+from pipeline.evaluate.ablation_tables import FOOTNOTE as MODALITY_FOOTNOTE
+from pipeline.evaluate.ablation_tables import best_baseline, judged_on, modality_errors
+from pipeline.evaluate.evaluation import Judgement
+from pipeline.evaluate.names import with_unit
+from pipeline.evaluate.tables import FOOTNOTE, HEADINGS, error_rows, still_dimensions
 from pipeline.report.evaluation.episodes import episodes, extremes
 from pipeline.report.page.blocks import Block, Document, Picture, Report, Section, Table, Text
 from pipeline.report.page.cells import sentence

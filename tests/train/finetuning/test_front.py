@@ -13,9 +13,9 @@ from torch import nn
 
 from pipeline.base.config import Params
 from pipeline.base.errors import CheckpointMismatch, ConfigError
-from pipeline.policy.live_policy import LivePolicy
 from pipeline.extract import extract
 from pipeline.policy.checkpoint import find_policy, load_policy
+from pipeline.policy.live_policy import LivePolicy
 from pipeline.store import FeatureStore
 from pipeline.train.batches import Draw, Windows
 from pipeline.train.finetuning import Live, head_params, out_of_memory_named

@@ -6,8 +6,8 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.probing.ridge import Score, standard_error
-from pipeline.probing.run import Finding, Study
+from pipeline.evaluate.probe.ridge import Score, standard_error
+from pipeline.evaluate.probe.run import Finding, Study
 
 Reading = Literal["beside", "alone"]
 """Together with state + sensor, or by itself."""

@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.base.config import ProbeParams
 from pipeline.base.errors import NumericsError
-from pipeline.probing import (
+from pipeline.evaluate.probe import (
     Finding,
     Folds,
     Score,
@@ -181,7 +181,7 @@ def test_only_the_plain_variant_is_read(
 def test_a_wide_group_is_read_along_its_main_directions(
     store: FeatureStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.probing.readers.GROUP_WIDTH", 12)
+    monkeypatch.setattr("pipeline.evaluate.probe.readers.GROUP_WIDTH", 12)
     (group,) = probed(store).groups
     assert (group.channels, group.inputs) == (24, 12)
     assert "24 channels are read along 12 main directions, 4 a slot, of" in table(probed(store))
@@ -192,7 +192,7 @@ def test_threads_and_memory_change_no_bit(
     store: FeatureStore, monkeypatch: pytest.MonkeyPatch, changed: dict[str, int]
 ) -> None:
     before = probed(store, threads=1)
-    monkeypatch.setattr("pipeline.probing.run.MEMORY_BYTES", 1)
+    monkeypatch.setattr("pipeline.evaluate.probe.run.MEMORY_BYTES", 1)
     after = probed(store, **changed)
     for one, other in zip(
         [*before.slots, *before.groups], [*after.slots, *after.groups], strict=True
@@ -207,9 +207,9 @@ def test_blocks_change_nothing_but_rounding(
     store: FeatureStore, monkeypatch: pytest.MonkeyPatch, blocks: int
 ) -> None:
     before = probed(store)
-    monkeypatch.setattr("pipeline.probing.accumulation._BLOCK_ROWS", 3)
-    monkeypatch.setattr("pipeline.probing.accumulation._LEAST_ROWS", 1)
-    monkeypatch.setattr("pipeline.probing.accumulation._BLOCK_BYTES", blocks)
+    monkeypatch.setattr("pipeline.evaluate.probe.accumulation._BLOCK_ROWS", 3)
+    monkeypatch.setattr("pipeline.evaluate.probe.accumulation._LEAST_ROWS", 1)
+    monkeypatch.setattr("pipeline.evaluate.probe.accumulation._BLOCK_BYTES", blocks)
     after = probed(store)
     for one, other in zip(before.slots, after.slots, strict=True):
         assert one.beside is not None

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pipeline.base.errors import StoreMismatch
-from pipeline.probing import fold_by_recording
+from pipeline.evaluate.probe import fold_by_recording
 from pipeline.store import FeatureStore
 
 

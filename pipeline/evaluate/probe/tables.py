@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from pipeline.base.durable import write_document
-from pipeline.evaluation.cells import aligned, cell, numbers, write_rows
-from pipeline.probing.ranking import gain_error, ranked, recommend
-from pipeline.probing.ridge import Score
-from pipeline.probing.run import Finding, Study
+from pipeline.evaluate.cells import aligned, cell, numbers, write_rows
+from pipeline.evaluate.probe.ranking import gain_error, ranked, recommend
+from pipeline.evaluate.probe.ridge import Score
+from pipeline.evaluate.probe.run import Finding, Study
 
 TOP = 12
 """Slots that are printed; the tables have all."""

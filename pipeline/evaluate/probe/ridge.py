@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pipeline.base.errors import NumericsError
-from pipeline.probing.moments import Moments, total, variance
-from pipeline.probing.projection import STILL
+from pipeline.evaluate.probe.moments import Moments, total, variance
+from pipeline.evaluate.probe.projection import STILL
 
 
 @dataclass(frozen=True, eq=False)

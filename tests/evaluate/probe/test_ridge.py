@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from pipeline.base.errors import NumericsError
-from pipeline.probing.moments import Moments
-from pipeline.probing.ridge import Score, cross_validate
+from pipeline.evaluate.probe.moments import Moments
+from pipeline.evaluate.probe.ridge import Score, cross_validate
 
 PENALTIES = (1e-3, 1e-1, 1.0, 30.0)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import zarr
 
-from pipeline.probing.projection import LIMIT, STILL
+from pipeline.evaluate.probe.projection import LIMIT, STILL
 from pipeline.store import FeatureStore
 
 Rewrite = Callable[[FeatureStore, np.random.Generator], None]

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from pipeline.evaluation.corruption import (
+from pipeline.evaluate.corruption import (
     FIELDS,
     Alter,
     donors_of,

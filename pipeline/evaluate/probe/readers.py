@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pipeline.base.errors import NumericsError
-from pipeline.probing.projection import Projection
+from pipeline.evaluate.probe.projection import Projection
 from pipeline.store import FeatureStore, place
 
 GROUP_WIDTH = 1024

@@ -10,7 +10,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from pipeline.base.errors import NumericsError
-from pipeline.probing.projection import GroupedProjection
+from pipeline.evaluate.probe.projection import GroupedProjection
 from pipeline.store import Batch, FeatureStore, place
 from pipeline.train.batches import Prefetch, Windows, draws
 

@@ -3,9 +3,9 @@
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from pipeline.evaluation.cells import aligned, cell, ratio
-from pipeline.evaluation.modalities import ModalityStudy
-from pipeline.evaluation.names import with_unit
+from pipeline.evaluate.ablation import ModalityStudy
+from pipeline.evaluate.cells import aligned, cell, ratio
+from pipeline.evaluate.names import with_unit
 from pipeline.train.predictions import BASELINES
 from pipeline.train.scores import Comparison
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pipeline.base.errors import DiskFull
-from pipeline.evaluation.tables import FOOTNOTE, metrics, table, write_tables
+from pipeline.evaluate.tables import FOOTNOTE, metrics, table, write_tables
 from pipeline.store import FeatureStore
 from pipeline.train.predictions import BASELINES, Predictions
 from pipeline.train.scores import Comparison

@@ -8,8 +8,8 @@ from typing import Any
 import torch
 
 from pipeline.base.config import EvaluateParams
-from pipeline.evaluation.curves import Curves, read_curves
-from pipeline.evaluation.modalities import ModalityStudy, judge_modalities
+from pipeline.evaluate.ablation import ModalityStudy, judge_modalities
+from pipeline.evaluate.curves import Curves, read_curves
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.policy import Trainable
 from pipeline.store import FeatureStore

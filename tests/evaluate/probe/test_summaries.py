@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from pipeline.base.errors import NumericsError
-from pipeline.probing.projection import LIMIT, STILL, Projection, main_directions
-from pipeline.probing.summaries import summarize
+from pipeline.evaluate.probe.projection import LIMIT, STILL, Projection, main_directions
+from pipeline.evaluate.probe.summaries import summarize
 from pipeline.store import FeatureStore
 
 TICKS = np.arange(0, 180, 7)
@@ -53,7 +53,7 @@ def test_ticks_without_a_reading_say_so(store: FeatureStore) -> None:
 def test_a_force_is_not_lost_beside_a_wide_scan(
     tiny_store: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.probing.summaries.GROUP_WIDTH", 2)
+    monkeypatch.setattr("pipeline.evaluate.probe.summaries.GROUP_WIDTH", 2)
     store = FeatureStore.open(tiny_store(tmp_path, sensor_channels=9, state_dim=0))
     store.streams["sensor"]["units"][4] = "N"
     values = summarize(store, TICKS, FOLD, 1, 1)

@@ -11,13 +11,13 @@ from tqdm import tqdm
 
 from pipeline.base.config import ProbeParams
 from pipeline.base.errors import StoreMismatch
-from pipeline.probing.accumulation import Table
-from pipeline.probing.effort import foretold
-from pipeline.probing.folds import Folds, fold_by_recording
-from pipeline.probing.moments import Moments
-from pipeline.probing.readers import Reader, SlotName, fit_reader, groups_of, slot_names
-from pipeline.probing.ridge import Score, Scores, cross_validate
-from pipeline.probing.summaries import summarize
+from pipeline.evaluate.probe.accumulation import Table
+from pipeline.evaluate.probe.effort import foretold
+from pipeline.evaluate.probe.folds import Folds, fold_by_recording
+from pipeline.evaluate.probe.moments import Moments
+from pipeline.evaluate.probe.readers import Reader, SlotName, fit_reader, groups_of, slot_names
+from pipeline.evaluate.probe.ridge import Score, Scores, cross_validate
+from pipeline.evaluate.probe.summaries import summarize
 from pipeline.store import FeatureStore
 
 _Result = TypeVar("_Result")

@@ -6,10 +6,10 @@ from typing import Any
 
 from pipeline.base.channels import named
 from pipeline.base.durable import write_document
-from pipeline.evaluation.cells import aligned, cell, numbers, ratio, write_rows
-from pipeline.evaluation.modalities import ModalityStudy
-from pipeline.evaluation.modality_tables import best_baseline, modality_rows, stream_rows
-from pipeline.evaluation.names import with_unit
+from pipeline.evaluate.ablation import ModalityStudy
+from pipeline.evaluate.ablation_tables import best_baseline, modality_rows, stream_rows
+from pipeline.evaluate.cells import aligned, cell, numbers, ratio, write_rows
+from pipeline.evaluate.names import with_unit
 from pipeline.store import FeatureStore
 from pipeline.train.predictions import METHODS, Predictions
 from pipeline.train.scores import Comparison

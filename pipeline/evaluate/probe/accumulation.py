@@ -9,10 +9,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pipeline.evaluate.probe.folds import Folds
+from pipeline.evaluate.probe.moments import Moments
+from pipeline.evaluate.probe.readers import Reader, check
 from pipeline.policy.normalization import fit_channels
-from pipeline.probing.folds import Folds
-from pipeline.probing.moments import Moments
-from pipeline.probing.readers import Reader, check
 from pipeline.store import FeatureStore
 
 _BLOCK_BYTES = 64 * 2**20

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.evaluation.cells import write_rows
-from pipeline.evaluation.corruption import donors_of, exchanged, missing, zeroed
-from pipeline.evaluation.modalities import ModalityStudy, delays, judge_modalities
-from pipeline.evaluation.modality_tables import modality_rows, modality_table, stream_rows
+from pipeline.evaluate.ablation import ModalityStudy, delays, judge_modalities
+from pipeline.evaluate.ablation_tables import modality_rows, modality_table, stream_rows
+from pipeline.evaluate.cells import write_rows
+from pipeline.evaluate.corruption import donors_of, exchanged, missing, zeroed
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.normalization import ChannelStatistics, Normalization
 from pipeline.policy.policy import Policy

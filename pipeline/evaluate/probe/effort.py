@@ -5,8 +5,8 @@ from time import perf_counter
 
 import torch
 
-from pipeline.probing.accumulation import Table
-from pipeline.probing.readers import GROUP_WIDTH
+from pipeline.evaluate.probe.accumulation import Table
+from pipeline.evaluate.probe.readers import GROUP_WIDTH
 
 _TRIED = 768
 """Columns of the product that is timed: a few hundredths of a second."""

@@ -5,12 +5,12 @@ is read of a row, `accumulation` adds it up to `moments` in one pass, `ridge` is
 such sums, `run` does it for all slots, `ranking` says which are better and `tables` tells it.
 """
 
-from pipeline.probing.folds import Folds, fold_by_recording
-from pipeline.probing.ranking import Recommendation, ranked, recommend
-from pipeline.probing.readers import SlotName
-from pipeline.probing.ridge import Score
-from pipeline.probing.run import Finding, Study, probe
-from pipeline.probing.tables import advice, metrics, table, write_tables
+from pipeline.evaluate.probe.folds import Folds, fold_by_recording
+from pipeline.evaluate.probe.ranking import Recommendation, ranked, recommend
+from pipeline.evaluate.probe.readers import SlotName
+from pipeline.evaluate.probe.ridge import Score
+from pipeline.evaluate.probe.run import Finding, Study, probe
+from pipeline.evaluate.probe.tables import advice, metrics, table, write_tables
 
 __all__ = [
     "Finding",

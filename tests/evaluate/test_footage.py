@@ -12,7 +12,7 @@ from pipeline.base.config import Source
 from pipeline.base.digests import file_digest
 from pipeline.data import Recording, content_digest, open_recordings
 from pipeline.data.timeline import Timeline, build_timeline
-from pipeline.evaluation.footage import Footage, footage, shown_ticks
+from pipeline.evaluate.episode_frames import Footage, footage, shown_ticks
 from pipeline.simulation.demo_recordings import write_demo_recordings
 from pipeline.store import FeatureStore
 

@@ -11,8 +11,8 @@ from typing import Any, get_args
 
 from pipeline.base.config import FusionStrategy, ModelType
 from pipeline.base.errors import ConfigError
-from pipeline.evaluation.judged import JUDGED
-from pipeline.evaluation.tables import ERRORS, OVERALL
+from pipeline.evaluate.evaluation import JUDGED
+from pipeline.evaluate.tables import ERRORS, OVERALL
 from pipeline.policy.checkpoint import describe, differences
 from pipeline.train.log import speed_file
 from pipeline.train.predictions import BASELINES, METHODS

@@ -3,10 +3,10 @@
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from pipeline.evaluation.cells import aligned, cell, ratio
-from pipeline.evaluation.experiments import Experiment
-from pipeline.evaluation.names import with_unit
-from pipeline.evaluation.tables import HEADINGS
+from pipeline.evaluate.cells import aligned, cell, ratio
+from pipeline.evaluate.experiments import Experiment
+from pipeline.evaluate.names import with_unit
+from pipeline.evaluate.tables import HEADINGS
 from pipeline.train.predictions import BASELINES
 
 

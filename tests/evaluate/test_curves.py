@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import pytest
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.evaluation.curves import Curves
-from pipeline.evaluation.curves import read_curves as curves_of
+from pipeline.evaluate.curves import Curves
+from pipeline.evaluate.curves import read_curves as curves_of
 
 
 def read_curves(logs: Path, step: int = 20, **metrics: float) -> Curves:
