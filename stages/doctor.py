@@ -23,7 +23,7 @@ if __name__ == "__main__":  # here, for --help waits for no import below
 
 from pipeline.base.config import Params
 from pipeline.base.errors import PipelineError
-from pipeline.machine import Finding, described, examine
+from pipeline.look.doctor import Finding, described, examine
 
 
 def main(params: Params) -> None:

@@ -23,9 +23,9 @@ from pipeline.base.ownership import REPORT, claim, refuse_foreign
 from pipeline.evaluate.ablation_tables import modality_table
 from pipeline.evaluate.evaluation import JUDGED, Judgement, judgement
 from pipeline.evaluate.tables import table, write_tables
+from pipeline.look.evaluation.page import evaluation_report
+from pipeline.look.page.writing import write_report
 from pipeline.policy.checkpoint import PolicyCheckpoint, find_policy, load_policy
-from pipeline.report import write_report
-from pipeline.report.evaluation.evaluation import evaluation_report
 from pipeline.store import FeatureStore, check_trailers
 from pipeline.train.batches import open_store
 from pipeline.train.held_out import check_store

@@ -32,13 +32,14 @@ from collections.abc import Iterator
 
 from pipeline.base.config import Params
 from pipeline.base.ownership import REPORT, claim
-from pipeline.inspection.store import inspect_store
-from pipeline.inspection.subject import Subject, subject_of
-from pipeline.plots.style import boxes
-from pipeline.report import Notice, Notices, Report, write_report
-from pipeline.report.inspection.recording import recordings_report
-from pipeline.report.inspection.store import store_report
-from pipeline.report.page.findings import FINDINGS
+from pipeline.look.page.blocks import Notice, Notices, Report
+from pipeline.look.page.findings import FINDINGS
+from pipeline.look.page.style import boxes
+from pipeline.look.page.writing import write_report
+from pipeline.look.recording.page import recordings_report
+from pipeline.look.recording.subject import Subject, subject_of
+from pipeline.look.store.facts import inspect_store
+from pipeline.look.store.page import store_report
 
 SAID = 8
 """Findings that the terminal shows."""

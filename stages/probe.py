@@ -25,7 +25,7 @@ from functools import partial
 from pipeline.base.config import Params
 from pipeline.base.ownership import REPORT, claim, refuse_foreign, release
 from pipeline.evaluate.probe import advice, probe, table, write_tables
-from pipeline.plots.probe import write_probe_plots
+from pipeline.look.evaluation.draw_probe import write_probe_plots
 from pipeline.store import FeatureStore, check_trailers
 
 

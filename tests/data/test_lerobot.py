@@ -17,8 +17,8 @@ from pipeline.data import content_digest, open_recording, open_recordings
 from pipeline.data.lerobot import action_kind
 from pipeline.data.lerobot_clock import read_clock
 from pipeline.data.timeline import build_timeline
-from pipeline.inspection.episodes import view_episode
-from pipeline.inspection.flaws import find_flaws
+from pipeline.look.recording.episodes import view_episode
+from pipeline.look.recording.flaws import find_flaws
 
 VERSIONS = ["v2.0", "v2.1", "v3.0"]
 LENGTHS = (7, 5, 9)

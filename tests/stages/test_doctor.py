@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 import yaml
 
-from pipeline import machine
-from pipeline.machine import GROUPS
+from pipeline.look import doctor as machine
+from pipeline.look.doctor import GROUPS
 from pipeline.simulation.insertion_formats import write_raw
 from pipeline.simulation.recorder import simulate_episode
 from stages import doctor

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import yaml
 
-from pipeline.report import Picture, Report, Text
+from pipeline.look.page.blocks import Picture, Report, Text
 from pipeline.store.archive import archive
 from pipeline.store.metadata import note_metadata
 from stages import evaluate, train_head

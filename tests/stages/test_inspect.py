@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 import zarr
 
-from pipeline.plots.style import RC
-from pipeline.report import Notice, Notices, Place, Report, Section
+from pipeline.look.page.blocks import Notice, Notices, Place, Report, Section
+from pipeline.look.page.style import RC
 from stages import inspect
 from stages.command import run
 

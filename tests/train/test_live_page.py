@@ -62,7 +62,7 @@ def test_it_draws_itself_again_until_the_run_ends(tmp_path: Path, clock: Clock) 
 def test_its_colours_are_those_of_the_other_pages(tmp_path: Path) -> None:
     live = LivePage(tmp_path, "head", 10)
     live.close(finished=True)
-    css = (ROOT / "pipeline/report/page/templates/page.css").read_text(encoding="utf-8")
+    css = (ROOT / "pipeline/look/page/templates/page.css").read_text(encoding="utf-8")
     for name in ("paper", "panel", "ink", "soft", "grid", "blue"):
         found = re.search(rf"--{name}: light-dark\((#\w+), (#\w+)\)", css)
         assert found is not None

@@ -1,0 +1,82 @@
+"""A matplotlib figure -> SVG inside a page: transparent, in the page's own ink, nothing outside."""
+
+import base64
+import io
+import re
+
+import matplotlib as mpl
+from markupsafe import escape
+from matplotlib.figure import Figure
+from PIL import Image
+
+from pipeline.look.page.style import GRID, INK, PALETTE
+
+RASTER_DPI = 144
+"""Of what is drawn as points of an image inside the SVG."""
+POINT_PX = 96 / 72
+PHOTO_BYTES, PHOTO_RATIO, PHOTO_QUALITY = 2**15, 3, 88
+"""An image of at least so many bytes that JPEG makes so many times smaller is a photograph."""
+FONTS = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Noto Sans', sans-serif"
+COLOURS = {INK: "ink", "#000000": "ink", GRID: "grid", PALETTE[0]: "blue"}
+"""Colours of a picture that follow the page's light or dark, by their names in its style."""
+
+
+def inline_svg(figure: Figure, name: str, label: str) -> str:
+    """One `<svg>` element of `figure`; the same figure gives the same bytes.
+
+    Text stays text in the page's font. Neutral colours become the page's, the background nothing,
+    images data URIs (photographs as JPEG). Every id begins with `name`, so that several pictures
+    stand in one page. `label` is what a screen reader says.
+    """
+    written = io.StringIO()
+    # Matplotlib makes ids of clips and markers from their content and this salt.
+    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": name, "svg.image_inline": True}):
+        figure.savefig(
+            written,
+            format="svg",
+            dpi=RASTER_DPI,
+            transparent=True,
+            metadata={"Date": None, "Creator": None, "Format": None, "Type": None},
+        )
+    text = written.getvalue()
+    head, body = re.match(r".*?<svg([^>]*)>(.*)</svg>\s*$", text, re.DOTALL).groups()  # pyright: ignore[reportOptionalMemberAccess]
+    return _opening(head, label) + _body(body, name) + "</svg>"
+
+
+def _opening(head: str, label: str) -> str:
+    """The `<svg …>` tag: sized by its box, no wider than it was drawn, and named."""
+    box = re.search(r'viewBox="([^"]*)"', head)
+    assert box is not None, head
+    width, height = (float(value) * POINT_PX for value in box[1].split()[2:])
+    # What has no colour of its own is black in SVG: give it the ink too.
+    return (
+        f'<svg viewBox="{box[1]}" xmlns:xlink="http://www.w3.org/1999/xlink" fill="currentColor" '
+        f'style="--w:{width:.0f};--h:{height:.0f}" role="img" aria-label="{escape(label)}">'
+        f"<title>{escape(label)}</title>"
+    )
+
+
+def _body(body: str, name: str) -> str:
+    body = re.sub(r"<metadata>.*?</metadata>\s*", "", body, count=1, flags=re.DOTALL)
+    body = re.sub(r'(?<=\sid=")(?=[^"])', f"{name}-", body)
+    body = re.sub(r'(?<=href="#)', f"{name}-", body)
+    body = re.sub(r"(?<=url\(#)", f"{name}-", body)
+    body = re.sub(r"'DejaVu Sans'[^;\"]*", FONTS, body)
+    for colour, name in COLOURS.items():
+        body = re.sub(rf"{colour}(?![0-9a-f])", f"var(--{name})", body, flags=re.IGNORECASE)
+    return re.sub(r"data:image/png;base64,([^\"]+)", _smaller, body)
+
+
+def _smaller(image: re.Match[str]) -> str:
+    """A camera's frame as JPEG; curves, maps and what is partly transparent as they are."""
+    png = base64.b64decode(image[1])
+    with Image.open(io.BytesIO(png)) as decoded:
+        alpha = decoded.getchannel("A").getextrema() if "A" in decoded.getbands() else (255, 255)
+        if len(png) < PHOTO_BYTES or alpha != (255, 255):
+            return image[0]
+        written = io.BytesIO()
+        decoded.convert("RGB").save(written, "JPEG", quality=PHOTO_QUALITY, subsampling=0)
+    jpeg = written.getvalue()
+    if len(jpeg) * PHOTO_RATIO > len(png):
+        return image[0]
+    return f"data:image/jpeg;base64,{base64.b64encode(jpeg).decode()}"

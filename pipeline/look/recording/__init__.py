@@ -1,0 +1,1 @@
+"""Recordings: what they hold, what looks wrong, and their page."""

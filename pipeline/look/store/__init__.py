@@ -1,0 +1,1 @@
+"""Stores: what they hold, what looks wrong, and their page."""

@@ -1,1 +1,0 @@
-"""The pages of recordings and of a store."""

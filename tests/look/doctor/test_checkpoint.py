@@ -1,0 +1,126 @@
+"""The checkpoint: here, half here, elsewhere, too large."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from pipeline.base.config import Params
+from pipeline.look.doctor.checkpoint import check_adapter, check_checkpoint, check_fit
+from pipeline.look.doctor.gpu import GPU
+from pipeline.simulation.demo_recordings import MARKER
+
+GIB = 2**30
+Make = Callable[..., Params]
+
+
+@pytest.fixture
+def params(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Make:
+    """`params(checkpoint, key=value…)` with an empty cache of the hub."""
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "hub"))
+    monkeypatch.delenv("HF_HUB_OFFLINE", raising=False)
+
+    def make(checkpoint: str | Path, **vlm: object) -> Params:
+        document = {
+            "data": {"sources": [{"name": "a", "path": "."}]},
+            "vlm": {"checkpoint": str(checkpoint), "dtype": "float32", **vlm},
+            "extract": {"device": "cpu"},
+        }
+        return Params.model_validate(document)
+
+    return make
+
+
+def test_a_whole_folder(params: Make, demo_checkpoint: Path) -> None:
+    here, fits = check_checkpoint(params(demo_checkpoint))
+    assert (here.level, fits.level) == ("ok", "ok")
+    assert "whole, 2,519,424 parameters" in here.found
+    assert fits.found.startswith("9.6 MiB in float32, memory has")
+
+
+def test_the_demos_random_weights_are_nothing_to_learn_from(
+    params: Make, demo_checkpoint: Path, tmp_path: Path
+) -> None:
+    """Wherever the folder that stages.demo marks lies."""
+    mine = shutil.copytree(demo_checkpoint, tmp_path / "mine")
+    (mine / MARKER).write_text('{"seed": 0}')
+    here, fits = check_checkpoint(params(mine))
+    assert (here.level, fits.level) == ("note", "ok")
+    assert "whole, " in here.found and "random weights" in here.found
+    assert "Qwen/Qwen2.5-VL-3B-Instruct" in here.remedy and "docs/real-model.md" in here.remedy
+
+
+def test_a_folder_with_a_hole(params: Make, demo_checkpoint: Path, tmp_path: Path) -> None:
+    broken = shutil.copytree(demo_checkpoint, tmp_path / "broken")
+    next(broken.glob("*.safetensors")).unlink()
+    (finding,) = check_checkpoint(params(broken))
+    assert finding.level == "missing"
+    assert str(broken) in finding.found
+
+
+def test_a_file_that_is_cut_off(params: Make, demo_checkpoint: Path, tmp_path: Path) -> None:
+    broken = shutil.copytree(demo_checkpoint, tmp_path / "broken")
+    weights = next(broken.glob("*.safetensors"))
+    whole = weights.read_bytes()
+    for kept in (whole[:-1], whole[:5], b"\x08" + bytes(7) + b"garbage!"):
+        weights.write_bytes(kept)
+        (finding,) = check_checkpoint(params(broken))
+        assert (finding.level, finding.remedy) == ("missing", "copy it again")
+        assert f"{weights}: cut off or damaged: " in finding.found
+
+
+def test_what_is_not_here(params: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    (folder,) = check_checkpoint(params("/no/such/folder"))
+    assert folder.level == "missing" and "no hub id" in folder.found
+    hub = params("Qwen/Qwen2.5-VL-3B-Instruct")
+    (fetched,) = check_checkpoint(hub)
+    assert fetched.level == "note" and "first extraction downloads it" in fetched.found
+    assert fetched.remedy == "hf download Qwen/Qwen2.5-VL-3B-Instruct"
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    (offline,) = check_checkpoint(hub)
+    assert offline.level == "missing" and "HF_HUB_OFFLINE forbids" in offline.found
+
+
+def test_the_demos_own_checkpoint_is_written_by_its_stage(params: Make, tmp_path: Path) -> None:
+    absent = tmp_path / "demo_vlm"
+    given = params(absent)
+    given = given.model_copy(update={"demo": given.demo.model_copy(update={"checkpoint": absent})})
+    (finding,) = check_checkpoint(given)
+    assert finding.level == "missing"
+    assert "stages.demo" in finding.remedy
+
+
+def test_an_adapter(tmp_path: Path) -> None:
+    assert check_adapter("/no/such/adapter").level == "missing"
+    (tmp_path / "adapter_config.json").write_text("{}")
+    half = check_adapter(str(tmp_path))
+    assert half.level == "missing" and "adapter_model.safetensors" in half.found
+    weights = tmp_path / "adapter_model.safetensors"
+    weights.write_bytes(b"")
+    damaged = check_adapter(str(tmp_path))
+    assert damaged.level == "missing" and "cut off or damaged" in damaged.found
+    save_file({"lora_A.weight": torch.zeros(2, 2)}, weights)
+    assert check_adapter(str(tmp_path)).level == "ok"
+
+
+@pytest.mark.parametrize(
+    ("dtype", "gpus", "available", "level"),
+    [
+        ("bfloat16", [24], 8, "ok"),
+        ("float32", [24], 8, "note"),
+        ("bfloat16", [80, 8], 64, "note"),
+        ("bfloat16", [], 16, "ok"),
+        ("float32", [], 16, "note"),
+    ],
+)
+def test_seven_billion_parameters_fit_or_not(
+    params: Make, dtype: str, gpus: list[int], available: int, level: str
+) -> None:
+    found = [GPU(f"GPU {gib}", gib * GIB, True) for gib in gpus]
+    finding = check_fit(7_000_000_000, params("a/b", dtype=dtype).vlm, found, available * GIB)
+    assert finding.level == level
+    if level == "note":
+        assert ("vlm.dtype to bfloat16" in finding.remedy) == (dtype == "float32")

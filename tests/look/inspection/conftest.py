@@ -1,0 +1,92 @@
+"""Healthy simulated recordings of every format, and copies of them that a test may damage."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.base.config import DataParams, Source
+from pipeline.data import open_recordings
+from pipeline.data.timeline import choose_action_rotation
+from pipeline.look.recording.episodes import view_episode
+from pipeline.look.recording.facts import EpisodeView, Flaw
+from pipeline.look.recording.flaws import find_flaws
+from pipeline.simulation.insertion_formats import ABUTTING, write_new, write_old, write_raw
+from pipeline.simulation.lerobot_format import write_lerobot
+from pipeline.simulation.recorder import simulate_episode
+
+EPOCH_S = 1.767e9 + 0.25
+
+
+@pytest.fixture(scope="session")
+def healthy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """`raw/`, `new/`, `old/` and `lerobot/`: the same episode in each, seen by other clocks."""
+    root = tmp_path_factory.mktemp("healthy")
+    write_raw(root / "raw" / "Red_point", simulate_episode(4, EPOCH_S))
+    write_new(root / "new" / "Red_point", simulate_episode(4, EPOCH_S), ABUTTING, robot_clock=True)
+    write_old(root / "old" / "Red_point", simulate_episode(4, EPOCH_S))
+    write_lerobot(root / "lerobot", iter([simulate_episode(4, EPOCH_S)]))
+    return root
+
+
+@pytest.fixture
+def copied(healthy: Path, tmp_path: Path) -> Callable[[str], Path]:
+    """`copied("raw")`: the episode folder (or LeRobot root) of a copy that a test may damage."""
+
+    def copy(format: str) -> Path:
+        folder = Path(shutil.copytree(healthy / format, tmp_path / format))
+        return folder if format == "lerobot" else next((folder / "Red_point").iterdir())
+
+    return copy
+
+
+@pytest.fixture(scope="session")
+def look() -> Callable[..., EpisodeView]:
+    """`look(folder, action_hz=10)`: the one recording there, as far as it can be read."""
+
+    def view(folder: Path, **data: Any) -> EpisodeView:
+        source = Source(name="s", path=str(folder))
+        params = DataParams(sources=(source,), **data)
+        (recording,) = open_recordings([source], views=params.views).recordings
+        return view_episode(recording, params, choose_action_rotation("auto", [recording]))
+
+    return view
+
+
+@pytest.fixture(scope="session")
+def flaws_of(look: Callable[..., EpisodeView]) -> Callable[..., tuple[Flaw, ...]]:
+    """`flaws_of(folder)`: what looks wrong in the one recording there."""
+
+    def find(folder: Path, **data: Any) -> tuple[Flaw, ...]:
+        found = find_flaws(look(folder, **data))
+        assert not any("\n" in flaw.message for flaw in found)
+        return found
+
+    return find
+
+
+@pytest.fixture(scope="session")
+def change_npz() -> Callable[..., None]:
+    """`change_npz(path, values=function)`: rewrite members of a .npz by functions of themselves."""
+
+    def change(path: Path, **changes: Callable[[np.ndarray], np.ndarray]) -> None:
+        with np.load(path) as archive:
+            members = {name: archive[name] for name in archive.files}
+        np.savez(path, **members | {name: how(members[name]) for name, how in changes.items()})
+
+    return change
+
+
+@pytest.fixture(scope="session")
+def change_csv() -> Callable[[Path, Callable[[np.ndarray], np.ndarray]], None]:
+    """`change_csv(path, function)`: rewrite the table of a robot-state CSV."""
+
+    def change(path: Path, how: Callable[[np.ndarray], np.ndarray]) -> None:
+        header = path.read_text().splitlines()[0]
+        table = how(np.loadtxt(path, delimiter=",", skiprows=1))
+        np.savetxt(path, table, delimiter=",", header=header, comments="", fmt="%.6f")
+
+    return change

@@ -1,0 +1,195 @@
+"""All recordings in one go: their lines, what is wrong, and which to look at."""
+
+import pickle
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.base.config import Params, Source
+from pipeline.data import open_recordings
+from pipeline.look.recording.overview import RecordingsOverview, survey_recordings
+
+
+def survey(*sources: Source, views: Sequence[str] | None = None, **data: Any) -> RecordingsOverview:
+    document = {
+        "data": {"sources": [source.model_dump() for source in sources], **data},
+        "vlm": {"checkpoint": "none"},
+    }
+    params = Params.model_validate(document)
+    return survey_recordings(open_recordings(params.data.sources, views=views), params)
+
+
+@pytest.fixture
+def many(healthy: Path, tmp_path: Path) -> Path:
+    """Three old episodes that differ."""
+    (episode,) = (healthy / "old" / "Red_point").iterdir()
+    for name in "abc":
+        folder = Path(shutil.copytree(episode, tmp_path / "many" / name))
+        document = pickle.loads((folder / "data.pkl").read_bytes())
+        document["action"][1, 0] += 0.01 * ord(name)
+        (folder / "data.pkl").write_bytes(pickle.dumps(document))
+    return tmp_path / "many"
+
+
+def test_formats_of_one_source_need_not_have_the_same_streams(healthy: Path) -> None:
+    paths = tuple(str(healthy / name) for name in ("raw", "new", "old", "lerobot"))
+    # Only the LeRobot episode has no poses beside its actions.
+    assert survey(Source(name="s", path=paths)).flaws == ()
+
+
+def test_healthy_recordings_of_every_format(healthy: Path) -> None:
+    names = ("raw", "new", "old")
+    found = survey(*(Source(name=name, path=str(healthy / name)) for name in names))
+    assert found.flaws == ()
+    assert found.views == ("View1", "View2", "View5") and found.rotation == "rotvec"
+    assert [one.source for one in found.summaries] == list(names)
+    for one in found.summaries:
+        assert one.format == one.source and one.errors == one.warnings == 0
+        assert one.ticks > 30 and one.vl_rows == -(-one.ticks // 3)
+        assert one.duration_s == pytest.approx(one.ticks / 10, abs=0.5)
+        assert set(one.frames) == {"View1", "View2", "View5"} and min(one.frames.values()) > 30
+        assert one.readings and one.states and one.instruction
+        assert found.flaws_of(one) == ()
+
+
+def test_one_broken_episode_hides_no_other(many: Path) -> None:
+    pickled = many / "b" / "data.pkl"
+    pickled.write_bytes(pickled.read_bytes()[:1000])
+    found = survey(Source(name="s", path=str(many)))
+    assert [one.episode for one in found.summaries] == ["a", "b", "c"]
+    assert [one.errors for one in found.summaries] == [0, 1, 0]
+    broken = found.summaries[1]
+    assert (broken.ticks, broken.frames, broken.readings, broken.instruction) == (0, {}, 0, None)
+    # The file is the flaw; that its streams are absent follows and is not told again.
+    (flaw,) = found.flaws
+    assert found.flaws_of(broken) == (flaw,) and flaw.severity == "error"
+    assert found.chosen(1) == (1,) and found.chosen(2) == (0, 1) and found.chosen(9) == (0, 1, 2)
+
+
+def test_what_most_episodes_of_a_source_have(many: Path) -> None:
+    (many / "c" / "robot_states.npz").unlink()
+
+    def missing() -> tuple[str, str]:
+        found = survey(Source(name="s", path=str(many)))
+        (flaw,) = [flaw for flaw in found.flaws if flaw.kind == "missing"]
+        assert found.summaries[2].warnings == 1
+        return flaw.episode, flaw.stream
+
+    assert missing() == ("c", "state")  # its own metadata count them
+    pickled = many / "c" / "data.pkl"
+    document = pickle.loads(pickled.read_bytes())
+    del document["metadata"]["num_robot_states"]
+    pickled.write_bytes(pickle.dumps(document))
+    assert missing() == ("c", "poses, state")
+
+
+def test_the_same_recording_twice(many: Path) -> None:
+    shutil.copytree(many / "a", many / "d")
+    found = survey(Source(name="s", path=str(many)), Source(name="t", path=str(many / "b")))
+    first, second = found.flaws
+    assert {flaw.kind for flaw in found.flaws} == {"duplicate recording"}
+    assert (first.source, first.episode, second.source, second.episode) == ("s", "d", "t", "b")
+    assert first.message.startswith(f"the same recording as a ({many / 'a'}): ")
+    assert second.message.startswith(f"the same recording as s/b ({many / 'b'}): ")
+    assert [one.warnings for one in found.summaries] == [0, 0, 0, 1, 1]
+
+
+def test_the_same_recording_in_two_formats(shared_data: Path) -> None:
+    paths = (str(shared_data / "insertion/new"), str(shared_data / "insertion/raw"))
+    found = survey(Source(name="s", path=paths), views=())
+    (flaw,) = [flaw for flaw in found.flaws if flaw.kind == "duplicate recording"]
+    assert flaw.episode == "data_collection_20251108_055533"
+    assert "the same recording as episode_20251108_055533" in flaw.message
+    assert "all values of state are equal, and nothing else was compared" in flaw.message
+
+
+def test_a_recording_without_its_actions_is_still_the_same(many: Path) -> None:
+    found = survey(Source(name="s", path=str(many)))
+    assert found.flaws == ()  # equal states with other actions
+    shutil.copytree(many / "a", many / "d")
+    (many / "d" / "robot_states.npz").unlink()
+    twice = [f for f in survey(Source(name="s", path=str(many))).flaws if "same" in f.message]
+    assert [flaw.episode for flaw in twice] == ["d"]
+    assert "all values of action are equal" in twice[0].message
+
+
+def test_real_recordings_in_two_versions(shared_data: Path) -> None:
+    # Their motion tells; decoding the videos would tell nothing more.
+    found = survey(Source(name="s", path=str(shared_data / "lerobot")), views=())
+    twice = [flaw for flaw in found.flaws if flaw.kind == "duplicate recording"]
+    assert [flaw.episode for flaw in twice] == [
+        f"cr5_banana_v30_split/episode_{index:06d}" for index in range(5)
+    ]
+    assert "the same recording as cr5_banana_v21/episode_000000" in twice[0].message
+
+
+def test_episodes_that_cannot_be_opened(healthy: Path, tmp_path: Path) -> None:
+    (episode,) = (healthy / "new" / "Red_point").iterdir()
+    shutil.copytree(episode, tmp_path / "new" / "good")
+    shutil.copytree(episode, tmp_path / "new" / "bad")
+    (tmp_path / "new" / "bad" / "metadata.json").write_text("{")
+    found = survey(Source(name="s", path=str(tmp_path / "new")))
+    assert [one.episode for one in found.summaries] == ["good"]
+    (flaw,) = found.flaws
+    assert (flaw.kind, flaw.severity, flaw.episode) == ("unreadable", "error", "bad")
+    assert found.summaries[0].errors == 0
+
+
+def test_episodes_that_meta_lists_and_are_not_there(healthy: Path, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(healthy / "lerobot", tmp_path / "lerobot"))
+    lines = root / "meta/episodes.jsonl"
+    line = lines.read_text()
+    lines.write_text(
+        line
+        + line.replace('"episode_index": 0', '"episode_index": 1')
+        + line.replace('"episode_index": 0', '"episode_index": 2')
+    )
+    found = survey(Source(name="s", path=str(root)))
+    (flaw,) = found.flaws
+    assert (flaw.kind, flaw.severity, flaw.source) == ("missing", "warning", "s")
+    assert "episode_000001" in flaw.message and "(2 such episodes in all)" in flaw.message
+
+
+def test_ticks_at_another_rate_than_the_recorded_rows(healthy: Path) -> None:
+    sources = [
+        Source(name="held", path=str(healthy / "lerobot"), action_kind="absolute"),
+        Source(name="poses", path=str(healthy / "raw")),
+    ]
+    assert survey(*sources[:1]).flaws == survey(*sources[:1], action_hz=None).flaws == ()
+    for action_hz, fate in ((5, "left out between ticks"), (20, "held")):
+        (flaw,) = [f for f in survey(*sources, action_hz=action_hz).flaws if f.kind == "tick rate"]
+        assert (flaw.severity, flaw.source, flaw.episode) == ("warning", "held", "")
+        assert f"ticks at {action_hz} Hz, recorded at 10 Hz: actions are {fate}" in flaw.message
+
+
+def test_recordings_of_two_robots(healthy: Path, tmp_path: Path) -> None:
+    (episode,) = (healthy / "old" / "Red_point").iterdir()
+    other = Path(shutil.copytree(episode, tmp_path / "old" / "other"))
+    (other / "robot_states.npz").unlink()
+    # A velocity in the same channels is another kind of action.
+    sources = (
+        Source(name="one", path=str(episode)),
+        Source(name="two", path=str(other), action_kind="velocity"),
+    )
+    found = survey(*sources)
+    (flaw,) = [flaw for flaw in found.flaws if flaw.kind == "embodiment"]
+    assert flaw.severity == "error" and "'one'" in flaw.message and "'two'" in flaw.message
+
+
+def test_the_choice_spreads_over_sound_episodes(healthy: Path) -> None:
+    (one,) = survey(Source(name="s", path=str(healthy / "old"))).summaries
+    summaries = [replace(one, episode=str(place)) for place in range(11)]
+    found = RecordingsOverview(tuple(summaries), (), "rotvec", ())
+    assert found.chosen(3) == (0, 5, 10) and found.chosen(1) == (0,)
+    summaries[7] = replace(one, warnings=2)
+    summaries[8] = replace(one, errors=1)
+    summaries[3] = replace(one, warnings=3)
+    found = RecordingsOverview(tuple(summaries), (), "rotvec", ())
+    assert found.chosen(1) == (8,) and found.chosen(2) == (3, 8)
+    assert found.chosen(5) == (0, 3, 7, 8, 10)
+    assert np.array_equal(found.chosen(99), np.arange(11))

@@ -1,0 +1,79 @@
+"""Clipped readings are found, also where they are most; what rests at its end is not."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.look.recording.facts import Flaw
+
+Change = Callable[[np.ndarray], np.ndarray]
+Found = Callable[..., tuple[Flaw, ...]]
+
+
+@pytest.fixture
+def with_sensor(
+    copied: Callable[[str], Path], flaws_of: Found, change_npz: Callable[..., None]
+) -> Found:
+    """`with_sensor(forces=…, alines=…)`: what is found after members were changed."""
+
+    def find(**changes: Change) -> tuple[Flaw, ...]:
+        folder: Path = copied("raw")
+        (path,) = folder.glob("sensor_data_*.npz")
+        change_npz(path, **changes)
+        return flaws_of(folder)
+
+    return find
+
+
+def loaded(force: np.ndarray) -> np.ndarray:
+    """Noise about zero, then a load of 1 N for three quarters of the readings."""
+    noise = np.random.default_rng(0).normal(0, 0.005, len(force)).astype(np.float32)
+    return noise + (np.arange(len(force)) >= len(force) // 4)
+
+
+def test_a_force(with_sensor: Found) -> None:
+    (flaw,) = with_sensor(forces=lambda f: np.minimum(f, 0.4))
+    assert (flaw.kind, flaw.stream) == ("saturated", "sensor")
+    assert "force (1 of 1026 channels)" in flaw.message and "0.4" in flaw.message
+    assert flaw.start_s is not None and flaw.stop_s is not None and flaw.start_s < flaw.stop_s
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_force_clipped_in_most_readings(with_sensor: Found, sign: int) -> None:
+    (flaw,) = with_sensor(forces=lambda f: sign * np.minimum(loaded(f), 0.3))
+    end = "upper" if sign > 0 else "lower"
+    assert f"the {end} end of their range, {sign * 0.3:g}, in 75.0 % of" in flaw.message
+
+
+def test_a_scan(with_sensor: Found) -> None:
+    (flaw,) = with_sensor(alines=lambda a: np.minimum(a, 130))
+    assert flaw.kind == "saturated" and "aline_" in flaw.message
+    assert "upper end of their range, 130" in flaw.message
+
+
+def test_the_brightest_depths_of_a_scan_are_clipped_too(with_sensor: Found) -> None:
+    def amplify(scan: np.ndarray) -> np.ndarray:
+        rail = scan.max() / 5
+        clipped = np.minimum(scan, rail)
+        clipped[:, 40] = rail
+        clipped[1000, 40] = 0  # at the rail but once
+        assert (clipped[:, 30:230] == rail).mean() > 0.5
+        return clipped
+
+    (flaw,) = with_sensor(alines=amplify)
+    assert "aline_0000–aline_1024 (1025 of 1026 channels)" in flaw.message
+
+
+@pytest.mark.parametrize(
+    "rest",
+    [
+        pytest.param(lambda f: np.maximum(loaded(f), 0.02), id="from the start"),
+        pytest.param(lambda f: np.maximum(loaded(f), 0.02) - 5.02, id="biased"),
+        pytest.param(lambda f: np.maximum(1 - loaded(f), 0.02), id="touching at the start"),
+        pytest.param(lambda f: np.where(loaded(f) > 0.5, 0.5, 0.1), id="a switch"),
+    ],
+)
+def test_a_force_that_rests_at_its_end_is_not_clipped(with_sensor: Found, rest: Change) -> None:
+    assert [flaw for flaw in with_sensor(forces=rest) if flaw.kind == "saturated"] == []

@@ -1,0 +1,150 @@
+"""What a path means, and what is said of one that means nothing."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from pipeline.base.config import Params, load_params
+from pipeline.base.errors import ConfigError, RecordingError
+from pipeline.look.recording.subject import subject_of
+
+PARAMS = Path(__file__).resolve().parents[3] / "params.yaml"
+
+
+def looking_at(*paths: object, output: Path | None = None) -> Params:
+    said = ", ".join(f'"{path}"' for path in paths)
+    more = [] if output is None else [f"inspect.output={output}"]
+    return load_params(PARAMS, [f"inspect.path=[{said}]", *more])
+
+
+def refused(*paths: object) -> str:
+    with pytest.raises((ConfigError, RecordingError)) as caught:
+        subject_of(looking_at(*paths)).recordings(None)
+    return str(caught.value)
+
+
+def test_without_a_path_it_is_the_sources_of_the_params() -> None:
+    params = load_params(PARAMS)
+    subject = subject_of(params)
+    assert subject.sources == params.data.sources and subject.root == params.data.root
+    assert subject.folder == Path("reports/inspect")
+
+
+def test_a_path_that_is_not_there_names_what_is(tmp_path: Path) -> None:
+    (tmp_path / "monday").mkdir()
+    said = refused(tmp_path / "mondey" / "run")
+    assert f"{tmp_path / 'mondey/run'} is not there" in said
+    assert said.endswith(f"Did you mean {tmp_path / 'monday'}?")
+    assert f"In {tmp_path} there is monday" in refused(tmp_path / "tuesday")
+
+
+def test_a_path_below_the_data_root_is_found_there(tmp_path: Path) -> None:
+    (tmp_path / "monday").mkdir()
+    params = load_params(PARAMS, [f"data.root={tmp_path}", "inspect.path=monday"])
+    with pytest.raises(ConfigError) as caught:
+        subject_of(params)
+    assert f"It is under data.root: python -m stages.inspect '{tmp_path / 'monday'}'" in str(
+        caught.value
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "said"), [("run.zip", "Unpack it"), ("meta.json", "Name the folder")]
+)
+def test_a_file_is_no_recording(tmp_path: Path, name: str, said: str) -> None:
+    (tmp_path / name).write_bytes(b"")
+    assert said in refused(tmp_path / name)
+    assert str(tmp_path / name) in refused(tmp_path / name)
+
+
+def test_a_foreign_file_or_folder_is_told_what_it_looks_like(tmp_path: Path) -> None:
+    buffer = tmp_path / "umi.zarr"
+    buffer.mkdir()
+    (buffer / ".zgroup").write_text("{}")
+    (tmp_path / "demo.hdf5").write_bytes(b"")
+    for path, what in ((buffer, "a zarr replay buffer"), (tmp_path / "demo.hdf5", "HDF5")):
+        assert f"looks like {what}" in refused(path)
+        assert refused(path).endswith("docs/recipes/reader.md")
+
+
+def test_the_id_of_a_data_set_on_the_hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "secrets.txt").write_bytes(b"")
+    said = refused("lerobot/pusht")
+    assert "Hugging Face hub" in said and "reads local folders" in said
+    assert said.endswith("hf download --repo-type dataset lerobot/pusht --local-dir pusht")
+    assert "secrets.txt" not in said
+    assert "hf download" not in refused("data/demo")  # the demo's, before it is written
+    (tmp_path / "lerobot").mkdir()
+    assert "hf download" not in refused("lerobot/pusht")
+
+
+def test_a_folder_with_nothing_in_it_names_the_markers(tmp_path: Path) -> None:
+    said = refused(tmp_path)
+    assert str(tmp_path) in said
+    for marker in ("metadata.json", "meta/info.json"):
+        assert marker in said
+
+
+def test_a_glob_that_matches_nothing_says_so(tmp_path: Path) -> None:
+    assert "matches nothing" in refused(tmp_path / "day*")
+
+
+def test_stores_below_a_folder_are_named(tmp_path: Path, tiny_store: Callable[..., Path]) -> None:
+    store = tiny_store(tmp_path)
+    assert f"There is a store: python -m stages.inspect {store}" in refused(tmp_path)
+
+
+def test_a_store_is_known_by_its_content(tmp_path: Path, tiny_store: Callable[..., Path]) -> None:
+    store = tiny_store(tmp_path)
+    renamed = store.rename(tmp_path / "copy of a store")
+    assert subject_of(looking_at(renamed)).store == renamed
+
+
+def test_a_store_is_looked_at_alone(tmp_path: Path, tiny_store: Callable[..., Path]) -> None:
+    one, two = tiny_store(tmp_path, name="one"), tiny_store(tmp_path, name="two")
+    assert f"Look at it alone: python -m stages.inspect {one}" in refused(one, two)
+    assert f"python -m stages.inspect {one}" in refused(tmp_path / "*.zarr")
+
+
+def test_every_path_has_a_folder_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for place in ("lab/day 1/run", "lab/day2/run"):
+        (tmp_path / place).mkdir(parents=True)
+    folders = [
+        subject_of(looking_at(*paths)).folder.as_posix()
+        for paths in (["lab/day 1/run"], ["lab/day2/run"], ["lab/*"], ["."], ["lab", "lab/day2"])
+    ]
+    base = "reports/inspect"
+    assert folders == [
+        f"{base}/lab_day_1_run",
+        f"{base}/lab_day2_run",
+        f"{base}/lab_any",
+        f"{base}/here",
+        f"{base}/lab_and_1_more",
+    ]
+    assert subject_of(looking_at("lab", output=Path("mine"))).folder == Path("mine")
+    for place in ("데이터", "실험"):
+        (tmp_path / place).mkdir()
+        assert subject_of(looking_at(place)).folder == Path("reports/inspect", place)
+
+
+def test_a_page_that_could_not_be_written_is_refused_first(
+    tmp_path: Path, tiny_store: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refusal(output: Path) -> str:
+        with pytest.raises(ConfigError, match=r"--set inspect\.output=FOLDER") as caught:
+            subject_of(looking_at(tmp_path, output=output))
+        return str(caught.value)
+
+    (tmp_path / "file").write_bytes(b"")
+    for output in (tmp_path / "file", tmp_path / "file" / "in it"):
+        assert f"found the file {tmp_path / 'file'}" in refusal(output)
+    store = tiny_store(tmp_path)
+    assert f"lies in the store {store}" in refusal(store / "page")
+    # Permissions do not bind root, whom tests may run as.
+    monkeypatch.setattr("os.access", lambda path, mode: path != tmp_path)
+    assert f"{tmp_path} cannot be written to" in refusal(tmp_path / "new")
