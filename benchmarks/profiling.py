@@ -13,7 +13,7 @@ import torch
 from torch.profiler import ProfilerActivity, profile
 
 from benchmarks.timing import Work
-from pipeline.extract.rows import Span
+from pipeline.data.row_range import RowRange
 from pipeline.store import StoreBuild
 from pipeline.vlm.extractor import Extractor
 from pipeline.vlm.vision import VisionTower
@@ -73,9 +73,9 @@ def stopwatch_table(work: Work) -> dict[str, float]:
     Steps in the background run beside the model, so their sum may exceed the whole.
     """
     watch = Stopwatch()
-    read = Span.read
+    read = RowRange.read
 
-    def timed_read(span: Span) -> Iterator[Any]:
+    def timed_read(span: RowRange) -> Iterator[Any]:
         rows = read(span)
         while True:
             with watch.step("decode"):
@@ -85,7 +85,7 @@ def stopwatch_table(work: Work) -> dict[str, float]:
             yield row
 
     with ExitStack() as stack:
-        stack.enter_context(patch.object(Span, "read", timed_read))
+        stack.enter_context(patch.object(RowRange, "read", timed_read))
         for name, owner, attribute in _STEPS:
             found = __import__(owner, fromlist=["_"]) if isinstance(owner, str) else owner
             timed = watch.timed(name, getattr(found, attribute))

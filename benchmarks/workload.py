@@ -15,9 +15,10 @@ from tqdm import tqdm
 from pipeline.base.config import Params
 from pipeline.base.digests import ContentDigests
 from pipeline.data import Recording
+from pipeline.data.row_range import RowRange
 from pipeline.extract.check import CheckedEpisode, check_episodes
 from pipeline.extract.layout import build_arrays, lay_out
-from pipeline.extract.rows import Span, spans_of
+from pipeline.extract.rows import spans_of
 from pipeline.extract.survey import Survey, survey
 from pipeline.simulation.demo_recordings import TASK
 from pipeline.simulation.insertion_formats import write_raw
@@ -70,7 +71,7 @@ class Workload:
         """A build with everything but feature rows, in place of the one before."""
         return _laid_out(self.params, self.survey, self.checked)
 
-    def spans(self) -> Iterator[Span]:
+    def spans(self) -> Iterator[RowRange]:
         """The rows in spans, as stage one cuts them."""
         views = self.survey.spec.views
         return spans_of(self.recordings, self.vl_start, self.frame_time, views, self.missing, 1)

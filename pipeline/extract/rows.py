@@ -2,17 +2,17 @@
 
 import threading
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import islice
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import CameraStream, Recording
-from pipeline.data.timeline import last_at
+from pipeline.data import Recording
+from pipeline.data.row_range import RowRange
 from pipeline.store import Donor
 from pipeline.vlm.feature_spec import FeatureSpec, row_key
 from pipeline.vlm.preparation import PreparedRow, Preparer
@@ -25,43 +25,6 @@ SPAN_ROWS = 16
 
 Variants count as rows of their own here: they wait in memory alike.
 """
-
-
-@dataclass(frozen=True)
-class Span:
-    """Rows of one episode, ascending, and the frame of each view for each."""
-
-    recording: Recording
-    cameras: Mapping[str, CameraStream]
-    """Opened once an episode: listing its frames costs time."""
-    rows: NDArray[np.int64]
-    """Store-global VL rows."""
-    frames: Mapping[str, NDArray[np.int64]]
-
-    @classmethod
-    def of(
-        cls,
-        recording: Recording,
-        cameras: Mapping[str, CameraStream],
-        rows: NDArray[np.int64],
-        frame_time: NDArray[np.float64],
-        views: Sequence[str],
-    ) -> Self:
-        """Which frames rows show follows from the capture times (row, view) that a store has."""
-        frames = {
-            view: last_at(cameras[view].time, frame_time[:, column])
-            for column, view in enumerate(views)
-            if np.isfinite(frame_time[0, column])
-        }
-        return cls(recording, cameras, rows, frames)
-
-    def read(self) -> Iterator[tuple[int, dict[str, NDArray[np.uint8]]]]:
-        """Each row and its frames by view, decoded one row at a time."""
-        readers = {
-            view: self.cameras[view].read(frames.tolist()) for view, frames in self.frames.items()
-        }
-        for row in self.rows.tolist():
-            yield row, {view: next(reader) for view, reader in readers.items()}
 
 
 @dataclass(frozen=True)
@@ -103,7 +66,7 @@ def spans_of(
     views: Sequence[str],
     missing: NDArray[np.int64],
     variants: int,
-) -> Iterator[Span]:
+) -> Iterator[RowRange]:
     """Cut the missing rows into spans of `SPAN_ROWS` prepared rows, `variants` of each.
 
     By the frame times that the layout wrote, so that a resumed build needs no stream.
@@ -116,7 +79,7 @@ def spans_of(
         cameras = recording.cameras()
         for start in range(first, last, together):
             rows = missing[start : min(start + together, last)]
-            yield Span.of(recording, cameras, rows, frame_time[rows], views)
+            yield RowRange.of(recording, cameras, rows, frame_time[rows], views)
 
 
 class RowPreparation:
@@ -129,21 +92,21 @@ class RowPreparation:
         self._firsts: dict[bytes, int] = {}
         self._lock = threading.Lock()
 
-    def prepare(self, span: Span) -> list[KnownRow | ReadyRow]:
+    def prepare(self, span: RowRange) -> list[KnownRow | ReadyRow]:
         """The rows of a span, each decoded frame held only while its row is made."""
         return [
             self._known(row, key) or self._ready(span, row, key, frames)
             for row, key, frames in self._keyed(span)
         ]
 
-    def prepare_once(self, span: Span) -> list[KnownRow | ReadyRow | RepeatedRow]:
+    def prepare_once(self, span: RowRange) -> list[KnownRow | ReadyRow | RepeatedRow]:
         """As `prepare`, but of all rows of equal key only one is made ready."""
         return [
             self._known(row, key) or self._repeated(row, key) or self._ready(span, row, key, frames)
             for row, key, frames in self._keyed(span)
         ]
 
-    def _keyed(self, span: Span) -> Iterator[tuple[int, bytes, dict[str, NDArray[np.uint8]]]]:
+    def _keyed(self, span: RowRange) -> Iterator[tuple[int, bytes, dict[str, NDArray[np.uint8]]]]:
         prompt = self._preparer.render(span.recording.instruction, list(span.frames))
         for row, frames in span.read():
             yield row, row_key(self._spec, prompt, frames), frames
@@ -162,7 +125,7 @@ class RowPreparation:
         return RepeatedRow(row, key, first) if first != row else None
 
     def _ready(
-        self, span: Span, row: int, key: bytes, frames: dict[str, NDArray[np.uint8]]
+        self, span: RowRange, row: int, key: bytes, frames: dict[str, NDArray[np.uint8]]
     ) -> ReadyRow:
         variants = self._preparer.prepare_variants(span.recording.instruction, frames, key)
         return ReadyRow(row, key, variants, f"{span.recording.path}, VL row {row}")

@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 from pipeline.base.digests import file_digest
 from pipeline.base.errors import ConfigError, NumericsError, StoreIncomplete
 from pipeline.data import CameraStream
+from pipeline.data.row_range import RowRange
 from pipeline.extract.encoder import Encoder
 from pipeline.extract.job import Came, Job, Outcome, Piece, WrittenRows
-from pipeline.extract.rows import KnownRow, ReadyRow, RowPreparation, Span
+from pipeline.extract.rows import KnownRow, ReadyRow, RowPreparation
 from pipeline.store import Donor, StoreBuild, part_path, read_plan
 from pipeline.store.schema import read_specs
 from pipeline.vlm.feature_spec import differences, feature_spec
@@ -114,7 +115,7 @@ class RangeComputer:
         """The decoded and prepared rows of a piece; raises what its recording makes it raise."""
         views = self._job.spec.views
         cameras = self._cameras_of(piece)
-        span = Span.of(piece.recording, cameras, piece.rows, piece.frame_time, views)
+        span = RowRange.of(piece.recording, cameras, piece.rows, piece.frame_time, views)
         return self._preparation.prepare(span)
 
     def written(self, made: Sequence[KnownRow | ReadyRow]) -> Iterator[WrittenRows]:

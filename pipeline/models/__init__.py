@@ -1,7 +1,7 @@
-"""What is trained: encoders, fusion, action experts, and the policy made of them.
+"""What is trained, under the names that people import: a thin door of `pipeline.policy`.
 
-`QwenVLAUnified` and the names that it is known by are here too, but come from `unified` when first
-asked for: they bring a vision-language model, and training from a store needs none.
+`QwenVLAUnified` and its other names come from `pipeline.compat.unified` when first asked for: they
+bring a vision-language model, and training from a store needs none.
 """
 
 from importlib import import_module

@@ -9,7 +9,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from pipeline.datasets import UnifiedBatch
+from pipeline.compat.batch import UnifiedBatch
 from pipeline.look.page.style import PALETTE, canvas
 from pipeline.look.recording.draw_drawing import say
 from pipeline.look.recording.runs import runs

@@ -10,8 +10,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from pipeline.compat.batch import UnifiedBatch
+from pipeline.compat.dataset import UnifiedVLADataset
 from pipeline.data import Channels
-from pipeline.datasets import UnifiedBatch, UnifiedVLADataset
 from pipeline.look.page.style import canvas
 from pipeline.look.recording.draw_channels import Group, groups, short_names
 from pipeline.look.recording.draw_drawing import absent, centre, curves, legend_beside, words

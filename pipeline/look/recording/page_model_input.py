@@ -7,7 +7,8 @@ from itertools import groupby
 
 from pipeline.base.config import Params
 from pipeline.base.errors import PipelineError
-from pipeline.datasets import UnifiedBatch, UnifiedVLADataset
+from pipeline.compat.batch import UnifiedBatch
+from pipeline.compat.dataset import UnifiedVLADataset
 from pipeline.look.page.blocks import Block, Document, Picture, Run, Section, Table, Text, Tokens
 from pipeline.look.recording import pictures as plots
 from pipeline.look.recording.facts import EpisodeView, PromptToken, PromptView

@@ -3,7 +3,8 @@
 import numpy as np
 
 from pipeline.base.config import Params
-from pipeline.datasets import UnifiedBatch, UnifiedVLADataset, unified_collate_fn
+from pipeline.compat.batch import UnifiedBatch, unified_collate_fn
+from pipeline.compat.dataset import UnifiedVLADataset
 from pipeline.look.recording.facts import EpisodeView
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data import CameraStream, Recording
-from pipeline.extract.rows import Span
+from pipeline.data.row_range import RowRange
 from pipeline.store import FeatureStore
 from pipeline.vlm.preparation import PreparedRow, Preparer
 
@@ -67,7 +67,7 @@ class LiveRows:
         episode = int(np.searchsorted(self._vl_start, rows[0], side="right")) - 1
         cameras = self._cameras(episode)
         shown = self._frame_time[rows]
-        span = Span.of(self._recordings[episode], cameras, rows, shown, self._views)
+        span = RowRange.of(self._recordings[episode], cameras, rows, shown, self._views)
         made: dict[int, PreparedRow] = {}
         for row, frames in span.read():
             made[row] = self._preparer.prepare(self._instructions[episode], frames)

@@ -12,12 +12,12 @@ from torch.utils.data import Dataset, Subset
 
 from pipeline.base.config import Source
 from pipeline.base.errors import ConfigError, RecordingError
+from pipeline.compat.batch import Sample, UnifiedBatch
+from pipeline.compat.cached import check_store, episodes_of_format, episodes_of_recordings
+from pipeline.compat.frames import Frames
+from pipeline.compat.streams import in_memory, read_episodes
 from pipeline.data import Recording, open_recordings
 from pipeline.data.timeline import choose_action_rotation
-from pipeline.datasets.batch import Sample, UnifiedBatch
-from pipeline.datasets.cached import check_store, episodes_of_format, episodes_of_recordings
-from pipeline.datasets.frames import Frames
-from pipeline.datasets.streams import in_memory, read_episodes
 from pipeline.store import Episode, FeatureStore
 from pipeline.train.batches import Windows
 from pipeline.train.split import split_by_episode

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.compat.batch import Images
+from pipeline.compat.streams import ReadEpisode
 from pipeline.data import CameraStream
-from pipeline.datasets.batch import Images
-from pipeline.datasets.streams import ReadEpisode
 from pipeline.store import KEY_BYTES
 
 

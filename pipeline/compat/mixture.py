@@ -11,8 +11,8 @@ from torch.utils.data import DataLoader, Sampler
 
 from pipeline.base.config import Source
 from pipeline.base.errors import ConfigError
-from pipeline.datasets.batch import unified_collate_fn
-from pipeline.datasets.unified import UnifiedVLADataset
+from pipeline.compat.batch import unified_collate_fn
+from pipeline.compat.dataset import UnifiedVLADataset
 from pipeline.store import FeatureStore
 from pipeline.train.mixture import TickSampler
 
