@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch.utils.data import DataLoader, Dataset
 
 from pipeline.store import FeatureStore
-from pipeline.train.batches import Draw, Prefetch, Windows
+from pipeline.train.batches import BatchIndices, Prefetch, Windows
 
 _BATCH = 64
 _SKIPPED = 4
@@ -43,7 +43,7 @@ def stream_rates(store: FeatureStore, length: int, batches: int) -> dict[str, di
 
     def prefetch() -> Iterator[object]:
         cpu = torch.device("cpu")
-        with Prefetch(store, (Draw(each) for each in ticks), windows, cpu) as feed:
+        with Prefetch(store, (BatchIndices(each) for each in ticks), windows, cpu) as feed:
             yield from feed
 
     def loader() -> Iterator[object]:

@@ -24,7 +24,7 @@ from pipeline.base.config import TrainHeadParams, load_params
 from pipeline.policy.cost import flop_table
 from pipeline.store import Batch, FeatureStore
 from pipeline.store.gather import WIDE
-from pipeline.train.batches import Draw, Feed, Windows
+from pipeline.train.batches import BatchIndices, Feed, Windows
 from pipeline.train.feature_source import Cached
 from pipeline.train.loop import Trainer
 from pipeline.train.run import Run
@@ -136,11 +136,11 @@ def measure(
     return results, found.ratios(RAM), targets
 
 
-def _kept(trainer: Trainer, steps: int) -> Iterator[tuple[Draw, Batch]]:
+def _kept(trainer: Trainer, steps: int) -> Iterator[tuple[BatchIndices, Batch]]:
     """The batches of the first steps, again and again, each taken to the device when asked for."""
     windows = Windows.of(trainer.params)
     sizes = (windows.horizon, windows.sensor_window, windows.state_window)
-    kept: list[tuple[Draw, Batch]] = []
+    kept: list[tuple[BatchIndices, Batch]] = []
     for draw in trainer.plan.draws(range(steps)):
         batch = trainer.store.gather(draw.ticks, *sizes, variants=draw.variants)
         kept.append((draw, batch.pin() if trainer.device.type == "cuda" else batch))

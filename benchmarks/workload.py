@@ -23,7 +23,7 @@ from pipeline.extract.survey import Survey, survey
 from pipeline.simulation.demo_recordings import TASK
 from pipeline.simulation.insertion_formats import write_raw
 from pipeline.simulation.recorder import simulate_episode
-from pipeline.store import Donor, StoreBuild
+from pipeline.store import RowSource, StoreBuild
 from pipeline.vlm.preparation import Preparer
 
 ROWS_AN_EPISODE = 18
@@ -57,7 +57,7 @@ class Workload:
         checked, bad = check_episodes(surveyed, params)
         assert not bad, bad
         with closing(_laid_out(params, surveyed, checked)) as build:
-            layout = Donor(build.part)
+            layout = RowSource(build.part)
             vl_start = layout.episode_edges("vl")
             by_digest = {one.digest: one.recording for one in surveyed.episodes}
             recordings = [by_digest[digest] for digest in layout.episode_digests]

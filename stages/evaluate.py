@@ -21,7 +21,7 @@ from pipeline.base.device import resolve_device
 from pipeline.base.durable import write_document
 from pipeline.base.ownership import REPORT, claim, refuse_foreign
 from pipeline.evaluate.ablation_tables import modality_table
-from pipeline.evaluate.evaluation import JUDGED, Judgement, judgement
+from pipeline.evaluate.evaluation import JUDGED, Evaluation, judgement
 from pipeline.evaluate.tables import table, write_tables
 from pipeline.look.evaluation.page import evaluation_report
 from pipeline.look.page.writing import write_report
@@ -58,7 +58,7 @@ def _store_for(checkpoint: PolicyCheckpoint, params: Params) -> FeatureStore:
     return store
 
 
-def _write(folder: Path, found: Judgement) -> list[Path]:
+def _write(folder: Path, found: Evaluation) -> list[Path]:
     """The tables, the page with its pictures, and what was judged; returns their paths."""
     claim(folder, REPORT)
     files = write_tables(folder, found.comparison, found.predictions, found.store, found.study)

@@ -34,7 +34,7 @@ MOST_SAMPLES = 4
 
 
 @dataclass(frozen=True)
-class Spoilt:
+class Ablated:
     """A policy judged with one stream spoilt."""
 
     stream: str
@@ -48,7 +48,7 @@ class ModalityStudy:
     """A policy judged on the same ticks with all streams intact and with each one spoilt."""
 
     intact: Comparison
-    spoilt: tuple[Spoilt, ...]
+    spoilt: tuple[Ablated, ...]
     notes: tuple[str, ...]
     """What could not be judged as asked, and why."""
     samples: int
@@ -59,7 +59,7 @@ class ModalityStudy:
         """The streams that the policy sees."""
         return tuple(dict.fromkeys(one.stream for one in self.spoilt))
 
-    def times_intact(self, one: Spoilt) -> float | None:
+    def times_intact(self, one: Ablated) -> float | None:
         """The error with a stream spoilt, as a multiple of the intact one; None where that is 0."""
         intact = self.intact.overall("policy")
         return one.comparison.overall("policy") / intact if intact > 0 else None
@@ -114,7 +114,7 @@ def judge_modalities(
         )
     ]
     spoilt = (
-        Spoilt(stream, how, comparison)
+        Ablated(stream, how, comparison)
         for (stream, how, _), comparison in zip(ways[1:], comparisons[1:], strict=True)
     )
     return ModalityStudy(comparisons[0], tuple(spoilt), tuple(notes), samples)

@@ -10,10 +10,10 @@ import torch
 from numpy.typing import NDArray
 
 from pipeline.store import Batch, FeatureStore
-from pipeline.train.batches import NO_LAGS, Draw, Feed, Lags, Prefetch, Ticks, Windows
+from pipeline.train.batches import NO_LAGS, BatchIndices, Feed, Lags, Prefetch, Ticks, Windows
 from pipeline.train.predictions import FeedMaker
 
-Alter = Callable[[Draw, Batch], Batch]
+Alter = Callable[[BatchIndices, Batch], Batch]
 """A batch as the policy is to see it; the one it is given stays as it is."""
 
 FIELDS = {
@@ -45,7 +45,7 @@ class Altered:
     ) -> None:
         self._feed.__exit__(kind, error, trace)
 
-    def __iter__(self) -> Iterator[tuple[Draw, Batch]]:
+    def __iter__(self) -> Iterator[tuple[BatchIndices, Batch]]:
         for draw, batch in self._feed:
             self.waited_s = self._feed.waited_s
             yield draw, self._alter(draw, batch)
@@ -60,7 +60,7 @@ def feed_maker(
 ) -> FeedMaker:
     """Feeds of this store in which streams come late or are altered."""
 
-    def make(plan: Sequence[Draw]) -> Feed:
+    def make(plan: Sequence[BatchIndices]) -> Feed:
         feed = Prefetch(store, plan, windows, device, lags=lags)
         return feed if alter is None else Altered(feed, alter)
 
@@ -74,7 +74,7 @@ def zeroed(stream: str, mean: NDArray[np.floating]) -> Alter:
     intensity): the error would tell how the policy extrapolates, not what it does without knowing.
     """
 
-    def alter(draw: Draw, batch: Batch) -> Batch:
+    def alter(draw: BatchIndices, batch: Batch) -> Batch:
         values = getattr(batch, stream)
         level = torch.tensor(mean, dtype=torch.float32, device=values.device)
         return replace(batch, **{stream: level.expand(values.shape)})
@@ -86,7 +86,7 @@ def missing(stream: str) -> Alter:
     """Nothing of the stream is real: the policy's encoder gives its embedding for that."""
     valid = FIELDS[stream][1]
 
-    def alter(draw: Draw, batch: Batch) -> Batch:
+    def alter(draw: BatchIndices, batch: Batch) -> Batch:
         return replace(batch, **{valid: torch.zeros_like(getattr(batch, valid))})
 
     return alter
@@ -97,7 +97,7 @@ def exchanged(
 ) -> Alter:
     """Tick `ticks[i]` sees the stream as it is at tick `donors[i]`; `ticks` ascend."""
 
-    def alter(draw: Draw, batch: Batch) -> Batch:
+    def alter(draw: BatchIndices, batch: Batch) -> Batch:
         here = donors[np.searchsorted(ticks, draw.ticks)]
         other = store.gather(here, *astuple(windows)).to(batch.action.device)
         return replace(batch, **{name: getattr(other, name) for name in FIELDS[stream]})

@@ -24,7 +24,7 @@ JUDGED = "judged.json"
 
 
 @dataclass(frozen=True)
-class Judgement:
+class Evaluation:
     """A policy that was judged, and all that is known of it."""
 
     name: str
@@ -49,7 +49,7 @@ def judgement(
     device: torch.device,
     recordings: Path,
     say: Callable[[str], None],
-) -> Judgement:
+) -> Evaluation:
     """The policy of the checkpoint in `folder`, judged on its held-out ticks of a store it fits.
 
     What is judged on what is said first. Raises `CheckpointMismatch` as `held_out_ticks` does, and
@@ -81,7 +81,7 @@ def judgement(
         study = judge_modalities(
             checkpoint, policy, store, ticks, wanted.batch_size, wanted.samples, progress=True
         )
-    return Judgement(
+    return Evaluation(
         name=str(folder),
         checkpoint=checkpoint,
         store=store,

@@ -15,7 +15,7 @@ from distributed import Client
 
 from pipeline.base.errors import ConfigError, PipelineError
 from pipeline.extract.connection import connected
-from pipeline.extract.handout import Handout, Task
+from pipeline.extract.handout import Task, TaskScheduler
 from pipeline.extract.job import Job, Piece, WrittenRows
 from pipeline.extract.ranges import by_episode, ranges_of, rows_between_pages
 from pipeline.extract.work import Computed, Work
@@ -40,7 +40,9 @@ def compute_on_cluster(work: Work) -> Computed:
     job = _job(work)
     patience_s = _LOCAL_PATIENCE_S if job.local else math.inf
     with connected(extract) as client, _plugged(client, job):
-        handout = Handout(client, job.name, _tasks(work, job.local), extract.retries, patience_s)
+        handout = TaskScheduler(
+            client, job.name, _tasks(work, job.local), extract.retries, patience_s
+        )
         with closing(handout.results()) as written:
             return _marked(work, written)
 

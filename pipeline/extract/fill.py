@@ -16,7 +16,7 @@ from pipeline.base.digests import ContentDigests, joint_digest
 from pipeline.extract.survey import Survey
 from pipeline.extract.takeover import take_over
 from pipeline.extract.work import Computed, Work
-from pipeline.store import Donor, StoreBuild
+from pipeline.store import RowSource, StoreBuild
 
 _DECIDES_SPEED = ("weights", "adapter", "processor", "compute_dtype", "variants")
 
@@ -43,7 +43,7 @@ class ExtractionReport:
 def fill(
     build: StoreBuild,
     surveyed: Survey,
-    donors: Sequence[Donor],
+    donors: Sequence[RowSource],
     params: Params,
     digests: ContentDigests,
     missing: NDArray[np.int64],
@@ -55,7 +55,7 @@ def fill(
     begun = time.monotonic()
     rows = build.specs["vl/time"].shape[0]
     with (
-        closing(Donor(build.part)) as layout,
+        closing(RowSource(build.part)) as layout,
         tqdm(
             total=rows,
             initial=rows - len(missing),

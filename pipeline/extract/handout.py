@@ -50,7 +50,7 @@ class Task:
     """Computed while nothing else is, so that a death is surely its own."""
 
 
-class Handout:
+class TaskScheduler:
     """Tasks on their way to workers and back."""
 
     def __init__(

@@ -16,14 +16,14 @@ from pipeline.data.timeline import Timeline
 from pipeline.extract.check import CheckedEpisode, embodiment_of
 from pipeline.extract.plan import store_bytes
 from pipeline.extract.survey import Survey, shown_path
-from pipeline.store import SCHEMA, Donor, Sizes, StoreBuild, arrays
+from pipeline.store import SCHEMA, RowSource, Sizes, StoreBuild, arrays
 from pipeline.store.episodes import EpisodeRows, episode_arrays, episode_edges
 from pipeline.store.schema import ArraySpec
 from pipeline.vlm.feature_spec import FeatureSpec
 
 
 def check_space(
-    build: StoreBuild, checked: Sequence[CheckedEpisode], donors: Sequence[Donor]
+    build: StoreBuild, checked: Sequence[CheckedEpisode], donors: Sequence[RowSource]
 ) -> None:
     """Raise `DiskFull` where the store will not fit, chunks that can be linked left out."""
     linked = sum(
@@ -46,7 +46,7 @@ def lay_out(
     checked: Sequence[CheckedEpisode],
     survey: Survey,
     params: Params,
-    donors: Sequence[Donor],
+    donors: Sequence[RowSource],
 ) -> None:
     """Write all but the feature rows; chunks of unchanged streams are linked from a finished store.
 
@@ -113,8 +113,8 @@ def _episodes(checked: Sequence[CheckedEpisode], params: Params) -> list[Episode
 
 
 def _linkable(
-    build: StoreBuild, checked: Sequence[CheckedEpisode], donors: Sequence[Donor]
-) -> Iterator[tuple[Donor, str, int]]:
+    build: StoreBuild, checked: Sequence[CheckedEpisode], donors: Sequence[RowSource]
+) -> Iterator[tuple[RowSource, str, int]]:
     """Stream arrays of a finished store, and how many of their first rows are the same here.
 
     Those of the leading episodes of unchanged content; only whole chunks of them can be linked.

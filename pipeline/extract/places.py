@@ -11,7 +11,7 @@ from pipeline.base.ownership import refuse_foreign, remove_folder
 from pipeline.data.embodiment import Embodiment
 from pipeline.extract.plan import spec_differences
 from pipeline.extract.survey import Survey
-from pipeline.store import Donor, StoreBuild, part_path, read_plan
+from pipeline.store import RowSource, StoreBuild, part_path, read_plan
 from pipeline.store.paths import MERGED, STORE, is_store
 from pipeline.store.schema import read_specs
 
@@ -43,9 +43,9 @@ def known_places(target: Path) -> list[Path]:
 
 
 @contextmanager
-def donors_at(places: Sequence[Path], surveyed: Survey) -> Generator[list[Donor]]:
+def donors_at(places: Sequence[Path], surveyed: Survey) -> Generator[list[RowSource]]:
     """Stores and laid-out builds of the same feature spec among these places."""
-    donors = [Donor(place) for place in places if read_plan(place) is not None]
+    donors = [RowSource(place) for place in places if read_plan(place) is not None]
     try:
         yield [donor for donor in donors if donor.spec_digest == surveyed.spec.digest]
     finally:
@@ -63,11 +63,11 @@ def refuse_to_lose(target: Path, surveyed: Survey, embodiment: Embodiment) -> No
     begun, finished = plans(target)
     for place in (target, part_path(target)):
         if read_plan(place) is not None:
-            with closing(Donor(place)) as donor:
+            with closing(RowSource(place)) as donor:
                 _refuse_another(donor, surveyed, embodiment)
     if finished is None or not (begun == finished or finished.startswith(MERGED)):
         return
-    with closing(Donor(part_path(target) if begun == finished else target)) as donor:
+    with closing(RowSource(part_path(target) if begun == finished else target)) as donor:
         lost = set(donor.episode_contents) - {one.content for one in surveyed.episodes}
     if lost:
         what = "is under repair" if begun == finished else "was merged of others"
@@ -78,7 +78,7 @@ def refuse_to_lose(target: Path, surveyed: Survey, embodiment: Embodiment) -> No
         )
 
 
-def _refuse_another(donor: Donor, surveyed: Survey, embodiment: Embodiment) -> None:
+def _refuse_another(donor: RowSource, surveyed: Survey, embodiment: Embodiment) -> None:
     known, now = set(donor.episode_contents), {one.content for one in surveyed.episodes}
     if not known or known & now or not donor.rows:
         return
@@ -161,7 +161,7 @@ def _lost(target: Path, surveyed: Survey) -> str | None:
 
 def _contents(store: Path) -> list[str] | None:
     """The content digest of each episode; None where they can no longer be read."""
-    with closing(Donor(store)) as donor:
+    with closing(RowSource(store)) as donor:
         try:
             return donor.episode_contents
         except StoreIncomplete:
@@ -179,7 +179,7 @@ def make_room(target: Path, surveyed: Survey, say: Say) -> None:
     part = part_path(target)
     if read_plan(part) is None:
         return
-    abandoned = Donor(part)
+    abandoned = RowSource(part)
     abandoned.close()
     if abandoned.spec_digest == surveyed.spec.digest:
         taken = len(set_aside(target))

@@ -8,7 +8,7 @@ from pipeline.base.config import DataParams, Params
 from pipeline.base.format import duration, size
 from pipeline.extract.check import CheckedEpisode
 from pipeline.extract.survey import Survey
-from pipeline.store import FEATURES, Donor
+from pipeline.store import FEATURES, RowSource
 from pipeline.store.schema import ArraySpec
 from pipeline.vlm.feature_spec import differences
 
@@ -63,7 +63,9 @@ def store_bytes(specs: dict[str, ArraySpec]) -> int:
     return sum(spec.data_bytes for spec in specs.values())
 
 
-def reasons(survey: Survey, store: Donor | None, specs: dict[str, ArraySpec]) -> tuple[str, ...]:
+def reasons(
+    survey: Survey, store: RowSource | None, specs: dict[str, ArraySpec]
+) -> tuple[str, ...]:
     """Why the store that is there, if any, will not do."""
     if store is None:
         return ("there is no store yet",)
@@ -104,7 +106,7 @@ def spec_differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[
     return [*first[:_MOST_DIFFERENCES], *more]
 
 
-def warnings(survey: Survey, store: Donor | None, data: DataParams) -> tuple[str, ...]:
+def warnings(survey: Survey, store: RowSource | None, data: DataParams) -> tuple[str, ...]:
     """What makes every row or action another one, with the way out."""
     found: list[str] = []
     recordings = [one.recording for one in survey.episodes]
@@ -151,7 +153,7 @@ def dtype_warnings(params: Params, missing: int) -> tuple[str, ...]:
 
 
 def known_rows(
-    checked: Sequence[CheckedEpisode], views: Sequence[str], donors: Sequence[Donor]
+    checked: Sequence[CheckedEpisode], views: Sequence[str], donors: Sequence[RowSource]
 ) -> int:
     """How many rows donors are known to have before a frame is decoded."""
     count = 0

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.data import Recording
 from pipeline.data.row_range import RowRange
-from pipeline.store import Donor
+from pipeline.store import RowSource
 from pipeline.vlm.feature_spec import FeatureSpec, row_key
 from pipeline.vlm.preparation import PreparedRow, Preparer
 
@@ -85,7 +85,7 @@ def spans_of(
 class RowPreparation:
     """Turns spans into rows; used from several threads."""
 
-    def __init__(self, preparer: Preparer, spec: FeatureSpec, donors: Sequence[Donor]) -> None:
+    def __init__(self, preparer: Preparer, spec: FeatureSpec, donors: Sequence[RowSource]) -> None:
         self._preparer = preparer
         self._spec = spec
         self._donors = donors

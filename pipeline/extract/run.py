@@ -36,8 +36,8 @@ from pipeline.extract.plan import (
 )
 from pipeline.extract.survey import Survey, survey
 from pipeline.store import (
-    Donor,
     FeatureStore,
+    RowSource,
     StoreBuild,
     build_lock,
     part_path,
@@ -197,13 +197,13 @@ def _new_plan(
     build: StoreBuild,
     checked: Sequence[CheckedEpisode],
     surveyed: Survey,
-    donors: Sequence[Donor],
+    donors: Sequence[RowSource],
     params: Params,
     digests: ContentDigests,
 ) -> ExtractionPlan:
     before = {digest for donor in donors for digest in donor.episode_digests}
     before_it = build.target if build.target in known_places(build.target) else build.part
-    store = Donor(before_it) if read_plan(before_it) is not None else None
+    store = RowSource(before_it) if read_plan(before_it) is not None else None
     rows = build.specs["vl/time"].shape[0]
     known = known_rows(checked, surveyed.spec.views, donors)
     return ExtractionPlan(
@@ -220,7 +220,7 @@ def _new_plan(
     )
 
 
-def _reasons(build: StoreBuild, surveyed: Survey, store: Donor | None) -> tuple[str, ...]:
+def _reasons(build: StoreBuild, surveyed: Survey, store: RowSource | None) -> tuple[str, ...]:
     if read_plan(build.part) == surveyed.plan and (damage := layout_damage(build.target)):
         return (f"{damage}; streams are laid out again, the feature rows are kept",)
     return reasons(surveyed, store, build.specs)

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from pipeline.extract.commits import TOGETHER, commit_known
 from pipeline.extract.rows import KnownRow
 from pipeline.extract.work import Work
-from pipeline.store import Donor
+from pipeline.store import RowSource
 
 
-def take_over(work: Work, layout: Donor) -> NDArray[np.int64]:
+def take_over(work: Work, layout: RowSource) -> NDArray[np.int64]:
     """Commit the missing rows that donors know by content, instruction and frame times.
 
     Returns their numbers. `layout` is the build itself, which says what its episodes are.
@@ -25,7 +25,7 @@ def take_over(work: Work, layout: Donor) -> NDArray[np.int64]:
     return np.array(taken, np.int64)
 
 
-def _known(work: Work, layout: Donor) -> Iterator[KnownRow]:
+def _known(work: Work, layout: RowSource) -> Iterator[KnownRow]:
     missing = set(work.missing.tolist())
     for episode, (content, instruction) in enumerate(layout.episode_said):
         keys = [(donor, donor.keys_of(content, instruction)) for donor in work.donors]
@@ -35,7 +35,7 @@ def _known(work: Work, layout: Donor) -> Iterator[KnownRow]:
 
 
 def _of_row(
-    row: int, frame_time: NDArray[np.float64], keys: Sequence[tuple[Donor, dict[bytes, bytes]]]
+    row: int, frame_time: NDArray[np.float64], keys: Sequence[tuple[RowSource, dict[bytes, bytes]]]
 ) -> KnownRow | None:
     """The row from the first donor that has it, whole."""
     for donor, by_frames in keys:

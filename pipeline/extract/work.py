@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pipeline.base.config import Params
 from pipeline.base.digests import ContentDigests
 from pipeline.data import Recording
-from pipeline.store import Donor, StoreBuild
+from pipeline.store import RowSource, StoreBuild
 from pipeline.vlm.feature_spec import FeatureSpec
 
 
@@ -27,7 +27,7 @@ class Work:
     """(row, view)"""
     missing: NDArray[np.int64]
     """Rows to compute, ascending."""
-    donors: Sequence[Donor]
+    donors: Sequence[RowSource]
     """Of the same feature spec: a row of known key is copied."""
     params: Params
     digests: ContentDigests

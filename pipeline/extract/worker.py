@@ -24,7 +24,7 @@ from pipeline.data.row_range import RowRange
 from pipeline.extract.encoder import Encoder
 from pipeline.extract.job import Came, Job, Outcome, Piece, WrittenRows
 from pipeline.extract.rows import KnownRow, ReadyRow, RowPreparation
-from pipeline.store import Donor, StoreBuild, part_path, read_plan
+from pipeline.store import RowSource, StoreBuild, part_path, read_plan
 from pipeline.store.schema import read_specs
 from pipeline.vlm.feature_spec import differences, feature_spec
 from pipeline.vlm.preparation import Preparer
@@ -90,7 +90,7 @@ class RangeComputer:
         check_place(job)
         self._job = job
         self._worker_name = worker_name
-        self._donors = [Donor(path) for path in job.donors]
+        self._donors = [RowSource(path) for path in job.donors]
         self._build = StoreBuild(job.target, read_specs(part_path(job.target)), job.plan)
         self._preparation = RowPreparation(
             Preparer(job.params.vlm, job.spec), job.spec, self._donors

@@ -14,7 +14,7 @@ from pipeline.store.lock import build_lock
 from pipeline.store.names import episode_name, place
 from pipeline.store.paths import part_path, read_plan, recover
 from pipeline.store.reader import Episode, FeatureStore
-from pipeline.store.row_source import Donor
+from pipeline.store.row_source import RowSource
 from pipeline.store.schema import FEATURES, KEY_BYTES, SCHEMA, Sizes, arrays
 from pipeline.store.writer import StoreBuild
 
@@ -26,9 +26,9 @@ __all__ = [
     "KEY_BYTES",
     "SCHEMA",
     "Batch",
-    "Donor",
     "Episode",
     "FeatureStore",
+    "RowSource",
     "Sizes",
     "StoreBuild",
     "arrays",

@@ -17,7 +17,7 @@ from pipeline.store.environments import EnvironmentLog, environment_at
 from pipeline.store.schema import CHECKSUMS, FEATURES, KEYS, ArraySpec, read_specs
 
 
-class Donor:
+class RowSource:
     """Known feature rows by key, and streams by episode.
 
     Works on a finished store and on a laid-out build alike: it reads chunk files, not chunks.

@@ -12,7 +12,7 @@ from pipeline.policy.checkpoint import PolicyCheckpoint, load_policy, save_polic
 from pipeline.policy.normalization import Normalization
 from pipeline.policy.observation import PolicyShape
 from pipeline.store import FeatureStore
-from pipeline.train.feature_source import Front
+from pipeline.train.feature_source import FeatureSource
 from pipeline.train.held_out import held_out_contents, held_out_ranges
 from pipeline.train.identity import source_of
 from pipeline.train.run import Run
@@ -29,7 +29,7 @@ class Checkpoints:
     store: FeatureStore
     params: TrainHeadParams
     split: Split
-    front: Front
+    front: FeatureSource
     normalization: Normalization
     shape: PolicyShape
 

@@ -9,10 +9,10 @@ from torch import nn
 
 from pipeline.policy.policy import Policy, Trainable
 from pipeline.store import FeatureStore
-from pipeline.train.batches import Draw, Feed, Prefetch, Resident, Windows
+from pipeline.train.batches import BatchIndices, DeviceStore, Feed, Prefetch, Windows
 
 
-class Front(Protocol):
+class FeatureSource(Protocol):
     """What stands before a policy in training: the store, or a model that still learns."""
 
     identity: Mapping[str, Any]
@@ -32,7 +32,7 @@ class Front(Protocol):
         """Peak learning rate of a parameter by its name in the module; None: `train_head`'s."""
         ...
 
-    def feed(self, plan: Iterable[Draw], windows: Windows, device: torch.device) -> Feed:
+    def feed(self, plan: Iterable[BatchIndices], windows: Windows, device: torch.device) -> Feed:
         """The batches of a plan, in its order, as the module takes them."""
         ...
 
@@ -54,7 +54,7 @@ class Cached:
     def __init__(self, store: FeatureStore, on_device: Collection[str] = ()) -> None:
         self._store = store
         self._on_device = on_device
-        self._resident: Resident | None = None
+        self._resident: DeviceStore | None = None
 
     def attach(self, policy: Policy) -> Trainable:
         """The policy itself."""
@@ -69,10 +69,10 @@ class Cached:
         """None: every rate is the trainer's."""
         return None
 
-    def feed(self, plan: Iterable[Draw], windows: Windows, device: torch.device) -> Feed:
+    def feed(self, plan: Iterable[BatchIndices], windows: Windows, device: torch.device) -> Feed:
         """Batches of the store, gathered ahead of time or on the device."""
         if self._on_device and self._resident is None:
-            self._resident = Resident(self._store, self._on_device, device)
+            self._resident = DeviceStore(self._store, self._on_device, device)
         return Prefetch(self._store, plan, windows, device, resident=self._resident)
 
     def save(self, folder: Path, module: nn.Module) -> None:

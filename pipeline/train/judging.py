@@ -13,7 +13,7 @@ from pipeline.policy.normalization import Normalization
 from pipeline.policy.policy import Trainable
 from pipeline.store import FeatureStore
 from pipeline.train.batches import Windows
-from pipeline.train.feature_source import Front
+from pipeline.train.feature_source import FeatureSource
 from pipeline.train.held_out import judge
 from pipeline.train.split import Split
 
@@ -22,7 +22,7 @@ EVALUATION_TICKS = 1000
 
 
 @dataclass
-class Standing:
+class EarlyStopping:
     """The best held-out error so far and how many evaluations have come since."""
 
     patience: int | None
@@ -62,7 +62,7 @@ class Standing:
         return self.patience is not None and self.stalled >= self.patience
 
 
-def judged_ticks(held_out: NDArray[np.int64], front: Front) -> NDArray[np.int64]:
+def judged_ticks(held_out: NDArray[np.int64], front: FeatureSource) -> NDArray[np.int64]:
     """The held-out ticks that evaluations of a run look at: as many as it may, evenly spaced."""
     limit = EVALUATION_TICKS if front.eval_ticks is None else front.eval_ticks
     spread = np.linspace(0, len(held_out) - 1, min(len(held_out), limit)).round()
@@ -71,7 +71,7 @@ def judged_ticks(held_out: NDArray[np.int64], front: Front) -> NDArray[np.int64]
 
 def held_out_error(
     module: nn.Module,
-    front: Front,
+    front: FeatureSource,
     store: FeatureStore,
     ticks: NDArray[np.int64],
     params: TrainHeadParams,

@@ -10,10 +10,10 @@ from pipeline.base.config import TrainHeadParams
 from pipeline.base.device import use_bfloat16
 from pipeline.policy.policy import Policy
 from pipeline.store import Batch, FeatureStore
-from pipeline.train.batches import Draw
+from pipeline.train.batches import BatchIndices
 from pipeline.train.compilation import compiled
 from pipeline.train.ema import WeightAverage, trainable
-from pipeline.train.feature_source import Front
+from pipeline.train.feature_source import FeatureSource
 from pipeline.train.gradients import sum_gradients
 from pipeline.train.optimizer import (
     make_optimizer,
@@ -37,7 +37,7 @@ class Learner:
 
     def __init__(
         self,
-        front: Front,
+        front: FeatureSource,
         policy: Policy,
         store: FeatureStore,
         params: TrainHeadParams,
@@ -60,7 +60,7 @@ class Learner:
     def step(
         self,
         number: int,
-        parts: Iterable[tuple[Draw, Batch]],
+        parts: Iterable[tuple[BatchIndices, Batch]],
         interrupted: Callable[[], bool],
     ) -> tuple[dict[str, Tensor], bool]:
         """Step `number`, counted from 0, on this process's parts of its batch.
@@ -94,7 +94,7 @@ class Learner:
         load_weights(self.average.weights, state.average, place)
         restore_optimizer(self.optimizer, self.module, state.optimizer)
 
-    def _backward(self, part: Draw, batch: Batch) -> dict[str, Tensor]:
+    def _backward(self, part: BatchIndices, batch: Batch) -> dict[str, Tensor]:
         """Add a part's gradients; its loss and the parts of it, each by its share of the whole."""
         assert isinstance(part, Part), "a feed hands back the draws of its plan"
         # Dropout and sampled noise of a part depend on nothing that came before it.

@@ -11,13 +11,13 @@ from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import NumericsError
 from pipeline.policy.policy import Policy
 from pipeline.store import Batch, FeatureStore
-from pipeline.train.batches import Draw, Windows, choose_feed
+from pipeline.train.batches import BatchIndices, Windows, choose_feed
 from pipeline.train.checkpoints import Checkpoints, read_last
-from pipeline.train.feature_source import Cached, Front
+from pipeline.train.feature_source import Cached, FeatureSource
 from pipeline.train.history import History
 from pipeline.train.identity import policy_shape
 from pipeline.train.interrupt import deferred_interrupt
-from pipeline.train.judging import Standing, held_out_error, judged_ticks
+from pipeline.train.judging import EarlyStopping, held_out_error, judged_ticks
 from pipeline.train.learner import Learner
 from pipeline.train.log import Row, TrainingLog, open_log
 from pipeline.train.optimizer import schedule
@@ -50,7 +50,7 @@ class Trainer:
         params: TrainHeadParams,
         split: Split,
         run: Run,
-        front: Front | None = None,
+        front: FeatureSource | None = None,
     ) -> None:
         self.store, self.params, self.split, self.run = store, params, split, run
         self.world = World.current()
@@ -63,7 +63,7 @@ class Trainer:
         self.front = front
         self.plan = Plan(store, params, split, self.world, run.section)
         self.step = 0
-        self.standing = Standing.of(params, split)
+        self.standing = EarlyStopping.of(params, split)
         self.history = History()
         self._earlier: tuple[Row, ...] = ()
         self._trained_s = 0.0
@@ -137,7 +137,7 @@ class Trainer:
         return self.step == self.params.max_steps or self.standing.exhausted
 
     def _train_step(
-        self, batches: Iterator[tuple[Draw, Batch]], interrupted: Callable[[], bool]
+        self, batches: Iterator[tuple[BatchIndices, Batch]], interrupted: Callable[[], bool]
     ) -> bool:
         """One step of all processes; whether one of them was told to stop."""
         parts = islice(batches, len(self.plan.own))

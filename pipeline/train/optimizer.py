@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from pipeline.base.config import TrainHeadParams
 from pipeline.train.ema import trainable
-from pipeline.train.feature_source import Front
+from pipeline.train.feature_source import FeatureSource
 
 
 def make_optimizer(
@@ -36,7 +36,9 @@ def make_optimizer(
     )
 
 
-def peak_rates(module: nn.Module, front: Front, params: TrainHeadParams) -> dict[str, float]:
+def peak_rates(
+    module: nn.Module, front: FeatureSource, params: TrainHeadParams
+) -> dict[str, float]:
     """The peak learning rate of each parameter that does not have `params.lr`, by name.
 
     The front's word comes first, then `sensor_lr` for the sensor encoder.

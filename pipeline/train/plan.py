@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import ConfigError
 from pipeline.store import FeatureStore
-from pipeline.train.batches import Draw
+from pipeline.train.batches import BatchIndices
 from pipeline.train.mixture import TickSampler, ticks_by_source
 from pipeline.train.split import Split
 from pipeline.train.world import World
@@ -20,7 +20,7 @@ takes (seed, step, part) for (seed, step, part, 0), so that a third number would
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Part(Draw):
+class Part(BatchIndices):
     """A part of a step's batch, computed at once; a feed hands it back beside its batch."""
 
     share: float

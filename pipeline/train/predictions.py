@@ -13,12 +13,12 @@ from pipeline.base.errors import NumericsError
 from pipeline.policy.observation import Observation
 from pipeline.policy.policy import Trainable
 from pipeline.store import FeatureStore, place
-from pipeline.train.batches import Draw, Feed, Prefetch, Ticks, Windows, draws
+from pipeline.train.batches import BatchIndices, Feed, Prefetch, Ticks, Windows, draws
 
 Actions = NDArray[np.float32]
 METHODS = ("policy", "zero_action", "mean_action", "repeat_last")
 BASELINES = METHODS[1:]
-FeedMaker = Callable[[Sequence[Draw]], Feed]
+FeedMaker = Callable[[Sequence[BatchIndices]], Feed]
 """Makes the feed of a plan: what a policy is to see at these ticks."""
 _SEED = 0
 _CHUNKS_AT_ONCE = 1024

@@ -106,8 +106,8 @@ def open_run(
 ) -> Run:
     """The run of these params on this store: new, resumed or finished.
 
-    `extra_identity` is what else decides its numbers (`Front.identity`); `section` of the params
-    is the one that errors name.
+    `extra_identity` is what else decides its numbers (`FeatureSource.identity`); `section` of the
+    params is the one that errors name.
 
     Begins nothing. A finished run with a damaged checkpoint is new: trained again, then replaced.
     Raises `CheckpointMismatch` when an unfinished run with a checkpoint saw other features or other

@@ -9,7 +9,7 @@ from pipeline.policy.cost import describe_cost
 from pipeline.policy.observation import PolicyShape
 from pipeline.policy.policy import Policy
 from pipeline.store import FeatureStore
-from pipeline.train.judging import Standing
+from pipeline.train.judging import EarlyStopping
 from pipeline.train.learner import Learner
 from pipeline.train.mixture import ticks_by_source
 from pipeline.train.speed import peak_memory_bytes
@@ -87,7 +87,9 @@ def describe_learner(learner: Learner, policy: Policy) -> list[str]:
     return lines
 
 
-def closing(step: int, standing: Standing, trained_s: float, device: torch.device) -> list[str]:
+def closing(
+    step: int, standing: EarlyStopping, trained_s: float, device: torch.device
+) -> list[str]:
     """Lines on what a run took: its steps, `trained_s` seconds of them, and this process's memory.
 
     Evaluations and checkpoints are not in the seconds.

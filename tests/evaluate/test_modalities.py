@@ -17,7 +17,7 @@ from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.normalization import ChannelStatistics, Normalization
 from pipeline.policy.policy import Policy
 from pipeline.store import FeatureStore
-from pipeline.train.batches import Draw, Lags, Windows
+from pipeline.train.batches import BatchIndices, Lags, Windows
 from pipeline.train.held_out import held_out_contents, held_out_ranges
 from pipeline.train.identity import policy_shape, source_of
 from pipeline.train.split import split_by_episode
@@ -210,7 +210,7 @@ def test_an_episode_without_the_stream_gives_and_takes_nothing(
 
 def test_an_alteration_leaves_the_batch_and_the_other_streams_alone(store: FeatureStore) -> None:
     ticks, windows = np.arange(40, 44), Windows(2, 3, 3)
-    draw, batch = Draw(ticks), store.gather(ticks, 2, 3, 3)
+    draw, batch = BatchIndices(ticks), store.gather(ticks, 2, 3, 3)
     before = batch.sensor.clone()
     mean = np.arange(5.0)
     at_mean = zeroed("sensor", mean)(draw, batch)

@@ -42,7 +42,7 @@ from pipeline.extract.job import Job
 from pipeline.extract.places import ledger_path
 from pipeline.extract.survey import survey
 from pipeline.extract.worker import check_place, device_of
-from pipeline.store import Donor, FeatureStore, StoreBuild, part_path, read_plan
+from pipeline.store import FeatureStore, RowSource, StoreBuild, part_path, read_plan
 from pipeline.store.schema import ARRAY_NAMES, read_specs
 from pipeline.vlm.feature_spec import feature_spec
 
@@ -360,7 +360,7 @@ class TestDeaths:
         assert_same(params.extract.store, FeatureStore.open(expected.extract.store))
 
     def edges(self, store: Path) -> dict[str, range]:
-        build = Donor(part_path(store))
+        build = RowSource(part_path(store))
         starts = build.episode_edges("vl")
         said = [Path(one["id"]).name for one in build._said]
         build.close()

@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pipeline.base.errors import DiskFull, StoreIncomplete, StoreLocked
-from pipeline.store import Donor, FeatureStore, Sizes, StoreBuild, arrays, build_lock, recover
+from pipeline.store import FeatureStore, RowSource, Sizes, StoreBuild, arrays, build_lock, recover
 from pipeline.store.chunks import check_trailers, row_checksums
 from pipeline.store.schema import FEATURES, TRAILER_BYTES, ArraySpec
 
@@ -260,7 +260,7 @@ class TestLinks:
         build.seal()
         longer, grown = self._specs(tmp_path, 14000, "two")
         longer.create()
-        donor = Donor(build.target)
+        donor = RowSource(build.target)
         spec = donor.specs["sensor/values"]
         assert longer.linkable("sensor/values", spec, 9000) == 2, "the last holds the stream's end"
         longer.link_unchanged("sensor/values", build.target, spec, 9000)

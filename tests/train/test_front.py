@@ -13,7 +13,7 @@ from pipeline.base.durable import read_document
 from pipeline.policy.checkpoint import load_policy
 from pipeline.policy.policy import Policy
 from pipeline.store import FeatureStore
-from pipeline.train.batches import Draw, Feed, Prefetch, Windows
+from pipeline.train.batches import BatchIndices, Feed, Prefetch, Windows
 from pipeline.train.loop import Trainer
 from pipeline.train.run import open_run
 from pipeline.train.split import split_by_episode
@@ -66,7 +66,7 @@ class AdaptedFront:
     def parameter_lr(self, name: str) -> float | None:
         return 1e-2 if name.startswith("adapter") else None
 
-    def feed(self, plan: Iterable[Draw], windows: Windows, device: torch.device) -> Feed:
+    def feed(self, plan: Iterable[BatchIndices], windows: Windows, device: torch.device) -> Feed:
         if isinstance(plan, Iterator):
             return Prefetch(self.store, plan, windows, device)
         plan = list(plan)

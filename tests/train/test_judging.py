@@ -11,7 +11,7 @@ from pipeline.base.errors import ConfigError
 from pipeline.policy.checkpoint import load_policy
 from pipeline.store import FeatureStore
 from pipeline.train.feature_source import Cached
-from pipeline.train.judging import EVALUATION_TICKS, Standing, judged_ticks
+from pipeline.train.judging import EVALUATION_TICKS, EarlyStopping, judged_ticks
 from pipeline.train.loop import Trainer
 
 Make = Callable[..., Any]
@@ -22,14 +22,14 @@ class Stop(Exception):
 
 
 def test_the_standing_counts_since_the_best() -> None:
-    standing = Standing(patience=2)
+    standing = EarlyStopping(patience=2)
     assert [standing.take(error) for error in (3.0, 2.0, 2.0, 1.0)] == [True, True, False, True]
     assert (standing.best_error, standing.stalled, standing.exhausted) == (1.0, 0, False)
     standing.take(5.0)
     assert not standing.exhausted
     standing.take(1.5)
     assert standing.exhausted
-    assert not Standing(None, 1.0, stalled=10**6).exhausted
+    assert not EarlyStopping(None, 1.0, stalled=10**6).exhausted
 
 
 def test_judged_ticks_are_spread_and_limited_by_the_front(store: FeatureStore) -> None:

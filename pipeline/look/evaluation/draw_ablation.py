@@ -3,7 +3,7 @@
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from pipeline.evaluate.ablation import ModalityStudy, Spoilt
+from pipeline.evaluate.ablation import Ablated, ModalityStudy
 from pipeline.evaluate.ablation_tables import FOOTNOTE as MODALITY_FOOTNOTE
 from pipeline.evaluate.ablation_tables import best_baseline
 from pipeline.look.page.style import GRID, INK, LABELS, STYLES, canvas, legend_below
@@ -42,7 +42,7 @@ def modalities(study: ModalityStudy) -> Figure:
     return figure
 
 
-def _panel(axis: Axes, panel: list[Spoilt], study: ModalityStudy, unit: float) -> None:
+def _panel(axis: Axes, panel: list[Ablated], study: ModalityStudy, unit: float) -> None:
     heights = [one.comparison.overall("policy") / unit for one in panel]
     colours = [COLOURS[one.how.split()[0]] for one in panel]
     bars = axis.bar(range(len(panel)), heights, color=colours, width=0.7)

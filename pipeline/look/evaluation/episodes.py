@@ -6,7 +6,7 @@ from functools import cache, partial
 from pipeline.base.digests import file_digest
 from pipeline.evaluate.ablation_tables import best_baseline
 from pipeline.evaluate.episode_frames import footage, shown_ticks
-from pipeline.evaluate.evaluation import Judgement
+from pipeline.evaluate.evaluation import Evaluation
 from pipeline.evaluate.tables import HEADINGS
 from pipeline.look.evaluation import pictures as plots
 from pipeline.look.page.blocks import Block, Picture, Section, Table, Text
@@ -21,7 +21,7 @@ _EPISODES = 40
 _ABOVE = "Above, the frames that the features at the dotted ticks were computed from. "
 
 
-def episodes(found: Judgement) -> list[Block]:
+def episodes(found: Evaluation) -> list[Block]:
     """All held-out episodes by error."""
     comparison, store = found.comparison, found.store
     best = best_baseline(comparison)
@@ -55,7 +55,7 @@ def episodes(found: Judgement) -> list[Block]:
     ]
 
 
-def extremes(found: Judgement) -> Iterator[Section]:
+def extremes(found: Evaluation) -> Iterator[Section]:
     """The best and the worst closely, with their frames where the recordings still lie there.
 
     The picture of a single one is that of the worst, which dvc.yaml lists.

@@ -7,7 +7,7 @@ from typing import Any
 from pipeline.evaluate.ablation import ModalityStudy
 from pipeline.evaluate.ablation_tables import FOOTNOTE as MODALITY_FOOTNOTE
 from pipeline.evaluate.ablation_tables import best_baseline, judged_on, modality_errors
-from pipeline.evaluate.evaluation import Judgement
+from pipeline.evaluate.evaluation import Evaluation
 from pipeline.evaluate.names import with_unit
 from pipeline.evaluate.tables import FOOTNOTE, HEADINGS, error_rows, still_dimensions
 from pipeline.look.evaluation import pictures as plots
@@ -21,7 +21,7 @@ _NAMES = 8
 """Channels of a stream named in the params; an A-scan has a thousand."""
 
 
-def evaluation_report(found: Judgement) -> Report:
+def evaluation_report(found: Evaluation) -> Report:
     """The page of a judgement, its recordings' frames read where they still lie.
 
     Says nothing of the clock and nothing of where it is written: the same judgement gives the same
@@ -102,7 +102,7 @@ def _baselines(comparison: Comparison) -> list[Block]:
     ]
 
 
-def _dimensions(found: Judgement) -> list[Block]:
+def _dimensions(found: Evaluation) -> list[Block]:
     comparison = found.comparison
     columns = ["dimension", "unit", *(HEADINGS[method] for method in METHODS), "policy RMSE"]
     scores = comparison.scores
@@ -183,7 +183,7 @@ def _modalities(study: ModalityStudy | None) -> list[Block]:
     ]
 
 
-def _training(found: Judgement) -> list[Block]:
+def _training(found: Evaluation) -> list[Block]:
     if not found.curves.curves:
         return [Text(found.curves.absence)]
     return [
@@ -196,7 +196,7 @@ def _training(found: Judgement) -> list[Block]:
     ]
 
 
-def _documents(found: Judgement) -> list[Block]:
+def _documents(found: Evaluation) -> list[Block]:
     checkpoint = found.checkpoint
     source = {key: value for key, value in checkpoint.source.items() if key != "feature_spec"}
     streams = {name: _shortened(said) for name, said in source.pop("streams").items()}

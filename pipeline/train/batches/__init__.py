@@ -5,20 +5,28 @@ the device; `choice` opens a store or an archive and picks between these ways; `
 archive is restored to.
 """
 
-from pipeline.train.batches.batch_indices import NO_LAGS, Draw, Feed, Lags, Ticks, Windows, draws
+from pipeline.train.batches.batch_indices import (
+    NO_LAGS,
+    BatchIndices,
+    Feed,
+    Lags,
+    Ticks,
+    Windows,
+    draws,
+)
 from pipeline.train.batches.choice import Choice, FeedName, choose_feed, open_store
-from pipeline.train.batches.device_store import Resident
+from pipeline.train.batches.device_store import DeviceStore
 from pipeline.train.batches.prefetch import Prefetch
 
 __all__ = [
     "NO_LAGS",
+    "BatchIndices",
     "Choice",
-    "Draw",
+    "DeviceStore",
     "Feed",
     "FeedName",
     "Lags",
     "Prefetch",
-    "Resident",
     "Ticks",
     "Windows",
     "choose_feed",

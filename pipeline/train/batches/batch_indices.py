@@ -15,7 +15,7 @@ Ticks = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
-class Draw:
+class BatchIndices:
     """What one batch is made of."""
 
     ticks: Ticks
@@ -24,9 +24,11 @@ class Draw:
     """(batch,) which stored variant of its VL row each tick sees; None: all 0, the plain frames."""
 
 
-def draws(ticks: Ticks, batch_size: int) -> list[Draw]:
+def draws(ticks: Ticks, batch_size: int) -> list[BatchIndices]:
     """The ticks in their order, `batch_size` at a time."""
-    return [Draw(part) for part in np.split(ticks, range(batch_size, len(ticks), batch_size))]
+    return [
+        BatchIndices(part) for part in np.split(ticks, range(batch_size, len(ticks), batch_size))
+    ]
 
 
 @dataclass(frozen=True)
@@ -75,4 +77,4 @@ class Feed(Protocol):
         /,
     ) -> None: ...
 
-    def __iter__(self) -> Iterator[tuple[Draw, Batch]]: ...
+    def __iter__(self) -> Iterator[tuple[BatchIndices, Batch]]: ...

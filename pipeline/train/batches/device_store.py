@@ -14,7 +14,7 @@ from pipeline.store.gather import Index, Selection, Window
 _UPLOAD_BYTES = 64 * 2**20
 
 
-class Resident:
+class DeviceStore:
     """The arrays of these wide fields of a store (`pipeline.store.gather.WIDE`) on a device.
 
     Copied once, with a progress bar. Which rows a batch is made of is worked out on the host: a few

@@ -15,8 +15,8 @@ import torch
 
 from pipeline.store import Batch, FeatureStore
 from pipeline.store.gather import Selection
-from pipeline.train.batches.batch_indices import NO_LAGS, Draw, Lags, Windows
-from pipeline.train.batches.device_store import Resident
+from pipeline.train.batches.batch_indices import NO_LAGS, BatchIndices, Lags, Windows
+from pipeline.train.batches.device_store import DeviceStore
 
 
 @dataclass
@@ -31,7 +31,7 @@ class _Buffer:
     copied: torch.cuda.Event | None = None
 
 
-class Prefetch(Iterator[tuple[Draw, Batch]]):
+class Prefetch(Iterator[tuple[BatchIndices, Batch]]):
     """Hands out `(draw, batch)` for each draw of `plan`, in its order.
 
     The plan is consumed in the background thread, at most `buffers` draws ahead. On the CPU a
@@ -48,12 +48,12 @@ class Prefetch(Iterator[tuple[Draw, Batch]]):
     def __init__(
         self,
         store: FeatureStore,
-        plan: Iterable[Draw],
+        plan: Iterable[BatchIndices],
         windows: Windows,
         device: torch.device,
         buffers: int = 2,
         lags: Lags = NO_LAGS,
-        resident: Resident | None = None,
+        resident: DeviceStore | None = None,
     ) -> None:
         assert buffers >= 2, "one buffer in use, one being filled"
         self.waited_s = 0.0
@@ -65,7 +65,7 @@ class Prefetch(Iterator[tuple[Draw, Batch]]):
         self._resident = resident
         self._on_device = frozenset[str]() if resident is None else resident.fields
         self._free: queue.SimpleQueue[_Buffer | None] = queue.SimpleQueue()
-        self._filled: queue.SimpleQueue[tuple[Draw, _Buffer] | BaseException | None] = (
+        self._filled: queue.SimpleQueue[tuple[BatchIndices, _Buffer] | BaseException | None] = (
             queue.SimpleQueue()
         )
         self._in_use: _Buffer | None = None
@@ -78,7 +78,7 @@ class Prefetch(Iterator[tuple[Draw, Batch]]):
         )
         self._thread.start()
 
-    def __next__(self) -> tuple[Draw, Batch]:
+    def __next__(self) -> tuple[BatchIndices, Batch]:
         if self._ended:
             raise StopIteration
         self._release()
@@ -129,7 +129,7 @@ class Prefetch(Iterator[tuple[Draw, Batch]]):
             self._free.put(self._in_use)
             self._in_use = None
 
-    def _work(self, plan: Iterable[Draw]) -> None:
+    def _work(self, plan: Iterable[BatchIndices]) -> None:
         try:
             self._store.warm(but=self._on_device)
             for draw in plan:
@@ -142,7 +142,7 @@ class Prefetch(Iterator[tuple[Draw, Batch]]):
         except BaseException as error:  # it belongs to the thread that asks for the batch
             self._filled.put(error)
 
-    def _fill(self, buffer: _Buffer, draw: Draw) -> None:
+    def _fill(self, buffer: _Buffer, draw: BatchIndices) -> None:
         if buffer.copied is not None:
             buffer.copied.synchronize()
         windows, count = astuple(self._windows), len(draw.ticks)

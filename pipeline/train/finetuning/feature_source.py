@@ -17,7 +17,7 @@ from pipeline.policy.checkpoint import DOCUMENT
 from pipeline.policy.live_policy import LivePolicy
 from pipeline.policy.policy import Policy, Trainable
 from pipeline.store import FeatureStore
-from pipeline.train.batches import Draw, Windows
+from pipeline.train.batches import BatchIndices, Windows
 from pipeline.train.finetuning.feed import LiveFeed
 from pipeline.train.finetuning.recordings import (
     check_recordings,
@@ -37,7 +37,7 @@ _FREE_TUNING = {"gradient_checkpointing"}
 
 
 class Live:
-    """A `Front` whose features come from a model that learns, over the recordings of a store."""
+    """A `FeatureSource` whose features come from a model that learns, over a store's recordings."""
 
     identity: Mapping[str, Any]
     eval_ticks: int | None
@@ -100,7 +100,9 @@ class Live:
         """`finetune.lr` for what is the model's."""
         return self._finetune.lr if name.startswith("vlm.") else None
 
-    def feed(self, plan: Iterable[Draw], windows: Windows, device: torch.device) -> LiveFeed:
+    def feed(
+        self, plan: Iterable[BatchIndices], windows: Windows, device: torch.device
+    ) -> LiveFeed:
         """Batches of the store with the rows of their ticks, decoded ahead of time."""
         threads = self._finetune.decode_threads
         return LiveFeed(self._store, self._rows, plan, windows, device, threads)

@@ -13,7 +13,7 @@ from jaxtyping import Int64
 from torch import Tensor
 
 from pipeline.store import Batch, FeatureStore
-from pipeline.train.batches import Draw, Prefetch, Windows
+from pipeline.train.batches import BatchIndices, Prefetch, Windows
 from pipeline.train.finetuning.rows import LiveRows
 from pipeline.vlm.preparation import PreparedRow
 
@@ -36,7 +36,7 @@ class _Coming:
     rows: list[Future[list[PreparedRow]]]
 
 
-class LiveFeed(Iterator[tuple[Draw, LiveBatch]]):
+class LiveFeed(Iterator[tuple[BatchIndices, LiveBatch]]):
     """A `Feed` that hands out `(draw, live batch)` for each draw of a plan, in its order.
 
     Streams come from a `Prefetch`; the distinct VL rows of each draw are decoded by `threads`
@@ -49,7 +49,7 @@ class LiveFeed(Iterator[tuple[Draw, LiveBatch]]):
         self,
         store: FeatureStore,
         rows: LiveRows,
-        plan: Iterable[Draw],
+        plan: Iterable[BatchIndices],
         windows: Windows,
         device: torch.device,
         threads: int,
@@ -63,7 +63,7 @@ class LiveFeed(Iterator[tuple[Draw, LiveBatch]]):
         announced = (self._announce(draw) for draw in plan)
         self._prefetch = Prefetch(store, announced, windows, device, buffers=threads + 1)
 
-    def __next__(self) -> tuple[Draw, LiveBatch]:
+    def __next__(self) -> tuple[BatchIndices, LiveBatch]:
         started = time.perf_counter()
         draw, batch = next(self._prefetch)
         coming = self._coming.popleft()
@@ -83,7 +83,7 @@ class LiveFeed(Iterator[tuple[Draw, LiveBatch]]):
     def __exit__(self, *raised: object) -> None:
         self.close()
 
-    def _announce(self, draw: Draw) -> Draw:
+    def _announce(self, draw: BatchIndices) -> BatchIndices:
         """Begin with the rows of a draw; called in the thread that consumes the plan, in order."""
         distinct, row_of = np.unique(self._vl_row[draw.ticks], return_inverse=True)
         pieces = self._rows.by_episode(distinct)

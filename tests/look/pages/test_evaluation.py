@@ -12,7 +12,7 @@ from pipeline.base.config import TrainHeadParams
 from pipeline.evaluate.ablation import judge_modalities
 from pipeline.evaluate.curves import Curve, Curves
 from pipeline.evaluate.episode_frames import Footage
-from pipeline.evaluate.evaluation import Judgement, judged_document
+from pipeline.evaluate.evaluation import Evaluation, judged_document
 from pipeline.evaluate.experiments import Experiment
 from pipeline.look.evaluation import episodes as episode_sections
 from pipeline.look.evaluation.comparison import comparison_report
@@ -45,7 +45,7 @@ CURVES = Curves({"train/loss": Curve(np.array([10, 20]), np.array([1.0, 0.1]))})
 @pytest.fixture(scope="module")
 def judgement(
     tiny_store: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory
-) -> Judgement:
+) -> Evaluation:
     """An untrained policy on three held-out episodes whose recordings are nowhere."""
     store = FeatureStore.open(tiny_store(tmp_path_factory.mktemp("judged"), sensor_channels=40))
 
@@ -75,7 +75,7 @@ def judgement(
     )
     windows = Windows.of(PARAMS)
     comparison, predictions = judge(policy, store, ticks, windows, 64, normalization)
-    return Judgement(
+    return Evaluation(
         name="models/head",
         checkpoint=checkpoint,
         store=store,
@@ -93,7 +93,7 @@ def section(report: Report, title: str) -> Section:
     return found
 
 
-def test_tables_say_what_the_comparison_says(judgement: Judgement) -> None:
+def test_tables_say_what_the_comparison_says(judgement: Evaluation) -> None:
     comparison = judgement.comparison
     report = evaluation_report(judgement)
     errors, dimensions, steps, episodes, streams = report.blocks(Table)
@@ -115,7 +115,7 @@ def test_tables_say_what_the_comparison_says(judgement: Judgement) -> None:
     assert dict(report.tiles)["held-out episodes"] == "3"
 
 
-def test_groups_in_which_a_baseline_is_better_stand_at_the_top(judgement: Judgement) -> None:
+def test_groups_in_which_a_baseline_is_better_stand_at_the_top(judgement: Evaluation) -> None:
     comparison = judgement.comparison
     group, *_ = comparison.varying_groups()
     places = list(group.dimensions)
@@ -133,7 +133,7 @@ def test_groups_in_which_a_baseline_is_better_stand_at_the_top(judgement: Judgem
         assert (said in summary) == ("A baseline is better" in summary) == bool(times)
 
 
-def test_dimensions_that_hardly_move_stand_at_the_top(judgement: Judgement) -> None:
+def test_dimensions_that_hardly_move_stand_at_the_top(judgement: Evaluation) -> None:
     comparison = judgement.comparison
     names = tuple(f"joint_{index}" for index in range(5))
     still = replace(
@@ -149,7 +149,7 @@ def test_dimensions_that_hardly_move_stand_at_the_top(judgement: Judgement) -> N
     assert "ardly mov" not in f"{report.summary} {report.tiles}"
 
 
-def test_params_spec_and_what_was_judged_are_there(judgement: Judgement) -> None:
+def test_params_spec_and_what_was_judged_are_there(judgement: Evaluation) -> None:
     trained, spec, source, judged = evaluation_report(judgement).blocks(Document)
     assert trained.content["horizon"] == 4
     assert spec.content["digest"] == "tiny-spec"
@@ -160,7 +160,7 @@ def test_params_spec_and_what_was_judged_are_there(judgement: Judgement) -> None
 
 
 def test_a_page_with_frames_and_without_is_sound(
-    judgement: Judgement,
+    judgement: Evaluation,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     assert_page_is_sound: Sound,
@@ -190,7 +190,7 @@ def test_a_page_with_frames_and_without_is_sound(
     assert_page_is_sound(tmp_path / PAGE)
 
 
-def test_what_is_missing_is_said(judgement: Judgement) -> None:
+def test_what_is_missing_is_said(judgement: Evaluation) -> None:
     bare = replace(judgement, study=None, curves=Curves({}, "No training curves: gone."))
     report = evaluation_report(bare)
     assert {one.name for one in report.blocks(Picture)}.isdisjoint({"modalities", "curves"})

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from pipeline.evaluate.ablation import ModalityStudy, Spoilt
+from pipeline.evaluate.ablation import Ablated, ModalityStudy
 from pipeline.evaluate.curves import Curve, Curves
 from pipeline.evaluate.experiments import Experiment
 from pipeline.evaluate.probe import Finding, Folds, Score, SlotName, Study
@@ -313,7 +313,7 @@ def studied(*errors: float) -> ModalityStudy:
 
     ways = (("sensor", "zeroed"), ("sensor", "delayed 50 ms"), ("features", "shuffled"))
     spoilt = tuple(
-        Spoilt(stream, how, judged(error))
+        Ablated(stream, how, judged(error))
         for (stream, how), error in zip(ways, errors[1:], strict=True)
     )
     return ModalityStudy(judged(errors[0]), spoilt, (), 4)

@@ -8,7 +8,7 @@ import pytest
 import zarr
 
 from pipeline.store import Batch, FeatureStore
-from pipeline.train.batches import Draw
+from pipeline.train.batches import BatchIndices
 
 KINDS = ("plain", "bfloat16", "variants", "no sensor", "no state")
 
@@ -35,13 +35,13 @@ def any_store(
 
 
 @pytest.fixture(scope="session")
-def draw_plan() -> Callable[..., list[Draw]]:
+def draw_plan() -> Callable[..., list[BatchIndices]]:
     """`draw_plan(store, batches, size=7)`: random ticks of random variants."""
 
-    def make(store: FeatureStore, batches: int, size: int = 7) -> list[Draw]:
+    def make(store: FeatureStore, batches: int, size: int = 7) -> list[BatchIndices]:
         rng = np.random.default_rng(0)
         return [
-            Draw(rng.integers(0, store.ticks, size), rng.integers(0, store.variants, size))
+            BatchIndices(rng.integers(0, store.ticks, size), rng.integers(0, store.variants, size))
             for _ in range(batches)
         ]
 

@@ -12,7 +12,7 @@ import zarr
 
 from pipeline.base.config import TrainHeadParams
 from pipeline.store import Batch, FeatureStore
-from pipeline.train.batches import Draw, Lags, Prefetch, Windows, draws
+from pipeline.train.batches import BatchIndices, Lags, Prefetch, Windows, draws
 
 CPU = torch.device("cpu")
 WINDOWS = Windows(horizon=4, sensor_window=6, state_window=5)
@@ -25,19 +25,19 @@ def store(
     return FeatureStore.open(tiny_store(tmp_path_factory.mktemp("batches")))
 
 
-def plan(store: FeatureStore, batches: int, size: int = 7) -> list[Draw]:
+def plan(store: FeatureStore, batches: int, size: int = 7) -> list[BatchIndices]:
     rng = np.random.default_rng(0)
     return [
-        Draw(rng.integers(0, store.ticks, size), rng.integers(0, store.variants, size))
+        BatchIndices(rng.integers(0, store.ticks, size), rng.integers(0, store.variants, size))
         for _ in range(batches)
     ]
 
 
-def at(*ticks: int) -> Draw:
-    return Draw(np.array(ticks))
+def at(*ticks: int) -> BatchIndices:
+    return BatchIndices(np.array(ticks))
 
 
-def fresh(store: FeatureStore, draw: Draw, **lags: float) -> Batch:
+def fresh(store: FeatureStore, draw: BatchIndices, **lags: float) -> Batch:
     sizes = {"horizon": 4, "sensor_window": 6, "state_window": 5}
     return store.gather(draw.ticks, **sizes, **lags, variants=draw.variants)
 
@@ -89,7 +89,7 @@ def test_variants_reach_the_store(tiny_store: Callable[..., Path], tmp_path: Pat
     with Prefetch(store, wanted, WINDOWS, CPU) as batches:
         for draw, batch in batches:
             assert equal(batch, fresh(store, draw))
-            assert not equal(batch, fresh(store, Draw(draw.ticks)))
+            assert not equal(batch, fresh(store, BatchIndices(draw.ticks)))
 
 
 def test_a_batch_is_not_overwritten_before_the_next_is_asked_for(store: FeatureStore) -> None:
@@ -123,7 +123,7 @@ def test_an_exception_comes_out_at_its_batch_and_ends_the_thread(store: FeatureS
 
 
 def test_an_exception_of_the_plan_is_handed_on(store: FeatureStore) -> None:
-    def failing() -> Iterator[Draw]:
+    def failing() -> Iterator[BatchIndices]:
         yield at(0)
         raise RuntimeError("no more ticks")
 
@@ -134,7 +134,7 @@ def test_an_exception_of_the_plan_is_handed_on(store: FeatureStore) -> None:
 
 
 def test_leaving_early_ends_the_thread_and_an_endless_plan(store: FeatureStore) -> None:
-    def endless() -> Iterator[Draw]:
+    def endless() -> Iterator[BatchIndices]:
         while True:
             yield at(1, 2, 3)
 
@@ -148,7 +148,7 @@ def test_leaving_early_ends_the_thread_and_an_endless_plan(store: FeatureStore) 
 def test_the_plan_is_consumed_no_further_ahead_than_there_are_buffers(store: FeatureStore) -> None:
     taken: list[int] = []
 
-    def counted() -> Iterator[Draw]:
+    def counted() -> Iterator[BatchIndices]:
         for step in range(100):
             taken.append(step)
             yield at(step)
@@ -160,7 +160,7 @@ def test_the_plan_is_consumed_no_further_ahead_than_there_are_buffers(store: Fea
 
 
 def test_waiting_is_measured(store: FeatureStore) -> None:
-    def slow() -> Iterator[Draw]:
+    def slow() -> Iterator[BatchIndices]:
         for step in range(3):
             time.sleep(0.03)
             yield at(step)

@@ -9,11 +9,11 @@ import torch
 
 from pipeline.store import Batch, FeatureStore
 from pipeline.store.gather import WIDE
-from pipeline.train.batches import Draw, Lags, Prefetch, Resident, Windows, draws
+from pipeline.train.batches import BatchIndices, DeviceStore, Lags, Prefetch, Windows, draws
 
 CPU = torch.device("cpu")
 FIELDS = [{*WIDE}, {"sensor"}, {"features", "action"}, {"state"}]
-Plan = Callable[..., list[Draw]]
+Plan = Callable[..., list[BatchIndices]]
 Same = Callable[[Batch, Batch], bool]
 
 
@@ -24,7 +24,7 @@ def test_batches_are_those_of_the_map(
 ) -> None:
     windows, lags = Windows(4, window, window + 1), Lags(2, 0.13, 0.2)
     wanted = [*draw_plan(any_store, 6), *draws(np.arange(any_store.ticks), 32)]
-    resident = Resident(any_store, fields, CPU)
+    resident = DeviceStore(any_store, fields, CPU)
     for late in (Lags(), lags):
         with (
             Prefetch(any_store, wanted, windows, CPU, lags=late) as mapped,
@@ -39,7 +39,7 @@ def test_batches_are_those_of_the_map(
 def test_a_batch_stays_as_it_is_until_the_next(
     any_store: FeatureStore, draw_plan: Plan, same_bits: Same
 ) -> None:
-    resident = Resident(any_store, {"features", "sensor"}, CPU)
+    resident = DeviceStore(any_store, {"features", "sensor"}, CPU)
     windows = Windows(4, 6, 5)
     with Prefetch(any_store, draw_plan(any_store, 8), windows, CPU, resident=resident) as batches:
         for draw, batch in batches:
@@ -50,10 +50,10 @@ def test_a_batch_stays_as_it_is_until_the_next(
 def test_it_is_a_copy(tiny_store: Callable[..., Path], tmp_path: Path) -> None:
     store = FeatureStore.open(tiny_store(tmp_path))
     before = store.gather([40]).features.clone()
-    resident = Resident(store, {"features"}, CPU)
+    resident = DeviceStore(store, {"features"}, CPU)
     store.array("vl/features")[:] = 0
     with Prefetch(
-        store, [Draw(np.array([40]))], Windows(8, 65, 100), CPU, resident=resident
+        store, [BatchIndices(np.array([40]))], Windows(8, 65, 100), CPU, resident=resident
     ) as batches:
         assert torch.equal(next(batches)[1].features, before)
 
@@ -65,7 +65,7 @@ def test_on_a_gpu(
 ) -> None:
     device, windows = torch.device("cuda"), Windows(4, 40, 5)
     wanted = [*draw_plan(any_store, 6), *draws(np.arange(any_store.ticks), 32)]
-    resident = Resident(any_store, fields, device)
+    resident = DeviceStore(any_store, fields, device)
     with Prefetch(any_store, wanted, windows, device, resident=resident) as batches:
         kept = [*batches]
     for draw, batch in kept:

@@ -13,7 +13,7 @@ from pipeline.base.config import Params, TuningParams
 from pipeline.base.errors import RecordingError
 from pipeline.policy.live_observation import LiveObservation
 from pipeline.store import Batch, FeatureStore
-from pipeline.train.batches import Draw, Windows
+from pipeline.train.batches import BatchIndices, Windows
 from pipeline.train.finetuning.feed import LiveFeed
 from pipeline.train.finetuning.recordings import check_spec, find_recordings, known_digests
 from pipeline.train.finetuning.rows import LiveRows
@@ -28,7 +28,7 @@ CPU = torch.device("cpu")
 def feed(store: FeatureStore, params: Callable[..., Params]) -> Callable[..., LiveFeed]:
     """`feed(plan)`, over rows of its own."""
 
-    def make(plan: Iterable[Draw], threads: int = 2) -> LiveFeed:
+    def make(plan: Iterable[BatchIndices], threads: int = 2) -> LiveFeed:
         with known_digests(store) as digests:
             spec = check_spec(store, params(), digests)
         rows = LiveRows(store, find_recordings(store, params()), Preparer(params().vlm, spec))
@@ -37,9 +37,9 @@ def feed(store: FeatureStore, params: Callable[..., Params]) -> Callable[..., Li
     return make
 
 
-def plan_of(store: FeatureStore, draws: int, batch: int) -> list[Draw]:
+def plan_of(store: FeatureStore, draws: int, batch: int) -> list[BatchIndices]:
     rng = np.random.default_rng(1)
-    return [Draw(rng.integers(0, store.ticks, batch)) for _ in range(draws)]
+    return [BatchIndices(rng.integers(0, store.ticks, batch)) for _ in range(draws)]
 
 
 @pytest.mark.parametrize("threads", [1, 3])
@@ -70,7 +70,7 @@ def test_an_untuned_model_gives_the_cached_features(
     with known_digests(store) as digests:
         spec = check_spec(store, params(), digests)
     vlm = LiveVLM.load(params().vlm, spec, TuningParams(method="none"), "cpu").eval()
-    with feed([Draw(np.arange(0, store.ticks, 5))]) as batches, torch.no_grad():
+    with feed([BatchIndices(np.arange(0, store.ticks, 5))]) as batches, torch.no_grad():
         _, batch = next(batches)
         features, valid = vlm(batch.rows)
     assert isinstance(batch, LiveObservation)
@@ -95,10 +95,10 @@ def test_a_frame_that_is_gone_comes_out_at_its_batch(
 ) -> None:
     first, second = store.episodes[0].ticks, store.episodes[1].ticks
 
-    def plan() -> Iterator[Draw]:  # read once the recordings are open, before the first row
+    def plan() -> Iterator[BatchIndices]:  # read once the recordings are open, before the first row
         for frame in (own_recordings / "Follow_disc" / "episode_1" / "images").rglob("*.jpg"):
             frame.write_bytes(b"")
-        yield from (Draw(np.array(ticks[:3])) for ticks in (first, second, first))
+        yield from (BatchIndices(np.array(ticks[:3])) for ticks in (first, second, first))
 
     with feed(plan()) as batches:
         next(batches)

@@ -17,7 +17,7 @@ from pipeline.extract import extract
 from pipeline.policy.checkpoint import find_policy, load_policy
 from pipeline.policy.live_policy import LivePolicy
 from pipeline.store import FeatureStore
-from pipeline.train.batches import Draw, Windows
+from pipeline.train.batches import BatchIndices, Windows
 from pipeline.train.finetuning import Live, head_params, out_of_memory_named
 from pipeline.train.held_out import check_store, held_out_ticks, judge
 from pipeline.train.loop import Trainer
@@ -94,7 +94,7 @@ def test_what_is_kept_is_the_averaged_model_that_was_judged(
     averaged = made.averaged
     assert isinstance(averaged, LivePolicy)
     assert averaged.vlm is not None
-    with made.front.feed([Draw(ticks)], Windows(2, 1, 1), CPU) as feed, torch.no_grad():
+    with made.front.feed([BatchIndices(ticks)], Windows(2, 1, 1), CPU) as feed, torch.no_grad():
         _, batch = next(iter(feed))
         features, _ = averaged.vlm(batch.rows)
     cached = store.gather(ticks, 2, 1, 1).features
@@ -208,11 +208,11 @@ def test_what_is_not_used_of_a_store_is_said(params: Callable[..., Params], tmp_
     store = FeatureStore.open(given.extract.store)
     front = Live.open(store, given, CPU)
     assert any("1 augmented variant(s) of each row are not used" in s for s in front.summary())
-    draw = Draw(np.arange(6), variants=np.ones(6, np.int64))
+    draw = BatchIndices(np.arange(6), variants=np.ones(6, np.int64))
     with front.feed([draw], Windows(2, 1, 1), CPU) as feed:
         _, live = next(iter(feed))
     with Live.open(FeatureStore.open(params().extract.store), params(), CPU).feed(
-        [Draw(np.arange(6))], Windows(2, 1, 1), CPU
+        [BatchIndices(np.arange(6))], Windows(2, 1, 1), CPU
     ) as feed:
         _, plain = next(iter(feed))
     for one, other in zip(live.rows, plain.rows, strict=True):

@@ -1,0 +1,55 @@
+"""Where two JSON documents differ: the one comparison of specs, sources and checkpoints."""
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+Differences = dict[str, tuple[Any, Any]]
+"""Dotted place -> (expected, what is there); None where absent."""
+
+
+def differences(expected: Any, actual: Any, place: str = "") -> Differences:
+    """The places of two JSON documents that differ, in the order of the first.
+
+    Two mappings with equal `digest` are equal; of two with different ones the entries that differ
+    are named, and the digest only where they all agree. Of two lists of mappings of one length the
+    entries are compared, other lists are compared as a whole.
+    """
+    if isinstance(expected, Mapping) and isinstance(actual, Mapping):
+        if "digest" in expected and expected["digest"] == actual.get("digest"):
+            return {}
+        keys = [*expected, *(key for key in actual if key not in expected)]
+        inside = {
+            key: differences(expected.get(key), actual.get(key), f"{place}.{key}".lstrip("."))
+            for key in keys
+        }
+        digest = inside.pop("digest", {})
+        return {where: pair for found in inside.values() for where, pair in found.items()} or digest
+    expected = list(expected) if isinstance(expected, tuple) else expected
+    actual = list(actual) if isinstance(actual, tuple) else actual
+    if expected == actual:
+        return {}
+    if isinstance(expected, list) and isinstance(actual, list) and len(expected) == len(actual):
+        pairs = list(zip(expected, actual, strict=True))
+        if all(isinstance(a, Mapping) and isinstance(b, Mapping) for a, b in pairs):
+            return {
+                where: pair
+                for index, (a, b) in enumerate(pairs)
+                for where, pair in differences(a, b, f"{place}[{index}]").items()
+            }
+    return {place: (expected, actual)}
+
+
+def describe(differing: Differences, arrow: str = " -> ") -> list[str]:
+    """A line for each place, `prompt: "x" -> "y"`; long values are cut around where they differ."""
+    return [f"{place}: {_short(a, b)}{arrow}{_short(b, a)}" for place, (a, b) in differing.items()]
+
+
+def _short(value: Any, other: Any, most: int = 80) -> str:
+    text, beside = (json.dumps(one, ensure_ascii=False) for one in (value, other))
+    if len(text) <= most:
+        return text
+    same = next((at for at, (a, b) in enumerate(zip(text, beside, strict=False)) if a != b), 0)
+    begin = max(0, min(same - 25, len(text) - most))
+    end = begin + most
+    return f"{'…' if begin else ''}{text[begin:end]}{'…' if end < len(text) else ''}"

@@ -1,0 +1,29 @@
+"""Where numbers are no numbers: the one check for NaN and infinity, of numpy arrays."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def first_non_finite(
+    values: NDArray[Any], valid: NDArray[np.bool_] | None = None
+) -> tuple[int, ...] | None:
+    """The index of the first NaN or infinity, in C order; None where there is none.
+
+    `valid` has the shape of the leading axes of `values`: what is not valid is not looked at. A
+    uint16 array is read as the bits of bfloat16.
+    """
+    bad = non_finite(values)
+    if valid is not None:
+        bad &= valid.reshape(valid.shape + (1,) * (values.ndim - valid.ndim))
+    if not bad.any():
+        return None
+    return tuple(int(index) for index in np.unravel_index(int(bad.argmax()), bad.shape))
+
+
+def non_finite(values: NDArray[Any]) -> NDArray[np.bool_]:
+    """Whether each value is NaN or infinite; a uint16 array is read as the bits of bfloat16."""
+    if values.dtype == np.uint16:
+        return (values & np.uint16(0x7F80)) == np.uint16(0x7F80)
+    return ~np.isfinite(values)

@@ -1,0 +1,156 @@
+"""Rows under column heads, and how they read as text, CSV, Markdown and in a page."""
+
+import csv
+import io
+import math
+import numbers
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pipeline.base.durable import disk_full_named, fresh
+
+NOTHING = "–"
+"""What stands where there is no value."""
+DIGITS = 4
+"""Significant digits of a number that is no count."""
+PLAIN = (1e-4, 1e7)
+"""Magnitudes outside these are written with an exponent."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column as words; `numeric` ones stand right."""
+
+    head: str
+    numeric: bool
+    cells: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of cells under column heads; numbers stand right, in as many digits as they deserve.
+
+    A cell is a word, a number, a bool or None. Raises `ValueError` for a row of another length
+    than the heads.
+    """
+
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Any]]
+    caption: str = ""
+    strong: frozenset[int] = field(default_factory=frozenset[int])
+    """Rows that stand out in a page."""
+
+    def __post_init__(self) -> None:
+        for index, row in enumerate(self.rows):
+            if len(row) != len(self.columns):
+                raise ValueError(f"row {index}: {len(row)} cells, {len(self.columns)} heads")
+
+    def words(self) -> list[Column]:
+        """The columns as words."""
+        return [
+            _column(head, [row[index] for row in self.rows])
+            for index, head in enumerate(self.columns)
+        ]
+
+    def text(self) -> list[str]:
+        """Aligned lines for a terminal, heads first."""
+        columns = self.words()
+        widths = [max(map(len, (column.head, *column.cells))) for column in columns]
+        lines = [
+            [column.head for column in columns],
+            *zip(*(c.cells for c in columns), strict=True),
+        ]
+        return [
+            "  ".join(
+                cell.rjust(width) if column.numeric else cell.ljust(width)
+                for cell, width, column in zip(line, widths, columns, strict=True)
+            ).rstrip()
+            for line in lines
+        ]
+
+    def markdown(self) -> list[str]:
+        """Lines of a Markdown table."""
+        columns = self.words()
+        rule = ["---:" if column.numeric else "---" for column in columns]
+        lines = [[column.head for column in columns], rule]
+        lines += [list(row) for row in zip(*(column.cells for column in columns), strict=True)]
+        return ["| " + " | ".join(line) + " |" for line in lines]
+
+    def csv(self) -> str:
+        """For programs: floats in 6 significant digits, empty where there is no value."""
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(self.columns)
+        writer.writerows([_plain(cell) for cell in row] for row in self.rows)
+        return text.getvalue()
+
+    def write_csv(self, path: Path) -> Path:
+        """Write `csv()` and return the path. Raises `DiskFull`."""
+        with (
+            disk_full_named(path.parent),
+            fresh(path).open("w", encoding="utf-8", newline="") as out,
+        ):
+            out.write(self.csv())
+        return path
+
+
+def number(value: float) -> str:
+    """A number in four significant digits, thousands apart; NaN is an en dash."""
+    value = float(value)
+    if math.isnan(value):
+        return NOTHING
+    if math.isinf(value):
+        return "∞" if value > 0 else "-∞"
+    size = abs(value)
+    if size == 0:
+        return "0"
+    if not PLAIN[0] <= size < PLAIN[1]:
+        return f"{value:.{DIGITS - 1}e}"
+    # Of the rounded number: 9.9999 has one digit more before the point than it seems.
+    magnitude = int(f"{size:.{DIGITS - 1}e}".partition("e")[2])
+    return f"{value:,.{max(0, DIGITS - 1 - magnitude)}f}"
+
+
+def _column(head: str, values: Sequence[Any]) -> Column:
+    numeric = any(_is_number(value) for value in values) and all(
+        value is None or _is_number(value) for value in values
+    )
+    if numeric and all(_is_whole(value) for value in values):
+        cells = tuple(NOTHING if _is_missing(value) else f"{int(value):,}" for value in values)
+    else:
+        cells = tuple(_word(value) for value in values)
+    return Column(head, numeric, cells)
+
+
+def _word(value: Any) -> str:
+    if value is None:
+        return NOTHING
+    if _is_bool(value):
+        return "yes" if value else "no"
+    if isinstance(value, numbers.Integral):
+        return f"{int(value):,}"
+    return number(float(value)) if isinstance(value, numbers.Real) else str(value)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, numbers.Real) and not isinstance(value, numbers.Integral):
+        return "" if math.isnan(value) else f"{float(value):.6g}"
+    return "" if value is None else value
+
+
+def _is_bool(value: Any) -> bool:
+    return type(value).__name__ in ("bool", "bool_")
+
+
+def _is_number(value: Any) -> bool:
+    return not _is_bool(value) and isinstance(value, numbers.Real)
+
+
+def _is_missing(value: Any) -> bool:
+    return value is None or math.isnan(value)
+
+
+def _is_whole(value: Any) -> bool:
+    return _is_missing(value) or (math.isfinite(value) and float(value).is_integer())
