@@ -1,4 +1,4 @@
-"""Check a finished store: structure, files, the checksum of every row, NaN, clocks and offsets.
+"""Check a finished store: structure, files, the checksum of every row, NaN in features.
 
 Reads every byte of verify.store (extract.store where null) and says what is wrong and where. Exit 0
 where the store is sound; 2 with everything that is wrong and what to run next.
@@ -26,7 +26,7 @@ if __name__ == "__main__":  # here, for --help waits for no import below
 from pipeline.base.config import Params
 from pipeline.base.errors import NumericsError, StoreIncomplete
 from pipeline.extract.reextract import reextract
-from pipeline.extract.repair import repair, with_identity
+from pipeline.extract.repair import repair
 from pipeline.store.integrity import verify
 
 
@@ -34,19 +34,18 @@ def main(params: Params) -> None:
     """Check, and repair or compute rows again where asked to; raises where something is wrong."""
     store = params.verify.store or params.extract.store
     checked = verify(store, params.verify.threads, params.verify.workers)
-    findings = with_identity(checked)
-    print("\n".join([findings.summary(), *findings.notes]))
-    if not findings.sound and params.verify.repair:
-        print("\n".join(findings.lines()))
-        print("\n".join(repair(findings, params, print).lines()))
+    print("\n".join([checked.summary(), *checked.notes]))
+    if not checked.sound:
+        if not params.verify.repair:
+            lines = [f"{store}: the store is damaged:", *checked.lines(), checked.advice()]
+            raise StoreIncomplete("\n".join(lines))
+        print("\n".join(checked.lines()))
+        repair(checked, params, print)
         return
-    if not findings.sound:
-        said = [f"{store}: the store is damaged:", *findings.lines(), findings.advice()]
-        raise StoreIncomplete("\n".join(said))
     print(f"{store}: sound")
     if params.verify.reextract:
-        found = reextract(store, params, print)
-        print("\n".join(found.lines()))
-        if found.beyond:
-            said = [f"{store}: rows are not what they would be today:", *found.refusals()]
-            raise NumericsError("\n".join(said))
+        computed = reextract(store, params, print)
+        print("\n".join(computed.lines()))
+        if computed.beyond:
+            lines = [f"{store}: rows are not what they would be today:", *computed.refusals()]
+            raise NumericsError("\n".join(lines))

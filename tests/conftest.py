@@ -146,6 +146,37 @@ def fork_server() -> ForkServerContext:
     return server
 
 
+@pytest.fixture(scope="session")
+def hold_together() -> Callable[[FeatureStore], None]:
+    """`hold_together(store)`: its arrays agree, which `verify` leaves to those who build stores."""
+    return assert_arrays_agree
+
+
+def assert_arrays_agree(store: FeatureStore) -> None:
+    """Offsets, indices, clocks, numbers and names."""
+    for stream, stored in schema.STREAMS.items():
+        edges, time = store.array(f"episode/{stream}_start"), store.array(f"{stream}/time")
+        assert (edges[0], edges[-1]) == (0, len(time)), stream
+        for episode in store.episodes:
+            rows = getattr(episode, stored.rows)
+            assert (np.diff(time[rows.start : rows.stop]) >= 0).all(), stream
+    for episode in store.episodes:
+        ticks = slice(episode.ticks.start, episode.ticks.stop)
+        rows = episode.vl_rows.start + np.arange(len(episode.ticks)) // store.vlm_reuse_count
+        assert np.array_equal(store.array("tick/vl_row")[ticks], rows)
+        assert len(episode.vl_rows) == -(-len(episode.ticks) // store.vlm_reuse_count)
+        for stream in ("sensor", "state"):
+            ends = store.array(f"tick/{stream}_end")[ticks]
+            readings = getattr(episode, schema.STREAMS[stream].rows)
+            assert (np.diff(ends) >= 0).all()
+            assert ((ends >= readings.start) & (ends <= readings.stop)).all()
+    widths = {"action": store.action_dim, "sensor": store.sensor_channels, "state": store.state_dim}
+    assert {stream: len(store.streams[stream]["names"]) for stream in widths} == widths
+    assert len(store.streams["views"]) == store.array("vl/frame_time").shape[1]
+    for name in ("tick/action", "sensor/values", "state/values"):
+        assert np.isfinite(store.array(name)).all(), name
+
+
 def write_tiny_store(
     folder: Path,
     *,

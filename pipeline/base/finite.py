@@ -22,8 +22,13 @@ def first_non_finite(
     return tuple(int(index) for index in np.unravel_index(int(bad.argmax()), bad.shape))
 
 
+_EXPONENTS = {"uint16": np.uint16(0x7F80), "float16": np.uint16(0x7C00)}
+"""The bits that are all set in a NaN or infinity, and in no number; numpy is slow with float16."""
+
+
 def non_finite(values: NDArray[Any]) -> NDArray[np.bool_]:
     """Whether each value is NaN or infinite; a uint16 array is read as the bits of bfloat16."""
-    if values.dtype == np.uint16:
-        return (values & np.uint16(0x7F80)) == np.uint16(0x7F80)
-    return ~np.isfinite(values)
+    exponent = _EXPONENTS.get(values.dtype.name)
+    if exponent is None:
+        return ~np.isfinite(values)
+    return (values.view(np.uint16) & exponent) == exponent

@@ -11,19 +11,17 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from pipeline.base.bfloat16 import widen
 from pipeline.base.config import Params
 from pipeline.base.digests import ContentDigests
-from pipeline.base.errors import StoreMismatch
+from pipeline.base.errors import NumericsError, StoreMismatch
 from pipeline.data import Recording
-from pipeline.extract.encoder import Encoder
-from pipeline.extract.places import ledger_path
-from pipeline.extract.rows import ReadyRow, RowPreparation, in_background, spans_of
-from pipeline.extract.survey import Survey, survey
-from pipeline.store import FEATURES, FeatureStore
-from pipeline.store.integrity.findings import capped
-from pipeline.store.reader import Episode
-from pipeline.vlm.feature_spec import differences
-from pipeline.vlm.preparation import Preparer
+from pipeline.data.row_range import RowRange
+from pipeline.extract.survey import survey
+from pipeline.store import FEATURES, Episode, FeatureStore, ledger_path
+from pipeline.store.integrity.verification import capped
+from pipeline.vlm.feature_spec import FeatureSpec, differences, row_key
+from pipeline.vlm.preparation import PreparedRow, Preparer
 from pipeline.vlm.qwen import FrozenVLM
 
 TOLERANCES = {"float32": 1e-3, "float16": 5e-2, "bfloat16": 3e-1}
@@ -70,87 +68,75 @@ class Reextraction:
     @property
     def beyond(self) -> list[Deviation]:
         """Rows that deviate more than is tolerated; a NaN always does."""
-        return [one for one in self.deviations if not one.relative <= self.tolerance]
+        return [row for row in self.deviations if not row.relative <= self.tolerance]
 
     def lines(self) -> list[str]:
         """For people."""
+        gone = "cannot be checked, its recording changed or is gone: "
+        unchecked = capped([gone + episode for episode in self.unchecked], "episodes")
         if not self.deviations:
-            return ["no row can be computed again", *self._unchecked()]
+            return ["no row can be computed again", *unchecked]
         worst = self.deviations[0]
-        other = [one for one in self.deviations if not one.same_pixels]
+        other = [row.where for row in self.deviations if not row.same_pixels]
         return [
             f"computed {len(self.deviations)} rows again; the largest deviation is "
             f"{worst.relative:.2e} of its slot's root mean square "
-            f"(absolute {max(one.absolute for one in self.deviations):.2e}), {self.tolerance:.0e} "
+            f"(absolute {max(row.absolute for row in self.deviations):.2e}), {self.tolerance:.0e} "
             f"is tolerated: {worst.where}, slot {worst.slot}",
-            *capped([f"other pixels than the store's: {one.where}" for one in other], "rows"),
+            *capped([f"other pixels than the store's: {where}" for where in other], "rows"),
             *(["the decoder of today gives other pixels than that of the store"] if other else []),
             *(f"environment, {line}" for line in self.environment),
-            *self._unchecked(),
+            *unchecked,
         ]
 
     def refusals(self) -> list[str]:
         """For people: the rows beyond the tolerance."""
-        said = (
-            f"{one.where}: slot {one.slot} deviates {one.relative:.2e} of its root mean square, "
-            f"{one.absolute:.2e} absolute"
-            + ("" if one.same_pixels else "; its frames decode to other pixels")
-            for one in self.beyond
-        )
-        return capped(list(said), "rows beyond the tolerance")
-
-    def _unchecked(self) -> list[str]:
-        said = [
-            f"cannot be checked, its recording changed or is gone: {one}" for one in self.unchecked
+        lines = [
+            f"{row.where}: slot {row.slot} deviates {row.relative:.2e} of its root mean square, "
+            f"{row.absolute:.2e} absolute"
+            + ("" if row.same_pixels else "; its frames decode to other pixels")
+            for row in self.beyond
         ]
-        return capped(said, "episodes")
+        return capped(lines, "rows beyond the tolerance")
 
 
 def reextract(path: Path, params: Params, say: Callable[[str], None]) -> Reextraction:
     """Compute `verify.reextract` random rows of a store again, each with all its variants.
 
-    By the same path as extraction, from the recordings that the store was made of; the rows of
-    episodes whose recordings changed are left out and named. Raises `StoreMismatch` where the
-    params describe features of another kind than the store's.
+    From the recordings that the store was made of; the rows of episodes whose recordings changed
+    are left out and named. Raises `StoreMismatch` where the params describe features of another
+    kind than the store's, and `NumericsError` where a feature is NaN or infinite.
 
     The tolerance is `verify.tolerance`, else that of the coarser of compute and storage dtype.
     """
     store = FeatureStore.open(path)
     with closing(ContentDigests(ledger_path(path))) as digests:
         surveyed = survey(params, digests)
-    _refuse_other_spec(store, surveyed)
-    recordings = {one.digest: one.recording for one in surveyed.episodes}
+    _refuse_other_spec(store, surveyed.spec)
+    recordings = {episode.digest: episode.recording for episode in surveyed.episodes}
     known = [episode for episode in store.episodes if episode.digest in recordings]
-    rows = _choice(known, params.verify.reextract, params.verify.seed)
     unchecked = tuple(one.id for one in store.episodes if one.digest not in recordings)
-    tolerance = params.verify.tolerance or _tolerance(store.spec)
+    dtypes = (store.spec["compute_dtype"], store.spec["storage_dtype"])
+    tolerance = params.verify.tolerance or max(TOLERANCES[dtype] for dtype in dtypes)
+    rows = _draw_rows(known, params.verify.reextract, params.verify.seed)
     if not len(rows):
         return Reextraction((), tolerance, unchecked, ())
     say(f"computing {len(rows)} rows again")
     vlm = FrozenVLM.load(params.vlm, surveyed.spec, params.extract.device)
-    by_episode = [recordings.get(episode.digest) for episode in store.episodes]
-    found = [
-        _deviation(store, ready, features)
-        for ready, features in tqdm(
-            _computed(store, surveyed, by_episode, rows, vlm, params),
-            "reextract",
-            total=len(rows),
-            unit="row",
-            disable=None,
-        )
-    ]
+    found = _deviations(store, known, recordings, rows, vlm, surveyed.spec, params)
+    found = list(tqdm(found, "reextract", total=len(rows), unit="row", disable=None))
     return Reextraction(
-        tuple(sorted(found, key=lambda one: -np.nan_to_num(one.relative, nan=np.inf))),
+        tuple(sorted(found, key=lambda row: -np.nan_to_num(row.relative, nan=np.inf))),
         tolerance,
         unchecked,
         tuple(_environment_differences(store.attrs["environment"], rows, vlm.environment)),
     )
 
 
-def _refuse_other_spec(store: FeatureStore, surveyed: Survey) -> None:
-    if store.spec["digest"] == surveyed.spec.digest:
+def _refuse_other_spec(store: FeatureStore, spec: FeatureSpec) -> None:
+    if store.spec["digest"] == spec.digest:
         return
-    lines = [f"  {line}" for line in differences(store.spec, surveyed.spec.attrs())]
+    lines = [f"  {line}" for line in differences(store.spec, spec.attrs())]
     raise StoreMismatch(
         "\n".join(
             [
@@ -163,64 +149,62 @@ def _refuse_other_spec(store: FeatureStore, surveyed: Survey) -> None:
     )
 
 
-def _choice(episodes: Sequence[Episode], count: int, seed: int) -> NDArray[np.int64]:
+def _draw_rows(episodes: Sequence[Episode], count: int, seed: int) -> NDArray[np.int64]:
     """That many different rows of these episodes, ascending."""
-    rows = np.concatenate(
-        [np.zeros(0, np.int64), *(np.array(one.vl_rows, np.int64) for one in episodes)]
-    )
-    chosen = np.random.default_rng(seed).choice(rows, min(count, len(rows)), replace=False)
-    return np.sort(chosen)
+    rows = np.array([row for episode in episodes for row in episode.vl_rows], np.int64)
+    drawn = np.random.default_rng(seed).choice(rows, min(count, len(rows)), replace=False)
+    return np.sort(drawn)
 
 
-def _computed(
+def _deviations(
     store: FeatureStore,
-    surveyed: Survey,
-    recordings: Sequence[Recording | None],
+    episodes: Sequence[Episode],
+    recordings: Mapping[str, Recording],
     rows: NDArray[np.int64],
     vlm: FrozenVLM,
+    spec: FeatureSpec,
     params: Params,
-) -> Iterator[tuple[ReadyRow, NDArray[Any]]]:
-    """Each row and its features (variant x slot, dim) of today, as they would be stored."""
-    spec, frame_time = surveyed.spec, store.array("vl/frame_time")
-    present = [one for one in recordings if one is not None]
-    # Episodes that are gone have none of the chosen rows; any recording may stand in their place.
-    by_episode = [one if one is not None else present[0] for one in recordings]
-    starts = store.array("episode/vl_start")
-    spans = spans_of(by_episode, starts, frame_time, spec.views, rows, spec.variants)
-    preparation = RowPreparation(Preparer(params.vlm, spec), spec, donors=())
-    prepared = in_background(spans, preparation.prepare, params.extract.decode_threads)
-    ready = (row for row in prepared if isinstance(row, ReadyRow))
-    encoder = Encoder(vlm, params.extract.batch_size, spec.variants)
-    for batch, features in encoder.encoded(ready):
-        yield from zip(batch, features, strict=True)
+) -> Iterator[Deviation]:
+    """That of each of these rows, in order, from its recording by the digest of its episode."""
+    preparer, frame_time = Preparer(params.vlm, spec), store.array("vl/frame_time")
+    size = params.extract.batch_size
+    for episode in episodes:
+        own = rows[np.isin(rows, episode.vl_rows)]
+        if not len(own):
+            continue
+        recording = recordings[episode.digest]
+        rows_of = RowRange.of(recording, recording.cameras(), own, frame_time[own], spec.views)
+        for row, frames in rows_of.read():
+            where = f"{recording.path}, VL row {row}"
+            key = row_key(spec, preparer.render(recording.instruction, list(frames)), frames)
+            variants = preparer.prepare_variants(recording.instruction, frames, key)
+            today = _encode(vlm, variants, len(variants) if size == "auto" else size, where)
+            same_pixels = store.array("vl/key")[row].tobytes() == key
+            yield _compare(store.array(FEATURES)[row], today, row, same_pixels, where)
 
 
-def _deviation(store: FeatureStore, ready: ReadyRow, today: NDArray[Any]) -> Deviation:
-    dtype = str(store.spec["storage_dtype"])
-    stored = _numbers(store.array(FEATURES)[ready.row], dtype)
-    apart = np.abs(_numbers(today, dtype) - stored).max(axis=-1)
-    rms = np.sqrt(np.mean(stored**2, axis=-1))
+def _encode(
+    vlm: FrozenVLM, variants: Sequence[PreparedRow], size: int, where: str
+) -> NDArray[np.float64]:
+    """The features (variant x slot, dim) of a row, as they would be stored."""
+    parts = (variants[start : start + size] for start in range(0, len(variants), size))
+    try:
+        features = torch.cat([vlm.encode(part)[0] for part in parts])
+    except NumericsError as error:
+        raise NumericsError(f"{where}: {error}") from None
+    return features.flatten(0, 1).double().numpy()
+
+
+def _compare(
+    stored: NDArray[Any], today: NDArray[np.float64], row: int, same_pixels: bool, where: str
+) -> Deviation:
+    numbers = widen(stored).astype(np.float64)
+    apart = np.abs(today - numbers).max(axis=-1)
+    rms = np.sqrt(np.mean(numbers**2, axis=-1))
     with np.errstate(divide="ignore", invalid="ignore"):
         relative = np.where(apart == 0, 0.0, apart / rms)  # a slot of zeros may stay one
     slot = int(np.argmax(np.nan_to_num(relative, nan=np.inf)))
-    return Deviation(
-        row=ready.row,
-        absolute=float(apart.max()),
-        relative=float(relative[slot]),
-        slot=slot,
-        same_pixels=store.array("vl/key")[ready.row].tobytes() == ready.key,
-        where=ready.where,
-    )
-
-
-def _numbers(values: NDArray[Any], dtype: str) -> NDArray[np.float64]:
-    """Features (slot, dim) as numbers; bfloat16 is stored as its bits."""
-    tensor = torch.from_numpy(np.ascontiguousarray(values))
-    return (tensor.view(torch.bfloat16) if dtype == "bfloat16" else tensor).double().numpy()
-
-
-def _tolerance(spec: Mapping[str, Any]) -> float:
-    return max(TOLERANCES[spec[name]] for name in ("compute_dtype", "storage_dtype"))
+    return Deviation(row, float(apart.max()), float(relative[slot]), slot, same_pixels, where)
 
 
 def _environment_differences(

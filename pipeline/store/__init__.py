@@ -1,7 +1,7 @@
 """The seam between the stages: a zarr store that is also a set of flat files.
 
-`schema` says what is in it, `writer` builds it so that a kill loses nothing, `donor` takes rows
-over from an older one, `reader` maps a finished one and gathers batches from it.
+`schema` says what is in it, `writer` builds it so that a kill loses nothing, `row_source` takes
+rows over from an older one, `reader` maps a finished one and gathers batches from it.
 
 `Batch` comes from `batch` when first asked for: it brings torch, which a store that is written,
 opened or checked does without.
@@ -10,10 +10,10 @@ opened or checked does without.
 from typing import TYPE_CHECKING, Any
 
 from pipeline.store.chunks import check_trailers
+from pipeline.store.episodes import Episode
 from pipeline.store.lock import build_lock
-from pipeline.store.names import episode_name, place
-from pipeline.store.paths import part_path, read_plan, recover
-from pipeline.store.reader import Episode, FeatureStore
+from pipeline.store.paths import ledger_path, part_path, read_plan, recover
+from pipeline.store.reader import FeatureStore, episode_name, place
 from pipeline.store.row_source import RowSource
 from pipeline.store.schema import FEATURES, KEY_BYTES, SCHEMA, Sizes, arrays
 from pipeline.store.writer import StoreBuild
@@ -35,6 +35,7 @@ __all__ = [
     "build_lock",
     "check_trailers",
     "episode_name",
+    "ledger_path",
     "part_path",
     "place",
     "read_plan",

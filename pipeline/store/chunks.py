@@ -1,12 +1,13 @@
 """The chunk files of one array, written and read by row with plain system calls.
 
-Never through a map: a full disk must be an error of `pwrite`, not a SIGBUS.
+Never through a map: a full disk must be an error of `pwrite`, a file that ends early one of this
+module, and neither a SIGBUS.
 """
 
 import errno
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -18,11 +19,12 @@ from tqdm import tqdm
 
 from pipeline.base.durable import disk_full_named, sync
 from pipeline.base.errors import StoreIncomplete
-from pipeline.store.chunk_pass import ChunkPass
 from pipeline.store.metadata import check_metadata
 from pipeline.store.repair_hints import mend
 from pipeline.store.schema import TRAILER_BYTES, ArraySpec, chunk_paths, read_specs
 
+BLOCK_BYTES = 4 * 2**20
+"""Read at a time: it is still in the processor's cache when it is checked."""
 _MOST_OPEN = 32
 
 
@@ -45,14 +47,14 @@ def check_row_checksums(
         )
 
 
-def check_trailers(root: Path) -> None:
+def check_trailers(root: Path, but: Collection[str] = ()) -> None:
     """Read a finished store once, every byte of it, with a bar on a terminal.
 
-    Raises `StoreIncomplete` where a chunk does not give the checksum that was written behind it,
-    or the metadata do not give their digest.
+    The arrays named in `but` are left out. Raises `StoreIncomplete` where a chunk does not give the
+    checksum that was written behind it, or the metadata do not give their digest.
     """
     check_metadata(root)
-    specs = read_specs(root).values()
+    specs = [spec for name, spec in read_specs(root).items() if name not in but]
     total = sum(spec.chunk_count * spec.chunk_bytes for spec in specs)
     with tqdm(
         total=total, desc="checksums", unit="B", unit_scale=True, leave=False, disable=None
@@ -68,13 +70,87 @@ def read_rows(root: Path, spec: ArraySpec, start: int = 0, stop: int | None = No
         return files.read(start, (spec.shape[0] if stop is None else stop) - start)
 
 
+class ChunkPass:
+    """One pass over a chunk file: its rows, and at the end what is wrong with the file."""
+
+    def __init__(self, path: Path, spec: ArraySpec) -> None:
+        self.damage: str | None = None
+        """Expected and found; None as long as nothing is wrong with the file as a file."""
+        self.bytes = 0
+        """That were read."""
+        self.whole_rows = 0
+        """That lie in the file, those of padding among them."""
+        self.crc = 0
+        """The crc32c of the data that were read."""
+        self._spec = spec
+        self._descriptor = -1
+        try:
+            self._descriptor = os.open(path, os.O_RDONLY)
+        except OSError as error:
+            self.damage = f"expected a chunk file, found none ({error.strerror})"
+
+    @property
+    def complete(self) -> bool:
+        """Whether all rows were read, whatever stands behind them."""
+        return self.whole_rows == self._spec.chunk_rows
+
+    def blocks(self, buffer: NDArray[np.uint8] | None = None) -> Iterator[tuple[int, NDArray[Any]]]:
+        """(first row within the chunk, rows); the rows are valid until the next block.
+
+        As many at a time as fit into `buffer` (byte,), where one is given.
+        """
+        if self.damage:
+            return
+        spec = self._spec
+        if buffer is None:
+            rows = max(1, min(spec.chunk_rows, BLOCK_BYTES // spec.row_bytes))
+            buffer = np.empty(rows * spec.row_bytes, np.uint8)
+        together = buffer.nbytes // spec.row_bytes
+        for first in range(0, spec.chunk_rows, together):
+            wanted = min(together, spec.chunk_rows - first) * spec.row_bytes
+            got = self._read(buffer[:wanted], first * spec.row_bytes)
+            whole = got // spec.row_bytes
+            self.whole_rows += whole
+            self.crc = google_crc32c.extend(self.crc, buffer[:got])
+            values = buffer[: whole * spec.row_bytes].view(spec.dtype)
+            yield first, values.reshape(whole, *spec.shape[1:])
+            if got < wanted:
+                break
+        self.damage = self.damage or self._file_damage()
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+
+    def _file_damage(self) -> str | None:
+        size, wanted = os.fstat(self._descriptor).st_size, self._spec.chunk_bytes + TRAILER_BYTES
+        if size != wanted:
+            return f"expected {wanted} bytes, found {size}"
+        trailer = np.zeros(1, "<u4")
+        self._read(trailer.view(np.uint8), self._spec.chunk_bytes)
+        if trailer[0] != self.crc:
+            return f"expected the crc32c {trailer[0]:08x} of its trailer, found {self.crc:08x}"
+        return None
+
+    def _read(self, into: NDArray[np.uint8], offset: int) -> int:
+        """Bytes read, fewer where the file ends or the disk fails."""
+        try:
+            done = _read_into(self._descriptor, into, offset)
+        except OSError as error:
+            self.damage = f"cannot be read at byte {offset}: {error.strerror}"
+            return 0
+        self.bytes += done
+        return done
+
+
 class ChunkFiles:
     """Row-wise access to the files of one array of a build.
 
     Those of a store that is only read from, which may lie where nothing can be written, are opened
-    with `writable=False`. A linked chunk belongs to another store too and is never written: rows of
-    it count as there already or, `owned`, go into a copy that takes its place. Rows of an `owned`
-    array have checksums of their own, which the caller compares.
+    with `writable=False`. A linked chunk belongs to another store too: `write` skips it, or copies
+    it first when the array is `owned`. Rows of an `owned` array have checksums of their own, which
+    the caller compares.
     """
 
     def __init__(
@@ -106,12 +182,12 @@ class ChunkFiles:
         path = self.paths[chunk]
         return path.exists() and path.stat().st_nlink > 1
 
-    def link(self, chunk: int, donor: Path) -> bool:
+    def link(self, chunk: int, source: Path) -> bool:
         """Take a chunk over from another store as it is; False where files cannot be linked."""
         self.paths[chunk].parent.mkdir(parents=True, exist_ok=True)
         try:
             # A cache may hand its files out as symbolic links: the file itself has to be shared.
-            os.link(donor.resolve(), self.paths[chunk])
+            os.link(source.resolve(), self.paths[chunk])
         except OSError as error:
             if error.errno not in (errno.EXDEV, errno.EPERM, errno.EMLINK, errno.EOPNOTSUPP):
                 raise
@@ -125,35 +201,26 @@ class ChunkFiles:
         block = np.ascontiguousarray(values, self.spec.dtype)
         assert block.shape[1:] == self.spec.shape[1:], (block.shape, self.spec)
         assert start + len(block) <= self.spec.shape[0], (start, len(block), self.spec)
-        raw = block.reshape(len(block), -1).view(np.uint8)
-        for chunk, first, count in self._spans(start, len(block)):
+        for chunk, offset, data in self._parts(start, block):
             if self.is_linked(chunk):
                 if not self._owned:
                     continue
                 self._unlink(chunk)
-            lines = raw[first - start : first - start + count].ravel()
             with disk_full_named(self.paths[chunk]):
                 descriptor = self._descriptor(chunk)
                 if os.fstat(descriptor).st_size > self.spec.chunk_bytes:
                     os.ftruncate(descriptor, self.spec.chunk_bytes)  # a trailer of other rows
-                _write_all(descriptor, lines.data, self._offset(first))
-            self._sum_up(chunk, self._offset(first), lines)
+                _write_all(descriptor, data.data, offset)
+            self._sum_up(chunk, offset, data)
             self._unsynced.add(chunk)
 
     def read(self, start: int, count: int) -> NDArray[Any]:
         """Consecutive rows as they are on disk."""
-        raw = bytearray()
-        if not self.spec.row_bytes:
-            return np.zeros((count, *self.spec.shape[1:]), self.spec.dtype)
-        for chunk, first, rows in self._spans(start, count):
-            wanted, offset = rows * self.spec.row_bytes, self._offset(first)
-            while wanted:
-                part = os.pread(self._descriptor(chunk), wanted, offset)
-                if not part:
-                    raise self._incomplete(chunk, "the file ends early")
-                raw += part
-                wanted, offset = wanted - len(part), offset + len(part)
-        return np.frombuffer(raw, self.spec.dtype).reshape(count, *self.spec.shape[1:])
+        rows = np.zeros((count, *self.spec.shape[1:]), self.spec.dtype)
+        for chunk, offset, data in self._parts(start, rows):
+            if _read_into(self._descriptor(chunk), data, offset) < len(data):
+                raise self._incomplete(chunk, "the file ends early")
+        return rows
 
     def damage(self, chunk: int) -> str | None:
         """What is wrong with a chunk file of a finished store; None where it gives its trailer."""
@@ -207,9 +274,9 @@ class ChunkFiles:
             data = self._passed(chunk)
             if not data.complete:
                 raise self._incomplete(chunk, "the file ends early")
-            if data.damage and path.stat().st_size == sealed and not self._owned:
-                raise self._incomplete(chunk, data.damage)
             if data.damage:
+                if path.stat().st_size == sealed and not self._owned:
+                    raise self._incomplete(chunk, data.damage)
                 self._write_trailer(chunk, data.crc)
             with disk_full_named(path):
                 os.fsync(self._descriptor(chunk))
@@ -220,12 +287,12 @@ class ChunkFiles:
             os.close(descriptor)
         self._descriptors.clear()
 
-    def _sum_up(self, chunk: int, offset: int, lines: NDArray[np.uint8]) -> None:
+    def _sum_up(self, chunk: int, offset: int, data: NDArray[np.uint8]) -> None:
         """Go on with the checksum of a chunk that is written in order; -1 says that it was not."""
         done, crc = self._sums.get(chunk, (0, 0))
         in_order = offset == done
-        crc = google_crc32c.extend(crc, lines) if in_order else 0
-        self._sums[chunk] = (done + lines.nbytes if in_order else -1, crc)
+        crc = google_crc32c.extend(crc, data) if in_order else 0
+        self._sums[chunk] = (done + data.nbytes if in_order else -1, crc)
 
     def _write_trailer(self, chunk: int, crc: int) -> None:
         trailer = memoryview(crc.to_bytes(TRAILER_BYTES, "little"))
@@ -266,16 +333,26 @@ class ChunkFiles:
     def _incomplete(self, chunk: int, what: str) -> StoreIncomplete:
         return StoreIncomplete(f"{self.paths[chunk]}: {what}. {mend(self._root)}")
 
-    def _offset(self, row: int) -> int:
-        return row % self.spec.chunk_rows * self.spec.row_bytes
+    def _parts(
+        self, start: int, rows: NDArray[Any]
+    ) -> Iterator[tuple[int, int, NDArray[np.uint8]]]:
+        """(chunk, offset in its file, bytes) of consecutive rows from `start`, chunk by chunk."""
+        if not rows.nbytes:
+            return
+        raw, done = rows.reshape(len(rows), -1).view(np.uint8), 0
+        while done < len(raw):
+            chunk, inside = divmod(start + done, self.spec.chunk_rows)
+            taken = min(len(raw) - done, self.spec.chunk_rows - inside)
+            yield chunk, inside * self.spec.row_bytes, raw[done : done + taken].reshape(-1)
+            done += taken
 
-    def _spans(self, start: int, count: int) -> Iterator[tuple[int, int, int]]:
-        """The (chunk, first row, rows) that a run of rows falls into."""
-        while count > 0:
-            chunk, inside = divmod(start, self.spec.chunk_rows)
-            taken = min(count, self.spec.chunk_rows - inside)
-            yield chunk, start, taken
-            start, count = start + taken, count - taken
+
+def _read_into(descriptor: int, into: NDArray[np.uint8], offset: int) -> int:
+    """Bytes read, fewer where the file ends."""
+    done = 0
+    while done < len(into) and (got := os.preadv(descriptor, [into[done:].data], offset + done)):
+        done += got
+    return done
 
 
 def _write_all(descriptor: int, block: memoryview, offset: int) -> None:

@@ -7,7 +7,7 @@ file of its own; sealing folds it into ranges of rows in the store's attributes.
 import json
 import os
 from bisect import bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,22 @@ def environment_at(ranges: Sequence[Mapping[str, Any]], row: int) -> dict[str, A
     if at < 0 or row >= ranges[at]["rows"][1]:
         return {}
     return {name: value for name, value in ranges[at].items() if name != "rows"}
+
+
+def runs_of(rows: NDArray[np.int64]) -> list[range]:
+    """Consecutive rows among these, which ascend."""
+    runs = np.split(rows, np.flatnonzero(np.diff(rows) != 1) + 1)
+    return [range(int(run[0]), int(run[-1]) + 1) for run in runs if len(run)]
+
+
+def environment_runs(
+    ranges: Sequence[Mapping[str, Any]], rows: NDArray[np.int64]
+) -> Iterator[tuple[dict[str, Any], range]]:
+    """Consecutive rows among these, which ascend, that were computed in one environment."""
+    edges = [edge for noted in ranges for edge in noted["rows"]]
+    for part in np.split(rows, np.searchsorted(rows, np.unique(edges))):
+        for run in runs_of(part):
+            yield environment_at(ranges, run.start), run
 
 
 class EnvironmentLog:

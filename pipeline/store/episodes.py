@@ -6,10 +6,13 @@
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+from pipeline.store.schema import STREAMS
 
 SAID = ("id", "path", "format", "instruction", "content", "digest")
 """What `episode/text` says of each episode."""
@@ -35,31 +38,31 @@ class Episode:
     states: range
 
 
+def read_texts(arrays: Mapping[str, NDArray[Any]]) -> list[dict[str, str]]:
+    """What `episode/text` says of each episode: the fields named in `SAID`."""
+    text = arrays["episode/text"].tobytes()
+    return [json.loads(text[start:stop]) for start, stop in pairwise(arrays["episode/text_start"])]
+
+
 def read_episodes(
     arrays: Mapping[str, NDArray[Any]], sources: Sequence[str]
 ) -> tuple[Episode, ...]:
     """All episodes of a store with these arrays, in order; `sources` as `episode/source` counts."""
-    edges = {
-        kind: arrays[f"episode/{kind}_start"].tolist()
-        for kind in ("tick", "vl", "sensor", "state", "text")
-    }
-    text = arrays["episode/text"].tobytes()
-    found: list[Episode] = []
-    for index, source in enumerate(arrays["episode/source"]):
-        rows = {kind: range(edge[index], edge[index + 1]) for kind, edge in edges.items()}
-        said = json.loads(text[rows["text"].start : rows["text"].stop])
-        found.append(
-            Episode(
-                index=index,
-                source=sources[int(source)],
-                ticks=rows["tick"],
-                vl_rows=rows["vl"],
-                readings=rows["sensor"],
-                states=rows["state"],
-                **said,
-            )
+    edges = {stream: arrays[f"episode/{stream}_start"].tolist() for stream in STREAMS}
+    return tuple(
+        Episode(
+            index=index,
+            source=sources[int(source)],
+            **{
+                STREAMS[stream].rows: range(edge[index], edge[index + 1])
+                for stream, edge in edges.items()
+            },
+            **text,
         )
-    return tuple(found)
+        for index, (source, text) in enumerate(
+            zip(arrays["episode/source"], read_texts(arrays), strict=True)
+        )
+    )
 
 
 class Ticks(Protocol):
@@ -83,7 +86,7 @@ class Ticks(Protocol):
 
 @dataclass(frozen=True)
 class EpisodeRows:
-    """How many rows of each kind an episode has, and what is said of it."""
+    """How many rows of each stream an episode has, and what is said of it."""
 
     ticks: Ticks
     readings: int
@@ -97,17 +100,20 @@ class EpisodeRows:
         """What is said, as JSON."""
         return json.dumps(self.said, ensure_ascii=False).encode()
 
+    @property
+    def counts(self) -> dict[str, int]:
+        """Rows by stream, and bytes of `text`."""
+        rows = (len(self.ticks.time), len(self.ticks.vl_time), self.readings, self.states)
+        return {**dict(zip(STREAMS, rows, strict=True)), "text": len(self.text)}
+
 
 def episode_edges(episodes: Sequence[EpisodeRows]) -> dict[str, NDArray[np.int64]]:
-    """(episode + 1,) where the ticks, VL rows, readings, states and text of each begin."""
-    counts = {
-        "tick": [len(one.ticks.time) for one in episodes],
-        "vl": [len(one.ticks.vl_time) for one in episodes],
-        "sensor": [one.readings for one in episodes],
-        "state": [one.states for one in episodes],
-        "text": [len(one.text) for one in episodes],
+    """(episode + 1,) where the rows of each stream, and the text, of each episode begin."""
+    counts = [episode.counts for episode in episodes]
+    return {
+        stream: np.cumsum([0, *(count[stream] for count in counts)], dtype=np.int64)
+        for stream in (*STREAMS, "text")
     }
-    return {kind: np.cumsum([0, *each], dtype=np.int64) for kind, each in counts.items()}
 
 
 def episode_arrays(
@@ -115,24 +121,22 @@ def episode_arrays(
 ) -> dict[str, NDArray[Any]]:
     """Everything under `tick/` and `episode/`, and the times under `vl/`; indices store-global."""
     edges = episode_edges(episodes)
-    ticks = [one.ticks for one in episodes]
-
-    def shifted(kind: str, values: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
-        starts = edges[kind][:-1]
-        return np.concatenate([one + start for one, start in zip(values, starts, strict=True)])
-
+    ticks = [episode.ticks for episode in episodes]
+    of_episodes = [episode.source for episode in episodes]
     arrays = {
-        "tick/time": np.concatenate([one.time for one in ticks]),
-        "tick/action": np.concatenate([one.action for one in ticks]),
-        "tick/vl_row": shifted("vl", [one.vl_row for one in ticks]),
-        "tick/sensor_end": shifted("sensor", [one.sensor_end for one in ticks]),
-        "tick/state_end": shifted("state", [one.state_end for one in ticks]),
-        "vl/time": np.concatenate([one.vl_time for one in ticks]),
-        "vl/frame_time": np.concatenate([one.frame_times(views) for one in ticks]),
-        "episode/source": np.array([sources.index(one.source) for one in episodes], np.int32),
-        "episode/text": np.frombuffer(b"".join(one.text for one in episodes), np.uint8),
+        "tick/time": np.concatenate([tick.time for tick in ticks]),
+        "tick/action": np.concatenate([tick.action for tick in ticks]),
+        "vl/time": np.concatenate([tick.vl_time for tick in ticks]),
+        "vl/frame_time": np.concatenate([tick.frame_times(views) for tick in ticks]),
+        "episode/source": np.array([*map(sources.index, of_episodes)], np.int32),
+        "episode/text": np.frombuffer(b"".join(episode.text for episode in episodes), np.uint8),
     }
-    return arrays | {f"episode/{kind}_start": edge for kind, edge in edges.items()}
+    for stream, stored in STREAMS.items():
+        if name := stored.counted_by:
+            own = [getattr(tick, name.removeprefix("tick/")) for tick in ticks]
+            pairs = zip(own, edges[stream][:-1], strict=True)
+            arrays[name] = np.concatenate([positions + start for positions, start in pairs])
+    return arrays | {f"episode/{stream}_start": edge for stream, edge in edges.items()}
 
 
 def episode_of(arrays: Mapping[str, NDArray[Any]], ticks: NDArray[np.int64]) -> NDArray[np.int64]:

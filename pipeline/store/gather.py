@@ -13,10 +13,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pipeline.base.memory import available_bytes
 from pipeline.store.batch import Batch
 from pipeline.store.episodes import episode_of
 from pipeline.store.mapping import fitting, populate, read_at_random, will_need
-from pipeline.store.memory import available_bytes
 
 WIDE = {
     "action": "tick/action",

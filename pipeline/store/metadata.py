@@ -7,24 +7,23 @@ root's without the digest itself. Written when a build is finished.
 import hashlib
 import json
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import zarr
 
 from pipeline.base.errors import StoreIncomplete
 from pipeline.store.repair_hints import mend
-from pipeline.store.schema import ARRAY_NAMES
+from pipeline.store.schema import ARRAY_NAMES, GROUPS
 
 ATTRIBUTE = "metadata_digest"
-_PLACES = ("", *sorted({name.split("/")[0] for name in ARRAY_NAMES}), *ARRAY_NAMES)
 
 
 def note_metadata(root: Path) -> None:
     """Write the digest into the root's attributes; running it again changes nothing."""
-    found, stored = _found_and_stored(root)
-    if found != stored:
+    actual, stored = _digests(root)
+    if actual != stored:
         group = zarr.open_group(root, mode="r+")
-        group.attrs.put({**group.attrs.asdict(), ATTRIBUTE: found})
+        group.attrs.put({**group.attrs.asdict(), ATTRIBUTE: actual})
 
 
 def metadata_damage(root: Path) -> str | None:
@@ -32,10 +31,10 @@ def metadata_damage(root: Path) -> str | None:
 
     Raises `StoreIncomplete` where they cannot be read.
     """
-    found, stored = _found_and_stored(root)
-    if stored is None or stored == found:
+    actual, stored = _digests(root)
+    if stored in (None, actual):
         return None
-    return f"the metadata were changed: expected their digest {stored}, found {found}"
+    return f"the metadata were changed: expected their digest {stored}, found {actual}"
 
 
 def check_metadata(root: Path) -> None:
@@ -44,19 +43,16 @@ def check_metadata(root: Path) -> None:
         raise StoreIncomplete(f"{root / 'zarr.json'}: {what}. {mend(root)}")
 
 
-def _found_and_stored(root: Path) -> tuple[str, Any]:
-    documents = {place: _document(root / place / "zarr.json") for place in _PLACES}
-    attributes = documents[""].get("attributes")
-    stored = attributes.pop(ATTRIBUTE, None) if isinstance(attributes, dict) else None
+def _digests(root: Path) -> tuple[str, Any]:
+    """That of the metadata as they are, and the one that stands in the attributes."""
+    documents = {place: _read(root / place / "zarr.json") for place in ("", *GROUPS, *ARRAY_NAMES)}
+    stored = documents[""].get("attributes", {}).pop(ATTRIBUTE, None)
     text = json.dumps(documents, sort_keys=True)
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest(), stored
 
 
-def _document(path: Path) -> dict[str, Any]:
+def _read(path: Path) -> dict[str, Any]:
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        return dict(json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError) as error:
         raise StoreIncomplete(f"{path}: cannot be read ({error}). {mend(path)}") from None
-    if not isinstance(document, dict):
-        raise StoreIncomplete(f"{path}: expected a JSON object. {mend(path)}")
-    return cast("dict[str, Any]", document)

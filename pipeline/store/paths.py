@@ -1,21 +1,31 @@
-"""Where a store lies and where it is built, and whether what lies there is one."""
+"""Where a store lies, what lies beside it, and whether what lies there is one."""
 
 import json
 from pathlib import Path
 from typing import Any
 
 from pipeline.base.durable import recover as recover_replaced
-from pipeline.base.errors import StoreIncomplete
-from pipeline.base.ownership import OutputKind, refuse_foreign
-from pipeline.store.repair_hints import start_over
+from pipeline.base.errors import StoreIncomplete, StoreMismatch
+from pipeline.base.ownership import OutputKind, described, refuse_foreign, there
+from pipeline.store.repair_hints import extract_command, restore_command, start_over
+from pipeline.store.schema import SCHEMA
 
 MERGED = "merge-"
 """How the plan of a store begins that was not extracted but merged."""
+LEDGER = ".files.sqlite"
+"""What is added to a store's name for the file that remembers the digests of recordings."""
+
+Inode = tuple[int, int]
 
 
 def part_path(target: Path) -> Path:
     """Where a store is built."""
     return target.with_name(target.name + ".part")
+
+
+def ledger_path(target: Path) -> Path:
+    """Where the content digests of a store's recordings are remembered."""
+    return target.with_name(target.name + LEDGER)
 
 
 def is_store(path: Path) -> bool:
@@ -54,6 +64,64 @@ def read_plan(store: Path) -> str | None:
             f"{start_over(store)}"
         )
     return plan if isinstance(plan, str) else None
+
+
+def read_attributes(root: Path) -> dict[str, Any]:
+    """The root attributes of a finished store.
+
+    Raises `StoreIncomplete` where there is none, only a build of it, or one that lost them, and
+    `StoreMismatch` where it follows another schema or something else lies there.
+    """
+    build = root.name.endswith(".part")  # which looks like a store until its files are read
+    if build or not (root / "zarr.json").exists():
+        part = root if build else part_path(root)
+        if not build and there(root) and not STORE.owns(root):
+            raise _foreign(root)
+        what = f"only the unfinished build {part}" if part.exists() else "nothing there"
+        target = root.with_name(root.name.removesuffix(".part").removesuffix(".repair"))
+        raise StoreIncomplete(f"{root}: no finished store ({what}). Run {extract_command(target)}.")
+    attributes = _attributes(root)
+    if "archive" in attributes:
+        raise StoreMismatch(
+            f"{root}: expected a store, found an archive of one. Restore it: "
+            f"{restore_command(root)}"
+        )
+    if "schema" not in attributes:
+        raise _foreign(root)
+    if attributes["schema"] != SCHEMA:
+        raise StoreMismatch(
+            f"{root}: expected store schema {SCHEMA}, found {attributes['schema']!r}. "
+            "Extract it again with this version."
+        )
+    return attributes
+
+
+def inode_of(store: Path) -> Inode | None:
+    """Tells a store from another that took its place; None where there is none."""
+    try:
+        status = store.stat()
+    except FileNotFoundError:
+        return None
+    return status.st_dev, status.st_ino
+
+
+def refuse_replaced(store: Path, before: Inode | None) -> None:
+    """Raise `StoreMismatch` where a store is no longer the one that it was `before`.
+
+    A finished store is never modified, but an extraction may put another in its place.
+    """
+    if inode_of(store) != before:
+        raise StoreMismatch(
+            f"{store}: another store took its place while it was being read. Run the same command "
+            "again."
+        )
+
+
+def _foreign(root: Path) -> StoreMismatch:
+    return StoreMismatch(
+        f"{root}: no finished store: expected what this project wrote, found {described(root)}. "
+        "Name a store that stages.extract made, which never writes in place of anything else."
+    )
 
 
 def _attributes(path: Path) -> dict[str, Any]:

@@ -12,16 +12,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import zarr
 from numpy.typing import NDArray
 
-from pipeline.base.errors import StoreIncomplete, StoreMismatch
-from pipeline.base.ownership import described, there
+from pipeline.base.errors import StoreIncomplete
 from pipeline.store.episodes import Episode, episode_of, read_episodes
 from pipeline.store.mapping import map_flat
-from pipeline.store.paths import STORE
-from pipeline.store.repair_hints import extract_command, mend, restore_command, start_over
-from pipeline.store.schema import SCHEMA, TRAILER_BYTES, ArraySpec, chunk_paths, read_specs
+from pipeline.store.paths import read_attributes
+from pipeline.store.repair_hints import mend
+from pipeline.store.schema import STREAMS, TRAILER_BYTES, ArraySpec, chunk_paths, read_specs
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -59,36 +57,9 @@ class FeatureStore:
         it follows another schema.
         """
         root = Path(path)
-        build = root.name.endswith(".part")  # which looks like a store until its files are read
-        if build or not (root / "zarr.json").exists():
-            part = root if build else root.with_name(root.name + ".part")
-            if not build and there(root) and not STORE.owns(root):
-                raise StoreMismatch(_foreign(root))
-            found = f"only the unfinished build {part}" if part.exists() else "nothing there"
-            base = root.name.removesuffix(".part").removesuffix(".repair")
-            run = extract_command(root.with_name(base))
-            raise StoreIncomplete(f"{root}: no finished store ({found}). Run {run}.")
-        try:
-            attrs = zarr.open_group(root, mode="r").attrs.asdict()
-        except (ValueError, KeyError) as error:
-            raise StoreIncomplete(
-                f"{root / 'zarr.json'}: not a zarr group's metadata ({error}). {start_over(root)}"
-            ) from None
-        if "archive" in attrs:
-            raise StoreMismatch(
-                f"{root}: expected a store, found an archive of one. stages.train_head and "
-                "stages.evaluate restore it where train_head.feed is auto or compressed; to make "
-                f"the store of it: {restore_command(root)}"
-            )
-        if "schema" not in attrs:
-            raise StoreMismatch(_foreign(root))
-        if attrs.get("schema") != SCHEMA:
-            raise StoreMismatch(
-                f"{root}: expected store schema {SCHEMA}, found {attrs.get('schema')!r}. "
-                "Extract it again with this version."
-            )
+        attrs = read_attributes(root)
         specs = read_specs(root)
-        return cls(root, attrs, {name: _mapped(root, spec) for name, spec in specs.items()})
+        return cls(root, attrs, {name: map_array(root, spec) for name, spec in specs.items()})
 
     def __reduce__(self) -> tuple[Any, ...]:
         return FeatureStore.open, (self.path,)
@@ -279,20 +250,32 @@ class FeatureStore:
             )
 
 
-def _mapped(root: Path, spec: ArraySpec) -> NDArray[Any]:
+def episode_name(episode: Episode) -> str:
+    """`source/id`, by which a checkpoint, a report and an error call an episode."""
+    return f"{episode.source}/{episode.id}"
+
+
+def place(store: FeatureStore, stream: str, row: int) -> str:
+    """Where a store-global row of a stream lies: episode, row in it and time on its clock."""
+    starts = store.array(f"episode/{stream}_start")
+    index = int(starts.searchsorted(row, side="right")) - 1
+    time_s = float(store.array(f"{stream}/time")[row])
+    return (
+        f"{episode_name(store.episodes[index])}, {STREAMS[stream].row} "
+        f"{row - int(starts[index])} (at {time_s:.3f} s)"
+    )
+
+
+def map_array(root: Path, spec: ArraySpec) -> NDArray[Any]:
+    """The map of an array; `StoreIncomplete` where a chunk file has another size than it must."""
     paths = chunk_paths(root, spec)
     wanted = spec.chunk_bytes + TRAILER_BYTES
     for path in paths:
         size = path.stat().st_size if path.exists() else None
         if size != wanted:
-            found = "no file" if size is None else f"{size} bytes"
-            said = f"{path}: expected {wanted} bytes, found {found}: the store is damaged"
-            raise StoreIncomplete(f"{said}. {mend(root)}")
+            actual = "no file" if size is None else f"{size} bytes"
+            raise StoreIncomplete(
+                f"{path}: expected {wanted} bytes, found {actual}: the store is damaged. "
+                f"{mend(root)}"
+            )
     return map_flat(paths, spec.chunk_bytes, spec.shape, spec.dtype)
-
-
-def _foreign(root: Path) -> str:
-    return (
-        f"{root}: no finished store: expected what this project wrote, found {described(root)}. "
-        "Name a store that stages.extract made, which never writes in place of anything else."
-    )

@@ -1,9 +1,8 @@
 """Take over what another store or an abandoned build already knows."""
 
-import json
+from collections import defaultdict
 from contextlib import closing
 from functools import cached_property
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from pipeline.base.errors import StoreIncomplete
 from pipeline.store.chunks import ChunkFiles, row_checksums
 from pipeline.store.environments import EnvironmentLog, environment_at
+from pipeline.store.episodes import read_texts
 from pipeline.store.schema import CHECKSUMS, FEATURES, KEYS, ArraySpec, read_specs
 
 
@@ -29,7 +29,7 @@ class RowSource:
         self.specs: dict[str, ArraySpec] = read_specs(path)
         self.attrs: dict[str, Any] = zarr.open_group(path, mode="r").attrs.asdict()
         self._features = ChunkFiles(path, self.specs[FEATURES], writable=False)
-        self._edges: dict[str, NDArray[np.int64]] = {}
+        self._arrays: dict[str, NDArray[Any]] = {}
 
     @property
     def spec_digest(self) -> str:
@@ -39,30 +39,27 @@ class RowSource:
     @cached_property
     def episode_digests(self) -> list[str]:
         """The digest of each episode, in order: equal digest, equal rows."""
-        return [said["digest"] for said in self._said]
+        return [text["digest"] for text in self._texts]
 
     @property
     def episode_said(self) -> list[tuple[str, str]]:
         """Content digest and instruction of each episode, in order."""
-        return [(said["content"], said["instruction"]) for said in self._said]
+        return [(text["content"], text["instruction"]) for text in self._texts]
 
     @cached_property
     def episode_contents(self) -> list[str]:
         """The content digest of each episode, in order: equal content, equal streams."""
-        return [said["content"] for said in self._said]
+        return [text["content"] for text in self._texts]
 
-    def episode_edges(self, kind: str) -> NDArray[np.int64]:
-        """(episode + 1,) offsets of `tick`, `vl`, `sensor` or `state` rows."""
-        if kind not in self._edges:
-            self._edges[kind] = self._read(f"episode/{kind}_start")
-        return self._edges[kind]
+    def episode_edges(self, stream: str) -> NDArray[np.int64]:
+        """(episode + 1,) where the rows of a stream begin."""
+        return self._read(f"episode/{stream}_start")
 
     @cached_property
     def rows(self) -> dict[bytes, int]:
         """Where the features of each key are."""
-        done = np.flatnonzero(self._checksums)
-        keys = self._keys
-        return {keys[row].tobytes(): int(row) for row in done}
+        keys = self._read(KEYS)
+        return {keys[row].tobytes(): int(row) for row in np.flatnonzero(self._read(CHECKSUMS))}
 
     def keys_of(self, content: str, instruction: str) -> dict[bytes, bytes]:
         """Keys of the rows of episodes of this content and instruction, by their frame times.
@@ -70,11 +67,15 @@ class RowSource:
         Under one feature spec, the same files and the same capture time of every view (the bytes
         of a row of `vl/frame_time`) are the same frames: no pixel needs to be decoded to tell.
         """
+        episodes = self._episodes_by_text.get((content, instruction), [])
+        if not episodes:
+            return {}
+        frame_time, keys, checksums = map(self._read, ("vl/frame_time", KEYS, CHECKSUMS))
         return {
-            self._frame_time[row].tobytes(): self._keys[row].tobytes()
-            for episode in self._episodes_by_said.get((content, instruction), ())
+            frame_time[row].tobytes(): keys[row].tobytes()
+            for episode in episodes
             for row in range(*self.episode_edges("vl")[episode : episode + 2])
-            if self._checksums[row]
+            if checksums[row]
         }
 
     def take(self, key: bytes) -> NDArray[Any] | None:
@@ -86,7 +87,7 @@ class RowSource:
             values = self._features.read(row, 1)
         except StoreIncomplete:  # its file is cut short or gone: the row is computed again
             return None
-        return values[0] if row_checksums(values)[0] == self._checksums[row] else None
+        return values[0] if row_checksums(values)[0] == self._read(CHECKSUMS)[row] else None
 
     def environment_of(self, key: bytes) -> dict[str, Any]:
         """With which software and hardware a known row was computed; empty where not noted."""
@@ -97,15 +98,11 @@ class RowSource:
         self._features.close()
 
     @cached_property
-    def _episodes_by_said(self) -> dict[tuple[str, str], list[int]]:
-        found: dict[tuple[str, str], list[int]] = {}
-        for index, said in enumerate(self._said):
-            found.setdefault((said["content"], said["instruction"]), []).append(index)
-        return found
-
-    @cached_property
-    def _frame_time(self) -> NDArray[np.float64]:
-        return self._read("vl/frame_time")
+    def _episodes_by_text(self) -> dict[tuple[str, str], list[int]]:
+        episodes = defaultdict[tuple[str, str], list[int]](list)
+        for index, said in enumerate(self.episode_said):
+            episodes[said].append(index)
+        return episodes
 
     @cached_property
     def _environments(self) -> list[dict[str, Any]]:
@@ -113,35 +110,26 @@ class RowSource:
         return log.ranges() if log.noted else self.attrs.get("environment", [])
 
     @cached_property
-    def _said(self) -> list[dict[str, Any]]:
-        if not self._finished and self._index_is_damaged():
+    def _texts(self) -> list[dict[str, str]]:
+        index = [name for name in self.specs if name.startswith("episode/")]
+        if not self._finished and any(map(self._is_damaged, ["vl/frame_time", *index])):
             return []  # rows are known by their keys alone, frame by frame
-        edges, text = self._read("episode/text_start"), self._read("episode/text").tobytes()
-        return [json.loads(text[start:stop]) for start, stop in pairwise(edges)]
-
-    @cached_property
-    def _checksums(self) -> NDArray[np.uint32]:
-        return self._read(CHECKSUMS)
-
-    @cached_property
-    def _keys(self) -> NDArray[np.uint8]:
-        return self._read(KEYS)
+        return read_texts({name: self._read(name) for name in index})
 
     @property
     def _finished(self) -> bool:
         """Whether every chunk has a trailer; those of feature rows in a build have none yet."""
         return self.path.suffix in (".zarr", ".previous")
 
-    def _index_is_damaged(self) -> bool:
-        """Whether it cannot be relied on which rows of a build are of which episode and instant."""
-        for name in ("vl/frame_time", *(name for name in self.specs if name.startswith("episode"))):
-            with closing(ChunkFiles(self.path, self.specs[name], writable=False)) as files:
-                if any(files.damage(chunk) for chunk in range(len(files.paths))):
-                    return True
-        return False
+    def _is_damaged(self, name: str) -> bool:
+        with closing(ChunkFiles(self.path, self.specs[name], writable=False)) as files:
+            return any(files.damage(chunk) for chunk in range(len(files.paths)))
 
     def _read(self, name: str) -> NDArray[Any]:
-        with closing(ChunkFiles(self.path, self.specs[name], writable=False)) as files:
-            if self._finished:
-                files.check()
-            return files.read(0, self.specs[name].shape[0])
+        """All of a small array, read once."""
+        if name not in self._arrays:
+            with closing(ChunkFiles(self.path, self.specs[name], writable=False)) as files:
+                if self._finished:
+                    files.check()
+                self._arrays[name] = files.read(0, self.specs[name].shape[0])
+        return self._arrays[name]

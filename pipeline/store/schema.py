@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import zarr
 from zarr.codecs import BytesCodec, Crc32cCodec
+from zarr.storage import MemoryStore
 
 from pipeline.base.errors import StoreIncomplete
 from pipeline.store.repair_hints import mend
@@ -31,6 +32,31 @@ INCREMENTAL = (FEATURES, KEYS, CHECKSUMS)
 
 
 @dataclass(frozen=True)
+class StoredStream:
+    """Rows of which each episode has a range: those of the arrays `<stream>/…`.
+
+    `episode/<stream>_start` says where the range of each episode begins.
+    """
+
+    axis: str
+    """The first axis of its arrays, as zarr's metadata name it."""
+    rows: str
+    """What `Sizes` calls their number, and `Episode` the range of an episode."""
+    row: str
+    """How messages call one of them."""
+    counted_by: str = ""
+    """The array of ticks that holds positions among these rows."""
+
+
+STREAMS = {
+    "tick": StoredStream("tick", "ticks", "tick"),
+    "vl": StoredStream("vl_row", "vl_rows", "VL row", "tick/vl_row"),
+    "sensor": StoredStream("sensor_reading", "readings", "sensor reading", "tick/sensor_end"),
+    "state": StoredStream("state_reading", "states", "state reading", "tick/state_end"),
+}
+
+
+@dataclass(frozen=True)
 class ArraySpec:
     """One array of a store: its name, shape, dtype and the names of its axes."""
 
@@ -41,6 +67,11 @@ class ArraySpec:
     attributes: Mapping[str, Any] = field(default_factory=dict)
     stored_chunk_rows: int | None = None
     """As an array on disk is cut; None for one that follows the rule."""
+
+    @property
+    def stored_dtype(self) -> str:
+        """What its numbers are: `bfloat16` where the array holds their bits."""
+        return self.attributes.get("dtype", self.dtype.name)
 
     @property
     def row_bytes(self) -> int:
@@ -75,9 +106,14 @@ class ArraySpec:
         start = chunk * self.chunk_rows
         return range(start, min(start + self.chunk_rows, self.shape[0]))
 
-    def create(self, root: Path) -> None:
+    @property
+    def document(self) -> dict[str, Any]:
+        """The array's zarr metadata as JSON."""
+        return self.create(MemoryStore()).metadata.to_dict()
+
+    def create(self, root: Path | MemoryStore) -> "zarr.Array[Any]":
         """Write the array's zarr metadata below `root`."""
-        zarr.create_array(
+        return zarr.create_array(
             store=root,
             name=self.name,
             shape=self.shape,
@@ -117,51 +153,59 @@ class Sizes:
     state_dim: int
 
 
+_ARRAYS = {
+    FEATURES: ("", "vl_row", "slot", "dim"),
+    "vl/slot_valid": ("u1", "vl_row", "slot"),
+    "vl/time": ("f8", "vl_row"),
+    "vl/frame_time": ("f8", "vl_row", "view"),
+    KEYS: ("u1", "vl_row", "key_byte"),
+    CHECKSUMS: ("u4", "vl_row"),
+    "tick/time": ("f8", "tick"),
+    "tick/action": ("f4", "tick", "action_dim"),
+    "tick/vl_row": ("i8", "tick"),
+    "tick/sensor_end": ("i8", "tick"),
+    "tick/state_end": ("i8", "tick"),
+    "sensor/values": ("", "sensor_reading", "channel"),
+    "sensor/time": ("f8", "sensor_reading"),
+    "state/values": ("f4", "state_reading", "state_dim"),
+    "state/time": ("f8", "state_reading"),
+    **{f"episode/{stream}_start": ("i8", "episode_edge") for stream in (*STREAMS, "text")},
+    "episode/source": ("i4", "episode"),
+    "episode/text": ("u1", "byte"),
+}
+"""Every array in the order of the contract: its type, where none of the params says so, and axes.
+"""
+ARRAY_NAMES = tuple(_ARRAYS)
+GROUPS = tuple(sorted({name.partition("/")[0] for name in ARRAY_NAMES}))
+
+
 def arrays(sizes: Sizes, features_dtype: str, sensor_dtype: str) -> dict[str, ArraySpec]:
     """Every array of a store, by name, in the order of the contract."""
-    s = sizes
-    bfloat16 = features_dtype == "bfloat16"
-    stored = np.dtype("<u2" if bfloat16 else features_dtype)
-    bits = {"dtype": "bfloat16"} if bfloat16 else {}
-    f4, f8, i4, i8, u1, u4 = (np.dtype(f"<{code}") for code in ("f4", "f8", "i4", "i8", "u1", "u4"))
-    edge = s.episodes + 1
-    view = ("vl_row", "view")
-    return {
-        spec.name: spec
-        for spec in (
-            ArraySpec(
-                FEATURES, (s.vl_rows, s.slots, s.dim), stored, ("vl_row", "slot", "dim"), bits
-            ),
-            ArraySpec("vl/slot_valid", (s.vl_rows, s.slots), u1, ("vl_row", "slot")),
-            ArraySpec("vl/time", (s.vl_rows,), f8, ("vl_row",)),
-            ArraySpec("vl/frame_time", (s.vl_rows, s.views), f8, view),
-            ArraySpec(KEYS, (s.vl_rows, KEY_BYTES), u1, ("vl_row", "byte")),
-            ArraySpec(CHECKSUMS, (s.vl_rows,), u4, ("vl_row",)),
-            ArraySpec("tick/time", (s.ticks,), f8, ("tick",)),
-            ArraySpec("tick/action", (s.ticks, s.action_dim), f4, ("tick", "action_dim")),
-            ArraySpec("tick/vl_row", (s.ticks,), i8, ("tick",)),
-            ArraySpec("tick/sensor_end", (s.ticks,), i8, ("tick",)),
-            ArraySpec("tick/state_end", (s.ticks,), i8, ("tick",)),
-            ArraySpec(
-                "sensor/values",
-                (s.readings, s.sensor_channels),
-                np.dtype(sensor_dtype).newbyteorder("<"),
-                ("sensor_reading", "channel"),
-            ),
-            ArraySpec("sensor/time", (s.readings,), f8, ("sensor_reading",)),
-            ArraySpec("state/values", (s.states, s.state_dim), f4, ("state_reading", "state_dim")),
-            ArraySpec("state/time", (s.states,), f8, ("state_reading",)),
-            *(
-                ArraySpec(f"episode/{kind}_start", (edge,), i8, ("episode_edge",))
-                for kind in ("tick", "vl", "sensor", "state", "text")
-            ),
-            ArraySpec("episode/source", (s.episodes,), i4, ("episode",)),
-            ArraySpec("episode/text", (s.text_bytes,), u1, ("byte",)),
-        )
+    lengths = {stream.axis: getattr(sizes, stream.rows) for stream in STREAMS.values()}
+    lengths |= {
+        "slot": sizes.slots,
+        "dim": sizes.dim,
+        "view": sizes.views,
+        "action_dim": sizes.action_dim,
+        "channel": sizes.sensor_channels,
+        "state_dim": sizes.state_dim,
+        "episode": sizes.episodes,
+        "episode_edge": sizes.episodes + 1,
+        "key_byte": KEY_BYTES,
+        "byte": sizes.text_bytes,
     }
-
-
-ARRAY_NAMES = tuple(arrays(Sizes(0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0), "float32", "float32"))
+    bfloat16 = features_dtype == "bfloat16"
+    chosen = {FEATURES: "u2" if bfloat16 else features_dtype, "sensor/values": sensor_dtype}
+    return {
+        name: ArraySpec(
+            name,
+            tuple(lengths[axis] for axis in axes),
+            np.dtype(chosen.get(name, code)).newbyteorder("<"),
+            tuple(axis.removeprefix("key_") for axis in axes),
+            {"dtype": "bfloat16"} if bfloat16 and name == FEATURES else {},
+        )
+        for name, (code, *axes) in _ARRAYS.items()
+    }
 
 
 def read_specs(root: Path) -> dict[str, ArraySpec]:

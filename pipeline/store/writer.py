@@ -204,7 +204,7 @@ class StoreBuild:
         for partial in self.part.rglob("*.partial"):  # of a write that was killed
             partial.unlink()
         self.close()
-        _sync_folders(self.part)
+        sync_folders(self.part)
 
     def _seal_arrays(self) -> None:
         try:
@@ -253,7 +253,7 @@ def _runs(rows: Sequence[int] | NDArray[np.int64]) -> list[NDArray[np.intp]]:
     return np.split(order, gaps)
 
 
-def _sync_folders(root: Path) -> None:
+def sync_folders(root: Path) -> None:
     """Wait for every folder and zarr's metadata; chunk files are synced as they are sealed."""
     for folder, _, files in os.walk(root):
         sync(Path(folder))

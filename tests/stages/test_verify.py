@@ -20,9 +20,7 @@ def original(tiny_store, tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def store(original, tmp_path, monkeypatch) -> Path:
-    # What a small store says of its features was never a document of the vlm room.
-    monkeypatch.setattr("stages.verify.with_identity", lambda findings: findings)
+def store(original, tmp_path) -> Path:
     return Path(shutil.copytree(original, tmp_path / "tiny.zarr"))
 
 
@@ -71,7 +69,7 @@ def test_a_damaged_store_says_what_is_wrong_and_what_to_run_next(verified, store
     assert verified() == 2
     err = capsys.readouterr().err
     assert err.startswith(f"error: {store}: the store is damaged:\n")
-    assert "VL row 17 (episode 'episode_001', tick 51)" in err
+    assert "VL row 17: its bytes do not give its checksum; right/episode_001" in err
     assert f"python -m stages.verify --repair --set verify.store={store}, which" in err
     assert "which keeps what is sound, then what it says." in err
 

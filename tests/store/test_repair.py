@@ -48,10 +48,10 @@ def contents(store: Path) -> dict[str, bytes]:
 
 def repaired(store: Path) -> StoreBuild:
     """The build that `stages.extract` would find."""
-    findings = verify(store, threads=1)
-    assert layout_is_sound(findings)
+    verification = verify(store, threads=1)
+    assert layout_is_sound(verification)
     build = copy_layout(store)
-    carry_rows(store, build, findings)
+    carry_rows(store, build, verification)
     put_in_place(build, store)
     return StoreBuild(store, read_specs(part_path(store)), read_plan(part_path(store)) or "")
 
@@ -151,12 +151,12 @@ def test_they_are_copied_where_not(original, store, monkeypatch):
 
 def test_a_store_that_was_replaced_since_it_was_checked_gives_no_row(original, store):
     flip_row_17(chunk_file(store, "vl/features"))
-    findings = verify(store, threads=1)
+    verification = verify(store, threads=1)
     store.rename(store.with_name("before.zarr"))
     shutil.copytree(original, store)
     build = copy_layout(store)
     with pytest.raises(StoreMismatch, match=r"another store took its place.*Run the same"):
-        carry_rows(store, build, findings)
+        carry_rows(store, build, verification)
 
 
 class Killed(BaseException):

@@ -8,10 +8,10 @@ from pathlib import Path
 from pipeline.base.config import Params, VLMParams
 from pipeline.base.errors import VLMError
 from pipeline.base.format import size
+from pipeline.base.memory import available_bytes
 from pipeline.look.doctor.findings import Finding, missing, note, ok
 from pipeline.look.doctor.gpu import GPU, read_accelerator, usable_device
 from pipeline.simulation.demo_recordings import MARKER
-from pipeline.store.memory import available_bytes
 from pipeline.vlm.checkpoint_folder import (
     adapter_files,
     cached_checkpoint,

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from pipeline.base.config import Params
 from pipeline.base.format import size
+from pipeline.base.memory import memory_bytes
 from pipeline.look.doctor.findings import Finding, note, ok
-from pipeline.store.memory import memory_bytes
 
 _CGROUP = Path("/sys/fs/cgroup")
 _LEAST_FILES = 1024

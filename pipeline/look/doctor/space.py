@@ -11,6 +11,7 @@ from pipeline.base.config import Params
 from pipeline.base.durable import free_bytes
 from pipeline.base.errors import RecordingError, StoreMismatch, VLMError
 from pipeline.base.format import size
+from pipeline.base.memory import memory_bytes
 from pipeline.data import Recording, open_recordings
 from pipeline.data.embodiment import Embodiment
 from pipeline.data.timeline import ActionRotation, build_timeline, choose_action_rotation
@@ -23,7 +24,6 @@ from pipeline.look.doctor.data import unusable
 from pipeline.look.doctor.findings import Finding, missing, note, ok
 from pipeline.look.doctor.links import links_here
 from pipeline.store import part_path
-from pipeline.store.memory import memory_bytes
 from pipeline.vlm.feature_spec import feature_spec
 
 BUDGET_S = 2.0

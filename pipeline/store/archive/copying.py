@@ -40,9 +40,8 @@ from pipeline.store.chunks import check_row_checksums
 from pipeline.store.lock import build_lock
 from pipeline.store.metadata import ATTRIBUTE as METADATA_DIGEST
 from pipeline.store.metadata import check_metadata
-from pipeline.store.paths import part_path
+from pipeline.store.paths import inode_of, part_path, refuse_replaced
 from pipeline.store.reader import FeatureStore
-from pipeline.store.replacement import inode_of, refuse_replaced
 from pipeline.store.schema import CHECKSUMS, FEATURES, ArraySpec, chunk_paths, read_specs
 
 SAMPLES = 4

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pipeline.base.errors import StoreIncomplete
 from pipeline.store.archive.layout import rows_of
-from pipeline.store.chunk_pass import ChunkPass
+from pipeline.store.chunks import ChunkPass
 from pipeline.store.repair_hints import mend
 from pipeline.store.schema import TRAILER_BYTES, ArraySpec, chunk_paths
 

@@ -1,11 +1,10 @@
 """Does a store hold what it should, and what of it can be kept where it does not.
 
 `verification` checks it whole: `structure` its metadata and files, `scan` the bytes of each chunk
-file, `relations` what arrays must agree on. `findings` is what was found, `repair` begins a build
-with all that is sound.
+file. `repair` begins a build with all that is sound.
 """
 
-from pipeline.store.integrity.findings import Damage, Findings
-from pipeline.store.integrity.verification import verify
+from pipeline.store.integrity.scan import judge_rows
+from pipeline.store.integrity.verification import Verification, verify
 
-__all__ = ["Damage", "Findings", "verify"]
+__all__ = ["Verification", "judge_rows", "verify"]

@@ -1,8 +1,9 @@
 """What a chunk file and its rows say, read once."""
 
+from collections import defaultdict
 from collections.abc import Mapping
-from contextlib import ExitStack, closing, suppress
-from dataclasses import dataclass, field
+from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.errors import StoreIncomplete
-from pipeline.store.chunk_pass import ChunkPass
-from pipeline.store.chunks import ChunkFiles, row_checksums
-from pipeline.store.schema import CHECKSUMS, FEATURES, TRAILER_BYTES, ArraySpec
-
-_EXPONENTS = {"bfloat16": np.uint16(0x7F80), "float16": np.uint16(0x7C00)}
-"""The bits that are all set in a NaN or an infinity, and in no number: numpy knows no bfloat16,
-and is slow with float16."""
+from pipeline.base.finite import non_finite
+from pipeline.store.chunks import ChunkFiles, ChunkPass, read_rows, row_checksums
+from pipeline.store.schema import CHECKSUMS, FEATURES, ArraySpec, chunk_paths
 
 UNREADABLE = "not in its file"
 UNWRITTEN = "was never written (its checksum is 0)"
@@ -26,97 +23,78 @@ NOT_FINITE = "NaN or infinity"
 
 @dataclass(frozen=True)
 class ChunkReport:
-    """What was found in one chunk file."""
+    """How one chunk file is."""
 
-    array: str
-    chunk: int
-    bytes: int
-    damage: str | None = None
-    """What is wrong with the file as a file."""
-    faults: Mapping[str, NDArray[np.int64]] = field(default_factory=dict[str, NDArray[np.int64]])
-    """Rows by what is wrong with them."""
-    rows: int = 0
-    """That could be read, those of padding left out."""
-
-
-@dataclass(frozen=True)
-class ChunkTask:
-    """Read one chunk file once, in blocks, and check it; runs in any process that sees it."""
-
-    root: Path
-    specs: Mapping[str, ArraySpec]
     array: str
     chunk: int
     path: Path
-
-    @property
-    def bytes(self) -> int:
-        """That it reads."""
-        return self.specs[self.array].chunk_bytes + TRAILER_BYTES
-
-    def __call__(self) -> ChunkReport:
-        """Check the file and its rows."""
-        spec = self.specs[self.array]
-        rows = spec.chunk_rows_of(self.chunk)
-        faults: dict[str, list[NDArray[np.int64]]] = {}
-        with ExitStack() as stack:
-            file = stack.enter_context(closing(ChunkPass(self.path, spec)))
-            beside = {
-                name: stack.enter_context(closing(ChunkFiles(self.root, other, writable=False)))
-                for name, other in self.specs.items()
-                if name != self.array
-            }
-            for first, values in file.blocks():
-                start = rows.start + first
-                kept = values[: max(0, rows.stop - start)]
-                found = self._faults(start, kept, beside) if len(kept) else {}  # else padding
-                for what, bad in found.items():
-                    if bad.any():
-                        faults.setdefault(what, []).append(start + np.flatnonzero(bad))
-        read = min(file.whole_rows, len(rows))
-        unread = np.arange(rows.start + read, rows.stop)
-        if len(unread):
-            faults.setdefault(UNREADABLE, []).append(unread)
-        found = {what: np.concatenate(each) for what, each in faults.items()}
-        return ChunkReport(self.array, self.chunk, file.bytes, file.damage, found, read)
-
-    def _faults(
-        self, start: int, values: NDArray[Any], beside: Mapping[str, ChunkFiles]
-    ) -> dict[str, NDArray[np.bool_]]:
-        """Which rows (row,) of a block are bad, by what is wrong."""
-        if self.array == FEATURES:
-            return self._feature_faults(start, values, beside)
-        if values.dtype.kind != "f":
-            return {}
-        if self.array == "vl/frame_time":  # NaN says that the episode lacks the view
-            return {"an infinite time": _any_in_row(np.isinf(values))}
-        return {NOT_FINITE: _any_in_row(not_finite(values, str(values.dtype)))}
-
-    def _feature_faults(
-        self, start: int, values: NDArray[Any], beside: Mapping[str, ChunkFiles]
-    ) -> dict[str, NDArray[np.bool_]]:
-        spec = self.specs[FEATURES]
-        bad = not_finite(values, spec.attributes.get("dtype", str(spec.dtype)))
-        if bad.any():
-            with suppress(StoreIncomplete):  # the file of slots is a finding of its own
-                valid = beside["vl/slot_valid"].read(start, len(values))
-                bad &= (valid != 0)[..., None]
-        faults = {NOT_FINITE: _any_in_row(bad)}
-        try:
-            stored = beside[CHECKSUMS].read(start, len(values))
-        except StoreIncomplete:  # so is the file of checksums
-            return faults | {CHANGED: np.ones(len(values), np.bool_)}
-        changed = stored != row_checksums(values)
-        return faults | {UNWRITTEN: stored == 0, CHANGED: changed & (stored != 0)}
+    bytes: int
+    """That were read."""
+    rows: int
+    """That could be read, those of padding left out."""
+    damage: str | None
+    """What is wrong with the file as a file."""
+    faults: Mapping[str, NDArray[np.int64]]
+    """Feature rows that cannot be used, by what is wrong with them."""
 
 
-def not_finite(values: NDArray[Any], dtype: str) -> NDArray[np.bool_]:
-    """Where values are NaN or infinite, in their shape; `dtype` says what bits stand for."""
-    if dtype not in _EXPONENTS:
-        return ~np.isfinite(values)
-    exponents = values.view(np.uint16) & _EXPONENTS[dtype]
-    return exponents == _EXPONENTS[dtype]
+def judge_rows(
+    features: NDArray[Any], checksums: NDArray[np.uint32], slot_valid: NDArray[np.uint8]
+) -> dict[str, NDArray[np.bool_]]:
+    """Which feature rows (row, slot, dim) cannot be used, (row,) each, by what is wrong.
+
+    `checksums` (row,) and `slot_valid` (row, slot) are as the store holds them: a NaN in a slot
+    that is not valid is nobody's.
+    """
+    broken = non_finite(features).any(axis=2) & (slot_valid != 0)
+    changed = checksums != row_checksums(features)
+    return {
+        NOT_FINITE: broken.any(axis=1),
+        UNWRITTEN: checksums == 0,
+        CHANGED: changed & (checksums != 0),
+    }
 
 
-def _any_in_row(bad: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    return np.any(bad.reshape(len(bad), -1), axis=1) if bad.size else np.zeros(len(bad), np.bool_)
+def check_chunk(root: Path, specs: Mapping[str, ArraySpec], array: str, chunk: int) -> ChunkReport:
+    """Read a chunk file once, in blocks; runs in any process that sees the store."""
+    spec, path = specs[array], chunk_paths(root, specs[array])[chunk]
+    rows, faults = spec.chunk_rows_of(chunk), defaultdict[str, list[NDArray[np.int64]]](list)
+    with closing(ChunkPass(path, spec)) as file:
+        for first, block in file.blocks():
+            start = rows.start + first
+            values = block[: max(0, rows.stop - start)]  # the rest is padding
+            if array == FEATURES and len(values):
+                beside = (_beside(root, specs, name, start, values) for name in _BESIDE)
+                for what, bad in judge_rows(values, *beside).items():
+                    faults[what].append(start + np.flatnonzero(bad))
+    read = min(file.whole_rows, len(rows))
+    if array == FEATURES:
+        faults[UNREADABLE].append(np.arange(rows.start + read, rows.stop))
+        if file.damage is None and _checksums_are_damaged(root, specs, rows):
+            del faults[CHANGED], faults[UNWRITTEN]
+    joined = {what: np.concatenate(parts) for what, parts in faults.items()}
+    found = {what: bad for what, bad in joined.items() if len(bad)}
+    return ChunkReport(array, chunk, path, file.bytes, read, file.damage, found)
+
+
+_BESIDE = (CHECKSUMS, "vl/slot_valid")
+"""What feature rows are judged by."""
+
+
+def _beside(
+    root: Path, specs: Mapping[str, ArraySpec], name: str, start: int, features: NDArray[Any]
+) -> NDArray[Any]:
+    """The same rows of another array; ones where that cannot be read, as is said of its file."""
+    try:
+        return read_rows(root, specs[name], start, start + len(features))
+    except (KeyError, StoreIncomplete):
+        return np.ones(features.shape[: 1 if name == CHECKSUMS else 2], np.uint8)
+
+
+def _checksums_are_damaged(root: Path, specs: Mapping[str, ArraySpec], rows: range) -> bool:
+    """Whether the checksums of these rows are lost: then those of a sound file are good."""
+    if CHECKSUMS not in specs:
+        return True
+    with closing(ChunkFiles(root, specs[CHECKSUMS], writable=False)) as files:
+        chunks = {row // files.spec.chunk_rows for row in (rows.start, rows.stop - 1)}
+        return any(files.damage(chunk) for chunk in chunks)

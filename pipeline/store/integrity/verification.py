@@ -1,123 +1,176 @@
-"""Check a whole store: structure, files, the checksum of every row, NaN, and what arrays agree on.
+"""Check a whole store: structure, files, the checksum of every row, NaN.
 
 Every byte is read once, a chunk file at a time in blocks of a few megabytes, by several threads or
-by dask workers on hosts that see the store.
+by dask workers on hosts that see the store. What the arrays say of each other is left to those who
+build stores: the trailers prove that they hold what was written.
 """
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, TypeVar, cast
+from typing import Any
 
 import numpy as np
-import zarr
-from dask.threaded import get as run_in_threads
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.base.errors import StoreIncomplete, StoreMismatch
-from pipeline.store.archive import is_archive
-from pipeline.store.integrity.findings import MOST_LINES, Damage, Findings, Places, runs_of
-from pipeline.store.integrity.invariants import EpisodeTable, RelationTask, relation_tasks
-from pipeline.store.integrity.scan import CHANGED, UNREADABLE, UNWRITTEN, ChunkReport, ChunkTask
+from pipeline.base.errors import StoreIncomplete
+from pipeline.base.format import size
+from pipeline.base.issue import Issue
+from pipeline.store.environments import runs_of
+from pipeline.store.integrity.scan import ChunkReport, check_chunk
 from pipeline.store.integrity.structure import (
-    GROUPS,
-    NO_DIGEST,
     check_attributes,
     check_digest,
     read_arrays,
     strange_files,
 )
 from pipeline.store.metadata import ATTRIBUTE
-from pipeline.store.repair_hints import extract_command, restore_command
-from pipeline.store.replacement import inode_of, refuse_replaced
-from pipeline.store.schema import CHECKSUMS, FEATURES, ArraySpec, chunk_paths
+from pipeline.store.paths import Inode, inode_of, read_attributes, read_plan, refuse_replaced
+from pipeline.store.reader import FeatureStore, map_array, place
+from pipeline.store.repair_hints import mend
+from pipeline.store.schema import FEATURES, STREAMS, ArraySpec
 
-Report = TypeVar("Report", covariant=True)
+MOST_LINES = 20
+"""Of one kind that are shown; the rest is counted."""
+_NO_DIGEST = "an earlier version wrote it without a metadata_digest: attributes cannot be checked"
 
 
-def verify(path: Path, threads: int, workers: int | str = 0) -> Findings:
+@dataclass(frozen=True)
+class Verification:
+    """What was checked of a store and everything that is wrong with it."""
+
+    store: Path
+    inode: Inode | None
+    """Of the store that was checked: another may have taken its place since."""
+    rows: int
+    """Feature rows that could be read and were checked."""
+    row_bytes: int
+    """Of the rows of all arrays."""
+    bytes: int
+    """Of the chunk files that were read, with the padding behind the last rows."""
+    seconds: float
+    issues: tuple[Issue, ...]
+    """Of metadata, chunk files and feature rows, `stream` being the array, and strange files."""
+    bad_rows: NDArray[np.int64]
+    """The VL rows whose features cannot be used, ascending."""
+    notes: tuple[str, ...]
+    """What could not be checked."""
+
+    @property
+    def sound(self) -> bool:
+        """Whether nothing is wrong."""
+        return not self.issues
+
+    @property
+    def damaged(self) -> list[Issue]:
+        """Those of metadata and chunk files."""
+        return [issue for issue in self.issues if issue.kind in ("metadata", "chunk")]
+
+    def damaged_chunks(self, array: str) -> set[int]:
+        """Chunks of an array that something is wrong with."""
+        issues = (issue for issue in self.damaged if issue.stream == array)
+        return {issue.chunk for issue in issues if issue.chunk is not None}
+
+    def lines(self) -> list[str]:
+        """For people: everything that is wrong, long lists capped."""
+        by_kind: dict[str, list[str]] = {}
+        for issue in self.issues:
+            line = f"{issue.file}: {issue.message}" if issue.file else issue.message
+            by_kind.setdefault(issue.kind, []).append(line)
+        return [line for kind, lines in by_kind.items() for line in capped(lines, f"of {kind}")]
+
+    def advice(self) -> str:
+        """For people: what to run next."""
+        if all(issue.kind == "strange file" for issue in self.issues):
+            return "All that was stored is sound: look at these files and remove them."
+        return mend(self.store)
+
+    def summary(self) -> str:
+        """For people: how much was checked, how fast."""
+        rate = self.bytes / 1e9 / self.seconds if self.seconds else 0.0
+        return (
+            f"{self.store}: checked {self.rows} feature rows, {size(self.row_bytes)} of "
+            f"rows in {size(self.bytes)} of files, in {self.seconds:.1f} s "
+            f"({rate:.2f} GB/s)"
+        )
+
+
+def verify(path: Path, threads: int, workers: int | str = 0) -> Verification:
     """Everything that is wrong with a finished store, which is only read.
 
     `workers` is 0 for `threads` of this process, a number of local dask processes, or the address
     of a scheduler whose workers see the store under the same path. Raises `StoreIncomplete` where
-    there is no finished store, `StoreMismatch` where it is an archive, or was replaced meanwhile,
-    `ConfigError` where no scheduler answers at the address.
+    there is no finished store, or one that no longer says what it is, `StoreMismatch` where it is
+    an archive or was replaced meanwhile, `ConfigError` where no scheduler answers at the address.
     """
-    begun = time.monotonic()
-    _refuse_other_things(path)
-    inode = inode_of(path)
-    specs, damaged = read_arrays(path)
-    attrs, unreadable = _attributes(path)
-    damaged += unreadable or check_attributes(path, attrs, specs)
-    damaged += [] if damaged else check_digest(path)
-    notes = () if damaged or ATTRIBUTE in attrs else (NO_DIGEST,)
-    tasks = _chunk_tasks(path, specs)
-    reports = list(run_tasks(tasks, threads, workers, "verify"))
+    begun, inode = time.monotonic(), inode_of(path)
+    attributes = read_attributes(path)
+    read_plan(path)  # without one, nothing of it can be kept
+    specs, issues = read_arrays(path)
+    issues += check_attributes(path, attributes)
+    issues += [] if issues else check_digest(path)
+    notes = () if issues or ATTRIBUTE in attributes else (_NO_DIGEST,)
+    checks = [
+        partial(check_chunk, path, specs, name, chunk)
+        for name, spec in specs.items()
+        for chunk in range(spec.chunk_count)
+    ]
+    total = sum(spec.chunk_count * spec.chunk_bytes for spec in specs.values())
+    with tqdm(total=total, desc="verify", unit="B", unit_scale=True, disable=None) as bar:
+        reports = list(_run(checks, threads, workers, bar))
     if workers:
-        _refuse_blind_workers(path, tasks, reports)
-    unsound = {task.array for task, report in zip(tasks, reports, strict=True) if report.damage}
-    places, relations = Places({}, (), 1), list[Damage]()
-    if not any(one.array == "" for one in damaged):
-        table = EpisodeTable(path, specs, attrs, unsound)
-        reuse, places = int(attrs["vlm_reuse_count"]), table.places
-        relations += table.damaged()
-        blocks = relation_tasks(path, specs, table, reuse, unsound)
-        relations += _relations(path, blocks, run_tasks(blocks, threads, workers, "agree"), places)
-    for task, report in zip(tasks, reports, strict=True):
-        damaged += _file_damage(task, report, places)
-    problems = tuple(strange_files(path, specs))
+        _refuse_blind_workers(path, reports)
+    bad = [report for report in reports if report.damage or report.faults]
+    store = _naming_store(path, attributes, specs, issues, bad) if bad else None
+    for report in bad:
+        issues += _chunk_issues(report, specs[report.array], store)
+    issues += _row_issues(bad, store)
+    faults = [rows for report in bad for rows in report.faults.values()]
+    issues += strange_files(path, specs)
     refuse_replaced(path, inode)
-    return Findings(
+    return Verification(
         store=path,
         inode=inode,
         rows=sum(report.rows for report in reports if report.array == FEATURES),
         row_bytes=sum(report.rows * specs[report.array].row_bytes for report in reports),
         bytes=sum(report.bytes for report in reports),
         seconds=time.monotonic() - begun,
-        damaged=tuple(damaged + relations),
-        problems=problems,
-        faults=_row_faults(specs, reports),
-        places=places,
+        issues=tuple(issues),
+        bad_rows=np.unique(np.concatenate([np.zeros(0, np.int64), *faults])),
         notes=notes,
-        plan=isinstance(attrs.get("plan"), str),
     )
 
 
-class Task(Protocol[Report]):
-    """A piece of work that can be sent to another process."""
-
-    @property
-    def bytes(self) -> int:
-        """That it reads, for the progress bar."""
-        ...
-
-    def __call__(self) -> Report: ...
+def capped(lines: Sequence[str], kind: str) -> list[str]:
+    """The first lines, and how many more there are."""
+    more = len(lines) - MOST_LINES
+    return [*lines[:MOST_LINES], *([f"and {more} more {kind}"] if more > 0 else [])]
 
 
-def run_tasks(
-    tasks: Sequence[Task[Report]], threads: int, workers: int | str, label: str
-) -> Iterator[Report]:
-    """What each task gives, in order; with a progress bar in bytes."""
-    total = sum(task.bytes for task in tasks)
-    with tqdm(total=total, desc=label, unit="B", unit_scale=True, disable=None) as progress:
-        if workers:
-            yield from _on_cluster(tasks, workers, progress)
-            return
-
-        def run(task: Task[Report]) -> Report:
-            report = task()
-            progress.update(task.bytes)
-            return report
-
-        graph = {index: (run, task) for index, task in enumerate(tasks)}
-        yield from cast("Sequence[Report]", run_in_threads(graph, list(graph), num_workers=threads))
+Check = Callable[[], ChunkReport]
 
 
-def _on_cluster(
-    tasks: Sequence[Task[Report]], workers: int | str, progress: "tqdm[Any]"
-) -> Iterator[Report]:
+def _run(
+    checks: Sequence[Check], threads: int, workers: int | str, bar: "tqdm[Any]"
+) -> Iterator[ChunkReport]:
+    """What each check gives, in order."""
+    if workers:
+        yield from _run_on_cluster(checks, workers, bar)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        for report in pool.map(lambda check: check(), checks):
+            bar.update(report.bytes)
+            yield report
+
+
+def _run_on_cluster(
+    checks: Sequence[Check], workers: int | str, bar: "tqdm[Any]"
+) -> list[ChunkReport]:
     from distributed import Client, as_completed
 
     from pipeline.base.scheduler import client_of, private_cluster, quiet
@@ -130,116 +183,68 @@ def _on_cluster(
             # Of one thread each: checksums hold the interpreter's lock.
             cluster = stack.enter_context(private_cluster(workers, threads=1))
             client = stack.enter_context(Client(cluster, set_as_default=False))
-        futures = client.map(_call, tasks, pure=False)
-        sizes = {future.key: task.bytes for future, task in zip(futures, tasks, strict=True)}
-        for future in as_completed(futures, loop=client.loop):
-            progress.update(sizes[future.key])
-        yield from cast("list[Report]", client.gather(futures))
+        futures = [client.submit(check, pure=False) for check in checks]
+        for _, report in as_completed(futures, loop=client.loop, with_results=True):
+            bar.update(report.bytes)
+        return client.gather(futures)
 
 
-def _refuse_blind_workers(
-    path: Path, tasks: Sequence[ChunkTask], reports: Sequence[ChunkReport]
-) -> None:
+def _refuse_blind_workers(path: Path, reports: Sequence[ChunkReport]) -> None:
     """A file that is here and not there is no damage."""
-    pairs = zip(tasks, reports, strict=True)
-    if any(report.bytes == 0 and task.path.exists() for task, report in pairs):
+    if any(report.bytes == 0 and report.path.exists() for report in reports):
         raise StoreIncomplete(
             f"{path}: expected the workers to see the store under this path, they find no file. "
             "Put it on a file system that they share, or set verify.workers=0."
         )
 
 
-def _call(task: Task[Report]) -> Report:
-    return task()
-
-
-def _refuse_other_things(path: Path) -> None:
-    part = path.with_name(path.name + ".part")
-    if path.suffix == ".part" and path.exists():
-        command = extract_command(path.with_suffix(""))
-        raise StoreIncomplete(f"{path}: an unfinished build. Run {command}, then verify.")
-    if not path.is_dir():
-        found = f"only the unfinished build {part}" if part.exists() else "nothing there"
-        raise StoreIncomplete(f"{path}: no finished store ({found}). Run {extract_command(path)}.")
-    if not any((path / place / "zarr.json").exists() for place in ("", *GROUPS)):
-        raise StoreIncomplete(
-            f"{path}: no store (no zarr.json in it). Name one with --set verify.store=…"
-        )
-    if is_archive(path):
-        raise StoreMismatch(
-            f"{path}: expected a store, found an archive of one, whose chunks carry checksums of "
-            f"their own. Restore it: {restore_command(path)}"
-        )
-
-
-def _attributes(path: Path) -> tuple[dict[str, Any], list[Damage]]:
-    try:
-        return zarr.open_group(path, mode="r").attrs.asdict(), []
-    except (FileNotFoundError, ValueError, KeyError, TypeError) as error:
-        what = f"not a zarr group's metadata ({error})"
-        return {}, [Damage("", None, path / "zarr.json", what)]
-
-
-def _chunk_tasks(path: Path, specs: Mapping[str, ArraySpec]) -> list[ChunkTask]:
-    """One for each chunk file; of features, where what is needed to judge a row is there."""
-    judge = {name: specs[name] for name in (FEATURES, CHECKSUMS, "vl/slot_valid") if name in specs}
-    return [
-        ChunkTask(path, judge if name == FEATURES else {name: spec}, name, chunk, file)
-        for name, spec in specs.items()
-        if name != FEATURES or len(judge) == 3
-        for chunk, file in enumerate(chunk_paths(path, spec))
-    ]
-
-
-def _row_faults(
-    specs: Mapping[str, ArraySpec], reports: Sequence[ChunkReport]
-) -> dict[str, NDArray[np.int64]]:
-    """Bad feature rows by what is wrong with them.
-
-    Where a file of features is sound and the file of its checksums is not, the rows are good.
-    """
-    unsound = [one.chunk for one in reports if one.array == CHECKSUMS and one.damage]
-    found: dict[str, list[NDArray[np.int64]]] = {}
-    for report in (one for one in reports if one.array == FEATURES):
-        for what, rows in report.faults.items():
-            if what in (CHANGED, UNWRITTEN) and report.damage is None:
-                rows = rows[~np.isin(rows // specs[CHECKSUMS].chunk_rows, unsound)]
-            if len(rows):
-                found.setdefault(what, []).append(rows)
-    return {what: np.concatenate(each) for what, each in found.items()}
-
-
-def _file_damage(task: ChunkTask, report: ChunkReport, places: Places) -> Iterator[Damage]:
-    """What is wrong with a chunk file, and with the rows in it unless they are feature rows."""
-    rows = task.specs[task.array].chunk_rows_of(task.chunk)
-    kind = task.array.split("/")[0]
-    if report.damage:
-        span = places.span(kind, rows.start, rows.stop - 1)
-        what = f"{report.damage}; rows {span} of {task.array}"
-        yield Damage(task.array, task.chunk, task.path, what)
-    if task.array == FEATURES:
-        return
-    for what, bad in report.faults.items():
-        if what != UNREADABLE:  # said of the file already
-            said = _rows_said(bad, kind, places)
-            yield Damage(task.array, task.chunk, task.path, f"{what} in {said}")
-
-
-def _relations(
+def _naming_store(
     path: Path,
-    tasks: Sequence[RelationTask],
-    found: Iterator[tuple[str, str, NDArray[np.int64]]],
-    places: Places,
-) -> Iterator[Damage]:
-    for task, (array, what, rows) in zip(tasks, found, strict=True):
-        if len(rows):
-            said = _rows_said(rows, array.split("/")[0], places)
-            chunk = int(rows[0]) // task.spec.chunk_rows
-            yield Damage(array, chunk, path / array, f"{what} in {said}")
+    attributes: Mapping[str, Any],
+    specs: Mapping[str, ArraySpec],
+    issues: Sequence[Issue],
+    bad: Sequence[ChunkReport],
+) -> FeatureStore | None:
+    """The store, as far as rows are named by it; None where that part of it is damaged."""
+    needed = [name for name in specs if name.startswith("episode/") or name.endswith("/time")]
+    lost = any(report.damage for report in bad if report.array in needed)
+    if issues or lost:
+        return None
+    return FeatureStore(path, attributes, {name: map_array(path, specs[name]) for name in needed})
 
 
-def _rows_said(rows: NDArray[np.int64], kind: str, places: Places) -> str:
-    runs = runs_of(rows)
-    named = ", ".join(places.span(kind, first, last) for first, last in runs[:MOST_LINES])
-    more = sum(last - first + 1 for first, last in runs[MOST_LINES:])
-    return f"{'row' if len(rows) == 1 else 'rows'} {named}" + (f" and {more} more" if more else "")
+def _chunk_issues(
+    report: ChunkReport, spec: ArraySpec, store: FeatureStore | None
+) -> Iterator[Issue]:
+    if report.damage:
+        rows, stream = spec.chunk_rows_of(report.chunk), report.array.partition("/")[0]
+        named = _name(store, stream, rows) if stream in STREAMS else ""
+        yield Issue(
+            severity="error",
+            kind="chunk",
+            message=f"{report.damage}; rows {rows.start} to {rows.stop - 1} of {spec.name}{named}",
+            stream=report.array,
+            file=report.path,
+            chunk=report.chunk,
+        )
+
+
+def _row_issues(bad: Sequence[ChunkReport], store: FeatureStore | None) -> Iterator[Issue]:
+    """Of each run of feature rows with one fault."""
+    faults: dict[str, list[NDArray[np.int64]]] = {}
+    for report in bad:
+        for what, rows in report.faults.items():
+            faults.setdefault(what, []).append(rows)
+    for what, parts in faults.items():
+        for run in runs_of(np.concatenate(parts)):
+            rows = f"row {run[0]}" if len(run) == 1 else f"rows {run[0]} to {run[-1]}"
+            message = f"VL {rows}: {what}{_name(store, 'vl', run)}"
+            yield Issue(severity="error", kind="feature rows", message=message, stream=FEATURES)
+
+
+def _name(store: FeatureStore | None, stream: str, rows: range) -> str:
+    """Which rows of which episodes these are."""
+    if store is None:
+        return ""
+    ends = dict.fromkeys((rows[0], rows[-1]))
+    return "; " + " to ".join(place(store, stream, row) for row in ends)

@@ -27,10 +27,17 @@ from pipeline.store.lock import build_lock
 from pipeline.store.merging.copying import axis_kind, copy_features, copy_stream
 from pipeline.store.merging.joining import Joined, join
 from pipeline.store.metadata import ATTRIBUTE, check_metadata
-from pipeline.store.paths import MERGED, part_path, read_plan, recover
+from pipeline.store.paths import (
+    MERGED,
+    Inode,
+    inode_of,
+    part_path,
+    read_plan,
+    recover,
+    refuse_replaced,
+)
 from pipeline.store.reader import FeatureStore
 from pipeline.store.repair_hints import gc_command
-from pipeline.store.replacement import Inode, inode_of, refuse_replaced
 from pipeline.store.schema import (
     FEATURES,
     INCREMENTAL,

@@ -9,11 +9,11 @@ import torch
 
 from pipeline.base.errors import ConfigError
 from pipeline.base.format import size
+from pipeline.base.memory import available_bytes
 from pipeline.store import FeatureStore
 from pipeline.store.archive import is_archive
 from pipeline.store.gather import WIDE
 from pipeline.store.mapping import fitting
-from pipeline.store.memory import available_bytes
 from pipeline.store.repair_hints import restore_command
 from pipeline.train.batches.scratch import restored
 
