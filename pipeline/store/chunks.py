@@ -9,6 +9,7 @@ import os
 import shutil
 from collections.abc import Callable, Collection, Iterator
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -70,78 +71,52 @@ def read_rows(root: Path, spec: ArraySpec, start: int = 0, stop: int | None = No
         return files.read(start, (spec.shape[0] if stop is None else stop) - start)
 
 
-class ChunkPass:
-    """One pass over a chunk file: its rows, and at the end what is wrong with the file."""
+@dataclass(frozen=True)
+class ChunkState:
+    """How a chunk file is, read once from end to end."""
 
-    def __init__(self, path: Path, spec: ArraySpec) -> None:
-        self.damage: str | None = None
-        """Expected and found; None as long as nothing is wrong with the file as a file."""
-        self.bytes = 0
-        """That were read."""
-        self.whole_rows = 0
-        """That lie in the file, those of padding among them."""
-        self.crc = 0
-        """The crc32c of the data that were read."""
-        self._spec = spec
-        self._descriptor = -1
-        try:
-            self._descriptor = os.open(path, os.O_RDONLY)
-        except OSError as error:
-            self.damage = f"expected a chunk file, found none ({error.strerror})"
+    bytes: int
+    """That could be read, of rows and trailer."""
+    crc: int
+    """The crc32c of the rows, those of padding among them."""
+    damage: str | None
+    """Expected and found; None where the file gives its trailer."""
 
-    @property
-    def complete(self) -> bool:
-        """Whether all rows were read, whatever stands behind them."""
-        return self.whole_rows == self._spec.chunk_rows
 
-    def blocks(self, buffer: NDArray[np.uint8] | None = None) -> Iterator[tuple[int, NDArray[Any]]]:
-        """(first row within the chunk, rows); the rows are valid until the next block.
+def read_chunk(
+    path: Path,
+    spec: ArraySpec,
+    visit: Callable[[int, NDArray[Any]], object] = lambda first, rows: None,
+) -> ChunkState:
+    """Read a chunk file block by block.
 
-        As many at a time as fit into `buffer` (byte,), where one is given.
-        """
-        if self.damage:
-            return
-        spec = self._spec
-        if buffer is None:
-            rows = max(1, min(spec.chunk_rows, BLOCK_BYTES // spec.row_bytes))
-            buffer = np.empty(rows * spec.row_bytes, np.uint8)
-        together = buffer.nbytes // spec.row_bytes
-        for first in range(0, spec.chunk_rows, together):
-            wanted = min(together, spec.chunk_rows - first) * spec.row_bytes
-            got = self._read(buffer[:wanted], first * spec.row_bytes)
-            whole = got // spec.row_bytes
-            self.whole_rows += whole
-            self.crc = google_crc32c.extend(self.crc, buffer[:got])
-            values = buffer[: whole * spec.row_bytes].view(spec.dtype)
-            yield first, values.reshape(whole, *spec.shape[1:])
-            if got < wanted:
-                break
-        self.damage = self.damage or self._file_damage()
-
-    def close(self) -> None:
-        """Close the file."""
-        if self._descriptor >= 0:
-            os.close(self._descriptor)
-
-    def _file_damage(self) -> str | None:
-        size, wanted = os.fstat(self._descriptor).st_size, self._spec.chunk_bytes + TRAILER_BYTES
-        if size != wanted:
-            return f"expected {wanted} bytes, found {size}"
-        trailer = np.zeros(1, "<u4")
-        self._read(trailer.view(np.uint8), self._spec.chunk_bytes)
-        if trailer[0] != self.crc:
-            return f"expected the crc32c {trailer[0]:08x} of its trailer, found {self.crc:08x}"
-        return None
-
-    def _read(self, into: NDArray[np.uint8], offset: int) -> int:
-        """Bytes read, fewer where the file ends or the disk fails."""
-        try:
-            done = _read_into(self._descriptor, into, offset)
-        except OSError as error:
-            self.damage = f"cannot be read at byte {offset}: {error.strerror}"
-            return 0
-        self.bytes += done
-        return done
+    `visit` is given each block's first row within the chunk and its whole rows, which are valid
+    until the next block.
+    """
+    together = max(1, min(spec.chunk_rows, BLOCK_BYTES // spec.row_bytes))
+    buffer = np.empty(together * spec.row_bytes, np.uint8)
+    trailer = np.zeros(1, "<u4")
+    done = crc = 0
+    try:
+        with path.open("rb", buffering=0) as file:
+            for first in range(0, spec.chunk_rows, together):
+                block = buffer[: min(together, spec.chunk_rows - first) * spec.row_bytes]
+                got = _read_into(file.fileno(), block, done)
+                done, crc = done + got, google_crc32c.extend(crc, block[:got])
+                rows = block[: got // spec.row_bytes * spec.row_bytes].view(spec.dtype)
+                visit(first, rows.reshape(-1, *spec.shape[1:]))
+                if got < len(block):
+                    break
+            done += _read_into(file.fileno(), trailer.view(np.uint8), done)
+            size = os.fstat(file.fileno()).st_size
+    except OSError as error:
+        return ChunkState(done, crc, f"cannot be read at byte {done}: {error.strerror}")
+    if size != spec.chunk_bytes + TRAILER_BYTES:
+        return ChunkState(
+            done, crc, f"expected {spec.chunk_bytes + TRAILER_BYTES} bytes, found {size}"
+        )
+    wrong = f"expected the crc32c {trailer[0]:08x} of its trailer, found {crc:08x}"
+    return ChunkState(done, crc, wrong if trailer[0] != crc else None)
 
 
 class ChunkFiles:
@@ -224,7 +199,7 @@ class ChunkFiles:
 
     def damage(self, chunk: int) -> str | None:
         """What is wrong with a chunk file of a finished store; None where it gives its trailer."""
-        return self._passed(chunk).damage
+        return read_chunk(self.paths[chunk], self.spec).damage
 
     def check(self, checked: Callable[[int], object] = lambda size: None) -> None:
         """Raise `StoreIncomplete` where a chunk of a finished store does not give its trailer.
@@ -271,13 +246,13 @@ class ChunkFiles:
                 if path.stat().st_size == sealed:
                     continue
                 self._unlink(chunk)  # its other name is no store's: a copy of the build, say
-            data = self._passed(chunk)
-            if not data.complete:
+            state = read_chunk(path, self.spec)
+            if state.bytes < self.spec.chunk_bytes:
                 raise self._incomplete(chunk, "the file ends early")
-            if data.damage:
+            if state.damage:
                 if path.stat().st_size == sealed and not self._owned:
-                    raise self._incomplete(chunk, data.damage)
-                self._write_trailer(chunk, data.crc)
+                    raise self._incomplete(chunk, state.damage)
+                self._write_trailer(chunk, state.crc)
             with disk_full_named(path):
                 os.fsync(self._descriptor(chunk))
 
@@ -309,13 +284,6 @@ class ChunkFiles:
             shutil.copyfile(path, copy)
             sync(copy)
         copy.replace(path)
-
-    def _passed(self, chunk: int) -> ChunkPass:
-        """A pass over the whole file."""
-        with closing(ChunkPass(self.paths[chunk], self.spec)) as data:
-            for _ in data.blocks():
-                pass
-        return data
 
     def _descriptor(self, chunk: int) -> int:
         if chunk not in self._descriptors:

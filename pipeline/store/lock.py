@@ -38,9 +38,21 @@ def build_lock(target: Path) -> Generator[None]:
     path = target.with_name(target.name + ".lock")
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a+", encoding="utf-8") as file:
-        alone_here = _flocked(file, target, path)
-        _refuse_removed(file, path)
-        _refuse_living(file, target, path, alone_here)
+        locked = _flock(file, fcntl.LOCK_EX)
+        holder = _holder(file)
+        if locked is False:
+            raise StoreLocked(_held(target, path, holder))
+        if not path.exists() or path.stat().st_ino != os.fstat(file.fileno()).st_ino:
+            # Tidied away before it was locked: a lock on it excludes nobody.
+            raise StoreLocked(f"{path}: removed by another process just now; run the same again.")
+        if locked is None:
+            print(
+                f"{path}: this file system has no locks; two builds begun within the same instant "
+                "would not see each other",
+                file=sys.stderr,
+            )
+        if holder and not (locked and _is_here(holder)):
+            _refuse_living(file, target, path, holder)
         file.truncate(0)
         file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
         file.flush()
@@ -58,53 +70,33 @@ def lock_holder(path: Path) -> str | None:
     after its last sign of life, as `build_lock` believes it.
     """
     with path.open("r", encoding="utf-8") as file:
-        try:
-            # Shared, so that two that ask do not take each other for a builder.
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-            held = False
-        except OSError:
-            held = True
-        holder = _holder(file)
-        here = not holder or holder.endswith(f" on {socket.gethostname()}")
-        alive = held or (not here and time.time() - path.stat().st_mtime < _STALE_S)
+        # Shared, so that two that ask do not take each other for a builder.
+        locked, holder = _flock(file, fcntl.LOCK_SH), _holder(file)
+        elsewhere = bool(holder) and not (locked and _is_here(holder))
+        alive = locked is False or (elsewhere and time.time() - path.stat().st_mtime < _STALE_S)
     return (holder or "another process") if alive else None
 
 
-def _flocked(file: TextIO, target: Path, path: Path) -> bool:
-    """Take the kernel's lock; False, said on stderr, where the file system has none."""
+def _flock(file: TextIO, how: int) -> bool | None:
+    """Whether the kernel's lock was to be had; None where the file system has none."""
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(file, how | fcntl.LOCK_NB)
     except BlockingIOError:
-        raise StoreLocked(_held(target, path, _holder(file))) from None
+        return False
     except OSError as error:
         if error.errno not in _NO_FLOCK:
             raise
-        print(
-            f"{path}: this file system has no locks ({error.strerror}); two builds begun within "
-            "the same instant would not see each other",
-            file=sys.stderr,
-        )
-        return False
+        return None
     return True
 
 
-def _refuse_removed(file: TextIO, path: Path) -> None:
-    """Raise where the file was tidied away before it was locked: a lock on it excludes nobody."""
-    if not path.exists() or path.stat().st_ino != os.fstat(file.fileno()).st_ino:
-        raise StoreLocked(f"{path}: removed by another process just now; run the same again.")
-
-
-def _refuse_living(file: TextIO, target: Path, path: Path, alone_here: bool) -> None:
+def _refuse_living(file: TextIO, target: Path, path: Path, holder: str) -> None:
     """Raise where another host's process, or one that flock cannot see, gave a sign of life."""
-    holder = _holder(file)
-    if holder and not _HELD.match(holder):
+    if not _HELD.match(holder):
         raise ConfigError(
             f"{path}: expected the lock of {target}, found a file that this project did not write. "
             f"It was left as it is: move it away, or name another place than {target}."
         )
-    ours = holder.endswith(f" on {socket.gethostname()}")
-    if not holder or (ours and alone_here):
-        return
     seen = os.fstat(file.fileno()).st_mtime_ns
     os.utime(file.fileno())  # both times by the clock of the file's own host
     age_s = (os.fstat(file.fileno()).st_mtime_ns - seen) / 1e9
@@ -114,6 +106,10 @@ def _refuse_living(file: TextIO, target: Path, path: Path, alone_here: bool) -> 
             f"{_held(target, path, holder)} It gave a sign of life {age_s:.0f} s ago; if it was "
             f"killed, wait until that is {_STALE_S:.0f} s."
         )
+
+
+def _is_here(holder: str) -> bool:
+    return bool(_HELD.match(holder)) and holder.endswith(f" on {socket.gethostname()}")
 
 
 def _holder(file: TextIO) -> str:

@@ -201,7 +201,7 @@ class TestFeatureRows:
         chunk_file(store, "vl/features").unlink()
         verification = checked(store)
         assert verification.bad_rows.tolist() == list(range(60))
-        assert "found none (No such file or directory)" in verification.lines()[0]
+        assert "cannot be read at byte 0: No such file or directory" in verification.lines()[0]
         assert verification.rows == 0
         assert "VL rows 0 to 59: not in its file" in verification.lines()[1]
 

@@ -6,7 +6,6 @@ writing, so that a read-only store will do.
 
 import os
 from collections.abc import Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 
 from pipeline.base.errors import StoreIncomplete
 from pipeline.store.archive.layout import rows_of
-from pipeline.store.chunks import ChunkPass
+from pipeline.store.chunks import read_chunk
 from pipeline.store.repair_hints import mend
 from pipeline.store.schema import TRAILER_BYTES, ArraySpec, chunk_paths
 
@@ -31,9 +30,12 @@ def checked_rows(
     block = np.empty((len(chunks), spec.chunk_bytes), np.uint8)
     crcs: list[int] = []
     for data, chunk in zip(block, chunks, strict=True):
-        with closing(ChunkPass(paths[chunk], spec)) as file:
-            for _ in file.blocks(data):
-                pass
+        rows_of_file = data.view(spec.dtype).reshape(-1, *spec.shape[1:])
+
+        def keep(first: int, rows: NDArray[Any], into: NDArray[Any] = rows_of_file) -> None:
+            into[first : first + len(rows)] = rows
+
+        file = read_chunk(paths[chunk], spec, keep)
         if file.damage:
             bad = spec.chunk_rows_of(chunk)
             raise StoreIncomplete(

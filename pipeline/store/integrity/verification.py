@@ -6,9 +6,10 @@ build stores: the trailers prove that they hold what was written.
 """
 
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -19,10 +20,11 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from pipeline.base.errors import StoreIncomplete
+from pipeline.base.finite import non_finite
 from pipeline.base.format import size
 from pipeline.base.issue import Issue
+from pipeline.store.chunks import ChunkFiles, read_chunk, read_rows, row_checksums
 from pipeline.store.environments import runs_of
-from pipeline.store.integrity.scan import ChunkReport, check_chunk
 from pipeline.store.integrity.structure import (
     check_attributes,
     check_digest,
@@ -33,11 +35,34 @@ from pipeline.store.metadata import ATTRIBUTE
 from pipeline.store.paths import Inode, inode_of, read_attributes, read_plan, refuse_replaced
 from pipeline.store.reader import FeatureStore, map_array, place
 from pipeline.store.repair_hints import mend
-from pipeline.store.schema import FEATURES, STREAMS, ArraySpec
+from pipeline.store.schema import CHECKSUMS, FEATURES, STREAMS, ArraySpec, chunk_paths
 
 MOST_LINES = 20
 """Of one kind that are shown; the rest is counted."""
+UNREADABLE = "not in its file"
+UNWRITTEN = "was never written (its checksum is 0)"
+CHANGED = "its bytes do not give its checksum"
+NOT_FINITE = "NaN or infinity"
+_BESIDE = (CHECKSUMS, "vl/slot_valid")
+"""What feature rows are judged by."""
 _NO_DIGEST = "an earlier version wrote it without a metadata_digest: attributes cannot be checked"
+
+
+@dataclass(frozen=True)
+class ChunkReport:
+    """How one chunk file is."""
+
+    array: str
+    chunk: int
+    path: Path
+    bytes: int
+    """That were read."""
+    rows: int
+    """That could be read, those of padding left out."""
+    damage: str | None
+    """What is wrong with the file as a file."""
+    faults: Mapping[str, NDArray[np.int64]]
+    """Feature rows that cannot be used, by what is wrong with them."""
 
 
 @dataclass(frozen=True)
@@ -129,8 +154,11 @@ def verify(path: Path, threads: int, workers: int | str = 0) -> Verification:
     store = _naming_store(path, attributes, specs, issues, bad) if bad else None
     for report in bad:
         issues += _chunk_issues(report, specs[report.array], store)
-    issues += _row_issues(bad, store)
-    faults = [rows for report in bad for rows in report.faults.values()]
+    faults = {
+        what: np.concatenate([report.faults[what] for report in bad if what in report.faults])
+        for what in dict.fromkeys(what for report in bad for what in report.faults)
+    }
+    issues += _row_issues(faults, store)
     issues += strange_files(path, specs)
     refuse_replaced(path, inode)
     return Verification(
@@ -141,9 +169,69 @@ def verify(path: Path, threads: int, workers: int | str = 0) -> Verification:
         bytes=sum(report.bytes for report in reports),
         seconds=time.monotonic() - begun,
         issues=tuple(issues),
-        bad_rows=np.unique(np.concatenate([np.zeros(0, np.int64), *faults])),
+        bad_rows=np.unique(np.concatenate([np.zeros(0, np.int64), *faults.values()])),
         notes=notes,
     )
+
+
+def judge_rows(
+    features: NDArray[Any], checksums: NDArray[np.uint32], slot_valid: NDArray[np.uint8]
+) -> dict[str, NDArray[np.bool_]]:
+    """Which feature rows (row, slot, dim) cannot be used, (row,) each, by what is wrong.
+
+    `checksums` (row,) and `slot_valid` (row, slot) are as the store holds them: a NaN in a slot
+    that is not valid is nobody's.
+    """
+    broken = non_finite(features).any(axis=2) & (slot_valid != 0)
+    changed = checksums != row_checksums(features)
+    return {
+        NOT_FINITE: broken.any(axis=1),
+        UNWRITTEN: checksums == 0,
+        CHANGED: changed & (checksums != 0),
+    }
+
+
+def check_chunk(root: Path, specs: Mapping[str, ArraySpec], array: str, chunk: int) -> ChunkReport:
+    """Read a chunk file once, in blocks; runs in any process that sees the store."""
+    spec, path = specs[array], chunk_paths(root, specs[array])[chunk]
+    rows, faults = spec.chunk_rows_of(chunk), defaultdict[str, list[NDArray[np.int64]]](list)
+
+    def judge(first: int, block: NDArray[Any]) -> None:
+        start = rows.start + first
+        values = block[: max(0, rows.stop - start)]  # the rest is padding
+        if len(values):
+            beside = (_beside(root, specs, name, start, values) for name in _BESIDE)
+            for what, bad in judge_rows(values, *beside).items():
+                faults[what].append(start + np.flatnonzero(bad))
+
+    file = read_chunk(path, spec, *([judge] if array == FEATURES else []))
+    read = min(file.bytes // spec.row_bytes, len(rows))
+    if array == FEATURES:
+        faults[UNREADABLE].append(np.arange(rows.start + read, rows.stop))
+    joined = {what: np.concatenate(parts) for what, parts in faults.items() if any(map(len, parts))}
+    by_checksum = joined.keys() & {CHANGED, UNWRITTEN}
+    if by_checksum and not file.damage and _checksums_are_damaged(root, specs, rows):
+        joined = {what: bad for what, bad in joined.items() if what not in by_checksum}
+    return ChunkReport(array, chunk, path, file.bytes, read, file.damage, joined)
+
+
+def _beside(
+    root: Path, specs: Mapping[str, ArraySpec], name: str, start: int, features: NDArray[Any]
+) -> NDArray[Any]:
+    """The same rows of another array; ones where that cannot be read, as is said of its file."""
+    try:
+        return read_rows(root, specs[name], start, start + len(features))
+    except (KeyError, StoreIncomplete):
+        return np.ones(features.shape[: 1 if name == CHECKSUMS else 2], np.uint8)
+
+
+def _checksums_are_damaged(root: Path, specs: Mapping[str, ArraySpec], rows: range) -> bool:
+    """Whether the checksums of these rows are lost: then those of a sound file are good."""
+    if CHECKSUMS not in specs:
+        return True
+    with closing(ChunkFiles(root, specs[CHECKSUMS], writable=False)) as files:
+        chunks = {row // files.spec.chunk_rows for row in (rows.start, rows.stop - 1)}
+        return any(files.damage(chunk) for chunk in chunks)
 
 
 def capped(lines: Sequence[str], kind: str) -> list[str]:
@@ -152,11 +240,8 @@ def capped(lines: Sequence[str], kind: str) -> list[str]:
     return [*lines[:MOST_LINES], *([f"and {more} more {kind}"] if more > 0 else [])]
 
 
-Check = Callable[[], ChunkReport]
-
-
 def _run(
-    checks: Sequence[Check], threads: int, workers: int | str, bar: "tqdm[Any]"
+    checks: Sequence[Callable[[], ChunkReport]], threads: int, workers: int | str, bar: "tqdm[Any]"
 ) -> Iterator[ChunkReport]:
     """What each check gives, in order."""
     if workers:
@@ -169,7 +254,7 @@ def _run(
 
 
 def _run_on_cluster(
-    checks: Sequence[Check], workers: int | str, bar: "tqdm[Any]"
+    checks: Sequence[Callable[[], ChunkReport]], workers: int | str, bar: "tqdm[Any]"
 ) -> list[ChunkReport]:
     from distributed import Client, as_completed
 
@@ -229,14 +314,12 @@ def _chunk_issues(
         )
 
 
-def _row_issues(bad: Sequence[ChunkReport], store: FeatureStore | None) -> Iterator[Issue]:
+def _row_issues(
+    faults: Mapping[str, NDArray[np.int64]], store: FeatureStore | None
+) -> Iterator[Issue]:
     """Of each run of feature rows with one fault."""
-    faults: dict[str, list[NDArray[np.int64]]] = {}
-    for report in bad:
-        for what, rows in report.faults.items():
-            faults.setdefault(what, []).append(rows)
-    for what, parts in faults.items():
-        for run in runs_of(np.concatenate(parts)):
+    for what, bad in faults.items():
+        for run in runs_of(bad):
             rows = f"row {run[0]}" if len(run) == 1 else f"rows {run[0]} to {run[-1]}"
             message = f"VL {rows}: {what}{_name(store, 'vl', run)}"
             yield Issue(severity="error", kind="feature rows", message=message, stream=FEATURES)
