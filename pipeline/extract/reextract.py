@@ -13,14 +13,16 @@ from tqdm import tqdm
 
 from pipeline.base.bfloat16 import widen
 from pipeline.base.config import Params
+from pipeline.base.differences import describe, differences
 from pipeline.base.digests import ContentDigests
 from pipeline.base.errors import NumericsError, StoreMismatch
 from pipeline.data import Recording
 from pipeline.data.row_range import RowRange
 from pipeline.extract.survey import survey
 from pipeline.store import FEATURES, Episode, FeatureStore, ledger_path
+from pipeline.store.environments import environment_runs
 from pipeline.store.integrity.verification import capped
-from pipeline.vlm.feature_spec import FeatureSpec, differences, row_key
+from pipeline.vlm.feature_spec import FeatureSpec, row_key
 from pipeline.vlm.preparation import PreparedRow, Preparer
 from pipeline.vlm.qwen import FrozenVLM
 
@@ -123,29 +125,27 @@ def reextract(path: Path, params: Params, say: Callable[[str], None]) -> Reextra
         return Reextraction((), tolerance, unchecked, ())
     say(f"computing {len(rows)} rows again")
     vlm = FrozenVLM.load(params.vlm, surveyed.spec, params.extract.device)
-    found = _deviations(store, known, recordings, rows, vlm, surveyed.spec, params)
-    found = list(tqdm(found, "reextract", total=len(rows), unit="row", disable=None))
+    environments = environment_runs(store.attrs["environment"], rows)
+    differing = (describe(differences(then, vlm.environment)) for then, _ in environments)
+    computed = _deviations(store, known, recordings, rows, vlm, surveyed.spec, params)
+    deviations = list(tqdm(computed, "reextract", total=len(rows), unit="row", disable=None))
     return Reextraction(
-        tuple(sorted(found, key=lambda row: -np.nan_to_num(row.relative, nan=np.inf))),
+        tuple(sorted(deviations, key=lambda row: -np.nan_to_num(row.relative, nan=np.inf))),
         tolerance,
         unchecked,
-        tuple(_environment_differences(store.attrs["environment"], rows, vlm.environment)),
+        tuple(sorted({line for lines in differing for line in lines})),
     )
 
 
 def _refuse_other_spec(store: FeatureStore, spec: FeatureSpec) -> None:
     if store.spec["digest"] == spec.digest:
         return
-    lines = [f"  {line}" for line in differences(store.spec, spec.attrs())]
+    lines = describe(differences(store.spec, spec.attrs()))
     raise StoreMismatch(
-        "\n".join(
-            [
-                f"{store.path}: the params describe other features than the store holds, which "
-                "cannot be compared (store -> params):",
-                *lines,
-                "Run with the params that it was extracted with, or extract it anew.",
-            ]
-        )
+        f"{store.path}: the params describe other features than the store holds, which cannot be "
+        "compared (store -> params):\n"
+        + "\n".join(f"  {line}" for line in lines)
+        + "\nRun with the params that it was extracted with, or extract it anew."
     )
 
 
@@ -205,16 +205,3 @@ def _compare(
         relative = np.where(apart == 0, 0.0, apart / rms)  # a slot of zeros may stay one
     slot = int(np.argmax(np.nan_to_num(relative, nan=np.inf)))
     return Deviation(row, float(apart.max()), float(relative[slot]), slot, same_pixels, where)
-
-
-def _environment_differences(
-    recorded: Sequence[Mapping[str, Any]], rows: NDArray[np.int64], today: Mapping[str, Any]
-) -> list[str]:
-    """Where today's software and hardware differ from what these rows were computed with."""
-    lines: list[str] = []
-    for noted in recorded:
-        start, stop = noted["rows"]
-        if ((rows >= start) & (rows < stop)).any():
-            then = {name: value for name, value in noted.items() if name != "rows"}
-            lines += differences(then, today)
-    return sorted(set(lines))

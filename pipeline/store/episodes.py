@@ -38,7 +38,7 @@ class Episode:
     states: range
 
 
-def read_texts(arrays: Mapping[str, NDArray[Any]]) -> list[dict[str, str]]:
+def read_texts(arrays: Mapping[str, NDArray[Any]]) -> list[dict[str, Any]]:
     """What `episode/text` says of each episode: the fields named in `SAID`."""
     text = arrays["episode/text"].tobytes()
     return [json.loads(text[start:stop]) for start, stop in pairwise(arrays["episode/text_start"])]

@@ -191,8 +191,14 @@ class FeatureStore:
         tick = np.asarray(ticks, np.int64)
         if tick.size and (tick.min() < 0 or tick.max() >= self.ticks):
             raise IndexError(f"{self.path}: ticks lie in 0..{self.ticks - 1}, asked for {tick}")
-        if variants is not None:
-            self._check_variants(variants, len(tick))
+        if variants is not None and (
+            variants.shape != tick.shape
+            or (tick.size and not 0 <= variants.min() <= variants.max() < self.variants)
+        ):
+            raise ValueError(
+                f"{self.path}: expected a variant in 0..{self.variants - 1} for each of "
+                f"{len(tick)} ticks, asked for {variants}. A store holds `vlm.variants` of them."
+            )
         sizes = (len(tick), *windows)
         batch = self.empty_batch(*sizes) if out is None else out
         if batch.sizes != sizes:
@@ -237,17 +243,6 @@ class FeatureStore:
         from pipeline.store.gather import Gatherer
 
         return Gatherer(self._arrays, self.variants)
-
-    def _check_variants(self, variants: NDArray[np.int64], batch: int) -> None:
-        if variants.shape != (batch,):
-            raise ValueError(
-                f"`variants` names one a tick: expected shape ({batch},), found {variants.shape}"
-            )
-        if variants.size and (variants.min() < 0 or variants.max() >= self.variants):
-            raise ValueError(
-                f"{self.path}: variants lie in 0..{self.variants - 1}, asked for "
-                f"{variants.min()}..{variants.max()}. A store holds `vlm.variants` of them."
-            )
 
 
 def episode_name(episode: Episode) -> str:

@@ -110,7 +110,7 @@ class RowSource:
         return log.ranges() if log.noted else self.attrs.get("environment", [])
 
     @cached_property
-    def _texts(self) -> list[dict[str, str]]:
+    def _texts(self) -> list[dict[str, Any]]:
         index = [name for name in self.specs if name.startswith("episode/")]
         if not self._finished and any(map(self._is_damaged, ["vl/frame_time", *index])):
             return []  # rows are known by their keys alone, frame by frame

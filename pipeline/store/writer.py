@@ -56,28 +56,24 @@ class StoreBuild:
         for name in self.specs:
             self.files(name).allocate()
 
-    def linkable(self, name: str, donor_spec: ArraySpec, rows: int) -> int:
-        """How many chunks lie wholly in the first `rows` rows and are cut as the donor's are."""
+    def linkable(self, name: str, source_spec: ArraySpec, rows: int) -> int:
+        """How many chunks lie wholly in the first `rows` rows and are cut as the other's are."""
         spec = self.specs[name]
-        alike = (spec.chunk_rows, spec.row_bytes, spec.dtype) == (
-            donor_spec.chunk_rows,
-            donor_spec.row_bytes,
-            donor_spec.dtype,
-        )
-        if not alike or name in INCREMENTAL:
+        cuts = {(one.chunk_rows, one.row_bytes, one.dtype) for one in (spec, source_spec)}
+        if len(cuts) > 1 or name in INCREMENTAL:
             return 0
-        return min(rows // spec.chunk_rows, spec.chunk_count, donor_spec.chunk_count)
+        return min(rows // spec.chunk_rows, spec.chunk_count, source_spec.chunk_count)
 
-    def link_unchanged(self, name: str, donor: Path, donor_spec: ArraySpec, rows: int) -> None:
+    def link_unchanged(self, name: str, source: Path, source_spec: ArraySpec, rows: int) -> None:
         """Take the linkable chunks of the first `rows` rows from a finished store.
 
         One that does not give its trailer is left to be written anew.
         """
-        with closing(ChunkFiles(donor, donor_spec, writable=False)) as source:
-            for chunk in range(self.linkable(name, donor_spec, rows)):
-                if source.damage(chunk) is not None:
+        with closing(ChunkFiles(source, source_spec, writable=False)) as known:
+            for chunk in range(self.linkable(name, source_spec, rows)):
+                if known.damage(chunk) is not None:
                     continue
-                if not self.files(name).link(chunk, source.paths[chunk]):
+                if not self.files(name).link(chunk, known.paths[chunk]):
                     return
 
     def write(self, name: str, start: int, values: NDArray[Any]) -> None:
@@ -119,7 +115,7 @@ class StoreBuild:
         A row whose bytes do not give its checksum is not there.
         """
         rows = self.specs[FEATURES].shape[0]
-        checksums = self.files(CHECKSUMS).read(0, rows).copy()
+        checksums = self.files(CHECKSUMS).read(0, rows)
         step = max(1, 2**26 // max(1, self.specs[FEATURES].row_bytes))
         for start in range(0, rows, step):
             stored = checksums[start : start + step]

@@ -198,13 +198,10 @@ class TestVariants:
         )
 
     def test_refuses_a_variant_that_is_not_there(self, varied, store):
-        with pytest.raises(ValueError, match=r"variants lie in 0\.\.2, asked for 0\.\.3.*vlm\.var"):
-            varied.gather([0, 1], variants=np.array([0, 3]))
-        with pytest.raises(ValueError, match=r"asked for -1\.\.0"):
-            varied.gather([0, 1], variants=np.array([0, -1]))
-        with pytest.raises(ValueError, match=r"expected shape \(2,\), found \(1,\)"):
-            varied.gather([0, 1], variants=np.array([0]))
-        with pytest.raises(ValueError, match=r"variants lie in 0\.\.0"):
+        for wrong in ([0, 3], [0, -1], [0]):
+            with pytest.raises(ValueError, match=r"a variant in 0\.\.2 .*vlm\.variants"):
+                varied.gather([0, 1], variants=np.array(wrong))
+        with pytest.raises(ValueError, match=r"a variant in 0\.\.0"):
             store.gather([0], variants=np.array([1]))
 
 

@@ -18,10 +18,17 @@ from pipeline.base.durable import disk_full_named, sync
 from pipeline.base.durable import put_in_place as replace_folder
 from pipeline.base.ownership import begin_folder
 from pipeline.store.chunks import ChunkFiles, row_checksums
-from pipeline.store.environments import environment_runs, runs_of
+from pipeline.store.environments import environment_runs
 from pipeline.store.integrity.verification import Verification
 from pipeline.store.paths import STORE, part_path, read_attributes, read_plan, refuse_replaced
-from pipeline.store.schema import FEATURES, INCREMENTAL, KEYS, chunk_paths, read_specs
+from pipeline.store.schema import (
+    FEATURES,
+    INCREMENTAL,
+    KEYS,
+    ArraySpec,
+    chunk_paths,
+    read_specs,
+)
 from pipeline.store.writer import StoreBuild, sync_folders
 
 _BLOCK_BYTES = 2**26
@@ -72,10 +79,7 @@ def carry_rows(store: Path, build: StoreBuild, verification: Verification) -> in
         build.files(name).close()
         for path in build.files(name).paths:  # of zeros, where it was laid out anew
             path.unlink(missing_ok=True)
-    _carry_features(store, build, verification, sound)
-    _mark(store, build, np.flatnonzero(sound))
-    for name in INCREMENTAL:
-        build.files(name).sync()
+    _carry(store, build, verification, sound)
     return int(sound.sum())
 
 
@@ -86,38 +90,32 @@ def put_in_place(build: StoreBuild, store: Path) -> None:
     replace_folder(build.part, part_path(store), STORE)
 
 
-def _carry_features(
+def _carry(
     store: Path, build: StoreBuild, verification: Verification, sound: NDArray[np.bool_]
 ) -> None:
     """Link the chunk files in which everything is sound; of the others, copy the sound rows."""
     spec, files = build.specs[FEATURES], build.files(FEATURES)
     damaged = verification.damaged_chunks(FEATURES)
-    with closing(ChunkFiles(store, spec, writable=False)) as source:
-        for chunk, path in enumerate(source.paths):
+    environments = read_attributes(store).get("environment", [])
+    with (
+        closing(ChunkFiles(store, spec, writable=False)) as features,
+        closing(ChunkFiles(store, build.specs[KEYS], writable=False)) as keys,
+    ):
+        for chunk, path in enumerate(features.paths):
             if chunk not in damaged and sound[_slice(spec.chunk_rows_of(chunk))].all():
                 files.link(chunk, path)
         for name in INCREMENTAL:
             build.files(name).allocate()
-        for chunk in range(spec.chunk_count):
-            rows = spec.chunk_rows_of(chunk)
-            if not files.is_linked(chunk):
-                for run in runs_of(rows.start + np.flatnonzero(sound[_slice(rows)])):
-                    for block in _blocks(run, spec.row_bytes):
-                        files.write(block.start, source.read(block.start, len(block)))
-
-
-def _mark(store: Path, build: StoreBuild, rows: NDArray[np.int64]) -> None:
-    """Note keys, environments and checksums of feature rows that were taken over."""
-    environments = read_attributes(store).get("environment", [])
-    with closing(ChunkFiles(store, build.specs[KEYS], writable=False)) as keys:
-        for environment, run in environment_runs(environments, rows):
+        for environment, run in environment_runs(environments, np.flatnonzero(sound)):
             number = build.environment_index(environment)
-            for block in _blocks(run, build.specs[FEATURES].row_bytes):
-                features = build.files(FEATURES).read(block.start, len(block))
+            for block in _blocks(run, spec):
+                values = features.read(block.start, len(block))
+                if not files.is_linked(block.start // spec.chunk_rows):
+                    files.write(block.start, values)
                 names = [key.tobytes() for key in keys.read(block.start, len(block))]
-                build.mark(
-                    np.arange(block.start, block.stop), names, row_checksums(features), number
-                )
+                build.mark(block, names, row_checksums(values), number)
+        for name in INCREMENTAL:
+            build.files(name).sync()
 
 
 def _copy(path: Path, to: Path) -> None:
@@ -126,11 +124,13 @@ def _copy(path: Path, to: Path) -> None:
     sync(to)
 
 
-def _blocks(run: range, row_bytes: int) -> Iterator[range]:
-    """The run in pieces that memory holds."""
-    step = max(1, _BLOCK_BYTES // max(1, row_bytes))
-    for start in range(run.start, run.stop, step):
-        yield range(start, min(start + step, run.stop))
+def _blocks(rows: range, spec: ArraySpec) -> Iterator[range]:
+    """These rows in pieces of one chunk each, which memory holds."""
+    step, start = max(1, _BLOCK_BYTES // max(1, spec.row_bytes)), rows.start
+    while start < rows.stop:
+        end_of_chunk = (start // spec.chunk_rows + 1) * spec.chunk_rows
+        yield (block := range(start, min(start + step, end_of_chunk, rows.stop)))
+        start = block.stop
 
 
 def _slice(rows: range) -> slice:

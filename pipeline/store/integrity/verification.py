@@ -13,7 +13,7 @@ from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -271,7 +271,7 @@ def _run_on_cluster(
         futures = [client.submit(check, pure=False) for check in checks]
         for _, report in as_completed(futures, loop=client.loop, with_results=True):
             bar.update(report.bytes)
-        return client.gather(futures)
+        return cast("list[ChunkReport]", client.gather(futures))
 
 
 def _refuse_blind_workers(path: Path, reports: Sequence[ChunkReport]) -> None:
