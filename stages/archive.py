@@ -25,7 +25,11 @@ from pathlib import Path
 
 from pipeline.base.config import Params
 from pipeline.base.errors import ConfigError
-from pipeline.store.archive import archive, restore
+from pipeline.base.table import Table
+from pipeline.store.archive import Manifest, archive, restore
+
+SMALL = 0.01
+"""Share of the bytes up to which an array has no line: of a tiny one, padding makes the ratio."""
 
 
 def main(params: Params) -> None:
@@ -42,11 +46,28 @@ def main(params: Params) -> None:
         return
     seconds = time.perf_counter() - begun
     raw, stored = manifest.raw_bytes / 1e6, manifest.stored_bytes / 1e6
-    print(*manifest.table().text(), sep="\n")
+    print(*_table(manifest).text(), sep="\n")
     print(
         f"{output}: {raw:.1f} MB in {stored:.1f} MB ({raw / stored:.2f} : 1), {seconds:.1f} s "
         f"({raw / seconds:.0f} MB/s)"
     )
+
+
+def _table(manifest: Manifest) -> Table:
+    """The large arrays: size, how much smaller they became, codec; then all of them."""
+    arrays = [
+        (name, array.raw_bytes, sum(array.shard_bytes), array.codec)
+        for name, array in manifest.arrays.items()
+        if array.raw_bytes > SMALL * manifest.raw_bytes
+    ]
+    rows = [
+        (name, raw / 1e6, raw / stored if stored else None, codec)  # zeros take no shard
+        for name, raw, stored, codec in [
+            *arrays,
+            ("all", manifest.raw_bytes, manifest.stored_bytes, ""),
+        ]
+    ]
+    return Table(("array", "MB", "ratio", "codec"), rows)
 
 
 def _places(params: Params) -> tuple[Path, Path]:

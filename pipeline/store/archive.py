@@ -10,10 +10,12 @@ store and the checksum of each of its chunk files. That is what proves an archiv
 store to the byte. The manifest is written last: a folder that has one is a complete archive.
 """
 
+import hashlib
+import json
 import math
 import os
 import warnings
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from itertools import count
 from pathlib import Path
@@ -23,6 +25,7 @@ import google_crc32c
 import numpy as np
 import zarr
 from numpy.typing import NDArray
+from pydantic import BaseModel
 from tqdm import tqdm
 from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec
 from zarr.errors import ZarrUserWarning
@@ -33,42 +36,99 @@ from pipeline.base.errors import StoreIncomplete, StoreMismatch
 from pipeline.base.ownership import OutputKind, begin_folder, remove_folder
 from pipeline.store.chunks import ChunkFiles, check_row_checksums, check_trailers, read_rows
 from pipeline.store.lock import build_lock
-from pipeline.store.manifest import (
-    ARCHIVE,
-    MANIFEST,
-    ZARR_JSON,
-    ArchivedArray,
-    Manifest,
-    damaged,
-    is_archive,
-    read_manifest,
-)
 from pipeline.store.metadata import ATTRIBUTE as METADATA_DIGEST
 from pipeline.store.metadata import check_metadata
 from pipeline.store.paths import STORE, part_path, read_plan, recover
 from pipeline.store.reader import FeatureStore
 from pipeline.store.repair_hints import extract_command, gc_command
 from pipeline.store.replacement import inode_of, refuse_replaced
-from pipeline.store.schema import (
-    ARRAY_NAMES,
-    CHECKSUMS,
-    FEATURES,
-    TRAILER_BYTES,
-    ArraySpec,
-    chunk_paths,
-    read_specs,
-)
+from pipeline.store.schema import CHECKSUMS, FEATURES, ArraySpec, chunk_paths, read_spec, read_specs
 from pipeline.store.writer import StoreBuild
 
-__all__ = ["archive", "is_archive", "restore"]
-
+_SCHEMA = 1
+_ZARR_JSON = "zarr.json"
+_MANIFEST = "archive"
+"""The attribute of the root that holds the manifest."""
 SHARD_BYTES = 256 * 2**20
 """Raw bytes of a shard at most, where one chunk file of the store is not larger."""
 INNER_BYTES = 4 * 2**20
 """Raw bytes of an inner chunk at most, where one row is not larger."""
-_GROUPS = ("", *sorted({name.split("/")[0] for name in ARRAY_NAMES}))
 _OF_A_STORE = ("schema", "plan", METADATA_DIGEST)
 """Attributes of the root that would be false of an archive."""
+
+
+class ArchivedArray(BaseModel, frozen=True):
+    """What the manifest says of one array."""
+
+    codec: str
+    ratios: dict[str, float | None] = {}
+    """What each codec made of samples, where an earlier version chose among several."""
+    raw_bytes: int
+    """Of its rows."""
+    shard_bytes: tuple[int, ...]
+    """Size of each shard's file; 0 where all is zero, for which zarr writes no file."""
+    crc32c: tuple[int, ...]
+    """Checksum of the data of each chunk file of the store, in order."""
+    metadata: str
+    """Digest of this array's metadata in the archive."""
+
+
+class Manifest(BaseModel, frozen=True):
+    """The content of an archive."""
+
+    metadata: dict[str, str]
+    """Every `zarr.json` of the store, as text, by its path."""
+    arrays: dict[str, ArchivedArray]
+
+    @property
+    def plan(self) -> str | None:
+        """The plan of the store."""
+        return json.loads(self.metadata[_ZARR_JSON])["attributes"].get("plan")
+
+    @property
+    def raw_bytes(self) -> int:
+        """Of the rows of all arrays."""
+        return sum(array.raw_bytes for array in self.arrays.values())
+
+    @property
+    def stored_bytes(self) -> int:
+        """Of all shards."""
+        return sum(sum(array.shard_bytes) for array in self.arrays.values())
+
+    def document(self) -> dict[str, Any]:
+        """The manifest as JSON, with a digest of itself."""
+        body = {"schema": _SCHEMA, **self.model_dump(mode="json")}
+        return {**body, "digest": _digest_of(body)}
+
+
+def is_archive(path: Path) -> bool:
+    """Whether a complete archive lies there; reads the group's metadata only."""
+    return _manifest_document(path) is not None
+
+
+ARCHIVE = OutputKind("an archive of a store", is_archive)
+
+
+def read_manifest(path: Path) -> Manifest:
+    """The manifest of an archive.
+
+    Raises `StoreMismatch` where there is something else, `StoreIncomplete` where it is damaged.
+    """
+    document = _manifest_document(path)
+    if document is None:
+        found = "something else" if path.exists() else "nothing"
+        raise StoreMismatch(
+            f"{path}: expected an archive, found {found}. Name one with archive.output, or make "
+            "it with stages.archive."
+        )
+    if document.get("schema") != _SCHEMA:
+        raise StoreMismatch(
+            f"{path}: expected an archive of schema {_SCHEMA}, found "
+            f"{document.get('schema')!r}. Restore it with the version that made it."
+        )
+    if document.pop("digest", None) != _digest_of(document):
+        raise _damaged(path / _ZARR_JSON, "its manifest does not give its digest")
+    return Manifest.model_validate(document)
 
 
 def archive(store: Path, output: Path, level: int, threads: int) -> Manifest | None:
@@ -139,45 +199,42 @@ def _begun(target: Path, kind: OutputKind, threads: int) -> Generator[Path]:
 def _write(store: Path, part: Path, level: int) -> Manifest:
     """Everything of an archive, its manifest last, all of it on the disk."""
     inode, specs, metadata = inode_of(store), read_specs(store), _read_metadata(store)
-    for name in _GROUPS:
+    for name in ("", *sorted({name.split("/")[0] for name in specs})):
         attributes = zarr.open_group(store, path=name, mode="r").attrs.asdict()
         if not name:
             attributes = {k: v for k, v in attributes.items() if k not in _OF_A_STORE}
         zarr.create_group(part, path=name, attributes=attributes)
-    checksums = read_rows(store, specs[CHECKSUMS])
     with _progress("archive", sum(spec.data_bytes for spec in specs.values())) as progress:
         arrays = {
-            name: _write_array(store, part, spec, level, checksums, progress)
-            for name, spec in specs.items()
+            name: _write_array(store, part, spec, level, progress) for name, spec in specs.items()
         }
     refuse_replaced(store, inode)
     manifest = Manifest(metadata=metadata, arrays=arrays)
     group = zarr.open_group(part, mode="r+")
-    group.attrs.put({**group.attrs.asdict(), MANIFEST: manifest.document()})
+    group.attrs.put({**group.attrs.asdict(), _MANIFEST: manifest.document()})
     for folder, _, files in os.walk(part):
-        if ZARR_JSON in files:  # shards were synced as they were written
-            sync(Path(folder, ZARR_JSON))
+        if _ZARR_JSON in files:  # shards were synced as they were written
+            sync(Path(folder, _ZARR_JSON))
         sync(Path(folder))
     return manifest
 
 
 def _write_array(
-    store: Path,
-    part: Path,
-    spec: ArraySpec,
-    level: int,
-    checksums: NDArray[np.uint32],
-    progress: "tqdm[Any]",
+    store: Path, part: Path, spec: ArraySpec, level: int, progress: "tqdm[Any]"
 ) -> ArchivedArray:
-    """Copy an array shard by shard; each has to give the store's trailers before the next.
-
-    `checksums` are those of the feature rows.
-    """
-    array, codec = _create_array(part, spec, level)
+    """Copy an array shard by shard; each has to give the store's trailers before the next."""
+    array = _create_array(part, spec, level)
     trailers = _trailers(store, spec)
     sizes: list[int] = []
     for shard, rows in _shards(part, spec, array):
-        _write_shard(store, spec, array, shard, rows, checksums)
+        values = read_rows(store, spec, rows.start, rows.stop)
+        if spec.name == FEATURES:
+            wanted = read_rows(store, read_spec(store, CHECKSUMS), rows.start, rows.stop)
+            check_row_checksums(store, spec, rows.start, values, wanted)
+        array[rows.start : rows.stop] = values
+        del values  # a shard may be large: what is read back takes its place
+        if shard.exists():
+            sync(shard)
         try:
             _checked_rows(spec, array, shard, rows, trailers)
         except StoreIncomplete:
@@ -187,33 +244,17 @@ def _write_array(
         sizes.append(shard.stat().st_size if shard.exists() else 0)
         progress.update(len(rows) * spec.row_bytes)
     return ArchivedArray(
-        codec=codec,
+        codec=f"zstd+{codec_for(spec.dtype, 0, level).shuffle.value}",
         raw_bytes=spec.data_bytes,
         shard_bytes=tuple(sizes),
         crc32c=trailers,
-        metadata=file_digest(part / spec.name / ZARR_JSON),
+        metadata=file_digest(part / spec.name / _ZARR_JSON),
     )
-
-
-def _write_shard(
-    store: Path,
-    spec: ArraySpec,
-    array: "zarr.Array[Any]",
-    shard: Path,
-    rows: range,
-    checksums: NDArray[np.uint32],
-) -> None:
-    values = read_rows(store, spec, rows.start, rows.stop)
-    if spec.name == FEATURES:
-        check_row_checksums(store, spec, rows.start, values, checksums[rows.start : rows.stop])
-    array[rows.start : rows.stop] = values
-    if shard.exists():
-        sync(shard)
 
 
 def _rebuild(manifest: Manifest, archive: Path, target: Path, part: Path) -> None:
     for name, text in manifest.metadata.items():
-        if name != ZARR_JSON:
+        if name != _ZARR_JSON:
             _write_text(part / name, text)
     with closing(StoreBuild(target, read_specs(part), manifest.plan or "")) as build:
         build.allocate()
@@ -228,8 +269,8 @@ def _rebuild(manifest: Manifest, archive: Path, target: Path, part: Path) -> Non
         build.finish()
         # With the root's attributes, which hold the plan, it is what an extraction would go on
         # with, or an earlier one have left, and so nothing that another restoration may remove.
-        _write_text(part / ZARR_JSON, manifest.metadata[ZARR_JSON])
-        sync(part / ZARR_JSON)
+        _write_text(part / _ZARR_JSON, manifest.metadata[_ZARR_JSON])
+        sync(part / _ZARR_JSON)
         sync(part)
         build.put_in_place()
 
@@ -244,7 +285,7 @@ def _checked_rows(
     try:
         values = np.ascontiguousarray(array[rows.start : rows.stop])
     except (ValueError, RuntimeError) as error:
-        raise damaged(shard, f"{spec.name} cannot be read: {error}") from None
+        raise _damaged(shard, f"{spec.name} cannot be read: {error}") from None
     raw = values.reshape(-1).view(np.uint8)
     expected = crc32c[rows.start // spec.chunk_rows :]
     for start, crc in zip(range(0, len(raw), spec.chunk_bytes), expected, strict=False):
@@ -252,16 +293,16 @@ def _checked_rows(
         padding = bytes(spec.chunk_bytes - len(data))
         if google_crc32c.extend(google_crc32c.value(data), padding) != crc:
             said = f"rows {rows.start} to {rows.stop - 1} of {spec.name} are other ones"
-            raise damaged(shard, said)
+            raise _damaged(shard, said)
     return values
 
 
-def _create_array(root: Path, spec: ArraySpec, level: int) -> tuple["zarr.Array[Any]", str]:
-    """The array in an archive, without data, with the attributes it has in the store; its codec."""
+def _create_array(root: Path, spec: ArraySpec, level: int) -> "zarr.Array[Any]":
+    """The array in an archive, without data, with the attributes it has in the store."""
     widths = tuple(max(1, size) for size in spec.shape[1:])
     inner = inner_rows(spec)
     codec = codec_for(spec.dtype, inner * spec.row_bytes, level)
-    array = zarr.create_array(
+    return zarr.create_array(
         store=root,
         name=spec.name,
         shape=spec.shape,
@@ -273,7 +314,6 @@ def _create_array(root: Path, spec: ArraySpec, level: int) -> tuple["zarr.Array[
         dimension_names=spec.dimensions,
         attributes=dict(spec.attributes),
     )
-    return array, f"zstd+{codec.shuffle.value}"
 
 
 def codec_for(dtype: np.dtype[Any], chunk_bytes: int, level: int) -> BloscCodec:
@@ -317,11 +357,11 @@ def _shards(root: Path, spec: ArraySpec, array: "zarr.Array[Any]") -> Generator[
 
 def _open_array(archive: Path, name: str, record: ArchivedArray) -> "zarr.Array[Any]":
     """An array of an archive; raises `StoreIncomplete` where its metadata are not as written."""
-    metadata = archive / name / ZARR_JSON
+    metadata = archive / name / _ZARR_JSON
     if not metadata.exists():
-        raise damaged(metadata, f"the file is missing, and with it {name}")
+        raise _damaged(metadata, f"the file is missing, and with it {name}")
     if file_digest(metadata) != record.metadata:
-        raise damaged(metadata, f"the metadata of {name} are not those that were written")
+        raise _damaged(metadata, f"the metadata of {name} are not those that were written")
     with warnings.catch_warnings():  # earlier versions took numcodecs' Delta for some integers
         warnings.filterwarnings("ignore", "Numcodecs codecs are not in the Zarr", ZarrUserWarning)
         return zarr.open_array(archive, path=name, mode="r")
@@ -333,19 +373,15 @@ def _holds(manifest: Manifest, store: Path) -> bool:
         return False
     try:
         found = {name: _trailers(store, spec) for name, spec in read_specs(store).items()}
-    except OSError:
+    except (OSError, IndexError):
         return False
     return found == {name: array.crc32c for name, array in manifest.arrays.items()}
 
 
 def _trailers(store: Path, spec: ArraySpec) -> tuple[int, ...]:
     """The checksum at the end of each chunk file."""
-    found: list[int] = []
-    for path in chunk_paths(store, spec):
-        with path.open("rb") as file:
-            file.seek(-TRAILER_BYTES, os.SEEK_END)
-            found.append(int.from_bytes(file.read(), "little"))
-    return tuple(found)
+    trailers = [np.fromfile(p, "<u4", 1, offset=spec.chunk_bytes) for p in chunk_paths(store, spec)]
+    return tuple(int(trailer[0]) for trailer in trailers)
 
 
 def _refuse_build(target: Path) -> None:
@@ -361,7 +397,7 @@ def _refuse_build(target: Path) -> None:
 
 def _read_metadata(store: Path) -> dict[str, str]:
     """Every `zarr.json` of a store as text, by its path in it."""
-    paths = sorted(store.rglob(ZARR_JSON))
+    paths = sorted(store.rglob(_ZARR_JSON))
     return {path.relative_to(store).as_posix(): path.read_bytes().decode() for path in paths}
 
 
@@ -372,3 +408,25 @@ def _progress(label: str, total: int) -> "tqdm[Any]":
 def _write_text(path: Path, text: str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(text.encode())
+
+
+def _manifest_document(path: Path) -> dict[str, Any] | None:
+    try:
+        attributes = json.loads((path / _ZARR_JSON).read_text(encoding="utf-8"))["attributes"]
+        document = attributes[_MANIFEST]
+    except (FileNotFoundError, NotADirectoryError, ValueError, KeyError, TypeError):
+        return None
+    return document if isinstance(document, dict) else None
+
+
+def _digest_of(body: Mapping[str, Any]) -> str:
+    text = json.dumps(body, sort_keys=True, ensure_ascii=False)
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+def _damaged(path: Path, why: str) -> StoreIncomplete:
+    """The error for a file of an archive that is not as it was written."""
+    return StoreIncomplete(
+        f"{path}: the archive is damaged: {why}. Nothing was restored from it; take another copy "
+        "of the archive, or make it anew with stages.archive where the store still is."
+    )

@@ -22,8 +22,7 @@ from zarr.errors import ZarrUserWarning
 from pipeline.base.digests import file_digest
 from pipeline.base.errors import ConfigError, DiskFull, StoreIncomplete, StoreLocked, StoreMismatch
 from pipeline.store import FeatureStore, Sizes, StoreBuild, arrays, build_lock, part_path
-from pipeline.store.archive import archive, codec_for, is_archive, restore
-from pipeline.store.manifest import read_manifest
+from pipeline.store.archive import archive, codec_for, is_archive, read_manifest, restore
 from pipeline.store.schema import INCREMENTAL, read_specs
 
 DEMO = Path(__file__).resolve().parents[2] / "cache_store/demo.zarr"
