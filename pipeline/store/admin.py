@@ -49,7 +49,7 @@ _KINDS = {
     ".wait": "lock",  # of a version that restored archives while it trained
     LEDGER: "ledger",
 }
-"""What a name is that ends so behind a store's; also `archive`, and `unknown` for a torn write."""
+"""What a name is that ends so behind a store's; a store may turn out to be an `archive`."""
 _NAME = re.compile(r"(?P<base>.+?\.zarr)(?P<suffix>\.[a-z.]+?)?(?:-(?:\d+|wal|shm))?")
 _BUILDS = ("build", "set aside", "replaced", "previous")
 _UNREADABLE = (PipelineError, OSError, ValueError, KeyError, TypeError, AttributeError, IndexError)
@@ -246,8 +246,6 @@ def _walk(folder: Path, subfolders: bool) -> Iterator[tuple[Path, str, Path]]:
         name = _NAME.fullmatch(path.name)
         if name and name["suffix"] in _KINDS:
             yield path, _KINDS[name["suffix"]], path.with_name(name["base"])
-        elif path.name.endswith(".partial"):
-            yield path, "unknown", path
         elif subfolders and path.is_dir() and not path.is_symlink():
             yield from _walk(path, subfolders)
 
@@ -279,7 +277,7 @@ def _contents(path: Path, kind: str) -> StoreContents:
 
 def _disk(path: Path) -> tuple[dict[str, int], dict[tuple[int, int], int]]:
     """Bytes on the disk by group and by file."""
-    sizes, files = dict.fromkeys(GROUPS, 0), dict[tuple[int, int], int]()
+    sizes, files = dict[str, int].fromkeys(GROUPS, 0), dict[tuple[int, int], int]()
     for file in path.rglob("*") if path.is_dir() else [path]:
         try:
             status = file.stat()  # of the file itself where a cache hands out symbolic links
@@ -405,10 +403,8 @@ def _fate(inventory: Inventory, entry: StoreEntry) -> tuple[Fate, str]:
             if any(other.kind not in ("lock", "ledger") for other in beside):
                 return "in place", "content digests for a store that is there"
             why = "content digests for a store that is not there"
-        case "lock":
-            why = "held by no process"
         case _:
-            why = "of a write that was killed"
+            why = "held by no process"
     return "unneeded", why
 
 

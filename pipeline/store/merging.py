@@ -9,10 +9,10 @@ of a merged store is completed by merging the same stores again.
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from itertools import takewhile
+from itertools import pairwise, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -333,33 +333,24 @@ def _copy_rows(build: StoreBuild, name: str, store: Path, rows: range, shift: in
 def _fill(build: StoreBuild, merged: MergedEpisodes) -> None:
     """Copy the feature rows that are missing, with their keys and environments.
 
-    Raises `StoreIncomplete` naming a row that does not give its checksum.
+    In blocks of one environment, which are copied whole. Raises `StoreIncomplete` naming a row that
+    does not give its checksum.
     """
-    missing, total = build.missing(), build.specs[FEATURES].shape[0]
+    missing, spec = build.missing(), build.specs[FEATURES]
+    total, step = spec.shape[0], max(1, _BLOCK_BYTES // max(1, spec.row_bytes))
     done = total - len(missing)
     with tqdm(total=total, initial=done, desc="merge", unit="row", disable=None) as progress:
         for store, rows, shift in merged.runs("vl"):
-            spec, noted = read_spec(store.path, FEATURES), store.attrs["environment"]
-            wanted = np.intersect1d(missing - shift, rows)
-            for block in _blocks(wanted, noted, spec.row_bytes):
-                first, stop = int(block[0]), int(block[-1]) + 1
-                values = read_rows(store.path, spec, first, stop)
-                checksums = store.array(CHECKSUMS)[first:stop]
-                check_row_checksums(store.path, spec, first, values, checksums)
-                keys = [key.tobytes() for key in store.array(KEYS)[first:stop]]
-                number = build.environment_index(environment_at(noted, first))
-                build.commit(block + shift, values, keys, number)
-                progress.update(len(block))
-
-
-def _blocks(
-    rows: NDArray[np.int64], environments: Sequence[Mapping[str, Any]], row_bytes: int
-) -> Iterator[NDArray[np.int64]]:
-    """Consecutive rows of one environment, of 32 MiB at most."""
-    edges = [edge for noted in environments for edge in noted["rows"]]
-    noted = np.searchsorted(edges, rows, side="right")
-    cuts = np.flatnonzero((np.diff(rows) != 1) | (np.diff(noted) != 0)) + 1
-    step = max(1, _BLOCK_BYTES // max(1, row_bytes))
-    for together in np.split(rows, cuts):
-        for start in range(0, len(together), step):
-            yield together[start : start + step]
+            source, noted = read_spec(store.path, FEATURES), store.attrs["environment"]
+            edges = {edge for environment in noted for edge in environment["rows"] if edge in rows}
+            for start, stop in pairwise(sorted({*rows[::step], *edges, rows.stop})):
+                first, last = np.searchsorted(missing, [start + shift, stop + shift])
+                if first == last:
+                    continue
+                values = read_rows(store.path, source, start, stop)
+                checksums = store.array(CHECKSUMS)[start:stop]
+                check_row_checksums(store.path, source, start, values, checksums)
+                keys = [key.tobytes() for key in store.array(KEYS)[start:stop]]
+                number = build.environment_index(environment_at(noted, start))
+                build.commit(range(start + shift, stop + shift), values, keys, number)
+                progress.update(last - first)
