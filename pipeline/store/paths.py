@@ -83,7 +83,7 @@ def read_attributes(root: Path) -> dict[str, Any]:
     attributes = _attributes(root)
     if "archive" in attributes:
         raise StoreMismatch(
-            f"{root}: expected a store, found an archive of one. Restore it: "
+            f"{root}: expected a store, found an archive of one. Restore it first: "
             f"{restore_command(root)}"
         )
     if "schema" not in attributes:

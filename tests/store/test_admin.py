@@ -14,10 +14,17 @@ from pipeline.base.durable import KEPT, previous_path
 from pipeline.base.errors import ConfigError, StoreLocked
 from pipeline.base.ownership import MARKER, mark
 from pipeline.store import FeatureStore, StoreBuild, build_lock
+from pipeline.store.admin import (
+    Inventory,
+    StoreEntry,
+    describe_inventory,
+    describe_kept,
+    find_leftovers,
+    find_named,
+    remove_leftover,
+    take_inventory,
+)
 from pipeline.store.archive import archive
-from pipeline.store.housekeeping.inventory import Entry, Inventory, take_inventory
-from pipeline.store.housekeeping.leftovers import kept_back, leftovers, named, remove
-from pipeline.store.housekeeping.listing import table
 from pipeline.store.paths import STORE
 from pipeline.store.schema import read_specs
 
@@ -45,7 +52,7 @@ def held(target: Path) -> Iterator[int]:
             process.kill()
 
 
-def entry(inventory: Inventory, name: str) -> Entry:
+def entry(inventory: Inventory, name: str) -> StoreEntry:
     return next(one for one in inventory.entries if one.path.name == name)
 
 
@@ -66,9 +73,8 @@ class TestInventory:
         assert (found.kind, found.damage) == ("store", None)
         held = found.contents
         assert held is not None
-        assert (held.episodes, held.ticks, held.rows, held.done) == (6, 180, 60, 60)
-        assert held.widths == {"action": 5, "sensor": 5, "state": 4}
-        assert held.features == (3, 8, "float32")
+        assert (held.plan, held.rows, held.done) == (FeatureStore.open(path).attrs["plan"], 60, 60)
+        assert held.specs["vl/features"].shape == (60, 3, 8)
         used = sum(file.stat().st_blocks * 512 for file in path.rglob("*") if file.is_file())
         assert found.bytes == used
         chunks = (path / "vl/features").rglob("*")
@@ -83,7 +89,7 @@ class TestInventory:
         assert found.kind == "build"
         assert found.contents is not None
         assert (found.contents.done, found.contents.rows) == (25, 60)
-        assert "25 of 60" in "\n".join(table(take_inventory(tmp_path), {}))
+        assert "25 of 60" in "\n".join(describe_inventory(take_inventory(tmp_path), {}))
 
     def test_hard_links_are_counted_once_and_said(self, tiny_store: Make, tmp_path: Path) -> None:
         path = tiny_store(tmp_path)
@@ -92,15 +98,10 @@ class TestInventory:
         inventory = take_inventory(tmp_path)
         one = entry(inventory, "twin.zarr")
         assert inventory.bytes == one.bytes
-        assert inventory.siblings(one) == {path: one.bytes}
-        assert not inventory.linked_elsewhere(one)
-        said = "\n".join(table(inventory, {}))
+        assert inventory.shared(one) == {path: one.bytes}
+        said = "\n".join(describe_inventory(inventory, {}))
         assert "with tiny.zarr by hard links" in said
         assert "of hard links counted once" in said
-        (tmp_path / "cache").mkdir()
-        os.link(path / "zarr.json", tmp_path / "cache" / "abc")
-        again = take_inventory(tmp_path)
-        assert again.linked_elsewhere(entry(again, "tiny.zarr"))
 
     @pytest.mark.parametrize(
         ("harm", "said"),
@@ -120,7 +121,7 @@ class TestInventory:
         inventory = take_inventory(tmp_path)
         assert said in (entry(inventory, "damaged.zarr").damage or "")
         assert entry(inventory, "sound.zarr").damage is None
-        lines = table(inventory, {})
+        lines = describe_inventory(inventory, {})
         assert any(line.startswith("damaged.zarr  damaged") for line in lines)
         assert any(said in line for line in lines)
 
@@ -131,15 +132,17 @@ class TestInventory:
         inventory = take_inventory(tmp_path)
         found = entry(inventory, "tiny.archive.zarr")
         assert found.kind == "archive"
-        assert inventory.archives_of(entry(inventory, "tiny.zarr")) == [found]
-        assert inventory.archives_of(entry(inventory, "other.zarr")) == []
+        lines = describe_inventory(inventory, {})
+        (archived,) = (index for index, line in enumerate(lines) if "archived as" in line)
+        assert lines[archived] == "    archived as tiny.archive.zarr"
+        assert archived > next(i for i, line in enumerate(lines) if line.startswith("tiny.zarr "))
 
     def test_who_builds(self, tiny_store: Make, tmp_path: Path) -> None:
         part = unfinish(tiny_store(tmp_path), 0)
         target = part.with_name("tiny.zarr")
         with held(target) as process:
             assert take_inventory(tmp_path).holders[target].startswith(f"process {process} on")
-            said = "\n".join(table(take_inventory(tmp_path), {}))
+            said = "\n".join(describe_inventory(take_inventory(tmp_path), {}))
             assert f"being built by process {process}" in said
         assert take_inventory(tmp_path).holders == {}
 
@@ -160,7 +163,7 @@ class TestInventory:
     def test_no_folder(self, tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match=r"stores\.folder"):
             take_inventory(tmp_path / "nowhere")
-        assert table(take_inventory(tmp_path), {}) == [f"{tmp_path}: no store in it"]
+        assert describe_inventory(take_inventory(tmp_path), {}) == [f"{tmp_path}: no store in it"]
 
 
 class TestLeftovers:
@@ -170,7 +173,7 @@ class TestLeftovers:
         path = tiny_store(tmp_path)
         archive(path, tmp_path / "tiny.archive.zarr", level=1, threads=1)
         os.truncate(tiny_store(tmp_path, name="bad") / "vl/features/c/0/0/0", 99)
-        kinds = {one.path.suffix for one in leftovers(take_inventory(tmp_path))}
+        kinds = {one.entry.path.suffix for one in find_leftovers(take_inventory(tmp_path))}
         assert kinds <= {".lock"}
 
     def test_each_is_named_with_its_reason_and_removed(
@@ -188,8 +191,8 @@ class TestLeftovers:
             "b.zarr.wait",
         ):
             (tmp_path / name).touch()
-        found = leftovers(take_inventory(tmp_path))
-        assert {one.path.name: one.why for one in found} == {
+        found = find_leftovers(take_inventory(tmp_path))
+        assert {one.entry.path.name: one.why for one in found} == {
             "gone.zarr.files.sqlite": "content digests for a store that is not there",
             "new.zarr.part": "a build that was stopped before any row was done; there is nothing "
             "to resume",
@@ -202,7 +205,7 @@ class TestLeftovers:
             "b.zarr.wait": "held by no process",
         }
         for one in found:
-            remove(one)
+            remove_leftover(one)
         assert sorted(os.listdir(tmp_path)) == ["tiny.zarr", "tiny.zarr.files.sqlite"]
         assert FeatureStore.open(tmp_path / "tiny.zarr").ticks == 180
 
@@ -213,8 +216,8 @@ class TestLeftovers:
         unread = Path(shutil.copytree(begun, tmp_path / "unread.zarr.part"))
         (unread / "vl" / "key" / "zarr.json").write_text("{")
         inventory = take_inventory(tmp_path)
-        assert leftovers(inventory) == []
-        lines = kept_back(inventory)
+        assert find_leftovers(inventory) == []
+        lines = describe_kept(inventory)
         assert lines[0] == (
             f"{begun}: unfinished build, 12 of 60 rows done; stages.extract resumes it, and "
             f"python -m stages.store gc {begun} --remove removes it"
@@ -223,9 +226,9 @@ class TestLeftovers:
         assert f"{unread}: unfinished build that cannot be read" in lines[2]
         for path in (store, tmp_path / "gone.zarr.part"):
             with pytest.raises(ConfigError, match=rf"{path}: .*Nothing was removed"):
-                named(inventory, [begun, path])
-        for one in named(inventory, [begun, aside, unread]):
-            remove(one)
+                find_named(inventory, [begun, path])
+        for one in find_named(inventory, [begun, aside, unread]):
+            remove_leftover(one)
         assert os.listdir(tmp_path) == ["tiny.zarr"]
 
     def test_the_only_copy_of_a_store_is_no_leftover(
@@ -234,25 +237,24 @@ class TestLeftovers:
         """A kill between the two renames of a replacement leaves it under `.old`."""
         path = tiny_store(tmp_path)
         shutil.copytree(path, tmp_path / "tiny.zarr.old")
-        listed = next(
-            one for one in leftovers(take_inventory(tmp_path)) if one.path.suffix == ".old"
-        )
+        found = find_leftovers(take_inventory(tmp_path))
+        listed = next(one for one in found if one.entry.path.suffix == ".old")
         shutil.rmtree(path)
-        assert leftovers(take_inventory(tmp_path)) == []
-        assert "the only copy of tiny.zarr" in kept_back(take_inventory(tmp_path))[0]
-        remove(listed)  # found while the store was still there
+        assert find_leftovers(take_inventory(tmp_path)) == []
+        assert "the only copy of tiny.zarr" in describe_kept(take_inventory(tmp_path))[0]
+        remove_leftover(listed)  # found while the store was still there
         assert (tmp_path / "tiny.zarr.old").exists()
 
     def test_what_is_being_built_is_not_touched(self, tiny_store: Make, tmp_path: Path) -> None:
         part = unfinish(tiny_store(tmp_path), 5)
-        (listed,) = named(take_inventory(tmp_path), [part])
+        (listed,) = find_named(take_inventory(tmp_path), [part])
         with held(tmp_path / "tiny.zarr") as process:
             inventory = take_inventory(tmp_path)
             with pytest.raises(ConfigError, match="in use by process"):
-                named(inventory, [part])
-            assert kept_back(inventory)[0].startswith(f"{part}: in use by process {process}")
+                find_named(inventory, [part])
+            assert describe_kept(inventory)[0].startswith(f"{part}: in use by process {process}")
             with pytest.raises(StoreLocked, match="not removed"):
-                remove(listed)
+                remove_leftover(listed)
         assert part.exists()
 
     @pytest.mark.parametrize("damaged", [False, True])
@@ -264,7 +266,7 @@ class TestLeftovers:
         damaged: bool,
     ) -> None:
         part = unfinish(tiny_store(tmp_path / "stores"), 0)
-        (leftover,) = leftovers(take_inventory(part.parent))
+        (leftover,) = find_leftovers(take_inventory(part.parent))
         if damaged:
             (part / "zarr.json").write_text("{")
 
@@ -274,7 +276,7 @@ class TestLeftovers:
 
         monkeypatch.setattr("pipeline.base.ownership.shutil.rmtree", killed)
         with pytest.raises(KeyboardInterrupt):
-            remove(leftover)
+            remove_leftover(leftover)
         assert any(part.iterdir())
         assert STORE.owns(part)
 
@@ -284,23 +286,23 @@ class TestLeftovers:
         kept = previous_path(tmp_path / "stores" / "tiny.zarr")
         tiny_store(tmp_path / "stores").rename(kept)
         mark(kept, KEPT)
-        (leftover,) = named(take_inventory(kept.parent), [kept])
+        (leftover,) = find_named(take_inventory(kept.parent), [kept])
 
         def killed(path: Path) -> None:
             raise KeyboardInterrupt
 
         monkeypatch.setattr("pipeline.base.ownership.shutil.rmtree", killed)
         with pytest.raises(KeyboardInterrupt):
-            remove(leftover)
+            remove_leftover(leftover)
         assert KEPT.owns(kept)
 
     def test_a_foreign_file_at_a_ledger_is_no_leftover(self, tmp_path: Path) -> None:
         ledger = tmp_path / "gone.zarr.files.sqlite"
         ledger.write_text("years of work")
         inventory = take_inventory(tmp_path)
-        assert leftovers(inventory) == []
+        assert find_leftovers(inventory) == []
         with pytest.raises(ConfigError, match="did not write"):
-            named(inventory, [ledger])
+            find_named(inventory, [ledger])
 
     def test_nothing_behind_a_symbolic_link_is_touched(
         self, tiny_store: Make, tmp_path: Path
@@ -311,14 +313,14 @@ class TestLeftovers:
         (folder / "tiny.zarr.part").symlink_to(outside)
         (folder / "more").symlink_to(outside.parent)
         inventory = take_inventory(folder)
-        assert leftovers(inventory) == []
-        assert "a symbolic link" in kept_back(inventory)[0]
+        assert find_leftovers(inventory) == []
+        assert "a symbolic link" in describe_kept(inventory)[0]
         part = folder / "own.zarr.part"
         part.mkdir()
         (part / MARKER).write_text("a feature store\n")
         (part / "inside").symlink_to(outside)
-        for one in leftovers(take_inventory(folder)):
-            remove(one)
+        for one in find_leftovers(take_inventory(folder)):
+            remove_leftover(one)
         assert not part.exists()
         assert outside.exists()
         assert (outside / "zarr.json").exists()
