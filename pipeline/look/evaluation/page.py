@@ -1,22 +1,34 @@
-"""The page of an evaluation: how well a policy does, where it errs, and what it was made of."""
+"""The pages of an evaluation and of several beside each other.
 
-from collections.abc import Mapping
-from functools import partial
+How well a policy does, where it errs, and what it was made of.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache, partial
 from typing import Any
 
+from pipeline.base.digests import file_digest
+from pipeline.base.table import Table
 from pipeline.evaluate.ablation import ModalityStudy
 from pipeline.evaluate.ablation_tables import FOOTNOTE as MODALITY_FOOTNOTE
 from pipeline.evaluate.ablation_tables import best_baseline, judged_on, modality_errors
+from pipeline.evaluate.episode_frames import footage, shown_ticks
 from pipeline.evaluate.evaluation import Evaluation
+from pipeline.evaluate.experiment_tables import experiment_errors
+from pipeline.evaluate.experiments import Experiment
 from pipeline.evaluate.names import with_unit
 from pipeline.evaluate.tables import FOOTNOTE, HEADINGS, error_rows, still_dimensions
 from pipeline.look.evaluation import pictures as plots
-from pipeline.look.evaluation.episodes import episodes, extremes
-from pipeline.look.page.blocks import Block, Document, Picture, Report, Section, Table, Text
-from pipeline.look.page.cells import sentence
-from pipeline.train.predictions import METHODS
+from pipeline.look.page.blocks import Block, Document, Picture, Report, Section, Text
+from pipeline.store import episode_name
+from pipeline.train.batches import Ticks
+from pipeline.train.predictions import METHODS, Predictions
 from pipeline.train.scores import Comparison
 
+_INSTANTS = 5
+"""Ticks of an episode at which its frames are shown."""
+_EPISODES = 40
+"""Rows of the table of episodes."""
 _NAMES = 8
 """Channels of a stream named in the params; an A-scan has a thousand."""
 
@@ -41,7 +53,7 @@ def evaluation_report(found: Evaluation) -> Report:
         sections=(
             Section("Errors beside baselines", _baselines(comparison)),
             Section("Dimensions and steps ahead", _dimensions(found)),
-            Section("Episodes", episodes(found), tuple(extremes(found))),
+            Section("Episodes", _episodes(found), tuple(_extremes(found))),
             Section("Which streams are used", _modalities(found.study)),
             Section("Training", _training(found)),
             Section("What was judged", _documents(found)),
@@ -62,7 +74,7 @@ def _beaten(comparison: Comparison) -> str:
 def _still(comparison: Comparison) -> str:
     """A sentence on the dimensions that hardly move, which the overall error counts like others."""
     said = still_dimensions(comparison)
-    return f" {sentence(said)}" if said else ""
+    return f" {_sentence(said)}" if said else ""
 
 
 def _tiles(comparison: Comparison) -> list[tuple[str, str]]:
@@ -91,7 +103,7 @@ def _baselines(comparison: Comparison) -> list[Block]:
         Table(
             ["mean absolute error", *(HEADINGS[method] for method in METHODS), "policy / best"],
             rows,
-            caption=sentence(FOOTNOTE),
+            caption=_sentence(FOOTNOTE),
             strong=frozenset({len(rows) - 1}),
         ),
         Picture(
@@ -159,6 +171,74 @@ def _steps(comparison: Comparison, action_hz: float | None) -> Table:
     return Table(columns, rows, caption=caption)
 
 
+def _episodes(found: Evaluation) -> list[Block]:
+    """All held-out episodes by error."""
+    comparison, store = found.comparison, found.store
+    best = best_baseline(comparison)
+    errors = {method: comparison.overall_by_episode(method) for method in ("policy", best)}
+    rows: list[tuple[object, ...]] = []
+    for place in comparison.ranked()[::-1][:_EPISODES]:
+        episode = store.episodes[comparison.episodes[place]]
+        policy, rule = (float(errors[method][place]) for method in ("policy", best))
+        ticks = int((found.predictions.episodes == episode.index).sum())
+        rows.append((episode_name(episode), ticks, policy, rule, policy / rule if rule else None))
+    caption = "Overall error [training std] by episode, the worst first"
+    if len(rows) < len(comparison.episodes):
+        caption += f"; the worst {len(rows)} of {len(comparison.episodes)}"
+    heads = ["episode", "held-out ticks", "policy", HEADINGS[best], "policy / baseline"]
+    return [
+        Table(heads, rows, f"{caption}."),
+        Picture(
+            "episodes",
+            "Mean absolute error of policy and baselines in each held-out episode.",
+            partial(plots.episodes, comparison, store),
+        ),
+        Picture(
+            "timeline",
+            "Every action dimension over the episodes of lowest and highest error: recorded, and "
+            "what the policy would do next.",
+            partial(plots.timeline, comparison, found.predictions, store),
+        ),
+    ]
+
+
+def _extremes(found: Evaluation) -> Iterator[Section]:
+    """The best and the worst closely, with their frames where the recordings still lie there.
+
+    The picture of a single one is that of the worst, which dvc.yaml lists.
+    """
+    comparison, predictions, store = found.comparison, found.predictions, found.store
+    errors = dict(zip(comparison.episodes, comparison.overall_by_episode("policy"), strict=True))
+    digest_of = cache(file_digest)  # episodes of a LeRobot data set share files
+    *_, (_, worst) = comparison.extremes()
+    for title, index in comparison.extremes():
+        episode = store.episodes[index]
+        ticks = shown_ticks(store, _whole(predictions, index), _INSTANTS)
+        rows = store.array("tick/vl_row")[ticks]
+        seen = footage(store, episode, rows.tolist(), found.recordings, digest_of)
+        above = "Above, the frames that the features at the dotted ticks were computed from. "
+        caption = (
+            f"Instruction: {episode.instruction}. {above if seen.frames else ''}Recorded action, "
+            "the policy's next action at every tick, and the whole chunks that it predicts at the "
+            "dotted ticks; what was recorded then is the recorded line from there on."
+        )
+        picture = Picture(
+            "episode_worst" if index == worst else "episode_best",
+            caption,
+            partial(plots.chunks, comparison, predictions, store, episode, ticks, seen.frames),
+        )
+        words = f"Overall error {errors[index]:.3f} [training std]. {seen.absence}".strip()
+        name = f"{title[0].upper()}{title[1:]}: {episode_name(episode)}"
+        yield Section(name, [Text(words), picture])
+
+
+def _whole(predictions: Predictions, index: int) -> Ticks:
+    """The judged ticks of an episode whose chunk ends within it; all, where it is that short."""
+    here = predictions.episodes == index
+    whole = here & predictions.valid.all(axis=1)
+    return predictions.ticks[whole if whole.any() else here]
+
+
 def _modalities(study: ModalityStudy | None) -> list[Block]:
     if study is None:
         return [
@@ -170,11 +250,11 @@ def _modalities(study: ModalityStudy | None) -> list[Block]:
     columns, rows = modality_errors(study)
     return [
         Text(
-            f"{sentence(judged_on(study))} {sentence(MODALITY_FOOTNOTE)} An error that stays says "
-            "that the policy does not use the stream, or that others tell it the same."
+            f"{_sentence(judged_on(study))} {_sentence(MODALITY_FOOTNOTE)} An error that stays "
+            "says that the policy does not use the stream, or that others tell it the same."
         ),
         Table(columns, rows, strong=frozenset({0})),
-        *(Text(sentence(note)) for note in study.notes),
+        *(Text(_sentence(note)) for note in study.notes),
         Picture(
             "modalities",
             "The error with one stream spoilt as a multiple of the error with all intact.",
@@ -217,3 +297,40 @@ def _shortened(said: Any) -> Any:
     if isinstance(said, list) and len(said) > _NAMES:
         return [*said[:_NAMES], f"… {len(said)} in all"]
     return said
+
+
+def comparison_report(experiments: Sequence[Experiment]) -> Report:
+    """The page of these experiments, of which the first are no better than the last."""
+    best = min(experiments, key=lambda one: one.error)
+    columns, rows = experiment_errors(experiments)
+    edge = columns.index("expert")
+    errors = Table(
+        columns[:edge],
+        [row[:edge] for row in rows],
+        f"Mean absolute errors. {_sentence(FOOTNOTE)}",
+        frozenset({experiments.index(best)}),
+    )
+    picture = Picture(
+        "experiments",
+        "Held-out error of each experiment, coloured by expert; the baselines are lines.",
+        partial(plots.comparison_of_experiments, experiments),
+    )
+    own = Table(
+        [columns[0], *columns[edge:]],
+        [(row[0], *row[edge:]) for row in rows[: len(experiments)]],
+        "What they are; samples: chunks a tick whose mean was judged.",
+    )
+    return Report(
+        title="Experiments side by side",
+        summary=(
+            f"{len(experiments)} policies judged on the same held-out ticks, beside the baselines "
+            "of all of them."
+        ),
+        tiles=(("lowest held-out error [training std]", f"{best.error:.3f}"), ("by", best.name)),
+        sections=(Section("Errors", (errors, picture, own)),),
+    )
+
+
+def _sentence(words: str) -> str:
+    """Words of a table or a terminal with a capital and a full stop, to stand in a text."""
+    return f"{words[0].upper()}{words[1:]}."
