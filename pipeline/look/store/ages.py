@@ -88,8 +88,9 @@ def draw_ages(found: Ages) -> Figure:
         counts = np.histogram(age[np.isfinite(age)], edges)[0]
         return counts * (100 / max(1, counts.sum()))
 
-    newest = {"color": PALETTE[0], "alpha": 0.55, "label": "newest frame (feature_age)"}
-    axis.stairs(shares(found.newest), edges, fill=True, **newest)
+    label = "newest frame (feature_age)"
+    newest = shares(found.newest)
+    axis.stairs(newest, edges, fill=True, color=PALETTE[0], alpha=0.55, label=label)
     for column, name in enumerate(found.views):
         colour = PALETTE[(column + 1) % len(PALETTE)]
         axis.stairs(shares(found.by_view[:, column]), edges, color=colour, lw=1.6, label=name)
@@ -107,16 +108,18 @@ def age_issues(
 ) -> Iterator[Issue]:
     """Frames from the future, and features far older than their VL row serves, by episode."""
     limit = _STALE_PERIODS * found.period_s
-    for of, episode in zip(episodes, store.episodes, strict=True):
-        ticks = slice(episode.ticks.start, episode.ticks.stop)
-        time, age = store.array("tick/time")[ticks], found.newest[ticks]
+    for episode in episodes:
+        time, age = store.array("tick/time")[episode.ticks], found.newest[episode.ticks]
         ahead, old = np.flatnonzero(age < -COARSEST_S), np.flatnonzero(age > limit)
         if len(ahead):
             told = f"{len(ahead)} ticks see a frame taken after them, by up to {-age.min():.3f} s"
-            span = (time[ahead[[0, -1]]] - time[0]).tolist()
-            yield of.issue("frames from the future", "vl/frame_time", told, *span, "error")
+            span = _span(time, ahead)
+            yield episode.issue("frames from the future", "vl/frame_time", told, span, "error")
         if len(old):
             told = f"{len(old)} of {len(age)} ticks see features up to {age.max():.2f} s old; "
             told += f"expected less than {limit:.2f} s, the time of {_STALE_PERIODS} VL rows"
-            span = (time[old[[0, -1]]] - time[0]).tolist()
-            yield of.issue("old frames", "vl/frame_time", told, *span)
+            yield episode.issue("old frames", "vl/frame_time", told, _span(time, old))
+
+
+def _span(time: NDArray[np.float64], ticks: NDArray[np.int64]) -> tuple[float, float]:
+    return float(time[ticks[0]] - time[0]), float(time[ticks[-1]] - time[0])

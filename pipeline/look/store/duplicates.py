@@ -93,4 +93,6 @@ def duplicate_issues(found: Duplicates, episodes: Sequence[EpisodeCoverage]) -> 
         if pair.share >= _SAME_SHARE:
             told = f"{pair.rows[0]} of its VL rows have the very frames and prompt of "
             told += f"{pair.rows[1]} rows of {episodes[pair.second].name}"
-            yield episodes[pair.first].issue("same recording", "vl/key", told, pair.time_s[0])
+            yield episodes[pair.first].issue(
+                "same recording", "vl/key", told, (pair.time_s[0], None)
+            )

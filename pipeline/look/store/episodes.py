@@ -1,7 +1,7 @@
 """What each episode of a store has: how long it is, which streams and views its ticks see."""
 
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from pipeline.base.channels import named
 from pipeline.base.issue import Issue, Severity
 from pipeline.base.table import Table
 from pipeline.look.page.blocks import Block, Picture
@@ -34,40 +33,40 @@ _NAME_ENDS = 6, 15
 class EpisodeCoverage:
     """One episode: how long it is, and which streams it has for how much of it."""
 
-    name: str
-    """`source/id`."""
-    id: str
-    source: str
-    format: str
-    instruction: str
-    ticks: int
-    vl_rows: int
+    episode: Episode
     seconds: float
     """From the first tick to the last."""
-    readings: Mapping[str, int]
-    """`sensor` and `state` -> readings."""
     covered: Mapping[str, float]
     """`sensor`, `state`, and each view -> share of the episode's ticks that see it, 0 to 1."""
+
+    @property
+    def name(self) -> str:
+        """`source/id`."""
+        return episode_name(self.episode)
+
+    @property
+    def ticks(self) -> slice:
+        """Of the store's ticks."""
+        return slice(self.episode.ticks.start, self.episode.ticks.stop)
 
     def issue(
         self,
         kind: str,
         stream: str,
         message: str,
-        start_s: float | None = None,
-        stop_s: float | None = None,
+        span: tuple[float | None, float | None] = (None, None),
         severity: Severity = "warning",
     ) -> Issue:
-        """An issue of this episode; times are s since its first tick."""
+        """An issue of this episode; `span` is (start, stop) in s since its first tick."""
         return Issue(
             severity=severity,
             kind=kind,
             message=message,
-            source=self.source,
-            episode=self.id,
+            source=self.episode.source,
+            episode=self.episode.id,
             stream=stream,
-            start_s=start_s,
-            stop_s=stop_s,
+            start_s=span[0],
+            stop_s=span[1],
         )
 
 
@@ -79,37 +78,27 @@ def coverage(store: FeatureStore) -> tuple[EpisodeCoverage, ...]:
 def _coverage_of(store: FeatureStore, episode: Episode) -> EpisodeCoverage:
     ticks = slice(episode.ticks.start, episode.ticks.stop)
     time = store.array("tick/time")[ticks]
-    streams = {"sensor": episode.readings, "state": episode.states}
     seen = {
-        name: store.array(f"tick/{name}_end")[ticks] > rows.start for name, rows in streams.items()
+        "sensor": store.array("tick/sensor_end")[ticks] > episode.readings.start,
+        "state": store.array("tick/state_end")[ticks] > episode.states.start,
     }
     shown = np.isfinite(store.array("vl/frame_time")[store.array("tick/vl_row")[ticks]])
     seen |= dict(zip(store.streams["views"], shown.T, strict=True))
-    return EpisodeCoverage(
-        name=episode_name(episode),
-        id=episode.id,
-        source=episode.source,
-        format=episode.format,
-        instruction=episode.instruction,
-        ticks=len(time),
-        vl_rows=len(episode.vl_rows),
-        seconds=float(time[-1] - time[0]) if len(time) else 0.0,
-        readings={name: len(rows) for name, rows in streams.items()},
-        covered={name: float(there.mean()) if len(time) else 0.0 for name, there in seen.items()},
-    )
+    covered = {name: float(there.mean()) if len(time) else 0.0 for name, there in seen.items()}
+    return EpisodeCoverage(episode, float(np.ptp(time)) if len(time) else 0.0, covered)
 
 
 def coverage_blocks(episodes: Sequence[EpisodeCoverage]) -> list[Block]:
     """A row a source, the picture, and a row an episode."""
-    heads = ("source", "episode", "instruction", "ticks", "length [s]", "VL rows", "ticks see")
-    rows = [
-        (one.source, one.id, one.instruction, one.ticks, round(one.seconds, 2), one.vl_rows,
-         _lacking(one.covered))
-        for one in episodes[:ROWS]
-    ]  # fmt: skip
     caption = "Ticks see all streams and views, none of one (no …), or one in a share of them."
     if len(episodes) > ROWS:
         caption += f" The first {ROWS} of {len(episodes)} episodes."
+    heads = ("source", "episode", "instruction", "ticks", "length [s]", "VL rows", "ticks see")
+    rows: list[tuple[object, ...]] = []
+    for one in episodes[:ROWS]:
+        own = one.episode
+        counts = len(own.ticks), round(one.seconds, 2), len(own.vl_rows)
+        rows.append((own.source, own.id, own.instruction, *counts, _lacking(one.covered)))
     return [
         _sources(episodes),
         Picture(
@@ -124,22 +113,21 @@ def coverage_blocks(episodes: Sequence[EpisodeCoverage]) -> list[Block]:
 def _sources(episodes: Sequence[EpisodeCoverage]) -> Table:
     parts: dict[str, list[EpisodeCoverage]] = defaultdict(list)
     for episode in episodes:
-        parts[episode.source].append(episode)
+        parts[episode.episode.source].append(episode)
     if len(parts) > 1:
         parts["all"] = [*episodes]
-    rows = [
-        (
-            name,
-            ", ".join(sorted({one.format for one in part})),
-            len({one.instruction for one in part}),
-            len(part),
-            sum(one.ticks for one in part),
-            round(sum(one.seconds for one in part), 1),
-            sum(one.vl_rows for one in part),
-            *(sum(one.readings[stream] for one in part) for stream in ("sensor", "state")),
+    rows: list[tuple[object, ...]] = []
+    for name, part in parts.items():
+        own = [one.episode for one in part]
+        formats = ", ".join(sorted({one.format for one in own}))
+        seconds = round(sum(one.seconds for one in part), 1)
+        vl_rows, readings, states = (
+            sum(len(getattr(one, kind)) for one in own)
+            for kind in ("vl_rows", "readings", "states")
         )
-        for name, part in parts.items()
-    ]
+        ticks = sum(len(one.ticks) for one in own)
+        told = len({one.instruction for one in own})
+        rows.append((name, formats, told, len(own), ticks, seconds, vl_rows, readings, states))
     heads = ("source", "format", "instructions", "episodes", "ticks", "length [s]", "VL rows")
     strong = frozenset({len(rows) - 1} if len(parts) > 1 else ())
     return Table((*heads, "sensor readings", "state readings"), rows, strong=strong)
@@ -158,12 +146,13 @@ def _lacking(covered: Mapping[str, float]) -> str:
 def draw_coverage(episodes: Sequence[EpisodeCoverage]) -> Figure:
     """Length of each episode above, and below which streams and views its ticks see."""
     streams = list(episodes[0].covered)
-    sources = list(dict.fromkeys(one.source for one in episodes))
+    source_of = [one.episode.source for one in episodes]
+    sources = list(dict.fromkeys(source_of))
     figure = canvas(9.0, 3.8 + 0.3 * len(streams))
     ratios = (2.2, 0.3 * len(streams) + 0.2)
     above, below = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": ratios})
     for number, source in enumerate(sources):
-        own = [at for at, one in enumerate(episodes) if one.source == source]
+        own = [at for at, name in enumerate(source_of) if name == source]
         seconds = [episodes[at].seconds for at in own]
         above.bar(own, seconds, 0.9, color=PALETTE[number % len(PALETTE)], label=source)
     above.set_ylabel("length [s]")
@@ -193,12 +182,12 @@ def draw_coverage(episodes: Sequence[EpisodeCoverage]) -> Figure:
 
 def mark_sources(axis: Axes, episodes: Sequence[EpisodeCoverage], line: str = INK) -> None:
     """Sources below an axis of episodes, parted by lines; the episodes' names where few."""
-    sources = [one.source for one in episodes]
+    sources = [one.episode.source for one in episodes]
     starts = [at for at, source in enumerate(sources) if not at or source != sources[at - 1]]
     for start in starts[1:]:
         axis.axvline(start - 0.5, color=line, lw=1.0)
     if len(episodes) <= _NAMED_EPISODES:
-        names = [_short(one.id if len(starts) == 1 else one.name) for one in episodes]
+        names = [_short(one.episode.id if len(starts) == 1 else one.name) for one in episodes]
         axis.set_xticks(range(len(episodes)), names, rotation=45, ha="right")
         return
     spans = list(zip(starts, [*starts[1:], len(episodes)], strict=True))
@@ -215,70 +204,55 @@ def _short(name: str) -> str:
 
 def episode_issues(store: FeatureStore, episodes: Sequence[EpisodeCoverage]) -> Iterator[Issue]:
     """Gaps, short episodes, missing streams and views, instructions that stand out."""
-    for coverage_of, episode in zip(episodes, store.episodes, strict=True):
-        time = store.array("tick/time")[episode.ticks.start : episode.ticks.stop]
-        yield from _gaps(coverage_of, time)
+    there = {name for one in episodes for name, share in one.covered.items() if share}
+    for episode in episodes:
+        time = store.array("tick/time")[episode.ticks]
+        yield from _gaps(episode, time)
         if len(time) < FEW_TICKS:
-            told = f"{len(time)} ticks ({coverage_of.seconds:.1f} s); expected at least {FEW_TICKS}"
-            yield coverage_of.issue("short episode", "ticks", told)
-    yield from _missing(episodes)
+            told = f"{len(time)} ticks ({episode.seconds:.1f} s); expected at least {FEW_TICKS}"
+            yield episode.issue("short episode", "ticks", told)
+        if len(time):
+            yield from _missing(episode, there)
     yield from _instructions(episodes)
 
 
 def _gaps(episode: EpisodeCoverage, time: NDArray[np.float64]) -> Iterator[Issue]:
     """The widest gap of an episode's ticks."""
     steps = np.diff(time)
-    if not len(steps):
-        return
-    usual, at = float(np.median(steps)), int(steps.argmax())
-    if steps[at] > _GAP_STEPS * usual > 0:
-        count = int((steps > _GAP_STEPS * usual).sum())
-        told = f"{count} gap{'s' * (count > 1)}, the widest {steps[at]:.2f} s without a tick; "
-        start, stop = (time[at : at + 2] - time[0]).tolist()
-        yield episode.issue("gap", "ticks", f"{told}a step is usually {usual:.3f} s", start, stop)
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    gaps = np.flatnonzero(steps > _GAP_STEPS * usual)
+    if usual > 0 and len(gaps):
+        at = int(steps.argmax())
+        told = f"{len(gaps)} gap{'s' * (len(gaps) > 1)}, the widest {steps[at]:.2f} s without a "
+        told += f"tick; a step is usually {usual:.3f} s"
+        span = (float(time[at] - time[0]), float(time[at + 1] - time[0]))
+        yield episode.issue("gap", "ticks", told, span)
 
 
-def _missing(episodes: Sequence[EpisodeCoverage]) -> Iterator[Issue]:
-    """Streams and views that some episodes have and others do not, an issue a source."""
-    by_source: dict[str, list[EpisodeCoverage]] = defaultdict(list)
-    for episode in episodes:
-        if episode.ticks:
-            by_source[episode.source].append(episode)
-    names = [name for one in episodes for name, share in one.covered.items() if share]
-    for name in dict.fromkeys(names):
+def _missing(episode: EpisodeCoverage, there: Collection[str]) -> Iterator[Issue]:
+    """Streams and views that others have, and this episode has not or not for all its ticks."""
+    for name, share in episode.covered.items():
         stream = name if name in ("sensor", "state") else f"view {name}"
-        for source, own in by_source.items():
-            lacking = [at for at, one in enumerate(own) if not one.covered[name]]
-            if lacking:
-                yield Issue(
-                    severity="warning",
-                    kind="missing",
-                    message=f"{len(lacking)} of {len(own)} episodes of this source lack it; "
-                    "others of the store have it",
-                    source=source,
-                    episode=named([one.id for one in own], lacking),
-                    stream=stream,
-                )
-            for one in own:
-                if 0 < one.covered[name] < 1:
-                    told = f"only {one.covered[name]:.0%} of the ticks see it"
-                    yield one.issue("partly missing", stream, told)
+        if name in there and not share:
+            yield episode.issue("missing", stream, "no tick sees it; other episodes have it")
+        elif 0 < share < 1:
+            yield episode.issue("partly missing", stream, f"only {share:.0%} of the ticks see it")
 
 
 def _instructions(episodes: Sequence[EpisodeCoverage]) -> Iterator[Issue]:
     """No instruction, or one that stands out in its source."""
     by_source: dict[str, Counter[str]] = defaultdict(Counter)
-    for episode in episodes:
-        by_source[episode.source][episode.instruction] += 1
+    for one in episodes:
+        by_source[one.episode.source][one.episode.instruction] += 1
     usual = {source: counts.most_common(1)[0] for source, counts in by_source.items()}
     totals = {source: counts.total() for source, counts in by_source.items()}
     for one in episodes:
-        words, often = usual[one.source]
-        total = totals[one.source]
-        rare = by_source[one.source][one.instruction] <= max(1, _RARE * total) < often
-        if not one.instruction.strip():
+        source, words = one.episode.source, one.episode.instruction
+        (most, often), total = usual[source], totals[source]
+        rare = by_source[source][words] <= max(1, _RARE * total) < often
+        if not words.strip():
             told = "the prompt says nothing of the task; set `instruction` of its data source"
             yield one.issue("no instruction", "instruction", told)
         elif rare and often >= _USUAL * total:
-            told = f"{one.instruction!r}; {often} of {total} episodes of this source say {words!r}"
+            told = f"{words!r}; {often} of {total} episodes of this source say {most!r}"
             yield one.issue("other instruction", "instruction", told)

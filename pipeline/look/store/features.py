@@ -293,7 +293,7 @@ def _issues_of(
         told += f"in slot {found.names[slot[0]]} at {time[row[0]]:.2f} s; left out of all that is "
         told += "shown of features. Training refuses them: extract these rows anew"
         span = (float(time[row[0]]), float(time[row[-1]]))
-        yield episode.issue("not finite", FEATURES, told, *span, "error")
+        yield episode.issue("not finite", FEATURES, told, span, "error")
     index = int(found.sampled.episode[own[0]])
     still = (found.within[index] < DEAD) & (found.variation >= DEAD)
     if still.any() and len(own) >= _STILL_ROWS:
@@ -308,4 +308,4 @@ def _issues_of(
         told += f"{norms[own[row[worst]]]:.4g} in slot {name}, of which the median is "
         told += f"{np.nanmedian(norms):.4g}"
         span = (float(time[row[0]]), float(time[row[-1]]))
-        yield episode.issue("feature norm", FEATURES, told, *span)
+        yield episode.issue("feature norm", FEATURES, told, span)

@@ -38,7 +38,7 @@ from pipeline.look.store.features import (
     look_at_features,
     sample_rows,
 )
-from pipeline.look.store.sizes import ArraySize, array_sizes, size_blocks
+from pipeline.look.store.sizes import ArraySize, array_sizes, size_table
 from pipeline.store import FeatureStore
 from pipeline.store.chunks import ChunkFiles
 from pipeline.store.gather import WIDE
@@ -127,7 +127,7 @@ def store_report(view: StoreView) -> Report:
             Section("What looks wrong", [_issues(view), _checked(view)]),
             Section("Coverage", coverage_blocks(view.episodes)),
             Section("Age of the features", age_blocks(view.ages)),
-            Section("Size", size_blocks(view.sizes)),
+            Section("Size", [size_table(view.sizes)]),
             Section("Features", feature_blocks(view.features, view.episodes)),
             Section("Duplicates", duplicate_blocks(view.duplicates, view.episodes)),
             Section("Channels", channel_blocks(view.statistics)),

@@ -3,20 +3,12 @@
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
-import numpy as np
-from matplotlib.figure import Figure
-
-from pipeline.base.format import size
 from pipeline.base.table import Table
-from pipeline.look.page.blocks import Block, Picture
-from pipeline.look.page.style import PALETTE, canvas
 from pipeline.store.schema import read_specs
 
 METADATA = "metadata"
-_BARS = 8
 
 
 @dataclass(frozen=True)
@@ -55,40 +47,16 @@ def array_sizes(path: Path) -> tuple[ArraySize, ...]:
     return tuple(sorted(sizes, key=lambda one: one.disk_bytes, reverse=True))
 
 
-def size_blocks(sizes: Sequence[ArraySize]) -> list[Block]:
-    """The picture, and a row an array."""
-    total = sum(one.disk_bytes for one in sizes)
+def size_table(sizes: Sequence[ArraySize]) -> Table:
+    """A row an array."""
+    total = max(1, sum(one.disk_bytes for one in sizes))
     rows = [
         (
             one.name,
             " × ".join(f"{count:,}" for count in one.shape),
-            *(one.dtype, one.chunks, one.disk_bytes / 2**20, 100 * one.disk_bytes / max(1, total)),
+            *(one.dtype, one.chunks, one.disk_bytes / 2**20, 100 * one.disk_bytes / total),
         )
         for one in sizes
     ]
-    return [
-        Picture("sizes", "Bytes on the disk by array.", partial(draw_sizes, sizes)),
-        Table(("array", "shape", "dtype", "chunks", "on the disk [MiB]", "share [%]"), rows),
-    ]
-
-
-def draw_sizes(sizes: Sequence[ArraySize]) -> Figure:
-    """Bytes on the disk by array, the largest first, the small ones together."""
-    shown = {one.name: one.disk_bytes for one in sizes[:_BARS]}
-    if rest := sum(one.disk_bytes for one in sizes[_BARS:]):
-        shown[f"{len(sizes) - _BARS} others"] = rest
-    figure = canvas(8.5, 1.1 + 0.34 * len(shown))
-    axis = figure.subplots()
-    taken = np.array([*shown.values()])
-    shares = taken / max(1, taken.sum())
-    bars = axis.barh([*shown], taken / 2**20, 0.7, color=PALETTE[0])
-    labels = [
-        f"{size(count)}, {share:.1%}" if share >= 0.001 else size(count)
-        for count, share in zip(taken, shares, strict=True)
-    ]
-    axis.bar_label(bars, labels, padding=5, size=9)
-    axis.invert_yaxis()
-    axis.set_xlim(0, max(taken.max() / 2**20 * 1.25, 1e-3))
-    axis.set_xlabel("on the disk [MiB]")
-    axis.grid(axis="y", visible=False)
-    return figure
+    heads = ("array", "shape", "dtype", "chunks", "on the disk [MiB]", "share [%]")
+    return Table(heads, rows, "Bytes on the disk by array.")

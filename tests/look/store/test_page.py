@@ -102,7 +102,7 @@ def test_the_spec_is_there_whole(report, view):
 
 def test_the_page_loads(report, tmp_path, assert_page_is_sound):
     page, *pictures = write_report(tmp_path / "page", report)
-    assert {one.stem for one in pictures} >= {"coverage", "ages", "norms", "sizes"}
+    assert {one.stem for one in pictures} >= {"coverage", "ages", "norms"}
     assert_page_is_sound(page)
 
 

@@ -16,14 +16,12 @@ from pipeline.look.store.channels import draw_profiles, numbered_channels
 from pipeline.look.store.episodes import draw_coverage
 from pipeline.look.store.features import draw_norms
 from pipeline.look.store.page import StoreView, inspect_store
-from pipeline.look.store.sizes import draw_sizes
 from pipeline.store import FeatureStore
 
 ROWS = 10
 EVERY: dict[str, Callable[[StoreView], Figure]] = {
     "coverage": lambda view: draw_coverage(view.episodes),
     "ages": lambda view: draw_ages(view.ages),
-    "sizes": lambda view: draw_sizes(view.sizes),
     "norms": lambda view: draw_norms(view.features, view.episodes),
 }
 
@@ -86,13 +84,6 @@ def test_ages_are_shares_of_all_ticks(flawed):
         (axis,) = EVERY["ages"](flawed).axes
     newest, view1 = (patch.get_data().values for patch in axis.patches)
     assert (newest.sum(), view1.sum()) == pytest.approx((100, 100))
-
-
-def test_sizes_are_of_the_whole_store(flawed):
-    with mpl.rc_context(RC):
-        (axis,) = EVERY["sizes"](flawed).axes
-    total = sum(bar.get_width() for bar in axis.containers[0])
-    assert total * 2**20 == pytest.approx(sum(one.disk_bytes for one in flawed.sizes))
 
 
 def test_numbered_channels_are_drawn_together(flawed):
