@@ -20,7 +20,7 @@ from pipeline.base.ownership import REPORT, OutputKind, begins_with, claim, refu
 from pipeline.evaluate.cells import write_rows
 from pipeline.evaluate.experiment_tables import experiment_rows, experiments_table
 from pipeline.evaluate.experiments import read_experiments
-from pipeline.look.evaluation.page import comparison_report
+from pipeline.look.evaluation.comparison import comparison_report
 from pipeline.look.page.writing import write_report
 
 _TABLE = OutputKind("a table of experiments", begins_with("| experiment |"))

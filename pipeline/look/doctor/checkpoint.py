@@ -73,25 +73,25 @@ def absent_checkpoint(params: Params) -> Issue:
     """What is said of a checkpoint that is not on this machine."""
     checkpoint = params.vlm.checkpoint
     if Path(checkpoint) == params.demo.checkpoint:
-        said = f"{checkpoint}: the demo's checkpoint is not written yet"
-        return missing("vlm.checkpoint", said, "python -m stages.demo (or dvc repro)")
+        text = f"{checkpoint}: the demo's checkpoint is not written yet"
+        return missing("vlm.checkpoint", text, "python -m stages.demo (or dvc repro)")
     if not could_be_hub_id(checkpoint):
-        said = f"{checkpoint}: no such folder, and no hub id"
-        return missing("vlm.checkpoint", said, _EXAMPLE)
-    said = f"{checkpoint}: no such folder, and no complete copy in the hub's cache"
+        text = f"{checkpoint}: no such folder, and no hub id"
+        return missing("vlm.checkpoint", text, _EXAMPLE)
+    text = f"{checkpoint}: no such folder, and no complete copy in the hub's cache"
     remedy = f"hf download {checkpoint}"
     if os.environ.get("HF_HUB_OFFLINE", "0").lower() in ("1", "true", "yes", "on"):
-        said += "; HF_HUB_OFFLINE forbids to fetch it"
-        return missing("vlm.checkpoint", said, f"{remedy}, where there is network")
-    return note("vlm.checkpoint", f"{said}; the first extraction downloads it", remedy)
+        text += "; HF_HUB_OFFLINE forbids to fetch it"
+        return missing("vlm.checkpoint", text, f"{remedy}, where there is network")
+    return note("vlm.checkpoint", f"{text}; the first extraction downloads it", remedy)
 
 
 def check_adapter(adapter: str) -> Issue:
     """`vlm.adapter`."""
     folder = local_folder(adapter, None)
     if folder is None:
-        said = f"{adapter}: not on this machine"
-        return missing("vlm.adapter", said, "set vlm.adapter to its folder, or to null")
+        text = f"{adapter}: not on this machine"
+        return missing("vlm.adapter", text, "set vlm.adapter to its folder, or to null")
     try:
         adapter_files(folder)
     except VLMError as error:
@@ -106,8 +106,8 @@ def check_fit(count: int, vlm: VLMParams, gpus: Sequence[GPU], available: int) -
     if gpus:
         smallest = min(gpus, key=lambda gpu: gpu.memory)
         where, room, needed = smallest.name, smallest.memory, weights + _BESIDE
-    said = f"{size(weights)} in {vlm.dtype}, {where} has {size(room)}"
+    text = f"{size(weights)} in {vlm.dtype}, {where} has {size(room)}"
     if needed <= room:
-        return ok("it fits", said)
+        return ok("it fits", text)
     half = "set vlm.dtype to bfloat16, or " if vlm.dtype == "float32" else ""
-    return note("it may not fit", said, f"{half}take a smaller checkpoint, or a larger machine")
+    return note("it may not fit", text, f"{half}take a smaller checkpoint, or a larger machine")

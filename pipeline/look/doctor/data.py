@@ -23,10 +23,10 @@ def check(params: Params) -> Iterator[Issue]:
     yield check_decoders(av.codecs_available)
     data = params.data
     demo = "python -m stages.demo (or dvc repro)" if data.root == params.demo.recordings else ""
-    relative = any(not Path(path).is_absolute() for one in data.sources for path in one.paths)
+    relative = any(not Path(path).is_absolute() for source in data.sources for path in source.paths)
     if relative and not data.root.is_dir():
-        said = f"{data.root}: no such folder"
-        yield missing("data.root", said, demo or "set data.root to the folder of recordings")
+        text = f"{data.root}: no such folder"
+        yield missing("data.root", text, demo or "set data.root to the folder of recordings")
         return
     yield ok("data.root", str(data.root))
     for source in data.sources:
@@ -42,40 +42,40 @@ def check_decoders(available: set[str]) -> Issue:
     """The video codecs; without AV1, most LeRobot data sets cannot be read."""
     lacking = [codec for codec, decoder in DECODERS.items() if decoder not in available]
     if lacking:
-        said = f"PyAV {av.__version__} does not decode {', '.join(lacking)}"
-        return note("video", said, f"{_WHEEL} (a wheel, which has libdav1d)")
+        text = f"PyAV {av.__version__} does not decode {', '.join(lacking)}"
+        return note("video", text, f"{_WHEEL} (a wheel, which has libdav1d)")
     return ok("video", f"PyAV {av.__version__} decodes {', '.join(DECODERS)}")
 
 
 def check_source(source: Source, opened: Opened, on_bad: str) -> Iterator[Issue]:
     """What a source holds, what of it cannot be read, and whether DVC sees it."""
     formats = Counter(recording.format for recording in opened.recordings)
-    said = ", ".join(f"{count} episode(s), {name}" for name, count in formats.items())
+    text = ", ".join(f"{count} episode(s), {name}" for name, count in formats.items())
     # The old format keeps its instruction in a pickle, which takes long to open.
     quick = [recording for recording in opened.recordings if recording.format != "old"]
     told = f', told "{quick[0].instruction}"' if quick else ""
-    yield ok(source.name, f"{said or 'no episode'}{told}")
+    yield ok(source.name, f"{text or 'no episode'}{told}")
     if opened.bad:
         first = f"{len(opened.bad)} episode(s) cannot be read, first: {opened.bad[0].reason}"
         yield unusable(source.name, first, on_bad)
     if opened.missing:
-        said = f"{len(opened.missing)} listed episode(s) are not there: {opened.missing[0]}"
-        yield note(source.name, said, "copy them too, or leave them out")
+        text = f"{len(opened.missing)} listed episode(s) are not there: {opened.missing[0]}"
+        yield note(source.name, text, "copy them too, or leave them out")
     outside = [path for path in source.paths if Path(path).is_absolute()]
     if outside:
-        said = f"{outside[0]} is absolute, so DVC does not watch it"
-        yield note(source.name, said, "lay it below data.root, for dvc repro")
-    lerobot = [one for one in opened.recordings if one.format == "lerobot"]
-    videos = [file for one in lerobot[:1] for file in one.files() if file.suffix in _VIDEOS]
+        text = f"{outside[0]} is absolute, so DVC does not watch it"
+        yield note(source.name, text, "lay it below data.root, for dvc repro")
+    lerobot = [episode for episode in opened.recordings if episode.format == "lerobot"]
+    videos = [file for episode in lerobot[:1] for file in episode.files() if file.suffix in _VIDEOS]
     if videos:
         yield check_video(source.name, videos[0])
 
 
-def unusable(subject: str, found: str, on_bad: str) -> Issue:
+def unusable(subject: str, message: str, on_bad: str) -> Issue:
     """What is said of episodes that cannot be used: they are left out, or nothing runs."""
     if on_bad == "skip":
-        return note(subject, found, "left out, as data.on_bad_episode says")
-    return missing(subject, found, "mend or remove them, or set data.on_bad_episode=skip")
+        return note(subject, message, "left out, as data.on_bad_episode says")
+    return missing(subject, message, "mend or remove them, or set data.on_bad_episode=skip")
 
 
 def check_video(source: str, path: Path) -> Issue:
@@ -86,6 +86,6 @@ def check_video(source: str, path: Path) -> Issue:
             codec = container.streams.video[0].codec_context.codec.canonical_name
             next(container.decode(video=0))
     except (av.FFmpegError, OSError, IndexError, StopIteration) as error:
-        said = f"{path}: its video ({codec}) is not decoded: {error or 'it has no frame'}"
-        return missing(source, said, f"copy it again, or {_WHEEL}")
+        text = f"{path}: its video ({codec}) is not decoded: {error or 'it has no frame'}"
+        return missing(source, text, f"copy it again, or {_WHEEL}")
     return ok(source, f"its videos are {codec}")

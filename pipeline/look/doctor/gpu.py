@@ -36,14 +36,14 @@ class GPU:
 def check(params: Params) -> Iterator[Issue]:
     """The machine, its GPU and the attention backend under these params."""
     yield ok("machine", f"{len(os.sched_getaffinity(0))} cores, {size(memory_bytes())} of memory")
-    driver = shutil.which("nvidia-smi") is not None or any(Path(one).exists() for one in _DRIVERS)
+    driver = shutil.which("nvidia-smi") is not None or any(Path(path).exists() for path in _DRIVERS)
     yield from check_gpus(read_gpus(), driver, params.vlm.dtype)
     for section in ("extract", "train_head", "evaluate"):
         name = getattr(params, section).device
         if usable_device(name) is None:
             key = f"{section}.device"
-            said = f"{name}: torch cannot use it here, see GPU"
-            yield missing(key, said, f"mend that, or set {key}=auto")
+            text = f"{name}: torch cannot use it here, see GPU"
+            yield missing(key, text, f"mend that, or set {key}=auto")
     device = usable_device(params.extract.device)
     if device is not None:
         yield check_attention(params.vlm, device)
@@ -64,7 +64,7 @@ def read_gpus() -> tuple[GPU, ...]:
         return ()
     seen = [torch.cuda.get_device_properties(at) for at in range(torch.cuda.device_count())]
     amd = torch.version.hip is not None
-    return tuple(GPU(one.name, one.total_memory, amd or one.major >= 8) for one in seen)
+    return tuple(GPU(device.name, device.total_memory, amd or device.major >= 8) for device in seen)
 
 
 def check_gpus(gpus: Sequence[GPU], driver: bool, dtype: str) -> Iterator[Issue]:
@@ -75,23 +75,23 @@ def check_gpus(gpus: Sequence[GPU], driver: bool, dtype: str) -> Iterator[Issue]
     if gpus:
         yield ok("build", build)
     elif not driver:
-        said = f"{build}; this machine has no GPU driver, so everything runs on the CPU: "
-        yield note("GPU", f"{said}well enough for the demo, not for a 3B or 7B checkpoint")
+        text = f"{build}; this machine has no GPU driver, so everything runs on the CPU: "
+        yield note("GPU", f"{text}well enough for the demo, not for a 3B or 7B checkpoint")
     else:
-        said = f"{build}; this machine has a GPU driver, but torch says: {_why_unseen()}"
+        text = f"{build}; this machine has a GPU driver, but torch says: {_why_unseen()}"
         remedy = (
             "look at CUDA_VISIBLE_DEVICES and nvidia-smi (in a container, start it with --gpus "
             "all); then update the driver, or pip install --force-reinstall torch from the index "
             "that pytorch.org/get-started names for the driver's CUDA version"
         )
-        yield note("GPU", said, remedy)
+        yield note("GPU", text, remedy)
     for index, gpu in enumerate(gpus):
-        said = f"{gpu.name}, {size(gpu.memory)}"
+        text = f"{gpu.name}, {size(gpu.memory)}"
         if dtype != "bfloat16" or gpu.bfloat16:
-            yield ok(f"cuda:{index}", said)
+            yield ok(f"cuda:{index}", text)
         else:
-            said += "; it only emulates bfloat16, which vlm.dtype asks for"
-            yield note(f"cuda:{index}", said, "set vlm.dtype to float16 or float32")
+            text += "; it only emulates bfloat16, which vlm.dtype asks for"
+            yield note(f"cuda:{index}", text, "set vlm.dtype to float16 or float32")
 
 
 def _why_unseen() -> str:
@@ -106,11 +106,11 @@ def check_attention(vlm: VLMParams, device: torch.device) -> Issue:
     """What `vlm.attention` comes to."""
     best = attention_backend(vlm.model_copy(update={"attention": "auto"}), device)
     if vlm.attention == "flash_attention_2" != best:
-        said = f"vlm.attention asks for flash-attention, which {device} with vlm.dtype {vlm.dtype} "
-        said += "has not: it needs CUDA, half precision and the package flash-attn"
-        return missing("attention", said, f"set vlm.attention to auto, or {FLASH}")
+        text = f"vlm.attention asks for flash-attention, which {device} with vlm.dtype {vlm.dtype} "
+        text += "has not: it needs CUDA, half precision and the package flash-attn"
+        return missing("attention", text, f"set vlm.attention to auto, or {FLASH}")
     taken = attention_backend(vlm, device)
-    said = f"vlm.attention: {vlm.attention} takes {taken} on {device}"
+    text = f"vlm.attention: {vlm.attention} takes {taken} on {device}"
     if device.type == "cuda" and vlm.dtype != "float32" and best == "sdpa":
-        return note("attention", f"{said}; flash-attention is optional", FLASH)
-    return ok("attention", said)
+        return note("attention", f"{text}; flash-attention is optional", FLASH)
+    return ok("attention", text)

@@ -11,19 +11,19 @@ _WORDS = {"error": "missing"}
 """What the terminal calls a severity, where that is not its own word."""
 
 
-def ok(subject: str, found: str) -> Issue:
+def ok(subject: str, message: str) -> Issue:
     """It is as it should be."""
-    return Issue(severity="ok", kind=subject, message=found)
+    return Issue(severity="ok", kind=subject, message=message)
 
 
-def note(subject: str, found: str, remedy: str = "") -> Issue:
+def note(subject: str, message: str, remedy: str = "") -> Issue:
     """It works, but could be better; or it will be needed later."""
-    return Issue(severity="note", kind=subject, message=found, remedy=remedy)
+    return Issue(severity="note", kind=subject, message=message, remedy=remedy)
 
 
-def missing(subject: str, found: str, remedy: str) -> Issue:
+def missing(subject: str, message: str, remedy: str) -> Issue:
     """Without it a stage of the default pipeline does not run with these params."""
-    return Issue(severity="error", kind=subject, message=found, remedy=remedy)
+    return Issue(severity="error", kind=subject, message=message, remedy=remedy)
 
 
 def described(title: str, issues: Sequence[Issue]) -> list[str]:

@@ -46,19 +46,27 @@ def check_required(
 ) -> Iterator[Issue]:
     """One line for all that are as they should be, and one for each that is not."""
     wanted = {line: Requirement(line) for line in lines}
-    found = {one.name: version_of(one.name) for one in wanted.values()}
-    bad = {line: one.name for line, one in wanted.items() if not _fits(one, found[one.name])}
+    versions = {requirement.name: version_of(requirement.name) for requirement in wanted.values()}
+    bad = {
+        line: requirement.name
+        for line, requirement in wanted.items()
+        if not _fits(requirement, versions[requirement.name])
+    }
     shown = ", ".join(
-        f"{name} {found[name]}" for name in _SHOWN if name in found and name not in bad.values()
+        f"{name} {versions[name]}"
+        for name in _SHOWN
+        if name in versions and name not in bad.values()
     )
     yield ok("packages", f"{len(wanted) - len(bad)} of {len(wanted)} as they should be: {shown}")
     for line, name in bad.items():
         remedy = f"pip install '{line}'"
         if name == "python":
             remedy = "make a virtual environment with another Python and install again"
-        yield missing(name, f"expected {line}, found {found[name] or 'none'}", remedy)
+        yield missing(name, f"expected {line}, found {versions[name] or 'none'}", remedy)
 
 
-def _fits(wanted: Requirement, found: str | None) -> bool:
+def _fits(wanted: Requirement, version: str | None) -> bool:
     # A build such as 2.13.0+cpu, or a nightly, is what its number says.
-    return found is not None and wanted.specifier.contains(found.split("+")[0], prereleases=True)
+    return version is not None and wanted.specifier.contains(
+        version.split("+")[0], prereleases=True
+    )

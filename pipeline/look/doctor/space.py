@@ -43,43 +43,43 @@ def check(params: Params) -> Iterator[Issue]:
         return
     counts, bad = measure(recordings, params)
     if bad:
-        said = f"{len(bad)} episode(s) read for the size cannot be used, first: {bad[0]}"
-        yield unusable("episodes", said, data.on_bad_episode)
+        text = f"{len(bad)} episode(s) read for the size cannot be used, first: {bad[0]}"
+        yield unusable("episodes", text, data.on_bad_episode)
     if not counts:
         yield note("size", "not known: no episode could be read; see above")
         return
     episodes = len(recordings) - len(bad)
     taken = estimated_bytes(counts, episodes, params)
-    told = f"about {size(taken)} for {episodes} episodes"
+    estimate = f"about {size(taken)} for {episodes} episodes"
     if len(counts) < episodes:
-        told += f", judged by {len(counts)} of them"
-    yield check_disk(taken, told, target, free_bytes(target), used_bytes(part_path(target)))
+        estimate += f", judged by {len(counts)} of them"
+    yield check_disk(taken, estimate, target, free_bytes(target), used_bytes(part_path(target)))
     yield check_page_cache(taken, memory_bytes())
 
 
-def check_disk(taken: int, told: str, target: Path, free: int, begun: int) -> Issue:
+def check_disk(taken: int, estimate: str, target: Path, free: int, begun: int) -> Issue:
     """Room for the store, less what an unfinished build of it has already."""
-    said = f"{told}; {size(free)} free in {target.parent}"
+    text = f"{estimate}; {size(free)} free in {target.parent}"
     if begun:
-        said += f", {size(begun)} of it written by an unfinished build"
+        text += f", {size(begun)} of it written by an unfinished build"
     if target.exists():
-        said += f"; {target} is finished"
+        text += f"; {target} is finished"
     if taken - begun <= free:
-        return ok("disk", said)
+        return ok("disk", text)
     remedy = (
         "make room, set extract.store to another disk, extract.dtype to float16, or fewer "
         "vlm.pooling slots"
     )
-    return (note if target.exists() else missing)("disk", said, remedy)
+    return (note if target.exists() else missing)("disk", text, remedy)
 
 
 def check_page_cache(taken: int, memory: int) -> Issue:
     """Whether training reads the store at memory speed after its first epoch."""
     if taken <= 0.7 * memory:
         return ok("page cache", f"the store fits into memory ({size(memory)})")
-    said = f"the store is larger than what {size(memory)} of memory keeps, so it is read from disk"
+    text = f"the store is larger than what {size(memory)} of memory keeps, so it is read from disk"
     remedy = "keep it on a local NVMe disk, or set extract.dtype to float16"
-    return note("page cache", said, remedy)
+    return note("page cache", text, remedy)
 
 
 def measure(recordings: Sequence[Recording], params: Params) -> tuple[list[Streams], list[str]]:
@@ -127,18 +127,18 @@ def estimated_bytes(read: Sequence[Streams], episodes: int, params: Params) -> i
         episodes=episodes,
         ticks=in_all(line.time for line in lines),
         vl_rows=in_all(line.vl_time for line in lines),
-        readings=in_all(one.time for one in sensors),
-        states=in_all(one.time for one in states),
+        readings=in_all(stream.time for stream in sensors),
+        states=in_all(stream.time for stream in states),
         text_bytes=_TEXT_BYTES * episodes,
         slots=len(spec.slots) * spec.variants,
         dim=spec.dim,
         views=len(views),
         action_dim=len(lines[0].action_channels.names),
-        sensor_channels=max((len(one.channels.names) for one in sensors), default=0),
-        state_dim=max((len(one.channels.names) for one in states), default=0),
+        sensor_channels=max((len(stream.channels.names) for stream in sensors), default=0),
+        state_dim=max((len(stream.channels.names) for stream in states), default=0),
     )
     specs = arrays(sizes, params.extract.dtype, params.extract.sensor_dtype).values()
-    return sum(one.data_bytes for one in specs)
+    return sum(spec.data_bytes for spec in specs)
 
 
 def used_bytes(folder: Path) -> int:

@@ -219,7 +219,7 @@ def chunks(
     tall = 1.15 * len(shown) + 1.2
     width = _CHUNKS_WIDTH / max(3, len(instants))
     shapes = [[image.shape for image in images] for images in frames.values()]
-    heights = [width * max(shape[0] / shape[1] for shape in each) for each in shapes]
+    heights = [width * max(shape[0] / shape[1] for shape in view) for view in shapes]
     above_in = [sum(heights) + 0.5] if heights else []
     figure = canvas(_CHUNKS_WIDTH, sum(above_in) + tall)
     parts = figure.subfigures(len(above_in) + 1, 1, height_ratios=[*above_in, tall], squeeze=False)
@@ -287,13 +287,13 @@ def _plot_chunks(
         label = ""
 
 
-def curves(found: Curves, step: int) -> Figure:
+def curves(logged: Curves, step: int) -> Figure:
     """Loss, held-out error and learning rate over the steps; a line marks the step judged here."""
-    shown = [name for name in _CURVES if name in found.curves] or sorted(found.curves)[:3]
+    shown = [name for name in _CURVES if name in logged.curves] or sorted(logged.curves)[:3]
     figure = canvas(max(4.2 * len(shown), 8.4), 3.4)
     axes = figure.subplots(1, len(shown), squeeze=False, sharex=True)[0]
     for axis, name in zip(axes, shown, strict=True):
-        _plot_curve(axis, name, found.curves[name])
+        _plot_curve(axis, name, logged.curves[name])
         axis.axvline(step, color=INK, lw=1, ls="--")
     figure.suptitle(f"Course of the training; the checkpoint judged here is of step {step}")
     return figure
@@ -318,7 +318,9 @@ def modalities(study: ModalityStudy) -> Figure:
 
     The error itself, in units of the training standard deviation, where the intact one is 0.
     """
-    panels = [[one for one in study.spoilt if one.stream == name] for name in study.streams]
+    panels = [
+        [ablated for ablated in study.spoilt if ablated.stream == name] for name in study.streams
+    ]
     widths = [len(panel) for panel in panels]
     figure = canvas(max(0.95 * sum(widths) + 1.5, 7.5), 4.6)
     axes = figure.subplots(
@@ -340,8 +342,8 @@ def modalities(study: ModalityStudy) -> Figure:
 
 def _plot_ablations(axis: Axes, panel: Sequence[Ablated], study: ModalityStudy) -> None:
     unit = study.intact.overall("policy") or 1.0
-    heights = [one.comparison.overall("policy") / unit for one in panel]
-    colours = [_ABLATIONS[one.how.split()[0]] for one in panel]
+    heights = [ablated.comparison.overall("policy") / unit for ablated in panel]
+    colours = [_ABLATIONS[ablated.how.split()[0]] for ablated in panel]
     bars = axis.bar(range(len(panel)), heights, color=colours, width=0.7)
     # On a ground of its own, for a line may pass behind a number.
     ground = {"facecolor": GRID, "edgecolor": "none", "pad": 1}
@@ -351,7 +353,7 @@ def _plot_ablations(axis: Axes, panel: Sequence[Ablated], study: ModalityStudy) 
     axis.axhline(intact, color=_POLICY, lw=1.8, label="policy, all streams intact")
     label = f"best {LABELS[best]}, which sees nothing"
     axis.axhline(blind, color=INK, lw=1.8, ls="--", label=label)
-    axis.set_xticks(range(len(panel)), [one.how.replace(" ", "\n", 1) for one in panel])
+    axis.set_xticks(range(len(panel)), [ablated.how.replace(" ", "\n", 1) for ablated in panel])
     axis.grid(axis="x", visible=False)
     axis.set_title(panel[0].stream)
 
@@ -360,8 +362,12 @@ def comparison_of_experiments(experiments: Sequence[Experiment]) -> Figure:
     """Held-out error of each experiment, coloured by expert, and the baselines as lines."""
     figure = canvas(9.0, 0.36 * len(experiments) + 2.6)
     axis = figure.subplots()
-    for index, expert in enumerate(dict.fromkeys(one.model_type for one in experiments)):
-        places = [at for at, one in enumerate(experiments) if one.model_type == expert]
+    for index, expert in enumerate(
+        dict.fromkeys(experiment.model_type for experiment in experiments)
+    ):
+        places = [
+            at for at, experiment in enumerate(experiments) if experiment.model_type == expert
+        ]
         errors = [experiments[at].error for at in places]
         colour = _EXPERTS[index % len(_EXPERTS)]
         axis.barh(places, errors, color=colour, height=0.72, label=expert.replace("_", " "))
@@ -369,17 +375,17 @@ def comparison_of_experiments(experiments: Sequence[Experiment]) -> Figure:
         error, style = experiments[0].overall[method], STYLES[method]
         line = {"color": style["color"], "ls": style["linestyle"]}
         axis.axvline(error, lw=2, label=LABELS[method], **line)
-    for place, one in enumerate(experiments):
+    for place, experiment in enumerate(experiments):
         # Beside the panel: at its bar's end a number would lie on the baselines that are near.
         axis.annotate(
-            f"{one.error:.3f}",
+            f"{experiment.error:.3f}",
             (1, place),
             xycoords=axis.get_yaxis_transform(),
             xytext=(6, 0),
             textcoords="offset points",
             va="center",
         )
-    axis.set_yticks(range(len(experiments)), [one.name for one in experiments])
+    axis.set_yticks(range(len(experiments)), [experiment.name for experiment in experiments])
     axis.invert_yaxis()
     axis.grid(axis="y", visible=False)
     axis.set_xlabel("mean absolute error on held-out ticks [training std] (left is better)")

@@ -68,5 +68,5 @@ def _where(stream: str, group: Sequence[Issue]) -> str:
     places, episodes = len(group), len({(issue.source, issue.episode) for issue in group})
     among = "1 episode" if episodes == 1 else f"{episodes:,} episodes"
     count = among if places == episodes else f"{places:,} places in {among}"
-    told = place_of(group[0]) if places == 1 else count
-    return " · ".join(part for part in (stream, told) if part)
+    words = place_of(group[0]) if places == 1 else count
+    return " · ".join(part for part in (stream, words) if part)

@@ -180,6 +180,11 @@ class _PageWriter:
         return Markup(svg)
 
 
+def sentence(words: str) -> str:
+    """Words of a table or a terminal with a capital and a full stop, to stand in a text."""
+    return f"{words[0].upper()}{words[1:]}."
+
+
 def prose(words: str) -> Markup:
     """Plain words with what stands in backticks as code."""
     return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(words))))

@@ -36,7 +36,7 @@ class Ages:
     episode has two ticks."""
 
 
-def ages(store: FeatureStore) -> Ages:
+def read_ages(store: FeatureStore) -> Ages:
     """Read all ticks in blocks; neither features nor readings are read."""
     views = tuple(store.streams["views"])
     newest = np.empty(store.ticks, np.float32)
@@ -51,9 +51,9 @@ def ages(store: FeatureStore) -> Ages:
     return Ages(newest, by_view, views, reuse, reuse * store.tick_step())
 
 
-def age_blocks(found: Ages) -> list[Block]:
+def show_ages(ages: Ages) -> list[Block]:
     """What an age is, its picture, and its spread for each view."""
-    ages_of = {"newest frame": found.newest, **dict(zip(found.views, found.by_view.T, strict=True))}
+    ages_of = {"newest frame": ages.newest, **dict(zip(ages.views, ages.by_view.T, strict=True))}
     finite = {name: age[np.isfinite(age)] for name, age in ages_of.items()}
     rows = [
         (name, *np.quantile(age, (0.01, 0.5, 0.99, 1.0)).tolist())
@@ -70,55 +70,55 @@ def age_blocks(found: Ages) -> list[Block]:
             "ages",
             "Share of the ticks by the age of what they see: of the newest frame, filled, and of "
             "each view's; the dashed line is the time of one VL row.",
-            partial(draw_ages, found),
+            partial(draw_ages, ages),
         ),
         Table(("age [s] of", "1 %", "median", "99 %", "oldest"), rows),
     ]
 
 
-def draw_ages(found: Ages) -> Figure:
+def draw_ages(ages: Ages) -> Figure:
     """How many ticks see features how old: since the newest frame, and since that of each view."""
     figure = canvas(8.5, 3.6)
     axis = figure.subplots()
-    every = np.concatenate([found.newest, found.by_view[np.isfinite(found.by_view)]])
-    low = min(0.0, float(every.min()))
-    edges = np.linspace(low, max(float(every.max()), low + 1e-3), _BINS + 1)
+    all_ages = np.concatenate([ages.newest, ages.by_view[np.isfinite(ages.by_view)]])
+    low = min(0.0, float(all_ages.min()))
+    edges = np.linspace(low, max(float(all_ages.max()), low + 1e-3), _BINS + 1)
 
     def shares(age: NDArray[np.float32]) -> NDArray[np.float64]:
         counts = np.histogram(age[np.isfinite(age)], edges)[0]
         return counts * (100 / max(1, counts.sum()))
 
     label = "newest frame (feature_age)"
-    newest = shares(found.newest)
+    newest = shares(ages.newest)
     axis.stairs(newest, edges, fill=True, color=PALETTE[0], alpha=0.55, label=label)
-    for column, name in enumerate(found.views):
+    for column, name in enumerate(ages.views):
         colour = PALETTE[(column + 1) % len(PALETTE)]
-        axis.stairs(shares(found.by_view[:, column]), edges, color=colour, lw=1.6, label=name)
-    if np.isfinite(found.period_s):
-        label = f"one VL row ({found.vlm_reuse_count} ticks)"
-        axis.axvline(found.period_s, color=INK, ls="--", lw=1.2, label=label)
+        axis.stairs(shares(ages.by_view[:, column]), edges, color=colour, lw=1.6, label=name)
+    if np.isfinite(ages.period_s):
+        label = f"one VL row ({ages.vlm_reuse_count} ticks)"
+        axis.axvline(ages.period_s, color=INK, ls="--", lw=1.2, label=label)
     axis.set_xlabel("age of what the model saw, at each tick [s]")
     axis.set_ylabel("ticks [%]")
     figure.legend(loc="outside lower center", ncols=5)
     return figure
 
 
-def age_issues(
-    store: FeatureStore, episodes: Sequence[EpisodeCoverage], found: Ages
+def find_age_issues(
+    store: FeatureStore, episodes: Sequence[EpisodeCoverage], ages: Ages
 ) -> Iterator[Issue]:
     """Frames from the future, and features far older than their VL row serves, by episode."""
-    limit = _STALE_PERIODS * found.period_s
+    limit = _STALE_PERIODS * ages.period_s
     for episode in episodes:
-        time, age = store.array("tick/time")[episode.ticks], found.newest[episode.ticks]
+        time, age = store.array("tick/time")[episode.ticks], ages.newest[episode.ticks]
         ahead, old = np.flatnonzero(age < -COARSEST_S), np.flatnonzero(age > limit)
         if len(ahead):
-            told = f"{len(ahead)} ticks see a frame taken after them, by up to {-age.min():.3f} s"
+            text = f"{len(ahead)} ticks see a frame taken after them, by up to {-age.min():.3f} s"
             span = _span(time, ahead)
-            yield episode.issue("frames from the future", "vl/frame_time", told, span, "error")
+            yield episode.issue("frames from the future", "vl/frame_time", text, span, "error")
         if len(old):
-            told = f"{len(old)} of {len(age)} ticks see features up to {age.max():.2f} s old; "
-            told += f"expected less than {limit:.2f} s, the time of {_STALE_PERIODS} VL rows"
-            yield episode.issue("old frames", "vl/frame_time", told, _span(time, old))
+            text = f"{len(old)} of {len(age)} ticks see features up to {age.max():.2f} s old; "
+            text += f"expected less than {limit:.2f} s, the time of {_STALE_PERIODS} VL rows"
+            yield episode.issue("old frames", "vl/frame_time", text, _span(time, old))
 
 
 def _span(time: NDArray[np.float64], ticks: NDArray[np.int64]) -> tuple[float, float]:

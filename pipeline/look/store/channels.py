@@ -27,7 +27,7 @@ _ARRAYS = {"action": "tick/action", "state": "state/values", "sensor": "sensor/v
 
 
 @dataclass(frozen=True)
-class StreamStatistics:
+class StreamSummary:
     """One stream over all episodes."""
 
     stream: str
@@ -40,15 +40,15 @@ class StreamStatistics:
     """What is wrong with channels that hardly move, as of a recording; never of the sensor."""
 
 
-def stream_statistics(
+def summarize_streams(
     store: FeatureStore, sample_bytes: int = SAMPLE_BYTES
-) -> tuple[StreamStatistics, ...]:
+) -> tuple[StreamSummary, ...]:
     """Of action, state and sensor, those that the store has.
 
     Of a stream that is larger than `sample_bytes` as float32, evenly spread readings are looked at:
     extremes that last shorter than the step between two can be missed.
     """
-    statistics: list[StreamStatistics] = []
+    statistics: list[StreamSummary] = []
     for stream, name in _ARRAYS.items():
         values = store.array(name)
         total = len(values)
@@ -57,10 +57,10 @@ def stream_statistics(
             channels = Channels(tuple(document["names"]), tuple(document["units"]))
             rows = evenly(total, max(2, sample_bytes // (4 * values.shape[1])))
             values = values[rows]
-            one_by_one = tuple(statistics_of(stream, channels.names, channels.units, values))
+            by_channel = tuple(statistics_of(stream, channels.names, channels.units, values))
             still = None if stream == "sensor" else still_channels(channels, values)
-            told = "" if still is None else still[1]
-            statistics.append(StreamStatistics(stream, total, len(rows), one_by_one, told))
+            text = "" if still is None else still[1]
+            statistics.append(StreamSummary(stream, total, len(rows), by_channel, text))
     return tuple(statistics)
 
 
@@ -70,31 +70,33 @@ def evenly(total: int, most: int) -> NDArray[np.int64]:
     return np.arange(count, dtype=np.int64) * total // max(1, count)
 
 
-def channel_blocks(statistics: Sequence[StreamStatistics]) -> list[Block]:
+def show_channels(statistics: Sequence[StreamSummary]) -> list[Block]:
     """How much was looked at, the profiles as a picture, and every channel in a table."""
     looked_at = ", ".join(
-        f"{one.stream}: all {one.rows:,} rows"
-        if one.looked_at == one.rows
-        else f"{one.stream}: {one.looked_at:,} of {one.rows:,}, evenly spread"
-        for one in statistics
+        f"{summary.stream}: all {summary.rows:,} rows"
+        if summary.looked_at == summary.rows
+        else f"{summary.stream}: {summary.looked_at:,} of {summary.rows:,}, evenly spread"
+        for summary in statistics
     )
-    table = statistics_table([channel for one in statistics for channel in one.channels])
+    table = statistics_table([channel for summary in statistics for channel in summary.channels])
     blocks: list[Block] = [
         Text(f"Over the whole store, before any normalisation. Looked at: {looked_at}."),
         replace(table, caption=table.caption.replace("Over the whole episode", "Physical units")),
     ]
-    if profiles := list(numbered_channels(statistics)):
+    if profiles := list(find_profiles(statistics)):
         caption = "Numbered channels side by side: median, 1 to 99 %, least and greatest."
         blocks.insert(1, Picture("wide_channels", caption, partial(draw_profiles, profiles)))
     return blocks
 
 
-def numbered_channels(
-    statistics: Sequence[StreamStatistics],
+def find_profiles(
+    statistics: Sequence[StreamSummary],
 ) -> Iterator[tuple[ChannelStatistics, ...]]:
     """Runs of channels that make a profile, such as an A-scan."""
     for stream in statistics:
-        for _, run in groupby(stream.channels, key=lambda one: (unnumbered(one.name), one.unit)):
+        for _, run in groupby(
+            stream.channels, key=lambda channel: (unnumbered(channel.name), channel.unit)
+        ):
             channels = tuple(run)
             if len(channels) >= PROFILE_CHANNELS:
                 yield channels
@@ -113,7 +115,10 @@ def draw_profiles(profiles: Sequence[Sequence[ChannelStatistics]]) -> Figure:
 
 def _band(axis: Axes, channels: Sequence[ChannelStatistics]) -> None:
     at, first = np.arange(len(channels)), channels[0]
-    lines = [(one.minimum, one.low, one.median, one.high, one.maximum) for one in channels]
+    lines = [
+        (channel.minimum, channel.low, channel.median, channel.high, channel.maximum)
+        for channel in channels
+    ]
     minimum, low, median, high, maximum = np.array(lines).T
     axis.fill_between(at, minimum, maximum, color=GRID, label="least to greatest")
     axis.fill_between(at, low, high, color=PALETTE[4], alpha=0.5, lw=0, label="1 to 99 %")
@@ -123,23 +128,24 @@ def _band(axis: Axes, channels: Sequence[ChannelStatistics]) -> None:
     axis.margins(x=0)
 
 
-def channel_issues(statistics: Sequence[StreamStatistics]) -> Iterator[Issue]:
+def find_channel_issues(statistics: Sequence[StreamSummary]) -> Iterator[Issue]:
     """Channels that never change, hardly move, or hold what is no number."""
     for stream in statistics:
         issue = partial(Issue, stream=stream.stream)
-        channels, names = stream.channels, [one.name for one in stream.channels]
+        channels, names = stream.channels, [channel.name for channel in stream.channels]
         # The gripper of pose-derived actions is 1 by definition.
         flat = [
             at
-            for at, one in enumerate(channels)
-            if one.minimum == one.maximum and (one.name, one.minimum) != ("gripper", 1)
+            for at, channel in enumerate(channels)
+            if channel.minimum == channel.maximum
+            and (channel.name, channel.minimum) != ("gripper", 1)
         ]
         if flat:
-            told = f"{named(names, flat)}: one value in all {stream.looked_at} rows looked at"
-            yield issue(severity="warning", kind="flat channel", message=told)
+            text = f"{named(names, flat)}: one value in all {stream.looked_at} rows looked at"
+            yield issue(severity="warning", kind="flat channel", message=text)
         if stream.still:
             yield issue(severity="warning", kind="still channel", message=stream.still)
-        broken = [at for at, one in enumerate(channels) if not np.isfinite(one.mean)]
+        broken = [at for at, channel in enumerate(channels) if not np.isfinite(channel.mean)]
         if broken:
-            told = f"{named(names, broken)}: NaN or infinite in {stream.looked_at} rows looked at"
-            yield issue(severity="error", kind="not finite", message=told)
+            text = f"{named(names, broken)}: NaN or infinite in {stream.looked_at} rows looked at"
+            yield issue(severity="error", kind="not finite", message=text)

@@ -66,33 +66,36 @@ def find_duplicates(store: FeatureStore) -> Duplicates:
     return Duplicates(len(keys), int((counts[key] > 1).sum()), tuple(pairs))
 
 
-def duplicate_blocks(found: Duplicates, episodes: Sequence[EpisodeCoverage]) -> list[Block]:
+def show_duplicates(duplicates: Duplicates, episodes: Sequence[EpisodeCoverage]) -> list[Block]:
     """How many rows there are twice, and in which episodes."""
     text = Text(
-        f"By their keys, {found.rows:,} of {found.total:,} VL rows have exactly the frames and "
-        f"prompt of another row; pairs of episodes with such rows: {len(found.pairs):,}."
+        f"By their keys, {duplicates.rows:,} of {duplicates.total:,} VL rows have exactly the "
+        "frames and prompt of another row; pairs of episodes with such rows: "
+        f"{len(duplicates.pairs):,}."
     )
-    if not found.pairs:
+    if not duplicates.pairs:
         return [text]
     rows = [
         (
             *(episodes[pair.first].name, pair.rows[0], pair.time_s[0]),
             *(episodes[pair.second].name, pair.rows[1], pair.time_s[1]),
         )
-        for pair in found.pairs[:_LISTED]
+        for pair in duplicates.pairs[:_LISTED]
     ]
-    count = len(found.pairs)
+    count = len(duplicates.pairs)
     shown = f"all {count:,}" if count <= _LISTED else f"the first {_LISTED} of {count:,}"
     heads = ("episode", "rows", "at [s]", "other episode", "rows ", "at [s] ")
     return [text, Table(heads, rows, f"Rows with equal keys, in different episodes: {shown}.")]
 
 
-def duplicate_issues(found: Duplicates, episodes: Sequence[EpisodeCoverage]) -> Iterator[Issue]:
+def find_duplicate_issues(
+    duplicates: Duplicates, episodes: Sequence[EpisodeCoverage]
+) -> Iterator[Issue]:
     """Pairs of episodes of which one says little that the other does not."""
-    for pair in found.pairs:
+    for pair in duplicates.pairs:
         if pair.share >= _SAME_SHARE:
-            told = f"{pair.rows[0]} of its VL rows have the very frames and prompt of "
-            told += f"{pair.rows[1]} rows of {episodes[pair.second].name}"
+            text = f"{pair.rows[0]} of its VL rows have the very frames and prompt of "
+            text += f"{pair.rows[1]} rows of {episodes[pair.second].name}"
             yield episodes[pair.first].issue(
-                "same recording", "vl/key", told, (pair.time_s[0], None)
+                "same recording", "vl/key", text, (pair.time_s[0], None)
             )

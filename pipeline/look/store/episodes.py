@@ -70,7 +70,7 @@ class EpisodeCoverage:
         )
 
 
-def coverage(store: FeatureStore) -> tuple[EpisodeCoverage, ...]:
+def read_coverage(store: FeatureStore) -> tuple[EpisodeCoverage, ...]:
     """Every episode, in the order of the store."""
     return tuple(_coverage_of(store, episode) for episode in store.episodes)
 
@@ -88,17 +88,17 @@ def _coverage_of(store: FeatureStore, episode: Episode) -> EpisodeCoverage:
     return EpisodeCoverage(episode, float(np.ptp(time)) if len(time) else 0.0, covered)
 
 
-def coverage_blocks(episodes: Sequence[EpisodeCoverage]) -> list[Block]:
+def show_coverage(episodes: Sequence[EpisodeCoverage]) -> list[Block]:
     """A row a source, the picture, and a row an episode."""
     caption = "Ticks see all streams and views, none of one (no …), or one in a share of them."
     if len(episodes) > ROWS:
         caption += f" The first {ROWS} of {len(episodes)} episodes."
     heads = ("source", "episode", "instruction", "ticks", "length [s]", "VL rows", "ticks see")
     rows: list[tuple[object, ...]] = []
-    for one in episodes[:ROWS]:
-        own = one.episode
-        counts = len(own.ticks), round(one.seconds, 2), len(own.vl_rows)
-        rows.append((own.source, own.id, own.instruction, *counts, _lacking(one.covered)))
+    for part in episodes[:ROWS]:
+        own = part.episode
+        counts = len(own.ticks), round(part.seconds, 2), len(own.vl_rows)
+        rows.append((own.source, own.id, own.instruction, *counts, _lacking(part.covered)))
     return [
         _sources(episodes),
         Picture(
@@ -118,16 +118,15 @@ def _sources(episodes: Sequence[EpisodeCoverage]) -> Table:
         parts["all"] = [*episodes]
     rows: list[tuple[object, ...]] = []
     for name, part in parts.items():
-        own = [one.episode for one in part]
-        formats = ", ".join(sorted({one.format for one in own}))
-        seconds = round(sum(one.seconds for one in part), 1)
-        vl_rows, readings, states = (
-            sum(len(getattr(one, kind)) for one in own)
-            for kind in ("vl_rows", "readings", "states")
+        own = [coverage.episode for coverage in part]
+        seconds = round(sum(coverage.seconds for coverage in part), 1)
+        formats = ", ".join(sorted({episode.format for episode in own}))
+        instructions = len({episode.instruction for episode in own})
+        ticks, *counts = (
+            sum(len(getattr(episode, kind)) for episode in own)
+            for kind in ("ticks", "vl_rows", "readings", "states")
         )
-        ticks = sum(len(one.ticks) for one in own)
-        told = len({one.instruction for one in own})
-        rows.append((name, formats, told, len(own), ticks, seconds, vl_rows, readings, states))
+        rows.append((name, formats, instructions, len(own), ticks, seconds, *counts))
     heads = ("source", "format", "instructions", "episodes", "ticks", "length [s]", "VL rows")
     strong = frozenset({len(rows) - 1} if len(parts) > 1 else ())
     return Table((*heads, "sensor readings", "state readings"), rows, strong=strong)
@@ -146,7 +145,7 @@ def _lacking(covered: Mapping[str, float]) -> str:
 def draw_coverage(episodes: Sequence[EpisodeCoverage]) -> Figure:
     """Length of each episode above, and below which streams and views its ticks see."""
     streams = list(episodes[0].covered)
-    source_of = [one.episode.source for one in episodes]
+    source_of = [episode.episode.source for episode in episodes]
     sources = list(dict.fromkeys(source_of))
     figure = canvas(9.0, 3.8 + 0.3 * len(streams))
     ratios = (2.2, 0.3 * len(streams) + 0.2)
@@ -157,7 +156,7 @@ def draw_coverage(episodes: Sequence[EpisodeCoverage]) -> Figure:
         above.bar(own, seconds, 0.9, color=PALETTE[number % len(PALETTE)], label=source)
     above.set_ylabel("length [s]")
     above.grid(axis="x", visible=False)
-    shares = np.array([[one.covered[name] for one in episodes] for name in streams])
+    shares = np.array([[episode.covered[name] for episode in episodes] for name in streams])
     # 0 absent, 1 seen by some ticks, 2 by all.
     levels = (shares > 0) + np.floor(shares)
     mesh = below.pcolormesh(
@@ -182,12 +181,14 @@ def draw_coverage(episodes: Sequence[EpisodeCoverage]) -> Figure:
 
 def mark_sources(axis: Axes, episodes: Sequence[EpisodeCoverage], line: str = INK) -> None:
     """Sources below an axis of episodes, parted by lines; the episodes' names where few."""
-    sources = [one.episode.source for one in episodes]
+    sources = [episode.episode.source for episode in episodes]
     starts = [at for at, source in enumerate(sources) if not at or source != sources[at - 1]]
     for start in starts[1:]:
         axis.axvline(start - 0.5, color=line, lw=1.0)
     if len(episodes) <= _NAMED_EPISODES:
-        names = [_short(one.episode.id if len(starts) == 1 else one.name) for one in episodes]
+        names = [
+            _short(episode.episode.id if len(starts) == 1 else episode.name) for episode in episodes
+        ]
         axis.set_xticks(range(len(episodes)), names, rotation=45, ha="right")
         return
     spans = list(zip(starts, [*starts[1:], len(episodes)], strict=True))
@@ -202,15 +203,17 @@ def _short(name: str) -> str:
     return name if len(name) <= begin + end + 1 else f"{name[:begin]}…{name[-end:]}"
 
 
-def episode_issues(store: FeatureStore, episodes: Sequence[EpisodeCoverage]) -> Iterator[Issue]:
+def find_episode_issues(
+    store: FeatureStore, episodes: Sequence[EpisodeCoverage]
+) -> Iterator[Issue]:
     """Gaps, short episodes, missing streams and views, instructions that stand out."""
-    there = {name for one in episodes for name, share in one.covered.items() if share}
+    there = {name for episode in episodes for name, share in episode.covered.items() if share}
     for episode in episodes:
         time = store.array("tick/time")[episode.ticks]
         yield from _gaps(episode, time)
         if len(time) < FEW_TICKS:
-            told = f"{len(time)} ticks ({episode.seconds:.1f} s); expected at least {FEW_TICKS}"
-            yield episode.issue("short episode", "ticks", told)
+            text = f"{len(time)} ticks ({episode.seconds:.1f} s); expected at least {FEW_TICKS}"
+            yield episode.issue("short episode", "ticks", text)
         if len(time):
             yield from _missing(episode, there)
     yield from _instructions(episodes)
@@ -223,10 +226,10 @@ def _gaps(episode: EpisodeCoverage, time: NDArray[np.float64]) -> Iterator[Issue
     gaps = np.flatnonzero(steps > _GAP_STEPS * usual)
     if usual > 0 and len(gaps):
         at = int(steps.argmax())
-        told = f"{len(gaps)} gap{'s' * (len(gaps) > 1)}, the widest {steps[at]:.2f} s without a "
-        told += f"tick; a step is usually {usual:.3f} s"
+        text = f"{len(gaps)} gap{'s' * (len(gaps) > 1)}, the widest {steps[at]:.2f} s without a "
+        text += f"tick; a step is usually {usual:.3f} s"
         span = (float(time[at] - time[0]), float(time[at + 1] - time[0]))
-        yield episode.issue("gap", "ticks", told, span)
+        yield episode.issue("gap", "ticks", text, span)
 
 
 def _missing(episode: EpisodeCoverage, there: Collection[str]) -> Iterator[Issue]:
@@ -242,17 +245,17 @@ def _missing(episode: EpisodeCoverage, there: Collection[str]) -> Iterator[Issue
 def _instructions(episodes: Sequence[EpisodeCoverage]) -> Iterator[Issue]:
     """No instruction, or one that stands out in its source."""
     by_source: dict[str, Counter[str]] = defaultdict(Counter)
-    for one in episodes:
-        by_source[one.episode.source][one.episode.instruction] += 1
+    for episode in episodes:
+        by_source[episode.episode.source][episode.episode.instruction] += 1
     usual = {source: counts.most_common(1)[0] for source, counts in by_source.items()}
     totals = {source: counts.total() for source, counts in by_source.items()}
-    for one in episodes:
-        source, words = one.episode.source, one.episode.instruction
+    for episode in episodes:
+        source, words = episode.episode.source, episode.episode.instruction
         (most, often), total = usual[source], totals[source]
         rare = by_source[source][words] <= max(1, _RARE * total) < often
         if not words.strip():
-            told = "the prompt says nothing of the task; set `instruction` of its data source"
-            yield one.issue("no instruction", "instruction", told)
+            text = "the prompt says nothing of the task; set `instruction` of its data source"
+            yield episode.issue("no instruction", "instruction", text)
         elif rare and often >= _USUAL * total:
-            told = f"{words!r}; {often} of {total} episodes of this source say {most!r}"
-            yield one.issue("other instruction", "instruction", told)
+            text = f"{words!r}; {often} of {total} episodes of this source say {most!r}"
+            yield episode.issue("other instruction", "instruction", text)

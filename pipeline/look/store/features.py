@@ -153,16 +153,16 @@ def _variation(values: NDArray[np.float32]) -> float:
     return float(np.median(spread / np.maximum(size, _TINY)))
 
 
-def feature_blocks(found: FeatureNorms, episodes: Sequence[EpisodeCoverage]) -> list[Block]:
+def show_features(norms: FeatureNorms, episodes: Sequence[EpisodeCoverage]) -> list[Block]:
     """How many rows were looked at, and how long their features are."""
-    sampled = found.sampled
+    sampled = norms.sampled
     words = "Looked at: all VL rows"
     if len(sampled.rows) < sampled.total:
         words = f"Looked at: {len(sampled.rows):,} of {sampled.total:,} VL rows, the same moments "
         words += "of each episode (`inspect.points`)"
-    if broken := int(found.broken.any(axis=1).sum()):
+    if broken := int(norms.broken.any(axis=1).sum()):
         words += f", but for what is not finite in {broken:,} of them"
-    if not np.isfinite(found.norm).any():
+    if not np.isfinite(norms.norm).any():
         return [Text(f"{words}; none has features that are numbers.")]
     return [
         Text(f"{words}. Of augmented variants, plain frames only."),
@@ -170,28 +170,28 @@ def feature_blocks(found: FeatureNorms, episodes: Sequence[EpisodeCoverage]) -> 
             "norms",
             "Left: how long the features of each slot are. Right: their median length in each "
             "episode divided by that in all; a column that stands out is an episode unlike others.",
-            partial(draw_norms, found, episodes),
+            partial(draw_norms, norms, episodes),
         ),
     ]
 
 
-def draw_norms(found: FeatureNorms, episodes: Sequence[EpisodeCoverage]) -> Figure:
+def draw_norms(norms: FeatureNorms, episodes: Sequence[EpisodeCoverage]) -> Figure:
     """Length of the features: by slot on the left, by slot and episode on the right."""
-    slots = len(found.names)
+    slots = len(norms.names)
     figure = canvas(9.5, 3.0 + min(5.0, 0.3 * slots))
     left, right = figure.subplots(1, 2, sharey=True, gridspec_kw={"width_ratios": (1, 1.7)})
     at = np.arange(slots)
-    low, middle, high = _quantiles(found.norm, (0.01, 0.5, 0.99))
+    low, middle, high = _quantiles(norms.norm, (0.01, 0.5, 0.99))
     left.hlines(at, low, high, color=PALETTE[4], lw=min(5.0, 160 / slots), label="1 to 99 %")
     left.plot(middle, at, "o", color=PALETTE[0], ms=min(5.0, 120 / slots), label="median")
-    row, slot = np.nonzero(outliers(found) > 0)
+    row, slot = np.nonzero(find_outliers(norms) > 0)
     if len(row):
-        far = found.norm[row, slot]
+        far = norms.norm[row, slot]
         left.plot(far, slot, "x", color=PALETTE[5], label="outlier", zorder=4)
     left.set_xlabel("norm of the features")
     left.set_ylim(slots - 0.5, -0.5)
-    _name_slots(left, found.names)
-    _draw_by_episode(figure, right, found, episodes, middle)
+    _name_slots(left, norms.names)
+    _draw_by_episode(figure, right, norms, episodes, middle)
     figure.legend(*left.get_legend_handles_labels(), loc="outside lower left", ncols=3)
     return figure
 
@@ -199,14 +199,14 @@ def draw_norms(found: FeatureNorms, episodes: Sequence[EpisodeCoverage]) -> Figu
 def _draw_by_episode(
     figure: Figure,
     axis: Axes,
-    found: FeatureNorms,
+    norms: FeatureNorms,
     episodes: Sequence[EpisodeCoverage],
     middle: NDArray[np.float64],
 ) -> None:
     """The median length in each episode beside that over all, as a map."""
     ratio = np.full((len(middle), len(episodes)), np.nan)
-    for index in np.unique(found.sampled.episode):
-        (median,) = _quantiles(found.norm[found.sampled.episode == index], (0.5,))
+    for index in np.unique(norms.sampled.episode):
+        (median,) = _quantiles(norms.norm[norms.sampled.episode == index], (0.5,))
         ratio[:, index] = median / middle
     most = max(0.02, *np.abs(ratio[np.isfinite(ratio)] - 1))
     axis.set_facecolor(GRID)
@@ -250,13 +250,13 @@ def _without_cell(name: str) -> str:
     return stem if "," in last else name
 
 
-def outliers(found: FeatureNorms) -> NDArray[np.float64]:
+def find_outliers(norms: FeatureNorms) -> NDArray[np.float64]:
     """(row, slot) robust deviations of a norm that is far from its slot's median, else 0.
 
     Far is further than ten deviations (1.4826 x the median distance) and than half of the median:
     Iglewicz and Hoaglin's score, with a wider bound as norms are many.
     """
-    norm = np.ma.masked_invalid(found.norm.astype(np.float64))
+    norm = np.ma.masked_invalid(norms.norm.astype(np.float64))
     median = np.ma.median(norm, axis=0)
     distance = np.abs(norm - median)
     deviations = distance / np.maximum(1.4826 * np.ma.median(distance, axis=0), _TINY)
@@ -264,48 +264,50 @@ def outliers(found: FeatureNorms) -> NDArray[np.float64]:
     return np.ma.where(far, deviations, 0).filled(0)
 
 
-def feature_issues(found: FeatureNorms, episodes: Sequence[EpisodeCoverage]) -> Iterator[Issue]:
+def find_feature_issues(
+    norms: FeatureNorms, episodes: Sequence[EpisodeCoverage]
+) -> Iterator[Issue]:
     """Dead slots, odd lengths and what is no number; times are s since the episode's first tick."""
-    dead = np.flatnonzero(found.variation < DEAD).tolist()
+    dead = np.flatnonzero(norms.variation < DEAD).tolist()
     if dead:
-        told = f"{named(found.names, dead)}: the same in all {len(found.sampled.rows)} VL rows "
-        told += "looked at; expected features that follow the scene (is a camera dead, or its view "
-        told += "black?)"
-        yield Issue(severity="warning", kind="dead slot", message=told, stream=FEATURES)
-    far = outliers(found)
+        text = f"{named(norms.names, dead)}: the same in all {len(norms.sampled.rows)} VL rows "
+        text += "looked at; expected features that follow the scene (is a camera dead, or its view "
+        text += "black?)"
+        yield Issue(severity="warning", kind="dead slot", message=text, stream=FEATURES)
+    far = find_outliers(norms)
     for index, episode in enumerate(episodes):
-        own = np.flatnonzero(found.sampled.episode == index)
+        own = np.flatnonzero(norms.sampled.episode == index)
         if len(own):
-            yield from _issues_of(episode, found, own, far)
+            yield from _issues_of(episode, norms, own, far)
 
 
 def _issues_of(
     episode: EpisodeCoverage,
-    found: FeatureNorms,
+    norms: FeatureNorms,
     own: NDArray[np.int64],
     far: NDArray[np.float64],
 ) -> Iterator[Issue]:
     """Of the rows `own` of an episode."""
-    time = found.sampled.time[own]
-    row, slot = np.nonzero(found.broken[own])
+    time = norms.sampled.time[own]
+    row, slot = np.nonzero(norms.broken[own])
     if len(row):
-        told = f"{len(np.unique(row))} VL row(s) with features that are NaN or infinite, the first "
-        told += f"in slot {found.names[slot[0]]} at {time[row[0]]:.2f} s; left out of all that is "
-        told += "shown of features. Training refuses them: extract these rows anew"
+        text = f"{len(np.unique(row))} VL row(s) with features that are NaN or infinite, the first "
+        text += f"in slot {norms.names[slot[0]]} at {time[row[0]]:.2f} s; left out of all that is "
+        text += "shown of features. Training refuses them: extract these rows anew"
         span = (float(time[row[0]]), float(time[row[-1]]))
-        yield episode.issue("not finite", FEATURES, told, span, "error")
-    index = int(found.sampled.episode[own[0]])
-    still = (found.within[index] < DEAD) & (found.variation >= DEAD)
+        yield episode.issue("not finite", FEATURES, text, span, "error")
+    index = int(norms.sampled.episode[own[0]])
+    still = (norms.within[index] < DEAD) & (norms.variation >= DEAD)
     if still.any() and len(own) >= _STILL_ROWS:
-        told = f"{named(found.names, np.flatnonzero(still).tolist())}: the same in all {len(own)} "
-        told += "VL rows looked at of this episode; expected them to follow the scene"
-        yield episode.issue("still features", FEATURES, told)
+        text = f"{named(norms.names, np.flatnonzero(still).tolist())}: the same in all {len(own)} "
+        text += "VL rows looked at of this episode; expected them to follow the scene"
+        yield episode.issue("still features", FEATURES, text)
     row, slot = np.nonzero(far[own])
     if len(row):
         worst = far[own][row, slot].argmax()
-        norms, name = found.norm[:, slot[worst]], found.names[slot[worst]]
-        told = f"{len(row)} feature norm(s) far from the rest, the furthest "
-        told += f"{norms[own[row[worst]]]:.4g} in slot {name}, of which the median is "
-        told += f"{np.nanmedian(norms):.4g}"
+        column, name = norms.norm[:, slot[worst]], norms.names[slot[worst]]
+        text = f"{len(row)} feature norm(s) far from the rest, the furthest "
+        text += f"{column[own[row[worst]]]:.4g} in slot {name}, of which the median is "
+        text += f"{np.nanmedian(column):.4g}"
         span = (float(time[row[0]]), float(time[row[-1]]))
-        yield episode.issue("feature norm", FEATURES, told, span)
+        yield episode.issue("feature norm", FEATURES, text, span)

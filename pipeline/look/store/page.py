@@ -11,34 +11,34 @@ from pipeline.base.errors import StoreIncomplete
 from pipeline.base.format import duration, size
 from pipeline.base.issue import Issue
 from pipeline.look.page.blocks import Block, Document, Issues, Report, Section, Text
-from pipeline.look.store.ages import Ages, age_blocks, age_issues, ages
+from pipeline.look.store.ages import Ages, find_age_issues, read_ages, show_ages
 from pipeline.look.store.channels import (
-    StreamStatistics,
-    channel_blocks,
-    channel_issues,
-    stream_statistics,
+    StreamSummary,
+    find_channel_issues,
+    show_channels,
+    summarize_streams,
 )
 from pipeline.look.store.duplicates import (
     Duplicates,
-    duplicate_blocks,
-    duplicate_issues,
+    find_duplicate_issues,
     find_duplicates,
+    show_duplicates,
 )
 from pipeline.look.store.episodes import (
     EpisodeCoverage,
-    coverage,
-    coverage_blocks,
-    episode_issues,
+    find_episode_issues,
+    read_coverage,
+    show_coverage,
 )
 from pipeline.look.store.features import (
     FeatureNorms,
     check_rows,
-    feature_blocks,
-    feature_issues,
+    find_feature_issues,
     look_at_features,
     sample_rows,
+    show_features,
 )
-from pipeline.look.store.sizes import ArraySize, array_sizes, size_table
+from pipeline.look.store.sizes import ArraySize, read_sizes, tabulate_sizes
 from pipeline.store import FeatureStore
 from pipeline.store.chunks import ChunkFiles
 from pipeline.store.gather import WIDE
@@ -60,7 +60,7 @@ class StoreView:
     sizes: tuple[ArraySize, ...]
     features: FeatureNorms
     duplicates: Duplicates
-    statistics: tuple[StreamStatistics, ...]
+    statistics: tuple[StreamSummary, ...]
     issues: tuple[Issue, ...]
     """One of the whole store names no episode."""
 
@@ -79,16 +79,16 @@ def inspect_store(path: str | Path, params: InspectParams) -> StoreView:
     store = _open_checked(Path(path))
     sampled = sample_rows(store, params.points)
     check_rows(store, sampled.rows)
-    episodes, age, statistics = coverage(store), ages(store), stream_statistics(store)
+    episodes, age, statistics = read_coverage(store), read_ages(store), summarize_streams(store)
     features, duplicates = look_at_features(store, sampled), find_duplicates(store)
     issues = [
-        *episode_issues(store, episodes),
-        *age_issues(store, episodes, age),
-        *channel_issues(statistics),
-        *feature_issues(features, episodes),
-        *duplicate_issues(duplicates, episodes),
+        *find_episode_issues(store, episodes),
+        *find_age_issues(store, episodes, age),
+        *find_channel_issues(statistics),
+        *find_feature_issues(features, episodes),
+        *find_duplicate_issues(duplicates, episodes),
     ]
-    sizes = array_sizes(store.path)
+    sizes = read_sizes(store.path)
     return StoreView(store, episodes, age, sizes, features, duplicates, statistics, tuple(issues))
 
 
@@ -125,12 +125,12 @@ def store_report(view: StoreView) -> Report:
         tiles=_tiles(view),
         sections=(
             Section("What looks wrong", [_issues(view), _checked(view)]),
-            Section("Coverage", coverage_blocks(view.episodes)),
-            Section("Age of the features", age_blocks(view.ages)),
-            Section("Size", [size_table(view.sizes)]),
-            Section("Features", feature_blocks(view.features, view.episodes)),
-            Section("Duplicates", duplicate_blocks(view.duplicates, view.episodes)),
-            Section("Channels", channel_blocks(view.statistics)),
+            Section("Coverage", show_coverage(view.episodes)),
+            Section("Age of the features", show_ages(view.ages)),
+            Section("Size", [tabulate_sizes(view.sizes)]),
+            Section("Features", show_features(view.features, view.episodes)),
+            Section("Duplicates", show_duplicates(view.duplicates, view.episodes)),
+            Section("Channels", show_channels(view.statistics)),
             Section("What it was made of", _documents(store)),
         ),
     )
@@ -139,10 +139,10 @@ def store_report(view: StoreView) -> Report:
 def _tiles(view: StoreView) -> list[tuple[str, str]]:
     return [
         ("episodes", f"{len(view.episodes):,}"),
-        ("length", duration(sum(one.seconds for one in view.episodes))),
+        ("length", duration(sum(episode.seconds for episode in view.episodes))),
         ("ticks", f"{view.store.ticks:,}"),
         ("VL rows", f"{view.features.sampled.total:,}"),
-        ("on the disk", size(sum(one.disk_bytes for one in view.sizes))),
+        ("on the disk", size(sum(array.disk_bytes for array in view.sizes))),
         ("findings", f"{len(view.issues):,}"),
     ]
 
@@ -169,10 +169,10 @@ def _checked(view: StoreView) -> Text:
 
 def _documents(store: FeatureStore) -> list[Block]:
     computed = {
-        f"VL rows {one['rows'][0]} to {one['rows'][1] - 1}": {
-            name: value for name, value in one.items() if name != "rows"
+        f"VL rows {entry['rows'][0]} to {entry['rows'][1] - 1}": {
+            name: value for name, value in entry.items() if name != "rows"
         }
-        for one in store.attrs["environment"]
+        for entry in store.attrs["environment"]
     }
     streams = {
         name: document if name == "views" else _stream(document)

@@ -25,7 +25,7 @@ class ArraySize:
     """Blocks that its files take: values, padding of the last chunk, and trailers."""
 
 
-def array_sizes(path: Path) -> tuple[ArraySize, ...]:
+def read_sizes(path: Path) -> tuple[ArraySize, ...]:
     """Every array, the largest on the disk first; together they are all files below `path`."""
     disk: dict[str, int] = defaultdict(int)
     for file in path.rglob("*"):
@@ -44,19 +44,19 @@ def array_sizes(path: Path) -> tuple[ArraySize, ...]:
         for name, spec in read_specs(path).items()
     ]
     sizes.append(ArraySize(METADATA, (), "", 0, disk[METADATA]))
-    return tuple(sorted(sizes, key=lambda one: one.disk_bytes, reverse=True))
+    return tuple(sorted(sizes, key=lambda array: array.disk_bytes, reverse=True))
 
 
-def size_table(sizes: Sequence[ArraySize]) -> Table:
+def tabulate_sizes(sizes: Sequence[ArraySize]) -> Table:
     """A row an array."""
-    total = max(1, sum(one.disk_bytes for one in sizes))
+    total = max(1, sum(array.disk_bytes for array in sizes))
     rows = [
         (
-            one.name,
-            " × ".join(f"{count:,}" for count in one.shape),
-            *(one.dtype, one.chunks, one.disk_bytes / 2**20, 100 * one.disk_bytes / total),
+            array.name,
+            " × ".join(f"{count:,}" for count in array.shape),
+            *(array.dtype, array.chunks, array.disk_bytes / 2**20, 100 * array.disk_bytes / total),
         )
-        for one in sizes
+        for array in sizes
     ]
     heads = ("array", "shape", "dtype", "chunks", "on the disk [MiB]", "share [%]")
     return Table(heads, rows, "Bytes on the disk by array.")

@@ -16,7 +16,8 @@ from pipeline.evaluate.episode_frames import Footage
 from pipeline.evaluate.evaluation import Evaluation, judged_document
 from pipeline.evaluate.experiments import Experiment
 from pipeline.look.evaluation import page as evaluation_page
-from pipeline.look.evaluation.page import comparison_report, evaluation_report
+from pipeline.look.evaluation.comparison import comparison_report
+from pipeline.look.evaluation.page import evaluation_report
 from pipeline.look.page.blocks import Document, Picture, Report, Section
 from pipeline.look.page.writing import PAGE, write_report
 from pipeline.policy.checkpoint import PolicyCheckpoint

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from pipeline.base.config import InspectParams
 from pipeline.look.page.style import INK, RC, write
 from pipeline.look.store.ages import draw_ages
-from pipeline.look.store.channels import draw_profiles, numbered_channels
+from pipeline.look.store.channels import draw_profiles, find_profiles
 from pipeline.look.store.episodes import draw_coverage
 from pipeline.look.store.features import draw_norms
 from pipeline.look.store.page import StoreView, inspect_store
@@ -87,7 +87,7 @@ def test_ages_are_shares_of_all_ticks(flawed):
 
 
 def test_numbered_channels_are_drawn_together(flawed):
-    profiles = list(numbered_channels(flawed.statistics))
+    profiles = list(find_profiles(flawed.statistics))
     assert [(one[0].name, one[-1].name, len(one)) for one in profiles] == [
         ("sensor_0", "sensor_39", 40)
     ]

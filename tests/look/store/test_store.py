@@ -14,8 +14,8 @@ import pytest
 
 from pipeline.base.config import InspectParams
 from pipeline.base.errors import StoreIncomplete, StoreMismatch
-from pipeline.look.store.channels import stream_statistics
-from pipeline.look.store.episodes import EpisodeCoverage, episode_issues
+from pipeline.look.store.channels import summarize_streams
+from pipeline.look.store.episodes import EpisodeCoverage, find_episode_issues
 from pipeline.look.store.features import look_at_features, read_slot, sample_rows
 from pipeline.look.store.page import StoreView, inspect_store
 from pipeline.store import Episode, FeatureStore
@@ -136,7 +136,7 @@ class TestFacts:
         whole, limit = store.array("sensor/values").nbytes, 2**18
         assert whole > 8e6
         tracemalloc.start()
-        found = stream_statistics(store, limit)
+        found = summarize_streams(store, limit)
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         sensor = next(one for one in found if one.stream == "sensor")
@@ -295,7 +295,7 @@ class TestIssues:
         ]
         store: Any = SimpleNamespace(array=lambda name: np.empty(0))
         begin = time.process_time()
-        found = {one.kind for one in episode_issues(store, episodes)}
+        found = {one.kind for one in find_episode_issues(store, episodes)}
         assert time.process_time() - begin < 4
         assert found == {"short episode"}
 
