@@ -8,7 +8,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from pipeline.evaluate.curves import Curve, Curves
-from pipeline.look.evaluation.draw_curves import curves
+from pipeline.look.evaluation.pictures import curves
 from pipeline.look.page import style
 from pipeline.look.recording.facts import Clock
 from pipeline.look.recording.pictures import clock_steps

@@ -14,12 +14,11 @@ import pytest
 
 from pipeline.base.config import InspectParams
 from pipeline.base.errors import StoreIncomplete, StoreMismatch
-from pipeline.look.store.coverage import Ages, EpisodeCoverage
-from pipeline.look.store.facts import StoreView, inspect_store
+from pipeline.look.store.channels import summarize_streams
+from pipeline.look.store.episodes import EpisodeCoverage, find_episode_issues
 from pipeline.look.store.features import look_at_features, read_slot, sample_rows
-from pipeline.look.store.flaws import episode_flaws
-from pipeline.look.store.statistics import stream_statistics
-from pipeline.store import FeatureStore
+from pipeline.look.store.page import StoreView, inspect_store
+from pipeline.store import Episode, FeatureStore
 from pipeline.store.metadata import note_metadata
 
 ROWS = 10
@@ -61,12 +60,12 @@ def look(path: Path, **params: Any) -> StoreView:
 
 
 def kinds(view: StoreView) -> list[tuple[str, str, str]]:
-    return [(one.kind, one.source, one.episode) for one in view.flaws]
+    return [(one.kind, one.source, one.episode) for one in view.issues]
 
 
 class TestFacts:
-    def test_a_sound_store_has_no_flaw(self, path):
-        assert look(path).flaws == ()
+    def test_a_sound_store_has_no_issue(self, path):
+        assert look(path).issues == ()
 
     def test_ages_are_those_that_gather_gives(self, path, plant):
         plant(path, "vl/frame_time", lambda shown: shown.__setitem__(3, np.nan))
@@ -82,7 +81,9 @@ class TestFacts:
     def test_sizes_are_all_bytes_on_the_disk(self, path):
         view = look(path)
         files = [Path(folder, name) for folder, _, names in os.walk(path) for name in names]
-        assert view.disk_bytes == sum(file.stat().st_blocks * 512 for file in files)
+        assert sum(one.disk_bytes for one in view.sizes) == sum(
+            file.stat().st_blocks * 512 for file in files
+        )
         assert sum(one.chunks for one in view.sizes) == sum(
             file.name != "zarr.json" for file in files
         )
@@ -92,13 +93,7 @@ class TestFacts:
     def test_coverage_is_counted_by_episode(self, path, plant):
         plant(path, "vl/frame_time", lambda shown: shown.__setitem__(slice(0, ROWS // 2), np.nan))
         first, second, *_ = look(path).episodes
-        assert (first.name, first.source, first.ticks, first.vl_rows) == (
-            "left/episode_000",
-            "left",
-            30,
-            ROWS,
-        )
-        assert first.readings == {"sensor": 240, "state": 120}
+        assert (first.name, first.ticks) == ("left/episode_000", slice(0, 30))
         assert first.covered == {"sensor": 1.0, "state": 1.0, "View1": 0.5}
         assert second.covered["View1"] == 1
         assert first.seconds == pytest.approx(2.9)
@@ -121,9 +116,9 @@ class TestFacts:
         attributes(path, two_variants)
         plant(path, "vl/features", lambda rows: rows.__setitem__((slice(None), slice(2, 4)), 1e6))
         view = look(path)
-        assert view.variants == 2
-        assert view.norms.norm.shape == (6 * ROWS, 2)
-        assert view.norms.norm.max() < 100
+        assert view.store.variants == 2
+        assert view.features.norm.shape == (6 * ROWS, 2)
+        assert view.features.norm.max() < 100
 
     def test_statistics_are_those_of_the_whole_stream(self, path):
         values = FeatureStore.open(path).array("state/values")
@@ -141,7 +136,7 @@ class TestFacts:
         whole, limit = store.array("sensor/values").nbytes, 2**18
         assert whole > 8e6
         tracemalloc.start()
-        found = stream_statistics(store, limit)
+        found = summarize_streams(store, limit)
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         sensor = next(one for one in found if one.stream == "sensor")
@@ -164,80 +159,22 @@ class TestFacts:
             look(archive)
 
 
-class TestProjection:
-    def test_it_is_that_of_a_singular_value_decomposition(self, path):
-        store, found = FeatureStore.open(path), look(path).projection
-        features = store.array("vl/features").reshape(6 * ROWS, -1).astype(np.float64)
-        left, values, _ = np.linalg.svd(features - features.mean(axis=0), full_matrices=False)
-        expected = left[:, :2] * values[:2]
-        expected *= np.sign(expected[np.abs(expected).argmax(axis=0), [0, 1]])
-        assert found.points == pytest.approx(expected, abs=1e-3)
-        assert found.explained == pytest.approx(values[:2] ** 2 / (values**2).sum(), rel=1e-4)
-        assert found.progress[[0, ROWS - 1, ROWS]].tolist() == [0, 1, 0]
-        assert found.time[[0, 1, ROWS]] == pytest.approx([0, 0.3, 0])
-        assert found.source[[0, ROWS, -1]].tolist() == [0, 1, 1]
-
-    def test_rows_are_spread_evenly_over_the_store(self, tiny_store, tmp_path):
-        view = look(tiny_store(tmp_path, episodes=30), points=100)
-        assert len(view.sampled.rows) == len(view.projection.points) == 90
-        assert view.sampled.total == 300
-        assert view.sampled.rows[:6].tolist() == [0, 4, 8, 10, 14, 18]
+class TestSampledRows:
+    def test_they_are_spread_evenly_over_the_store(self, tiny_store, tmp_path):
+        sampled = look(tiny_store(tmp_path, episodes=30), points=100).features.sampled
+        assert (len(sampled.rows), sampled.total) == (90, 300)
+        assert sampled.rows[:6].tolist() == [0, 4, 8, 10, 14, 18]
+        assert sampled.time[:4] == pytest.approx([0, 1.2, 2.4, 0])
 
     def test_of_more_episodes_than_rows_to_look_at_some_are_left_out(self, tiny_store, tmp_path):
         store = FeatureStore.open(tiny_store(tmp_path, episodes=30))
-        found = sample_rows(store, 15)
-        assert found.rows.tolist() == list(range(0, 300, 2 * ROWS))
-        assert set(found.progress) == {0}
-
-    def test_the_sign_of_an_axis_does_not_hang_on_rounding(self, tiny_store, tmp_path):
-        view = look(tiny_store(tmp_path, episodes=1, ticks=6))
-        (first, second), _ = view.projection.points.T
-        assert first > 0 and first == pytest.approx(-second)
-
-    def test_features_that_are_all_the_same_lie_in_one_point(self, path, plant):
-        plant(path, "vl/features", lambda rows: rows.__setitem__(slice(None), 2.0))
-        view = look(path)
-        assert not view.projection.points.any() and view.projection.explained == (0, 0)
-        assert (view.duplicates.within, view.duplicates.across) == (0, 0)
+        assert sample_rows(store, 15).rows.tolist() == list(range(0, 300, 2 * ROWS))
 
 
 class TestDuplicates:
     def test_nothing_is_found_where_all_rows_differ(self, path):
         found = look(path).duplicates
-        assert (found.within, found.across, found.still, found.twins) == (0, 0, (), ())
-        assert (found.equal_rows, found.equal_twins) == (0, ())
-
-    def test_a_recording_that_is_there_twice_is_found_and_nothing_else(self, path, plant):
-        def twice(rows: np.ndarray) -> None:
-            rows[4 * ROWS : 5 * ROWS] = rows[ROWS : 2 * ROWS] * (1 + 1e-5)
-
-        plant(path, "vl/features", twice)
-        view = look(path)
-        (twins,) = view.duplicates.twins
-        assert (twins.first, twins.second) == ("right/episode_001", "left/episode_004")
-        assert (twins.rows, twins.share) == ((ROWS, ROWS), 1)
-        assert twins.time_s[0] == pytest.approx(twins.time_s[1])
-        assert (view.duplicates.within, view.duplicates.across) == (0, 2 * ROWS)
-        alike = np.argwhere(view.duplicates.likeness > 0.9999).tolist()
-        assert alike == [[1, 4], [4, 1]]
-        assert kinds(view) == [("near-duplicate episodes", "right", "episode_001")]
-
-    def test_a_recording_that_is_there_twice_is_found_where_few_rows_are_looked_at(
-        self, tiny_store, tmp_path, plant
-    ):
-        path = tiny_store(tmp_path, episodes=13)
-        plant(path, "vl/features", lambda rows: rows.__setitem__(slice(80, 90), rows[10:20]))
-        (twins,) = look(path, points=100, duplicate_similarity=1).duplicates.twins
-        assert (twins.first, twins.second) == ("right/episode_001", "left/episode_008")
-        assert (twins.rows, twins.time_s[0]) == ((5, 5), twins.time_s[1])
-
-    def test_a_still_scene_is_found_where_it_is(self, path, plant):
-        plant(path, "vl/features", lambda rows: rows.__setitem__(slice(23, 27), rows[23]))
-        found = look(path).duplicates
-        (still,) = found.still
-        assert (still.episode, still.rows) == ("left/episode_002", 4)
-        assert (still.start_s, still.stop_s) == pytest.approx((0.9, 1.8))
-        assert (found.within, found.across, found.twins) == (4, 0, ())
+        assert (found.rows, found.pairs) == (0, ())
 
     def test_equal_keys_are_found_whatever_the_features(self, path, plant):
         def same(keys: np.ndarray) -> None:
@@ -245,23 +182,19 @@ class TestDuplicates:
 
         plant(path, "vl/key", same)
         view = look(path)
-        (twins,) = view.duplicates.equal_twins
-        assert (twins.first, twins.second, twins.rows) == (
-            "left/episode_000",
-            "right/episode_005",
-            (6, 6),
-        )
-        assert twins.share == pytest.approx(0.6)
-        assert twins.time_s == pytest.approx((0.6, 0))
-        assert view.duplicates.equal_rows == 12
+        (pair,) = view.duplicates.pairs
+        assert (pair.first, pair.second, pair.rows) == (0, 5, (6, 6))
+        assert pair.share == pytest.approx(0.6)
+        assert pair.time_s == pytest.approx((0.6, 0))
+        assert view.duplicates.rows == 12
         assert kinds(view) == [("same recording", "left", "episode_000")]
 
     def test_of_a_key_that_all_have_the_pairs_are_as_many_as_the_episodes(self, path, plant):
         plant(path, "vl/key", lambda keys: keys.__setitem__(slice(None), keys[0]))
         found = look(path).duplicates
-        assert {one.first for one in found.equal_twins} == {"left/episode_000"}
-        assert (found.equal_twins_count, found.equal_rows) == (5, 6 * ROWS)
-        assert {one.rows for one in found.equal_twins} == {(ROWS, ROWS)}
+        assert [(one.first, one.second) for one in found.pairs] == [(0, n) for n in range(1, 6)]
+        assert found.rows == 6 * ROWS
+        assert {one.rows for one in found.pairs} == {(ROWS, ROWS)}
 
 
 class TestIntegrity:
@@ -285,12 +218,12 @@ class TestIntegrity:
             look(path)
 
 
-class TestFlaws:
+class TestIssues:
     def test_a_dead_slot(self, path, plant):
         plant(path, "vl/features", lambda rows: rows.__setitem__((slice(None), 1), 3.0))
         view = look(path)
         assert kinds(view) == [("dead slot", "", "")]
-        assert view.norms.variation[1] == 0 and view.norms.variation[[0, 2]].min() > 0.5
+        assert view.features.variation[1] == 0 and view.features.variation[[0, 2]].min() > 0.5
 
     def test_features_that_stand_still_in_one_episode(self, path, plant):
         plant(path, "vl/features", lambda rows: rows.__setitem__(slice(30, 40), rows[30]))
@@ -298,8 +231,8 @@ class TestFlaws:
 
     def test_a_feature_of_another_length(self, path, plant):
         plant(path, "vl/features", lambda rows: rows.__setitem__((12, 0), rows[12, 0] * 100))
-        (flaw,) = look(path).flaws
-        assert (flaw.kind, flaw.episode, flaw.start_s) == (
+        (issue,) = look(path).issues
+        assert (issue.kind, issue.episode, issue.start_s) == (
             "feature norm",
             "episode_001",
             pytest.approx(0.6),
@@ -308,12 +241,12 @@ class TestFlaws:
     def test_of_three_rows_none_is_far_from_the_rest(self, tiny_store, tmp_path, plant):
         path = tiny_store(tmp_path, episodes=1, ticks=9)
         plant(path, "vl/features", lambda rows: rows.__setitem__((2, 0), rows[2, 0] * 100))
-        assert [one.kind for one in look(path).flaws] == ["short episode"]
+        assert [one.kind for one in look(path).issues] == ["short episode"]
 
     def test_a_missing_view(self, path, plant):
         plant(path, "vl/frame_time", lambda shown: shown.__setitem__(slice(0, ROWS), np.nan))
-        (flaw,) = look(path).flaws
-        assert (flaw.kind, flaw.source, flaw.episode, flaw.stream) == (
+        (issue,) = look(path).issues
+        assert (issue.kind, issue.source, issue.episode, issue.stream) == (
             "missing",
             "left",
             "episode_000",
@@ -327,23 +260,14 @@ class TestFlaws:
 
         plant(path, "vl/frame_time", shift)
         assert kinds(look(path)) == [
-            ("frames from the future", "right", "episode_001"),
             ("old frames", "left", "episode_000"),
+            ("frames from the future", "right", "episode_001"),
         ]
 
-    def test_ticks_that_go_back_and_ticks_that_skip(self, path, plant):
-        def disturb(time: np.ndarray) -> None:
-            time[5:30] += 10
-            time[40] = time[39]
-
-        plant(path, "tick/time", disturb)
-        found = {one.kind: one for one in look(path).flaws}
-        assert found["gap"].start_s == pytest.approx(0.4)
-        assert found["gap"].stop_s == pytest.approx(10.5)
-        assert (found["clock jump"].severity, found["clock jump"].episode) == (
-            "error",
-            "episode_001",
-        )
+    def test_ticks_that_skip(self, path, plant):
+        plant(path, "tick/time", lambda time: np.add(time[5:30], 10, out=time[5:30]))
+        (issue,) = [one for one in look(path).issues if one.kind == "gap"]
+        assert (issue.start_s, issue.stop_s) == pytest.approx((0.4, 10.5))
 
     def test_an_episode_with_another_instruction_or_none(self, tiny_store, tmp_path, plant):
         path = tiny_store(tmp_path, episodes=12)
@@ -360,50 +284,37 @@ class TestFlaws:
         ]
 
     def test_as_many_instructions_as_episodes_take_no_time(self):
-        nothing = {"ticks": 0, "vl_rows": 0, "seconds": 0.0, "readings": {}, "covered": {}}
+        none = range(0)
+        nothing = {"ticks": none, "vl_rows": none, "readings": none, "states": none}
+        told = {"path": "", "format": "raw", "content": "", "digest": ""}
         episodes = [
-            EpisodeCoverage(n, f"a/{n}", str(n), "a", "raw", f"do {n}", **nothing)
+            EpisodeCoverage(
+                Episode(n, str(n), "a", instruction=f"do {n}", **told, **nothing), 0, {}
+            )
             for n in range(20_000)
         ]
-        store: Any = SimpleNamespace(
-            episodes=[SimpleNamespace(ticks=range(0)) for _ in episodes],
-            array=lambda name: np.empty(0),
-        )
-        none = np.empty(0, np.float32)
-        ages = Ages(none, none.reshape(0, 1), ("View1",), np.nan)
+        store: Any = SimpleNamespace(array=lambda name: np.empty(0))
         begin = time.process_time()
-        found = {one.kind for one in episode_flaws(store, episodes, ages, ())}
+        found = {one.kind for one in find_episode_issues(store, episodes)}
         assert time.process_time() - begin < 4
         assert found == {"short episode"}
 
     def test_a_flat_channel(self, path, plant):
         plant(path, "tick/action", lambda action: action.__setitem__((slice(None), 1), 0))
-        (flaw,) = look(path).flaws
-        assert (flaw.kind, flaw.stream, flaw.message[:2]) == ("flat channel", "action", "dy")
-
-    def test_a_channel_that_is_noise_beside_others_of_its_unit(self, path, plant):
-        def quiet(state: np.ndarray) -> None:
-            state[:, 2] *= 1e-3
-
-        said = {"names": ["x", "y", "z", "other"], "units": 4 * ["rad/s"]}
-        attributes(path, lambda attrs: attrs["streams"]["state"].update(said))
-        assert look(path).flaws == ()
-        plant(path, "state/values", quiet)
-        (flaw,) = look(path).flaws
-        assert (flaw.kind, flaw.severity, flaw.stream) == ("noise", "warning", "state")
-        assert flaw.message.startswith("z: ") and "rad/s" in flaw.message
+        (issue,) = look(path).issues
+        assert (issue.kind, issue.stream, issue.message[:2]) == ("flat channel", "action", "dy")
 
     @pytest.mark.parametrize("unit", ["", "rad/s"])
     @pytest.mark.parametrize("scale", [0, 1e-3])
     def test_a_joint_that_hardly_moves_is_told_once(self, path, plant, unit, scale):
         """As of recordings, whose rule it is; one that never moves is flat."""
         attributes(path, lambda attrs: attrs["streams"]["state"].update(units=4 * [unit]))
-        assert look(path).flaws == ()
+        assert look(path).issues == ()
         plant(path, "state/values", lambda state: np.multiply(state[:, 2], scale, out=state[:, 2]))
-        (flaw,) = look(path).flaws
+        (issue,) = look(path).issues
         kind = "still channel" if scale else "flat channel"
-        assert (flaw.kind, flaw.severity, flaw.stream) == (kind, "warning", "state")
-        assert flaw.message.startswith("joint_2")
+        assert (issue.kind, issue.severity, issue.stream) == (kind, "warning", "state")
+        assert issue.message.startswith("joint_2")
 
     def test_channels_that_are_neither_of_one_unit_nor_of_one_kind_are_not_compared(
         self, path, plant
@@ -411,17 +322,17 @@ class TestFlaws:
         said = {"names": ["x", "y", "z", "other"], "units": 4 * [""]}
         attributes(path, lambda attrs: attrs["streams"]["state"].update(said))
         plant(path, "state/values", lambda state: np.multiply(state[:, 2], 1e-3, out=state[:, 2]))
-        assert look(path).flaws == ()
+        assert look(path).issues == ()
 
     def test_a_channel_with_what_is_no_number(self, path, plant):
         plant(path, "state/values", lambda state: state.__setitem__((5, 1), np.nan))
-        (flaw,) = look(path).flaws
-        assert (flaw.kind, flaw.severity, flaw.stream) == ("not finite", "error", "state")
-        assert flaw.message.startswith("joint_1: ")
+        (issue,) = look(path).issues
+        assert (issue.kind, issue.severity, issue.stream) == ("not finite", "error", "state")
+        assert issue.message.startswith("joint_1: ")
 
     def test_short_episodes(self, tiny_store, tmp_path):
         view = look(tiny_store(tmp_path, ticks=6, episodes=2))
-        assert [one.kind for one in view.flaws if one.kind == "short episode"] == 2 * [
+        assert [one.kind for one in view.issues if one.kind == "short episode"] == 2 * [
             "short episode"
         ]
 
@@ -433,33 +344,30 @@ class TestFlaws:
         sound = look(path)
         plant(path, "vl/features", lambda rows: rows.__setitem__((34, 2, 1), value))
         view = look(path)
-        (flaw,) = view.flaws
-        assert (flaw.kind, flaw.severity, flaw.source, flaw.episode) == (
+        (issue,) = view.issues
+        assert (issue.kind, issue.severity, issue.source, issue.episode) == (
             "not finite",
             "error",
             "right",
             "episode_003",
         )
-        assert flaw.start_s == flaw.stop_s == pytest.approx(1.2)
-        assert view.norms.names[2] in flaw.message
-        others = sound.sampled.rows != 34
-        assert view.sampled.rows.tolist() == sound.sampled.rows[others].tolist()
-        assert (view.sampled.left_out, view.sampled.looked_at) == (1, 6 * ROWS)
-        assert np.array_equal(view.norms.norm, sound.norms.norm[others])
-        assert np.isfinite(view.projection.points).all()
-        assert np.isfinite(view.duplicates.likeness).sum() == 6 * 5
+        assert issue.start_s == issue.stop_s == pytest.approx(1.2)
+        assert view.features.names[2] in issue.message
+        expected = sound.features.norm.copy()
+        expected[34, 2] = np.nan
+        assert np.array_equal(view.features.norm, expected, equal_nan=True)
 
     def test_a_store_without_a_finite_row_can_be_looked_at(self, path, plant):
         plant(path, "vl/features", lambda rows: rows.__setitem__(slice(None), np.nan))
         view = look(path)
-        assert [(one.kind, one.severity) for one in view.flaws] == 6 * [("not finite", "error")]
-        assert (len(view.sampled.rows), view.sampled.left_out) == (0, 6 * ROWS)
+        assert [(one.kind, one.severity) for one in view.issues] == 6 * [("not finite", "error")]
+        assert np.isnan(view.features.norm).all()
 
     def test_what_is_not_finite_does_not_count_where_its_slot_is_invalid(self, path, plant):
         plant(path, "vl/features", lambda rows: rows.__setitem__((34, 2), np.nan))
         plant(path, "vl/slot_valid", lambda valid: valid.__setitem__((34, 2), 0))
         view = look(path)
-        assert (view.flaws, view.sampled.left_out) == ((), 0)
+        assert view.issues == ()
 
 
 def test_one_slot_at_a_time_is_in_memory(tiny_store, tmp_path):

@@ -9,15 +9,16 @@ import numpy as np
 import pytest
 
 from pipeline.base.config import TrainHeadParams
+from pipeline.base.table import Table
 from pipeline.evaluate.ablation import judge_modalities
 from pipeline.evaluate.curves import Curve, Curves
 from pipeline.evaluate.episode_frames import Footage
 from pipeline.evaluate.evaluation import Evaluation, judged_document
 from pipeline.evaluate.experiments import Experiment
-from pipeline.look.evaluation import episodes as episode_sections
+from pipeline.look.evaluation import page as evaluation_page
 from pipeline.look.evaluation.comparison import comparison_report
 from pipeline.look.evaluation.page import evaluation_report
-from pipeline.look.page.blocks import Document, Picture, Report, Section, Table
+from pipeline.look.page.blocks import Document, Picture, Report, Section
 from pipeline.look.page.writing import PAGE, write_report
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.normalization import ChannelStatistics, Normalization
@@ -167,7 +168,7 @@ def test_a_page_with_frames_and_without_is_sound(
 ) -> None:
     """Frames of the best episode; the worst one's recording is where no recording is."""
     (_, best), (_, worst) = judgement.comparison.extremes()
-    look = episode_sections.footage
+    look = evaluation_page.footage
 
     def half(store: FeatureStore, episode: Any, rows: list[int], *rest: Any) -> Footage:
         if episode.index != best:
@@ -176,7 +177,7 @@ def test_a_page_with_frames_and_without_is_sound(
         shades = np.linspace(0, 255, len(rows)).astype(np.uint8)
         return Footage({"View1": [np.full((12, 16, 3), shade, np.uint8) for shade in shades]})
 
-    monkeypatch.setattr(episode_sections, "footage", half)
+    monkeypatch.setattr(evaluation_page, "footage", half)
     files = write_report(tmp_path, evaluation_report(judgement))
     assert {file.stem for file in files} == {
         *("report", "dimensions", "scatter", "horizon", "dimension_horizon", "episodes"),
