@@ -1,7 +1,6 @@
 """A store -> its page: what is in it, what looks wrong, and what it was made of."""
 
 from collections.abc import Mapping
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,12 +38,9 @@ from pipeline.look.store.features import (
     show_features,
 )
 from pipeline.look.store.sizes import ArraySize, read_sizes, tabulate_sizes
-from pipeline.store import FeatureStore
-from pipeline.store.chunks import ChunkFiles
+from pipeline.store import FeatureStore, check_trailers
 from pipeline.store.gather import WIDE
-from pipeline.store.metadata import check_metadata
 from pipeline.store.repair_hints import extract_command
-from pipeline.store.schema import read_specs
 
 _CHANNELS = 16
 """Of a stream, that its description names."""
@@ -98,11 +94,7 @@ def _open_checked(path: Path) -> FeatureStore:
     All that is said of a store rests on its metadata and its narrow arrays.
     """
     store = FeatureStore.open(path)
-    check_metadata(path)
-    for name, spec in read_specs(path).items():
-        if name not in WIDE.values():
-            with closing(ChunkFiles(path, spec, writable=False)) as files:
-                files.check()
+    check_trailers(path, but=tuple(WIDE.values()))
     if not len(store.array("vl/time")):
         raise StoreIncomplete(
             f"{path}: expected VL rows to look at, found none. Run {extract_command(path)}."
