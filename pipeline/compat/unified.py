@@ -9,18 +9,17 @@ from collections.abc import Mapping, Sequence
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from pipeline.base.config import FusionStrategy, ModelType, TrainHeadParams, TuningParams, VLMParams
 from pipeline.base.errors import ObservationError
-from pipeline.compat.unchanged import Unchanged
-from pipeline.policy.live_observation import LiveObservation, Seen, observation_of, target_of
 from pipeline.policy.live_policy import LivePolicy
-from pipeline.policy.normalizer import StreamStatistics
-from pipeline.policy.observation import PolicyShape
+from pipeline.policy.normalization import ChannelStatistics, Normalization
+from pipeline.policy.observation import LiveObservation, PolicyShape, check_axes
 from pipeline.policy.policy import Policy
-from pipeline.vlm.shape import feature_shape
+from pipeline.vlm.feature_spec import feature_shape
 
 __all__ = [
     "LiveObservation",
@@ -31,9 +30,8 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from pipeline.vlm.distinct import Frames
     from pipeline.vlm.live import LiveVLM
-    from pipeline.vlm.preparation import PreparedRow, Preparer
+    from pipeline.vlm.preparation import Frames, PreparedRow, Preparer
 else:  # a model that only ever sees cached features needs no transformers
     Frames = PreparedRow = Preparer = Any
     LiveVLM = nn.Module
@@ -86,7 +84,7 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
         prompt: str = "{instruction}\n{images}\n{instruction}",
         pooling: Sequence[str] = ("mean",),
         feature_dim: int | None = None,
-        normalization: StreamStatistics | None = None,
+        normalization: Normalization | None = None,
         vlm: Mapping[str, Any] | None = None,
         tuning: Mapping[str, Any] | None = None,
         **head: Any,
@@ -129,7 +127,7 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
         groups = _ACTION_GROUPS if action_dim == len(_ACTION_GROUPS) else ("other",) * action_dim
         sizes = (slots, feature_dim or width, sensor_channels, state_dim, action_dim)
         shape = PolicyShape(*sizes, action_groups=groups)
-        policy = Policy(params, shape, normalization or Unchanged(shape))
+        policy = Policy(params, shape, normalization or no_normalization(shape))
         self._assemble(policy, vlm_params, tuned, names)
 
     @classmethod
@@ -166,12 +164,9 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
         state: Any = None,
         actions: Any = None,
         *,
-        slot_valid: Any = None,
-        feature_age: Any = None,
-        sensor_valid: Any = None,
-        state_valid: Any = None,
         action_valid: Any = None,
         generator: torch.Generator | None = None,
+        **validity: Any,
     ) -> Tensor:
         """The loss where `actions` are given, else an action chunk (batch, horizon, action).
 
@@ -184,13 +179,19 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
         `train()` mode, which stays as it is. Raises `ObservationError` for a shape that does not
         fit and where there is nothing to look at.
         """
-        known = {"slot_valid": slot_valid, "feature_age": feature_age}
-        known |= {"sensor_valid": sensor_valid, "state_valid": state_valid}
-        observation = self.observe(images, text, features, sensor, state, **known)
+        observation = self.observe(images, text, features, sensor, state, **validity)
         if actions is None:
             return self.act(observation, generator)
-        action, valid = target_of(self.policy, observation, actions, action_valid)
-        return self.loss(observation, action, valid, generator)[0]
+        device, batch = observation.features.device, len(observation.features)
+        steps = {"batch": batch, "horizon": self.policy.params.horizon}
+        action = torch.as_tensor(actions, dtype=torch.float32, device=device)
+        channels = self.policy.shape.action_dim
+        check_axes("actions", action, {**steps, "channel": channels}, "the streams")
+        if action_valid is None:
+            action_valid = torch.ones(action.shape[:2], dtype=torch.bool)
+        valid = torch.as_tensor(action_valid, device=device)
+        check_axes("action_valid", valid, steps, "the streams")
+        return self.loss(observation, action, valid.bool(), generator)[0]
 
     def observe(
         self,
@@ -204,7 +205,7 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
         feature_age: Any = None,
         sensor_valid: Any = None,
         state_valid: Any = None,
-    ) -> Seen:
+    ) -> LiveObservation:
         """The observation of what `forward` takes; equal frames and text share a row."""
         rows: list[PreparedRow] = []
         row_of = [] if images is None else [-1] * len(images)
@@ -212,20 +213,31 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
             if text is None or isinstance(text, str) or len(text) != len(images):
                 wanted = f"expected {len(images)} instructions, one for each of images"
                 raise ObservationError(f"text: {wanted}, found {text!r}")
-            from pipeline.vlm.distinct import distinct_rows
-
-            spec = self.load_vlm().spec
-            rows, row_of = distinct_rows(self._preparer, spec, images, text)
+            rows, row_of = self._preparer.prepare_distinct(images, text)
         streams = {"features": features, "slot_valid": slot_valid, "feature_age": feature_age}
         streams |= {"sensor": sensor, "sensor_valid": sensor_valid}
         streams |= {"state": state, "state_valid": state_valid}
-        return observation_of(self.policy, streams, rows, row_of)
+        return self.policy.observe(streams, rows, row_of)
 
     @cached_property
     def _preparer(self) -> Preparer:
         from pipeline.vlm.preparation import Preparer
 
         return Preparer(self.vlm_params, self.load_vlm().spec)
+
+
+def no_normalization(shape: PolicyShape) -> Normalization:
+    """Statistics of this shape under which every stream stays as it is."""
+
+    def unit(*channels: int) -> ChannelStatistics:
+        return ChannelStatistics(np.zeros(channels), np.ones(channels), 0)
+
+    return Normalization(
+        action=unit(shape.action_dim),
+        features=unit(shape.slots, shape.feature_dim),
+        sensor=unit(shape.sensor_channels),
+        state=unit(shape.state_dim),
+    )
 
 
 def _with_seed_parts(head: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,16 +1,17 @@
 """A policy whose features, of some samples or all, a model computes as it goes."""
 
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, Generic, TypeVar
 
 import torch
-from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from jaxtyping import Float
+from torch import Generator, Tensor, nn
 
-from pipeline.policy.live_observation import LiveObservation, with_features
-from pipeline.policy.observation import Observation
+from pipeline.base.observation import Observation
+from pipeline.policy.observation import LiveObservation, with_features
 from pipeline.policy.policy import Policy
+from pipeline.policy.tensors import Chunk, Losses, StepMask
 
 Model = TypeVar("Model", bound=nn.Module)
 
@@ -73,16 +74,16 @@ class LivePolicy(nn.Module, Generic[Model]):
     def loss(
         self,
         observation: Observation,
-        action: Float[Tensor, "batch horizon action"],
-        action_valid: Bool[Tensor, "batch horizon"],
-        generator: torch.Generator | None = None,
-    ) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
+        action: Chunk,
+        action_valid: StepMask,
+        generator: Generator | None = None,
+    ) -> Losses:
         """As `Policy.loss`; gradients reach the model where a sample is live and it learns."""
         return self.policy.loss(self._seen(observation), action, action_valid, generator)
 
     @torch.no_grad()
     def sample(
-        self, observation: Observation, samples: int = 1, generator: torch.Generator | None = None
+        self, observation: Observation, samples: int = 1, generator: Generator | None = None
     ) -> Float[Tensor, "sample batch horizon action"]:
         """As `Policy.sample`, but never with dropout, whatever the mode; the model runs once.
 
@@ -91,9 +92,7 @@ class LivePolicy(nn.Module, Generic[Model]):
         with self._evaluating():
             return self.policy.sample(self._seen(observation), samples, generator)
 
-    def act(
-        self, observation: Observation, generator: torch.Generator | None = None
-    ) -> Float[Tensor, "batch horizon action"]:
+    def act(self, observation: Observation, generator: Generator | None = None) -> Chunk:
         """One sample: an action chunk in physical units, float32."""
         return self.sample(observation, 1, generator)[0]
 
@@ -114,7 +113,7 @@ class LivePolicy(nn.Module, Generic[Model]):
         return table
 
     @contextmanager
-    def _evaluating(self) -> Generator[None]:
+    def _evaluating(self) -> Iterator[None]:
         modes = {part: part.training for part in self.modules()}
         self.eval()
         try:
@@ -126,6 +125,6 @@ class LivePolicy(nn.Module, Generic[Model]):
 
     def _seen(self, observation: Observation) -> Observation:
         """The observation with the features of its live samples computed."""
-        if not isinstance(observation, LiveObservation) or not observation.rows:
-            return observation
-        return with_features(observation, *self.load_vlm()(observation.rows))
+        if isinstance(observation, LiveObservation) and observation.rows:
+            return with_features(observation, *self.load_vlm()(observation.rows))
+        return observation

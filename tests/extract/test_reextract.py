@@ -131,7 +131,7 @@ class TestOtherThanTheStore:
             return vlm
 
         monkeypatch.setattr(FrozenVLM, "load", classmethod(elsewhere))
-        assert any("-> '99'" in line for line in again(document, rows=1).environment)
+        assert any('-> "99"' in line for line in again(document, rows=1).environment)
 
     def test_params_of_other_features_are_refused(self, document):
         document["vlm"] = document["vlm"] | {"prompt": "{images}"}
