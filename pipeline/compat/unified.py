@@ -66,20 +66,15 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
         fusion_strategy: FusionStrategy = "concat",
         *,
         vl_model_name: str = "Qwen/Qwen2.5-VL-3B-Instruct",
-        sensor_enabled: bool = True,
-        robot_state_enabled: bool = True,
         finetune_vl: Literal["none", "lora", "full"] = "none",
         lora_r: int = 16,
         lora_alpha: int = 32,
         lora_dropout: float = 0.05,
         image_resize_height: int = 360,
         image_resize_width: int = 640,
-        horizon: int = 8,
         action_dim: int = 7,
         sensor_channels: int = 1026,
-        sensor_window: int = 65,
         state_dim: int = 12,
-        state_window: int = 100,
         views: Sequence[str] = ("View1", "View2", "View3", "View4", "View5"),
         prompt: str = "{instruction}\n{images}\n{instruction}",
         pooling: Sequence[str] = ("mean",),
@@ -91,8 +86,9 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
     ) -> None:
         """Build the policy; `vlm`, `tuning` and `head` are more params of those sections.
 
-        Of a part of the policy, such as `sensor_encoder`, what `head` does not name stays as this
-        class has always had it.
+        `head` is that of `train_head`: `sensor_enabled` and `robot_state_enabled` (True), `horizon`
+        (8), `sensor_window` (65), `state_window` (100) and all others. Of a part of the policy,
+        such as `sensor_encoder`, what `head` does not name stays as this class has always had it.
 
         `feature_dim` is the width of the checkpoint's hidden states: by default what a checkpoint
         folder says of itself, and 2048 (that of Qwen2.5-VL-3B) for a hub id. Of seven action
@@ -102,27 +98,19 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
         WARNING: without `normalization` every stream is taken as it is. Physical units (degrees,
         millimetres, raw A-scans) train badly: give the `pipeline.policy.normalization` of the data.
         """
-        said = {"checkpoint": vl_model_name, "prompt": prompt, "pooling": tuple(pooling)}
-        size = {
+        seen = {
+            "checkpoint": vl_model_name,
+            "prompt": prompt,
+            "pooling": tuple(pooling),
             "image_resize_height": image_resize_height,
             "image_resize_width": image_resize_width,
         }
         lora = {"lora_r": lora_r, "lora_alpha": lora_alpha, "lora_dropout": lora_dropout}
-        vlm_params = VLMParams.model_validate({**said, **size, **(vlm or {})})
+        vlm_params = VLMParams.model_validate({**seen, **(vlm or {})})
         tuned = TuningParams.model_validate({"method": finetune_vl, **lora, **(tuning or {})})
+        kinds = {"model_type": model_type, "fusion_strategy": fusion_strategy}
+        params = TrainHeadParams.model_validate({**kinds, **_with_seed_parts(head)})
         names = tuple(sorted(views))
-        params = TrainHeadParams.model_validate(
-            {
-                "model_type": model_type,
-                "fusion_strategy": fusion_strategy,
-                "sensor_enabled": sensor_enabled,
-                "robot_state_enabled": robot_state_enabled,
-                "horizon": horizon,
-                "sensor_window": sensor_window,
-                "state_window": state_window,
-                **_with_seed_parts(head),
-            }
-        )
         slots, width = feature_shape(vlm_params, names)
         groups = _ACTION_GROUPS if action_dim == len(_ACTION_GROUPS) else ("other",) * action_dim
         sizes = (slots, feature_dim or width, sensor_channels, state_dim, action_dim)

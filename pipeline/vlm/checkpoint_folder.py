@@ -77,17 +77,13 @@ def _downloaded(checkpoint: str, revision: str | None, setting: str) -> Path:
     except LocalEntryNotFoundError as error:
         cause, why = error, "it is neither whole in the local cache nor reachable"
     except (HFValidationError, OSError) as error:
-        cause, why = error, f"it cannot be downloaded: {_first_line(error)}"
+        cause, why = error, f"it cannot be downloaded: {str(error).strip().splitlines()[0]}"
     raise VLMError(
         f"{setting} {checkpoint}: there is no folder of that name here; and as a hub id, {why}. "
         "If it is the demo's folder, run `python -m stages.demo`; if it is a hub id, run "
         f"`hf download {checkpoint}` where there is network and set {setting} to the folder. "
         "`python -m stages.doctor` looks at the rest."
     ) from cause
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).strip().partition("\n")[0]
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -224,9 +220,8 @@ def _present_weights(folder: Path) -> list[Path]:
             f"{folder}: no *.safetensors file. Expected a checkpoint in the hub's format; pickled "
             "weights (*.bin, *.pt) are not opened."
         )
-    config = folder / "config.json"
-    read_json(config)
-    return sorted([config, *shards])
+    read_json(folder / "config.json")
+    return sorted([folder / "config.json", *shards])
 
 
 def tokenizer_files(folder: Path) -> list[Path]:

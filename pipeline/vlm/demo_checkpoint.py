@@ -23,22 +23,11 @@ from pipeline.base.durable import replace_folder
 from pipeline.base.ownership import OutputKind
 from pipeline.vlm.loading import quiet_transformers
 
-_SPECIAL_TOKENS = (
-    "<|endoftext|>",
-    "<|im_start|>",
-    "<|im_end|>",
-    "<|object_ref_start|>",
-    "<|object_ref_end|>",
-    "<|box_start|>",
-    "<|box_end|>",
-    "<|quad_start|>",
-    "<|quad_end|>",
-    "<|vision_start|>",
-    "<|vision_end|>",
-    "<|vision_pad|>",
-    "<|image_pad|>",
-    "<|video_pad|>",
-)
+_TOKEN_NAMES = """
+endoftext im_start im_end object_ref_start object_ref_end box_start box_end quad_start quad_end
+vision_start vision_end vision_pad image_pad video_pad
+"""
+_SPECIAL_TOKENS = tuple(f"<|{name}|>" for name in _TOKEN_NAMES.split())
 
 _CHAT_TEMPLATE = (
     "{% for message in messages %}"
@@ -197,8 +186,8 @@ def _config(tokenizer: Tokenizer) -> Qwen2_5_VLConfig:
             "rope_theta": 1000000.0,
             "mrope_section": [4, 6, 6],
         },
-        "bos_token_id": _id(tokenizer, "<|endoftext|>"),
-        "eos_token_id": _id(tokenizer, "<|im_end|>"),
+        "bos_token_id": tokenizer.token_to_id("<|endoftext|>"),
+        "eos_token_id": tokenizer.token_to_id("<|im_end|>"),
     }
     vision = {
         "depth": 4,
@@ -216,19 +205,13 @@ def _config(tokenizer: Tokenizer) -> Qwen2_5_VLConfig:
     return Qwen2_5_VLConfig(
         text_config=text,
         vision_config=vision,
-        image_token_id=_id(tokenizer, "<|image_pad|>"),
-        video_token_id=_id(tokenizer, "<|video_pad|>"),
-        vision_start_token_id=_id(tokenizer, "<|vision_start|>"),
-        vision_end_token_id=_id(tokenizer, "<|vision_end|>"),
+        image_token_id=tokenizer.token_to_id("<|image_pad|>"),
+        video_token_id=tokenizer.token_to_id("<|video_pad|>"),
+        vision_start_token_id=tokenizer.token_to_id("<|vision_start|>"),
+        vision_end_token_id=tokenizer.token_to_id("<|vision_end|>"),
         tie_word_embeddings=True,
         dtype="float32",
     )
-
-
-def _id(tokenizer: Tokenizer, token: str) -> int:
-    found = tokenizer.token_to_id(token)
-    assert found is not None, token
-    return found
 
 
 def _model(tokenizer: Tokenizer, seed: int) -> Qwen2_5_VLForConditionalGeneration:
@@ -247,12 +230,6 @@ def _model(tokenizer: Tokenizer, seed: int) -> Qwen2_5_VLForConditionalGeneratio
                 parameter.zero_()
             else:
                 values = generator.standard_normal(parameter.shape, dtype=np.float32)
-                parameter.copy_(torch.from_numpy(values * _scale(name, parameter)))
+                fan_in = 1 if "embed_tokens" in name else parameter[0].numel()
+                parameter.copy_(torch.from_numpy(values * (1 / math.sqrt(fan_in))))
     return model
-
-
-def _scale(name: str, parameter: torch.Tensor) -> float:
-    if "embed_tokens" in name:
-        return 1.0
-    fan_in = parameter[0].numel()
-    return 1 / math.sqrt(fan_in)

@@ -148,8 +148,7 @@ def feature_shape(vlm: VLMParams, views: Sequence[str]) -> tuple[int, int]:
 
 def _read(folder: Path, vlm: VLMParams, views: int) -> dict[str, Any]:
     """The entries of the document that transformers has to read."""
-    from pipeline.vlm.pixels import PixelSettings
-    from pipeline.vlm.prompt import PromptRenderer
+    from pipeline.vlm.processor import PixelSettings, PromptRenderer
 
     pixels = PixelSettings.read(folder, (vlm.image_resize_height, vlm.image_resize_width))
     renderer = PromptRenderer(folder, vlm.prompt)
@@ -166,9 +165,7 @@ def _read_digest(
     """The digest of all that `_read` depends on: files, libraries, this code and its arguments."""
     beside = folder.glob("additional_chat_templates/*")
     files = [p for p in (*folder.glob("*"), *beside) if p.suffix in _READ_FROM_CHECKPOINTS]
-    code = [
-        Path(__file__).with_name(name) for name in ("feature_spec.py", "pixels.py", "prompt.py")
-    ]
+    code = [Path(__file__).with_name(name) for name in ("feature_spec.py", "processor.py")]
     return _digest(
         {
             "files": {str(path.relative_to(folder)): digest_file(path) for path in sorted(files)},

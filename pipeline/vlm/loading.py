@@ -18,7 +18,7 @@ from transformers.utils import logging as transformers_logging
 from pipeline.base.config import VLMParams
 from pipeline.base.errors import VLMError
 from pipeline.vlm.checkpoint_folder import adapter_files, resolve_checkpoint, weight_files
-from pipeline.vlm.pixels import PixelSettings
+from pipeline.vlm.processor import PixelSettings
 from pipeline.vlm.vision import tower_attention
 
 _UNUSED = {"lm_head.weight"}

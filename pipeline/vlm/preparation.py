@@ -13,15 +13,14 @@ from pipeline.base.errors import VLMError
 from pipeline.vlm.augmentation import Augmentation
 from pipeline.vlm.checkpoint_folder import resolve_checkpoint
 from pipeline.vlm.feature_spec import FeatureSpec, row_key
-from pipeline.vlm.pixels import PixelSettings, stretch
-from pipeline.vlm.prompt import PromptRenderer, TokenKind
+from pipeline.vlm.processor import PixelSettings, PromptRenderer, TokenKind, stretch
 
 Frames = Mapping[str, NDArray[np.uint8] | Image.Image]
 """RGB frames (height, width, 3) of one moment by view."""
 
 
 @dataclass(frozen=True)
-class Layout:
+class TokenLayout:
     """Where what stands in a row's tokens; rows of equal layout need no padding between them."""
 
     length: int
@@ -48,7 +47,7 @@ class PreparedRow:
     """(token,), the placeholders expanded to one a merged patch."""
     pixels: NDArray[np.uint8]
     """(image, height, width, 3) RGB at the spec's image size, views in order."""
-    layout: Layout
+    layout: TokenLayout
 
 
 class Preparer:
@@ -89,7 +88,7 @@ class Preparer:
         pixels = np.empty((len(views), *size, 3), np.uint8)
         for place, view in zip(pixels, views, strict=True):
             place[:] = stretch(_checked(frames[view], view), size)
-        layout = Layout(
+        layout = TokenLayout(
             len(token_ids), tuple(zip(views, starts, strict=True)), self._settings.merged_grid
         )
         return PreparedRow(prompt, token_ids, pixels, layout)

@@ -21,21 +21,8 @@ from pipeline.vlm.slots import Slot
 TOWERS = {"language": "model.language_model.", "vision": "model.visual."}
 """Where each tower stands in a `Qwen2_5_VLForConditionalGeneration`."""
 
-_COMPANIONS = (
-    "config.json",
-    "generation_config.json",
-    "preprocessor_config.json",
-    "processor_config.json",
-    "video_preprocessor_config.json",
-    "chat_template.json",
-    "chat_template.jinja",
-    "tokenizer.json",
-    "tokenizer_config.json",
-    "vocab.json",
-    "merges.txt",
-    "added_tokens.json",
-    "special_tokens_map.json",
-)
+
+_COMPANIONS = ("*config.json", "chat_template.*", "*token*.json", "vocab.json", "merges.txt")
 """What a checkpoint folder holds beside its weights."""
 
 
@@ -114,9 +101,8 @@ def save_checkpoint(folder: Path, vlm: VLMParams, tuned: Mapping[str, Tensor]) -
     base = resolve_checkpoint(vlm.checkpoint, vlm.revision)
     with disk_full_named(folder), quiet_transformers():
         whole.save_pretrained(folder)
-        for name in _COMPANIONS:
-            if (base / name).exists():
-                shutil.copyfile(base / name, folder / name)
+        for path in (path for pattern in _COMPANIONS for path in base.glob(pattern)):
+            shutil.copyfile(path, folder / path.name)
         _finish(folder)
 
 

@@ -28,12 +28,12 @@ _KEPT = 64
 
 
 @dataclass(frozen=True)
-class Windows:
+class PatchWindows:
     """How patches stand: by window length, then image, then window."""
 
     images: int
     lengths: tuple[tuple[int, int], ...]
-    """Windows of an image, and patches of a window, for each length that there is."""
+    """PatchWindows of an image, and patches of a window, for each length that there is."""
     whole: bool = False
     """Whether a block attends over whole images."""
 
@@ -140,8 +140,8 @@ class VisionTower:
         counts = tuple((count // images, length) for length, count in Counter(lengths).items())
         told = {"cu_seqlens": None, "max_seqlen": patches}
         return (
-            told | {"windows": Windows(images, counts)},
-            told | {"windows": Windows(images, counts, whole=True)},
+            told | {"windows": PatchWindows(images, counts)},
+            told | {"windows": PatchWindows(images, counts, whole=True)},
         )
 
 
@@ -165,7 +165,7 @@ def _grouped_attention(
     attention_mask: None,
     *,
     each: Callable[..., tuple[Tensor, Any]],
-    windows: Windows,
+    windows: PatchWindows,
     scaling: float,
     dropout: float,
     **_: object,
@@ -184,18 +184,18 @@ def _grouped_attention(
     return torch.cat([tensor.flatten(0, 1) for tensor in found])[None], None
 
 
-def _slabs(tensor: Float[Tensor, "patch head dim"], windows: Windows) -> Sequence[Tensor]:
+def _slabs(tensor: Float[Tensor, "patch head dim"], windows: PatchWindows) -> Sequence[Tensor]:
     """The patches of each window length."""
     return tensor.split([windows.images * count * length for count, length in windows.lengths])
 
 
-def _of_windows(tensor: Float[Tensor, "patch head dim"], windows: Windows) -> list[Tensor]:
+def _of_windows(tensor: Float[Tensor, "patch head dim"], windows: PatchWindows) -> list[Tensor]:
     """(window, head, patch, dim) of each window length."""
     slabs = zip(_slabs(tensor, windows), windows.lengths, strict=True)
     return [slab.unflatten(0, (-1, length)).transpose(1, 2) for slab, (_, length) in slabs]
 
 
-def _of_images(tensor: Float[Tensor, "patch head dim"], windows: Windows) -> list[Tensor]:
+def _of_images(tensor: Float[Tensor, "patch head dim"], windows: PatchWindows) -> list[Tensor]:
     """(image, head, patch, dim)"""
     parts = [slab.unflatten(0, (windows.images, -1)) for slab in _slabs(tensor, windows)]
     return [torch.cat(parts, dim=1).transpose(1, 2)]
