@@ -10,14 +10,14 @@ from torch import Generator, Tensor, nn
 
 from pipeline.base.observation import Observation
 from pipeline.policy.observation import LiveObservation, with_features
-from pipeline.policy.policy import Policy
+from pipeline.policy.policy import Policy, Trainable
 from pipeline.policy.tensors import Chunk, Losses, StepMask
 
 Model = TypeVar("Model", bound=nn.Module)
 
 
-class LivePolicy(nn.Module, Generic[Model]):
-    """A `Trainable` of a policy and, in front of it, a model `rows -> (features, valid)`.
+class LivePolicy(Trainable, Generic[Model]):
+    """A policy and, in front of it, a model `rows -> (features, valid)`.
 
     A `LiveObservation` is looked at through the model, any other goes to the policy as it is.
     """
@@ -92,10 +92,6 @@ class LivePolicy(nn.Module, Generic[Model]):
         with self._evaluating():
             return self.policy.sample(self._seen(observation), samples, generator)
 
-    def act(self, observation: Observation, generator: Generator | None = None) -> Chunk:
-        """One sample: an action chunk in physical units, float32."""
-        return self.sample(observation, 1, generator)[0]
-
     @property
     def stochastic(self) -> bool:
         """Whether two samples differ."""
@@ -105,11 +101,9 @@ class LivePolicy(nn.Module, Generic[Model]):
         """The number of parameters of each part of the policy, and of the model where loaded."""
         table = self.policy.parameter_table()
         if self.vlm is not None:
-            sizes = [(p.numel(), p.requires_grad) for p in self.vlm.parameters()]
-            table += [
-                ("vlm, learning", sum(size for size, learns in sizes if learns)),
-                ("vlm, frozen", sum(size for size, learns in sizes if not learns)),
-            ]
+            for kind, learns in (("learning", True), ("frozen", False)):
+                sizes = (p.numel() for p in self.vlm.parameters() if p.requires_grad == learns)
+                table.append((f"vlm, {kind}", sum(sizes)))
         return table
 
     @contextmanager

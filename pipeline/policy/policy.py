@@ -1,7 +1,8 @@
 """The policy: encoders, fusion and action expert, from physical units to physical units."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -43,10 +44,10 @@ SENSOR_ENCODERS: dict[str, type[SensorEncoder] | type[ForceAwareSensorEncoder]] 
 """The class of each `train_head.sensor_encoder.kind`."""
 
 
-@runtime_checkable
-class Trainable(Protocol):
-    """What every module that is trained or judged can do; each is an `nn.Module`."""
+class Trainable(nn.Module, ABC):
+    """What every module that is trained or judged can do."""
 
+    @abstractmethod
     def loss(
         self,
         observation: Observation,
@@ -55,22 +56,25 @@ class Trainable(Protocol):
         generator: Generator | None = None,
     ) -> Losses:
         """The scalar to minimise and its detached parts by name; `action` is physical."""
-        ...
 
+    @abstractmethod
     def sample(
         self, observation: Observation, samples: int = 1, generator: Generator | None = None
     ) -> Float[Tensor, "sample batch horizon action"]:
         """Action chunks in physical units, float32."""
-        ...
+
+    def act(self, observation: Observation, generator: Generator | None = None) -> Chunk:
+        """One sample: an action chunk in physical units, float32."""
+        return self.sample(observation, 1, generator)[0]
 
     @property
+    @abstractmethod
     def stochastic(self) -> bool:
-        """Whether two samples differ."""
-        ...
+        """Whether two samples differ; else any number of them costs one."""
 
+    @abstractmethod
     def parameter_table(self) -> list[tuple[str, int]]:
         """The number of parameters of each part."""
-        ...
 
 
 class Normalizer(nn.Module):
@@ -97,7 +101,7 @@ class Normalizer(nn.Module):
         return values.to(self.mean.dtype) * self.scale + self.mean
 
 
-class Policy(nn.Module):
+class Policy(Trainable):
     """Encoders of the streams that are both present and enabled, fusion, expert.
 
     Raises `ConfigError` where no stream is left, `CheckpointMismatch` where the statistics do not
@@ -124,12 +128,19 @@ class Policy(nn.Module):
 
     @property
     def stochastic(self) -> bool:
-        """Whether two samples differ; else any number of them costs one."""
+        """Whether the expert draws what it answers."""
         return self.expert.stochastic
 
-    def context(self, observation: Observation) -> Context:
-        """What the expert attends to."""
-        return self._context(observation, self._validity(observation))
+    def context(
+        self, observation: Observation, validity: Mapping[str, Tensor] | None = None
+    ) -> Context:
+        """What the expert attends to; by default of all that is valid."""
+        return self.fusion(
+            {
+                name: self.encode(name, observation, valid)
+                for name, valid in (validity or self._validity(observation)).items()
+            }
+        )
 
     def loss(
         self,
@@ -147,7 +158,7 @@ class Policy(nn.Module):
         if self.training and any(self.drop_rates.values()):
             validity = drop_streams(validity, self.drop_rates, generator)
         target = self.action_normalizer.normalize(action)
-        context = self._context(observation, validity)
+        context = self.context(observation, validity)
         return self.expert.loss(context, target, action_valid, generator)
 
     @torch.no_grad()
@@ -163,10 +174,6 @@ class Policy(nn.Module):
         chunks = self.expert.act(context.repeat(repeats, 1, 1), generator)
         physical = self.action_normalizer.invert(chunks).unflatten(0, (repeats, len(context)))
         return physical.expand(samples, -1, -1, -1)
-
-    def act(self, observation: Observation, generator: Generator | None = None) -> Chunk:
-        """One sample: an action chunk in physical units, float32."""
-        return self.sample(observation, 1, generator)[0]
 
     def observe(
         self, streams: Mapping[str, Any], rows: Sequence[Any] = (), row_of: Sequence[int] = ()
@@ -204,11 +211,6 @@ class Policy(nn.Module):
         if stream == "features":
             return encoder(values, valid, observation.feature_age)
         return encoder(values, valid).unsqueeze(1)
-
-    def _context(self, observation: Observation, validity: Mapping[str, Tensor]) -> Context:
-        return self.fusion(
-            {name: self.encode(name, observation, valid) for name, valid in validity.items()}
-        )
 
     def _validity(self, observation: Observation) -> dict[str, Tensor]:
         return {name: stream_validity(observation, name) for name in self.encoders}

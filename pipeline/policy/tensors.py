@@ -9,6 +9,9 @@ Context = Float[Tensor, "batch token dim"]
 Chunk = Float[Tensor, "batch horizon action"]
 """Action chunks: the steps of a horizon, one value a channel."""
 
+TokenMask = Bool[Tensor, "batch token"]
+"""Which tokens of a context, or of any other sequence, are real."""
+
 StepMask = Bool[Tensor, "batch horizon"]
 """Which steps of a chunk are real."""
 
