@@ -31,9 +31,9 @@ __all__ = [
 
 if TYPE_CHECKING:
     from pipeline.vlm.live import LiveVLM
-    from pipeline.vlm.preparation import Frames, PreparedRow, Preparer
+    from pipeline.vlm.preparation import FramesByView, PreparedRow, Preparer
 else:  # a model that only ever sees cached features needs no transformers
-    Frames = PreparedRow = Preparer = Any
+    FramesByView = PreparedRow = Preparer = Any
     LiveVLM = nn.Module
 
 _SEED_PARTS: Mapping[str, Mapping[str, Any]] = {
@@ -145,7 +145,7 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
 
     def forward(
         self,
-        images: Sequence[Frames | None] | None = None,
+        images: Sequence[FramesByView | None] | None = None,
         text: Sequence[str] | None = None,
         features: Any = None,
         sensor: Any = None,
@@ -183,7 +183,7 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
 
     def observe(
         self,
-        images: Sequence[Frames | None] | None = None,
+        images: Sequence[FramesByView | None] | None = None,
         text: Sequence[str] | None = None,
         features: Any = None,
         sensor: Any = None,

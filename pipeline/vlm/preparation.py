@@ -15,7 +15,7 @@ from pipeline.vlm.checkpoint_folder import resolve_checkpoint
 from pipeline.vlm.feature_spec import FeatureSpec, row_key
 from pipeline.vlm.processor import PixelSettings, PromptRenderer, TokenKind, stretch
 
-Frames = Mapping[str, NDArray[np.uint8] | Image.Image]
+FramesByView = Mapping[str, NDArray[np.uint8] | Image.Image]
 """RGB frames (height, width, 3) of one moment by view."""
 
 
@@ -94,7 +94,7 @@ class Preparer:
         return PreparedRow(prompt, token_ids, pixels, layout)
 
     def prepare_distinct(
-        self, images: Sequence[Frames | None], instructions: Sequence[str]
+        self, images: Sequence[FramesByView | None], instructions: Sequence[str]
     ) -> tuple[list[PreparedRow], list[int]]:
         """The rows of samples that differ, each once, and which of them each sample is.
 
