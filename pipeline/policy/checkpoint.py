@@ -8,7 +8,7 @@ A kill at any instant leaves the previous checkpoint or the new one.
 
 import json
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
@@ -163,7 +163,7 @@ def check_policy(folder: Path) -> TrainHeadParams:
 
 
 @contextmanager
-def _description(folder: Path) -> Iterator[dict[str, Any]]:
+def _description(folder: Path) -> Generator[dict[str, Any]]:
     """The document of a checkpoint; what it lacks where it is read is `CheckpointIncomplete`."""
     path = folder / DOCUMENT
     document, has_digest = read_with_digest(path)
@@ -205,5 +205,5 @@ def _note_without_digest(path: Path) -> None:
 
 def source_differences(expected: Mapping[str, Any], actual: Mapping[str, Any]) -> Differences:
     """Where what a checkpoint's store was and what another store is differ."""
-    pair = ({key: source[key] for key in SOURCE_KEYS} for source in (expected, actual))
-    return differences(*pair)
+    first, second = ({key: source[key] for key in SOURCE_KEYS} for source in (expected, actual))
+    return differences(first, second)

@@ -1,12 +1,12 @@
 """A policy whose features, of some samples or all, a model computes as it goes."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, Generic, TypeVar
 
 import torch
 from jaxtyping import Float
-from torch import Generator, Tensor, nn
+from torch import Tensor, nn
 
 from pipeline.base.observation import Observation
 from pipeline.policy.observation import LiveObservation, with_features
@@ -76,14 +76,14 @@ class LivePolicy(Trainable, Generic[Model]):
         observation: Observation,
         action: Chunk,
         action_valid: StepMask,
-        generator: Generator | None = None,
+        generator: torch.Generator | None = None,
     ) -> Losses:
         """As `Policy.loss`; gradients reach the model where a sample is live and it learns."""
         return self.policy.loss(self._seen(observation), action, action_valid, generator)
 
     @torch.no_grad()
     def sample(
-        self, observation: Observation, samples: int = 1, generator: Generator | None = None
+        self, observation: Observation, samples: int = 1, generator: torch.Generator | None = None
     ) -> Float[Tensor, "sample batch horizon action"]:
         """As `Policy.sample`, but never with dropout, whatever the mode; the model runs once.
 
@@ -107,7 +107,7 @@ class LivePolicy(Trainable, Generic[Model]):
         return table
 
     @contextmanager
-    def _evaluating(self) -> Iterator[None]:
+    def _evaluating(self) -> Generator[None]:
         modes = {part: part.training for part in self.modules()}
         self.eval()
         try:

@@ -57,7 +57,8 @@ class PolicyShape:
         """The shape of a `document`. Raises `CheckpointMismatch`."""
         fields = dict(document)
         try:
-            return cls(**fields | {"action_groups": tuple(fields["action_groups"])})
+            fields["action_groups"] = tuple(fields["action_groups"])
+            return cls(**fields)
         except (KeyError, TypeError) as error:
             raise CheckpointMismatch(f"policy shape: {error!r} in {fields}") from None
 
