@@ -32,9 +32,10 @@ from pipeline.store import FeatureStore
 from pipeline.train.identity import policy_shape
 from pipeline.train.split import split_by_episode
 from pipeline.train.statistics import fit_normalization
-from pipeline.vlm.feature_spec import FeatureSpec, Slot, feature_spec, row_key
+from pipeline.vlm.feature_spec import FeatureSpec, feature_spec, row_key
 from pipeline.vlm.pooling import batch_weights, pool
 from pipeline.vlm.preparation import TokenLayout
+from pipeline.vlm.slots import Slot
 
 SMALL = {
     "sensor_encoder": {"channels": [16], "layers": 1, "heads": 2, "output_dim": 16},

@@ -21,14 +21,6 @@ from pipeline.policy.observation import LiveObservation, PolicyShape, check_axes
 from pipeline.policy.policy import Policy
 from pipeline.vlm.feature_spec import feature_shape
 
-__all__ = [
-    "LiveObservation",
-    "Not_freeze_QwenVLAWithSensor",
-    "QwenVLAUnified",
-    "QwenVLAWithSensor",
-    "QwenVLAWithSensorDiffusion",
-]
-
 if TYPE_CHECKING:
     from pipeline.vlm.live import LiveVLM
     from pipeline.vlm.preparation import FramesByView, PreparedRow, Preparer

@@ -34,8 +34,8 @@ class NoiseSchedule(nn.Module):
         super().__init__()
         self.timesteps = timesteps
         betas = _cosine_betas(timesteps) if kind == "cosine" else _linear_betas(timesteps)
-        one = torch.ones(1, dtype=torch.float64, device="cpu")
-        alpha_bar = torch.cat([one, (1 - betas).cumprod(0)])
+        clean = torch.ones(1, dtype=torch.float64, device="cpu")
+        alpha_bar = torch.cat([clean, (1 - betas).cumprod(0)])
         # Rounded at the end: of 1 - alpha_bar, float32 has few digits left at small steps.
         self.register_buffer("alpha_bar", alpha_bar.float())
         self.register_buffer("signal", alpha_bar.sqrt().float())

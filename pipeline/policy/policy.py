@@ -295,10 +295,10 @@ def _fitting(normalization: Normalization, name: str, shape: PolicyShape) -> Cha
         "action": (shape.action_dim,),
     }[name]
     statistics: ChannelStatistics | None = getattr(normalization, name)
-    found = None if statistics is None else statistics.mean.shape
-    if statistics is None or found != expected:
+    actual = None if statistics is None else statistics.mean.shape
+    if statistics is None or actual != expected:
         raise CheckpointMismatch(
-            f"normalisation of {name}: expected statistics of shape {expected}, found {found}. "
+            f"normalisation of {name}: expected statistics of shape {expected}, found {actual}. "
             "Train again: python -m stages.train_head"
         )
     return statistics

@@ -48,13 +48,13 @@ def cached_checkpoint(checkpoint: str, revision: str | None) -> Path | None:
     from huggingface_hub.errors import HFValidationError, LocalEntryNotFoundError
 
     try:
-        found = snapshot_download(
+        copy = snapshot_download(
             checkpoint, revision=revision, local_files_only=True, allow_patterns=_WANTED
         )
     except (LocalEntryNotFoundError, HFValidationError):
         return None
     # A download that was cut short leaves a folder with holes: it is finished, not trusted.
-    return Path(found) if _is_complete(Path(found)) else None
+    return Path(copy) if _is_complete(Path(copy)) else None
 
 
 def _is_complete(folder: Path) -> bool:
@@ -156,7 +156,9 @@ def tensor_headers(path: Path) -> dict[str, tuple[str, list[int]]]:
     try:
         with safe_open(path, "numpy") as file:
             tensors = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118
-            return {name: (one.get_dtype(), one.get_shape()) for name, one in tensors.items()}
+            return {
+                name: (tensor.get_dtype(), tensor.get_shape()) for name, tensor in tensors.items()
+            }
     except SafetensorError as error:
         raise VLMError(f"{path}: cut off or damaged: {error}. Copy or download it again.") from None
 

@@ -143,12 +143,12 @@ class Collator:
             kinds[0, torch.from_numpy(layout.image_tokens())] = 1
             grid = (1, *self._settings.grid)
             images = len(layout.image_starts)
-            found, _ = self._model.get_rope_index(
+            positions, _ = self._model.get_rope_index(
                 torch.zeros_like(kinds),
                 mm_token_type_ids=kinds,
                 image_grid_thw=torch.tensor([grid] * images) if images else None,
             )
-            self._positions[layout] = found[:, 0]
+            self._positions[layout] = positions[:, 0]
         return self._positions[layout]
 
     def _pinned(self, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
@@ -167,10 +167,10 @@ def unique(images: Sequence[NDArray[np.uint8]]) -> tuple[list[NDArray[np.uint8]]
     for image in images:
         flat = image.reshape(-1)
         sampled = alike[flat[:: max(1, flat.size // _SAMPLE)].tobytes()]
-        found = next((one for one in sampled if np.array_equal(distinct[one], image)), None)
-        if found is None:
-            found = len(distinct)
+        known = next((k for k in sampled if np.array_equal(distinct[k], image)), None)
+        if known is None:
+            known = len(distinct)
             distinct.append(image)
-            sampled.append(found)
-        which.append(found)
+            sampled.append(known)
+        which.append(known)
     return distinct, which

@@ -28,18 +28,6 @@ from pipeline.vlm.checkpoint_folder import (
 )
 from pipeline.vlm.slots import Slot, slot_documents, slots_of
 
-__all__ = [
-    "AUGMENTATION_VERSION",
-    "EXTRACTOR_VERSION",
-    "FeatureSpec",
-    "Slot",
-    "document_digest",
-    "feature_spec",
-    "live_differences",
-    "resolve_checkpoint",
-    "row_key",
-]
-
 EXTRACTOR_VERSION = 1
 """Raised whenever this code changes what a feature is: the golden-feature test sees to it."""
 

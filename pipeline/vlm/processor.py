@@ -73,10 +73,10 @@ class PromptRenderer:
             tokenize=False,
             add_generation_prompt=False,
         )
-        found = text.count(self._image_token)
-        if found != images:
+        shown = text.count(self._image_token)
+        if shown != images:
             raise VLMError(
-                f"{self._folder}: the chat template renders {found} of {images} images as "
+                f"{self._folder}: the chat template renders {shown} of {images} images as "
                 f"{self._image_token}. Expected the template of a Qwen2.5-VL checkpoint."
             )
         return text

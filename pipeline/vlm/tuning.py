@@ -141,11 +141,11 @@ def _prefixes(tuning: TuningParams) -> tuple[str, ...]:
 
 def _check_goes_on(model: Any, vlm: VLMParams, tuning: TuningParams) -> None:
     config = model.peft_config["default"]
-    found = f"lora_r {config.r}, lora_alpha {config.lora_alpha}"
+    actual = f"lora_r {config.r}, lora_alpha {config.lora_alpha}"
     asked = f"lora_r {tuning.lora_r}, lora_alpha {tuning.lora_alpha}"
-    if found != asked:
+    if actual != asked:
         raise VLMError(
-            f"{vlm.adapter}: tuning goes on from this adapter of {found}, but {asked} is asked "
+            f"{vlm.adapter}: tuning goes on from this adapter of {actual}, but {asked} is asked "
             "for. Set finetune.tuning to the adapter's values, or vlm.adapter to null."
         )
     names = [name for name, _ in model.named_parameters() if "lora_" in name]
@@ -161,10 +161,10 @@ def _check_goes_on(model: Any, vlm: VLMParams, tuning: TuningParams) -> None:
 def _beyond(model: Any, layers: int) -> dict[str, Tensor]:
     """The adapter's weights on decoder layers that do not run, by their names in its file."""
     place = re.compile(r"\.language_model\.layers\.(\d+)\..*\.lora_")
-    found = ((name, place.search(name), tensor) for name, tensor in model.state_dict().items())
+    weights = ((name, place.search(name), tensor) for name, tensor in model.state_dict().items())
     return {
         name.replace(".default.", "."): tensor
-        for name, match, tensor in found
+        for name, match, tensor in weights
         if match and int(match[1]) >= layers
     }
 

@@ -17,14 +17,13 @@ from safetensors.torch import load_file, save_file
 from pipeline.base.config import VLMParams
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import VLMError
-from pipeline.vlm.checkpoint_folder import weight_files
+from pipeline.vlm.checkpoint_folder import resolve_checkpoint, weight_files
 from pipeline.vlm.feature_spec import (
     FeatureSpec,
-    Slot,
     feature_spec,
-    resolve_checkpoint,
     row_key,
 )
+from pipeline.vlm.slots import Slot
 
 VIEWS = ("View1", "View2", "View3")
 

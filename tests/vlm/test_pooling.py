@@ -4,9 +4,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.vlm.feature_spec import Slot
 from pipeline.vlm.pooling import batch_weights, pool, token_weights
 from pipeline.vlm.preparation import TokenLayout
+from pipeline.vlm.slots import Slot
 
 CELLS = tuple(Slot(0, True, "grid", "View1", (r, c)) for r in range(4) for c in range(4))
 
