@@ -33,7 +33,7 @@ class PatchWindows:
 
     images: int
     lengths: tuple[tuple[int, int], ...]
-    """PatchWindows of an image, and patches of a window, for each length that there is."""
+    """Windows of an image, and patches of a window, for each length that there is."""
     whole: bool = False
     """Whether a block attends over whole images."""
 
