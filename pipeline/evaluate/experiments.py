@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any, get_args
 
 from pipeline.base.config import FusionStrategy, ModelType
+from pipeline.base.differences import describe, differences
 from pipeline.base.errors import ConfigError
 from pipeline.evaluate.evaluation import JUDGED
 from pipeline.evaluate.tables import ERRORS, OVERALL
-from pipeline.policy.checkpoint import describe, differences
 from pipeline.train.log import speed_file
 from pipeline.train.predictions import BASELINES, METHODS
 from pipeline.train.scores import Group
@@ -149,9 +149,10 @@ def _check_same(
     for (one, what), (other, what_other) in pairwise(judged):
         differing = differences(what[key], what_other[key])
         if differing:
+            lines = "\n".join(f"  {line}" for line in describe(differing))
             raise ConfigError(
-                f"compare.reports: expected {same.expected} in {reports}, but they differ:\n"
-                f"{describe(differing, one, other)}\n"
+                f"compare.reports: expected {same.expected} in {reports}, but they differ "
+                f"({one} -> {other}):\n{lines}\n"
                 f"{same.remedy}, or move those that do not belong away."
             )
 
