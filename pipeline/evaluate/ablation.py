@@ -22,9 +22,8 @@ from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.policy import Policy
 from pipeline.store import FeatureStore, episode_name
 from pipeline.train.batches import Lags, Ticks, Windows
-from pipeline.train.held_out import judge
 from pipeline.train.predictions import FeedMaker
-from pipeline.train.scores import Comparison
+from pipeline.train.scores import Comparison, evaluate_policy
 
 DELAYS_MS = (50, 100, 200)
 MOST_TICKS = 1000
@@ -99,7 +98,7 @@ def judge_modalities(
         ways += [(stream, how, feed) for how, feed in found.items()]
         notes += said
     comparisons = [
-        judge(
+        evaluate_policy(
             policy,
             store,
             ticks,

@@ -14,10 +14,9 @@ from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.policy import Trainable
 from pipeline.store import FeatureStore
 from pipeline.train.batches import Windows
-from pipeline.train.held_out import held_out_ticks, judge, named_as_in
-from pipeline.train.identity import source_of
 from pipeline.train.predictions import Predictions
-from pipeline.train.scores import Comparison
+from pipeline.train.scores import Comparison, evaluate_policy
+from pipeline.train.split import held_out_ticks, named_as_in, source_of
 
 JUDGED = "judged.json"
 """Its name in the folder of an evaluation, beside metrics.json."""
@@ -66,7 +65,7 @@ def judgement(
         f"{len(checkpoint.held_out_ticks)} episode(s) in {store.path}, device {device}, "
         f"{judged['policy']['samples']} chunk(s) a tick"
     )
-    comparison, predictions = judge(
+    comparison, predictions = evaluate_policy(
         policy,
         store,
         ticks,

@@ -16,7 +16,7 @@ from pipeline.evaluate.tables import ERRORS, OVERALL
 from pipeline.policy.checkpoint import describe, differences
 from pipeline.train.log import speed_file
 from pipeline.train.predictions import BASELINES, METHODS
-from pipeline.train.scores import Group
+from pipeline.train.scores import ActionGroup
 
 _OVERALL = (OVERALL, "training std")
 _SAME = 1e-4
@@ -58,7 +58,7 @@ class Experiment:
     @staticmethod
     def key(group: tuple[str, str]) -> str:
         """A group of `errors` as one word of a file."""
-        return OVERALL if group == _OVERALL else Group(*group, ()).key
+        return OVERALL if group == _OVERALL else ActionGroup(*group, ()).key
 
     @property
     def overall(self) -> Mapping[str, float]:

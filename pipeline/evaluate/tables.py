@@ -72,12 +72,12 @@ def error_rows(comparison: Comparison) -> list[tuple[str, list[float], float | N
 
 def still_dimensions(comparison: Comparison) -> str:
     """Which dimensions hardly move, and what the overall error is without; empty without any."""
-    still = comparison.still()
+    still = comparison.low_variance()
     if not still:
         return ""
     names = named(comparison.names, list(still))
     largest = max(still, key=lambda index: comparison.scale[index] / still[index])
-    moving = comparison.without_still()
+    moving = comparison.without_low_variance()
     relative, best = moving.relative(), HEADINGS[best_baseline(moving)]
     beside = "" if relative is None else f", {ratio(relative)} times the best baseline's ({best})"
     return (

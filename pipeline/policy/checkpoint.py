@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 FORMAT = 2
 WEIGHTS, DOCUMENT = "policy.safetensors", "policy.json"
 CHECKPOINT = OutputKind("a checkpoint of a policy", lambda folder: (folder / DOCUMENT).is_file())
+_OF_THE_RUN = ("feed", "loggers", "scratch")
+"""Keys of `train_head` that no policy depends on, and that had other values in the past."""
 SOURCE_KEYS = ("feature_spec", "streams", "action_hz", "vlm_reuse_count")
 
 
@@ -185,7 +187,10 @@ def _described(folder: Path) -> dict[str, Any]:
 
 
 def _params(document: Mapping[str, Any]) -> TrainHeadParams:
-    return TrainHeadParams.model_validate_json(json.dumps(document["params"]["train_head"]))
+    given = document["params"]["train_head"]
+    return TrainHeadParams.model_validate_json(
+        json.dumps({key: value for key, value in given.items() if key not in _OF_THE_RUN})
+    )
 
 
 def _strange(folder: Path, error: Exception) -> CheckpointIncomplete:

@@ -41,7 +41,7 @@ class FeatureSource(Protocol):
         ...
 
 
-class Cached:
+class CachedFeatures:
     """Features from the store: the policy is all that is trained, kept and saved.
 
     The wide fields of a batch that `on_device` names live on the device that is fed; they are

@@ -18,9 +18,8 @@ from pipeline.policy.normalization import ChannelStatistics, Normalization
 from pipeline.policy.policy import Policy
 from pipeline.store import FeatureStore
 from pipeline.train.batches import BatchIndices, Lags, Windows
-from pipeline.train.held_out import held_out_contents, held_out_ranges
-from pipeline.train.identity import policy_shape, source_of
-from pipeline.train.split import split_by_episode
+from pipeline.train.run import policy_shape
+from pipeline.train.split import held_out_contents, held_out_ranges, source_of, split_by_episode
 
 PARAMS = {
     "sensor_encoder": {"channels": [16], "layers": 0, "heads": 1, "output_dim": 16},

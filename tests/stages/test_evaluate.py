@@ -89,12 +89,12 @@ def test_a_store_that_grew_is_judged_on_the_same_episodes(
 @pytest.mark.parametrize(
     ("store", "said"),
     [
-        ({"spec_digest": "other"}, 'feature_spec.digest: "tiny-spec" (the checkpoint), "other"'),
+        ({"spec_digest": "other"}, 'feature_spec.digest: "tiny-spec" -> "other"'),
         ({"sensor_channels": 7}, "streams.sensor.names"),
         ({"state_dim": 0}, "streams.state.names"),
-        ({"reuse": 2}, "vlm_reuse_count: 3 (the checkpoint), 2 (the store)"),
-        ({"episodes": 1}, "lacks 1 of the 1 episodes"),
-        ({"seed": 1}, "other recordings under the names of 1 of the 1 held-out episodes"),
+        ({"reuse": 2}, "vlm_reuse_count: 3 -> 2"),
+        ({"episodes": 1}, "1 are not there as they were"),
+        ({"seed": 1}, "is another recording"),
     ],
 )
 def test_another_store_is_refused_by_name(
@@ -130,7 +130,7 @@ def test_a_flipped_bit_is_refused_where_it_would_be_judged_on(
     assert run("", evaluate.main, told) == 2
     assert f"{file}: " in capsys.readouterr().err
     assert not (tmp_path / "report").exists()
-    assert run("", evaluate.main, [*told, "--set", "train_head.check_store=false"]) == 0
+    assert run("", evaluate.main, [*told, "--set", "evaluate.check_store=false"]) == 0
 
 
 def test_a_missing_checkpoint_says_what_to_run(

@@ -29,9 +29,9 @@ def params(tiny_store: Callable[..., Path], tmp_path: Path) -> Path:
         "data": {"sources": [{"name": "left", "path": "a"}]},
         "vlm": {"checkpoint": "unused"},
         "extract": {"store": str(path)},
-        # Its attributes were written over, as no store is that was extracted so.
-        "train_head": {"check_store": False},
         "probe": {
+            # Its attributes were written over, as no store is that was extracted so.
+            "check_store": False,
             "output": str(tmp_path / "report"),
             "horizon": 2,
             "sensor_window": 4,
@@ -107,7 +107,7 @@ def test_a_damaged_store_is_refused(
 ) -> None:
     store = tiny_store(tmp_path, name="sound", episodes=6)
     arguments = ["--params", str(params), "--set", f"probe.store={store}"]
-    checked = [*arguments, "--set", "train_head.check_store=true"]
+    checked = [*arguments, "--set", "probe.check_store=true"]
     assert run("", probe.main, checked) == 0
     said = capsys.readouterr().out
     assert "scoring 3 slots one by one, groups of slots: 1; 174 ticks" in said

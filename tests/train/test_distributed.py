@@ -35,7 +35,7 @@ import torch.distributed as dist
 import pipeline.train.batches
 import pipeline.train.loop as loop
 from pipeline.base.errors import StoreIncomplete
-from pipeline.train import speaker
+from pipeline.train import world as speaker
 from stages import train_head
 from stages.command import run
 
@@ -90,8 +90,7 @@ import torch
 from torch import nn
 from pipeline.base.errors import StoreLocked
 from pipeline.train.world import process_group
-from pipeline.train.gradients import sum_gradients
-from pipeline.train.speaker import SaidByFirst
+from pipeline.train.world import SaidByFirst
 
 with process_group("cpu") as world:
     rank = float(world.rank)
@@ -110,7 +109,7 @@ with process_group("cpu") as world:
     used[0].grad = torch.ones(2) if world.rank == 1 else None
     used[1].grad = torch.full((2,), rank + 1)
     loss = {"loss": torch.tensor(rank)}
-    assert sum_gradients(world, used, loss, stop=world.rank == 1)
+    assert world.sum_gradients(used, loss, stop=world.rank == 1)
     assert used[0].grad.tolist() == [1.0, 1.0]
     assert used[1].grad.tolist() == [3.0, 3.0]
     assert used[2].grad is None

@@ -24,7 +24,7 @@ class Terminal(StringIO):
 def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """The time in s, which a test moves."""
     now = [1000.0]
-    monkeypatch.setattr("pipeline.train.progress.monotonic", lambda: now[0])
+    monkeypatch.setattr("pipeline.train.progress.time.monotonic", lambda: now[0])
     return now
 
 

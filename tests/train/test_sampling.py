@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from pipeline.base.errors import ConfigError, StoreMismatch
 from pipeline.store import FeatureStore
-from pipeline.train.mixture import TickSampler, ticks_by_source
+from pipeline.train.sampling import TickSampler, ticks_by_source
 from pipeline.train.split import hash64, split_by_episode
 
 

@@ -11,7 +11,7 @@ import torch
 
 from pipeline.store import FeatureStore
 from pipeline.train.log import speed_file
-from pipeline.train.speed import Speed, peak_memory_bytes
+from pipeline.train.progress import Speed, peak_memory_bytes
 
 Make = Callable[..., Any]
 CPU = torch.device("cpu")

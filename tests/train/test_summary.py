@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from pipeline.store import FeatureStore
-from pipeline.train.identity import policy_shape
+from pipeline.train.progress import describe_data
+from pipeline.train.run import policy_shape
 from pipeline.train.split import Split, split_by_episode
 from pipeline.train.statistics import fit_normalization
-from pipeline.train.summary import data_warnings
 
 Make = Callable[..., Any]
 
@@ -25,7 +25,7 @@ def warnings(store: FeatureStore, params: Make) -> Callable[..., list[str]]:
         held_out = np.setdiff1d(np.arange(store.ticks), train)
         shape = policy_shape(store, fit_normalization(store, train))
         split = Split(train, held_out, (), None)
-        return data_warnings(store, replace(shape, **(absent or {})), params(**head), split)
+        return describe_data(store, replace(shape, **(absent or {})), params(**head), split)[1]
 
     return found
 

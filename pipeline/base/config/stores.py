@@ -78,6 +78,9 @@ class ProbeParams(Section):
     """Readings before the tick, likewise."""
     threads: int = Field(default=2, ge=1)
     """That work at a time."""
+    check_store: bool = True
+    """Read the store once before, and refuse a chunk that does not give its checksum; false where
+    that takes too long."""
     output: Path = Path("reports/probe")
     """Folder of the table and the picture."""
 

@@ -12,7 +12,7 @@ from tqdm import tqdm
 from pipeline.base.errors import NumericsError
 from pipeline.evaluate.probe.projection import GroupedProjection
 from pipeline.store import Batch, FeatureStore, place
-from pipeline.train.batches import Prefetch, Windows, draws
+from pipeline.train.batches import Prefetch, Windows, cut_batches
 
 GROUP_WIDTH = 64
 """Directions at most of each summary of channels that share a unit."""
@@ -105,7 +105,7 @@ def _batches(
     """The windows of the ticks, in order, checked."""
     with (
         tqdm(total=len(ticks), desc=said, unit="tick", leave=False, disable=None) as bar,
-        Prefetch(store, draws(ticks, _BATCH_TICKS), windows, torch.device("cpu")) as batches,
+        Prefetch(store, cut_batches(ticks, _BATCH_TICKS), windows, torch.device("cpu")) as batches,
     ):
         for draw, batch in batches:
             for stream in ("sensor", "state"):

@@ -13,7 +13,7 @@ from pipeline.evaluate.names import with_unit
 from pipeline.look.page.style import LABELS, RECORDED, STYLES, canvas, legend_below
 from pipeline.store import Episode, FeatureStore, episode_name
 from pipeline.train.predictions import METHODS, Predictions
-from pipeline.train.scores import Comparison, Group
+from pipeline.train.scores import ActionGroup, Comparison
 
 SCATTER_POINTS = 4000
 EPISODE_LINES = 40
@@ -149,7 +149,7 @@ def marked(method: str) -> dict[str, Any]:
     return STYLES[method] | {"linewidth": 2.4 if wide else 1.5, "markersize": size}
 
 
-def _title(comparison: Comparison, group: Group) -> str:
+def _title(comparison: Comparison, group: ActionGroup) -> str:
     """The group and its dimensions, as the width of a panel allows."""
     names = [comparison.names[index] for index in group.dimensions]
     title = f"{group.name} ({', '.join(names)})"

@@ -68,8 +68,8 @@ def _still(comparison: Comparison) -> str:
 def _tiles(comparison: Comparison) -> list[tuple[str, str]]:
     tiles = [("overall error [training std]", f"{comparison.overall('policy'):.3f}")]
     ways = [("of the best baseline's", comparison)]
-    if comparison.still():
-        ways.append(("the same, without what hardly moves", comparison.without_still()))
+    if comparison.low_variance():
+        ways.append(("the same, without what hardly moves", comparison.without_low_variance()))
     for said, judged in ways:
         if (relative := judged.relative()) is not None:
             tiles.append((f"{said} ({HEADINGS[best_baseline(judged)]})", f"{100 * relative:.0f} %"))

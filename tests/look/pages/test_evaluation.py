@@ -24,9 +24,10 @@ from pipeline.policy.normalization import ChannelStatistics, Normalization
 from pipeline.policy.policy import Policy
 from pipeline.store import FeatureStore
 from pipeline.train.batches import Windows
-from pipeline.train.held_out import held_out_contents, held_out_ranges, judge
-from pipeline.train.identity import policy_shape, source_of
 from pipeline.train.predictions import BASELINES
+from pipeline.train.run import policy_shape
+from pipeline.train.scores import evaluate_policy
+from pipeline.train.split import held_out_contents, held_out_ranges, source_of
 
 Sound = Callable[[Path], None]
 PARAMS = TrainHeadParams.model_validate(
@@ -74,7 +75,7 @@ def judgement(
         weights=policy.state_dict(),
     )
     windows = Windows.of(PARAMS)
-    comparison, predictions = judge(policy, store, ticks, windows, 64, normalization)
+    comparison, predictions = evaluate_policy(policy, store, ticks, windows, 64, normalization)
     return Evaluation(
         name="models/head",
         checkpoint=checkpoint,
@@ -142,7 +143,7 @@ def test_dimensions_that_hardly_move_stand_at_the_top(judgement: Evaluation) -> 
     report = evaluation_report(replace(judgement, comparison=still))
     assert "Hardly moving: joint_3 (training std at most 0.001, where 1 is usual" in report.summary
     said = {label.split(" (")[0]: value for label, value in report.tiles}
-    relative = still.without_still().relative()
+    relative = still.without_low_variance().relative()
     assert relative is not None and relative != still.relative()
     assert said["the same, without what hardly moves"] == f"{100 * relative:.0f} %"
     report = evaluation_report(judgement)

@@ -19,7 +19,7 @@ from pipeline.look.evaluation import draw_probe as probe
 from pipeline.look.evaluation import pictures as plots
 from pipeline.look.page.style import write
 from pipeline.train.predictions import Predictions, baselines
-from pipeline.train.scores import Comparison, Group, compare
+from pipeline.train.scores import ActionGroup, Comparison, compare
 
 Drawn = tuple[Comparison, Predictions, SimpleNamespace]
 
@@ -65,8 +65,8 @@ def evaluated(
     names = [f"d{index}" for index in range(dimensions)]
     units = ["mm"] * (dimensions - 1) + [""]
     groups = (
-        Group("translation", "mm", tuple(range(dimensions - 1))),
-        Group("gripper", "", (dimensions - 1,)),
+        ActionGroup("translation", "mm", tuple(range(dimensions - 1))),
+        ActionGroup("gripper", "", (dimensions - 1,)),
     )
     spread = np.where(np.arange(dimensions) < dimensions - constant, 1.0, 0.0)
     comparison = compare(
@@ -228,8 +228,8 @@ def test_titles_of_groups_of_many_stay_within_their_panels() -> None:
     comparison, _, store = evaluated(2, 13)
     names = [f"joint_{index}_velocity" for index in range(13)]
     groups = (
-        Group("other", "rad/s", tuple(range(6))),
-        Group("translation", "rad/s", tuple(range(6, 12))),
+        ActionGroup("other", "rad/s", tuple(range(6))),
+        ActionGroup("translation", "rad/s", tuple(range(6, 12))),
     )
     comparison = replace(comparison, names=names, groups=groups)
     for figure in (plots.horizon(comparison, 10.0), plots.episodes(comparison, store)):  # type: ignore[arg-type]
@@ -308,7 +308,7 @@ def studied(*errors: float) -> ModalityStudy:
             name: np.full((4, 1, 1), wrong, np.float32)
             for name, wrong in (("zero_action", 5), ("mean_action", 3), ("repeat_last", 4))
         }
-        one = (Group("translation", "mm", (0,)),)
+        one = (ActionGroup("translation", "mm", (0,)),)
         return compare(predictions, rules, ["dx"], ["mm"], one, np.ones(1))
 
     ways = (("sensor", "zeroed"), ("sensor", "delayed 50 ms"), ("features", "shuffled"))

@@ -10,9 +10,7 @@ import pytest
 from pipeline.base.errors import ConfigError
 from pipeline.policy.checkpoint import load_policy
 from pipeline.store import FeatureStore
-from pipeline.train.feature_source import Cached
-from pipeline.train.judging import EVALUATION_TICKS, EarlyStopping, judged_ticks
-from pipeline.train.loop import Trainer
+from pipeline.train.loop import EVALUATION_TICKS, EarlyStopping, Trainer, evaluation_ticks
 
 Make = Callable[..., Any]
 
@@ -21,26 +19,24 @@ class Stop(Exception):
     """Stands for the end of the process."""
 
 
-def test_the_standing_counts_since_the_best() -> None:
-    standing = EarlyStopping(patience=2)
-    assert [standing.take(error) for error in (3.0, 2.0, 2.0, 1.0)] == [True, True, False, True]
-    assert (standing.best_error, standing.stalled, standing.exhausted) == (1.0, 0, False)
-    standing.take(5.0)
-    assert not standing.exhausted
-    standing.take(1.5)
-    assert standing.exhausted
+def test_it_counts_since_the_best() -> None:
+    stopping = EarlyStopping(patience=2)
+    assert [stopping.take(error) for error in (3.0, 2.0, 2.0, 1.0)] == [True, True, False, True]
+    assert (stopping.best_error, stopping.stalled, stopping.exhausted) == (1.0, 0, False)
+    stopping.take(5.0)
+    assert not stopping.exhausted
+    stopping.take(1.5)
+    assert stopping.exhausted
     assert not EarlyStopping(None, 1.0, stalled=10**6).exhausted
 
 
-def test_judged_ticks_are_spread_and_limited_by_the_front(store: FeatureStore) -> None:
+def test_ticks_of_an_evaluation_are_spread_and_limited() -> None:
     ticks = np.arange(5000)
-    front = Cached(store)
-    found = judged_ticks(ticks, front)
+    found = evaluation_ticks(ticks, None)
     assert (len(found), found[0], found[-1]) == (EVALUATION_TICKS, 0, 4999)
-    front.eval_ticks = 3
-    assert judged_ticks(ticks, front).tolist() == [0, 2500, 4999]
-    assert judged_ticks(ticks[:2], front).tolist() == [0, 1]
-    assert judged_ticks(ticks[:0], front).tolist() == []
+    assert evaluation_ticks(ticks, 3).tolist() == [0, 2500, 4999]
+    assert evaluation_ticks(ticks[:2], 3).tolist() == [0, 1]
+    assert evaluation_ticks(ticks[:0], 3).tolist() == []
 
 
 def test_stopping_early_needs_something_held_out(
@@ -58,7 +54,7 @@ def errors(monkeypatch: pytest.MonkeyPatch) -> dict[int, float]:
     found = {2: 0.9, 4: 0.5, 6: 0.8, 8: 0.6, 10: 0.7, 12: 0.1}
     monkeypatch.setattr(
         Trainer,
-        "_judge",
+        "_measure",
         lambda self, log: (
             log.write(self.step, {"val/error": found[self.step]}) or {"val/error": found[self.step]}
         ),
@@ -91,7 +87,7 @@ def test_it_stops_early_also_when_it_was_interrupted(
         with monkeypatch.context() as patched:
             patched.setattr(Trainer, "_train_step", killed)
             if stopped == "finish":
-                patched.setattr("pipeline.train.run.Run.finish", killed_at_the_end)
+                patched.setattr("pipeline.train.run.TrainingRun.finish", killed_at_the_end)
             with pytest.raises(Stop):
                 trainer(store, chosen).fit()
     done = trainer(store, chosen)

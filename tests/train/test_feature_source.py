@@ -96,7 +96,7 @@ def test_what_a_front_brings_is_trained_judged_and_saved(store: FeatureStore, pa
     assert not {"frozen.weight", "frozen.bias"} & changed
     assert done.averaged.frozen.weight is module.frozen.weight
     assert done.averaged.adapter.weight is not module.adapter.weight
-    assert done.front.judged == [7], "its own limit of held-out ticks, in its own feed"
+    assert done.source.judged == [7], "its own limit of held-out ticks, in its own feed"
 
     rates = {
         name: group["lr"]

@@ -1,6 +1,7 @@
 """The loggers: the same rows to each, a stop that leaves no step twice, and what is missing."""
 
 import errno
+import json
 import os
 import subprocess
 import sys
@@ -15,20 +16,19 @@ from pipeline.base.durable import read_document, write_document
 from pipeline.base.errors import ConfigError, DiskFull
 from pipeline.base.ownership import MARKER
 from pipeline.store import FeatureStore
-from pipeline.train import loggers
-from pipeline.train.log import TrainingLog
-from pipeline.train.loggers import check_loggers
+from pipeline.train import log as loggers
+from pipeline.train.log import TrainingLog, check_loggers
 from pipeline.train.loop import Trainer
 from pipeline.train.run import open_run
 
 ROOT = Path(__file__).resolve().parents[2]
-LOGS = {MARKER, "plots", "metrics.json", "report.html"}
+LOGS = {MARKER, "plots", "metrics.json"}
 Make = Callable[..., Any]
 WANDB = """
 import sys
 from pathlib import Path
 from pipeline.base.config import TrainHeadParams
-from pipeline.train.loggers import WandB
+from pipeline.train.log import WandB
 
 place = Path(sys.argv[1])
 params = TrainHeadParams(output=place / "head", wandb_project="needles")
@@ -116,10 +116,9 @@ def test_every_logger_has_the_curves_of_dvc_after_a_stop_too(
     """The stop comes at step 17, the last checkpoint is of step 15: 16 and 17 come again."""
     pytest.importorskip("tensorboard", reason="tensorboard is not installed")
     monkeypatch.setattr("pipeline.train.loop.LOG_EVERY", 1)
-    chosen = params(loggers=["report", "tensorboard"])
+    chosen = params(loggers=["tensorboard"])
     events = chosen.logs.with_name("logs.tensorboard")
     stop_at(trainer(store, chosen), 17)
-    assert "stopped before its end" in (chosen.logs / "report.html").read_text()
     assert f"live: tensorboard --logdir {events}" in capsys.readouterr().out
     assert scalars(events)["train/loss"][-1][0] == 17
     resumed = trainer(store, chosen)
@@ -132,8 +131,6 @@ def test_every_logger_has_the_curves_of_dvc_after_a_stop_too(
     for name, points in expected.items():
         assert [step for step, _ in found[name]] == [step for step, _ in points], name
         assert [v for _, v in found[name]] == pytest.approx([v for _, v in points], rel=1e-6)
-    said = (chosen.logs / "report.html").read_text()
-    assert "step 20 of 20, finished" in said
     assert {path.name for path in chosen.logs.iterdir()} == LOGS
 
 
@@ -161,8 +158,7 @@ def test_who_shows_the_curves_decides_no_number(
     store: FeatureStore, params: Make, trainer: Make, stop_at: Callable[[Trainer, int], None]
 ) -> None:
     stop_at(trainer(store, params(loggers=[])), 11)
-    assert not (params().logs / "report.html").exists()
-    resumed = trainer(store, params(loggers=["report"], wandb_project="other"))
+    resumed = trainer(store, params(wandb_project="other"))
     assert resumed.run.status == "resumed"
     resumed.fit()
     assert open_run(params(loggers=["tensorboard"]), store).status == "finished"
@@ -196,28 +192,27 @@ def test_a_missing_package_and_one_that_does_not_load_are_named(
     (tmp_path / "tensorboard").mkdir()
     (tmp_path / "tensorboard" / "__init__.py").write_text("raise ImportError('no protobuf')")
     monkeypatch.setattr("sys.path", [str(tmp_path)])
-    chosen = params(loggers=["report", "dvclive", "tensorboard", "wandb"])
+    chosen = params(loggers=["tensorboard", "wandb"])
     with pytest.raises(ConfigError, match=r"tensorboard \(no protobuf\), wandb \(No module named"):
         check_loggers(chosen)
-    check_loggers(params(loggers=["report", "dvclive"]))
+    check_loggers(params(loggers=[]))
 
 
-def test_dvclives_own_report_lies_beside_the_logs(
-    tmp_path: Path, params: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("DVCLIVE_RESUME", "true")
-    chosen = params(loggers=["report", "dvclive"], max_steps=20)
+def test_curves_are_those_that_dvc_plots(tmp_path: Path, params: Make) -> None:
+    chosen = params(max_steps=20)
     for last in (30, 20):
         opened = loggers.open_loggers(chosen, resumed=False)
         with TrainingLog(chosen.logs, opened) as log:
             for step in range(10, last + 10, 10):
-                log.write(step, {"train/loss": 1 / step})
-    assert "live: open" in opened[0].note and "with a network" in opened[0].note
-    said = (tmp_path / "logs.dvclive.html").read_text()
-    assert "vega" in said and "train/loss" in said and "0.05" in said
-    assert [step for step, _ in curves(chosen.logs)["train/loss"]] == [10, 20], "none stands twice"
-    assert (chosen.logs / "report.html").exists()
+                log.write(step, {"train/loss": 1 / step, "lr": float("nan")})
+    assert opened[0].note == f"live: dvc plots show {chosen.logs}/plots/metrics"
     assert {path.name for path in chosen.logs.iterdir()} == LOGS
+    metrics = chosen.logs / "plots" / "metrics"
+    # As dvclive writes them.
+    assert (metrics / "train" / "loss.tsv").read_text() == "step\tloss\n10\t0.1\n20\t0.05\n"
+    assert (metrics / "lr.tsv").read_text() == "step\tlr\n10\tnan\n20\tnan\n"
+    newest = json.loads((chosen.logs / "metrics.json").read_text())
+    assert newest == {"train": {"loss": 0.05}, "lr": "nan", "step": 20}
 
 
 def test_a_full_disk_is_named_and_every_logger_is_closed(
@@ -234,12 +229,12 @@ def test_a_full_disk_is_named_and_every_logger_is_closed(
     assert kept.closed == full.closed == [False]
 
 
-def test_a_page_that_finds_no_room_is_a_full_disk(small_disk: Path) -> None:
-    page = loggers.LivePage(small_disk, "head", 20)
+def test_curves_that_find_no_room_are_a_full_disk(small_disk: Path) -> None:
+    curves = loggers.CurveFiles(small_disk)
     (small_disk / "ballast").write_bytes(b"")
     with pytest.raises(OSError, match="No space"), (small_disk / "ballast").open("wb") as file:
         file.write(bytes(16 << 20))
-    with pytest.raises(DiskFull), TrainingLog(small_disk / "logs", [page]) as log:
+    with pytest.raises(DiskFull), TrainingLog(small_disk / "logs", [curves]) as log:
         log.write(10, {f"train/{name}": 1.0 for name in range(100)})
 
 

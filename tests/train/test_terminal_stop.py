@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from pipeline.store import FeatureStore
-from pipeline.train.terminal import TerminalStop
+from pipeline.train.loop import TerminalStop
 
 Make = Callable[..., Any]
 LAST = [29, 28, 5]

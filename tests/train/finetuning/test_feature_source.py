@@ -18,11 +18,11 @@ from pipeline.policy.checkpoint import find_policy, load_policy
 from pipeline.policy.live_policy import LivePolicy
 from pipeline.store import FeatureStore
 from pipeline.train.batches import BatchIndices, Windows
-from pipeline.train.finetuning import Live, head_params, out_of_memory_named
-from pipeline.train.held_out import check_store, held_out_ticks, judge
+from pipeline.train.finetuning import LiveFeatures, head_params, out_of_memory_named
 from pipeline.train.loop import Trainer
 from pipeline.train.run import open_run
-from pipeline.train.split import split_by_episode
+from pipeline.train.scores import evaluate_policy
+from pipeline.train.split import check_store, held_out_ticks, split_by_episode
 
 CPU = torch.device("cpu")
 
@@ -31,7 +31,7 @@ def trainer(params: Params) -> Trainer:
     """A trainer that begins anew or goes on with what lies at `finetune.output`."""
     store = FeatureStore.open(params.extract.store)
     head = head_params(params)
-    front = Live.open(store, params, CPU)
+    front = LiveFeatures(store, params, CPU)
     run = open_run(head, store, front.identity)
     return Trainer(store, head, split_by_episode(store, head.val_fraction, 2), run, front)
 
@@ -94,7 +94,7 @@ def test_what_is_kept_is_the_averaged_model_that_was_judged(
     averaged = made.averaged
     assert isinstance(averaged, LivePolicy)
     assert averaged.vlm is not None
-    with made.front.feed([BatchIndices(ticks)], Windows(2, 1, 1), CPU) as feed, torch.no_grad():
+    with made.source.feed([BatchIndices(ticks)], Windows(2, 1, 1), CPU) as feed, torch.no_grad():
         _, batch = next(iter(feed))
         features, _ = averaged.vlm(batch.rows)
     cached = store.gather(ticks, 2, 1, 1).features
@@ -108,7 +108,7 @@ def test_what_is_kept_is_the_averaged_model_that_was_judged(
     with pytest.raises(CheckpointMismatch, match=r"feature_spec\.adapter"):
         check_store(best, base)
     ticks = held_out_ticks(store, best.held_out_ticks, best.held_out_content)
-    comparison, _ = judge(
+    comparison, _ = evaluate_policy(
         best.policy(), store, ticks, Windows.of(best.params), 64, best.normalization
     )
     assert comparison.overall("policy") == pytest.approx(best.metrics["val/error"], rel=1e-3)
@@ -174,8 +174,8 @@ def test_parts_of_a_step_give_the_whole_step(params: Callable[..., Params], tmp_
 def test_a_setting_that_decides_the_numbers_is_another_run(
     store: FeatureStore, params: Callable[..., Params], changed: dict[str, Any], another: bool
 ) -> None:
-    before = Live.open(store, params(), CPU).identity
-    after = Live.open(store, params(finetune=changed), CPU).identity
+    before = LiveFeatures(store, params(), CPU).identity
+    after = LiveFeatures(store, params(finetune=changed), CPU).identity
     assert (before != after) == another
     json.dumps(before)
 
@@ -206,12 +206,12 @@ def test_what_is_not_used_of_a_store_is_said(params: Callable[..., Params], tmp_
     given = Params.model_validate(document)
     extract(given, say=lambda _: None)
     store = FeatureStore.open(given.extract.store)
-    front = Live.open(store, given, CPU)
+    front = LiveFeatures(store, given, CPU)
     assert any("1 augmented variant(s) of each row are not used" in s for s in front.summary())
     draw = BatchIndices(np.arange(6), variants=np.ones(6, np.int64))
     with front.feed([draw], Windows(2, 1, 1), CPU) as feed:
         _, live = next(iter(feed))
-    with Live.open(FeatureStore.open(params().extract.store), params(), CPU).feed(
+    with LiveFeatures(FeatureStore.open(params().extract.store), params(), CPU).feed(
         [BatchIndices(np.arange(6))], Windows(2, 1, 1), CPU
     ) as feed:
         _, plain = next(iter(feed))

@@ -17,13 +17,13 @@ import torch
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import ConfigError
 from pipeline.store import FeatureStore
-from pipeline.train.compilation import compiled
+from pipeline.train.optimizer import compiled
 
 ROOT = Path(__file__).resolve().parents[2]
 PROBE = """
 import sys, torch
 from pipeline.base.errors import ConfigError
-from pipeline.train.compilation import compiled
+from pipeline.train.optimizer import compiled
 
 def loss(x):
     return ((x * 3).sin() + x).sum()
@@ -37,7 +37,7 @@ except ConfigError as error:
 TRAIN = """
 import json, sys, torch
 from pipeline.base.config import TrainHeadParams
-from pipeline.train.sampling import split_by_episode
+from pipeline.train.split import split_by_episode
 from pipeline.store import FeatureStore
 from pipeline.train.loop import Trainer
 from pipeline.train.run import open_run

@@ -12,7 +12,7 @@ import zarr
 
 from pipeline.base.config import TrainHeadParams
 from pipeline.store import Batch, FeatureStore
-from pipeline.train.batches import BatchIndices, Lags, Prefetch, Windows, draws
+from pipeline.train.batches import BatchIndices, Lags, Prefetch, Windows, cut_batches
 
 CPU = torch.device("cpu")
 WINDOWS = Windows(horizon=4, sensor_window=6, state_window=5)
@@ -47,7 +47,7 @@ def equal(found: Batch, expected: Batch) -> bool:
 
 
 def threads() -> int:
-    return sum(thread.name == "prefetch" for thread in threading.enumerate())
+    return sum(thread.name.startswith("prefetch") for thread in threading.enumerate())
 
 
 @pytest.mark.parametrize("buffers", [2, 3])
@@ -62,7 +62,7 @@ def test_batches_are_those_of_gather_in_the_order_of_the_plan(
 
 
 def test_draws_are_the_ticks_in_order_and_the_plain_frames() -> None:
-    found = draws(np.arange(20), 8)
+    found = cut_batches(np.arange(20), 8)
     assert [draw.ticks.tolist() for draw in found] == [
         [*range(8)],
         [*range(8, 16)],
@@ -106,7 +106,7 @@ def test_buffers_are_reused(store: FeatureStore) -> None:
 
 
 def test_a_last_batch_may_be_smaller(store: FeatureStore) -> None:
-    with Prefetch(store, draws(np.arange(20), 8), WINDOWS, CPU) as batches:
+    with Prefetch(store, cut_batches(np.arange(20), 8), WINDOWS, CPU) as batches:
         assert [len(batch) for _, batch in batches] == [8, 8, 4]
 
 

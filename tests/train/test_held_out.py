@@ -10,14 +10,13 @@ import pytest
 
 from pipeline.base.errors import CheckpointMismatch
 from pipeline.store import FeatureStore
-from pipeline.train.held_out import (
-    groups_of,
+from pipeline.train.split import (
     held_out_contents,
     held_out_ranges,
     held_out_ticks,
     named_as_in,
+    split_by_episode,
 )
-from pipeline.train.split import split_by_episode
 
 
 @pytest.mark.parametrize("episodes", [1, 2, 6])
@@ -38,7 +37,8 @@ def test_episodes_that_are_gone_or_shorter_are_named(store: FeatureStore) -> Non
     contents = {"right/episode_001": "0-1", "left/episode_000": "0-0", "left/gone": "x"}
     found = held_out_ticks(store, {"right/episode_001": (10, 30)}, contents)
     assert found.tolist() == list(range(40, 60))
-    with pytest.raises(CheckpointMismatch, match=r"lacks 2 of the 3 episodes.*left/gone, left/epi"):
+    said = r"of the 3 episodes .* 2 are not .*left/gone is missing; left/episode_000 is shorter"
+    with pytest.raises(CheckpointMismatch, match=said):
         held_out_ticks(
             store,
             {"left/gone": (0, 3), "left/episode_000": (0, 31), "right/episode_001": (0, 30)},
@@ -51,7 +51,7 @@ def test_episodes_that_are_gone_or_shorter_are_named(store: FeatureStore) -> Non
 def test_other_recordings_of_the_same_names_and_lengths_are_refused(store: FeatureStore) -> None:
     ranges = {"left/episode_000": (0, 30), "right/episode_001": (0, 30)}
     contents = {"left/episode_000": "0-0", "right/episode_001": "another recording"}
-    said = r"other recordings under the names of 1 of the 2 held-out episodes.*: right/episode_001"
+    said = r"of the 2 episodes .* 1 are not .*: right/episode_001 is another recording"
     with pytest.raises(CheckpointMismatch, match=said):
         held_out_ticks(store, ranges, contents)
 
@@ -68,15 +68,5 @@ def test_an_episode_that_is_gone_is_not_hidden_by_one_under_its_name(store: Feat
     contents = {"left/episode_000": "removed since", "left/episode_009": "0-0"}
     checkpoint: Any = HeldOut({"left/episode_000": (0, 7), "left/episode_009": (0, 9)}, contents)
     assert named_as_in(store, checkpoint) == (checkpoint, None)
-    with pytest.raises(CheckpointMismatch, match="lacks 1 of the 2"):
+    with pytest.raises(CheckpointMismatch, match=r"of the 2 episodes .* 2 are not"):
         held_out_ticks(store, checkpoint.held_out_ticks, contents)
-
-
-def test_groups_share_a_unit() -> None:
-    groups = groups_of(["x", "roll", "y", "gripper", "j1"], ["mm", "deg", "mm", "", "rad"])
-    assert [(group.key, group.dimensions) for group in groups] == [
-        ("translation_mm", (0, 2)),
-        ("rotation_deg", (1,)),
-        ("gripper", (3,)),
-        ("rotation_rad", (4,)),
-    ]

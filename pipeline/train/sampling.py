@@ -1,18 +1,24 @@
-"""Which tick comes next: a weighted mixture of shuffled sources."""
+"""What every step of a run is made of: a weighted mixture of shuffled sources, cut into parts.
 
-from collections.abc import Mapping
+All of it is a function of (seed, step).
+"""
+
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import ConfigError
 from pipeline.store import FeatureStore
-from pipeline.train.split import hash64
+from pipeline.train.batches import BatchIndices, Ticks
+from pipeline.train.split import Split, hash64
+from pipeline.train.world import World
 
 
-def ticks_by_source(store: FeatureStore, ticks: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
+def ticks_by_source(store: FeatureStore, ticks: Ticks) -> dict[str, Ticks]:
     """The ticks of each of the store's sources, in the order given; empty where it has none."""
     starts = np.array([episode.ticks.start for episode in store.episodes], np.int64)
     names = np.array([episode.source for episode in store.episodes])
@@ -33,7 +39,7 @@ class TickSampler:
 
     def __init__(
         self,
-        ticks_by_source: Mapping[str, NDArray[np.int64]],
+        ticks_by_source: Mapping[str, Ticks],
         weights: Mapping[str, float],
         batch_size: int,
         seed: int,
@@ -59,9 +65,9 @@ class TickSampler:
         self.shares = {name: float(mass / sum(size.values())) for name, mass in size.items()}
         self._mixture = _mixture(size)
         self._ticks = {name: ticks_by_source[name] for name in size}
-        self._orders: dict[tuple[str, int], NDArray[np.int64]] = {}
+        self._orders: dict[tuple[str, int], Ticks] = {}
 
-    def batch(self, step: int) -> NDArray[np.int64]:
+    def batch(self, step: int) -> Ticks:
         """The ticks (batch_size,) of this step, source by source: a function of (seed, step)."""
         first = self.drawn(step * self.batch_size)
         last = self.drawn((step + 1) * self.batch_size)
@@ -71,10 +77,10 @@ class TickSampler:
         """How many of the first `draws` ticks each source gave."""
         return self._mixture.drawn(draws)
 
-    def _range(self, name: str, start: int, stop: int) -> NDArray[np.int64]:
+    def _range(self, name: str, start: int, stop: int) -> Ticks:
         """The draws [start, stop) of one source, across epochs."""
         ticks = self._ticks[name]
-        parts: list[NDArray[np.int64]] = []
+        parts: list[Ticks] = []
         while start < stop:
             epoch, offset = divmod(start, len(ticks))
             taken = min(len(ticks) - offset, stop - start)
@@ -82,7 +88,7 @@ class TickSampler:
             start += taken
         return np.concatenate(parts) if parts else np.zeros(0, np.int64)
 
-    def _order(self, name: str, epoch: int) -> NDArray[np.int64]:
+    def _order(self, name: str, epoch: int) -> Ticks:
         key = (name, epoch)
         if key not in self._orders:
             for old in [k for k in self._orders if k[0] == name]:
@@ -125,3 +131,86 @@ def _mixture(masses: Mapping[str, Fraction]) -> _Node:
         left, right, *others = sorted(nodes, key=lambda node: node.mass)
         nodes = [_Node(left.mass + right.mass, fork=(left, right)), *others]
     return nodes[0]
+
+
+_VARIANTS = (0, 1)
+"""After (seed, step), tells the random numbers that pick variants from those of any part: numpy
+takes (seed, step, part) for (seed, step, part, 0), so that a third number would not do."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StepPart(BatchIndices):
+    """A part of a step's batch, computed at once; a feed hands it back beside its batch."""
+
+    share: float
+    """Of the step's valid chunk steps: what the part's mean loss counts in the whole mean."""
+    seed: int
+    """Of its dropout and its sampled noise: a function of (seed, step, part)."""
+
+
+class Plan:
+    """The ticks of every step, in as many parts as processes times `grad_accumulation`.
+
+    Parts p·a to p·a + a - 1 are those of process p, so that N processes do what one with N times
+    the accumulation does. Everything follows from params and store: nothing is communicated and
+    nothing has to be kept to go on from any step. `section` of the params is the one that errors
+    name. Raises `ConfigError` where parts would be empty.
+    """
+
+    def __init__(
+        self,
+        store: FeatureStore,
+        params: TrainHeadParams,
+        split: Split,
+        world: World,
+        section: str = "train_head",
+    ) -> None:
+        self.parts = world.size * params.grad_accumulation
+        if params.batch_size < self.parts:
+            raise ConfigError(
+                f"{section}.batch_size is {params.batch_size}: expected a tick at least for "
+                f"each of the {self.parts} parts of a step ({world.size} process(es) x "
+                f"grad_accumulation {params.grad_accumulation}). Raise it, or accumulate less."
+            )
+        first = world.rank * params.grad_accumulation
+        self.own = range(first, first + params.grad_accumulation)
+        """The parts of this process."""
+        self._sampler = TickSampler(
+            ticks_by_source(store, split.train), params.mixture, params.batch_size, params.seed
+        )
+        self._params, self._variants = params, store.variants
+        starts = store.array("episode/tick_start")
+        self._ends = np.repeat(starts[1:], np.diff(starts))
+
+    def ticks(self, step: int) -> Ticks:
+        """The ticks (batch_size,) of a step, over all parts and processes."""
+        return self._sampler.batch(step)
+
+    def step(self, step: int) -> list[StepPart]:
+        """This process's parts of a step, counted from 0."""
+        ticks, seed = self.ticks(step), self._params.seed
+        variants: NDArray[np.int64] | None = None
+        if self._variants > 1:
+            rng = np.random.default_rng((seed, step, *_VARIANTS))
+            variants = rng.integers(self._variants, size=len(ticks))
+        counts = self._count_valid(ticks)
+        cuts = np.array_split(np.arange(len(ticks)), self.parts)
+        return [
+            StepPart(
+                ticks[cuts[p]],
+                None if variants is None else variants[cuts[p]],
+                share=float(counts[cuts[p]].sum() / counts.sum()),
+                seed=int(np.random.SeedSequence((seed, step, p)).generate_state(1, np.uint64)[0]),
+            )
+            for p in self.own
+        ]
+
+    def parts_of(self, steps: range) -> Iterator[StepPart]:
+        """This process's parts of these steps, one after the other."""
+        return (part for step in steps for part in self.step(step))
+
+    def _count_valid(self, ticks: Ticks) -> NDArray[np.int64]:
+        """How many steps of each tick's chunk count in the loss: those before its episode's end."""
+        if self._params.terminal_stop:
+            return np.full(len(ticks), self._params.horizon)
+        return np.minimum(self._params.horizon, self._ends[ticks] - ticks)
