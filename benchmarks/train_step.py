@@ -53,7 +53,7 @@ class Contender:
         begun, waited = time.perf_counter(), self._waited
         for _ in range(self._steps):
             parts = itertools.islice(self._batches, len(self._trainer.plan.own))
-            self._trainer.learner.step(self._trainer.step, parts, lambda: False)
+            self._trainer.learn(parts, lambda: False)
         if self._trainer.device.type == "cuda":
             torch.cuda.synchronize(self._trainer.device)
         taken = time.perf_counter() - begun

@@ -25,7 +25,6 @@ if __name__ == "__main__":  # here, for --help waits for no import below
 from pipeline.base.config import Params
 from pipeline.store import FeatureStore, build_lock, check_trailers
 from pipeline.train.finetuning import LiveFeatures, head_params, next_steps, out_of_memory_named
-from pipeline.train.finetuning.params import left_out
 from pipeline.train.log import check_loggers
 from pipeline.train.loop import Trainer
 from pipeline.train.run import open_run
@@ -42,7 +41,7 @@ def main(params: Params) -> None:
         with world.holding(build_lock(head.output)), out_of_memory_named():
             source = LiveFeatures(store, params, process_device(head.device))
             opened = world.shared(lambda: open_run(head, store, source.identity, "finetune"))
-            world.say(*left_out(params), *opened.notes)
+            world.say(*opened.notes)
             if opened.status == "finished":
                 world.say("nothing to do", *next_steps(params.finetune, store))
                 return

@@ -18,7 +18,7 @@ class FeatureSource(Protocol):
     identity: Mapping[str, Any]
     """JSON: what else decides the numbers of the run; empty where the params say it all."""
     eval_ticks: int | None
-    """Held-out ticks judged at most during training; None: the trainer's own limit."""
+    """Held-out ticks evaluated at most during training; None: the trainer's own limit."""
 
     def attach(self, policy: Policy) -> Trainable:
         """The module that is trained; it holds the policy."""

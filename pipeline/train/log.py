@@ -4,7 +4,6 @@ Every logger is handed the same rows. TensorBoard's and Weights & Biases' files 
 they lie beside the logs, which DVC hashes, not in them.
 """
 
-import csv
 import json
 import math
 from collections.abc import Generator, Iterable, Mapping, Sequence
@@ -27,7 +26,7 @@ from pipeline.train.world import World
 
 FINISH_TIMEOUT_S = 120.0
 """How long a finished run waits for Weights & Biases to take what it has not sent yet."""
-_SPEED = ("step", "steps_per_s", "data_wait_share", "peak_memory_mib", "trained_s")
+_SPEED = "step\tsteps_per_s\tdata_wait_share\tpeak_memory_mib\ttrained_s"
 _MODULES = {"tensorboard": "torch.utils.tensorboard", "wandb": "wandb.sdk"}
 """What is imported of a logger's package: a folder `wandb`, as that leaves where it runs, has none
 of it."""
@@ -94,11 +93,9 @@ class Logger(Protocol):
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
         """Add a point, at a step counted from 1, to each of these curves."""
-        ...
 
     def close(self, finished: bool) -> None:
         """End: the run is finished, or was stopped and may go on."""
-        ...
 
 
 class CurveFiles:
@@ -277,10 +274,9 @@ class TrainingLog:
         self._folder, self._loggers = folder, loggers
         self.rows: list[Row] = []
         speed = speed_file(folder)
-        refuse_foreign(speed, OutputKind("a run's speed", begins_with("\t".join(_SPEED))))
-        self._speed = fresh(speed).open("w", encoding="utf-8", newline="")
-        self._writer = csv.writer(self._speed, delimiter="\t")
-        self._writer.writerow(_SPEED)
+        refuse_foreign(speed, OutputKind("a run's speed", begins_with(_SPEED)))
+        self._speed = fresh(speed).open("w", encoding="utf-8")
+        self._speed.write(f"{_SPEED}\n")
         for step, metrics in earlier:
             self.write(step, metrics)
 
@@ -294,14 +290,9 @@ class TrainingLog:
     def write_speed(self, step: int, pace: Pace) -> None:
         """Add a line to `speed_file`."""
         with disk_full_named(self._folder):
-            self._writer.writerow(
-                [
-                    step,
-                    f"{pace.steps_per_s:.3f}",
-                    f"{pace.data_wait_share:.4f}",
-                    f"{pace.peak_memory / 2**20:.0f}",
-                    f"{pace.trained_s:.3f}",
-                ]
+            self._speed.write(
+                f"{step}\t{pace.steps_per_s:.3f}\t{pace.data_wait_share:.4f}\t"
+                f"{pace.peak_memory / 2**20:.0f}\t{pace.trained_s:.3f}\n"
             )
             self._speed.flush()
 

@@ -35,7 +35,7 @@ from pipeline.train.optimizer import (
     schedule,
     trainable,
 )
-from pipeline.train.progress import Progress, Speed, describe_data, peak_memory_bytes
+from pipeline.train.progress import Progress, describe_data, peak_memory_bytes
 from pipeline.train.run import TrainingRun, policy_shape
 from pipeline.train.sampling import Plan, StepPart
 from pipeline.train.scores import evaluate_policy
@@ -87,21 +87,40 @@ class Trainer:
         else:
             self.normalization = self.world.shared(lambda: fit_normalization(store, split.train))
             self.shape = policy_shape(store, self.normalization)
-        torch.manual_seed(params.seed)
-        policy = Policy(params, self.shape, self.normalization)
-        self.learner = Learner(self.source, policy, store, params, self.device, self.world)
+        self._build()
         if state is not None:
             self._restore(state)
+
+    def _build(self) -> None:
+        """The policy behind its features, its optimizer, and the average of what learns.
+
+        All processes begin with the weights of rank 0 and stay equal.
+        """
+        params = self.params
+        torch.manual_seed(params.seed)
+        policy = Policy(params, self.shape, self.normalization)
+        self._trained = self.source.attach(policy)
+        assert isinstance(self._trained, nn.Module)
+        self.module: nn.Module = self._trained.to(self.device).train()
+        self.learning = trainable(self.module)
+        """The parameters that learn, by name; the others are neither averaged nor kept."""
+        self.world.spread(value.data for value in self.learning.values())
+        rates = peak_rates(self.module, self.source, params)
+        self.optimizer = make_optimizer(self.module, params, rates)
+        self.average = WeightAverage(self.module, params.ema_decay)
+        self._bfloat16 = use_bfloat16(params.amp, self.device)
+        self._terminal = TerminalStop(self.store, self.device) if params.terminal_stop else None
+        self._compiled = compiled(self._trained.loss, self.device) if params.compile else None
 
     @property
     def policy(self) -> Policy:
         """The policy in training."""
-        return self.source.policy_of(self.learner.module)
+        return self.source.policy_of(self.module)
 
     @property
     def averaged(self) -> nn.Module:
         """The module with the averaged weights, which is evaluated and kept."""
-        return self.learner.average.module
+        return self.average.module
 
     def fit(self) -> None:
         """Train to the last step, or until nothing gets better, and finish the run.
@@ -110,25 +129,25 @@ class Trainer:
         ticks. On Ctrl-C or SIGTERM, to whichever process, all end the step, the last checkpoint is
         written and `KeyboardInterrupt` raised.
         """
-        parts = self.plan.parts_of(range(self.step, self.params.max_steps))
+        steps, shown = range(self.step, self.params.max_steps), self.world.first
         windows, resumed = Windows.of(self.params), self.run.status == "resumed"
         with (
             deferred_interrupt() as interrupted,
             open_log(self.params, resumed, self._earlier, self.world) as log,
-            self.source.feed(parts, windows, self.device) as feed,
-            Progress(self.step, self.params.max_steps, self.world.first) as progress,
+            self.source.feed(self.plan.parts_of(steps), windows, self.device) as feed,
+            Progress(feed, self.device, steps, self._trained_s, shown) as progress,
         ):
             self.world.shared(self.run.begin)
-            batches, speed = iter(feed), Speed(feed, self.device, self.step, self._trained_s)
+            batches = iter(feed)
             while not self._over:
                 stopped = self._train_step(batches, interrupted)
                 progress.advance(self._loss)
                 if self.step % self.params.eval_every == 0 or self._over:
-                    self._evaluate(log, speed)
+                    self._evaluate(log, progress)
                 if self.step % LOG_EVERY == 0 or self._over:
-                    self._write_down(log, speed, progress)
+                    self._write_down(log, progress)
                 if self.step % self.params.checkpoint_every == 0 or self._over or stopped:
-                    self._save_last(log, speed)
+                    self._save_last(log, progress)
                 if stopped and not self._over:
                     raise KeyboardInterrupt
         self.world.shared(self.run.finish)
@@ -138,20 +157,26 @@ class Trainer:
                 f"stopped early at step {self.step}: {stalled} evaluations without a better one"
             )
         self.world.say(
-            f"trained {self.step} steps in {duration(speed.trained_s)} "
-            f"({self.step / max(speed.trained_s, 1e-9):.1f} steps/s), "
+            f"trained {self.step} steps in {duration(progress.trained_s)} "
+            f"({self.step / max(progress.trained_s, 1e-9):.1f} steps/s), "
             f"peak memory {size(peak_memory_bytes(self.device))}"
         )
 
     def summary(self) -> list[str]:
         """What is trained, from what and on what, as lines for the user."""
         several = f" on {self.world.size} processes" if self.world.size > 1 else ""
-        precision = "bfloat16 autocast" if self.learner.bfloat16 else "float32"
+        precision = "bfloat16 autocast" if self._bfloat16 else "float32"
         lines, warnings = describe_data(self.store, self.shape, self.params, self.split)
+        lines += describe_cost(self.policy)
+        if self.module is not self.policy:
+            table = ", ".join(f"{part} {n:,}" for part, n in self._trained.parameter_table())
+            lines.append(f"parameters with what is before it: {table}")
+        learning = sum(value.numel() for value in self.learning.values())
+        whole = sum(value.numel() for value in self.module.parameters())
+        if learning < whole:
+            lines.append(f"learns {learning:,} of {whole:,} parameters")
         return [
             *lines,
-            *describe_cost(self.policy),
-            *self.learner.summary(),
             *self._feed_note,
             f"device {self.device}{several}, {precision}"
             f"{', compiled' if self.params.compile else ''}; "
@@ -167,20 +192,57 @@ class Trainer:
         self, batches: Iterator[tuple[BatchIndices, Batch]], interrupted: Callable[[], bool]
     ) -> bool:
         """One step of all processes; whether one of them was told to stop."""
-        parts = islice(batches, len(self.plan.own))
-        scalars, stopped = self.learner.step(self.step, parts, interrupted)
+        scalars, stopped = self.learn(islice(batches, len(self.plan.own)), interrupted)
         self.history.add(scalars)
         self.step += 1
         return stopped
 
-    def _write_down(self, log: TrainingLog | None, speed: Speed, progress: Progress) -> None:
+    def learn(
+        self, parts: Iterable[tuple[BatchIndices, Batch]], interrupted: Callable[[], bool]
+    ) -> tuple[dict[str, Tensor], bool]:
+        """Learn from this process's parts of the batch of the next step.
+
+        Returns the loss, the norm of the gradient and the loss's parts, detached and over all
+        processes, and whether any process was interrupted.
+        """
+        share = schedule(self.step, self.params)
+        for group in self.optimizer.param_groups:
+            group["lr"] = group["peak_lr"] * share
+        self.optimizer.zero_grad(set_to_none=True)
+        scalars: dict[str, Tensor] = {}
+        for part, batch in parts:
+            for name, value in self._backward(part, batch).items():
+                scalars[name] = scalars[name] + value if name in scalars else value
+        learning = self.learning.values()
+        stopped = self.world.sum_gradients(learning, scalars, interrupted())
+        norm = torch.nn.utils.clip_grad_norm_(learning, self.params.grad_clip)
+        self.optimizer.step()
+        self.average.update(self.step + 1)
+        return {"loss": scalars.pop("loss"), "grad_norm": norm, **scalars}, stopped
+
+    def _backward(self, part: BatchIndices, batch: Batch) -> dict[str, Tensor]:
+        """Add a part's gradients; its loss and the parts of it, each by its share of the whole."""
+        assert isinstance(part, StepPart), "a feed hands back the entries of its plan"
+        # Dropout and sampled noise of a part depend on nothing that came before it.
+        torch.manual_seed(part.seed)
+        action, valid = batch.action, batch.action_valid
+        if self._terminal is not None:
+            action, valid = self._terminal.extend(action, valid)
+        loss_of = self._compiled or self._trained.loss
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self._bfloat16):
+            loss, parts = loss_of(batch, action, valid)
+        loss = loss * part.share
+        loss.backward()
+        return {"loss": loss.detach()} | {name: part.share * v for name, v in parts.items()}
+
+    def _write_down(self, log: TrainingLog | None, progress: Progress) -> None:
         self._check_finite()
         means = self.history.mean((self.step - 1) // LOG_EVERY * LOG_EVERY, self.step)
         rate = self.params.lr * schedule(self.step - 1, self.params)
 
         def write() -> None:
             assert log is not None
-            pace = speed.read(self.step)
+            pace = progress.read()
             log.write(self.step, {f"train/{k}": v for k, v in means.items()} | {"lr": rate})
             log.write_speed(self.step, pace)
             memory, waited = f"{pace.peak_memory / 2**30:.1f}G", f"{pace.data_wait_share:.0%}"
@@ -189,10 +251,10 @@ class Trainer:
 
         self.world.shared(write)
 
-    def _evaluate(self, log: TrainingLog | None, speed: Speed) -> None:
+    def _evaluate(self, log: TrainingLog | None, progress: Progress) -> None:
         """Evaluate the averaged weights; save them where they are the best so far."""
         self._check_finite()
-        with speed.paused():
+        with progress.paused():
             metrics = self.world.shared(lambda: self._measure(log))
             if not metrics or self.stopping.take(metrics["val/error"]):
                 self.world.shared(lambda: self._save(self.run.best, metrics))
@@ -247,7 +309,7 @@ class Trainer:
                 f"{self.run.section}.lr or train_head.grad_clip.{kept}"
             )
 
-    def _save_last(self, log: TrainingLog | None, speed: Speed) -> None:
+    def _save_last(self, log: TrainingLog | None, progress: Progress) -> None:
         """Save the newest weights, with everything that going on from them takes."""
         self._check_finite()
 
@@ -255,17 +317,19 @@ class Trainer:
             assert log is not None
             state = TrainerState(
                 step=self.step,
-                **self.learner.tensors(),
+                weights=dict(self.learning),
+                average=self.average.weights,
+                optimizer=optimizer_tensors(self.optimizer, self.module),
                 history=self.history.tensor(),
                 columns=self.history.columns,
                 best_error=self.stopping.best_error,
                 stalled=self.stopping.stalled,
-                trained_s=speed.trained_s,
+                trained_s=progress.trained_s,
                 rows=tuple(log.rows),
             )
             self._save(self.run.last, {"train/loss": self.history.last("loss")}, state)
 
-        with speed.paused():
+        with progress.paused():
             self.world.shared(save)
 
     def _save(
@@ -295,107 +359,12 @@ class Trainer:
         save_policy(folder, checkpoint, beside=write_beside)
 
     def _restore(self, state: TrainerState) -> None:
-        self.learner.restore(state, self.run.last)
+        load_weights(self.learning, state.weights, self.run.last)
+        load_weights(self.average.weights, state.average, self.run.last)
+        restore_optimizer(self.optimizer, self.module, state.optimizer)
         self.history = History(state.columns, state.history)
         self.stopping.best_error, self.stopping.stalled = state.best_error, state.stalled
         self.step, self._earlier, self._trained_s = state.step, state.rows, state.trained_s
-
-
-class Learner:
-    """A policy behind its feature source, trained by AdamW, and the average of what learns.
-
-    All processes of `world` begin with the weights of rank 0 and stay equal.
-    """
-
-    def __init__(
-        self,
-        source: FeatureSource,
-        policy: Policy,
-        store: FeatureStore,
-        params: TrainHeadParams,
-        device: torch.device,
-        world: World,
-    ) -> None:
-        self._params, self._device, self._world = params, device, world
-        self.bfloat16 = use_bfloat16(params.amp, device)
-        self.trained = source.attach(policy)
-        assert isinstance(self.trained, nn.Module)
-        self.module: nn.Module = self.trained.to(device).train()
-        self.learning = trainable(self.module)
-        """The parameters that learn, by name; the others are neither averaged nor kept."""
-        world.spread(value.data for value in self.learning.values())
-        rates = peak_rates(self.module, source, params)
-        self.optimizer = make_optimizer(self.module, params, rates)
-        self.average = WeightAverage(self.module, params.ema_decay)
-        self._terminal = TerminalStop(store, device) if params.terminal_stop else None
-        self._compiled = compiled(self.trained.loss, device) if params.compile else None
-
-    def step(
-        self,
-        number: int,
-        parts: Iterable[tuple[BatchIndices, Batch]],
-        interrupted: Callable[[], bool],
-    ) -> tuple[dict[str, Tensor], bool]:
-        """Step `number`, counted from 0, on this process's parts of its batch.
-
-        Returns the loss, the norm of the gradient and the loss's parts, detached and over all
-        processes, and whether any process was interrupted.
-        """
-        share = schedule(number, self._params)
-        for group in self.optimizer.param_groups:
-            group["lr"] = group["peak_lr"] * share
-        self.optimizer.zero_grad(set_to_none=True)
-        scalars: dict[str, Tensor] = {}
-        for part, batch in parts:
-            for name, value in self._backward(part, batch).items():
-                scalars[name] = scalars[name] + value if name in scalars else value
-        learning = self.learning.values()
-        stopped = self._world.sum_gradients(learning, scalars, interrupted())
-        norm = torch.nn.utils.clip_grad_norm_(learning, self._params.grad_clip)
-        self.optimizer.step()
-        self.average.update(number + 1)
-        return {"loss": scalars.pop("loss"), "grad_norm": norm, **scalars}, stopped
-
-    def tensors(self) -> dict[str, Mapping[str, Tensor]]:
-        """What going on takes of it: `weights`, `average` and `optimizer` of a `TrainerState`."""
-        return {
-            "weights": dict(self.learning),
-            "average": self.average.weights,
-            "optimizer": optimizer_tensors(self.optimizer, self.module),
-        }
-
-    def restore(self, state: TrainerState, place: Path) -> None:
-        """Go on from there. Raises `CheckpointMismatch` where something else learnt."""
-        load_weights(self.learning, state.weights, place)
-        load_weights(self.average.weights, state.average, place)
-        restore_optimizer(self.optimizer, self.module, state.optimizer)
-
-    def summary(self) -> list[str]:
-        """Lines on what is trained beside the policy, and on what stays frozen."""
-        lines: list[str] = []
-        if not isinstance(self.module, Policy):
-            table = ", ".join(f"{part} {n:,}" for part, n in self.trained.parameter_table())
-            lines.append(f"parameters with what is before it: {table}")
-        learning = sum(value.numel() for value in self.learning.values())
-        whole = sum(value.numel() for value in self.module.parameters())
-        if learning < whole:
-            lines.append(f"learns {learning:,} of {whole:,} parameters")
-        return lines
-
-    def _backward(self, part: BatchIndices, batch: Batch) -> dict[str, Tensor]:
-        """Add a part's gradients; its loss and the parts of it, each by its share of the whole."""
-        assert isinstance(part, StepPart), "a feed hands back the entries of its plan"
-        # Dropout and sampled noise of a part depend on nothing that came before it.
-        torch.manual_seed(part.seed)
-        action, valid = batch.action, batch.action_valid
-        if self._terminal is not None:
-            action, valid = self._terminal.extend(action, valid)
-        loss_of = self._compiled or self.trained.loss
-        with torch.autocast(self._device.type, torch.bfloat16, enabled=self.bfloat16):
-            loss, parts = loss_of(batch, action, valid)
-        loss = loss * part.share
-        loss.backward()
-        return {"loss": loss.detach()} | {name: part.share * v for name, v in parts.items()}
 
 
 class TerminalStop:

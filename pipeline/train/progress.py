@@ -23,48 +23,8 @@ EVERY_S = 60.0
 """Between two lines where there is no terminal."""
 
 
-class Progress:
-    """Counts steps on stderr, `shown` on one process of several: a bar, or a line a minute."""
-
-    def __init__(self, step: int, total: int, shown: bool) -> None:
-        # None: shown where stderr is a terminal.
-        hidden = None if shown else True
-        self._bar: tqdm[NoReturn] = tqdm(initial=step, total=total, unit="step", disable=hidden)
-        self._writes_lines = shown and self._bar.disable
-        self._step, self._total = step, total
-        self._last_line = step, time.monotonic()
-
-    def advance(self, loss: Callable[[], float]) -> None:
-        """Count a step; `loss` gives its loss, and is only asked where a line is due."""
-        self._step += 1
-        self._bar.update()
-        step, since = self._last_line
-        elapsed = time.monotonic() - since
-        if not self._writes_lines or elapsed < EVERY_S:
-            return
-        steps_per_s = (self._step - step) / elapsed
-        left = duration((self._total - self._step) / steps_per_s)
-        print(
-            f"step {self._step} of {self._total}: train loss {loss():.4f}, "
-            f"{steps_per_s:.3g} steps/s, about {left} left",
-            file=sys.stderr,
-            flush=True,
-        )
-        self._last_line = self._step, time.monotonic()
-
-    def note(self, **values: str) -> None:
-        """Show these behind the bar."""
-        self._bar.set_postfix(values)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *raised: object) -> None:
-        self._bar.close()
-
-
 class Pace(NamedTuple):
-    """A reading of `Speed`."""
+    """How fast a run goes."""
 
     steps_per_s: float
     """Since the reading before."""
@@ -76,16 +36,53 @@ class Pace(NamedTuple):
     """Seconds of training so far, over all starts of the run."""
 
 
-class Speed:
-    """A stopwatch of training: steps and their data, not evaluations and checkpoints."""
+class Progress:
+    """Counts steps on stderr, `shown` on one process of several: a bar, or a line a minute.
+
+    And measures how fast they go: steps and their data, not evaluations and checkpoints.
+    """
 
     def __init__(
-        self, feed: Feed, device: torch.device, step: int = 0, trained_s: float = 0.0
+        self,
+        feed: Feed,
+        device: torch.device,
+        steps: range,
+        trained_s: float = 0.0,
+        shown: bool = True,
     ) -> None:
-        self._feed, self._device = feed, device
-        self._step, self._waited = step, feed.waited_s
-        self._before, self._at_reading = trained_s, trained_s
+        step, self._total = steps.start, steps.stop
+        # None: shown where stderr is a terminal.
+        self._bar: tqdm[NoReturn] = tqdm(
+            initial=step, total=self._total, unit="step", disable=None if shown else True
+        )
+        self._writes_lines = shown and self._bar.disable
+        self._feed, self._device, self._step = feed, device, step
+        self._last_line = step, time.perf_counter()
+        self._last_reading = step, trained_s, feed.waited_s
+        self._before = trained_s
         self._since: float | None = time.perf_counter()
+
+    def advance(self, loss: Callable[[], float]) -> None:
+        """Count a step; `loss` gives its loss, and is only asked where a line is due."""
+        self._step += 1
+        self._bar.update()
+        step, since = self._last_line
+        elapsed = time.perf_counter() - since
+        if not self._writes_lines or elapsed < EVERY_S:
+            return
+        steps_per_s = (self._step - step) / elapsed
+        left = duration((self._total - self._step) / steps_per_s)
+        print(
+            f"step {self._step} of {self._total}: train loss {loss():.4f}, "
+            f"{steps_per_s:.3g} steps/s, about {left} left",
+            file=sys.stderr,
+            flush=True,
+        )
+        self._last_line = self._step, time.perf_counter()
+
+    def note(self, **values: str) -> None:
+        """Show these behind the bar."""
+        self._bar.set_postfix(values)
 
     @property
     def trained_s(self) -> float:
@@ -100,18 +97,20 @@ class Speed:
         yield
         self._since = time.perf_counter()
 
-    def read(self, step: int) -> Pace:
+    def read(self) -> Pace:
         """The figures at this step."""
-        trained, waited = self.trained_s, self._feed.waited_s
-        elapsed = max(trained - self._at_reading, 1e-9)
-        pace = Pace(
-            (step - self._step) / elapsed,
-            (waited - self._waited) / elapsed,
-            peak_memory_bytes(self._device),
-            trained,
-        )
-        self._step, self._waited, self._at_reading = step, waited, trained
-        return pace
+        step, trained, waited = self._last_reading
+        self._last_reading = self._step, self.trained_s, self._feed.waited_s
+        now = self._last_reading
+        elapsed = max(now[1] - trained, 1e-9)
+        share = (now[2] - waited) / elapsed
+        return Pace((now[0] - step) / elapsed, share, peak_memory_bytes(self._device), now[1])
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self._bar.close()
 
 
 def peak_memory_bytes(device: torch.device) -> int:

@@ -142,11 +142,13 @@ def open_run(
     if (output / RUN).exists():
         if read_document(output / RUN) != identity:
             notes.append(f"{output} holds another run; it is replaced when this one is finished")
-        elif (why := _damage(output)) is None:
-            _drop_trainer_state(output)
-            return TrainingRun(output, "finished", _finished_notes(params), identity, section)
         else:
-            notes.append(f"{output} is this very run, but damaged; it is trained again: {why}")
+            try:
+                finished = _finished_notes(params)
+                _drop_trainer_state(output)
+                return TrainingRun(output, "finished", finished, identity, section)
+            except (CheckpointIncomplete, CheckpointMismatch) as why:
+                notes.append(f"{output} is this very run, but damaged; it is trained again: {why}")
     if _has_checkpoint(part) and not (part / RUN).exists():
         raise ConfigError(
             f"{part} has checkpoints but no {RUN}, so it cannot be told what run they are of. "
@@ -196,19 +198,11 @@ def finished_run(params: TrainHeadParams, path: Path) -> TrainingRun | None:
     return run if run.status == "finished" else None
 
 
-def _damage(output: Path) -> str | None:
-    """What is wrong with a finished run's checkpoints; None where both are whole."""
-    try:
-        for name in (BEST, LAST):
-            check_policy(output / name)
-    except (CheckpointIncomplete, CheckpointMismatch) as error:
-        return str(error)
-    return None
-
-
 def _finished_notes(params: TrainHeadParams) -> tuple[str, ...]:
-    note = f"{params.output} is this very run, finished"
+    """Of a finished run, what to say of it; raises where one of its checkpoints is damaged."""
+    check_policy(params.output / BEST)
     logs = check_policy(params.output / LAST).logs
+    note = f"{params.output} is this very run, finished"
     if logs == params.logs:
         return (note,)
     return note, f"its curves are left where they were written, in {logs}, not in {params.logs}"

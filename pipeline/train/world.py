@@ -3,7 +3,7 @@
 import os
 import signal
 import threading
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import timedelta
@@ -90,14 +90,6 @@ class World:
             for line in lines:
                 print(line, flush=True)
 
-    def any(self, flags: Sequence[bool]) -> list[bool]:
-        """Each flag: whether it is set on any process."""
-        if self.size == 1:
-            return list(flags)
-        anywhere = torch.tensor(flags, dtype=torch.uint8)
-        dist.all_reduce(anywhere, dist.ReduceOp.MAX)
-        return anywhere.bool().tolist()
-
     def sum(self, tensors: Iterable[Tensor]) -> None:
         """Replace each tensor by its sum over all processes."""
         if self.size > 1:
@@ -121,8 +113,9 @@ class World:
         if self.size == 1:
             return stop
         parameters = list(parameters)
-        used = [parameter.grad is not None for parameter in parameters]
-        stop, *used = self.any([stop, *used])
+        flags = torch.tensor([stop, *(p.grad is not None for p in parameters)], dtype=torch.uint8)
+        dist.all_reduce(flags, dist.ReduceOp.MAX)
+        stop, *used = flags.bool().tolist()
         gradients: list[Tensor] = []
         for parameter, anywhere in zip(parameters, used, strict=True):
             if anywhere and parameter.grad is None:

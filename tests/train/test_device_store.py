@@ -142,9 +142,8 @@ def test_a_run_with_another_feed_continues_bit_for_bit(
 
 
 def weights(trainer: Trainer) -> dict[str, torch.Tensor]:
-    return trainer.learner.tensors()["weights"] | {
-        f"average {name}": value for name, value in trainer.learner.tensors()["average"].items()
-    }
+    averaged = {f"average {name}": value for name, value in trainer.average.weights.items()}
+    return {**trainer.learning, **averaged}
 
 
 def test_the_summary_says_which_and_why(store: FeatureStore, params: Make, trainer: Make) -> None:

@@ -32,15 +32,15 @@ import contextlib, io, json, os, sys, time
 from datetime import timedelta
 from pathlib import Path
 import torch.distributed as dist
-import pipeline.train.batches
 import pipeline.train.loop as loop
 from pipeline.base.errors import StoreIncomplete
-from pipeline.train import world as speaker
+from pipeline.store import FeatureStore
+from pipeline.train import world
 from stages import train_head
 from stages.command import run
 
 loop.LOG_EVERY = 1
-step, fitted, opened = loop.Trainer._train_step, loop.Trainer.fit, pipeline.train.batches.open_store
+step, fitted, opened = loop.Trainer._train_step, loop.Trainer.fit, vars(FeatureStore)["open"]
 rank = os.environ["RANK"]
 
 def train_step(self, batches, interrupted):
@@ -56,7 +56,7 @@ def fail(*rest, **named):
     raise StoreIncomplete(f"no store on the machine of {rank}")
 
 def fit(self):
-    self.learner.step = fail
+    self.learn = fail
     fitted(self)
 
 def train(arguments, fails="", holds=None):
@@ -64,8 +64,8 @@ def train(arguments, fails="", holds=None):
     hold = holds
     # Rank 0 is waited for where it fails too, however late; where it does not, for a moment.
     alone = fails.endswith("1")
-    speaker.PRECEDENCE = timedelta(seconds=0.2 if alone else 200)
-    pipeline.train.batches.open_store = fail if fails == f"open {rank}" else opened
+    world.PRECEDENCE = timedelta(seconds=0.2 if alone else 200)
+    FeatureStore.open = fail if fails == f"open {rank}" else opened
     loop.Trainer.fit = fit if fails == f"step {rank}" else fitted
     return run("", train_head.main, arguments)
 
@@ -99,7 +99,6 @@ with process_group("cpu") as world:
     kept = {"a": torch.full((2, 3), 7.0), "n": torch.tensor(5)}
     found = world.tensors(kept if world.first else {})
     assert found["a"].tolist() == [[7.0] * 3] * 2 and found["n"].item() == 5
-    assert world.any([world.rank == 1, False, True]) == [True, False, True]
     double = torch.tensor([rank], dtype=torch.float64)
     several = [torch.full((3,), rank), torch.tensor(rank + 1), double]
     world.sum(several)

@@ -87,7 +87,7 @@ def make(store: FeatureStore, params: TrainHeadParams) -> Trainer:
 
 def test_what_a_front_brings_is_trained_judged_and_saved(store: FeatureStore, params: Make) -> None:
     done = make(store, params(max_steps=8, sensor_lr=5e-3))
-    module = done.learner.module
+    module = done.module
     assert isinstance(module, Adapted)
     begun = {name: value.clone() for name, value in module.state_dict().items()}
     done.fit()
@@ -100,7 +100,7 @@ def test_what_a_front_brings_is_trained_judged_and_saved(store: FeatureStore, pa
 
     rates = {
         name: group["lr"]
-        for group in done.learner.optimizer.param_groups
+        for group in done.optimizer.param_groups
         for name, value in module.named_parameters()
         if any(value is member for member in group["params"])
     }
@@ -140,7 +140,7 @@ def test_a_run_with_a_front_goes_on_to_the_bit(
     assert resumed.step == 10
     resumed.fit()
     for a, b in (
-        (resumed.learner.module, whole.learner.module),
+        (resumed.module, whole.module),
         (resumed.averaged, whole.averaged),
     ):
         for name, value in a.state_dict().items():

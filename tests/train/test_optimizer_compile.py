@@ -60,8 +60,9 @@ def said(code: str, *arguments: object, **environment: str) -> str:
 
 def test_without_a_compiler_it_says_what_is_missing() -> None:
     found = said(PROBE, CXX="/nowhere/g++")
-    assert found.startswith("ConfigError train_head.compile: expected a C++ compiler")
-    assert "found that it fails: InvalidCxxCompiler" in found
+    assert found.startswith("ConfigError train_head.compile: ")
+    assert "InvalidCxxCompiler" in found
+    assert "It takes a C++ compiler" in found
     assert "train_head.compile=false" in found
 
 
@@ -92,26 +93,12 @@ def test_compiled_a_training_has_the_numbers_it_has_without(
     assert not torch.allclose(curves["other noise"], curves["eager"], rtol=1e-2)
 
 
-def test_a_failure_of_the_probe_is_not_a_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(function: object) -> object:
-        def fails(*arguments: object) -> None:
-            raise RuntimeError("\nTriton: no compiler")
-
-        return fails
-
-    monkeypatch.setattr(torch, "compile", broken)
-    with pytest.raises(ConfigError, match="found that it fails: Triton: no compiler"):
-        compiled(torch.sin, torch.device("cpu"))
-
-
 def test_a_loss_that_does_not_compile_is_not_a_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
     from torch._dynamo.exc import BackendCompilerFailed
 
     def broken(function: Callable[..., Any], **chosen: object) -> Callable[..., Any]:
         def fails(*arguments: object) -> object:
-            if function is torch.sin:
-                raise BackendCompilerFailed(torch.sin, RuntimeError("C++ compile error"), None)
-            return function(*arguments)
+            raise BackendCompilerFailed(torch.sin, RuntimeError("C++ compile error"), None)
 
         return fails
 

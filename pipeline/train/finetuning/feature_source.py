@@ -58,7 +58,7 @@ class LiveFeatures:
         # Once for all processes: they would read the same files and say the same.
         self._spec = World.current().shared(checked)
         self._store, self._vlm, self._finetune = store, params.vlm, params.finetune
-        self._device = device
+        self._compile, self._device = params.train_head.compile, device
         self._rows = LiveRows(store, recordings, Preparer(params.vlm, self._spec))
         self._base_digest = lru_cache(file_digest)
         tuning = params.finetune.tuning
@@ -117,6 +117,11 @@ class LiveFeatures:
             f"tuning: {how}, peak learning rate {self._finetune.lr:g}; {rows} VL rows of "
             f"{len(self._store.episodes)} recordings"
         ]
+        if self._compile:
+            lines.append(
+                "train_head.compile is true, but a tuning runs uncompiled: torch.compile cannot "
+                "take its batches of rows"
+            )
         if self._store.variants > 1:
             lines.append(
                 f"tuning: the store's {self._store.variants - 1} augmented variant(s) of each row "

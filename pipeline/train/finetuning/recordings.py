@@ -84,9 +84,6 @@ def _why_missing(episode: Episode, sources: set[str], opened: Opened) -> str:
     for bad in opened.bad:
         if bad.source == episode.source and bad.where.name == episode.id.rpartition("/")[2]:
             return bad.reason
-    for line in opened.missing:
-        if line.startswith(f"{episode.source}: ") and episode.id in line:
-            return line
     return f"it is not there; it was extracted from {episode.path}, relative to data.root"
 
 

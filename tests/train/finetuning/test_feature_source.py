@@ -54,18 +54,18 @@ def test_all_that_learns_does_at_its_own_rate_and_the_loss_falls(
         finetune={"batch_size": 12, "max_steps": 16, "eval_every": 16, "checkpoint_every": 16},
     )
     made = trainer(given)
-    names = {id(p): n for n, p in made.learner.module.named_parameters()}
-    for group in made.learner.optimizer.param_groups:
+    names = {id(p): n for n, p in made.module.named_parameters()}
+    for group in made.optimizer.param_groups:
         for parameter in group["params"]:
             of_model = names[id(parameter)].startswith("vlm.")
             section = given.finetune if of_model else given.train_head
             assert group["peak_lr"] == section.lr
-    lora = {n for n in made.learner.learning if n.startswith("vlm.")}
+    lora = {n for n in made.learning if n.startswith("vlm.")}
     assert lora
     assert all("lora_" in name for name in lora)
-    before = weights(made.learner.module)
+    before = weights(made.module)
     made.fit()
-    after = weights(made.learner.module)
+    after = weights(made.module)
     assert [n for n in before if torch.equal(before[n], after[n])] == []
     losses = made.history.tensor()[:, made.history.columns.index("loss")]
     assert losses[-4:].mean() < 0.7 * losses[:4].mean()
