@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import astuple, dataclass, replace
-from typing import Literal, NoReturn, Protocol, Self
+from typing import Literal, Protocol, Self
 
 import numpy as np
 import torch
@@ -31,7 +31,6 @@ Ticks = NDArray[np.int64]
 FeedName = Literal["auto", "mapped", "device"]
 _DEVICE_SHARE = 0.6
 """Of the device's free memory, what a store may fill: the rest is for the model and its step."""
-_UPLOAD_BYTES = 64 * 2**20
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,11 +100,8 @@ class DeviceStore:
         self.fields = frozenset(sources)
         """What lives there; of a stream that the store lacks there is nothing to hold."""
         self._device = device
-        total = sum(source.nbytes for source in sources.values())
-        with tqdm(
-            total=total, desc=f"store to {device}", unit="B", unit_scale=True, disable=None
-        ) as bar:
-            self._tensors = {name: _upload(s, device, bar) for name, s in sources.items()}
+        bar = tqdm(sources.items(), f"store to {device}", unit="stream", disable=None)
+        self._tensors = {name: source.to(device, copy=True) for name, source in bar}
 
     def complete(self, batch: Batch, selection: Selection) -> Batch:
         """The batch with what lives here, on the device; the rest of it stays where it is.
@@ -139,16 +135,6 @@ class DeviceStore:
         if self._device.type == "cuda":
             host = host.pin_memory()
         return host.to(self._device, non_blocking=True)
-
-
-def _upload(source: Tensor, device: torch.device, bar: "tqdm[NoReturn]") -> Tensor:
-    """A copy of a map, made piece by piece: the map is read in order, and the bar moves."""
-    copy = torch.empty(source.shape, dtype=source.dtype, device=device)
-    rows = max(1, _UPLOAD_BYTES * len(source) // max(1, source.nbytes))
-    for start in range(0, len(source), rows):
-        copy[start : start + rows].copy_(source[start : start + rows])
-        bar.update(copy[start : start + rows].nbytes)
-    return copy
 
 
 def choose_feed(

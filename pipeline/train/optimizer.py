@@ -45,18 +45,18 @@ def make_optimizer(
 
 
 def peak_rates(
-    module: nn.Module, front: FeatureSource, params: TrainHeadParams
+    module: nn.Module, source: FeatureSource, params: TrainHeadParams
 ) -> dict[str, float]:
     """The peak learning rate of each parameter that does not have `params.lr`, by name.
 
-    The front's word comes first, then `sensor_lr` for the sensor encoder.
+    The source's word comes first, then `sensor_lr` for the sensor encoder.
     """
-    encoders = front.policy_of(module).encoders
+    encoders = source.policy_of(module).encoders
     sensor = encoders["sensor"].parameters() if "sensor" in encoders else ()
     felt = {id(parameter) for parameter in sensor}
     peaks = {}
     for name, parameter in trainable(module).items():
-        rate = front.parameter_lr(name)
+        rate = source.parameter_lr(name)
         if rate is None and id(parameter) in felt:
             rate = params.sensor_lr
         if rate is not None:
@@ -127,7 +127,7 @@ def restore_optimizer(
 
 
 class WeightAverage:
-    """A second module whose weights trail those of a first; it is the one that is judged.
+    """A second module whose weights trail those of a first; it is the one that is evaluated.
 
     After update t (from 1): average += (1 - d) (weights - average), d = min(decay, t / (t + 9)):
     the warm-up of Tarvainen and Valpola's mean teacher (2017) in the form of TensorFlow's

@@ -69,13 +69,13 @@ class TickSampler:
 
     def batch(self, step: int) -> Ticks:
         """The ticks (batch_size,) of this step, source by source: a function of (seed, step)."""
-        first = self.drawn(step * self.batch_size)
-        last = self.drawn((step + 1) * self.batch_size)
+        first = self.count_drawn(step * self.batch_size)
+        last = self.count_drawn((step + 1) * self.batch_size)
         return np.concatenate([self._range(name, first[name], last[name]) for name in self._ticks])
 
-    def drawn(self, draws: int) -> dict[str, int]:
+    def count_drawn(self, draws: int) -> dict[str, int]:
         """How many of the first `draws` ticks each source gave."""
-        return self._mixture.drawn(draws)
+        return self._mixture.count_drawn(draws)
 
     def _range(self, name: str, start: int, stop: int) -> Ticks:
         """The draws [start, stop) of one source, across epochs."""
@@ -106,7 +106,7 @@ class _Node:
     source: str = ""
     fork: tuple["_Node", "_Node"] | None = None
 
-    def drawn(self, draws: int) -> dict[str, int]:
+    def count_drawn(self, draws: int) -> dict[str, int]:
         """How many of the first `draws` that come here each source from here on gets.
 
         The left gets round(draws · share), exactly, the right the rest: of one more draw either
@@ -117,7 +117,7 @@ class _Node:
             return {self.source: draws}
         left, right = self.fork
         to_left = (2 * draws * left.mass + self.mass) // (2 * self.mass)
-        return left.drawn(to_left) | right.drawn(draws - to_left)
+        return left.count_drawn(to_left) | right.count_drawn(draws - to_left)
 
 
 def _mixture(masses: Mapping[str, Fraction]) -> _Node:

@@ -20,7 +20,7 @@ from pipeline.base.errors import ConfigError, PipelineError
 Outcome = TypeVar("Outcome")
 
 PATIENCE = timedelta(hours=12)
-"""How long a process waits for another: rank 0 fits the normalisation and judges while the others
+"""How long a process waits for another: rank 0 fits the normalisation and evaluates while others
 wait. A process that died is not waited for: torchrun ends the rest."""
 BUCKET_BYTES = 32 * 2**20
 """Gradients are summed over the processes this many bytes at a time: few calls, little copied."""
@@ -53,7 +53,7 @@ class World:
 
     @property
     def first(self) -> bool:
-        """Whether this is the process that logs, judges and saves."""
+        """Whether this is the process that logs, evaluates and saves."""
         return self.rank == 0
 
     def shared(self, work: Callable[[], Outcome]) -> Outcome:

@@ -166,14 +166,25 @@ def test_who_shows_the_curves_decides_no_number(
     assert not {"loggers", "wandb_project"} & decides.keys(), "as a run of before knows them"
 
 
-def test_a_run_of_before_there_were_loggers_goes_on(
-    store: FeatureStore, params: Make, trainer: Make, stop_at: Callable[[Trainer, int], None]
+EARLIER = {"loggers": ["report"], "scratch": None, "feed": "compressed"}
+"""Keys and values of `train_head` that there were."""
+
+
+@pytest.mark.parametrize("earlier", [{}, EARLIER], ids=["no loggers", "other loggers"])
+def test_a_run_of_an_earlier_version_goes_on(
+    store: FeatureStore,
+    params: Make,
+    trainer: Make,
+    stop_at: Callable[[Trainer, int], None],
+    earlier: dict[str, Any],
 ) -> None:
     stop_at(trainer(store, params()), 11)
     written = params().output.with_name("head.part") / "last" / "policy.json"
     document = read_document(written)
+    head = document["params"]["train_head"]
     for key in ("loggers", "wandb_project"):
-        del document["params"]["train_head"][key]
+        del head[key]
+    head |= earlier
     write_document(written, document)
     resumed = trainer(store, params())
     assert (resumed.run.status, resumed.step) == ("resumed", 10)
