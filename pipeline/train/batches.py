@@ -5,10 +5,10 @@ more in page faults than the gather itself, and a gather between two steps makes
 `DeviceStore` holds streams on the device and gathers there; `choose_feed` picks what it holds.
 """
 
+import queue
+import threading
 import time
-from collections import deque
 from collections.abc import Collection, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import astuple, dataclass, replace
 from typing import Literal, Protocol, Self
@@ -166,7 +166,7 @@ def choose_feed(
     return frozenset(fields), f"feed: device ({by}; {room}: {', '.join(fields) or 'nothing'})"
 
 
-@dataclass(eq=False)
+@dataclass
 class _Buffer:
     """A reused host batch, and the copy out of it that has to end before it is filled again."""
 
@@ -205,43 +205,50 @@ class Prefetch(Iterator[tuple[BatchIndices, Batch]]):
         assert buffers >= 2, "one buffer in use, one being filled"
         self.waited_s = 0.0
         """Time that the consumer has spent waiting for data."""
-        self._store, self._plan = store, iter(plan)
-        self._sizes, self._lags = astuple(windows), astuple(lags)
-        self._device, self._resident = device, resident
+        self._store = store
+        self._windows = windows
+        self._lags = lags
+        self._device = device
+        self._resident = resident
         self._on_device = frozenset[str]() if resident is None else resident.fields
+        self._free: queue.SimpleQueue[_Buffer | None] = queue.SimpleQueue()
+        self._filled: queue.SimpleQueue[tuple[BatchIndices, _Buffer] | BaseException | None] = (
+            queue.SimpleQueue()
+        )
         self._in_use: _Buffer | None = None
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="prefetch")
-        self._warmed = self._thread.submit(store.warm, but=self._on_device)
-        self._coming: deque[Future[tuple[BatchIndices, _Buffer] | None]] = deque()
+        self._ended = False
         for _ in range(buffers):
-            self._coming.append(self._thread.submit(self._fill, _Buffer()))
+            self._free.put(_Buffer())
+        self._closing = threading.Event()
+        self._thread = threading.Thread(
+            target=self._work, args=(plan,), name="prefetch", daemon=True
+        )
+        self._thread.start()
 
     def __next__(self) -> tuple[BatchIndices, Batch]:
-        if self._in_use is not None:
-            self._coming.append(self._thread.submit(self._fill, self._in_use))
-            self._in_use = None
-        if not self._coming:
+        if self._ended:
             raise StopIteration
+        self._release()
         started = time.perf_counter()
-        try:
-            self._warmed.result()
-            filled = self._coming.popleft().result()
-        except BaseException:
+        item = self._filled.get()
+        self.waited_s += time.perf_counter() - started
+        if not isinstance(item, tuple):
             self.close()
-            raise
-        if filled is None:
-            self.close()
-            raise StopIteration
-        indices, self._in_use = filled
+            if item is None:
+                raise StopIteration
+            raise item
+        indices, self._in_use = item
+        started = time.perf_counter()
         batch = self._deliver(self._in_use)
         self.waited_s += time.perf_counter() - started
         return indices, batch
 
     def close(self) -> None:
         """Stop the thread and wait for it; the last batch handed out stays valid."""
-        self._thread.shutdown(cancel_futures=True)
-        self._coming.clear()
-        self._in_use = None
+        self._ended = True
+        self._closing.set()
+        self._free.put(None)
+        self._thread.join()
 
     def __enter__(self) -> Self:
         return self
@@ -264,21 +271,34 @@ class Prefetch(Iterator[tuple[BatchIndices, Batch]]):
             return buffer.batch
         return self._resident.complete(buffer.batch, buffer.selection)
 
-    def _fill(self, buffer: _Buffer) -> tuple[BatchIndices, _Buffer] | None:
-        """Gather the next batch of the plan, in the thread; None where the plan has ended."""
-        indices = next(self._plan, None)
-        if indices is None:
-            return None
+    def _release(self) -> None:
+        if self._in_use is not None:
+            self._free.put(self._in_use)
+            self._in_use = None
+
+    def _work(self, plan: Iterable[BatchIndices]) -> None:
+        try:
+            self._store.warm(but=self._on_device)
+            for indices in plan:
+                buffer = self._free.get()
+                if buffer is None or self._closing.is_set():
+                    return
+                self._fill(buffer, indices)
+                self._filled.put((indices, buffer))
+            self._filled.put(None)
+        except BaseException as error:  # it belongs to the thread that asks for the batch
+            self._filled.put(error)
+
+    def _fill(self, buffer: _Buffer, indices: BatchIndices) -> None:
         if buffer.copied is not None:
             buffer.copied.synchronize()
-        count = len(indices.ticks)
+        windows, count = astuple(self._windows), len(indices.ticks)
         if buffer.batch is None or len(buffer.batch) != count:
-            empty = self._store.empty_batch(count, *self._sizes, but=self._on_device)
+            empty = self._store.empty_batch(count, *windows, but=self._on_device)
             buffer.batch = empty.pin() if self._device.type == "cuda" else empty.touch()
         _, buffer.selection = self._store.select(
-            indices.ticks, self._sizes, self._lags, buffer.batch, indices.variants
+            indices.ticks, windows, astuple(self._lags), buffer.batch, indices.variants
         )
         self._store.copy(buffer.selection, buffer.batch, but=self._on_device)
         if self._device.type == "cpu":
             buffer.whole = self._complete(buffer)
-        return indices, buffer
