@@ -25,6 +25,7 @@ ONLY_IN = {
     "zarr": {"store"},
     "numcodecs": {"store"},
     "yaml": {"base"},
+    "sklearn": {"evaluate"},
     "matplotlib": {"look"},
     "plotly": {"look"},
     "jinja2": {"look"},
