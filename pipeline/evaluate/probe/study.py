@@ -16,7 +16,6 @@ from pipeline.evaluate.probe.ridge import ProbeScore, cross_validate, standard_e
 from pipeline.policy.normalization import fit_channels
 from pipeline.store import FeatureStore
 
-
 _ROUNDING = 1e-9
 """A gain below this is none."""
 

@@ -3,8 +3,7 @@
 from collections.abc import Sequence
 from functools import partial
 
-from pipeline.evaluate.experiment_tables import experiment_errors
-from pipeline.evaluate.experiments import Experiment
+from pipeline.evaluate.experiments import Experiment, experiment_table
 from pipeline.evaluate.tables import FOOTNOTE
 from pipeline.look.evaluation import pictures as plots
 from pipeline.look.page.blocks import Picture, Report, Section, Table
@@ -14,7 +13,8 @@ from pipeline.look.page.cells import sentence
 def comparison_report(experiments: Sequence[Experiment]) -> Report:
     """The page of these experiments, of which the first are no better than the last."""
     best = min(experiments, key=lambda one: one.error)
-    columns, rows = experiment_errors(experiments)
+    table = experiment_table(experiments)
+    columns, rows = table.columns, table.rows
     edge = columns.index("expert")
     own = [(row[0], *row[edge:]) for row in rows[: len(experiments)]]
     return Report(

@@ -3,9 +3,8 @@
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from pipeline.evaluate.ablation import Ablated, ModalityStudy
-from pipeline.evaluate.ablation_tables import FOOTNOTE as MODALITY_FOOTNOTE
-from pipeline.evaluate.ablation_tables import best_baseline
+from pipeline.evaluate.ablation import Ablated, AblationStudy
+from pipeline.evaluate.tables import ABLATION_FOOTNOTE, best_baseline
 from pipeline.look.page.style import GRID, INK, LABELS, STYLES, canvas, legend_below
 
 COLOURS = {
@@ -16,13 +15,13 @@ COLOURS = {
 }
 
 
-def modalities(study: ModalityStudy) -> Figure:
-    """The error with each stream spoilt as a multiple of the intact one, a panel a stream.
+def modalities(study: AblationStudy) -> Figure:
+    """The error with each stream ablated as a multiple of the intact one, a panel a stream.
 
     The error itself, in units of the training standard deviation, where the intact one is 0.
     """
     unit = study.intact.overall("policy") or 1.0
-    panels = [[one for one in study.spoilt if one.stream == name] for name in study.streams]
+    panels = [[one for one in study.ablated if one.stream == name] for name in study.streams]
     widths = [len(panel) for panel in panels]
     figure = canvas(max(0.95 * sum(widths) + 1.5, 7.5), 4.6)
     axes = figure.subplots(
@@ -33,16 +32,16 @@ def modalities(study: ModalityStudy) -> Figure:
     axes[0].set_ylabel("held-out error / error with all streams intact")
     axes[0].set_ylim(0, 1.12 * axes[0].get_ylim()[1])
     legend_below(figure, axes[0], 2)
-    figure.legends[0].set_title(MODALITY_FOOTNOTE)
+    figure.legends[0].set_title(ABLATION_FOOTNOTE)
     figure.suptitle(
-        f"What the policy loses with one stream spoilt, on {study.intact.ticks} held-out ticks, "
+        f"What the policy loses with one stream ablated, on {study.intact.ticks} held-out ticks, "
         f"{study.samples} chunk(s) a tick\n"
         "(well above 1: the stream is used; delays fade where a stream changes slowly)"
     )
     return figure
 
 
-def _panel(axis: Axes, panel: list[Ablated], study: ModalityStudy, unit: float) -> None:
+def _panel(axis: Axes, panel: list[Ablated], study: AblationStudy, unit: float) -> None:
     heights = [one.comparison.overall("policy") / unit for one in panel]
     colours = [COLOURS[one.how.split()[0]] for one in panel]
     bars = axis.bar(range(len(panel)), heights, color=colours, width=0.7)

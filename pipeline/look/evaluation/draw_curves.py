@@ -3,7 +3,7 @@
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from pipeline.evaluate.curves import Curve, Curves
+from pipeline.evaluate.curves import TrainingCurve, TrainingCurves
 from pipeline.look.page.style import INK, PALETTE, canvas, logarithmic
 
 _PANELS = {
@@ -11,10 +11,10 @@ _PANELS = {
     "val/error": ("held-out error [training std]", PALETTE[5], False),
     "lr": ("learning rate", PALETTE[2], False),
 }
-"""Curve -> what its axis says, colour, and whether to draw decades of it logarithmic."""
+"""TrainingCurve -> what its axis says, colour, and whether to draw decades of it logarithmic."""
 
 
-def curves(found: Curves, step: int) -> Figure:
+def curves(found: TrainingCurves, step: int) -> Figure:
     """Loss, held-out error and learning rate over the steps; a line marks the step judged here."""
     shown = [name for name in _PANELS if name in found.curves] or sorted(found.curves)[:3]
     figure = canvas(max(4.2 * len(shown), 8.4), 3.4)
@@ -25,7 +25,7 @@ def curves(found: Curves, step: int) -> Figure:
     return figure
 
 
-def _panel(axis: Axes, name: str, curve: Curve, step: int) -> None:
+def _panel(axis: Axes, name: str, curve: TrainingCurve, step: int) -> None:
     said, colour, by_decades = _PANELS.get(name, (name, PALETTE[4], False))
     few = len(curve.step) <= 30
     axis.plot(curve.step, curve.value, color=colour, marker="o" if few else "", markersize=4)

@@ -4,10 +4,9 @@ from collections.abc import Iterator
 from functools import cache, partial
 
 from pipeline.base.digests import file_digest
-from pipeline.evaluate.ablation_tables import best_baseline
-from pipeline.evaluate.episode_frames import footage, shown_ticks
+from pipeline.evaluate.episode_frames import read_episode_frames, shown_ticks
 from pipeline.evaluate.evaluation import Evaluation
-from pipeline.evaluate.tables import HEADINGS
+from pipeline.evaluate.tables import HEADINGS, best_baseline
 from pipeline.look.evaluation import pictures as plots
 from pipeline.look.page.blocks import Block, Picture, Section, Table, Text
 from pipeline.store import episode_name
@@ -69,7 +68,7 @@ def extremes(found: Evaluation) -> Iterator[Section]:
         episode = store.episodes[index]
         ticks = shown_ticks(store, _whole(predictions, index), _INSTANTS)
         rows = store.array("tick/vl_row")[ticks]
-        seen = footage(store, episode, rows.tolist(), found.recordings, digest_of)
+        seen = read_episode_frames(store, episode, rows.tolist(), found.recordings, digest_of)
         drawn = partial(plots.chunks, comparison, predictions, store, episode, ticks, seen.frames)
         told = f"Overall error {errors[index]:.3f} [training std]. {seen.absence}".strip()
         caption = (

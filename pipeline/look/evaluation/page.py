@@ -4,12 +4,19 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
-from pipeline.evaluate.ablation import ModalityStudy
-from pipeline.evaluate.ablation_tables import FOOTNOTE as MODALITY_FOOTNOTE
-from pipeline.evaluate.ablation_tables import best_baseline, judged_on, modality_errors
+from pipeline.evaluate.ablation import AblationStudy
 from pipeline.evaluate.evaluation import Evaluation
 from pipeline.evaluate.names import with_unit
-from pipeline.evaluate.tables import FOOTNOTE, HEADINGS, error_rows, still_dimensions
+from pipeline.evaluate.tables import (
+    ABLATION_FOOTNOTE,
+    FOOTNOTE,
+    HEADINGS,
+    ablation_table,
+    best_baseline,
+    error_table,
+    evaluated_on,
+    still_dimensions,
+)
 from pipeline.look.evaluation import pictures as plots
 from pipeline.look.evaluation.episodes import episodes, extremes
 from pipeline.look.page.blocks import Block, Document, Picture, Report, Section, Table, Text
@@ -81,7 +88,7 @@ def _tiles(comparison: Comparison) -> list[tuple[str, str]]:
 
 
 def _baselines(comparison: Comparison) -> list[Block]:
-    rows = [(name, *errors, relative) for name, errors, relative in error_rows(comparison)]
+    errors = error_table(comparison)
     return [
         Text(
             "Mean absolute errors over all steps of the chunk, of the policy and of three rules "
@@ -89,10 +96,10 @@ def _baselines(comparison: Comparison) -> list[Block]:
             "deviation; below 1, `policy / best` beats the best rule."
         ),
         Table(
-            ["mean absolute error", *(HEADINGS[method] for method in METHODS), "policy / best"],
-            rows,
+            errors.columns,
+            errors.rows,
             caption=sentence(FOOTNOTE),
-            strong=frozenset({len(rows) - 1}),
+            strong=frozenset({len(errors.rows) - 1}),
         ),
         Picture(
             "dimensions",
@@ -159,7 +166,7 @@ def _steps(comparison: Comparison, action_hz: float | None) -> Table:
     return Table(columns, rows, caption=caption)
 
 
-def _modalities(study: ModalityStudy | None) -> list[Block]:
+def _modalities(study: AblationStudy | None) -> list[Block]:
     if study is None:
         return [
             Text(
@@ -167,17 +174,17 @@ def _modalities(study: ModalityStudy | None) -> list[Block]:
                 "its episode."
             )
         ]
-    columns, rows = modality_errors(study)
+    errors = ablation_table(study)
     return [
         Text(
-            f"{sentence(judged_on(study))} {sentence(MODALITY_FOOTNOTE)} An error that stays says "
-            "that the policy does not use the stream, or that others tell it the same."
+            f"{sentence(evaluated_on(study))} {sentence(ABLATION_FOOTNOTE)} An error that stays "
+            "says that the policy does not use the stream, or that others tell it the same."
         ),
-        Table(columns, rows, strong=frozenset({0})),
+        Table(errors.columns, errors.rows, strong=errors.strong),
         *(Text(sentence(note)) for note in study.notes),
         Picture(
             "modalities",
-            "The error with one stream spoilt as a multiple of the error with all intact.",
+            "The error with one stream ablated as a multiple of the error with all intact.",
             partial(plots.modalities, study),
         ),
     ]

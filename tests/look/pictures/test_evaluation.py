@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from pipeline.evaluate.ablation import Ablated, ModalityStudy
-from pipeline.evaluate.curves import Curve, Curves
+from pipeline.evaluate.ablation import Ablated, AblationStudy
+from pipeline.evaluate.curves import TrainingCurve, TrainingCurves
 from pipeline.evaluate.experiments import Experiment
 from pipeline.evaluate.probe import ProbeFolds, ProbeResult, ProbeScore, ProbeStudy, SlotName
 from pipeline.look.evaluation import draw_probe as probe
@@ -198,14 +198,14 @@ def test_errors_by_dimension_and_step_are_in_training_deviations() -> None:
 def test_curves_mark_the_step_that_was_judged() -> None:
     steps = np.array([10, 20, 30])
     logged = {
-        name: Curve(steps, np.array(values))
+        name: TrainingCurve(steps, np.array(values))
         for name, values in {
             "train/loss": [1.0, 0.1, 0.01],
             "lr": [0.0, 1e-3, 5e-4],
             "train/other": [1.0, 1.0, 1.0],
         }.items()
     }
-    figure = plots.curves(Curves(logged), 20)
+    figure = plots.curves(TrainingCurves(logged), 20)
     assert [axis.get_title() for axis in figure.axes] == ["training loss", "learning rate"]
     assert [axis.get_yscale() for axis in figure.axes] == ["log", "linear"]
     for axis in figure.axes:
@@ -214,13 +214,13 @@ def test_curves_mark_the_step_that_was_judged() -> None:
     assert len({axis.get_xlim() for axis in figure.axes}) == 1
     assert "step 20" in figure.get_suptitle()
     short = {
-        "train/loss": Curve(steps, np.array([0.31, 0.29, 0.3])),
-        "lr": Curve(steps[:1], steps[:1]),
+        "train/loss": TrainingCurve(steps, np.array([0.31, 0.29, 0.3])),
+        "lr": TrainingCurve(steps[:1], steps[:1]),
     }
-    loss, rate = plots.curves(Curves(short), 20).axes
+    loss, rate = plots.curves(TrainingCurves(short), 20).axes
     assert (loss.get_yscale(), loss.get_ylim()[0]) == ("linear", 0)
     assert rate.get_xlim() == loss.get_xlim()
-    (axis,) = plots.curves(Curves({"train/other": logged["train/other"]}), 5).axes
+    (axis,) = plots.curves(TrainingCurves({"train/other": logged["train/other"]}), 5).axes
     assert axis.get_title() == "train/other"
 
 
@@ -295,7 +295,7 @@ def heights(figure: Figure) -> list[list[float]]:
     return [[patch.get_height() for patch in axis.patches] for axis in figure.axes]
 
 
-def studied(*errors: float) -> ModalityStudy:
+def studied(*errors: float) -> AblationStudy:
     """A study whose policy, in the first dimension of two, is wrong by these, intact first."""
 
     def judged(error: float) -> Comparison:
@@ -316,7 +316,7 @@ def studied(*errors: float) -> ModalityStudy:
         Ablated(stream, how, judged(error))
         for (stream, how), error in zip(ways, errors[1:], strict=True)
     )
-    return ModalityStudy(judged(errors[0]), spoilt, (), 4)
+    return AblationStudy(judged(errors[0]), spoilt, (), 4)
 
 
 def test_what_each_stream_is_worth_stands_beside_intact_and_best_baseline(tmp_path: Path) -> None:
