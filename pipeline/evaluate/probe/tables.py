@@ -68,46 +68,37 @@ def metrics(study: ProbeStudy) -> dict[str, Any]:
 
 def table(study: ProbeStudy) -> str:
     """The groups and the best slots, ranked, below the baselines."""
-    beside = study.streams is not None
-    shown = ["r2_alone", "r2_alone_error"]
-    heads = ["what is read", "inputs", "valid", "R2 alone", "+-"]
-    if beside:
-        shown += ["r2_beside", "r2_beside_error", "gain", "gain_error"]
-        heads += ["R2 beside", "+-", "gain", "+-"]
-    baselines = [("mean action", 0, study.mean_action)]
+    baselines = {"mean action": (0, study.mean_action)}
     if study.streams is not None:
-        baselines.append(("state + sensor, without features", study.stream_inputs, study.streams))
+        baselines["state + sensor, without features"] = (study.stream_inputs, study.streams)
     rows: list[list[Any]] = [
-        [name, inputs, "", _short(score.mean), _short(score.error), *[""] * (len(heads) - 5)]
-        for name, inputs, score in baselines
+        [name, inputs, "", _short(score.mean), _short(score.error), *[""] * 4]
+        for name, (inputs, score) in baselines.items()
     ]
     single = [result for result in ranked(study.slots) if result.name != result.name.group]
     for result in [*ranked(study.groups), *single[:TOP]]:
         several = f" ({len(result.slots)} slots)" if len(result.slots) > 1 else ""
+        figures = [*_figures(result.alone), *_figures(result.beside)]
+        figures += study.gain(result) or (None, None)
         rows.append([result.name.label + several, result.inputs, f"{result.valid_share:.0%}"])
-        rows[-1] += [_short(_row(study, result)[figure]) for figure in shown]
+        rows[-1] += map(_short, figures)
+    heads = ["what is read", "inputs", "valid", "R2 alone", "+-", "R2 beside", "+-", "gain", "+-"]
     lines = [
         f"R2 of the action chunk of {study.horizon} ticks on recordings that were held out, mean "
         "over channels and steps (1: exact, 0: no better than their mean)",
         f"{len(study.folds.ticks)} ticks of {study.folds.recordings} recordings in "
         f"{study.folds.count} folds; +-: standard error over folds",
     ]
-    if beside:
+    if study.streams is not None:
         lines.append(
             "beside: together with state + sensor; gain: what that adds to them. Choices are "
             "compared by their gains fold by fold, as some folds are harder for everyone"
         )
     lines += [*Table(heads, rows).text(), *study.folds.notes]
-    lines += [
-        f"{result.name.label}: its {result.channels} channels are read along {result.inputs} main "
-        "directions of the inputs of all folds"
-        for result in study.groups
-        if 0 < result.inputs < result.channels
-    ]
-    if any(result.valid_share < 1 for result in [*study.groups, *study.slots]):
-        lines.append(
-            "valid: the share of ticks that have a slot; at the others, the slot's mean is read"
-        )
+    if any(0 < result.inputs < result.channels for result in study.groups):
+        lines.append("inputs fewer than channels are their main directions over all folds")
+    if any(result.valid_share < 1 for result in study.slots):
+        lines.append("valid: the share of ticks that have a slot; elsewhere its mean is read")
     if len(single) > TOP:
         lines.append(f"the other {len(single) - TOP} slots are in slots.csv")
     return "\n".join(lines)
