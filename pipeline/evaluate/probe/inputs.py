@@ -159,7 +159,8 @@ def reduce(values: Float[np.ndarray, "row channel"], fold: Folds, width: int) ->
     columns = StandardScaler().fit_transform(values.astype(np.float64))
     width = min(width, len(columns))
     if width < columns.shape[1]:
-        _, _, directions = randomized_svd(columns, width, n_iter=2, random_state=0)
+        options: Any = {"n_iter": 2, "random_state": 0}
+        _, _, directions = randomized_svd(columns, width, **options)
         columns = columns @ directions.T
     return limit(columns, fold)
 
