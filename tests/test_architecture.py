@@ -27,7 +27,6 @@ ONLY_IN = {
     "yaml": {"base"},
     "sklearn": {"evaluate"},
     "matplotlib": {"look"},
-    "plotly": {"look"},
     "jinja2": {"look"},
 }
 WITHOUT_TORCH = {"data"}

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from pipeline.base.errors import NumericsError
-from pipeline.policy.observation import Observation
+from pipeline.base.observation import Observation
 from pipeline.policy.policy import Trainable
 from pipeline.store import Batch, FeatureStore, place
 from pipeline.train.batches import BatchIndices, Prefetch, Ticks, Windows, draws

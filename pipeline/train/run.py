@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pipeline.base.config import TrainHeadParams
+from pipeline.base.differences import Differences, describe, differences
 from pipeline.base.durable import (
     damaged,
     put_in_place,
@@ -35,12 +36,9 @@ from pipeline.policy.checkpoint import (
     DOCUMENT,
     SOURCE_KEYS,
     check_policy,
-    describe,
-    differences,
     source_differences,
 )
 from pipeline.store import FeatureStore, build_lock
-from pipeline.store.archive import is_archive
 from pipeline.train.identity import NOTHING, run_identity
 
 RUN, BEST, LAST = "run.json", "best", "last"
@@ -142,7 +140,7 @@ def open_run(
         if differing:
             notes.append(
                 f"{part} is an unfinished run of something else; it is put aside as "
-                f"{_aside(part)}:\n{describe(differing, 'that run', 'now')}"
+                f"{_aside(part)} (that run -> now):\n{_indented(differing)}"
             )
         elif (part / LAST).exists():
             notes.append(f"resuming the run in {part}")
@@ -176,10 +174,10 @@ def finished_run(params: TrainHeadParams, path: Path) -> Run | None:
     """The run of these params on the store at `path` where it is finished, else None.
 
     What `open_run` gives, without torch, which takes over a second to import; None where several
-    processes train together, or the store has to be restored first.
+    processes train together.
     """
     together = int(os.environ.get("WORLD_SIZE", "1")) > 1
-    if together or not (params.output / RUN).exists() or is_archive(path):
+    if together or not (params.output / RUN).exists():
         return None
     with build_lock(params.output):
         run = open_run(params, FeatureStore.open(path))
@@ -204,7 +202,7 @@ def _finished_notes(params: TrainHeadParams) -> tuple[str, ...]:
     return said, f"its curves are left where they were written, in {logs}, not in {params.logs}"
 
 
-def _compare(part: Path, identity: Mapping[str, Any], section: str) -> dict[str, tuple[Any, Any]]:
+def _compare(part: Path, identity: Mapping[str, Any], section: str) -> Differences:
     """What else the unfinished run in `part` was to be; refused where its store was another."""
     prior = read_document(part / RUN)
     source = prior.get("source")
@@ -213,12 +211,16 @@ def _compare(part: Path, identity: Mapping[str, Any], section: str) -> dict[str,
     differing = source_differences(source, identity["source"])
     if differing:
         raise CheckpointMismatch(
-            f"{part}: this unfinished run cannot go on, its store was another one:\n"
-            f"{describe(differing, 'the run', 'the store now')}\n"
+            f"{part}: this unfinished run cannot go on, its store was another one "
+            f"(the run -> the store now):\n{_indented(differing)}\n"
             f"Remove {part} to begin anew, choose another {section}.output, or name the store "
             "it began with in train_head.store."
         )
     return differences(prior["decides"], identity["decides"])
+
+
+def _indented(differing: Differences) -> str:
+    return "\n".join(f"  {line}" for line in describe(differing))
 
 
 def _has_checkpoint(part: Path) -> bool:
