@@ -25,8 +25,8 @@ ONLY_IN = {
     "zarr": {"store"},
     "numcodecs": {"store"},
     "yaml": {"base"},
+    "sklearn": {"evaluate"},
     "matplotlib": {"look"},
-    "plotly": {"look"},
     "jinja2": {"look"},
 }
 WITHOUT_TORCH = {"data"}

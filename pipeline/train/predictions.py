@@ -1,6 +1,7 @@
 """What a policy does at recorded ticks, and what simple rules would have done there."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,15 +12,17 @@ from tqdm import tqdm
 
 from pipeline.base.errors import NumericsError
 from pipeline.base.finite import first_non_finite
-from pipeline.policy.observation import Observation
+from pipeline.base.observation import Observation
 from pipeline.policy.policy import Trainable
-from pipeline.store import FeatureStore, place
-from pipeline.train.batches import BatchIndices, Feed, Prefetch, Ticks, Windows, cut_batches
+from pipeline.store import Batch, FeatureStore, place
+from pipeline.train.batches import BatchIndices, Prefetch, Ticks, Windows, cut_batches
 
 Actions = NDArray[np.float32]
 METHODS = ("policy", "zero_action", "mean_action", "repeat_last")
 BASELINES = METHODS[1:]
-FeedMaker = Callable[[Sequence[BatchIndices]], Feed]
+FeedMaker = Callable[
+    [Sequence[BatchIndices]], AbstractContextManager[Iterable[tuple[BatchIndices, Batch]]]
+]
 """Makes the feed of a plan: what a policy is to see at these ticks."""
 _SEED = 0
 _CHUNKS_AT_ONCE = 1024

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from contextlib import redirect_stdout
 from io import StringIO
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -268,8 +269,9 @@ def test_a_sampling_policy_is_judged_on_the_mean_of_samples(trained: Path, tmp_p
     assert errors[1] == errors[2] != errors[0]
 
 
-def test_an_archive_is_refused_with_the_way_to_restore_it(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("stage", [train_head, evaluate])
+def test_an_archive_has_to_be_restored_first(
+    stage: ModuleType, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     packed = tmp_path / "tiny.archive.zarr"
     archive(trained.parent / "tiny.zarr", packed, level=1, threads=1)

@@ -6,7 +6,7 @@ from functools import lru_cache, partial
 from pipeline.base.config import Params
 from pipeline.base.format import duration
 from pipeline.data import Opened
-from pipeline.look.page.blocks import Block, Notices, Report, Section, Table, Text
+from pipeline.look.page.blocks import Block, Issues, Report, Section, Table, Text
 from pipeline.look.recording.episodes import view_episode
 from pipeline.look.recording.overview import EpisodeSummary, RecordingsOverview, survey_recordings
 from pipeline.look.recording.page_episode import Viewer, episode_section
@@ -55,10 +55,10 @@ def zeros(overview: RecordingsOverview) -> dict[tuple[str, str], float]:
     return {(one.source, one.episode): one.zero for one in overview.summaries}
 
 
-def _notices(overview: RecordingsOverview) -> Notices:
+def _notices(overview: RecordingsOverview) -> Issues:
     count = len(overview.summaries)
     whole = "the episode was" if count == 1 else f"all {count:,} episodes were"
-    return Notices(
+    return Issues(
         notices(overview.flaws, zeros(overview)),
         f"Nothing looks wrong: {whole} read and every check passed.",
     )

@@ -8,8 +8,7 @@ from functools import partial
 from matplotlib.figure import Figure
 
 from pipeline.base.config import InspectParams
-from pipeline.look.page.blocks import Block, Chart, Notices, Picture, Section, Table, Text
-from pipeline.look.recording import draw_interactive as interactive
+from pipeline.look.page.blocks import Block, Issues, Picture, Section, Table, Text
 from pipeline.look.recording.clocks import GAP_FACTOR, clocks
 from pipeline.look.recording.contact import RULE, contacts
 from pipeline.look.recording.facts import Clock, EpisodeView, Flaw
@@ -47,7 +46,7 @@ def episode_section(
         title,
         [
             Text(f"`{summary.path}`, format {summary.format}: “{summary.instruction or '–'}”"),
-            *([] if alone else [Notices(notices(flaws, zero), NOTHING_WRONG)]),
+            *([] if alone else [Issues(notices(flaws, zero), NOTHING_WRONG)]),
         ],
         [
             Section("Camera views", _views(view, draw, wanted.ticks, flaws)),
@@ -119,8 +118,8 @@ def _clocks(view: EpisodeView, draw: Draw) -> list[Block]:
         return [Text("No stream of this episode has a clock that can be read.")]
     lanes = draw(
         "clocks",
-        "When each stream was sampled, and which VL row serves which ticks; zoom in to see single "
-        "entries. Gaps are marked; rates are usual ones.",
+        "When each stream was sampled, and which VL row serves which ticks. "
+        "Gaps are marked; rates are usual ones.",
         lambda view: clock_lanes(view, clocks(view)),
     )
     steps = draw(
@@ -128,7 +127,7 @@ def _clocks(view: EpisodeView, draw: Draw) -> list[Block]:
         "How long a step from one entry to the next takes: a narrow peak is a steady clock.",
         lambda view: clock_steps(clocks(view)),
     )
-    return [Chart(lanes, interactive.clock_lanes(view, found)), _clock_table(view, found), steps]
+    return [lanes, _clock_table(view, found), steps]
 
 
 def _clock_table(view: EpisodeView, found: Sequence[Clock]) -> Table:

@@ -9,7 +9,16 @@ from pipeline.base.config import Params
 from pipeline.base.errors import PipelineError
 from pipeline.compat.batch import UnifiedBatch
 from pipeline.compat.dataset import UnifiedVLADataset
-from pipeline.look.page.blocks import Block, Document, Picture, Run, Section, Table, Text, Tokens
+from pipeline.look.page.blocks import (
+    Block,
+    Document,
+    Picture,
+    Section,
+    Table,
+    Text,
+    TokenRun,
+    Tokens,
+)
 from pipeline.look.recording import pictures as plots
 from pipeline.look.recording.facts import EpisodeView, PromptToken, PromptView
 from pipeline.look.recording.frames import frames_at
@@ -135,15 +144,15 @@ def _size(size: tuple[int, ...]) -> str:
     return f"{size[0]} × {size[1]}"
 
 
-def runs(tokens: Sequence[PromptToken]) -> list[Run]:
+def runs(tokens: Sequence[PromptToken]) -> list[TokenRun]:
     """Tokens of one kind and view as one run; those of an image folded to a count."""
-    found: list[Run] = []
+    found: list[TokenRun] = []
     for (kind, view), each in groupby(tokens, lambda one: (one.kind, one.view)):
         group = list(each)
         if kind == "image":
-            found.append(Run(group[0].text, kind, f"× {len(group):,}, {view}"))
+            found.append(TokenRun(group[0].text, kind, f"× {len(group):,}, {view}"))
         elif kind == "special":
-            found += [Run(one.text, kind) for one in group]
+            found += [TokenRun(one.text, kind) for one in group]
         else:
-            found.append(Run("".join(one.text for one in group), kind))
+            found.append(TokenRun("".join(one.text for one in group), kind))
     return found

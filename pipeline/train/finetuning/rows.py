@@ -15,12 +15,11 @@ from typing import Self
 
 import numpy as np
 import torch
-from jaxtyping import Int64
 from numpy.typing import NDArray
-from torch import Tensor
 
 from pipeline.data import CameraStream, Recording
 from pipeline.data.row_range import RowRange
+from pipeline.policy.observation import LiveObservation
 from pipeline.store import Batch, FeatureStore
 from pipeline.train.batches import BatchIndices, Prefetch, Windows
 from pipeline.vlm.preparation import PreparedRow, Preparer
@@ -104,13 +103,8 @@ class LiveRows:
 
 
 @dataclass
-class LiveBatch(Batch):
-    """A batch and the rows that its features are to be computed from; a `LiveObservation`."""
-
-    rows: Sequence[PreparedRow]
-    """The distinct VL rows of the batch, each once."""
-    row_of: Int64[Tensor, " batch"]
-    """Index into `rows` of each tick."""
+class LiveBatch(Batch, LiveObservation):
+    """A batch and the rows that its features are to be computed from, each distinct one once."""
 
 
 class LiveFeed(Iterator[tuple[BatchIndices, LiveBatch]]):

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.base.config import Params, load_params
-from pipeline.look.page.blocks import Chart, Document, Notices, Picture, Report, Table, Text, Tokens
+from pipeline.look.page.blocks import Document, Issues, Picture, Report, Table, Text, Tokens
 from pipeline.look.page.writing import write_report
 from pipeline.look.recording.facts import ChannelStatistics, Flaw, PromptToken
 from pipeline.look.recording.page import recordings_report
@@ -49,7 +49,6 @@ def test_the_page_of_a_recording_is_whole_and_sound(
     files = write_report(tmp_path, report)
     names = {file.stem.rpartition("-")[2] for file in files if file.suffix == ".png"}
     assert names == {"views", "sensor", "motion", "clocks", "steps", "samples", "batch"}
-    assert len(list(report.blocks(Chart))) == 1
     (clocks,) = [table for table in report.blocks(Table) if table.columns[0] == "clock"]
     usual, average = map(clocks.columns.index, ("usual rate [Hz]", "on average [Hz]"))
     # The simulated recorder loses five rows of the robot's.
@@ -82,9 +81,9 @@ def test_what_is_missing_is_said(
     assert "No sample can be made" in said
     assert ".. " not in said
     assert "nowhere" in said and "python -m stages.demo" in said
-    first = next(report.blocks(Notices))
-    assert [one.severity for one in first.notices] == ["error"]
-    assert folder.name in first.notices[0].where
+    first = next(report.blocks(Issues))
+    assert [one.severity for one in first.issues] == ["error"]
+    assert folder.name in first.issues[0].episode
 
 
 def test_all_episodes_are_checked_and_some_are_shown(
@@ -114,19 +113,16 @@ def test_what_the_model_sees_in_another_shape_is_said() -> None:
     assert "78% in height: c" in high
 
 
-def test_a_flaw_of_many_episodes_is_one_notice() -> None:
+def test_flaws_count_time_as_the_page_does() -> None:
     flaws = [
         Flaw("gap", "warning", "lab", f"e{index}", "view View1", 100.5, 101.0, f"found {index}")
         for index in range(200)
     ]
     flaws += [Flaw("unreadable", "error", "lab", "e7", "episode", None, None, "no file")]
     zeros = {("lab", f"e{index}"): 100.0 for index in range(200)}
-    error, gap = notices(flaws, zeros)
-    assert (error.severity, error.kind, error.where) == ("error", "unreadable", "e7")
-    assert gap.where == "view View1 · 200 episodes"
-    assert gap.message == "found 0"
-    assert [str(one) for one in gap.places] == [f"e{index} 0.50–1.00 s" for index in range(200)]
-    assert [one.message for one in gap.places] == [f"found {index}" for index in range(200)]
+    *gaps, error = notices(flaws, zeros)
+    assert (error.severity, error.kind, error.stream) == ("error", "unreadable", "")
+    assert {(one.start_s, one.stop_s) for one in gaps} == {(0.5, 1.0)}
 
 
 def test_channels_that_differ_by_a_number_are_one_row() -> None:

@@ -12,7 +12,6 @@ from matplotlib.patches import Rectangle
 
 from pipeline.base.channels import unnumbered
 from pipeline.data import Channels, Stream
-from pipeline.look.recording import draw_interactive as interactive
 from pipeline.look.recording import pictures as recording
 from pipeline.look.recording.draw_channels import groups
 from pipeline.look.recording.draw_lanes import BAND
@@ -119,8 +118,6 @@ def test_a_sensor_stamped_in_bursts_has_no_blank_stripes_and_lanes_of_full_heigh
     corners = band.get_paths()[0].vertices
     assert np.ptp(corners[:, 1]) == pytest.approx(0.72)
     assert np.unique(corners[:, 1].round(6)).tolist() == [-0.36, 0.36]
-    bars = interactive.clock_lanes(view, shown).data[0]
-    assert set(np.round(bars.y, 6)) == {0.7}
 
 
 def test_what_the_height_of_a_band_means_is_said_where_there_is_one(
@@ -132,7 +129,6 @@ def test_what_the_height_of_a_band_means_is_said_where_there_is_one(
 
     assert said(clocks[:4]) == BAND
     assert said(clocks[:3]) == ""
-    assert BAND in interactive.clock_lanes(view, clocks).layout.xaxis.title.text
 
 
 def test_an_episode_without_a_camera_has_lanes_and_says_so(

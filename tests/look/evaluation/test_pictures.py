@@ -1,0 +1,473 @@
+"""Pictures are written for any shape of data, whole, and the same for the same numbers."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from pipeline.evaluate.ablation import Ablated, AblationStudy
+from pipeline.evaluate.curves import TrainingCurve, TrainingCurves
+from pipeline.evaluate.experiments import Experiment
+from pipeline.evaluate.probe import ProbeFolds, ProbeResult, ProbeScore, ProbeStudy, SlotName
+from pipeline.look.evaluation import draw_probe as probe
+from pipeline.look.evaluation import pictures as plots
+from pipeline.look.page.style import write
+from pipeline.train.predictions import Predictions, baselines
+from pipeline.train.scores import ActionGroup, Comparison, compare
+
+Drawn = tuple[Comparison, Predictions, SimpleNamespace]
+
+
+def evaluated(
+    episodes: int, dimensions: int = 5, ticks: int = 12, constant: int = 1, horizon: int = 3
+) -> Drawn:
+    """`constant` dimensions at the end never vary."""
+    rng = np.random.default_rng(0)
+    action = rng.normal(size=(episodes * ticks, dimensions)).astype(np.float32)
+    action[:, dimensions - constant :] = 1
+    tick = np.arange(episodes * ticks)
+    episode = tick // ticks
+    ahead = tick[:, None] + np.arange(horizon)
+    end = (episode[:, None] + 1) * ticks
+    recorded = action[np.minimum(ahead, end - 1)]
+    predictions = Predictions(
+        tick,
+        episode,
+        (recorded + rng.normal(0, 0.2, recorded.shape)).astype(np.float32),
+        recorded,
+        ahead < end,
+    )
+    arrays = {
+        "tick/action": action,
+        "tick/time": (tick % ticks) * 0.1,
+        "episode/tick_start": np.arange(episodes + 1) * ticks,
+    }
+    store = SimpleNamespace(
+        array=arrays.__getitem__,
+        action_hz=10.0,
+        streams={"action": {"kind": "delta"}},
+        episodes=[
+            SimpleNamespace(
+                index=i,
+                source="demo",
+                id=f"episode_{i}" * (1 + i),
+                ticks=range(i * ticks, (i + 1) * ticks),
+            )
+            for i in range(episodes)
+        ],
+    )
+    names = [f"d{index}" for index in range(dimensions)]
+    units = ["mm"] * (dimensions - 1) + [""]
+    groups = (
+        ActionGroup("translation", "mm", tuple(range(dimensions - 1))),
+        ActionGroup("gripper", "", (dimensions - 1,)),
+    )
+    spread = np.where(np.arange(dimensions) < dimensions - constant, 1.0, 0.0)
+    comparison = compare(
+        predictions,
+        baselines(store, predictions, action.mean(0)),  # type: ignore[arg-type]
+        names,
+        units,
+        groups,
+        spread,
+    )
+    return comparison, predictions, store
+
+
+def pictures(comparison: Comparison, predictions: Predictions, store: Any) -> dict[str, Any]:
+    """Each picture of an evaluation by its file's name; frames of two views for one episode."""
+    rng = np.random.default_rng(0)
+    frames = {name: rng.integers(0, 255, (2, 12, 16, 3), np.uint8) for name in ("A", "B")}
+    instants = predictions.ticks[predictions.episodes == comparison.episodes[0]][[0, 6]]
+
+    def chunks() -> Figure:
+        return plots.chunks(comparison, predictions, store, store.episodes[0], instants, frames)
+
+    return {
+        "timeline.png": lambda: plots.timeline(comparison, predictions, store),
+        "scatter.png": lambda: plots.scatter(comparison, predictions),
+        "horizon.png": lambda: plots.horizon(comparison, store.action_hz),
+        "episodes.png": lambda: plots.episodes(comparison, store),
+        "dimensions.png": lambda: plots.dimensions(comparison),
+        "dimension_horizon.png": lambda: plots.dimension_horizon(comparison),
+        "chunks.png": chunks,
+    }
+
+
+@pytest.mark.parametrize(
+    ("episodes", "dimensions", "constant", "horizon"),
+    [(1, 5, 1, 3), (2, 2, 0, 3), (3, 14, 1, 20), (2, 3, 3, 3), (1, 1, 0, 1)],
+)
+def test_every_picture_is_written(
+    tmp_path: Path, episodes: int, dimensions: int, constant: int, horizon: int
+) -> None:
+    shown = evaluated(episodes, dimensions, constant=constant, horizon=horizon)
+    files = write(tmp_path, pictures(*shown))
+    assert len(files) == 7
+    for file in files:
+        assert file.read_bytes().startswith(b"\x89PNG")
+        assert file.stat().st_size > 5000
+
+
+def test_the_same_numbers_are_the_same_bytes(tmp_path: Path) -> None:
+    written = []
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        files = write(tmp_path / name, pictures(*evaluated(2)))
+        written.append([file.read_bytes() for file in files])
+    assert written[0] == written[1]
+
+
+def texts(figure: Figure) -> str:
+    said = [figure.get_suptitle()]
+    for axis in figure.axes:
+        said += [axis.get_title(), axis.get_xlabel(), axis.get_ylabel()]
+    return "\n".join(said)
+
+
+@pytest.mark.parametrize(
+    ("draw", "said"),
+    [
+        (lambda c, p, s: plots.timeline(c, p, s), ["d0 [mm]", "time since the episode began [s]"]),
+        (lambda c, p, s: plots.scatter(c, p), ["recorded [mm]", "policy [mm]"]),
+        (lambda c, p, s: plots.horizon(c, 10.0), ["[100 ms each]", "mean absolute error [mm]"]),
+        (
+            lambda c, p, s: plots.episodes(c, s),
+            ["error [mm]", "worst by overall error on top"],
+        ),
+    ],
+)
+def test_axes_carry_units_and_titles_say_what_one_sees(
+    draw: Callable[..., Figure], said: list[str]
+) -> None:
+    figure = draw(*evaluated(2))
+    assert figure.get_suptitle()
+    for part in said:
+        assert part in texts(figure)
+
+
+def test_frames_stand_above_the_chunks_that_were_made_of_them() -> None:
+    comparison, predictions, store = evaluated(2)
+    figure = pictures(comparison, predictions, store)["chunks.png"]()
+    views, courses = figure.axes[:4], figure.axes[4:]
+    assert [axis.get_ylabel() for axis in views] == ["A", "", "B", ""]
+    assert [axis.get_title() for axis in views] == ["0.0 s", "0.6 s", "", ""]
+    assert all(len(axis.images) == 1 for axis in views)
+    assert [axis.get_ylabel() for axis in courses] == ["d0 [mm]", "d1 [mm]", "d2 [mm]", "d3 [mm]"]
+    said = courses[0].get_legend_handles_labels()[1]
+    assert said == ["recorded", "policy, next action", "policy, whole chunk at the dotted ticks"]
+    for axis, dimension in zip(courses, range(4), strict=True):
+        whole = [line for line in axis.lines if len(line.get_xdata()) == 3]
+        assert [line.get_xdata()[0] for line in whole] == pytest.approx([0.0, 0.6])
+        np.testing.assert_array_equal(whole[1].get_ydata(), predictions.predicted[6, :, dimension])
+
+
+def test_chunks_are_drawn_without_frames_and_end_with_their_episode() -> None:
+    comparison, predictions, store = evaluated(2)
+    last = np.array([23])
+    figure = plots.chunks(comparison, predictions, store, store.episodes[1], last, {})  # type: ignore[arg-type]
+    assert len(figure.axes) == 4
+    assert "overall error" in figure.get_suptitle()
+    (point,) = (line for line in figure.axes[0].lines if line.get_label().startswith("policy, wh"))
+    assert point.get_xdata() == pytest.approx([1.1])
+
+
+def test_errors_by_dimension_and_step_are_in_training_deviations() -> None:
+    comparison, *_ = evaluated(2)
+    comparison = replace(comparison, scale=np.array([0.5, 1, 1, 2, 0.0]))
+    (axis, _) = plots.dimension_horizon(comparison).axes
+    shown = np.asarray(axis.images[0].get_array())
+    errors = comparison.scores["policy"].mae_horizon
+    np.testing.assert_allclose(shown[0], errors[:, 0] / 0.5)
+    np.testing.assert_allclose(shown[3], errors[:, 3] / 2)
+    assert len(shown) == 4
+    assert [text.get_text() for text in axis.texts][:3] == [f"{e:.2f}" for e in shown[0]]
+    (axis,) = plots.dimensions(comparison).axes
+    policy = next(line for line in axis.lines if line.get_label() == "policy")
+    np.testing.assert_allclose(
+        policy.get_xdata(), comparison.scores["policy"].mae[:4] / [0.5, 1, 1, 2]
+    )
+
+
+def test_curves_mark_the_step_that_was_judged() -> None:
+    steps = np.array([10, 20, 30])
+    logged = {
+        name: TrainingCurve(steps, np.array(values))
+        for name, values in {
+            "train/loss": [1.0, 0.1, 0.01],
+            "lr": [0.0, 1e-3, 5e-4],
+            "train/other": [1.0, 1.0, 1.0],
+        }.items()
+    }
+    figure = plots.curves(TrainingCurves(logged), 20)
+    assert [axis.get_title() for axis in figure.axes] == ["training loss", "learning rate"]
+    assert [axis.get_yscale() for axis in figure.axes] == ["log", "linear"]
+    for axis in figure.axes:
+        assert axis.lines[0].get_xdata().tolist() == steps.tolist()
+        assert axis.lines[1].get_xdata()[0] == 20
+    assert len({axis.get_xlim() for axis in figure.axes}) == 1
+    assert "step 20" in figure.get_suptitle()
+    short = {
+        "train/loss": TrainingCurve(steps, np.array([0.31, 0.29, 0.3])),
+        "lr": TrainingCurve(steps[:1], steps[:1]),
+    }
+    loss, rate = plots.curves(TrainingCurves(short), 20).axes
+    assert (loss.get_yscale(), loss.get_ylim()[0]) == ("linear", 0)
+    assert rate.get_xlim() == loss.get_xlim()
+    (axis,) = plots.curves(TrainingCurves({"train/other": logged["train/other"]}), 5).axes
+    assert axis.get_title() == "train/other"
+
+
+def test_titles_of_groups_of_many_stay_within_their_panels() -> None:
+    comparison, _, store = evaluated(2, 13)
+    names = [f"joint_{index}_velocity" for index in range(13)]
+    groups = (
+        ActionGroup("other", "rad/s", tuple(range(6))),
+        ActionGroup("translation", "rad/s", tuple(range(6, 12))),
+    )
+    comparison = replace(comparison, names=names, groups=groups)
+    for figure in (plots.horizon(comparison, 10.0), plots.episodes(comparison, store)):  # type: ignore[arg-type]
+        figure.draw_without_rendering()
+        left, right = (axis.title.get_window_extent() for axis in figure.axes)
+        assert figure.axes[0].get_title().startswith("other, 6 dimensions\n")
+        assert 0 < left.x0 < left.x1 < right.x0 < right.x1 < figure.bbox.x1
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1e-3, 1.0, 1e5])
+def test_labels_of_a_scatter_lie_apart_whatever_the_range(scale: float) -> None:
+    comparison, predictions, _ = evaluated(2)
+    small = np.float32(scale)
+    predictions = replace(
+        predictions,
+        recorded=predictions.recorded * small,
+        predicted=predictions.predicted * small,
+    )
+    figure = plots.scatter(comparison, predictions)
+    figure.draw_without_rendering()
+    for axis in figure.axes[:4]:
+        low, high = axis.get_xlim()
+        shown = [
+            label.get_window_extent()
+            for place, label in zip(axis.get_xticks(), axis.get_xticklabels(), strict=True)
+            if low <= place <= high
+        ]
+        assert len(shown) >= 2
+        assert all(right.x0 - left.x1 > 3 for left, right in pairwise(shown))
+
+
+def test_what_never_varies_takes_no_panel() -> None:
+    comparison, _, store = evaluated(2)
+    assert len(plots.horizon(comparison, None).axes) == 1
+    assert len(plots.episodes(comparison, store).axes) == 1  # type: ignore[arg-type]
+
+
+def test_many_episodes_are_thinned_but_not_the_extremes() -> None:
+    comparison, _, store = evaluated(60, ticks=4)
+    figure = plots.episodes(comparison, store)  # type: ignore[arg-type]
+    assert len(figure.axes[0].get_yticks()) == plots.EPISODE_LINES
+    assert "40 of 60" in figure.get_suptitle()
+    policy = plots.LABELS["policy"]
+    lines = figure.axes[0].lines
+    shown = next(line.get_xdata() for line in lines if line.get_label() == policy)
+    errors = comparison.groups[0].mean(comparison.scores["policy"].mae_episode)
+    assert shown[-1] == pytest.approx(errors.max())
+    assert shown[0] == pytest.approx(errors.min())
+
+
+def test_a_picture_never_writes_through_a_link(tmp_path: Path) -> None:
+    cache, report = tmp_path / "cache.png", tmp_path / "report"
+    report.mkdir()
+    cache.write_bytes(b"cached")
+    (report / "scatter.png").hardlink_to(cache)
+    write(report, {"scatter.png": pictures(*evaluated(1))["scatter.png"]})
+    assert (report / "scatter.png").read_bytes().startswith(b"\x89PNG")
+    assert cache.read_bytes() == b"cached"
+
+
+def heights(figure: Figure) -> list[list[float]]:
+    """The heights of the bars of each panel, from left to right."""
+    return [[patch.get_height() for patch in axis.patches] for axis in figure.axes]
+
+
+def studied(*errors: float) -> AblationStudy:
+    """A study whose policy, in the first dimension of two, is wrong by these, intact first."""
+
+    def judged(error: float) -> Comparison:
+        recorded = np.zeros((4, 1, 1), np.float32)
+        ticks = np.arange(4)
+        predictions = Predictions(
+            ticks, ticks // 2, recorded + np.float32(error), recorded, np.ones((4, 1), bool)
+        )
+        rules = {
+            name: np.full((4, 1, 1), wrong, np.float32)
+            for name, wrong in (("zero_action", 5), ("mean_action", 3), ("repeat_last", 4))
+        }
+        one = (ActionGroup("translation", "mm", (0,)),)
+        return compare(predictions, rules, ["dx"], ["mm"], one, np.ones(1))
+
+    ways = (("sensor", "zeroed"), ("sensor", "delayed 50 ms"), ("features", "shuffled"))
+    spoilt = tuple(
+        Ablated(stream, how, judged(error))
+        for (stream, how), error in zip(ways, errors[1:], strict=True)
+    )
+    return AblationStudy(judged(errors[0]), spoilt, (), 4)
+
+
+def test_what_each_stream_is_worth_stands_beside_intact_and_best_baseline(tmp_path: Path) -> None:
+    figure = plots.modalities(studied(0.5, 1.0, 0.75, 2.0))
+    assert [axis.get_title() for axis in figure.axes] == ["sensor", "features"]
+    assert heights(figure) == [[2.0, 1.5], [4.0]]
+    for axis in figure.axes:
+        assert [line.get_ydata()[0] for line in axis.lines] == [1.0, 6.0]
+    assert "mean training action" in figure.legends[0].get_texts()[1].get_text()
+    assert "4 held-out ticks, 4 chunk(s) a tick" in figure.get_suptitle()
+    assert "zeroed: every value at its training mean" in figure.legends[0].get_title().get_text()
+    (file,) = write(tmp_path, {"modalities.png": lambda: figure})
+    assert file.read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_policy_without_error_is_drawn_too() -> None:
+    assert heights(plots.modalities(studied(0.0, 1.0, 0.0, 2.0))) == [[1.0, 0.0], [2.0]]
+
+
+def compared(errors: dict[str, float], rules: dict[str, float]) -> list[Experiment]:
+    """Two experiments an expert."""
+    return [
+        Experiment(
+            f"{expert}-{fusion}", expert, fusion, 10, 100, 1,
+            {("overall", "training std"): {"policy": error, **rules}}, None,
+        )
+        for expert, error in errors.items()
+        for fusion in ("concat", "gated")
+    ]  # fmt: skip
+
+
+def test_experiments_are_bars_and_baselines_lines(tmp_path: Path) -> None:
+    rules = {"zero_action": 3.0, "mean_action": 2.0, "repeat_last": 1.0}
+    experiments = compared({"regression": 0.3, "diffusion": 0.4}, rules)
+    figure = plots.comparison_of_experiments(experiments)
+    (axis,) = figure.axes
+    assert [patch.get_width() for patch in axis.patches] == [0.3, 0.3, 0.4, 0.4]
+    assert [line.get_xdata()[0] for line in axis.lines] == list(rules.values())
+    assert [label.get_text() for label in axis.get_yticklabels()] == [e.name for e in experiments]
+    assert [text.get_text() for text in axis.texts] == ["0.300", "0.300", "0.400", "0.400"]
+    (file,) = write(tmp_path, {"experiments.png": lambda: figure})
+    assert file.read_bytes().startswith(b"\x89PNG")
+
+
+def test_numbers_of_experiments_lie_on_nothing() -> None:
+    """Errors just short of a baseline, where a number at the bar's end would lie on its line."""
+    rules = {"zero_action": 0.52, "mean_action": 0.46, "repeat_last": 0.45}
+    figure = plots.comparison_of_experiments(
+        compared({"regression": 0.44, "diffusion": 0.5}, rules)
+    )
+    figure.draw_without_rendering()
+    (axis,) = figure.axes
+    for text in axis.texts:
+        assert text.get_window_extent().x0 > axis.get_window_extent().x1
+        assert text.get_window_extent().x1 < figure.bbox.x1
+
+
+def score(mean: float, spread: float = 0.02) -> ProbeScore:
+    """Over three folds and two targets, of which one does not vary."""
+    by_fold = mean + spread * np.array([-1.0, 0.0, 1.0])
+    r2 = np.stack([by_fold, np.full(3, np.nan)], axis=1)
+    return ProbeScore(r2, np.full(3, 10.0), (1.0,) * 3)
+
+
+def found(name: SlotName, mean: float, slots: int = 1, streams: bool = True) -> ProbeResult:
+    """Alone half as good as beside."""
+    beside = score(mean) if streams else None
+    size = 8 * slots
+    return ProbeResult(name, tuple(range(slots)), size, size, 1.0, score(mean / 2), beside)
+
+
+def probed(streams: bool = True, layers: int = 2) -> ProbeStudy:
+    """Each layer has a mean, a mean a view and a grid of 2 x 2 cells a view."""
+    slots, groups = [], []
+    for layer in range(layers):
+        for norm in (True, False):
+            places = [("mean", None, None), *(("view_mean", view, None) for view in "AB")]
+            cells = [(row, column) for row in range(2) for column in range(2)]
+            places += [("grid", view, cell) for view in "AB" for cell in cells]
+            for pooling, view, cell in places:
+                place = (cell or (0, 0))[0] * 0.1 + (cell or (0, 0))[1] * 0.01
+                mean = 0.3 + 0.1 * layer + place
+                name = SlotName(layer, norm, pooling, view, cell)
+                slots.append(found(name, mean, streams=streams))
+            groups += [
+                found(SlotName(layer, norm, pooling), 0.5, count, streams)
+                for pooling, count in (("mean", 1), ("view_mean", 2), ("grid", 8))
+            ]
+    fold = np.arange(30) // 10
+    folds = ProbeFolds(np.arange(30), fold, fold, 3, ())
+    known = score(0.2) if streams else None
+    return ProbeStudy(2, ("dx",), folds, score(-0.01), known, 5, tuple(slots), tuple(groups))
+
+
+def test_slots_are_a_map_over_layers_and_cells_a_map_a_view(tmp_path: Path) -> None:
+    figure = probe.heat_map(probed())
+    overview, *maps, bar = figure.axes
+    assert [label.get_text() for label in overview.get_yticklabels()] == [
+        "layer 0",
+        "layer 0, no norm",
+        "layer 1",
+        "layer 1, no norm",
+    ]
+    columns = [label.get_text() for label in overview.get_xticklabels()]
+    assert columns == ["mean", "view_mean", "view_mean\nA", "view_mean\nB", "grid"]
+    assert "beside state + sensor" in bar.get_ylabel()
+    assert "state + sensor alone, 0.20" in bar.get_ylabel()
+    # Layer 1 is better than layer 0, of which two maps are left out.
+    assert [axis.get_title() for axis in maps[:4]] == [
+        "layer 1, A",
+        "layer 1, B",
+        "layer 1, no norm, A",
+        "layer 1, no norm, B",
+    ]
+    assert len(maps) == 6
+    assert "the 6 best of 8 maps" in figure.get_suptitle()
+    cells = maps[0].images[0].get_array()
+    np.testing.assert_allclose(cells, [[0.4, 0.41], [0.5, 0.51]])
+    assert {axis.images[0].get_clim() for axis in (overview, *maps)} == {(0.2, 0.51)}
+    assert bar.lines[-1].get_ydata()[0] == pytest.approx(0.2)
+    files = probe.write_probe_plots(tmp_path, probed())
+    assert [file.name for file in files] == ["probe.png", "probe_bars.png"]
+    assert all(file.read_bytes().startswith(b"\x89PNG") for file in files)
+
+
+def test_choices_are_bars_in_order_with_the_spread_over_folds() -> None:
+    (axis,) = probe.bars(probed()).axes
+    assert len(axis.patches) == 2 * 12
+    assert sorted({round(patch.get_width(), 9) for patch in axis.patches}) == [0.25, 0.5]
+    labels = [text.get_text() for text in axis.get_yticklabels()]
+    assert "layer 1\ngrid (8 slots)" in labels
+    lines = [
+        line.get_xdata()[0] for line in axis.lines if line.get_label() == "state + sensor alone"
+    ]
+    assert lines == pytest.approx([0.2])
+
+
+def test_what_is_far_below_the_mean_action_is_a_number_at_the_edge() -> None:
+    study = probed()
+    groups = [replace(study.groups[0], beside=score(-34.1, 20.0)), *study.groups[1:]]
+    study = replace(study, groups=tuple(groups), streams=score(-1109.4))
+    (axis,) = probe.bars(study).axes
+    assert axis.get_xlim()[0] == -0.2
+    assert axis.get_xlim()[1] <= 1
+    assert [text.get_text() for text in axis.texts] == ["◀ -34.10"]
+    labels = [str(line.get_label()) for line in axis.lines]
+    assert "state + sensor alone (-1109.40, left of the axis)" in labels
+    overview, *maps, bar = probe.heat_map(study).axes
+    assert {axis.images[0].get_clim() for axis in (overview, *maps)} == {(-0.49, 0.51)}
+    assert bar.lines[-1].get_ydata()[0] == pytest.approx(-0.49)
+
+
+def test_without_streams_all_stands_alone(tmp_path: Path) -> None:
+    assert len(probe.write_probe_plots(tmp_path, probed(streams=False, layers=1))) == 2
