@@ -25,9 +25,9 @@ from pipeline.policy.cost import flop_table
 from pipeline.store import Batch, FeatureStore
 from pipeline.store.gather import WIDE
 from pipeline.train.batches import BatchIndices, Feed, Windows
-from pipeline.train.feature_source import Cached
+from pipeline.train.feature_source import CachedFeatures
 from pipeline.train.loop import Trainer
-from pipeline.train.run import Run
+from pipeline.train.run import TrainingRun
 from pipeline.train.split import split_by_episode
 
 RAM = "batches in RAM"
@@ -53,7 +53,7 @@ class Contender:
         begun, waited = time.perf_counter(), self._waited
         for _ in range(self._steps):
             parts = itertools.islice(self._batches, len(self._trainer.plan.own))
-            self._trainer.learner.step(self._trainer.step, parts, lambda: False)
+            self._trainer.learn(parts, lambda: False)
         if self._trainer.device.type == "cuda":
             torch.cuda.synchronize(self._trainer.device)
         taken = time.perf_counter() - begun
@@ -101,7 +101,7 @@ def make_trainer(folder: Path, sizes: dict[str, int], device: str, quick: bool) 
     given = load_params(Path("params.yaml")).train_head.model_dump()
     params = TrainHeadParams.model_validate(given | changed | (SMALL if quick else {}))
     split = split_by_episode(store, params.val_fraction, params.horizon)
-    return Trainer(store, params, split, Run(params.output, "new", (), {}))
+    return Trainer(store, params, split, TrainingRun(params.output, "new", (), {}))
 
 
 def measure(
@@ -109,9 +109,12 @@ def measure(
 ) -> tuple[dict[str, Any], dict[str, Any], list[dict[str, Any]]]:
     """Steps with each feed against steps with batches that are in RAM."""
     windows, device = Windows.of(trainer.params), trainer.device
-    fronts = {"mapped": Cached(trainer.store), "device": Cached(trainer.store, WIDE)}
+    fronts = {
+        "mapped": CachedFeatures(trainer.store),
+        "device": CachedFeatures(trainer.store, WIDE),
+    }
     feeds = {
-        name: front.feed(trainer.plan.draws(_ENDLESS), windows, device)
+        name: front.feed(trainer.plan.parts_of(_ENDLESS), windows, device)
         for name, front in fronts.items()
     }
     with feeds["mapped"], feeds["device"]:
@@ -141,7 +144,7 @@ def _kept(trainer: Trainer, steps: int) -> Iterator[tuple[BatchIndices, Batch]]:
     windows = Windows.of(trainer.params)
     sizes = (windows.horizon, windows.sensor_window, windows.state_window)
     kept: list[tuple[BatchIndices, Batch]] = []
-    for draw in trainer.plan.draws(range(steps)):
+    for draw in trainer.plan.parts_of(range(steps)):
         batch = trainer.store.gather(draw.ticks, *sizes, variants=draw.variants)
         kept.append((draw, batch.pin() if trainer.device.type == "cuda" else batch))
     for draw, batch in itertools.cycle(kept):

@@ -3,7 +3,8 @@
 Ticks, streams, split and normalisation come from the store that extract wrote, frames from the
 recordings of data.sources. Writes checkpoints with an adapter (or a whole checkpoint) to
 finetune.output, for extract to compute better features with, and curves to finetune.logs; while it
-runs, open report.html there (train_head.loggers adds TensorBoard and Weights & Biases).
+runs, `dvc plots show <finetune.logs>/plots/metrics` draws them (train_head.loggers adds
+TensorBoard and Weights & Biases).
 
   python -m stages.finetune                                        low-rank adapters
   python -m stages.finetune --set finetune.tuning.method=full      every weight
@@ -23,9 +24,8 @@ if __name__ == "__main__":  # here, for --help waits for no import below
 
 from pipeline.base.config import Params
 from pipeline.store import FeatureStore, build_lock, check_trailers
-from pipeline.train.finetuning import Live, head_params, next_steps, out_of_memory_named
-from pipeline.train.finetuning.params import left_out
-from pipeline.train.loggers import check_loggers
+from pipeline.train.finetuning import LiveFeatures, head_params, next_steps, out_of_memory_named
+from pipeline.train.log import check_loggers
 from pipeline.train.loop import Trainer
 from pipeline.train.run import open_run
 from pipeline.train.split import split_by_episode
@@ -39,17 +39,17 @@ def main(params: Params) -> None:
         world.shared(lambda: check_loggers(head))
         store = FeatureStore.open(head.store or params.extract.store)
         with world.holding(build_lock(head.output)), out_of_memory_named():
-            front = Live.open(store, params, process_device(head.device))
-            opened = world.shared(lambda: open_run(head, store, front.identity, "finetune"))
-            world.say(*left_out(params), *opened.notes)
+            source = LiveFeatures(store, params, process_device(head.device))
+            opened = world.shared(lambda: open_run(head, store, source.identity, "finetune"))
+            world.say(*opened.notes)
             if opened.status == "finished":
                 world.say("nothing to do", *next_steps(params.finetune, store))
                 return
             if head.check_store:
                 world.shared(lambda: check_trailers(store.path))
             split = split_by_episode(store, head.val_fraction, head.horizon)
-            trainer = Trainer(store, head, split, opened, front)
-            world.say(*trainer.summary(), *front.summary())
+            trainer = Trainer(store, head, split, opened, source)
+            world.say(*trainer.summary(), *source.summary())
             trainer.fit()
         world.say(f"best and last checkpoint: {opened.output}; curves: {head.logs}")
         world.say(*next_steps(params.finetune, store))

@@ -1,6 +1,6 @@
 """Rank the slots of a store by how well a ridge regression reads the action chunk from them.
 
-Reads probe.store (extract.store where null), its checksums first (train_head.check_store). Each
+Reads probe.store (extract.store where null), its checksums first (probe.check_store). Each
 slot by itself and each choice of layer, norm and pooling as a whole, alone and beside state +
 sensor, cross-validated by recording. Prints the ranking and the line for params.yaml that the
 evidence supports; writes metrics.json, slots.csv, groups.csv, targets.csv and pictures (PNG) into
@@ -20,8 +20,6 @@ from stages.command import run
 if __name__ == "__main__":  # here, for --help waits for no import below
     raise SystemExit(run(__doc__ or "", "stages.probe", sections=("probe",)))
 
-from functools import partial
-
 from pipeline.base.config import Params
 from pipeline.base.ownership import REPORT, claim, refuse_foreign, release
 from pipeline.evaluate.probe import advice, probe, table, write_tables
@@ -36,9 +34,9 @@ def main(params: Params) -> None:
     store = FeatureStore.open(wanted.store or params.extract.store)
     slots, dim = store.feature_shape
     print(f"{store.path}: {slots} slots of {dim} channels at {store.ticks} ticks", flush=True)
-    if params.train_head.check_store:
+    if wanted.check_store:
         check_trailers(store.path)
-    study = probe(store, wanted, partial(print, flush=True))
+    study = probe(store, wanted)
     claim(wanted.output, REPORT)
     files = [*write_tables(wanted.output, study), *write_probe_plots(wanted.output, study)]
     release(wanted.output, REPORT)

@@ -50,7 +50,7 @@ from pipeline.store.admin import (
     take_inventory,
 )
 from pipeline.store.merging import merge
-from pipeline.train.dependents import find_trained
+from pipeline.train.run import find_trained
 
 
 def main(params: Params) -> None:

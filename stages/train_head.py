@@ -1,12 +1,12 @@
 """Train a policy head from the store alone: no image, no vision-language model.
 
 Reads train_head.store (extract.store where null). Writes the best and the last checkpoint to
-train_head.output and curves to train_head.logs; while it runs, open report.html there. Some
-episodes are held out to judge it by.
+train_head.output and curves to train_head.logs; while it runs, `dvc plots show` draws them. Some
+episodes are held out to evaluate it on.
 
   python -m stages.train_head                                      what params.yaml says
   python -m stages.train_head --set train_head.model_type=diffusion    or regression, flow_matching
-  python -m stages.train_head --set 'train_head.loggers=[report, tensorboard]'   or wandb, dvclive
+  python -m stages.train_head --set 'train_head.loggers=[tensorboard]'        or wandb, or both
   torchrun --nproc_per_node 2 -m stages.train_head                 on two GPUs: the same curve
 
 What is set first: train_head.max_steps, batch_size, lr, horizon (ticks an action chunk),
@@ -41,15 +41,14 @@ def main(params: Params) -> None:
 
 def _train(params: Params) -> None:
     # With torch, which takes over a second to import.
-    from pipeline.train.loggers import check_loggers
+    from pipeline.train.log import check_loggers
     from pipeline.train.loop import Trainer
     from pipeline.train.world import process_group
 
     head = params.train_head
     with process_group(head.device) as world:
         world.shared(lambda: check_loggers(head))
-        path = head.store or params.extract.store
-        store = FeatureStore.open(path)
+        store = FeatureStore.open(head.store or params.extract.store)
         with world.holding(build_lock(head.output)):
             opened = world.shared(lambda: open_run(head, store))
             world.say(*opened.notes)

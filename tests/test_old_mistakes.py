@@ -29,7 +29,7 @@ from pipeline.policy.regression import RegressionActionExpert
 from pipeline.simulation.insertion_formats import ABUTTING, write_new
 from pipeline.simulation.recorder import simulate_episode
 from pipeline.store import FeatureStore
-from pipeline.train.identity import policy_shape
+from pipeline.train.run import policy_shape
 from pipeline.train.split import split_by_episode
 from pipeline.train.statistics import fit_normalization
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec, row_key

@@ -140,7 +140,7 @@ REPORT = OutputKind("a folder of reports", _is_report)
 
 
 def _has_speed(logs: Path) -> bool:
-    """Whether a training's speed lies beside these logs: dvclive's files alone are anybody's."""
+    """Whether a training's speed lies beside these logs: curves alone are anybody's."""
     speed = logs.with_name(f"{logs.name}.speed.tsv")
     return logs.is_dir() and begins_with(_SPEED)(speed) and speed.stat().st_size > 0
 

@@ -14,7 +14,7 @@ from pipeline.base.errors import ConfigError
 from pipeline.compat.batch import unified_collate_fn
 from pipeline.compat.dataset import UnifiedVLADataset
 from pipeline.store import FeatureStore
-from pipeline.train.mixture import TickSampler
+from pipeline.train.sampling import TickSampler
 
 
 class MixtureBatches(Sampler[list[int]]):

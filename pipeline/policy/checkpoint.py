@@ -11,7 +11,6 @@ import sys
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,6 +40,8 @@ if TYPE_CHECKING:
 FORMAT = 2
 WEIGHTS, DOCUMENT = "policy.safetensors", "policy.json"
 CHECKPOINT = OutputKind("a checkpoint of a policy", lambda folder: (folder / DOCUMENT).is_file())
+_OF_THE_RUN = ("feed", "loggers", "scratch")
+"""Keys of `train_head` that no policy depends on, and that had other values in the past."""
 SOURCE_KEYS = ("feature_spec", "streams", "action_hz", "vlm_reuse_count")
 
 
@@ -186,14 +187,12 @@ def _description(folder: Path) -> Generator[dict[str, Any]]:
 
 
 def _params(document: Mapping[str, Any]) -> TrainHeadParams:
-    said = dict(document["params"]["train_head"])
-    said.pop("scratch", None)  # of earlier versions, which trained from archives, too
-    if said.get("feed") == "compressed":
-        del said["feed"]
-    return TrainHeadParams.model_validate_json(json.dumps(said))
+    given = document["params"]["train_head"]
+    return TrainHeadParams.model_validate_json(
+        json.dumps({key: value for key, value in given.items() if key not in _OF_THE_RUN})
+    )
 
 
-@cache
 def _note_without_digest(path: Path) -> None:
     """Say it once in a process: a checkpoint is read several times."""
     print(

@@ -179,7 +179,7 @@ def _moments(values: NDArray[Any], valid: NDArray[np.bool_] | None, what: str) -
 
 
 def _merge(left: _Moments, right: _Moments) -> _Moments:
-    count = left.count + right.count
+    count = np.asarray(left.count + right.count)
     delta = right.mean - left.mean
     share = right.count / np.maximum(count, 1)
     return _Moments(

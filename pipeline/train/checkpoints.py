@@ -1,101 +1,130 @@
-"""The best and the last checkpoint of a run, and the way back from the last."""
+"""What going on with a run takes beyond its policy, as safetensors and JSON, and the way back."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
-from torch import nn
+import torch
+from jaxtyping import Float64
+from torch import Tensor, nn
 
-from pipeline.base.config import TrainHeadParams
-from pipeline.base.durable import sync
-from pipeline.policy.checkpoint import PolicyCheckpoint, load_policy, save_policy
+from pipeline.base.durable import (
+    damaged,
+    read_document,
+    read_tensors,
+    write_tensors,
+    write_with_digest,
+)
+from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch, PipelineError
+from pipeline.policy.checkpoint import load_policy
 from pipeline.policy.normalization import Normalization
 from pipeline.policy.observation import PolicyShape
-from pipeline.store import FeatureStore
-from pipeline.train.feature_source import FeatureSource
-from pipeline.train.held_out import held_out_contents, held_out_ranges
-from pipeline.train.identity import source_of
-from pipeline.train.run import Run
-from pipeline.train.split import Split
-from pipeline.train.state import TrainerState, read_trainer, write_trainer
+from pipeline.train.log import Row
+from pipeline.train.run import TRAINER_DOCUMENT, TRAINER_WEIGHTS, TrainingRun
 from pipeline.train.world import World
+
+_KINDS = ("weights", "average", "optimizer")
 
 
 @dataclass(frozen=True)
-class Checkpoints:
-    """Writes the checkpoints of a run: policy, what the front has beside it, trainer state."""
+class TrainerState:
+    """A run after `step` steps.
 
-    run: Run
-    store: FeatureStore
-    params: TrainHeadParams
-    split: Split
-    front: FeatureSource
-    normalization: Normalization
-    shape: PolicyShape
+    There is no random state and no schedule state in it: both follow from the seed and the step.
+    """
 
-    def save_best(self, module: nn.Module, step: int, metrics: Mapping[str, float]) -> None:
-        """Put these weights at the run's best. Raises `DiskFull`."""
-        save_policy(
-            self.run.best,
-            self._checkpoint(module, step, metrics),
-            beside=lambda folder: self._save_front(folder, module),
+    step: int
+    weights: Mapping[str, Tensor]
+    """What learns, by its name in the trained module."""
+    average: Mapping[str, Tensor]
+    """The moving average of each of `weights`."""
+    optimizer: Mapping[str, Tensor]
+    history: Float64[Tensor, "step column"]
+    """A row for every step so far."""
+    columns: tuple[str, ...]
+    best_error: float | None
+    stalled: int
+    """Evaluations since the best one."""
+    trained_s: float
+    """Seconds of training so far, over all starts."""
+    rows: tuple[Row, ...]
+
+
+def write_trainer(folder: Path, state: TrainerState) -> None:
+    """Write the two files of a trainer's state into an existing folder."""
+    tensors = {
+        f"{kind}:{name}": value for kind in _KINDS for name, value in getattr(state, kind).items()
+    }
+    digest = write_tensors(folder / TRAINER_WEIGHTS, tensors | {"history:": state.history})
+    document = {
+        "step": state.step,
+        "columns": list(state.columns),
+        "best_error": state.best_error,
+        "stalled": state.stalled,
+        "trained_s": state.trained_s,
+        "rows": [[step, dict(metrics)] for step, metrics in state.rows],
+        "weights_sha256": digest,
+    }
+    write_with_digest(folder / TRAINER_DOCUMENT, document)
+
+
+def read_trainer(folder: Path) -> TrainerState:
+    """The state at `folder`; `CheckpointIncomplete` where a file is missing or damaged."""
+    path = folder / TRAINER_DOCUMENT
+    try:
+        document = read_document(path)
+        kinds: dict[str, Any] = {kind: {} for kind in (*_KINDS, "history")}
+        stored = read_tensors(folder / TRAINER_WEIGHTS, document.pop("weights_sha256"))
+        for key, value in stored.items():
+            kind, _, name = key.partition(":")
+            kinds[kind][name] = value
+        history = kinds.pop("history")[""]
+        columns = tuple(document.pop("columns"))
+        rows = tuple((step, metrics) for step, metrics in document.pop("rows"))
+        return TrainerState(**document, **kinds, history=history, columns=columns, rows=rows)
+    except PipelineError:
+        raise
+    except (KeyError, TypeError, ValueError) as error:
+        why = f"not what it must hold ({type(error).__name__}: {error})"
+        raise CheckpointIncomplete(damaged(path, why)) from None
+
+
+@torch.no_grad()
+def load_weights(
+    parameters: Mapping[str, nn.Parameter], tensors: Mapping[str, Tensor], place: Path
+) -> None:
+    """Lay the tensors into the parameters of the same names.
+
+    Raises `CheckpointMismatch` where names or shapes are others.
+    """
+    wanted = {name: tuple(value.shape) for name, value in parameters.items()}
+    stored = {name: tuple(value.shape) for name, value in tensors.items()}
+    if wanted != stored:
+        name = next(n for n in (*wanted, *stored) if wanted.get(n) != stored.get(n))
+        raise CheckpointMismatch(
+            f"{place}: expected what learns in this run, {len(wanted)} parameters; at {name} that "
+            f"is {wanted.get(name)}, the checkpoint has {stored.get(name)}. Remove {place} to "
+            "begin anew, or use the version of this code that wrote it."
         )
-
-    def save_last(
-        self, module: nn.Module, metrics: Mapping[str, float], state: TrainerState
-    ) -> None:
-        """Put these weights, and all that going on takes, at the run's last. Raises `DiskFull`."""
-
-        def beside(folder: Path) -> None:
-            self._save_front(folder, module)
-            write_trainer(folder, state)
-
-        save_policy(self.run.last, self._checkpoint(module, state.step, metrics), beside=beside)
-
-    def _save_front(self, folder: Path, module: nn.Module) -> None:
-        self.front.save(folder, module)
-        for path in folder.rglob("*"):
-            sync(path)
-
-    def _checkpoint(
-        self, module: nn.Module, step: int, metrics: Mapping[str, float]
-    ) -> PolicyCheckpoint:
-        ranges = held_out_ranges(self.store, self.split.held_out)
-        return PolicyCheckpoint(
-            params=self.params,
-            shape=self.shape,
-            normalization=self.normalization,
-            source=source_of(self.store),
-            held_out_ticks=ranges,
-            held_out_content=held_out_contents(self.store, ranges),
-            step=step,
-            weights=self.front.policy_of(module).state_dict(),
-            metrics=metrics,
-        )
+    for name, parameter in parameters.items():
+        parameter.copy_(tensors[name])
 
 
-def read_last(run: Run, world: World) -> tuple[Normalization, PolicyShape, TrainerState]:
+def read_last(run: TrainingRun, world: World) -> tuple[Normalization, PolicyShape, TrainerState]:
     """What a run goes on from, read on rank 0 and sent to the others.
 
     Raises `CheckpointIncomplete` or `CheckpointMismatch`.
     """
-    found: list[TrainerState] = []
+    tensors: dict[str, Mapping[str, Tensor]] = {kind: {} for kind in _KINDS}
 
     def read() -> tuple[Normalization, PolicyShape, TrainerState]:
-        checkpoint = load_policy(run.last)
-        found.append(read_trainer(run.last))
-        said = replace(found[0], weights={}, average={}, optimizer={})
-        return checkpoint.normalization, checkpoint.shape, said
+        checkpoint, state = load_policy(run.last), read_trainer(run.last)
+        tensors.update({kind: getattr(state, kind) for kind in _KINDS})
+        # Tensors are not pickled with the rest, but sent one by one.
+        rest = replace(state, weights={}, average={}, optimizer={})
+        return checkpoint.normalization, checkpoint.shape, rest
 
-    normalization, shape, state = world.shared(read)
-    here = found[0] if found else state
-    return (
-        normalization,
-        shape,
-        replace(
-            state,
-            weights=world.tensors(here.weights),
-            average=world.tensors(here.average),
-            optimizer=world.tensors(here.optimizer),
-        ),
-    )
+    normalization, shape, rest = world.shared(read)
+    sent = {kind: world.tensors(tensors[kind]) for kind in _KINDS}
+    return normalization, shape, replace(rest, **sent)

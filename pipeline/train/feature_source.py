@@ -18,7 +18,7 @@ class FeatureSource(Protocol):
     identity: Mapping[str, Any]
     """JSON: what else decides the numbers of the run; empty where the params say it all."""
     eval_ticks: int | None
-    """Held-out ticks judged at most during training; None: the trainer's own limit."""
+    """Held-out ticks evaluated at most during training; None: the trainer's own limit."""
 
     def attach(self, policy: Policy) -> Trainable:
         """The module that is trained; it holds the policy."""
@@ -41,7 +41,7 @@ class FeatureSource(Protocol):
         ...
 
 
-class Cached:
+class CachedFeatures:
     """Features from the store: the policy is all that is trained, kept and saved.
 
     The wide fields of a batch that `on_device` names live on the device that is fed; they are

@@ -1,27 +1,261 @@
-"""What a run writes down while it goes: its curves, to every logger, and speed beside them."""
+"""What a run writes down while it goes: the loss at every step, its curves and its speed.
 
-import csv
+Every logger is handed the same rows. TensorBoard's and Weights & Biases' files carry the clock, so
+they lie beside the logs, which DVC hashes, not in them.
+"""
+
+import json
+import math
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from importlib import import_module
 from pathlib import Path
-from typing import Self
+from typing import Any, Protocol, Self
+from uuid import uuid4
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
 
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.durable import disk_full_named, fresh
-from pipeline.base.ownership import OutputKind, begins_with, refuse_foreign
-from pipeline.train.loggers import Logger, open_loggers
-from pipeline.train.speed import Pace
+from pipeline.base.errors import ConfigError
+from pipeline.base.ownership import REPORT, OutputKind, begins_with, claim, refuse_foreign
+from pipeline.train.progress import Pace
 from pipeline.train.world import World
 
-_SPEED = ("step", "steps_per_s", "data_wait_share", "peak_memory_mib", "trained_s")
+FINISH_TIMEOUT_S = 120.0
+"""How long a finished run waits for Weights & Biases to take what it has not sent yet."""
+_SPEED = "step\tsteps_per_s\tdata_wait_share\tpeak_memory_mib\ttrained_s"
+_MODULES = {"tensorboard": "torch.utils.tensorboard", "wandb": "wandb.sdk"}
+"""What is imported of a logger's package: a folder `wandb`, as that leaves where it runs, has none
+of it."""
 
 Row = tuple[int, Mapping[str, float]]
 """A step, counted from 1, and metrics by name."""
 
 
+class History:
+    """One row of named scalars a step.
+
+    Rows stay on the device until `settle`: reading a scalar at every step would make the CPU wait
+    for the GPU at every step.
+    """
+
+    def __init__(
+        self, columns: Sequence[str] = (), rows: Float64[Tensor, "step column"] | None = None
+    ) -> None:
+        self.columns = tuple(columns)
+        self._settled = torch.empty((0, 0), dtype=torch.float64) if rows is None else rows
+        self._pending: list[Mapping[str, Tensor]] = []
+
+    def add(self, values: Mapping[str, Tensor]) -> None:
+        """Add the scalars of the next step; every step has the same names."""
+        self.columns = self.columns or tuple(values)
+        self._pending.append(values)
+
+    def settle(self) -> int | None:
+        """Fetch what is pending; the index of the first step with a NaN or inf, if there is one."""
+        if not self._pending:
+            return None
+        first = len(self._settled)
+        scalars = [values[name].float() for values in self._pending for name in self.columns]
+        rows = torch.stack(scalars).view(-1, len(self.columns)).to("cpu", torch.float64)
+        self._pending.clear()
+        self._settled = torch.cat([self._settled.view(-1, len(self.columns)), rows])
+        bad = ~torch.isfinite(rows).all(dim=1)
+        return first + int(bad.nonzero()[0, 0]) if bad.any() else None
+
+    def tensor(self) -> Float64[Tensor, "step column"]:
+        """All settled rows."""
+        return self._settled
+
+    def mean(self, first: int, stop: int) -> dict[str, float]:
+        """The mean of each column over the settled steps [first, stop)."""
+        means = self._settled[first:stop].mean(dim=0).tolist()
+        return dict(zip(self.columns, means, strict=True))
+
+    def last(self, name: str) -> float:
+        """A column at the newest settled step."""
+        return float(self._settled[-1, self.columns.index(name)])
+
+    def describe(self, step: int) -> str:
+        """A step's row as text."""
+        row = zip(self.columns, self._settled[step].tolist(), strict=True)
+        return ", ".join(f"{name} {value:g}" for name, value in row)
+
+
+class Logger(Protocol):
+    """Takes the rows of a run, in the order of their steps."""
+
+    note: str
+    """Where to look, as a line for the user."""
+
+    def write(self, step: int, metrics: Mapping[str, float]) -> None:
+        """Add a point, at a step counted from 1, to each of these curves."""
+
+    def close(self, finished: bool) -> None:
+        """End: the run is finished, or was stopped and may go on."""
+
+
+class CurveFiles:
+    """Curves as DVC plots them: `plots/metrics/<name>.tsv`, the newest values in `metrics.json`.
+
+    As dvclive writes them, which itself looks for git and DVC around the working directory: it
+    fails in a repository without a commit and runs `dvc init` in one that does not use DVC.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._plots = folder, folder / "plots" / "metrics"
+        self.note = f"live: dvc plots show {self._plots}"
+        for path in self._plots.rglob("*.tsv"):
+            path.unlink()
+        fresh(folder / "metrics.json")
+        self._newest: dict[str, Any] = {}
+
+    def write(self, step: int, metrics: Mapping[str, float]) -> None:
+        """Add a line to each file."""
+        for name, value in metrics.items():
+            path = self._plots / f"{name}.tsv"
+            *groups, column = name.split("/")
+            begun = path.exists()
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with path.open("a", encoding="utf-8") as file:
+                file.write("" if begun else f"step\t{column}\n")
+                file.write(f"{step}\t{value}\n")
+            entry = self._newest
+            for group in groups:
+                entry = entry.setdefault(group, {})
+            entry[column] = value if math.isfinite(value) else str(value)
+        self._newest["step"] = step
+        text = json.dumps(self._newest, indent=4)
+        (self._folder / "metrics.json").write_text(f"{text}\n", encoding="utf-8")
+
+    def close(self, finished: bool) -> None:
+        """Nothing: every row is written when it comes."""
+
+
+class TensorBoard:
+    """Event files in `folder`, of which the newest holds the whole run.
+
+    The rows of before a stop are handed in again (`TrainingLog`), so each start tells TensorBoard
+    to forget the files before it (`purge_step`): no step stands twice, nor any of a run before.
+    They are not removed, for a TensorBoard that is looking at one would look there for ever.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        from torch.utils.tensorboard import SummaryWriter
+
+        self.note = f"live: tensorboard --logdir {folder}"
+        self._writer = SummaryWriter(str(folder), purge_step=0, flush_secs=10)
+
+    def write(self, step: int, metrics: Mapping[str, float]) -> None:
+        """Add a scalar of each."""
+        for name, value in metrics.items():
+            self._writer.add_scalar(name, value, step)
+
+    def close(self, finished: bool) -> None:
+        """Write what is buffered."""
+        self._writer.close()
+
+
+class WandB:
+    """A run of Weights & Biases, which goes on where this one was stopped.
+
+    Its id lies in `<folder>/id` while a run of this folder may go on; rows that the service has are
+    not sent again. `WANDB_MODE=offline` keeps everything in `folder`. Raises `ConfigError` where a
+    run cannot begin; what cannot be sent later never stops a training.
+    """
+
+    def __init__(self, folder: Path, params: TrainHeadParams, resumed: bool) -> None:
+        import wandb
+
+        folder.mkdir(parents=True, exist_ok=True)
+        settings = wandb.Settings(
+            console="off", silent=True, finish_timeout=FINISH_TIMEOUT_S, init_timeout=30
+        )
+        try:
+            self._run: Any = wandb.init(
+                project=params.wandb_project,
+                dir=str(folder),
+                id=_run_id(folder / "id", resumed),
+                name=params.output.name,
+                resume="allow",
+                config=params.model_dump(mode="json"),
+                settings=settings,
+            )
+        except (wandb.Error, OSError, ValueError) as error:
+            why = str(error).strip().rstrip(".")
+            raise ConfigError(
+                f"train_head.loggers has wandb, but no run can begin: {why}. Log in with "
+                "`wandb login`, keep the run here with WANDB_MODE=offline (`wandb sync` sends it "
+                "later), or take wandb out of train_head.loggers."
+            ) from None
+        self._from = self._run.starting_step
+        if self._run.offline:
+            self.note = f"wandb is offline; wandb sync {self._run.settings.sync_dir} sends the run"
+        else:
+            self.note = f"live: {self._run.url}"
+
+    def write(self, step: int, metrics: Mapping[str, float]) -> None:
+        """Send a point of each, unless it is there from before a stop."""
+        if step >= self._from:
+            self._run.log(dict(metrics), step=step)
+
+    def close(self, finished: bool) -> None:
+        """Send the rest, for at most `FINISH_TIMEOUT_S`, and say where that fails."""
+        import wandb
+
+        try:
+            self._run.finish(exit_code=0 if finished else 1)
+        except (wandb.Error, OSError, RuntimeError) as error:
+            print(f"wandb: not everything could be sent ({error}); `wandb sync` sends the rest")
+
+
+def _run_id(path: Path, resumed: bool) -> str:
+    """That of the run that goes on; a new one for a new run."""
+    if resumed and path.exists():
+        return path.read_text(encoding="ascii").strip()
+    path.write_text(identifier := uuid4().hex[:16], encoding="ascii")
+    return identifier
+
+
+def check_loggers(params: TrainHeadParams) -> None:
+    """Raise `ConfigError` where a logger's package is not installed or does not load."""
+    troubles: list[str] = []
+    for name in params.loggers:
+        try:
+            import_module(_MODULES[name])
+        except ImportError as error:
+            troubles.append(f"{name} ({error})")
+    if troubles:
+        raise ConfigError(
+            "train_head.loggers: expected the package of each logger, cannot load "
+            f"{', '.join(troubles)}. "
+            "Run pip install 'vla-feature-cache[loggers]', in a checkout "
+            "pip install -e '.[loggers]', or set train_head.loggers=[]."
+        )
+
+
+def open_loggers(params: TrainHeadParams, resumed: bool) -> list[Logger]:
+    """The curves for DVC and the loggers of `params`. Raises `ConfigError`."""
+    claim(params.logs, REPORT)
+    loggers: list[Logger] = [CurveFiles(params.logs)]
+    if "wandb" in params.loggers:
+        loggers.append(WandB(_beside(params.logs, "wandb"), params, resumed))
+    if "tensorboard" in params.loggers:
+        loggers.append(TensorBoard(_beside(params.logs, "tensorboard")))
+    return loggers
+
+
 def speed_file(logs: Path) -> Path:
     """Where a training writes its speed: beside its logs, for DVC tracks all that is in them."""
-    return logs.with_name(f"{logs.name}.speed.tsv")
+    return _beside(logs, "speed.tsv")
+
+
+def _beside(logs: Path, name: str) -> Path:
+    """Where that lies which DVC must not hash."""
+    return logs.with_name(f"{logs.name}.{name}")
 
 
 class TrainingLog:
@@ -39,12 +273,10 @@ class TrainingLog:
         folder.mkdir(parents=True, exist_ok=True)
         self._folder, self._loggers = folder, loggers
         self.rows: list[Row] = []
-        refuse_foreign(
-            speed_file(folder), OutputKind("a run's speed", begins_with("\t".join(_SPEED)))
-        )
-        self._speed = fresh(speed_file(folder)).open("w", encoding="utf-8", newline="")
-        self._writer = csv.writer(self._speed, delimiter="\t")
-        self._writer.writerow(_SPEED)
+        speed = speed_file(folder)
+        refuse_foreign(speed, OutputKind("a run's speed", begins_with(_SPEED)))
+        self._speed = fresh(speed).open("w", encoding="utf-8")
+        self._speed.write(f"{_SPEED}\n")
         for step, metrics in earlier:
             self.write(step, metrics)
 
@@ -58,14 +290,9 @@ class TrainingLog:
     def write_speed(self, step: int, pace: Pace) -> None:
         """Add a line to `speed_file`."""
         with disk_full_named(self._folder):
-            self._writer.writerow(
-                [
-                    step,
-                    f"{pace.steps_per_s:.3f}",
-                    f"{pace.data_wait_share:.4f}",
-                    f"{pace.peak_memory / 2**20:.0f}",
-                    f"{pace.trained_s:.3f}",
-                ]
+            self._speed.write(
+                f"{step}\t{pace.steps_per_s:.3f}\t{pace.data_wait_share:.4f}\t"
+                f"{pace.peak_memory / 2**20:.0f}\t{pace.trained_s:.3f}\n"
             )
             self._speed.flush()
 
@@ -95,7 +322,7 @@ def open_log(
             with disk_full_named(params.logs):
                 loggers = open_loggers(params, resumed)
             opened.append(stack.enter_context(TrainingLog(params.logs, loggers, earlier)))
-            world.say(*(logger.note for logger in loggers if logger.note))
+            world.say(*(logger.note for logger in loggers))
 
         world.shared(begin)
         yield opened[0] if opened else None

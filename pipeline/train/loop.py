@@ -1,37 +1,51 @@
-"""The one training loop: every expert, cached or live, on one process or several."""
+"""The one training loop: every expert, cached or live features, on one process or several."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from itertools import islice
+from pathlib import Path
 
+import numpy as np
 import torch
-from torch import nn
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
 from tqdm import tqdm
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.base.errors import NumericsError
-from pipeline.policy.policy import Policy
+from pipeline.base.device import use_bfloat16
+from pipeline.base.durable import sync
+from pipeline.base.errors import ConfigError, NumericsError
+from pipeline.base.format import duration, size
+from pipeline.policy.checkpoint import PolicyCheckpoint, save_policy
+from pipeline.policy.cost import describe_cost
+from pipeline.policy.observation import action_groups
+from pipeline.policy.policy import Policy, Trainable
 from pipeline.store import Batch, FeatureStore
-from pipeline.train.batches import BatchIndices, Windows, choose_feed
-from pipeline.train.checkpoints import Checkpoints, read_last
-from pipeline.train.feature_source import Cached, FeatureSource
-from pipeline.train.history import History
-from pipeline.train.identity import policy_shape
-from pipeline.train.interrupt import deferred_interrupt
-from pipeline.train.judging import EarlyStopping, held_out_error, judged_ticks
-from pipeline.train.learner import Learner
-from pipeline.train.log import Row, TrainingLog, open_log
-from pipeline.train.optimizer import schedule
-from pipeline.train.plan import Plan
-from pipeline.train.progress import Progress
-from pipeline.train.run import Run
-from pipeline.train.speed import Speed
-from pipeline.train.split import Split
-from pipeline.train.state import TrainerState
+from pipeline.train.batches import BatchIndices, Ticks, Windows, choose_feed
+from pipeline.train.checkpoints import TrainerState, load_weights, read_last, write_trainer
+from pipeline.train.feature_source import CachedFeatures, FeatureSource
+from pipeline.train.log import History, Row, TrainingLog, open_log
+from pipeline.train.optimizer import (
+    WeightAverage,
+    compiled,
+    make_optimizer,
+    optimizer_tensors,
+    peak_rates,
+    restore_optimizer,
+    schedule,
+    trainable,
+)
+from pipeline.train.progress import Progress, describe_data, peak_memory_bytes
+from pipeline.train.run import TrainingRun, policy_shape
+from pipeline.train.sampling import Plan, StepPart
+from pipeline.train.scores import evaluate_policy
+from pipeline.train.split import Split, held_out_contents, held_out_ranges, source_of
 from pipeline.train.statistics import fit_normalization
-from pipeline.train.summary import closing, data_warnings, describe_data, describe_learner
-from pipeline.train.world import World, process_device
+from pipeline.train.world import World, deferred_interrupt, process_device
 
 LOG_EVERY = 10
+EVALUATION_TICKS = 1000
+"""Held-out ticks evaluated during training at most, evenly spaced; `stages.evaluate` takes all."""
 
 
 class Trainer:
@@ -49,21 +63,21 @@ class Trainer:
         store: FeatureStore,
         params: TrainHeadParams,
         split: Split,
-        run: Run,
-        front: FeatureSource | None = None,
+        run: TrainingRun,
+        source: FeatureSource | None = None,
     ) -> None:
         self.store, self.params, self.split, self.run = store, params, split, run
         self.world = World.current()
         self.device = process_device(params.device)
         self._feed_note: list[str] = []
-        if front is None:
-            chosen = choose_feed(params.feed, store, self.device)
-            self._feed_note = [chosen.why]
-            front = Cached(store, chosen.on_device)
-        self.front = front
+        if source is None:
+            on_device, note = choose_feed(params.feed, store, self.device)
+            self._feed_note = [note]
+            source = CachedFeatures(store, on_device)
+        self.source = source
         self.plan = Plan(store, params, split, self.world, run.section)
         self.step = 0
-        self.standing = EarlyStopping.of(params, split)
+        self.stopping = EarlyStopping.of(params, split)
         self.history = History()
         self._earlier: tuple[Row, ...] = ()
         self._trained_s = 0.0
@@ -73,24 +87,40 @@ class Trainer:
         else:
             self.normalization = self.world.shared(lambda: fit_normalization(store, split.train))
             self.shape = policy_shape(store, self.normalization)
-        torch.manual_seed(params.seed)
-        policy = Policy(params, self.shape, self.normalization)
-        self.learner = Learner(self.front, policy, store, params, self.device, self.world)
-        self._checkpoints = Checkpoints(
-            run, store, params, split, self.front, self.normalization, self.shape
-        )
+        self._build()
         if state is not None:
             self._restore(state)
+
+    def _build(self) -> None:
+        """The policy behind its features, its optimizer, and the average of what learns.
+
+        All processes begin with the weights of rank 0 and stay equal.
+        """
+        params = self.params
+        torch.manual_seed(params.seed)
+        policy = Policy(params, self.shape, self.normalization)
+        self._trained = self.source.attach(policy)
+        assert isinstance(self._trained, nn.Module)
+        self.module: nn.Module = self._trained.to(self.device).train()
+        self.learning = trainable(self.module)
+        """The parameters that learn, by name; the others are neither averaged nor kept."""
+        self.world.spread(value.data for value in self.learning.values())
+        rates = peak_rates(self.module, self.source, params)
+        self.optimizer = make_optimizer(self.module, params, rates)
+        self.average = WeightAverage(self.module, params.ema_decay)
+        self._bfloat16 = use_bfloat16(params.amp, self.device)
+        self._terminal = TerminalStop(self.store, self.device) if params.terminal_stop else None
+        self._compiled = compiled(self._trained.loss, self.device) if params.compile else None
 
     @property
     def policy(self) -> Policy:
         """The policy in training."""
-        return self.front.policy_of(self.learner.module)
+        return self.source.policy_of(self.module)
 
     @property
     def averaged(self) -> nn.Module:
-        """The module with the averaged weights, which is judged and kept."""
-        return self.learner.average.module
+        """The module with the averaged weights, which is evaluated and kept."""
+        return self.average.module
 
     def fit(self) -> None:
         """Train to the last step, or until nothing gets better, and finish the run.
@@ -99,71 +129,120 @@ class Trainer:
         ticks. On Ctrl-C or SIGTERM, to whichever process, all end the step, the last checkpoint is
         written and `KeyboardInterrupt` raised.
         """
-        steps = range(self.step, self.params.max_steps)
+        steps, shown = range(self.step, self.params.max_steps), self.world.first
         windows, resumed = Windows.of(self.params), self.run.status == "resumed"
         with (
             deferred_interrupt() as interrupted,
             open_log(self.params, resumed, self._earlier, self.world) as log,
-            self.front.feed(self.plan.draws(steps), windows, self.device) as feed,
-            Progress(self.step, self.params.max_steps, self.world.first) as progress,
+            self.source.feed(self.plan.parts_of(steps), windows, self.device) as feed,
+            Progress(feed, self.device, steps, self._trained_s, shown) as progress,
         ):
             self.world.shared(self.run.begin)
-            batches, speed = iter(feed), Speed(feed, self.device, self.step, self._trained_s)
+            batches = iter(feed)
             while not self._over:
                 stopped = self._train_step(batches, interrupted)
                 progress.advance(self._loss)
-                self._after_step(log, speed, progress, stopped)
+                if self.step % self.params.eval_every == 0 or self._over:
+                    self._evaluate(log, progress)
+                if self.step % LOG_EVERY == 0 or self._over:
+                    self._write_down(log, progress)
+                if self.step % self.params.checkpoint_every == 0 or self._over or stopped:
+                    self._save_last(log, progress)
                 if stopped and not self._over:
                     raise KeyboardInterrupt
         self.world.shared(self.run.finish)
-        self.world.say(*closing(self.step, self.standing, speed.trained_s, self.device))
+        if self.stopping.exhausted:
+            stalled = self.stopping.stalled
+            self.world.say(
+                f"stopped early at step {self.step}: {stalled} evaluations without a better one"
+            )
+        self.world.say(
+            f"trained {self.step} steps in {duration(progress.trained_s)} "
+            f"({self.step / max(progress.trained_s, 1e-9):.1f} steps/s), "
+            f"peak memory {size(peak_memory_bytes(self.device))}"
+        )
 
     def summary(self) -> list[str]:
         """What is trained, from what and on what, as lines for the user."""
         several = f" on {self.world.size} processes" if self.world.size > 1 else ""
-        precision = "bfloat16 autocast" if self.learner.bfloat16 else "float32"
+        precision = "bfloat16 autocast" if self._bfloat16 else "float32"
+        lines, warnings = describe_data(self.store, self.shape, self.params, self.split)
+        lines += describe_cost(self.policy)
+        if self.module is not self.policy:
+            table = ", ".join(f"{part} {n:,}" for part, n in self._trained.parameter_table())
+            lines.append(f"parameters with what is before it: {table}")
+        learning = sum(value.numel() for value in self.learning.values())
+        whole = sum(value.numel() for value in self.module.parameters())
+        if learning < whole:
+            lines.append(f"learns {learning:,} of {whole:,} parameters")
         return [
-            *describe_data(self.store, self.shape, self.params, self.split),
-            *describe_learner(self.learner, self.policy),
+            *lines,
             *self._feed_note,
             f"device {self.device}{several}, {precision}"
             f"{', compiled' if self.params.compile else ''}; "
             f"steps {self.step} to {self.params.max_steps}",
-            *data_warnings(self.store, self.shape, self.params, self.split),
+            *warnings,
         ]
 
     @property
     def _over(self) -> bool:
-        return self.step == self.params.max_steps or self.standing.exhausted
+        return self.step == self.params.max_steps or self.stopping.exhausted
 
     def _train_step(
         self, batches: Iterator[tuple[BatchIndices, Batch]], interrupted: Callable[[], bool]
     ) -> bool:
         """One step of all processes; whether one of them was told to stop."""
-        parts = islice(batches, len(self.plan.own))
-        scalars, stopped = self.learner.step(self.step, parts, interrupted)
+        scalars, stopped = self.learn(islice(batches, len(self.plan.own)), interrupted)
         self.history.add(scalars)
         self.step += 1
         return stopped
 
-    def _after_step(
-        self, log: TrainingLog | None, speed: Speed, progress: Progress, stopped: bool
-    ) -> None:
-        if self.step % self.params.eval_every == 0 or self._over:
-            self._evaluate(log, speed)
-        if self.step % LOG_EVERY == 0 or self._over:
-            self._write_down(log, speed, progress)
-        if self.step % self.params.checkpoint_every == 0 or self._over or stopped:
-            self._save_last(log, speed)
+    def learn(
+        self, parts: Iterable[tuple[BatchIndices, Batch]], interrupted: Callable[[], bool]
+    ) -> tuple[dict[str, Tensor], bool]:
+        """Learn from this process's parts of the batch of the next step.
 
-    def _write_down(self, log: TrainingLog | None, speed: Speed, progress: Progress) -> None:
+        Returns the loss, the norm of the gradient and the loss's parts, detached and over all
+        processes, and whether any process was interrupted.
+        """
+        share = schedule(self.step, self.params)
+        for group in self.optimizer.param_groups:
+            group["lr"] = group["peak_lr"] * share
+        self.optimizer.zero_grad(set_to_none=True)
+        scalars: dict[str, Tensor] = {}
+        for part, batch in parts:
+            for name, value in self._backward(part, batch).items():
+                scalars[name] = scalars[name] + value if name in scalars else value
+        learning = self.learning.values()
+        stopped = self.world.sum_gradients(learning, scalars, interrupted())
+        norm = torch.nn.utils.clip_grad_norm_(learning, self.params.grad_clip)
+        self.optimizer.step()
+        self.average.update(self.step + 1)
+        return {"loss": scalars.pop("loss"), "grad_norm": norm, **scalars}, stopped
+
+    def _backward(self, part: BatchIndices, batch: Batch) -> dict[str, Tensor]:
+        """Add a part's gradients; its loss and the parts of it, each by its share of the whole."""
+        assert isinstance(part, StepPart), "a feed hands back the entries of its plan"
+        # Dropout and sampled noise of a part depend on nothing that came before it.
+        torch.manual_seed(part.seed)
+        action, valid = batch.action, batch.action_valid
+        if self._terminal is not None:
+            action, valid = self._terminal.extend(action, valid)
+        loss_of = self._compiled or self._trained.loss
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self._bfloat16):
+            loss, parts = loss_of(batch, action, valid)
+        loss = loss * part.share
+        loss.backward()
+        return {"loss": loss.detach()} | {name: part.share * v for name, v in parts.items()}
+
+    def _write_down(self, log: TrainingLog | None, progress: Progress) -> None:
         self._check_finite()
         means = self.history.mean((self.step - 1) // LOG_EVERY * LOG_EVERY, self.step)
         rate = self.params.lr * schedule(self.step - 1, self.params)
 
         def write() -> None:
             assert log is not None
-            pace = speed.read(self.step)
+            pace = progress.read()
             log.write(self.step, {f"train/{k}": v for k, v in means.items()} | {"lr": rate})
             log.write_speed(self.step, pace)
             memory, waited = f"{pace.peak_memory / 2**30:.1f}G", f"{pace.data_wait_share:.0%}"
@@ -172,31 +251,44 @@ class Trainer:
 
         self.world.shared(write)
 
-    def _evaluate(self, log: TrainingLog | None, speed: Speed) -> None:
-        """Judge the averaged weights; save them where they are the best so far."""
+    def _evaluate(self, log: TrainingLog | None, progress: Progress) -> None:
+        """Evaluate the averaged weights; save them where they are the best so far."""
         self._check_finite()
-        with speed.paused():
-            metrics = self.world.shared(lambda: self._judge(log))
-            if not metrics or self.standing.take(metrics["val/error"]):
-                self.world.shared(
-                    lambda: self._checkpoints.save_best(self.averaged, self.step, metrics)
-                )
+        with progress.paused():
+            metrics = self.world.shared(lambda: self._measure(log))
+            if not metrics or self.stopping.take(metrics["val/error"]):
+                self.world.shared(lambda: self._save(self.run.best, metrics))
 
-    def _judge(self, log: TrainingLog | None) -> dict[str, float]:
-        """The held-out metrics, written down and said; none where nothing is held out."""
+    def _measure(self, log: TrainingLog | None) -> dict[str, float]:
+        """The held-out metrics, written down and said; none where nothing is held out.
+
+        `val/error` in training standard deviations, `val/<group>` in the group's unit.
+        """
         assert log is not None
-        ticks = judged_ticks(self.split.held_out, self.front)
+        ticks = evaluation_ticks(self.split.held_out, self.source.eval_ticks)
         if not len(ticks):
             return {}
-        metrics = held_out_error(
-            self.averaged, self.front, self.store, ticks, self.params, self.normalization
+        module, windows = self.averaged, Windows.of(self.params)
+        assert isinstance(module, Trainable)
+        comparison, _ = evaluate_policy(
+            module,
+            self.store,
+            ticks,
+            windows,
+            self.params.batch_size,
+            self.normalization,
+            samples=self.params.eval_samples,
+            feed=lambda plan: self.source.feed(plan, windows, self.device),
         )
+        error = comparison.overall("policy")
+        metrics = {"val/error": error} | {
+            f"val/{group.key}": comparison.group_mae("policy", group) for group in comparison.groups
+        }
         log.write(self.step, metrics)
-        error = metrics["val/error"]
         tqdm.write(
             f"step {self.step}: train loss {self.history.last('loss'):.4f}, held-out error "
             f"{error:.4f} of the training std"
-            + (" (best so far)" if self.standing.improves(error) else "")
+            + (" (best so far)" if self.stopping.improves(error) else "")
         )
         return metrics
 
@@ -217,32 +309,132 @@ class Trainer:
                 f"{self.run.section}.lr or train_head.grad_clip.{kept}"
             )
 
-    def _save_last(self, log: TrainingLog | None, speed: Speed) -> None:
+    def _save_last(self, log: TrainingLog | None, progress: Progress) -> None:
+        """Save the newest weights, with everything that going on from them takes."""
         self._check_finite()
 
         def save() -> None:
             assert log is not None
-            metrics = {"train/loss": self.history.last("loss")}
-            state = self._state(tuple(log.rows), speed.trained_s)
-            self._checkpoints.save_last(self.averaged, metrics, state)
+            state = TrainerState(
+                step=self.step,
+                weights=dict(self.learning),
+                average=self.average.weights,
+                optimizer=optimizer_tensors(self.optimizer, self.module),
+                history=self.history.tensor(),
+                columns=self.history.columns,
+                best_error=self.stopping.best_error,
+                stalled=self.stopping.stalled,
+                trained_s=progress.trained_s,
+                rows=tuple(log.rows),
+            )
+            self._save(self.run.last, {"train/loss": self.history.last("loss")}, state)
 
-        with speed.paused():
+        with progress.paused():
             self.world.shared(save)
 
-    def _state(self, rows: tuple[Row, ...], trained_s: float) -> TrainerState:
-        return TrainerState(
+    def _save(
+        self, folder: Path, metrics: Mapping[str, float], state: TrainerState | None = None
+    ) -> None:
+        """Put the averaged weights into a checkpoint folder. Raises `DiskFull`."""
+        ranges = held_out_ranges(self.store, self.split.held_out)
+        checkpoint = PolicyCheckpoint(
+            params=self.params,
+            shape=self.shape,
+            normalization=self.normalization,
+            source=source_of(self.store),
+            held_out_ticks=ranges,
+            held_out_content=held_out_contents(self.store, ranges),
             step=self.step,
-            **self.learner.tensors(),
-            history=self.history.tensor(),
-            columns=self.history.columns,
-            best_error=self.standing.best_error,
-            stalled=self.standing.stalled,
-            trained_s=trained_s,
-            rows=rows,
+            weights=self.source.policy_of(self.averaged).state_dict(),
+            metrics=metrics,
         )
 
+        def write_beside(temporary: Path) -> None:
+            self.source.save(temporary, self.averaged)
+            for path in temporary.rglob("*"):
+                sync(path)
+            if state is not None:
+                write_trainer(temporary, state)
+
+        save_policy(folder, checkpoint, beside=write_beside)
+
     def _restore(self, state: TrainerState) -> None:
-        self.learner.restore(state, self.run.last)
-        self.history = History.of(state.columns, state.history)
-        self.standing.best_error, self.standing.stalled = state.best_error, state.stalled
+        load_weights(self.learning, state.weights, self.run.last)
+        load_weights(self.average.weights, state.average, self.run.last)
+        restore_optimizer(self.optimizer, self.module, state.optimizer)
+        self.history = History(state.columns, state.history)
+        self.stopping.best_error, self.stopping.stalled = state.best_error, state.stalled
         self.step, self._earlier, self._trained_s = state.step, state.rows, state.trained_s
+
+
+class TerminalStop:
+    """The action chunk beyond an episode's end, as something to learn instead of to leave out.
+
+    A robot that is to stand still moves by zero: so deltas and velocities become 0, save a
+    gripper's, which is a position in every format and keeps its last value. Absolute actions
+    repeat the last one.
+    """
+
+    def __init__(self, store: FeatureStore, device: torch.device) -> None:
+        action = store.streams["action"]
+        absolute = action["kind"] == "absolute"
+        kept = [absolute or g == "gripper" for g in action_groups(action["names"], action["units"])]
+        self._kept = torch.tensor(kept, device=device)
+
+    def extend(
+        self, action: Float[Tensor, "batch horizon action"], valid: Bool[Tensor, "batch horizon"]
+    ) -> tuple[Float[Tensor, "batch horizon action"], Bool[Tensor, "batch horizon"]]:
+        """The chunk and what of it counts: everything.
+
+        The store repeats the last action beyond the end, so what is kept is there already.
+        """
+        counted = valid.unsqueeze(-1) | self._kept
+        return action.masked_fill(~counted, 0.0), torch.ones_like(valid)
+
+
+@dataclass
+class EarlyStopping:
+    """The best held-out error so far and how many evaluations have come since."""
+
+    patience: int | None
+    """Evaluations without a better one after which a run ends; None never ends it."""
+    best_error: float | None = None
+    stalled: int = 0
+
+    @classmethod
+    def of(cls, params: TrainHeadParams, split: Split) -> "EarlyStopping":
+        """That of a run which begins.
+
+        Raises `ConfigError` where it is to stop early and nothing tells when.
+        """
+        if params.early_stopping is not None and not len(split.held_out):
+            raise ConfigError(
+                f"train_head.early_stopping is {params.early_stopping}, but nothing is held out "
+                f"that could stop getting better: train_head.val_fraction is "
+                f"{params.val_fraction:g}. Set it above 0, or train_head.early_stopping=null."
+            )
+        return cls(params.early_stopping)
+
+    def improves(self, error: float) -> bool:
+        """Whether an error is below all before it."""
+        return self.best_error is None or error < self.best_error
+
+    def take(self, error: float) -> bool:
+        """Take in the error of an evaluation; whether it is the best so far."""
+        better = self.improves(error)
+        if better:
+            self.best_error = error
+        self.stalled = 0 if better else self.stalled + 1
+        return better
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether the run ends here."""
+        return self.patience is not None and self.stalled >= self.patience
+
+
+def evaluation_ticks(held_out: Ticks, limit: int | None) -> Ticks:
+    """The held-out ticks that evaluations of a run look at: as many as they may, evenly spaced."""
+    limit = EVALUATION_TICKS if limit is None else limit
+    spread = np.linspace(0, len(held_out) - 1, min(len(held_out), limit)).round()
+    return held_out[spread.astype(np.int64)]

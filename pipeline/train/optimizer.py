@@ -1,14 +1,22 @@
-"""AdamW over what learns, its learning rates, and its state as named tensors."""
+"""AdamW over what learns, its learning rates, the moving average of weights, torch.compile."""
 
+import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.train.ema import trainable
+from pipeline.base.errors import ConfigError
 from pipeline.train.feature_source import FeatureSource
+
+
+def trainable(module: nn.Module) -> dict[str, nn.Parameter]:
+    """The parameters that learn, by name."""
+    return {name: value for name, value in module.named_parameters() if value.requires_grad}
 
 
 def make_optimizer(
@@ -37,18 +45,18 @@ def make_optimizer(
 
 
 def peak_rates(
-    module: nn.Module, front: FeatureSource, params: TrainHeadParams
+    module: nn.Module, source: FeatureSource, params: TrainHeadParams
 ) -> dict[str, float]:
     """The peak learning rate of each parameter that does not have `params.lr`, by name.
 
-    The front's word comes first, then `sensor_lr` for the sensor encoder.
+    The source's word comes first, then `sensor_lr` for the sensor encoder.
     """
-    encoders = front.policy_of(module).encoders
+    encoders = source.policy_of(module).encoders
     sensor = encoders["sensor"].parameters() if "sensor" in encoders else ()
     felt = {id(parameter) for parameter in sensor}
     peaks = {}
     for name, parameter in trainable(module).items():
-        rate = front.parameter_lr(name)
+        rate = source.parameter_lr(name)
         if rate is None and id(parameter) in felt:
             rate = params.sensor_lr
         if rate is not None:
@@ -94,12 +102,6 @@ def schedule(step: int, params: TrainHeadParams) -> float:
     return params.min_lr_fraction + (1 - params.min_lr_fraction) * left
 
 
-def set_learning_rates(optimizer: torch.optim.Optimizer, share: float) -> None:
-    """Give every group of the optimizer this share of its peak."""
-    for group in optimizer.param_groups:
-        group["lr"] = group["peak_lr"] * share
-
-
 def optimizer_tensors(optimizer: torch.optim.Optimizer, module: nn.Module) -> dict[str, Tensor]:
     """The optimizer's state as `<name of the parameter>/<entry>`."""
     names: dict[Tensor, str] = {value: name for name, value in module.named_parameters()}
@@ -122,3 +124,60 @@ def restore_optimizer(
         fused = optimizer.defaults.get("fused")
         device = parameter.device if entry != "step" or fused else torch.device("cpu")
         optimizer.state[parameter][entry] = value.to(device, copy=True)
+
+
+class WeightAverage:
+    """A second module whose weights trail those of a first; it is the one that is evaluated.
+
+    After update t (from 1): average += (1 - d) (weights - average), d = min(decay, t / (t + 9)):
+    the warm-up of Tarvainen and Valpola's mean teacher (2017) in the form of TensorFlow's
+    ExponentialMovingAverage, without which a short run would still average in its random start.
+    What does not learn is shared with the first, not copied: frozen parameters (those of a
+    vision-language model may be gigabytes) and buffers (normalisation, group weights).
+    """
+
+    def __init__(self, module: nn.Module, decay: float) -> None:
+        frozen = [value for value in module.parameters() if not value.requires_grad]
+        shared = {id(value): value for value in (*frozen, *module.buffers())}
+        self.module = copy.deepcopy(module, shared).requires_grad_(False).eval()
+        learning = trainable(module)
+        self.weights = {n: v for n, v in self.module.named_parameters() if n in learning}
+        """The averaged parameters by name: those that learn in the first."""
+        # At every step: a walk through a vision-language model's modules would take its time.
+        self._learning, self._averaged = tuple(learning.values()), tuple(self.weights.values())
+        self._decay = decay
+
+    @torch.no_grad()
+    def update(self, updates: int) -> None:
+        """Take in the first's weights after the `updates`-th optimizer step, counted from 1."""
+        decay = min(self._decay, updates / (updates + 9))
+        get_ema_multi_avg_fn(decay)(self._averaged, self._learning, 0)
+
+
+def compiled(loss: Callable[..., Any], device: torch.device) -> Callable[..., Any]:
+    """The same function, compiled at its first call, with the random numbers of eager torch.
+
+    It raises `ConfigError` where the code that torch writes for the device (C++ for a CPU, Triton
+    for a GPU) does not compile.
+    """
+    from torch._dynamo.exc import BackendCompilerFailed  # it costs a second, and nobody else
+
+    # Inductor would draw dropout and noise from a generator of its own.
+    inner = torch.compile(loss, options={"fallback_random": True})
+
+    def checked(*arguments: Any) -> Any:
+        try:
+            return inner(*arguments)
+        except BackendCompilerFailed as error:
+            told = (line.strip() for line in str(error).splitlines())
+            why = next((line for line in told if line and not line.startswith("backend=")), "")
+            needed = "a C++ compiler (g++ or clang++, or the one that CXX names)"
+            if device.type == "cuda":
+                needed = "Triton, a C compiler"
+            raise ConfigError(
+                f"train_head.compile: torch {torch.__version__} fails to compile this policy for "
+                f"{device}: {why}. It takes {needed} and Python's headers: install them, or set "
+                "train_head.compile=false: the numbers are the same within float noise."
+            ) from None
+
+    return checked

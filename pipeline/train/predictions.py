@@ -1,6 +1,7 @@
 """What a policy does at recorded ticks, and what simple rules would have done there."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,15 +11,18 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from pipeline.base.errors import NumericsError
+from pipeline.base.finite import first_non_finite
 from pipeline.base.observation import Observation
 from pipeline.policy.policy import Trainable
-from pipeline.store import FeatureStore, place
-from pipeline.train.batches import BatchIndices, Feed, Prefetch, Ticks, Windows, draws
+from pipeline.store import Batch, FeatureStore, place
+from pipeline.train.batches import BatchIndices, Prefetch, Ticks, Windows, cut_batches
 
 Actions = NDArray[np.float32]
 METHODS = ("policy", "zero_action", "mean_action", "repeat_last")
 BASELINES = METHODS[1:]
-FeedMaker = Callable[[Sequence[BatchIndices]], Feed]
+FeedMaker = Callable[
+    [Sequence[BatchIndices]], AbstractContextManager[Iterable[tuple[BatchIndices, Batch]]]
+]
 """Makes the feed of a plan: what a policy is to see at these ticks."""
 _SEED = 0
 _CHUNKS_AT_ONCE = 1024
@@ -63,7 +67,7 @@ def predict(
     device = next(policy.parameters()).device
     # On the CPU, so that every device is given the same noise.
     generator = torch.Generator().manual_seed(_SEED)
-    plan = draws(ticks, batch_size)
+    plan = cut_batches(ticks, batch_size)
     predicted, recorded, valid = [], [], []
     with (
         torch.inference_mode(),
@@ -72,15 +76,15 @@ def predict(
             total=len(ticks), desc="predicting", unit="tick", disable=None if progress else True
         ) as bar,
     ):
-        for draw, batch in batches:
-            action = _mean_chunk(policy, batch, len(draw.ticks), samples, generator)
+        for indices, batch in batches:
+            at = indices.ticks
+            action = _mean_chunk(policy, batch, len(at), samples, generator)
             predicted.append(action.float().cpu().numpy())
             recorded.append(batch.action.cpu().numpy().copy())
             valid.append(batch.action_valid.cpu().numpy().astype(bool))
-            everywhere = np.ones_like(valid[-1])
-            _refuse_not_finite(store, draw.ticks, recorded[-1], valid[-1], "recorded action")
-            _refuse_not_finite(store, draw.ticks, predicted[-1], everywhere, "action of the policy")
-            bar.update(len(draw.ticks))
+            _check_finite(store, at, recorded[-1], "recorded action", valid[-1])
+            _check_finite(store, at, predicted[-1], "action of the policy")
+            bar.update(len(at))
     return Predictions(
         ticks=ticks,
         episodes=store.episode_of(ticks),
@@ -132,17 +136,21 @@ def _mean_chunk(
     return total / samples
 
 
-def _refuse_not_finite(
-    store: FeatureStore, ticks: Ticks, actions: Actions, counted: NDArray[np.bool_], what: str
+def _check_finite(
+    store: FeatureStore,
+    ticks: Ticks,
+    actions: Actions,
+    what: str,
+    valid: NDArray[np.bool_] | None = None,
 ) -> None:
-    bad = np.argwhere(~np.isfinite(actions) & counted[..., None])
-    if len(bad):
-        row, ahead, dimension = (int(index) for index in bad[0])
+    bad = first_non_finite(actions, valid)
+    if bad is not None:
+        row, ahead, dimension = bad
         # What was recorded lies at a tick of its own; what is predicted, at the tick it is of.
-        tick = int(ticks[row]) + (ahead if what.startswith("recorded") else 0)
+        tick = int(ticks[row]) + (0 if valid is None else ahead)
         name = store.streams["action"]["names"][dimension]
         raise NumericsError(
             f"{place(store, 'tick', tick)} of {store.path}: expected finite numbers, found "
-            f"{actions[row, ahead, dimension]} as the {what} ({name}). Look at what was recorded "
+            f"{actions[bad]} as the {what} ({name}). Look at what was recorded "
             "there, mend or leave out the recording and run stages.extract again."
         )

@@ -1,35 +1,73 @@
-"""How far a training is while it runs: a bar on a terminal, a line a minute anywhere else."""
+"""What a run says while it goes: what it trains and from what, how far it is, how fast it goes."""
 
+import resource
 import sys
-from collections.abc import Callable
-from time import monotonic
-from typing import NoReturn, Self
+import time
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from typing import NamedTuple, NoReturn, Self
 
+import numpy as np
+import torch
 from tqdm import tqdm
 
+from pipeline.base.config import TrainHeadParams
 from pipeline.base.format import duration
+from pipeline.policy.observation import PolicyShape
+from pipeline.store import FeatureStore
+from pipeline.train.batches import Feed
+from pipeline.train.sampling import ticks_by_source
+from pipeline.train.split import Split
 
 EVERY_S = 60.0
-"""Between two lines."""
+"""Between two lines where there is no terminal."""
+
+
+class Pace(NamedTuple):
+    """How fast a run goes."""
+
+    steps_per_s: float
+    """Since the reading before."""
+    data_wait_share: float
+    """Of that time, spent waiting for batches."""
+    peak_memory: int
+    """See `peak_memory_bytes`."""
+    trained_s: float
+    """Seconds of training so far, over all starts of the run."""
 
 
 class Progress:
-    """Counts steps on stderr, `shown` on one process of several."""
+    """Counts steps on stderr, `shown` on one process of several: a bar, or a line a minute.
 
-    def __init__(self, step: int, total: int, shown: bool) -> None:
+    And measures how fast they go: steps and their data, not evaluations and checkpoints.
+    """
+
+    def __init__(
+        self,
+        feed: Feed,
+        device: torch.device,
+        steps: range,
+        trained_s: float = 0.0,
+        shown: bool = True,
+    ) -> None:
+        step, self._total = steps.start, steps.stop
         # None: shown where stderr is a terminal.
-        hidden = None if shown else True
-        self._bar: tqdm[NoReturn] = tqdm(initial=step, total=total, unit="step", disable=hidden)
+        self._bar: tqdm[NoReturn] = tqdm(
+            initial=step, total=self._total, unit="step", disable=None if shown else True
+        )
         self._writes_lines = shown and self._bar.disable
-        self._step, self._total = step, total
-        self._last_line = step, monotonic()
+        self._feed, self._device, self._step = feed, device, step
+        self._last_line = step, time.perf_counter()
+        self._last_reading = step, trained_s, feed.waited_s
+        self._before = trained_s
+        self._since: float | None = time.perf_counter()
 
     def advance(self, loss: Callable[[], float]) -> None:
         """Count a step; `loss` gives its loss, and is only asked where a line is due."""
         self._step += 1
         self._bar.update()
         step, since = self._last_line
-        elapsed = monotonic() - since
+        elapsed = time.perf_counter() - since
         if not self._writes_lines or elapsed < EVERY_S:
             return
         steps_per_s = (self._step - step) / elapsed
@@ -40,14 +78,93 @@ class Progress:
             file=sys.stderr,
             flush=True,
         )
-        self._last_line = self._step, monotonic()
+        self._last_line = self._step, time.perf_counter()
 
     def note(self, **values: str) -> None:
         """Show these behind the bar."""
         self._bar.set_postfix(values)
+
+    @property
+    def trained_s(self) -> float:
+        """Seconds of training so far, over all starts of the run."""
+        running = 0.0 if self._since is None else time.perf_counter() - self._since
+        return self._before + running
+
+    @contextmanager
+    def paused(self) -> Generator[None]:
+        """Within it the watch stands still."""
+        self._before, self._since = self.trained_s, None
+        yield
+        self._since = time.perf_counter()
+
+    def read(self) -> Pace:
+        """The figures at this step."""
+        step, trained, waited = self._last_reading
+        self._last_reading = self._step, self.trained_s, self._feed.waited_s
+        now = self._last_reading
+        elapsed = max(now[1] - trained, 1e-9)
+        share = (now[2] - waited) / elapsed
+        return Pace((now[0] - step) / elapsed, share, peak_memory_bytes(self._device), now[1])
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *raised: object) -> None:
         self._bar.close()
+
+
+def peak_memory_bytes(device: torch.device) -> int:
+    """The most that this process has held: allocated on its GPU, else resident in memory.
+
+    What is resident includes the pages of the store that are mapped and in memory.
+    """
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device)
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+
+
+def describe_data(
+    store: FeatureStore, shape: PolicyShape, params: TrainHeadParams, split: Split
+) -> tuple[list[str], list[str]]:
+    """Lines on the store, its streams and the split; and warnings.
+
+    Those are of what the store has and the training episodes have not: a source, a stream.
+    """
+    slots, dim = store.feature_shape
+    lines = [
+        f"store {store.path}: {len(store.episodes)} episodes, {store.ticks} ticks, "
+        f"{slots} x {dim} features a VL row",
+        f"split: {len(split.train)} training ticks, {len(split.held_out)} held out "
+        f"of {len(split.held_out_episodes)} episode(s)",
+    ]
+    if split.note:
+        lines.append(f"split: {split.note}")
+    trained = ticks_by_source(store, split.train)
+    lost = [
+        f"source {source!r}: all of its episodes are held out. The policy is evaluated on them "
+        "and learns nothing from them"
+        for source, ticks in ticks_by_source(store, np.arange(store.ticks)).items()
+        if len(ticks) and not len(trained[source]) and params.mixture.get(source, 1) > 0
+    ]
+    for stream, stored, known, switch in (
+        ("sensor", store.sensor_channels, shape.sensor_channels, "sensor_enabled"),
+        ("state", store.state_dim, shape.state_dim, "robot_state_enabled"),
+        ("features", slots * dim, slots * dim, "features_enabled"),
+    ):
+        if not stored:
+            lines.append(f"{stream}: absent from the store, its encoder is disabled")
+        elif not getattr(params, switch):
+            lines.append(f"{stream}: disabled by train_head.{switch}")
+        elif not known:
+            lost.append(
+                f"{stream}: in the store, but absent from the training episodes. The policy learns "
+                "without it"
+            )
+    warnings = [
+        f"warning: {what}. Episodes are held out by the hash of their names, "
+        f"train_head.val_fraction {params.val_fraction:g} of them: set a smaller one (0 holds none "
+        "out), or extract more episodes with it"
+        for what in lost
+    ]
+    return lines, warnings

@@ -1,15 +1,18 @@
-"""Where a training run lies on disk, and whether it begins, goes on or is done.
+"""Where a training run lies on disk, what decides its numbers, and whether it goes on or is done.
 
 A run works in `<output>.part` (`run.json`, `best/`, `last/`) and renames it to `<output>` when it
 is finished. DVC deletes an output before it runs a stage, but not the `.part` beside it, so that a
-stopped run goes on under `dvc repro` too.
+stopped run goes on under `dvc repro` too. Without torch, which takes over a second to import.
 """
 
+import hashlib
+import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Literal
 
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.differences import Differences, describe, differences
@@ -31,29 +34,44 @@ from pipeline.base.ownership import (
     there,
     unmark,
 )
-from pipeline.policy.checkpoint import (
-    CHECKPOINT,
-    DOCUMENT,
-    SOURCE_KEYS,
-    check_policy,
-    source_differences,
-)
+from pipeline.policy.checkpoint import CHECKPOINT, DOCUMENT, SOURCE_KEYS, check_policy
+from pipeline.policy.normalization import Normalization
 from pipeline.store import FeatureStore, build_lock
-from pipeline.train.identity import NOTHING, run_identity
+from pipeline.train.split import source_of
+
+if TYPE_CHECKING:
+    from pipeline.policy.observation import PolicyShape
 
 RUN, BEST, LAST = "run.json", "best", "last"
 TRAINER_WEIGHTS, TRAINER_DOCUMENT = "trainer.safetensors", "trainer.json"
-Status = Literal["new", "resumed", "finished"]
+TRAINER_VERSION = 3
+"""Raised with every change of code that changes the numbers of a run: part of its identity, so
+that no run goes on under code other than it began with."""
+FREE_PARAMS = {
+    "device",
+    "feed",
+    "check_store",
+    "output",
+    "logs",
+    "loggers",
+    "wandb_project",
+    "checkpoint_every",
+    "store",
+    "grad_accumulation",
+}
+"""Params that may change between a stop and the next start: they decide no number of the run, or
+not alone: `parts`, accumulation times processes, stands for the last."""
+NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
-class Run:
+class TrainingRun:
     """A place on disk with room for one training run."""
 
     output: Path
-    status: Status
+    status: Literal["new", "resumed", "finished"]
     notes: tuple[str, ...]
-    """What was found and will be done, for the user."""
+    """What is there and will be done, for the user."""
     identity: Mapping[str, Any]
     section: str = "train_head"
     """Of the params: the one that names this run's output, steps and rate."""
@@ -101,7 +119,7 @@ def open_run(
     store: FeatureStore,
     extra_identity: Mapping[str, Any] = NOTHING,
     section: str = "train_head",
-) -> Run:
+) -> TrainingRun:
     """The run of these params on this store: new, resumed or finished.
 
     `extra_identity` is what else decides its numbers (`FeatureSource.identity`); `section` of the
@@ -115,16 +133,22 @@ def open_run(
     output, identity = params.output, run_identity(params, store, extra_identity)
     part = _part(output)
     notes = []
-    _refuse_to_replace(output, section)
+    if there(output) and not RUN_FOLDER.owns(output):
+        raise ConfigError(
+            f"{section}.output: {output} exists and is no training run (it has no {RUN} of one), "
+            "and a finished run would replace it. Choose another output or move it away."
+        )
     recover(output, RUN_FOLDER)
     if (output / RUN).exists():
         if read_document(output / RUN) != identity:
             notes.append(f"{output} holds another run; it is replaced when this one is finished")
-        elif (why := _damage(output)) is None:
-            _drop_trainer_state(output)
-            return Run(output, "finished", _finished_notes(params), identity, section)
         else:
-            notes.append(f"{output} is this very run, but damaged; it is trained again: {why}")
+            try:
+                finished = _finished_notes(params)
+                _drop_trainer_state(output)
+                return TrainingRun(output, "finished", finished, identity, section)
+            except (CheckpointIncomplete, CheckpointMismatch) as why:
+                notes.append(f"{output} is this very run, but damaged; it is trained again: {why}")
     if _has_checkpoint(part) and not (part / RUN).exists():
         raise ConfigError(
             f"{part} has checkpoints but no {RUN}, so it cannot be told what run they are of. "
@@ -140,12 +164,12 @@ def open_run(
         if differing:
             notes.append(
                 f"{part} is an unfinished run of something else; it is put aside as "
-                f"{_aside(part)} (that run -> now):\n{_indented(differing)}"
+                f"{_aside(part)} (that run -> now):\n{_lines(differing)}"
             )
         elif (part / LAST).exists():
             notes.append(f"resuming the run in {part}")
-            return Run(output, "resumed", tuple(notes), identity, section)
-    return Run(output, "new", tuple(notes), identity, section)
+            return TrainingRun(output, "resumed", tuple(notes), identity, section)
+    return TrainingRun(output, "new", tuple(notes), identity, section)
 
 
 def _is_run(folder: Path) -> bool:
@@ -162,44 +186,26 @@ def _is_run(folder: Path) -> bool:
 RUN_FOLDER = OutputKind("a training run", _is_run)
 
 
-def _refuse_to_replace(output: Path, section: str) -> None:
-    if there(output) and not RUN_FOLDER.owns(output):
-        raise ConfigError(
-            f"{section}.output: {output} exists and is no training run (it has no {RUN} of one), "
-            "and a finished run would replace it. Choose another output or move it away."
-        )
-
-
-def finished_run(params: TrainHeadParams, path: Path) -> Run | None:
+def finished_run(params: TrainHeadParams, path: Path) -> TrainingRun | None:
     """The run of these params on the store at `path` where it is finished, else None.
 
-    What `open_run` gives, without torch, which takes over a second to import; None where several
-    processes train together.
+    What `open_run` gives, without torch; None where several processes train together.
     """
-    together = int(os.environ.get("WORLD_SIZE", "1")) > 1
-    if together or not (params.output / RUN).exists():
+    if int(os.environ.get("WORLD_SIZE", "1")) > 1 or not (params.output / RUN).exists():
         return None
     with build_lock(params.output):
         run = open_run(params, FeatureStore.open(path))
     return run if run.status == "finished" else None
 
 
-def _damage(output: Path) -> str | None:
-    """What is wrong with a finished run's checkpoints; None where both are whole."""
-    try:
-        for name in (BEST, LAST):
-            check_policy(output / name)
-    except (CheckpointIncomplete, CheckpointMismatch) as error:
-        return str(error)
-    return None
-
-
 def _finished_notes(params: TrainHeadParams) -> tuple[str, ...]:
-    said = f"{params.output} is this very run, finished"
+    """Of a finished run, what to say of it; raises where one of its checkpoints is damaged."""
+    check_policy(params.output / BEST)
     logs = check_policy(params.output / LAST).logs
+    note = f"{params.output} is this very run, finished"
     if logs == params.logs:
-        return (said,)
-    return said, f"its curves are left where they were written, in {logs}, not in {params.logs}"
+        return (note,)
+    return note, f"its curves are left where they were written, in {logs}, not in {params.logs}"
 
 
 def _compare(part: Path, identity: Mapping[str, Any], section: str) -> Differences:
@@ -208,18 +214,18 @@ def _compare(part: Path, identity: Mapping[str, Any], section: str) -> Differenc
     source = prior.get("source")
     if not isinstance(source, dict) or {*SOURCE_KEYS} - {*source} or "decides" not in prior:
         raise CheckpointIncomplete(damaged(part / RUN, "not what it must hold"))
-    differing = source_differences(source, identity["source"])
+    differing = differences(source, identity["source"])
     if differing:
         raise CheckpointMismatch(
             f"{part}: this unfinished run cannot go on, its store was another one "
-            f"(the run -> the store now):\n{_indented(differing)}\n"
+            f"(the run -> the store now):\n{_lines(differing)}\n"
             f"Remove {part} to begin anew, choose another {section}.output, or name the store "
             "it began with in train_head.store."
         )
     return differences(prior["decides"], identity["decides"])
 
 
-def _indented(differing: Differences) -> str:
+def _lines(differing: Differences) -> str:
     return "\n".join(f"  {line}" for line in describe(differing))
 
 
@@ -239,3 +245,98 @@ def _part(output: Path) -> Path:
 
 def _aside(part: Path) -> Path:
     return part.with_name(f"{part.name}-old")
+
+
+def run_identity(
+    params: TrainHeadParams, store: FeatureStore, extra_identity: Mapping[str, Any] = NOTHING
+) -> dict[str, Any]:
+    """Everything that decides the numbers of a run, as JSON."""
+    decides = {
+        "trainer_version": TRAINER_VERSION,
+        "train_head": params.model_dump(mode="json", exclude=FREE_PARAMS),
+        "parts": int(os.environ.get("WORLD_SIZE", "1")) * params.grad_accumulation,
+        "front": dict(extra_identity),
+        "recordings": recordings_of(store),
+    }
+    return json.loads(json.dumps({"source": source_of(store), "decides": decides}))
+
+
+def recordings_of(store: FeatureStore) -> dict[str, Any]:
+    """Which episodes and rows a store holds, as a run remembers it."""
+    episodes = [[e.source, e.id, e.digest, len(e.ticks)] for e in store.episodes]
+    digest = hashlib.blake2b(json.dumps(episodes).encode(), digest_size=16)
+    digest.update(store.array("vl/key").tobytes())
+    return {
+        "episodes": len(store.episodes),
+        "ticks": store.ticks,
+        "digest": digest.hexdigest(),
+    }
+
+
+def policy_shape(store: FeatureStore, normalization: Normalization) -> "PolicyShape":
+    """The widths that this store gives to a policy.
+
+    A stream without statistics is absent from what the policy is trained on, so it has width 0.
+    """
+    from pipeline.policy.observation import PolicyShape, action_groups
+
+    action = store.streams["action"]
+    return PolicyShape(
+        *store.feature_shape,
+        sensor_channels=store.sensor_channels if normalization.sensor else 0,
+        state_dim=store.state_dim if normalization.state else 0,
+        action_dim=store.action_dim,
+        action_groups=action_groups(action["names"], action["units"]),
+    )
+
+
+@dataclass(frozen=True)
+class TrainedPolicy:
+    """A training run, or a checkpoint that was copied out of one, as what depends on stores."""
+
+    folder: Path
+    source: Mapping[str, Any] | None = None
+    """What its store was; None where its document is damaged."""
+    recordings: Mapping[str, Any] | None = None
+    """Of a run: which episodes and rows its store held."""
+    held_out: Mapping[str, str] | None = None
+    """Of a checkpoint alone: `source/id` of the held-out episodes -> digest of their files."""
+    damage: str | None = None
+
+    def depends_on(self, store: FeatureStore) -> str | None:
+        """How it depends on a store, for people; None where it does not."""
+        if self.source is None or differences(self.source, source_of(store)):
+            return None
+        if self.recordings is not None:
+            return "trained on it" if self.recordings == recordings_of(store) else None
+        contents = {episode.content for episode in store.episodes}
+        if self.held_out is not None and contents.issuperset(self.held_out.values()):
+            return "can be evaluated on it, has its features and held-out episodes"
+        return None
+
+
+def find_trained(folders: Sequence[Path]) -> list[TrainedPolicy]:
+    """Every run, finished or not, and every single checkpoint at or below these folders."""
+    return [policy for folder in folders if folder.is_dir() for policy in _trained_below(folder)]
+
+
+def _trained_below(folder: Path) -> Iterator[TrainedPolicy]:
+    for name in (RUN, DOCUMENT):
+        if (folder / name).exists():
+            yield _read_trained(folder, folder / name)
+            return
+    for path in sorted(folder.iterdir()):
+        if path.is_dir() and not path.is_symlink():
+            yield from _trained_below(path)
+
+
+def _read_trained(folder: Path, path: Path) -> TrainedPolicy:
+    try:
+        document = read_document(path)
+        if path.name == RUN:
+            source, recordings = document["source"], dict(document["decides"]["recordings"])
+            return TrainedPolicy(folder, {key: source[key] for key in SOURCE_KEYS}, recordings)
+        source = {key: document[key] for key in SOURCE_KEYS}
+        return TrainedPolicy(folder, source, held_out=dict(document["held_out_content"]))
+    except (CheckpointIncomplete, KeyError, TypeError, ValueError) as error:
+        return TrainedPolicy(folder, damage=f"{path}: {error}")

@@ -8,13 +8,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.channels import hardly_moving
-from pipeline.train.predictions import BASELINES, Actions, Predictions
+from pipeline.policy.normalization import Normalization
+from pipeline.policy.observation import action_groups
+from pipeline.policy.policy import Trainable
+from pipeline.store import FeatureStore
+from pipeline.train.batches import Ticks, Windows
+from pipeline.train.predictions import (
+    BASELINES,
+    Actions,
+    FeedMaker,
+    Predictions,
+    baselines,
+    predict,
+)
 
 Errors = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Scores:
+class ActionErrors:
     """Mean absolute and root mean square error of one way to act, over valid chunk entries.
 
     NaN where no entry is valid. The last axis is the action dimension.
@@ -30,7 +42,7 @@ class Scores:
 
 
 @dataclass(frozen=True)
-class Group:
+class ActionGroup:
     """Action dimensions that are summed up together: mean of their errors, in their unit."""
 
     name: str
@@ -53,13 +65,13 @@ class Comparison:
 
     names: tuple[str, ...]
     units: tuple[str, ...]
-    groups: tuple[Group, ...]
+    groups: tuple[ActionGroup, ...]
     scale: Errors
     """(action_dim,): standard deviation over the training ticks, 0 where it does not vary."""
     episodes: tuple[int, ...]
     """Store indices of the episodes with ticks here."""
     ticks: int
-    scores: Mapping[str, Scores]
+    scores: Mapping[str, ActionErrors]
 
     def overall(self, method: str) -> float:
         """Mean absolute error in units of the training standard deviation.
@@ -84,7 +96,7 @@ class Comparison:
     def extremes(self) -> list[tuple[str, int]]:
         """The episodes of lowest and highest error: what to call each, and its store index.
 
-        Only one where only one was judged.
+        Only one where there is no other.
         """
         order = self.ranked()
         best, worst = order[0], order[-1]
@@ -97,22 +109,22 @@ class Comparison:
         dimensions = np.flatnonzero(self.scale > 0).tolist()
         return dimensions or list(range(len(self.names)))
 
-    def varying_groups(self) -> list[Group]:
+    def varying_groups(self) -> list[ActionGroup]:
         """The groups with something to predict."""
         varying = set(self.varying())
         return [group for group in self.groups if varying & set(group.dimensions)]
 
-    def still(self) -> dict[int, float]:
+    def low_variance(self) -> dict[int, float]:
         """The dimensions that vary, but hardly: in `overall`, noise that counts like a motion.
 
         Each with the usual training deviation of those alike.
         """
         return hardly_moving(self.scale, self.names, self.units)
 
-    def without_still(self) -> "Comparison":
-        """The same, in which what is `still` counts as not varying: it weighs nothing."""
+    def without_low_variance(self) -> "Comparison":
+        """The same, in which what is `low_variance` counts as not varying: it weighs nothing."""
         scale = self.scale.copy()
-        scale[list(self.still())] = 0
+        scale[list(self.low_variance())] = 0
         return replace(self, scale=scale)
 
     def in_training_std(self, errors: Errors) -> Errors:
@@ -120,15 +132,15 @@ class Comparison:
         dimensions = self.varying()
         return errors[..., dimensions] / np.where(self.scale > 0, self.scale, 1)[dimensions]
 
-    def group_mae(self, method: str, group: Group) -> float:
+    def group_mae(self, method: str, group: ActionGroup) -> float:
         """Mean absolute error of a group, in its unit."""
         return float(group.mean(self.scores[method].mae))
 
-    def group_rmse(self, method: str, group: Group) -> float:
+    def group_rmse(self, method: str, group: ActionGroup) -> float:
         """Root mean square error of a group, in its unit."""
         return float(np.sqrt(group.mean(self.scores[method].rmse ** 2)))
 
-    def relative(self, group: Group | None = None) -> float | None:
+    def relative(self, group: ActionGroup | None = None) -> float | None:
         """The policy's mean absolute error divided by that of the best baseline; below 1 it wins.
 
         None for a group that never varies in training, where the mean action is right by itself.
@@ -143,12 +155,44 @@ class Comparison:
         return errors["policy"] / best if best > 0 else None
 
 
+def evaluate_policy(
+    policy: Trainable,
+    store: FeatureStore,
+    ticks: Ticks,
+    windows: Windows,
+    batch_size: int,
+    normalization: Normalization,
+    progress: bool = False,
+    samples: int = 1,
+    feed: FeedMaker | None = None,
+) -> tuple[Comparison, Predictions]:
+    """The policy beside the baselines on these ticks, and its predictions there.
+
+    `samples`, `feed` and what is raised are those of `predict`.
+    """
+    predictions = predict(policy, store, ticks, windows, batch_size, progress, samples, feed)
+    action, statistics = store.streams["action"], normalization.action
+    members: dict[tuple[str, str], list[int]] = {}
+    for index, group in enumerate(action_groups(action["names"], action["units"])):
+        members.setdefault((group, action["units"][index]), []).append(index)
+    comparison = compare(
+        predictions,
+        baselines(store, predictions, statistics.mean),
+        action["names"],
+        action["units"],
+        [ActionGroup(*key, tuple(dimensions)) for key, dimensions in members.items()],
+        # A channel that does not vary has a scale of 1 that is not its spread.
+        np.where(statistics.scale == statistics.std, statistics.std, 0.0),
+    )
+    return comparison, predictions
+
+
 def compare(
     predictions: Predictions,
     baselines: Mapping[str, Actions],
     names: Sequence[str],
     units: Sequence[str],
-    groups: Sequence[Group],
+    groups: Sequence[ActionGroup],
     scale: NDArray[np.floating],
 ) -> Comparison:
     """The scores of the policy and of each baseline on these predictions."""
@@ -165,7 +209,7 @@ def compare(
     )
 
 
-def _score(acted: Actions, predictions: Predictions, episode: NDArray[np.intp]) -> Scores:
+def _score(acted: Actions, predictions: Predictions, episode: NDArray[np.intp]) -> ActionErrors:
     valid = predictions.valid.astype(np.float64)
     error = (acted.astype(np.float64) - predictions.recorded) * valid[..., None]
     absolute, squared = np.abs(error), error**2
@@ -175,7 +219,7 @@ def _score(acted: Actions, predictions: Predictions, episode: NDArray[np.intp]) 
     by_episode = np.zeros((episodes, error.shape[2]))
     np.add.at(by_episode, episode, absolute.sum(axis=1))
     count_episode = np.bincount(episode, valid.sum(axis=1), episodes)[:, None]
-    return Scores(
+    return ActionErrors(
         mae=_ratio(absolute.sum(axis=(0, 1)), count),
         rmse=np.sqrt(_ratio(squared.sum(axis=(0, 1)), count)),
         mae_horizon=_ratio(absolute.sum(axis=0), count_horizon),

@@ -1,14 +1,17 @@
-"""Which ticks are trained on and which are held out."""
+"""Which ticks are trained on and which are held out; a checkpoint's held-out ticks found again."""
 
 import hashlib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.base.errors import ConfigError, StoreMismatch
-from pipeline.store import Episode, FeatureStore
+from pipeline.base.differences import describe, differences
+from pipeline.base.errors import CheckpointMismatch, ConfigError, StoreMismatch
+from pipeline.policy.checkpoint import SOURCE_KEYS, PolicyCheckpoint
+from pipeline.store import Episode, FeatureStore, episode_name
 
 _TAIL = 0.2
 """What a single recording holds out of its ticks."""
@@ -67,7 +70,11 @@ def split_by_episode(
     elif len(chosen) == len(ranks):
         chosen.remove(max(ranks, key=lambda name: ranks[name]))
         notes.append(f"{part} is all; one is trained on")
-    for source, names in sorted(_recordings_by_source(recordings).items()):
+    by_source: dict[str, set[str]] = {}
+    for name, episodes in recordings.items():
+        for episode in episodes:
+            by_source.setdefault(episode.source, set()).add(name)
+    for source, names in sorted(by_source.items()):
         if len(names) > 1 and names <= chosen:
             chosen.remove(max(names, key=lambda name: ranks[name]))
             notes.append(f"{part} is all of source {source!r}; one of it is trained on")
@@ -94,18 +101,10 @@ def episodes_by_recording(
             key = (
                 keys[row].tobytes()
                 if np.isfinite(frame_time[row]).any()
-                else _names([episode])[0].encode()
+                else episode_name(episode).encode()
             )
             by_key.setdefault(key, []).append(episode)
     return {min(_names(episodes)): episodes for episodes in by_key.values()}
-
-
-def _recordings_by_source(recordings: Mapping[str, Sequence[Episode]]) -> dict[str, set[str]]:
-    names: dict[str, set[str]] = {}
-    for name, episodes in recordings.items():
-        for episode in episodes:
-            names.setdefault(episode.source, set()).add(name)
-    return names
 
 
 def _split_tail(store: FeatureStore, episodes: list[Episode], horizon: int) -> Split:
@@ -162,8 +161,118 @@ def _ticks(episodes: Sequence[Episode]) -> NDArray[np.int64]:
 
 
 def _names(episodes: Sequence[Episode]) -> tuple[str, ...]:
-    return tuple(sorted(f"{episode.source}/{episode.id}" for episode in episodes))
+    return tuple(sorted(episode_name(episode) for episode in episodes))
 
 
 def hash64(text: str) -> int:
+    """A 64-bit hash, the same in every process."""
     return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "big")
+
+
+def source_of(store: FeatureStore) -> dict[str, Any]:
+    """What a checkpoint remembers of its store, and what another store must agree with."""
+    return {key: getattr(store, "spec" if key == "feature_spec" else key) for key in SOURCE_KEYS}
+
+
+def check_store(checkpoint: PolicyCheckpoint, store: FeatureStore) -> None:
+    """Raise `CheckpointMismatch`, naming what differs, when the policy does not fit this store."""
+    differing = differences(checkpoint.source, source_of(store))
+    if differing:
+        lines = "\n".join(f"  {line}" for line in describe(differing))
+        raise CheckpointMismatch(
+            f"the checkpoint does not fit {store.path} (the checkpoint -> the store):\n{lines}\n"
+            "Name the store it was trained from in evaluate.store, extract with the params it was "
+            "trained with, or train again: python -m stages.train_head"
+        )
+
+
+def held_out_ranges(store: FeatureStore, ticks: NDArray[np.int64]) -> dict[str, tuple[int, int]]:
+    """The held-out ticks of each episode as `source/id` -> [first, stop), counted in the episode.
+
+    So a checkpoint says what it has not seen in a way that outlives episodes added before these.
+    """
+    ticks = np.sort(ticks)
+    edges = np.searchsorted(ticks, store.array("episode/tick_start"))
+    ranges = {}
+    for index in np.flatnonzero(np.diff(edges)):
+        episode, inside = store.episodes[index], ticks[edges[index] : edges[index + 1]]
+        first, stop = int(inside[0]), int(inside[-1]) + 1
+        assert len(inside) == stop - first, "held-out ticks of an episode lie side by side"
+        start = episode.ticks.start
+        ranges[episode_name(episode)] = (first - start, stop - start)
+    return ranges
+
+
+def held_out_contents(store: FeatureStore, names: Collection[str]) -> dict[str, str]:
+    """The digest of the files of each of these episodes, by name."""
+    known = {episode_name(episode): episode.content for episode in store.episodes}
+    return {name: known[name] for name in names}
+
+
+def held_out_ticks(
+    store: FeatureStore, ranges: Mapping[str, tuple[int, int]], contents: Mapping[str, str]
+) -> NDArray[np.int64]:
+    """The store's ticks of `held_out_ranges`, ascending.
+
+    Raises `CheckpointMismatch` where there are none, or where the store lacks an episode, has a
+    shorter one of that name, or one made from other files than `contents` says.
+    """
+    if not ranges:
+        raise CheckpointMismatch(
+            "the checkpoint lists no held-out episode, so nothing is left to evaluate it on: it "
+            "was trained with train_head.val_fraction 0. Train with a fraction above 0."
+        )
+    episodes = {episode_name(episode): episode for episode in store.episodes}
+    wrong: list[str] = []
+    for name, (_, stop) in ranges.items():
+        if name not in episodes:
+            wrong.append(f"{name} is missing")
+        elif len(episodes[name].ticks) < stop:
+            wrong.append(f"{name} is shorter")
+        elif episodes[name].content != contents.get(name):
+            wrong.append(f"{name} is another recording, or the same one read otherwise since")
+    if wrong:
+        raise CheckpointMismatch(
+            f"{store.path}: of the {len(ranges)} episodes that the checkpoint holds out, "
+            f"{len(wrong)} are not there as they were: {'; '.join(wrong[:5])}"
+            f"{' …' if len(wrong) > 5 else ''}. Name the store it was trained from in "
+            "evaluate.store, or train again."
+        )
+    parts = [
+        np.arange(first, stop, dtype=np.int64) + episodes[name].ticks.start
+        for name, (first, stop) in ranges.items()
+    ]
+    return np.sort(np.concatenate(parts))
+
+
+def named_as_in(
+    store: FeatureStore, checkpoint: PolicyCheckpoint
+) -> tuple[PolicyCheckpoint, str | None]:
+    """The checkpoint with its held-out episodes under this store's names, and what to say of it.
+
+    An episode whose source or folder was renamed since is told by the digest of its files.
+    """
+    contents = checkpoint.held_out_content
+    ours = {episode_name(episode): episode.content for episode in store.episodes}
+    same = {name for name in contents if ours.get(name) == contents[name]}
+    free: dict[str, list[str]] = {}
+    for name in sorted(ours.keys() - same, reverse=True):
+        free.setdefault(ours[name], []).append(name)
+    now = {
+        name: free[content].pop() if name not in same and free.get(content) else name
+        for name, content in contents.items()
+    }
+    renamed = [f"{name} is {now[name]}" for name in contents if now[name] != name]
+    if not renamed or len(set(now.values())) < len(now):  # one of two under one name is not there
+        return checkpoint, None
+    return (
+        replace(
+            checkpoint,
+            held_out_ticks={
+                now.get(name, name): ticks for name, ticks in checkpoint.held_out_ticks.items()
+            },
+            held_out_content={now[name]: content for name, content in contents.items()},
+        ),
+        f"{len(renamed)} held-out episode(s) were renamed since the training and are told by their "
+        f"content: {', '.join(renamed[:3])}{' …' if len(renamed) > 3 else ''}",
+    )

@@ -1,14 +1,16 @@
 """The normalisation, fitted on what training may see and nothing else."""
 
 from functools import partial
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from pipeline.base.bfloat16 import widen
 from pipeline.base.errors import NumericsError
+from pipeline.base.finite import first_non_finite
 from pipeline.policy.normalization import Block, ChannelStatistics, Normalization, fit_channels
 from pipeline.store import FeatureStore, place
 from pipeline.train.batches import Ticks
@@ -20,12 +22,9 @@ Rows = range | NDArray[np.int64]
 """Rows of one of the store's arrays."""
 
 
-class _Chunk(NamedTuple):
-    rows: Rows
-    """Where in the store the values lie; of features, each row has one value a variant."""
-    values: NDArray[np.floating]
-    valid: NDArray[np.bool_] | None
-    """(row, slot) of features: False for what is neither checked nor counted."""
+_ARRAYS = {"tick": "tick/action", "vl": "vl/features"} | {
+    stream: f"{stream}/values" for stream in ("sensor", "state")
+}
 
 
 def fit_normalization(
@@ -42,8 +41,8 @@ def fit_normalization(
     """
     threads = torch.get_num_threads() if threads is None else threads
     parts: dict[str, list[Rows]] = {
-        "tick": _split(_array(store, "tick"), ticks),
-        "vl": _split(_array(store, "vl"), np.unique(store.array("tick/vl_row")[ticks])),
+        "tick": _cut(store, "tick", ticks),
+        "vl": _cut(store, "vl", np.unique(store.array("tick/vl_row")[ticks])),
         "sensor": _readings(store, ticks, "sensor"),
         "state": _readings(store, ticks, "state"),
     }
@@ -65,71 +64,65 @@ def _fit(
     )
 
     def read(rows: Rows) -> Block:
-        chunk = _chunk(store, stream, rows)
+        values, valid = _read(store, stream, rows)
         bar.update(len(rows))
-        return chunk.values if chunk.valid is None else (chunk.values, chunk.valid)
+        return values if valid is None else (values, valid)
 
-    array = _array(store, stream)
-    size = sum(map(len, parts)) * array.dtype.itemsize * int(np.prod(array.shape[1:]))
+    size = sum(map(len, parts)) * _row_bytes(store, stream)
     threads = threads if size >= THREAD_BYTES * len(parts) else 1
-    names = None if stream == "vl" else store.streams[_streams_entry(stream)]["names"]
     try:
-        return fit_channels([partial(read, rows) for rows in parts], what, names, threads)
+        return fit_channels([partial(read, rows) for rows in parts], what, threads=threads)
     except NumericsError:
         # It knows the row of what it was given, which says nothing to who made the recordings.
         for rows in parts:
-            _refuse_not_finite(store, stream, _chunk(store, stream, rows), what)
+            _check_finite(store, stream, rows, what)
         raise
 
 
-def _refuse_not_finite(store: FeatureStore, stream: str, chunk: _Chunk, what: str) -> None:
-    counted = True if chunk.valid is None else chunk.valid[..., None]
-    bad = np.argwhere(~np.isfinite(chunk.values) & counted)
-    if len(bad):
-        row, *channel = (int(index) for index in bad[0])
-        stored, variant = divmod(row, len(chunk.values) // len(chunk.rows))
-        name = ", ".join(map(str, channel))
-        if stream != "vl":
-            name = repr(store.streams[_streams_entry(stream)]["names"][channel[0]])
-        augmented = f" of variant {variant}" if variant else ""
-        raise NumericsError(
-            f"{what}: expected finite numbers, found {chunk.values[(row, *channel)]} at "
-            f"{place(store, stream, int(chunk.rows[stored]))}, channel {name}{augmented}, in "
-            f"{store.path}. Mend or leave out the recording and run stages.extract again."
-        ) from None
-
-
-def _streams_entry(stream: str) -> str:
-    return "action" if stream == "tick" else stream
-
-
-def _split(array: NDArray[Any], rows: NDArray[np.int64]) -> list[Rows]:
-    row_bytes = max(1, array.dtype.itemsize * int(np.prod(array.shape[1:])))
-    step = max(1, CHUNK_BYTES // row_bytes)
-    return [rows[start : start + step] for start in range(0, len(rows), step)]
+def _check_finite(store: FeatureStore, stream: str, rows: Rows, what: str) -> None:
+    values, valid = _read(store, stream, rows)
+    bad = first_non_finite(values, valid)
+    if bad is None:
+        return
+    stored, variant = divmod(bad[0], len(values) // len(rows))
+    channel = ", ".join(map(str, bad[1:])) + (f" of variant {variant}" if variant else "")
+    if stream != "vl":
+        names = store.streams["action" if stream == "tick" else stream]["names"]
+        channel = repr(names[bad[1]])
+    raise NumericsError(
+        f"{what}: expected finite numbers, found {values[bad]} at "
+        f"{place(store, stream, int(rows[stored]))}, channel {channel}, in {store.path}. Mend or "
+        "leave out the recording and run stages.extract again."
+    ) from None
 
 
 def _readings(store: FeatureStore, ticks: Ticks, stream: str) -> list[Rows]:
     """The readings from each episode's start to the last of its ticks, where it has any."""
     starts = store.array(f"episode/{stream}_start")
-    episode = store.episode_of(ticks)
     ends = np.array(starts, np.int64)
-    np.maximum.at(ends, episode, store.array(f"tick/{stream}_end")[ticks].astype(np.int64))
+    read = store.array(f"tick/{stream}_end")[ticks].astype(np.int64)
+    np.maximum.at(ends, store.episode_of(ticks), read)
     return [range(starts[index], ends[index]) for index in np.flatnonzero(ends > starts)]
 
 
-def _chunk(store: FeatureStore, stream: str, rows: Rows) -> _Chunk:
-    array = _array(store, stream)
-    values = array[rows.start : rows.stop] if isinstance(rows, range) else array[rows]
-    if values.dtype == np.uint16:
-        values = torch.from_numpy(values).view(torch.bfloat16).float().numpy()
-    valid = None
-    if stream == "vl":
-        slots = (-1, store.feature_shape[0])
-        values = values.reshape(*slots, values.shape[-1])
-        valid = store.array("vl/slot_valid")[rows].reshape(slots).astype(bool)
-    return _Chunk(rows, values, valid)
+def _cut(store: FeatureStore, stream: str, rows: NDArray[np.int64]) -> list[Rows]:
+    step = max(1, CHUNK_BYTES // max(1, _row_bytes(store, stream)))
+    return [rows[start : start + step] for start in range(0, len(rows), step)]
 
 
-def _array(store: FeatureStore, stream: str) -> NDArray[Any]:
-    return store.array({"tick": "tick/action", "vl": "vl/features"}.get(stream, f"{stream}/values"))
+def _row_bytes(store: FeatureStore, stream: str) -> int:
+    array = store.array(_ARRAYS[stream])
+    return array.dtype.itemsize * int(np.prod(array.shape[1:]))
+
+
+def _read(
+    store: FeatureStore, stream: str, rows: Rows
+) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
+    """The values, of features (row of one variant, slot, dim) with which slots are valid."""
+    array = store.array(_ARRAYS[stream])
+    values = widen(array[rows.start : rows.stop] if isinstance(rows, range) else array[rows])
+    if stream != "vl":
+        return values, None
+    slots = (-1, store.feature_shape[0])
+    valid = store.array("vl/slot_valid")[rows].reshape(slots).astype(bool)
+    return values.reshape(*slots, values.shape[-1]), valid

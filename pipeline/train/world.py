@@ -1,28 +1,37 @@
-"""The processes of one training: alone, or several that torchrun started."""
+"""The processes of one training, alone or several that torchrun started, and how they stop."""
 
 import os
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+import signal
+import threading
+from collections.abc import Callable, Generator, Iterable, Mapping
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import timedelta
+from types import FrameType
 from typing import Any, Self, TypeVar
 
 import torch
 import torch.distributed as dist
-from torch import Tensor
+from torch import Tensor, nn
 
 from pipeline.base.device import resolve_device
-from pipeline.base.errors import ConfigError
-from pipeline.train.speaker import SaidByFirst, one_speaker
+from pipeline.base.errors import ConfigError, PipelineError
 
 Outcome = TypeVar("Outcome")
 
 PATIENCE = timedelta(hours=12)
-"""How long a process waits for another: rank 0 fits the normalisation and judges while the others
+"""How long a process waits for another: rank 0 fits the normalisation and evaluates while others
 wait. A process that died is not waited for: torchrun ends the rest."""
 BUCKET_BYTES = 32 * 2**20
 """Gradients are summed over the processes this many bytes at a time: few calls, little copied."""
+PRECEDENCE = timedelta(seconds=5)
+"""How long a process that fails waits for rank 0, which mostly fails of the same, to say so."""
+_SPEAKER = "speaker"
 FROM_TORCHRUN = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT")
+
+
+class SaidByFirst(PipelineError):
+    """Rank 0 has failed and says why; the other processes only end."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +53,7 @@ class World:
 
     @property
     def first(self) -> bool:
-        """Whether this is the process that logs, judges and saves."""
+        """Whether this is the process that logs, evaluates and saves."""
         return self.rank == 0
 
     def shared(self, work: Callable[[], Outcome]) -> Outcome:
@@ -54,19 +63,19 @@ class World:
         """
         if self.size == 1:
             return work()
-        said: list[Any] = [None, None]
+        sent: list[Any] = [None, None]
         failure: BaseException | None = None
         if self.first:
             try:
-                said[0] = work()
+                sent[0] = work()
             except BaseException as error:
-                failure, said[1] = error, f"{type(error).__name__}: {error}"
-        dist.broadcast_object_list(said, src=0, device=torch.device("cpu"))
+                failure, sent[1] = error, f"{type(error).__name__}: {error}"
+        dist.broadcast_object_list(sent, src=0, device=torch.device("cpu"))
         if failure is not None:
             raise failure
-        if said[1] is not None:
-            raise SaidByFirst(said[1])
-        return said[0]
+        if sent[1] is not None:
+            raise SaidByFirst(sent[1])
+        return sent[0]
 
     @contextmanager
     def holding(self, lock: AbstractContextManager[None]) -> Generator[None]:
@@ -81,14 +90,6 @@ class World:
             for line in lines:
                 print(line, flush=True)
 
-    def any(self, flags: Sequence[bool]) -> list[bool]:
-        """Each flag: whether it is set on any process."""
-        if self.size == 1:
-            return list(flags)
-        found = torch.tensor(flags, dtype=torch.uint8)
-        dist.all_reduce(found, dist.ReduceOp.MAX)
-        return found.bool().tolist()
-
     def sum(self, tensors: Iterable[Tensor]) -> None:
         """Replace each tensor by its sum over all processes."""
         if self.size > 1:
@@ -99,17 +100,42 @@ class World:
                 for tensor, part in zip(bucket, parts, strict=True):
                     tensor.copy_(part.view_as(tensor))
 
+    def sum_gradients(
+        self, parameters: Iterable[nn.Parameter], sums: Mapping[str, Tensor], stop: bool
+    ) -> bool:
+        """Replace gradients and `sums` by their sums over the processes; whether any wants to stop.
+
+        Each process has weighted its parts by their share of the whole batch, so the sum is the
+        mean. A parameter that no process used keeps no gradient, so that the optimizer leaves it
+        alone as it does in a single process; one that only others used counts as zero here. All
+        processes end with the same bits.
+        """
+        if self.size == 1:
+            return stop
+        parameters = list(parameters)
+        flags = torch.tensor([stop, *(p.grad is not None for p in parameters)], dtype=torch.uint8)
+        dist.all_reduce(flags, dist.ReduceOp.MAX)
+        stop, *used = flags.bool().tolist()
+        gradients: list[Tensor] = []
+        for parameter, anywhere in zip(parameters, used, strict=True):
+            if anywhere and parameter.grad is None:
+                parameter.grad = torch.zeros_like(parameter)
+            if parameter.grad is not None:
+                gradients.append(parameter.grad)
+        self.sum([*sums.values(), *gradients])
+        return stop
+
     def tensors(self, named: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """The tensors in memory that rank 0 calls with, on every process, sent one by one."""
         if self.size == 1:
             return dict(named)
         shapes = self.shared(lambda: {name: (v.shape, v.dtype) for name, v in named.items()})
-        found = {
+        received = {
             name: named[name] if self.first else torch.empty(shape, dtype=dtype)
             for name, (shape, dtype) in shapes.items()
         }
-        self.spread(found.values())
-        return found
+        self.spread(received.values())
+        return received
 
     def spread(self, tensors: Iterable[Tensor]) -> None:
         """Give each tensor the value it has on rank 0."""
@@ -185,3 +211,77 @@ def _buckets(tensors: Iterable[Tensor]) -> Generator[list[Tensor]]:
         size += tensor.nbytes
     if bucket:
         yield bucket
+
+
+@contextmanager
+def one_speaker(store: dist.Store, rank: int) -> Generator[None]:
+    """Within it, what the user can mend is raised on one process; the others exit with code 2.
+
+    That one is rank 0 where it fails too, else the first that fails, and its message names its
+    rank. A stop is said by rank 0, unless it is torchrun's, which ends all when one has failed.
+    `store` is what the processes met at: it needs no other process to answer.
+    """
+    try:
+        yield
+    except SaidByFirst:
+        raise SystemExit(2) from None
+    except (PipelineError, OSError) as error:
+        if not _speaks(store, rank):
+            raise SystemExit(2) from None
+        if rank == 0:
+            raise
+        raise PipelineError(f"process of rank {rank}: {error}") from error
+    except KeyboardInterrupt:
+        if rank > 0 or _spoken(store):
+            raise SystemExit(1) from None
+        raise
+    except RuntimeError:
+        # As gloo and NCCL say that another process is gone.
+        if _spoken(store):
+            raise SystemExit(2) from None
+        raise
+
+
+def _speaks(store: dist.Store, rank: int) -> bool:
+    """Whether this process, of those that have failed, says so."""
+    try:
+        if rank > 0:
+            with suppress(dist.DistStoreError, KeyboardInterrupt):
+                store.wait([_SPEAKER], PRECEDENCE)
+        return store.compare_set(_SPEAKER, "", str(rank)) == str(rank).encode()
+    except RuntimeError:
+        # Rank 0 held the store and is gone: an error is rather said twice than never.
+        return True
+
+
+def _spoken(store: dist.Store) -> bool:
+    try:
+        return store.check([_SPEAKER])
+    except RuntimeError:
+        return False
+
+
+@contextmanager
+def deferred_interrupt() -> Generator[Callable[[], bool]]:
+    """Within it, a first SIGINT or SIGTERM only sets what the yielded function returns.
+
+    A step stopped half-way would leave weights of which some are updated and others not; so the
+    loop asks between steps. A second signal raises `KeyboardInterrupt` at once. Outside the main
+    thread, where Python delivers no signal, it changes nothing.
+    """
+    received: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
+
+    def note(signum: int, frame: FrameType | None) -> None:
+        if received:
+            raise KeyboardInterrupt
+        received.append(signum)
+
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: bool(received)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

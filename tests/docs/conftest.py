@@ -58,7 +58,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     document["demo"]["episodes"] = 2
     document["data"]["sources"] = [{"name": name, "path": name} for name in ("new", "old")]
     document["train_head"] |= {"max_steps": 4, "eval_every": 4, "warmup_steps": 1}
-    document["train_head"]["check_store"] = False
+    document["train_head"]["check_store"] = document["evaluate"]["check_store"] = False
     (folder / "params.yaml").write_text(yaml.safe_dump(document), encoding="utf-8")
     with pytest.MonkeyPatch.context() as patched:
         patched.chdir(folder)

@@ -8,12 +8,12 @@ import pytest
 
 from pipeline.store import FeatureStore
 from pipeline.train.predictions import Predictions, baselines
-from pipeline.train.scores import Comparison, Group, compare
+from pipeline.train.scores import ActionGroup, Comparison, compare
 
 GROUPS = (
-    Group("translation", "mm", (0, 1, 2)),
-    Group("rotation", "deg", (3,)),
-    Group("gripper", "", (4,)),
+    ActionGroup("translation", "mm", (0, 1, 2)),
+    ActionGroup("rotation", "deg", (3,)),
+    ActionGroup("gripper", "", (4,)),
 )
 
 

@@ -15,7 +15,7 @@ from pipeline.base.errors import NumericsError
 from pipeline.store import FeatureStore
 from pipeline.train.batches import Windows
 from pipeline.train.predictions import Predictions, baselines, predict
-from pipeline.train.scores import Comparison, Group, compare
+from pipeline.train.scores import ActionGroup, Comparison, compare
 
 Recorded = Callable[..., Predictions]
 Compared = Callable[[Predictions], Comparison]
@@ -55,7 +55,7 @@ def test_errors_worked_out_by_hand() -> None:
         recorded=recorded,
         valid=np.array([[True, True], [True, False]]),  # the second chunk leaves its episode
     )
-    groups = (Group("both", "mm", (0, 1)),)
+    groups = (ActionGroup("both", "mm", (0, 1)),)
     rules = {name: np.full((2, 1, 2), 30, np.float32) for name in ("zero_action", "mean_action")}
     rules["repeat_last"] = np.full((2, 1, 2), -13, np.float32)
     found = compare(predictions, rules, ["x", "y"], ["mm", "mm"], groups, np.array([2.0, 10.0]))
@@ -90,7 +90,7 @@ def test_what_lies_beyond_an_episode_changes_no_score(seed: int, ticks: int, hor
     valid = np.arange(horizon) < rng.integers(1, horizon + 1, (ticks, 1))
     clean = rng.normal(size=shape).astype(np.float32)
     dirty = np.where(valid[..., None], clean, np.float32(1e9))
-    groups = (Group("all", "", (0, 1, 2)),)
+    groups = (ActionGroup("all", "", (0, 1, 2)),)
     scores = []
     for predicted in (clean, dirty):
         predictions = Predictions(
@@ -129,10 +129,10 @@ def test_what_hardly_moves_beside_its_like_is_told_and_can_be_left_out(
     """By the yardstick of `stages.inspect`: a hundredth of the upper quartile of three or more."""
     error = np.array([0.1, 0.1, 0.1, 0.001, 0.001])
     found = joints(compared(recorded(np.arange(60), error)), [1.0, 1.0, 1.0, 0.0099, 0.0101])
-    assert found.still() == {3: 1.0}
-    assert joints(found, [1.0, 1.0, 0.001, 0.001, 0.001]).still().keys() == {2, 3, 4}
+    assert found.low_variance() == {3: 1.0}
+    assert joints(found, [1.0, 1.0, 0.001, 0.001, 0.001]).low_variance().keys() == {2, 3, 4}
     assert found.overall("policy") == pytest.approx((0.3 + 1 / 9.9 + 1 / 10.1) / 5, rel=1e-4)
-    moving = found.without_still()
+    moving = found.without_low_variance()
     assert moving.overall("policy") == pytest.approx((0.3 + 1 / 10.1) / 4, rel=1e-4)
     assert moving.varying() == [0, 1, 2, 4] and found.varying() == [0, 1, 2, 3, 4]
 
@@ -149,10 +149,10 @@ def test_what_has_no_like_is_not_still(
     recorded: Recorded, compared: Compared, changed: dict[str, Any]
 ) -> None:
     comparison = compared(recorded(np.arange(60)))
-    assert comparison.still() == {}
+    assert comparison.low_variance() == {}
     still = joints(comparison, [1.0, 1.0, 1.0, 0.001, 0.001])
-    assert still.still().keys() == {3, 4}
-    assert replace(still, **changed).still() == {}
+    assert still.low_variance().keys() == {3, 4}
+    assert replace(still, **changed).low_variance() == {}
 
 
 class FirstFeature(torch.nn.Module):

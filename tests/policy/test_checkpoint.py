@@ -20,7 +20,8 @@ from pipeline.policy.checkpoint import (
 )
 from pipeline.policy.policy import Policy
 from pipeline.store import FeatureStore
-from pipeline.train.identity import policy_shape, source_of
+from pipeline.train.run import policy_shape
+from pipeline.train.split import source_of
 from pipeline.train.statistics import fit_normalization
 
 PARAMS = TrainHeadParams.model_validate(

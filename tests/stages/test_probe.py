@@ -29,9 +29,9 @@ def params(tiny_store: Callable[..., Path], tmp_path: Path) -> Path:
         "data": {"sources": [{"name": "left", "path": "a"}]},
         "vlm": {"checkpoint": "unused"},
         "extract": {"store": str(path)},
-        # Its attributes were written over, as no store is that was extracted so.
-        "train_head": {"check_store": False},
         "probe": {
+            # Its attributes were written over, as no store is that was extracted so.
+            "check_store": False,
             "output": str(tmp_path / "report"),
             "horizon": 2,
             "sensor_window": 4,
@@ -49,7 +49,7 @@ def test_a_ranking_files_and_pictures(params: Path, capsys: pytest.CaptureFixtur
     report = params.parent / "report"
     assert sorted(file.name for file in report.iterdir()) == FILES
     # The action's first two channels are those of slot 0, which is the mean.
-    assert lines[8].startswith("layer 3, mean")
+    assert lines[7].startswith("layer 3, mean")
     assert lines[-3].endswith("vlm: {layers: [3], norms: [true], pooling: [mean]}")
     assert "run stages.extract" in lines[-2]
     assert sum("View1 cell" in line for line in lines) == 4
@@ -107,11 +107,9 @@ def test_a_damaged_store_is_refused(
 ) -> None:
     store = tiny_store(tmp_path, name="sound", episodes=6)
     arguments = ["--params", str(params), "--set", f"probe.store={store}"]
-    checked = [*arguments, "--set", "train_head.check_store=true"]
+    checked = [*arguments, "--set", "probe.check_store=true"]
     assert run("", probe.main, checked) == 0
-    said = capsys.readouterr().out
-    assert "scoring 3 slots one by one, groups of slots: 1; 174 ticks" in said
-    assert "5 folds, 6 penalties: a few seconds" in said
+    assert "3 slots of 8 channels at 180 ticks" in capsys.readouterr().out
     (params.parent / "report" / "metrics.json").unlink()
     chunk = store / "vl" / "features" / "c" / "0" / "0" / "0"
     damaged = bytearray(chunk.read_bytes())

@@ -36,7 +36,7 @@ import sys
 from stages.command import run
 
 assert run("", "stages.train_head", sys.argv[1:]) == 0
-heavy = "torch transformers dask distributed scipy matplotlib dvclive pandas"
+heavy = "torch transformers dask distributed scipy matplotlib sklearn pandas"
 print(sorted(set(heavy.split()) & sys.modules.keys()))
 """
 """A finished training, which says what it imported of what takes long."""
@@ -102,8 +102,8 @@ def test_a_logger_that_is_not_installed_is_named_before_the_store_is_opened(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr("pipeline.train.loggers._MODULES", {"wandb": "no_such_module"})
-    path = write_params(loggers=["report", "wandb"])
+    monkeypatch.setattr("pipeline.train.log._MODULES", {"wandb": "no_such_module"})
+    path = write_params(loggers=["wandb"])
     arguments = ["--params", str(path), "--set", "extract.store=/no/such.zarr"]
     assert run("", train_head.main, arguments) == 2
     assert "cannot load wandb (No module named 'no_such_module')" in capsys.readouterr().err

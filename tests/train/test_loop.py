@@ -20,12 +20,11 @@ from pipeline.base.errors import NumericsError
 from pipeline.policy.checkpoint import load_policy
 from pipeline.store import FeatureStore
 from pipeline.train.batches import Windows
-from pipeline.train.checkpoints import Checkpoints
-from pipeline.train.held_out import judge
-from pipeline.train.identity import TRAINER_VERSION
+from pipeline.train.checkpoints import read_trainer
 from pipeline.train.log import speed_file
 from pipeline.train.loop import Trainer
-from pipeline.train.state import read_trainer
+from pipeline.train.run import TRAINER_VERSION
+from pipeline.train.scores import evaluate_policy
 
 Make = Callable[..., Any]
 GOLDEN = Path(__file__).with_name("golden_run.json")
@@ -83,7 +82,7 @@ def test_killed_at_any_step_it_ends_the_same(
 
     with monkeypatch.context() as patched:
         if stopped == 20:
-            patched.setattr("pipeline.train.run.Run.finish", killed_at_the_end)
+            patched.setattr("pipeline.train.run.TrainingRun.finish", killed_at_the_end)
         else:
             patched.setattr(Trainer, "_train_step", killed)
         with pytest.raises(Stop):
@@ -95,7 +94,7 @@ def test_killed_at_any_step_it_ends_the_same(
     resumed.fit()
     assert losses(resumed) == losses(undisturbed)
     assert same_weights(resumed, undisturbed)
-    assert resumed.standing.best_error == undisturbed.standing.best_error
+    assert resumed.stopping.best_error == undisturbed.stopping.best_error
     logs, whole = resumed.params.logs, undisturbed.params.logs
     for file in whole.rglob("*.tsv"):
         assert (logs / file.relative_to(whole)).read_text() == file.read_text(), file
@@ -120,16 +119,16 @@ def test_a_signal_ends_the_step_and_saves_once(
         return real(self, *rest)
 
     saved: list[int] = []
-    save = Checkpoints.save_last
+    save = Trainer._save_last
 
-    def counted(self: Checkpoints, *rest: Any) -> None:
-        saved.append(rest[-1].step)
+    def counted(self: Trainer, *rest: Any) -> None:
+        saved.append(self.step)
         save(self, *rest)
 
     before = signal.getsignal(number)
     with monkeypatch.context() as patched:
         patched.setattr(Trainer, "_train_step", signalled)
-        patched.setattr(Checkpoints, "save_last", counted)
+        patched.setattr(Trainer, "_save_last", counted)
         with pytest.raises(KeyboardInterrupt):
             trainer(store, params(checkpoint_every=every)).fit()
     assert saved == ([5, 10, 13] if every == 5 else [13]), "also where a checkpoint was due"
@@ -148,7 +147,7 @@ def test_what_a_finished_run_leaves(undisturbed: Trainer, store: FeatureStore) -
     assert not undisturbed.run.part.exists()
     last, best = load_policy(output / "last"), load_policy(output / "best")
     assert last.step == 20
-    assert best.metrics["val/error"] == undisturbed.standing.best_error
+    assert best.metrics["val/error"] == undisturbed.stopping.best_error
     for name, value in undisturbed.averaged.state_dict().items():
         assert torch.equal(last.weights[name], value)
     with (logs / "plots/metrics/val/error.tsv").open() as file:
@@ -156,8 +155,8 @@ def test_what_a_finished_run_leaves(undisturbed: Trainer, store: FeatureStore) -
             int(row["step"]): float(row["error"]) for row in csv.DictReader(file, delimiter="\t")
         }
     assert set(curve) == {8, 16, 20}
-    assert min(curve.values()) == undisturbed.standing.best_error
-    assert curve[best.step] == undisturbed.standing.best_error
+    assert min(curve.values()) == undisturbed.stopping.best_error
+    assert curve[best.step] == undisturbed.stopping.best_error
     with (logs / "plots/metrics/train/loss.tsv").open() as file:
         rows = [float(row["loss"]) for row in csv.DictReader(file, delimiter="\t")]
     assert rows == pytest.approx(
@@ -340,7 +339,7 @@ def test_on_a_gpu_a_run_is_stopped_resumed_and_judged(
     resumed.fit()
     assert np.isfinite(losses(resumed)).all()
     best = load_policy(resumed.run.output / "best")
-    comparison, _ = judge(
+    comparison, _ = evaluate_policy(
         best.policy("cuda"),
         store,
         resumed.split.held_out,

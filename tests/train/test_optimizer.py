@@ -8,15 +8,15 @@ import torch
 from torch import nn
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.train.ema import WeightAverage, trainable
-from pipeline.train.history import History
+from pipeline.train.log import History
 from pipeline.train.optimizer import (
+    WeightAverage,
     decay_groups,
     make_optimizer,
     optimizer_tensors,
     restore_optimizer,
     schedule,
-    set_learning_rates,
+    trainable,
 )
 
 
@@ -93,26 +93,25 @@ def test_every_schedule_is_sane_at_the_extremes(kind: str, decay: float) -> None
         assert max(rates) == 1.0
 
 
-def test_every_group_follows_the_schedule_from_its_own_peak() -> None:
+def test_every_group_has_its_own_peak_and_decay() -> None:
     params = TrainHeadParams(lr=1e-3, weight_decay=0.1)
     toy = Toy()
     toy.embedding.requires_grad_(False)
     optimizer = make_optimizer(toy, params, {"linear.weight": 0.5, "linear.bias": 0.5})
-    set_learning_rates(optimizer, 0.5)
     found = {
-        name: (group["lr"], group["weight_decay"])
+        name: (group["peak_lr"], group["weight_decay"])
         for group in optimizer.param_groups
         for name, value in toy.named_parameters()
         if any(value is member for member in group["params"])
     }
     assert found == {
-        "linear.weight": (0.25, 0.1),
-        "linear.bias": (0.25, 0.0),
-        "conv.weight": (5e-4, 0.1),
-        "conv.bias": (5e-4, 0.0),
-        "norm.weight": (5e-4, 0.0),
-        "norm.bias": (5e-4, 0.0),
-        "query": (5e-4, 0.0),
+        "linear.weight": (0.5, 0.1),
+        "linear.bias": (0.5, 0.0),
+        "conv.weight": (1e-3, 0.1),
+        "conv.bias": (1e-3, 0.0),
+        "norm.weight": (1e-3, 0.0),
+        "norm.bias": (1e-3, 0.0),
+        "query": (1e-3, 0.0),
     }
 
 
@@ -204,5 +203,5 @@ def test_history_settles_late_and_names_the_first_bad_step() -> None:
     assert history.tensor().shape == (5, 2)
     assert history.mean(0, 3) == {"loss": 1.0, "grad_norm": 1.0}
     assert history.describe(3) == "loss nan, grad_norm 1"
-    again = History.of(history.columns, history.tensor()[:3])
+    again = History(history.columns, history.tensor()[:3])
     assert again.last("loss") == 2.0

@@ -11,7 +11,7 @@ import torch
 from pipeline.base.errors import ConfigError
 from pipeline.store import FeatureStore
 from pipeline.train.loop import Trainer
-from pipeline.train.plan import Part, Plan
+from pipeline.train.sampling import Plan, StepPart
 from pipeline.train.split import split_by_episode
 from pipeline.train.world import World
 
@@ -30,7 +30,7 @@ def plan(store: FeatureStore, params: Make) -> Make:
     return make
 
 
-def described(parts: list[Part]) -> list[tuple[Any, ...]]:
+def described(parts: list[StepPart]) -> list[tuple[Any, ...]]:
     return [(part.ticks.tolist(), part.share, part.seed) for part in parts]
 
 
@@ -67,7 +67,7 @@ def test_seeds_differ_by_step_and_part(plan: Make) -> None:
 def test_the_feed_takes_the_parts_in_their_order(plan: Make) -> None:
     cut = plan(grad_accumulation=2)
     expected = [part for step in (5, 6) for part in cut.step(step)]
-    assert described(list(cut.draws(range(5, 7)))) == described(expected)
+    assert described(list(cut.parts_of(range(5, 7)))) == described(expected)
 
 
 def test_with_a_terminal_stop_every_step_counts(plan: Make) -> None:

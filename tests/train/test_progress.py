@@ -1,16 +1,33 @@
-"""A training is never silent for long, on a terminal or without one."""
+"""A training is never silent for long, and says how fast it goes and what it lacks."""
 
+import csv
 import sys
+import time
 from collections.abc import Callable
+from dataclasses import replace
 from io import StringIO
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import torch
 
 from pipeline.store import FeatureStore
-from pipeline.train.progress import Progress
+from pipeline.train.log import speed_file
+from pipeline.train.progress import Progress, describe_data, peak_memory_bytes
+from pipeline.train.run import policy_shape
+from pipeline.train.split import Split, split_by_episode
+from pipeline.train.statistics import fit_normalization
 
 Make = Callable[..., Any]
+CPU = torch.device("cpu")
+
+
+class Waiting:
+    """Stands for a feed."""
+
+    waited_s = 0.0
 
 
 class Terminal(StringIO):
@@ -24,7 +41,7 @@ class Terminal(StringIO):
 def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """The time in s, which a test moves."""
     now = [1000.0]
-    monkeypatch.setattr("pipeline.train.progress.monotonic", lambda: now[0])
+    monkeypatch.setattr("pipeline.train.progress.time.perf_counter", lambda: now[0])
     return now
 
 
@@ -37,7 +54,7 @@ def test_without_a_terminal_a_line_a_minute(
         asked.append(1)
         return 0.25
 
-    with Progress(step=100, total=200, shown=True) as progress:
+    with Progress(Waiting(), CPU, range(100, 200)) as progress:
         for _ in range(30):  # steps of 5 s
             clock[0] += 5
             progress.advance(loss)
@@ -53,7 +70,7 @@ def test_without_a_terminal_a_line_a_minute(
 def test_of_several_processes_one_speaks(
     clock: list[float], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with Progress(step=0, total=2, shown=False) as progress:
+    with Progress(Waiting(), CPU, range(2), shown=False) as progress:
         clock[0] += 1e6
         progress.advance(lambda: 1.0)
     assert capsys.readouterr() == ("", "")
@@ -90,3 +107,96 @@ def test_on_a_terminal_a_bar_with_the_loss(
     assert "12/12" in shown
     assert "loss=" in shown.split("12/12")[0], "before the evaluation, too"
     assert "train loss" not in shown
+
+
+def test_pauses_are_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    feed = Waiting()
+    progress = Progress(feed, CPU, range(10, 100), trained_s=50.0, shown=False)
+    now[0] += 4
+    with progress.paused():
+        now[0] += 1000
+        assert progress.trained_s == 54
+    now[0] += 1
+    feed.waited_s = 2.0
+    for _ in range(10):
+        progress.advance(lambda: 0.0)
+    pace = progress.read()
+    assert (pace.steps_per_s, pace.data_wait_share, pace.trained_s) == (2.0, 0.4, 55.0)
+    now[0] += 10
+    progress.advance(lambda: 0.0)
+    assert progress.read()[:2] == (0.1, 0.0)
+
+
+def test_peak_memory_is_at_least_what_was_held() -> None:
+    held = torch.ones(64 * 2**20 // 4)
+    assert peak_memory_bytes(CPU) > held.nbytes
+
+
+def test_the_log_has_speed_memory_and_time_over_all_starts(
+    store: FeatureStore,
+    params: Make,
+    trainer: Make,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    begun = trainer(store, params(max_steps=30))
+    begun._trained_s = 1000.0
+    begun.fit()
+    with speed_file(Path(params().logs)).open() as file:
+        rows = list(csv.DictReader(file, delimiter="\t"))
+    assert [row["step"] for row in rows] == ["10", "20", "30"]
+    seconds = [float(row["trained_s"]) for row in rows]
+    assert 1000 < seconds[0] < seconds[1] < seconds[2] < 1060
+    assert all(float(row["peak_memory_mib"]) > 50 for row in rows)
+    assert all(float(row["steps_per_s"]) > 0 for row in rows)
+    said = capsys.readouterr().out.splitlines()[-1]
+    assert said.startswith("trained 30 steps in 16.7 min (0.0 steps/s)")
+    assert "steps/s), peak memory" in said
+    assert said.endswith((" MiB", " GiB"))
+
+
+@pytest.fixture
+def warnings(store: FeatureStore, params: Make) -> Callable[..., list[str]]:
+    """`warnings(train, key=value, ...)`: of a training on these ticks, the others held out."""
+
+    def found(train: np.ndarray, absent: dict[str, int] | None = None, **head: Any) -> list[str]:
+        held_out = np.setdiff1d(np.arange(store.ticks), train)
+        shape = policy_shape(store, fit_normalization(store, train))
+        split = Split(train, held_out, (), None)
+        return describe_data(store, replace(shape, **(absent or {})), params(**head), split)[1]
+
+    return found
+
+
+def test_nothing_is_said_where_every_source_and_stream_is_trained_on(
+    store: FeatureStore, warnings: Make
+) -> None:
+    assert warnings(split_by_episode(store, 0.3).train) == []
+
+
+def test_a_source_without_a_training_episode_is_named_with_the_way_out(warnings: Make) -> None:
+    """Episodes of 30 ticks: left, right, left, …"""
+    (line,) = warnings(np.arange(30), val_fraction=0.4)
+    assert line.startswith("warning: source 'right'")
+    assert "train_head.val_fraction 0.4" in line
+    assert warnings(np.arange(30), mixture={"right": 0.0}) == [], "the user wants it so"
+
+
+def test_a_stream_that_no_training_episode_has_is_named(
+    store: FeatureStore, warnings: Make
+) -> None:
+    train, absent = np.arange(store.ticks), {"sensor_channels": 0}
+    (line,) = warnings(train, absent)
+    assert line.startswith("warning: sensor")
+    assert "train_head.val_fraction" in line
+    assert warnings(train, absent, sensor_enabled=False) == []
+
+
+def test_a_training_says_it_last_before_it_begins(
+    tiny_store: Make, trainer: Make, params: Make, tmp_path: Path
+) -> None:
+    """Of two recordings one is held out, and with it its source."""
+    two = FeatureStore.open(tiny_store(tmp_path, episodes=2))
+    *_, last = trainer(two, params()).summary()
+    assert last.startswith("warning: source ")

@@ -13,9 +13,8 @@ from pipeline.base.durable import read_document
 from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch, ConfigError
 from pipeline.base.ownership import MARKER
 from pipeline.store import FeatureStore
-from pipeline.train.identity import TRAINER_VERSION
 from pipeline.train.loop import Trainer
-from pipeline.train.run import RUN_FOLDER, open_run
+from pipeline.train.run import RUN_FOLDER, TRAINER_VERSION, open_run
 
 Make = Callable[..., Any]
 
@@ -308,7 +307,7 @@ def test_a_run_without_a_checkpoint_refuses_no_other_store(
 def test_code_of_other_numbers_goes_on_with_no_run(
     store: FeatureStore, params: Make, unfinished: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.train.identity.TRAINER_VERSION", 99)
+    monkeypatch.setattr("pipeline.train.run.TRAINER_VERSION", 99)
     run = open_run(params(), store)
     assert run.status == "new"
     assert f"trainer_version: {TRAINER_VERSION} -> 99" in run.notes[0]

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from pipeline.base.errors import ConfigError, StoreMismatch
 from pipeline.store import FeatureStore
-from pipeline.train.mixture import TickSampler, ticks_by_source
+from pipeline.train.sampling import TickSampler, ticks_by_source
 from pipeline.train.split import hash64, split_by_episode
 
 
@@ -311,7 +311,7 @@ class TestTickSampler:
         self, sizes: list[int], draws: int
     ) -> None:
         sampler = TickSampler(sources(sizes), {"s0": 3.0}, 1, 0)
-        drawn, later = sampler.drawn(draws), sampler.drawn(draws + 1)
+        drawn, later = sampler.count_drawn(draws), sampler.count_drawn(draws + 1)
         assert sum(drawn.values()) == draws
         bound = 1.0 if len(sizes) <= 3 else 1.5
         for name, share in sampler.shares.items():

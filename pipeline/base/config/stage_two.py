@@ -17,7 +17,7 @@ from pipeline.base.config.section import Fraction, Section, Seed
 
 ModelType = Literal["regression", "diffusion", "flow_matching"]
 FusionStrategy = Literal["concat", "cross_attention", "gated", "none"]
-Logger = Literal["report", "dvclive", "tensorboard", "wandb"]
+LoggerName = Literal["tensorboard", "wandb"]
 Weight = Annotated[float, Field(ge=0)]
 
 
@@ -113,18 +113,17 @@ class TrainHeadParams(Section):
     """How batches are made: gathered from the mapped store, or on the device, which holds the
     streams that fit. `auto` picks and says why."""
     check_store: bool = True
-    """Read the store once before training, tuning and evaluation, and refuse a chunk that does not
-    give its checksum; false where that takes too long."""
+    """Read the store once before training or tuning, and refuse a chunk that does not give its
+    checksum; false where that takes too long."""
     store: Path | None = None
     """The store to train from; `extract.store` where null. Another one DVC does not watch."""
     output: Path = Path("models/head")
     """Folder of the best and the last checkpoint."""
     logs: Path = Path("reports/train_head")
     """Folder of the curves."""
-    loggers: tuple[Logger, ...] = ("report",)
-    """Who shows the curves while it trains, beside the files that DVC plots: `report` a page in
-    `logs`, `dvclive` dvclive's own page `<logs>.dvclive.html`, whose charts need a network,
-    `tensorboard` event files in `<logs>.tensorboard`, `wandb` Weights & Biases."""
+    loggers: tuple[LoggerName, ...] = ()
+    """Who shows the curves while it trains, beside the files that DVC plots: `tensorboard` event
+    files in `<logs>.tensorboard`, `wandb` Weights & Biases."""
     wandb_project: str = "vla-feature-cache"
     """Where Weights & Biases puts the run; its own environment variables decide the rest."""
 
@@ -162,7 +161,10 @@ class EvaluateParams(Section):
     device: str = "auto"
     """auto, cpu, cuda or cuda:N."""
     store: Path | None = None
-    """The store to judge on; `train_head.store`, else `extract.store`, where null."""
+    """The store to evaluate on; `train_head.store`, else `extract.store`, where null."""
+    check_store: bool = True
+    """Read the store once before the evaluation, and refuse a chunk that does not give its
+    checksum; false where that takes too long."""
 
 
 class CompareParams(Section):

@@ -1,10 +1,10 @@
 """Tuning the vision-language model end to end, below the policy that `train_head` describes.
 
-`recordings` finds the frames of a store's rows, `rows` decodes and prepares them, `feed` puts them
-beside the store's batches, `front` stands before the policy in the one training loop.
+`recordings` finds the frames of a store's rows, `rows` decodes them and puts them beside the
+store's batches, `feature_source` stands before the policy in the one training loop.
 """
 
-from pipeline.train.finetuning.feature_source import Live, next_steps, out_of_memory_named
+from pipeline.train.finetuning.feature_source import LiveFeatures, next_steps, out_of_memory_named
 from pipeline.train.finetuning.params import head_params
 
-__all__ = ["Live", "head_params", "next_steps", "out_of_memory_named"]
+__all__ = ["LiveFeatures", "head_params", "next_steps", "out_of_memory_named"]

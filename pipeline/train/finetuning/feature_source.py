@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from pipeline.base.config import FinetuneParams, Params, VLMParams
+from pipeline.base.config import FinetuneParams, Params
 from pipeline.base.digests import file_digest
 from pipeline.base.durable import read_document, write_with_digest
 from pipeline.base.errors import ConfigError
@@ -18,14 +18,13 @@ from pipeline.policy.live_policy import LivePolicy
 from pipeline.policy.policy import Policy, Trainable
 from pipeline.store import FeatureStore
 from pipeline.train.batches import BatchIndices, Windows
-from pipeline.train.finetuning.feed import LiveFeed
 from pipeline.train.finetuning.recordings import (
     check_recordings,
     check_spec,
     find_recordings,
     known_digests,
 )
-from pipeline.train.finetuning.rows import LiveRows
+from pipeline.train.finetuning.rows import LiveFeed, LiveRows
 from pipeline.train.world import World
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 from pipeline.vlm.live import LiveVLM
@@ -36,59 +35,47 @@ _FREE_TUNING = {"gradient_checkpointing"}
 """What of the tuning decides no number."""
 
 
-class Live:
+class LiveFeatures:
     """A `FeatureSource` whose features come from a model that learns, over a store's recordings."""
 
     identity: Mapping[str, Any]
     eval_ticks: int | None
 
-    def __init__(
-        self,
-        store: FeatureStore,
-        rows: LiveRows,
-        spec: FeatureSpec,
-        vlm: VLMParams,
-        finetune: FinetuneParams,
-        device: torch.device,
-    ) -> None:
-        self._store, self._rows, self._spec, self._vlm = store, rows, spec, vlm
-        self._finetune, self._device = finetune, device
-        self._base_digest = lru_cache(file_digest)
-        self.eval_ticks = finetune.eval_ticks
-        self.identity = {
-            "spec": spec.digest,
-            "tuning": finetune.tuning.model_dump(mode="json", exclude=_FREE_TUNING),
-            "lr": finetune.lr,
-            "eval_ticks": finetune.eval_ticks,
-        }
-
-    @classmethod
-    def open(cls, store: FeatureStore, params: Params, device: torch.device) -> "Live":
-        """The front of `params` over a store; the model is loaded when a policy is attached.
+    def __init__(self, store: FeatureStore, params: Params, device: torch.device) -> None:
+        """The model is loaded when a policy is attached.
 
         Raises `StoreMismatch` where `vlm` does not give the store's features, or a recording is
         missing or not what it was at extraction.
         """
+        recordings = find_recordings(store, params)
 
         def checked() -> FeatureSpec:
             with known_digests(store) as digests:
                 spec = check_spec(store, params, digests)
-                check_recordings(store, find_recordings(store, params), digests)
+                check_recordings(store, recordings, digests)
             return spec
 
         # Once for all processes: they would read the same files and say the same.
-        spec = World.current().shared(checked)
-        recordings = find_recordings(store, params)
-        rows = LiveRows(store, recordings, Preparer(params.vlm, spec))
-        return cls(store, rows, spec, params.vlm, params.finetune, device)
+        self._spec = World.current().shared(checked)
+        self._store, self._vlm, self._finetune = store, params.vlm, params.finetune
+        self._compile, self._device = params.train_head.compile, device
+        self._rows = LiveRows(store, recordings, Preparer(params.vlm, self._spec))
+        self._base_digest = lru_cache(file_digest)
+        tuning = params.finetune.tuning
+        self.eval_ticks = params.finetune.eval_ticks
+        self.identity = {
+            "spec": self._spec.digest,
+            "tuning": tuning.model_dump(mode="json", exclude=_FREE_TUNING),
+            "lr": params.finetune.lr,
+            "eval_ticks": self.eval_ticks,
+        }
 
     def attach(self, policy: Policy) -> Trainable:
         """The policy with the model in front."""
-        vlm = LiveVLM.load(self._vlm, self._spec, self._finetune.tuning, str(self._device))
-        vlm.check_shape(policy.shape.slots, policy.shape.feature_dim)
         load = partial(LiveVLM.load, self._vlm, self._spec, self._finetune.tuning)
         live = LivePolicy(policy, load, tuned=True)
-        live.vlm = vlm
+        live.vlm = load(str(self._device))
+        live.vlm.check_shape(policy.shape.slots, policy.shape.feature_dim)
         return live
 
     def policy_of(self, module: nn.Module) -> Policy:
@@ -110,8 +97,8 @@ class Live:
     def save(self, folder: Path, module: nn.Module) -> None:
         """Write what the model has learned, and into `policy.json` whose features the policy takes.
 
-        It is judged on a store that was extracted with this adapter or checkpoint, and refused on
-        the one whose ticks it was trained on. Raises `DiskFull`.
+        It is evaluated on a store that was extracted with this adapter or checkpoint, and refused
+        on the one whose ticks it was trained on. Raises `DiskFull`.
         """
         assert isinstance(module, LivePolicy)
         assert module.vlm is not None
@@ -130,6 +117,11 @@ class Live:
             f"tuning: {how}, peak learning rate {self._finetune.lr:g}; {rows} VL rows of "
             f"{len(self._store.episodes)} recordings"
         ]
+        if self._compile:
+            lines.append(
+                "train_head.compile is true, but a tuning runs uncompiled: torch.compile cannot "
+                "take its batches of rows"
+            )
         if self._store.variants > 1:
             lines.append(
                 f"tuning: the store's {self._store.variants - 1} augmented variant(s) of each row "
@@ -181,7 +173,7 @@ def next_steps(finetune: FinetuneParams, store: FeatureStore) -> list[str]:
         setting = f"--set vlm.checkpoint={learned} --set vlm.adapter=null"
     name = tuned.stem
     return [
-        "next, extract the tuned model's features, train a head on them and judge it:",
+        "next, extract the tuned model's features, train a head on them and evaluate it:",
         f"  python -m stages.extract {setting} --set extract.store={tuned}",
         f"  python -m stages.train_head --set train_head.store={tuned} "
         f"--set train_head.output=models/{name} --set train_head.logs=reports/{name}_training",

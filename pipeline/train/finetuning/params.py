@@ -2,30 +2,8 @@
 
 from pydantic import ValidationError
 
-from pipeline.base.config import Params, TrainHeadParams
+from pipeline.base.config import FinetuneParams, Params, TrainHeadParams
 from pipeline.base.errors import ConfigError
-
-_REPLACED = (
-    "batch_size",
-    "grad_accumulation",
-    "max_steps",
-    "warmup_steps",
-    "eval_every",
-    "checkpoint_every",
-    "output",
-    "logs",
-)
-"""Keys of `train_head` that `finetune` has too."""
-
-
-def left_out(params: Params) -> list[str]:
-    """Lines on what `train_head` asks for and a tuning does not do."""
-    if not params.train_head.compile:
-        return []
-    return [
-        "train_head.compile is true, but a tuning runs uncompiled: torch.compile cannot take its "
-        "batches of rows"
-    ]
 
 
 def head_params(params: Params) -> TrainHeadParams:
@@ -44,11 +22,12 @@ def head_params(params: Params) -> TrainHeadParams:
             "train_head.features_enabled is false, so the policy would not see the model that is "
             "tuned. Set it to true."
         )
-    given = params.train_head.model_dump()
-    laid_over = {name: getattr(params.finetune, name) for name in _REPLACED}
+    # `lr` is of the model alone; rows are objects of many shapes, which torch.compile cannot take.
+    given = {"lr": params.train_head.lr, "compile": False}
+    shared = TrainHeadParams.model_fields.keys() & FinetuneParams.model_fields.keys()
+    laid_over = {name: getattr(params.finetune, name) for name in shared} | given
     try:
-        # Batches of rows are Python objects of many shapes, which torch.compile cannot take.
-        return TrainHeadParams.model_validate(given | laid_over | {"compile": False})
+        return TrainHeadParams.model_validate(params.train_head.model_dump() | laid_over)
     except ValidationError as error:
         problems = "; ".join(problem["msg"] for problem in error.errors())
         raise ConfigError(f"finetune: {problems}") from None

@@ -10,7 +10,7 @@ from pipeline.base.differences import describe, differences
 from pipeline.base.digests import ContentDigests
 from pipeline.base.errors import RecordingError, StoreMismatch
 from pipeline.data import Opened, Recording, content_digest, open_recordings
-from pipeline.store import Episode, FeatureStore
+from pipeline.store import Episode, FeatureStore, episode_name
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 
 _SHOWN = 5
@@ -24,12 +24,12 @@ def find_recordings(store: FeatureStore, params: Params) -> tuple[Recording, ...
     episodes that `data.sources` no longer have.
     """
     opened = open_recordings(params.data.sources, params.data.root, store.spec["views"])
-    known = {(one.source, one.id): one for one in opened.recordings}
-    missing = [one for one in store.episodes if (one.source, one.id) not in known]
+    known = {(recording.source, recording.id): recording for recording in opened.recordings}
+    missing = [episode for episode in store.episodes if (episode.source, episode.id) not in known]
     if missing:
         sources = {source.name for source in params.data.sources}
-        _refuse(store, [(one, _why_missing(one, sources, opened)) for one in missing])
-    return tuple(known[one.source, one.id] for one in store.episodes)
+        _refuse(store, [(episode, _why_missing(episode, sources, opened)) for episode in missing])
+    return tuple(known[episode.source, episode.id] for episode in store.episodes)
 
 
 def check_recordings(
@@ -46,8 +46,8 @@ def check_recordings(
             if content_digest(recording, digests.of) != episode.content:
                 changed.append((episode, f"the files in {recording.path} changed since extraction"))
             elif recording.instruction != episode.instruction:
-                said = f"{episode.instruction!r} at extraction, {recording.instruction!r} now"
-                changed.append((episode, f"its instruction was {said}"))
+                told = f"{episode.instruction!r} at extraction, {recording.instruction!r} now"
+                changed.append((episode, f"its instruction was {told}"))
         except RecordingError as error:
             changed.append((episode, str(error)))
     if changed:
@@ -63,8 +63,7 @@ def check_spec(store: FeatureStore, params: Params, digests: ContentDigests) -> 
     stored = store.spec
     spec = feature_spec(params.vlm, stored["storage_dtype"], stored["views"], digests.of)
     if spec.digest != stored["digest"]:
-        differing = describe(differences(stored, spec.attrs()))
-        lines = "\n".join(f"  {line}" for line in differing)
+        lines = "\n".join(f"  {line}" for line in describe(differences(stored, spec.attrs())))
         raise StoreMismatch(
             f"{store.path}: tuning begins with the model whose features the store holds, but its "
             f"feature spec is not that of vlm (store -> vlm):\n{lines}\n"
@@ -85,14 +84,11 @@ def _why_missing(episode: Episode, sources: set[str], opened: Opened) -> str:
     for bad in opened.bad:
         if bad.source == episode.source and bad.where.name == episode.id.rpartition("/")[2]:
             return bad.reason
-    for line in opened.missing:
-        if line.startswith(f"{episode.source}: ") and episode.id in line:
-            return line
     return f"it is not there; it was extracted from {episode.path}, relative to data.root"
 
 
 def _refuse(store: FeatureStore, wrong: Sequence[tuple[Episode, str]]) -> None:
-    lines = [f"  {one.source}/{one.id}: {why}" for one, why in wrong[:_SHOWN]]
+    lines = [f"  {episode_name(episode)}: {why}" for episode, why in wrong[:_SHOWN]]
     if len(wrong) > _SHOWN:
         lines.append(f"  … and {len(wrong) - _SHOWN} more")
     raise StoreMismatch(

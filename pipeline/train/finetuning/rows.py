@@ -1,20 +1,27 @@
-"""VL rows of a store as the model takes them, decoded from the recordings when they are asked for.
+"""Batches of a store with the VL rows that a live model has to see, decoded from the recordings.
 
 Any frame of a folder of JPEG files costs the same, but in a video every frame since a key frame has
 to be decoded: so rows of one episode are read together and in order, and prepared rows are kept.
 """
 
 import threading
-from collections import OrderedDict
-from collections.abc import Sequence
+import time
+from collections import OrderedDict, deque
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import lru_cache
+from typing import Self
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from pipeline.data import CameraStream, Recording
 from pipeline.data.row_range import RowRange
-from pipeline.store import FeatureStore
+from pipeline.policy.observation import LiveObservation
+from pipeline.store import Batch, FeatureStore
+from pipeline.train.batches import BatchIndices, Prefetch, Windows
 from pipeline.vlm.preparation import PreparedRow, Preparer
 
 CACHE_BYTES = 2**30
@@ -46,7 +53,7 @@ class LiveRows:
         self._lock = threading.Lock()
 
     def by_episode(self, rows: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-        """Distinct rows in pieces of one episode each, ascending: what is best decoded together."""
+        """Distinct rows by episode, ascending: those are best decoded together."""
         distinct = np.unique(rows)
         episodes = np.searchsorted(self._vl_start, distinct, side="right") - 1
         return np.split(distinct, np.flatnonzero(np.diff(episodes)) + 1)
@@ -57,22 +64,22 @@ class LiveRows:
         In one pass through each of its videos, which is never read backwards. Raises
         `RecordingError` where a frame cannot be decoded.
         """
-        found = {row: kept for row in rows.tolist() if (kept := self._take(row)) is not None}
-        absent = np.array([row for row in rows.tolist() if row not in found], np.int64)
+        prepared = {row: kept for row in rows.tolist() if (kept := self._take(row)) is not None}
+        absent = np.array([row for row in rows.tolist() if row not in prepared], np.int64)
         if len(absent):
-            found |= self._decode(absent)
-        return [found[row] for row in rows.tolist()]
+            prepared |= self._decode(absent)
+        return [prepared[row] for row in rows.tolist()]
 
     def _decode(self, rows: NDArray[np.int64]) -> dict[int, PreparedRow]:
         episode = int(np.searchsorted(self._vl_start, rows[0], side="right")) - 1
         cameras = self._cameras(episode)
         shown = self._frame_time[rows]
-        span = RowRange.of(self._recordings[episode], cameras, rows, shown, self._views)
-        made: dict[int, PreparedRow] = {}
-        for row, frames in span.read():
-            made[row] = self._preparer.prepare(self._instructions[episode], frames)
-            self._keep(row, made[row])
-        return made
+        row_range = RowRange.of(self._recordings[episode], cameras, rows, shown, self._views)
+        prepared: dict[int, PreparedRow] = {}
+        for row, frames in row_range.read():
+            prepared[row] = self._preparer.prepare(self._instructions[episode], frames)
+            self._keep(row, prepared[row])
+        return prepared
 
     def _open_cameras(self, episode: int) -> dict[str, CameraStream]:
         return dict(self._recordings[episode].cameras())
@@ -93,3 +100,64 @@ class LiveRows:
             while self._room < 0:
                 _, oldest = self._kept.popitem(last=False)
                 self._room += oldest.pixels.nbytes
+
+
+@dataclass
+class LiveBatch(Batch, LiveObservation):
+    """A batch and the rows that its features are to be computed from, each distinct one once."""
+
+
+class LiveFeed(Iterator[tuple[BatchIndices, LiveBatch]]):
+    """A `Feed` that hands out `(indices, live batch)` for each entry of a plan, in its order.
+
+    Streams come from a `Prefetch`; the distinct VL rows of each batch are decoded by `threads`
+    threads, as many batches ahead. Every variant of a row is the plain frames: others exist in the
+    store only. An exception in the plan, the store or a recording comes out of `next` at the batch
+    it belongs to. Use as a context manager, or call `close`.
+    """
+
+    def __init__(
+        self,
+        store: FeatureStore,
+        rows: LiveRows,
+        plan: Iterable[BatchIndices],
+        windows: Windows,
+        device: torch.device,
+        threads: int,
+    ) -> None:
+        self._vl_row, self._rows = store.array("tick/vl_row"), rows
+        self._coming: deque[tuple[NDArray[np.int64], list[Future[list[PreparedRow]]]]] = deque()
+        self.waited_s = 0.0
+        """Time that the consumer has spent waiting for data."""
+        self._pool = ThreadPoolExecutor(threads, thread_name_prefix="decode")
+        announced = (self._announce(indices) for indices in plan)
+        self._prefetch = Prefetch(store, announced, windows, device, buffers=threads + 1)
+
+    def __next__(self) -> tuple[BatchIndices, LiveBatch]:
+        started = time.perf_counter()
+        indices, batch = next(self._prefetch)
+        row_of, decoded = self._coming.popleft()
+        rows = [row for future in decoded for row in future.result()]
+        self.waited_s += time.perf_counter() - started
+        places = torch.from_numpy(row_of).to(batch.features.device)
+        return indices, LiveBatch(**vars(batch), rows=rows, row_of=places)
+
+    def close(self) -> None:
+        """Stop all threads and wait for them."""
+        self._prefetch.close()
+        self._pool.shutdown(cancel_futures=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self.close()
+
+    def _announce(self, indices: BatchIndices) -> BatchIndices:
+        """Begin with the rows of a batch; called in the thread that consumes the plan, in order."""
+        distinct, row_of = np.unique(self._vl_row[indices.ticks], return_inverse=True)
+        decoded = [
+            self._pool.submit(self._rows.prepare, r) for r in self._rows.by_episode(distinct)
+        ]
+        self._coming.append((row_of.astype(np.int64), decoded))
+        return indices

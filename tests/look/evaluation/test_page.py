@@ -10,9 +10,9 @@ import pytest
 
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.table import Table
-from pipeline.evaluate.ablation import judge_modalities
-from pipeline.evaluate.curves import Curve, Curves
-from pipeline.evaluate.episode_frames import Footage
+from pipeline.evaluate.ablation import evaluate_ablation
+from pipeline.evaluate.curves import TrainingCurve, TrainingCurves
+from pipeline.evaluate.episode_frames import EpisodeFrames
 from pipeline.evaluate.evaluation import Evaluation, judged_document
 from pipeline.evaluate.experiments import Experiment
 from pipeline.look.evaluation import page as evaluation_page
@@ -25,9 +25,10 @@ from pipeline.policy.normalization import ChannelStatistics, Normalization
 from pipeline.policy.policy import Policy
 from pipeline.store import FeatureStore
 from pipeline.train.batches import Windows
-from pipeline.train.held_out import held_out_contents, held_out_ranges, judge
-from pipeline.train.identity import policy_shape, source_of
 from pipeline.train.predictions import BASELINES
+from pipeline.train.run import policy_shape
+from pipeline.train.scores import evaluate_policy
+from pipeline.train.split import held_out_contents, held_out_ranges, source_of
 
 Sound = Callable[[Path], None]
 PARAMS = TrainHeadParams.model_validate(
@@ -40,7 +41,7 @@ PARAMS = TrainHeadParams.model_validate(
         "state_window": 5,
     }
 )
-CURVES = Curves({"train/loss": Curve(np.array([10, 20]), np.array([1.0, 0.1]))})
+CURVES = TrainingCurves({"train/loss": TrainingCurve(np.array([10, 20]), np.array([1.0, 0.1]))})
 
 
 @pytest.fixture(scope="module")
@@ -75,14 +76,14 @@ def judgement(
         weights=policy.state_dict(),
     )
     windows = Windows.of(PARAMS)
-    comparison, predictions = judge(policy, store, ticks, windows, 64, normalization)
+    comparison, predictions = evaluate_policy(policy, store, ticks, windows, 64, normalization)
     return Evaluation(
         name="models/head",
         checkpoint=checkpoint,
         store=store,
         comparison=comparison,
         predictions=predictions,
-        study=judge_modalities(checkpoint, policy, store, ticks, 64),
+        study=evaluate_ablation(checkpoint, policy, store, ticks, 64),
         judged=judged_document(checkpoint, policy, store, 1, 64),
         curves=CURVES,
         recordings=Path("data/nowhere"),
@@ -112,7 +113,7 @@ def test_tables_say_what_the_comparison_says(judgement: Evaluation) -> None:
     worst_first = [row[2] for row in episodes.rows]
     assert worst_first == sorted(comparison.overall_by_episode("policy"), reverse=True)
     assert [row[1] for row in episodes.rows] == [30, 30, 30]
-    assert streams.rows[0][:2] == ("all", "intact") and len(streams.rows) > 5
+    assert streams.rows[0][:2] == ["all", "intact"] and len(streams.rows) > 5
     assert dict(report.tiles)["held-out episodes"] == "3"
 
 
@@ -143,7 +144,7 @@ def test_dimensions_that_hardly_move_stand_at_the_top(judgement: Evaluation) -> 
     report = evaluation_report(replace(judgement, comparison=still))
     assert "Hardly moving: joint_3 (training std at most 0.001, where 1 is usual" in report.summary
     said = {label.split(" (")[0]: value for label, value in report.tiles}
-    relative = still.without_still().relative()
+    relative = still.without_low_variance().relative()
     assert relative is not None and relative != still.relative()
     assert said["the same, without what hardly moves"] == f"{100 * relative:.0f} %"
     report = evaluation_report(judgement)
@@ -168,16 +169,16 @@ def test_a_page_with_frames_and_without_is_sound(
 ) -> None:
     """Frames of the best episode; the worst one's recording is where no recording is."""
     (_, best), (_, worst) = judgement.comparison.extremes()
-    look = evaluation_page.footage
+    look = evaluation_page.read_episode_frames
 
-    def half(store: FeatureStore, episode: Any, rows: list[int], *rest: Any) -> Footage:
+    def half(store: FeatureStore, episode: Any, rows: list[int], *rest: Any) -> EpisodeFrames:
         if episode.index != best:
             return look(store, episode, rows, *rest)
         assert all(row in episode.vl_rows for row in rows) and len(rows) == 5
         shades = np.linspace(0, 255, len(rows)).astype(np.uint8)
-        return Footage({"View1": [np.full((12, 16, 3), shade, np.uint8) for shade in shades]})
+        return EpisodeFrames({"View1": [np.full((12, 16, 3), shade, np.uint8) for shade in shades]})
 
-    monkeypatch.setattr(evaluation_page, "footage", half)
+    monkeypatch.setattr(evaluation_page, "read_episode_frames", half)
     files = write_report(tmp_path, evaluation_report(judgement))
     assert {file.stem for file in files} == {
         *("report", "dimensions", "scatter", "horizon", "dimension_horizon", "episodes"),
@@ -192,7 +193,7 @@ def test_a_page_with_frames_and_without_is_sound(
 
 
 def test_what_is_missing_is_said(judgement: Evaluation) -> None:
-    bare = replace(judgement, study=None, curves=Curves({}, "No training curves: gone."))
+    bare = replace(judgement, study=None, curves=TrainingCurves({}, "No training curves: gone."))
     report = evaluation_report(bare)
     assert {one.name for one in report.blocks(Picture)}.isdisjoint({"modalities", "curves"})
     (training,) = section(report, "Training").blocks

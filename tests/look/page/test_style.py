@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from pipeline.evaluate.curves import Curve, Curves
+from pipeline.evaluate.curves import TrainingCurve, TrainingCurves
 from pipeline.look.evaluation.pictures import curves
 from pipeline.look.page import style
 from pipeline.look.recording.facts import Clock
@@ -16,7 +16,9 @@ from pipeline.look.recording.pictures import clock_steps
 
 def test_axes_of_powers_of_ten_say_plain_numbers() -> None:
     steps = np.arange(1, 200)
-    course = curves(Curves({"train/loss": Curve(steps, 10.0 / steps**2)}), 1).axes[0]
+    course = curves(TrainingCurves({"train/loss": TrainingCurve(steps, 10.0 / steps**2)}), 1).axes[
+        0
+    ]
     time = np.cumsum(np.where(np.arange(2000) % 100, 0.1, 0.1001))
     histogram = clock_steps([Clock("state", "stream", time, 10.0, 0.0, ())]).axes[0]
     for axis, decade in ((course, "0.01"), (histogram, "100")):

@@ -14,9 +14,8 @@ from pipeline.base.errors import RecordingError
 from pipeline.policy.observation import LiveObservation
 from pipeline.store import Batch, FeatureStore
 from pipeline.train.batches import BatchIndices, Windows
-from pipeline.train.finetuning.feed import LiveFeed
 from pipeline.train.finetuning.recordings import check_spec, find_recordings, known_digests
-from pipeline.train.finetuning.rows import LiveRows
+from pipeline.train.finetuning.rows import LiveFeed, LiveRows
 from pipeline.vlm.live import LiveVLM
 from pipeline.vlm.preparation import Preparer
 

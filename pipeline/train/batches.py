@@ -1,0 +1,304 @@
+"""Batches of a store on their way to a policy: what each is made of, and who gathers it where.
+
+`Prefetch` gathers ahead of time into a few reused buffers: a fresh output for every batch costs
+more in page faults than the gather itself, and a gather between two steps makes the device wait.
+`DeviceStore` holds streams on the device and gathers there; `choose_feed` picks what it holds.
+"""
+
+import queue
+import threading
+import time
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import AbstractContextManager
+from dataclasses import astuple, dataclass, replace
+from typing import Literal, Protocol, Self
+
+import numpy as np
+import torch
+from jaxtyping import Shaped
+from numpy.typing import NDArray
+from torch import Tensor
+from tqdm import tqdm
+
+from pipeline.base.config import TrainHeadParams
+from pipeline.base.format import size
+from pipeline.base.memory import available_bytes
+from pipeline.store import Batch, FeatureStore
+from pipeline.store.gather import WIDE, Index, Selection, Window
+from pipeline.store.mapping import fitting
+
+Ticks = NDArray[np.int64]
+FeedName = Literal["auto", "mapped", "device"]
+_DEVICE_SHARE = 0.6
+"""Of the device's free memory, what a store may fill: the rest is for the model and its step."""
+
+
+@dataclass(frozen=True, eq=False)
+class BatchIndices:
+    """What one batch is made of."""
+
+    ticks: Ticks
+    """(batch,) store-global."""
+    variants: NDArray[np.int64] | None = None
+    """(batch,) which stored variant of its VL row each tick sees; None: all 0, the plain frames."""
+
+
+def cut_batches(ticks: Ticks, batch_size: int) -> list[BatchIndices]:
+    """The ticks in their order, `batch_size` at a time."""
+    return [
+        BatchIndices(part) for part in np.split(ticks, range(batch_size, len(ticks), batch_size))
+    ]
+
+
+@dataclass(frozen=True)
+class Lags:
+    """How late each stream is: `features` in whole VL rows, the others in seconds."""
+
+    features: int = 0
+    sensor_s: float = 0.0
+    state_s: float = 0.0
+
+
+NO_LAGS = Lags()
+
+
+@dataclass(frozen=True)
+class Windows:
+    """How much of each stream a sample sees, in ticks (`horizon`) and readings."""
+
+    horizon: int
+    sensor_window: int
+    state_window: int
+
+    @classmethod
+    def of(cls, params: TrainHeadParams) -> Self:
+        """What this policy needs; of a stream whose encoder is off, a single reading."""
+        return cls(
+            params.horizon,
+            params.sensor_window if params.sensor_enabled else 1,
+            params.state_window if params.robot_state_enabled else 1,
+        )
+
+
+class Feed(Iterable[tuple[BatchIndices, Batch]], AbstractContextManager["Feed"], Protocol):
+    """Batches in the order of a plan: what a training and an evaluation iterate over."""
+
+    waited_s: float
+    """Time that the consumer has spent waiting for data."""
+
+
+class DeviceStore:
+    """The arrays of these wide fields of a store (`pipeline.store.gather.WIDE`) on a device.
+
+    Copied once, with a progress bar. Which rows a batch is made of is worked out on the host: a few
+    small index tensors are all that is sent for a batch.
+    """
+
+    def __init__(self, store: FeatureStore, fields: Collection[str], device: torch.device) -> None:
+        sources = {name: store.tensor(name) for name in sorted(fields)}
+        sources = {name: source for name, source in sources.items() if source.nbytes}
+        self.fields = frozenset(sources)
+        """What lives there; of a stream that the store lacks there is nothing to hold."""
+        self._device = device
+        bar = tqdm(sources.items(), f"store to {device}", unit="stream", disable=None)
+        self._tensors = {name: source.to(device, copy=True) for name, source in bar}
+
+    def complete(self, batch: Batch, selection: Selection) -> Batch:
+        """The batch with what lives here, on the device; the rest of it stays where it is.
+
+        On CUDA nothing is waited for: the work joins the current stream.
+        """
+        gathered: dict[str, Tensor] = {}
+        for name in self.fields & selection.rows.keys():
+            shape = getattr(batch, name).shape
+            index = self._send(selection.rows[name])
+            gathered[name] = self._tensors[name].index_select(0, index).view(shape)
+        for name in self.fields & selection.windows.keys():
+            length = getattr(batch, name).shape[1]
+            gathered[name] = self._window(self._tensors[name], selection.windows[name], length)
+        return replace(batch, **gathered)
+
+    def _window(
+        self, readings: Shaped[Tensor, "reading channel"], window: Window, length: int
+    ) -> Shaped[Tensor, "batch window channel"]:
+        """Zeros before the first real reading."""
+        place = torch.arange(length, device=self._device)
+        rows = (self._send(window.end)[:, None] + place - length).clamp_(min=0)
+        values = readings.index_select(0, rows.view(-1)).view(*rows.shape, -1)
+        if len(rows) and int(window.valid.min()) < length:
+            before = place < length - self._send(window.valid)[:, None]
+            values.masked_fill_(before[..., None], 0)
+        return values
+
+    def _send(self, index: Index) -> Tensor:
+        host = torch.from_numpy(index)
+        if self._device.type == "cuda":
+            host = host.pin_memory()
+        return host.to(self._device, non_blocking=True)
+
+
+def choose_feed(
+    feed: FeedName, store: FeatureStore, device: torch.device, free: int | None = None
+) -> tuple[frozenset[str], str]:
+    """Which wide fields of a batch live on the device, and a line on why.
+
+    `device` takes the streams that fit into `free` bytes there (measured if None), the smallest
+    first; `auto` takes a GPU if all fit.
+    """
+    if feed == "mapped":
+        return frozenset(), "feed: mapped, as train_head.feed says"
+    if feed == "auto" and device.type != "cuda":
+        return frozenset(), f"feed: mapped (auto: training runs on the {device})"
+    if free is None:
+        on_gpu = device.type == "cuda"
+        free = torch.cuda.mem_get_info(device)[0] if on_gpu else available_bytes()
+    wide = {name: store.tensor(name) for name in WIDE if store.tensor(name).nbytes}
+    fields = fitting(wide, free, _DEVICE_SHARE)
+    whole = sum(tensor.nbytes for tensor in wide.values())
+    taken = sum(wide[name].nbytes for name in fields)
+    room = (
+        f"{size(taken)} of {size(whole)} fit in {_DEVICE_SHARE:.0%} of the "
+        f"{size(free)} free on {device}"
+    )
+    if feed == "auto" and taken < whole:
+        return frozenset(), f"feed: mapped (auto: {room})"
+    by = "auto" if feed == "auto" else "as train_head.feed says"
+    return frozenset(fields), f"feed: device ({by}; {room}: {', '.join(fields) or 'nothing'})"
+
+
+@dataclass
+class _Buffer:
+    """A reused host batch, and the copy out of it that has to end before it is filled again."""
+
+    batch: Batch | None = None
+    selection: Selection | None = None
+    """Where what the batch still lacks lies on the device."""
+    whole: Batch | None = None
+    """With that too; on CUDA only made when it is handed out."""
+    copied: torch.cuda.Event | None = None
+
+
+class Prefetch(Iterator[tuple[BatchIndices, Batch]]):
+    """Hands out `(indices, batch)` for each entry of `plan`, in its order.
+
+    The plan is consumed in a background thread, at most `buffers` batches ahead. On the CPU a
+    batch stays as it is until the next one is asked for; on CUDA it is a copy on the device, made
+    from pinned memory, that is never overwritten. An exception in the plan or in the store comes
+    out of `next` at the batch it belongs to. Use as a context manager, or call `close`. The thread
+    does not survive a fork: a forked process reads from the same store with a `Prefetch` it makes.
+
+    What `resident` holds of the store is gathered on its device, into fresh memory; on CUDA when
+    the batch is handed out, in the order of the consumer's stream. The rest of the store is read
+    into memory in the background, as far as it fits.
+    """
+
+    def __init__(
+        self,
+        store: FeatureStore,
+        plan: Iterable[BatchIndices],
+        windows: Windows,
+        device: torch.device,
+        buffers: int = 2,
+        lags: Lags = NO_LAGS,
+        resident: DeviceStore | None = None,
+    ) -> None:
+        assert buffers >= 2, "one buffer in use, one being filled"
+        self.waited_s = 0.0
+        """Time that the consumer has spent waiting for data."""
+        self._store = store
+        self._windows = windows
+        self._lags = lags
+        self._device = device
+        self._resident = resident
+        self._on_device = frozenset[str]() if resident is None else resident.fields
+        self._free: queue.SimpleQueue[_Buffer | None] = queue.SimpleQueue()
+        self._filled: queue.SimpleQueue[tuple[BatchIndices, _Buffer] | BaseException | None] = (
+            queue.SimpleQueue()
+        )
+        self._in_use: _Buffer | None = None
+        self._ended = False
+        for _ in range(buffers):
+            self._free.put(_Buffer())
+        self._closing = threading.Event()
+        self._thread = threading.Thread(
+            target=self._work, args=(plan,), name="prefetch", daemon=True
+        )
+        self._thread.start()
+
+    def __next__(self) -> tuple[BatchIndices, Batch]:
+        if self._ended:
+            raise StopIteration
+        self._release()
+        started = time.perf_counter()
+        item = self._filled.get()
+        self.waited_s += time.perf_counter() - started
+        if not isinstance(item, tuple):
+            self.close()
+            if item is None:
+                raise StopIteration
+            raise item
+        indices, self._in_use = item
+        started = time.perf_counter()
+        batch = self._deliver(self._in_use)
+        self.waited_s += time.perf_counter() - started
+        return indices, batch
+
+    def close(self) -> None:
+        """Stop the thread and wait for it; the last batch handed out stays valid."""
+        self._ended = True
+        self._closing.set()
+        self._free.put(None)
+        self._thread.join()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self.close()
+
+    def _deliver(self, buffer: _Buffer) -> Batch:
+        if self._device.type == "cpu":
+            assert buffer.whole is not None
+            return buffer.whole
+        delivered = self._complete(buffer).to(self._device, non_blocking=True)
+        buffer.copied = torch.cuda.Event()
+        buffer.copied.record(torch.cuda.current_stream(self._device))
+        return delivered
+
+    def _complete(self, buffer: _Buffer) -> Batch:
+        assert buffer.batch is not None and buffer.selection is not None
+        if self._resident is None:
+            return buffer.batch
+        return self._resident.complete(buffer.batch, buffer.selection)
+
+    def _release(self) -> None:
+        if self._in_use is not None:
+            self._free.put(self._in_use)
+            self._in_use = None
+
+    def _work(self, plan: Iterable[BatchIndices]) -> None:
+        try:
+            self._store.warm(but=self._on_device)
+            for indices in plan:
+                buffer = self._free.get()
+                if buffer is None or self._closing.is_set():
+                    return
+                self._fill(buffer, indices)
+                self._filled.put((indices, buffer))
+            self._filled.put(None)
+        except BaseException as error:  # it belongs to the thread that asks for the batch
+            self._filled.put(error)
+
+    def _fill(self, buffer: _Buffer, indices: BatchIndices) -> None:
+        if buffer.copied is not None:
+            buffer.copied.synchronize()
+        windows, count = astuple(self._windows), len(indices.ticks)
+        if buffer.batch is None or len(buffer.batch) != count:
+            empty = self._store.empty_batch(count, *windows, but=self._on_device)
+            buffer.batch = empty.pin() if self._device.type == "cuda" else empty.touch()
+        _, buffer.selection = self._store.select(
+            indices.ticks, windows, astuple(self._lags), buffer.batch, indices.variants
+        )
+        self._store.copy(buffer.selection, buffer.batch, but=self._on_device)
+        if self._device.type == "cpu":
+            buffer.whole = self._complete(buffer)

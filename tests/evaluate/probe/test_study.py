@@ -1,0 +1,314 @@
+"""The slot that carries the action is found, and nothing that only looks as if it did."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.base.config import ProbeParams
+from pipeline.base.errors import NumericsError
+from pipeline.evaluate.probe import (
+    ProbeFolds,
+    ProbeResult,
+    ProbeScore,
+    ProbeStudy,
+    SlotName,
+    advice,
+    metrics,
+    probe,
+    ranked,
+    recommend,
+    table,
+)
+from pipeline.store import FeatureStore
+
+PENALTIES = (1e-3, 1e-1, 1.0, 10.0)
+
+
+def probed(store: FeatureStore, **changed: Any) -> ProbeStudy:
+    """With small windows and chunks."""
+    small = {"horizon": 2, "sensor_window": 4, "state_window": 4, "penalties": PENALTIES}
+    return probe(store, ProbeParams.model_validate(small | changed))
+
+
+def test_the_slot_that_carries_the_action_is_first(
+    tiny_store: Callable[..., Path], tmp_path: Path
+) -> None:
+    store = FeatureStore.open(tiny_store(tmp_path, episodes=40, slots=5))
+    rows = store.array("tick/vl_row")
+    features = store.array("vl/features")
+    weights = np.random.default_rng(1).normal(size=(8, 4)).astype(np.float32)
+    store.array("tick/action")[:, :4] = features[rows, 3] @ weights
+    study = probed(store, horizon=1)
+    first, *others = ranked(study.slots)
+    assert first.slots == (3,)
+    assert first.alone.mean > 0.99
+    gain = study.gain(first)
+    assert gain is not None and gain[0] > 0.9
+    assert study.streams is not None
+    assert abs(study.streams.mean) < 0.1
+    for other in others:
+        assert abs(other.alone.mean) < 0.1
+
+
+def test_scores_are_those_of_a_plain_ridge_regression(
+    store: FeatureStore,
+    nested: Callable[..., tuple[np.ndarray, np.ndarray]],
+    limited: Callable[[np.ndarray, np.ndarray], np.ndarray],
+) -> None:
+    """Every tick a row of its own, although the store is read a VL row at a time.
+
+    A feature rests but in one recording, and another has a spike: what is read is within limits.
+    """
+    store.array("vl/features")[10:, 0, 2] = 0.5
+    store.array("vl/features")[33, 1, 3] = 300
+    study = probed(store, folds=3)
+    ticks, fold = study.folds.ticks, study.folds.fold
+    rows, first, row = np.unique(
+        store.array("tick/vl_row")[ticks], return_index=True, return_inverse=True
+    )
+    raw = store.array("vl/features")[rows].astype(np.float64)
+    x = np.stack([limited(raw[:, slot], fold[first]) for slot in range(3)], axis=1)[row]
+    assert (x[:, 0, 2] == 0).all()
+    assert np.abs(x[:, 1, 3]).max() < np.abs(raw[:, 1, 3] - raw[:, 1, 3].mean()).max() / 10
+    action = store.array("tick/action").astype(np.float64)
+    y = action[ticks[:, None] + np.arange(2)].reshape(len(ticks), -1)
+    for index, found in enumerate(study.slots):
+        r2, chosen = nested(x[:, index], y, fold, PENALTIES)
+        varies = y.std(0) > 0
+        np.testing.assert_allclose(found.alone.r2[:, varies], r2[:, varies], atol=1e-8)
+        np.testing.assert_array_equal(found.alone.penalties, chosen)
+    (group,) = study.groups
+    r2, _ = nested(x.reshape(len(x), -1), y, fold, PENALTIES)
+    np.testing.assert_allclose(group.alone.r2[:, varies], r2[:, varies], atol=1e-8)
+    assert (group.channels, group.inputs) == (24, 24)
+
+
+def test_what_only_tells_recordings_apart_does_not_help(
+    tiny_store: Callable[..., Path], tmp_path: Path
+) -> None:
+    """Each recording has its own action and its own constant feature, unrelated to each other."""
+    store = FeatureStore.open(tiny_store(tmp_path, episodes=20, slots=2, dim=32))
+    rng = np.random.default_rng(3)
+    episode = np.arange(store.ticks) // 30
+    own = rng.normal(size=(20, 32)).astype(np.float32)
+    store.array("vl/features")[:, 1] = own[np.arange(200) // 10]
+    action = rng.normal(size=(20, 4)).astype(np.float32)
+    store.array("tick/action")[:, :4] = action[episode] + 0.01 * rng.normal(size=(600, 4))
+    found = probed(store).slots[1]
+    assert found.alone.mean < 0.1
+    # By sample it would seem to know everything.
+    x = own[episode].astype(np.float64)
+    x = np.hstack([x - x.mean(0), np.ones((600, 1))])
+    weights = np.linalg.lstsq(x[::2], store.array("tick/action")[::2, :4], rcond=None)[0]
+    error = ((store.array("tick/action")[1::2, :4] - x[1::2] @ weights) ** 2).mean(0)
+    assert (1 - error / store.array("tick/action")[:, :4].var(0)).min() > 0.9
+
+
+def test_a_slot_stands_at_its_mean_where_it_is_not_valid(
+    store: FeatureStore,
+    nested: Callable[..., tuple[np.ndarray, np.ndarray]],
+    limited: Callable[[np.ndarray, np.ndarray], np.ndarray],
+) -> None:
+    store.array("vl/slot_valid")[12:17, 1] = 0
+    store.array("vl/features")[12:17, 1] = np.nan  # what is not valid is not read
+    study = probed(store, folds=3)
+    ticks, fold = study.folds.ticks, study.folds.fold
+    rows, first, of_tick = np.unique(
+        store.array("tick/vl_row")[ticks], return_index=True, return_inverse=True
+    )
+    there = ~np.isin(rows, range(12, 17))
+    assert study.slots[0].valid_share == 1
+    assert study.slots[1].valid_share == pytest.approx(there[of_tick].mean())
+    y = store.array("tick/action").astype(np.float64)[ticks[:, None] + np.arange(2)]
+    y = y.reshape(len(y), -1)
+    varies = y.std(0) > 0
+    raw = store.array("vl/features")[rows[there], 1].astype(np.float64)
+    x = np.zeros((len(rows), 8))
+    x[there] = limited(raw, fold[first][there])
+    r2, _ = nested(x[of_tick], y, fold, PENALTIES)
+    np.testing.assert_allclose(study.slots[1].alone.r2[:, varies], r2[:, varies], atol=1e-8)
+    assert "elsewhere its mean is read" in table(study)
+    assert study.groups[0].valid_share == 1
+
+
+def test_a_slot_that_is_valid_nowhere_says_nothing(store: FeatureStore) -> None:
+    store.array("vl/slot_valid")[:, 1] = 0
+    study = probed(store)
+    assert (study.slots[1].inputs, study.slots[1].valid_share) == (0, 0)
+    assert study.slots[1].alone.mean == study.mean_action.mean
+    store.array("vl/slot_valid")[:10, 1] = 1  # in one recording only
+    probed(store)
+    metrics(study)
+
+
+@pytest.mark.parametrize(("dtype", "within"), [("bfloat16", 2e-2), ("float16", 1e-3)])
+def test_stored_dtypes_say_the_same(
+    tiny_store: Callable[..., Path], tmp_path: Path, dtype: str, within: float
+) -> None:
+    exact = probed(FeatureStore.open(tiny_store(tmp_path)))
+    rounded = probed(FeatureStore.open(tiny_store(tmp_path, name="rounded", dtype=dtype)))
+    for one, other in zip(exact.slots, rounded.slots, strict=True):
+        assert other.alone.mean == pytest.approx(one.alone.mean, abs=within)
+
+
+def test_only_the_plain_variant_is_read(
+    tiny_store: Callable[..., Path], tmp_path: Path, renamed: Callable[..., FeatureStore]
+) -> None:
+    plain = {"layer": 1, "norm": True, "pooling": "mean"}
+    slots = [{**plain, "pooling": pooling} for pooling in ("mean", "last")]
+    path = tiny_store(tmp_path, slots=6)
+    store = renamed(path, [one | {"variant": v} for v in range(3) for one in slots], variants=3)
+    before = probed(store)
+    assert [one.name.pooling for one in before.slots] == ["mean", "last"]
+    store.array("vl/features")[:, 2:] = np.nan
+    after = probed(store)
+    for one, other in zip(before.slots, after.slots, strict=True):
+        np.testing.assert_array_equal(one.alone.r2, other.alone.r2)
+
+
+def test_a_wide_group_is_read_along_its_main_directions(
+    store: FeatureStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipeline.evaluate.probe.inputs.WIDTH", 12)
+    (group,) = probed(store).groups
+    assert (group.channels, group.inputs) == (24, 12)
+    assert "main directions" in table(probed(store))
+
+
+def test_threads_change_no_bit(store: FeatureStore) -> None:
+    before, after = probed(store, threads=1), probed(store, threads=3)
+    for one, other in zip(
+        [*before.slots, *before.groups], [*after.slots, *after.groups], strict=True
+    ):
+        np.testing.assert_array_equal(one.best.r2, other.best.r2)
+
+
+@pytest.mark.parametrize("ticks", [None, 60])
+def test_a_number_that_is_none_is_named(store: FeatureStore, ticks: int | None) -> None:
+    store.array("vl/features")[12, 1, 4] = np.nan
+    with pytest.raises(NumericsError, match=r"right/episode_001, VL row 2 .*, slot 1, channel 4"):
+        probed(store, max_ticks=ticks)
+    store.array("vl/features")[12, 1, 4] = 0
+    store.array("tick/action")[40, 1] = np.inf
+    with pytest.raises(NumericsError, match=r"actions: .* found inf in row 40, channel 'dy'"):
+        probed(store)
+
+
+def test_a_store_without_streams_is_ranked_alone(
+    tiny_store: Callable[..., Path], tmp_path: Path
+) -> None:
+    study = probed(FeatureStore.open(tiny_store(tmp_path, sensor_channels=0, state_dim=0)))
+    assert study.streams is None
+    assert all(one.beside is None and one.best is one.alone for one in study.slots)
+    assert "beside: " not in table(study)
+
+
+def test_the_cheapest_of_those_that_are_tied_is_recommended(
+    tiny_store: Callable[..., Path], tmp_path: Path, renamed: Callable[..., FeatureStore]
+) -> None:
+    """Two layers hold the same numbers, a third pooling holds noise."""
+    slots = [
+        {"layer": 7, "norm": True, "pooling": "mean"},
+        {"layer": 2, "norm": False, "pooling": "mean"},
+        {"layer": 2, "norm": False, "pooling": "last"},
+    ]
+    store = renamed(tiny_store(tmp_path, episodes=20), slots)
+    store.array("vl/features")[:, 1] = store.array("vl/features")[:, 0]
+    study = probed(store, horizon=1)
+    found = recommend(study)
+    assert found is not None
+    assert found.reading == "beside"
+    assert [one.name.layer for one in found.tied] in ([2], [7])
+    said = advice(study)
+    assert "vlm: {layers: [2], norms: [false], pooling: [mean]}" in said
+    assert "not ahead of these by more than one standard error" in said
+
+
+def test_a_joint_that_moves_in_one_recording_spoils_nothing(store: FeatureStore) -> None:
+    """It rests in what is trained on when that one is held out: thousands in units of its rest."""
+    before = probed(store)
+    state, ends = store.array("state/values"), store.array("tick/state_end")
+    rng = np.random.default_rng(2)
+    state[:, 0] = 1.6 + 1e-6 * rng.normal(size=len(state))
+    first = ends[59]
+    state[first : ends[89], 0] += np.linspace(0, 1, ends[89] - first)
+    # So small a movement goes with the action by chance: this is what is blown up.
+    study = probed(store)
+    assert before.streams is not None
+    assert study.streams is not None
+    assert study.streams.mean == pytest.approx(before.streams.mean, abs=0.2)
+    for one in (*study.slots, *study.groups):
+        assert one.beside is not None
+        assert one.beside.by_fold.min() > -1.5
+
+
+def by_fold(*values: float) -> ProbeScore:
+    """One target, as many ticks in each fold."""
+    return ProbeScore(np.array(values)[:, None], np.full(len(values), 9.0), (1.0,) * len(values))
+
+
+def study_of(
+    known: ProbeScore | None, *groups: tuple[int, ProbeScore, ProbeScore | None]
+) -> ProbeStudy:
+    """Groups of so many slots, alone and beside what is known."""
+    folds = ProbeFolds(np.arange(45), np.arange(45) // 9, np.arange(45) // 9, 5, ())
+    results = tuple(
+        ProbeResult(SlotName(layer, True, "mean"), tuple(range(slots)), 8, 8, 1.0, alone, beside)
+        for layer, (slots, alone, beside) in enumerate(groups)
+    )
+    mean_action = by_fold(-0.02, 0.01, 0.0, -0.01, 0.0)
+    return ProbeStudy(1, ("dx",), folds, mean_action, known, 3, (), results)
+
+
+def test_nothing_is_recommended_that_is_worse_than_what_is_known() -> None:
+    """Spreads so wide that all are within one standard error of all."""
+    wild = by_fold(0.3, 0.1, 0.2, 0.2, -5600)
+    worse = by_fold(0.4, 0.2, 0.2, 0.2, -170)
+    less = by_fold(0.4, 0.2, 0.3, 0.2, -4)
+    poor = by_fold(-0.1, 0.1, -0.2, 0.0, -0.1)
+    study = study_of(wild, (1, poor, worse), (16, poor, less))
+    assert recommend(study) is None
+    assert "recommended" not in metrics(study)
+    said = advice(study)
+    assert said.startswith("no recommendation")
+    assert "params.yaml" not in said
+
+
+def test_features_that_help_alone_are_said_to() -> None:
+    wild = by_fold(0.3, 0.1, 0.2, 0.2, -5600)
+    beside = by_fold(0.4, 0.2, 0.3, 0.2, -4)
+    good, better = by_fold(0.2, 0.1, 0.2, 0.3, 0.2), by_fold(0.4, 0.3, 0.4, 0.5, 0.4)
+    study = study_of(wild, (1, good, beside), (16, better, beside))
+    found = recommend(study)
+    assert found is not None
+    assert (found.reading, found.chosen.name.layer, found.tied) == ("alone", 1, ())
+    said = advice(study)
+    assert "features alone predict better than the mean action" in said
+    assert "does not show" not in said
+    assert "layers: [1]" in said
+
+
+def test_a_tie_keeps_half_of_the_gain() -> None:
+    known = by_fold(0.1, 0.1, 0.1, 0.1, 0.1)
+    best = by_fold(0.9, 0.9, 0.9, 0.9, 0.9)
+    wide = by_fold(0.8, 0.95, 0.95, 0.95, 0.4)
+    wider = by_fold(0.95, 0.95, 0.95, 0.95, -1.5)
+    found = recommend(study_of(known, (9, known, best), (4, known, wide), (1, known, wider)))
+    assert found is not None
+    assert found.best.beside is best
+    assert [one.name.layer for one in found.tied] == [1]
+    assert found.chosen.name.layer == 1
+
+
+def test_one_strange_fold_is_no_gain() -> None:
+    known = by_fold(0.1, 0.1, 0.1, 0.1, -90.0)
+    saved = by_fold(0.0, 0.0, 0.0, 0.0, 0.5)
+    assert recommend(study_of(known, (1, by_fold(0, 0, 0, 0, 0), saved))) is None
+
+
+def test_features_that_do_not_help_are_said_not_to(store: FeatureStore) -> None:
+    store.array("vl/features")[:] = 0.25
+    assert "does not show that a linear reader gains" in advice(probed(store))

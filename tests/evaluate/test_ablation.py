@@ -1,0 +1,281 @@
+"""A stream that decides the action must be missed, and one that decides nothing must not."""
+
+import csv
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.base.config import TrainHeadParams
+from pipeline.evaluate.ablation import (
+    AblationStudy,
+    delays,
+    donors_of,
+    evaluate_ablation,
+    exchanged,
+    missing,
+    zeroed,
+)
+from pipeline.evaluate.tables import ablation_text, write_tables
+from pipeline.policy.checkpoint import PolicyCheckpoint
+from pipeline.policy.normalization import ChannelStatistics, Normalization
+from pipeline.policy.policy import Policy
+from pipeline.store import FeatureStore
+from pipeline.train.batches import BatchIndices, Lags, Windows
+from pipeline.train.predictions import Predictions
+from pipeline.train.run import policy_shape
+from pipeline.train.split import held_out_contents, held_out_ranges, source_of, split_by_episode
+
+PARAMS = {
+    "sensor_encoder": {"channels": [16], "layers": 0, "heads": 1, "output_dim": 16},
+    "state_encoder": {"dim": 8, "layers": 0, "heads": 1, "output_dim": 8, "patch": 1},
+    "expert": {"dim": 16, "layers": 1, "heads": 1, "dropout": 0.0},
+    "horizon": 1,
+    "sensor_window": 1,
+    "state_window": 1,
+    "batch_size": 64,
+}
+
+
+def trained(store: FeatureStore, steps: int, **params: object) -> tuple[PolicyCheckpoint, Policy]:
+    """A policy trained on the third action, which is the newest reading's first channel."""
+    wanted = TrainHeadParams.model_validate(PARAMS | params)
+    split = split_by_episode(store, 0.3)
+    action = store.array("tick/action")
+    # Nothing but the sensor decides the action.
+    action[:, [0, 1, 3]] = 0.5
+
+    def statistics(values: np.ndarray) -> ChannelStatistics:
+        values = values.astype(np.float64)
+        return ChannelStatistics(values.mean(0), values.std(0), len(values))
+
+    normalization = Normalization(
+        statistics(action),
+        statistics(store.array("vl/features")),
+        statistics(store.array("sensor/values")),
+        statistics(store.array("state/values")),
+    )
+    torch.manual_seed(0)
+    shape = policy_shape(store, normalization)
+    policy = Policy(wanted, shape, normalization)
+    optimizer = torch.optim.Adam(policy.parameters(), lr=3e-3)
+    rng = np.random.default_rng(0)
+    for _ in range(steps):
+        batch = store.gather(rng.choice(split.train, 64), 1, 1, 1)
+        loss, _ = policy.loss(batch, batch.action, batch.action_valid)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    ranges = held_out_ranges(store, split.held_out)
+    checkpoint = PolicyCheckpoint(
+        params=wanted,
+        shape=shape,
+        normalization=normalization,
+        source=source_of(store),
+        held_out_ticks=ranges,
+        held_out_content=held_out_contents(store, ranges),
+        step=steps,
+        weights=policy.state_dict(),
+    )
+    return checkpoint, policy.eval()
+
+
+def held_out(store: FeatureStore) -> np.ndarray:
+    return split_by_episode(store, 0.3).held_out
+
+
+@pytest.fixture(scope="module")
+def study(
+    tiny_store: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory
+) -> AblationStudy:
+    store = FeatureStore.open(tiny_store(tmp_path_factory.mktemp("study"), episodes=20))
+    checkpoint, policy = trained(store, 250)
+    found = evaluate_ablation(checkpoint, policy, store, held_out(store), 64)
+    assert found is not None
+    return found
+
+
+def times(study: AblationStudy, stream: str, how: str) -> float:
+    (one,) = (one for one in study.ablated if (one.stream, one.how) == (stream, how))
+    ratio = study.times_intact(one)
+    assert ratio is not None
+    return ratio
+
+
+def test_a_stream_that_decides_the_action_is_missed(study: AblationStudy) -> None:
+    assert study.intact.relative() < 0.5  # type: ignore[operator]
+    for how in ("zeroed", "shuffled", "delayed 50 ms", "delayed 100 ms", "delayed 200 ms"):
+        assert times(study, "sensor", how) > 2, how
+
+
+def test_a_stream_that_decides_nothing_is_not(study: AblationStudy) -> None:
+    for one in study.ablated:
+        if one.stream != "sensor":
+            assert times(study, one.stream, one.how) < 1.5, one.how
+
+
+def test_the_ways_to_spoil_are_those_that_mean_something(study: AblationStudy) -> None:
+    assert study.streams == ("sensor", "state", "features")
+    hows = {name: [s.how for s in study.ablated if s.stream == name] for name in study.streams}
+    late = ["delayed 50 ms", "delayed 100 ms", "delayed 200 ms"]
+    assert hows["sensor"] == hows["state"] == ["zeroed", "shuffled", *late]
+    # A VL row serves 3 ticks of 100 ms: nothing shorter can be had.
+    assert hows["features"] == ["zeroed", "shuffled", "delayed 300 ms"]
+    assert study.notes[-1].startswith("features delayed: they change every 300 ms only")
+    assert study.notes[-1].endswith("judged 300 ms; 50, 100, 200 ms end within a row")
+    assert sum("missing: not judged" in note for note in study.notes) == 3
+    assert all(one.comparison.ticks == study.intact.ticks for one in study.ablated)
+
+
+def test_the_figures_are_the_same_in_table_and_files(
+    study: AblationStudy, tiny_store: Callable[..., Path], tmp_path: Path
+) -> None:
+    store = FeatureStore.open(tiny_store(tmp_path, episodes=20))
+    multiple = times(study, "sensor", "zeroed")
+    ticks = np.arange(4)
+    predictions = Predictions(ticks, ticks * 0, *[np.zeros((4, 1, 5), np.float32)] * 2, ticks > 0)
+    write_tables(tmp_path, study.intact, predictions, store, study)
+    rows = list(csv.DictReader((tmp_path / "modalities.csv").read_text().splitlines()))
+    (row,) = (
+        row
+        for row in rows
+        if (row["stream"], row["how"], row["group"]) == ("sensor", "zeroed", "overall")
+    )
+    assert float(row["error"]) / float(row["intact_error"]) == pytest.approx(multiple, rel=1e-4)
+    (row,) = (
+        row
+        for row in csv.DictReader((tmp_path / "streams.csv").read_text().splitlines())
+        if row["spoilt"] == "sensor zeroed"
+    )
+    assert float(row["times_intact"]) == pytest.approx(multiple, rel=1e-5)
+    lines = ablation_text(study).splitlines()
+    assert any(line.startswith("sensor    zeroed") for line in lines)
+    assert lines[2].split()[:2] == ["all", "intact"]
+    assert any(line.startswith("none") for line in lines)
+    assert "1 chunk(s) a tick" in lines[0]
+    assert lines[-1 - len(study.notes)].startswith("zeroed: every value at its training mean")
+    assert lines[-len(study.notes) :] == list(study.notes)
+
+
+def test_missing_is_judged_where_training_dropped_the_stream(
+    tiny_store: Callable[..., Path], tmp_path: Path
+) -> None:
+    store = FeatureStore.open(tiny_store(tmp_path))
+    checkpoint, policy = trained(store, 1, drop_sensor=0.2, robot_state_enabled=False)
+    found = evaluate_ablation(checkpoint, policy, store, held_out(store), 64)
+    assert found is not None
+    assert found.streams == ("sensor", "features")
+    assert times(found, "sensor", "missing") > 0
+    first, *others = found.notes
+    left_out = len(held_out(store)) - found.intact.ticks
+    assert first.startswith(f"intact is not the error above: {left_out} of {len(held_out(store))}")
+    assert [note.split(":")[0] for note in others] == ["features missing", "features delayed"]
+
+
+def test_one_held_out_episode_has_nobody_to_be_shuffled_with(
+    tiny_store: Callable[..., Path], tmp_path: Path
+) -> None:
+    store = FeatureStore.open(tiny_store(tmp_path))
+    checkpoint, policy = trained(store, 1)
+    found = evaluate_ablation(checkpoint, policy, store, np.arange(30, 60), 64)
+    assert found is not None
+    assert not [one for one in found.ablated if one.how == "shuffled"]
+    assert sum("shuffled: not judged" in note for note in found.notes) == 3
+    # The first ticks of an episode, at which a delay would find nothing, are not judged.
+    assert found.intact.ticks == 27
+    assert evaluate_ablation(checkpoint, policy, store, np.arange(30, 33), 64) is None
+
+
+def test_donors_are_of_other_episodes(store: FeatureStore) -> None:
+    ticks = np.r_[np.arange(10, 30), np.arange(30, 60), np.arange(95, 100)]
+    donors = donors_of(store, ticks, "sensor")
+    assert donors is not None
+    assert (donors // 30 != ticks // 30).all()
+    assert np.isin(donors, ticks).all()
+    assert np.array_equal(donors, donors_of(store, ticks, "sensor"))
+    assert set(donors[ticks // 30 == 0] // 30) == {1, 3}
+    assert donors_of(store, np.arange(30), "features") is None
+
+
+def test_an_episode_without_the_stream_gives_and_takes_nothing(
+    store: FeatureStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ticks = np.arange(90)
+    array = store.array
+
+    def lacking(name: str) -> np.ndarray:
+        return (
+            np.array([0, 240, 240, 480, 720, 960, 1200]) if "sensor_start" in name else array(name)
+        )
+
+    monkeypatch.setattr(store, "array", lacking)
+    donors = donors_of(store, ticks, "sensor")
+    assert donors is not None
+    assert np.array_equal(donors[30:60], ticks[30:60])
+    assert set(donors[:30] // 30) == {2}
+    assert set(donors[60:] // 30) == {0}
+
+
+def test_an_alteration_leaves_the_batch_and_the_other_streams_alone(store: FeatureStore) -> None:
+    ticks, windows = np.arange(40, 44), Windows(2, 3, 3)
+    draw, batch = BatchIndices(ticks), store.gather(ticks, 2, 3, 3)
+    before = batch.sensor.clone()
+    mean = np.arange(5.0)
+    at_mean = zeroed("sensor", mean)(draw, batch)
+    assert torch.equal(at_mean.sensor, torch.tensor(mean).float().expand(4, 3, 5))
+    assert not missing("features")(draw, batch).slot_valid.any()
+    donors = np.array([100, 101, 2, 3])
+    other = exchanged("features", store, windows, ticks, donors)(draw, batch)
+    expected = store.gather(donors, 2, 3, 3)
+    assert torch.equal(other.features, expected.features)
+    assert torch.equal(other.feature_age, expected.feature_age)
+    assert torch.equal(batch.sensor, before)
+    assert other.sensor is batch.sensor
+    assert other.action is batch.action
+
+
+def test_features_go_back_whole_rows_and_say_the_true_time(
+    tiny_store: Callable[..., Path], tmp_path: Path
+) -> None:
+    store = FeatureStore.open(tiny_store(tmp_path, reuse=1))
+    assert delays(store, "features") == {
+        "delayed 100 ms": Lags(features=1),
+        "delayed 200 ms": Lags(features=2),
+    }
+    assert delays(store, "state")["delayed 50 ms"] == Lags(state_s=0.05)
+    checkpoint, policy = trained(store, 1)
+    found = evaluate_ablation(checkpoint, policy, store, np.arange(30, 60), 64)
+    assert found is not None
+    assert found.notes[-1].endswith("judged 100 ms, 200 ms; 50 ms end within a row")
+
+
+@pytest.mark.parametrize(("ticks", "how"), [(2, "delayed 330 ms"), (1, "delayed inf ms")])
+def test_the_time_between_episodes_is_no_step_of_ticks(
+    tiny_store: Callable[..., Path], tmp_path: Path, ticks: int, how: str
+) -> None:
+    """Where recorded rows are the ticks, their median step says how long a delay is."""
+    store = FeatureStore.open(tiny_store(tmp_path, ticks=ticks))
+    store.attrs["action_hz"] = None
+    time = store.array("tick/time")
+    starts = 45.0 * np.arange(6)
+    time[::ticks] = starts
+    time[ticks - 1 :: ticks] = starts + (ticks - 1) * np.tile([0.1, 0.12], 3)
+    assert list(delays(store, "features")) == [how]
+
+
+@pytest.mark.parametrize(("asked", "judged"), [(1, 1), (16, 4)])
+def test_a_study_of_a_sampling_policy_is_of_few_samples(
+    tiny_store: Callable[..., Path], tmp_path: Path, asked: int, judged: int
+) -> None:
+    store = FeatureStore.open(tiny_store(tmp_path))
+    checkpoint, policy = trained(store, 1, model_type="flow_matching")
+    ticks = held_out(store)
+    found = evaluate_ablation(checkpoint, policy, store, ticks, 64, samples=asked)
+    assert found is not None
+    assert found.samples == judged
+    assert f"{judged} chunk(s) a tick" in ablation_text(found)
+    few = evaluate_ablation(checkpoint, policy, store, ticks, 64, samples=judged)
+    assert few is not None
+    assert few.intact.overall("policy") == found.intact.overall("policy")

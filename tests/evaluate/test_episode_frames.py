@@ -1,0 +1,173 @@
+"""The frames of a report are those of the recording that the store was made from, or none."""
+
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from pipeline.base.config import Source
+from pipeline.base.digests import file_digest
+from pipeline.data import Recording, content_digest, open_recordings
+from pipeline.data.timeline import Timeline, build_timeline
+from pipeline.evaluate.episode_frames import EpisodeFrames, read_episode_frames, shown_ticks
+from pipeline.simulation.demo_recordings import write_demo_recordings
+from pipeline.store import FeatureStore
+
+FORMATS = ("raw", "new", "old", "lerobot")
+REUSE = 3
+
+
+class Stored:
+    """What a store says of one recording, and the recording's own timeline beside it."""
+
+    def __init__(self, recording: Recording, root: Path, views: Sequence[str]) -> None:
+        self.recording = recording
+        self.timeline: Timeline = build_timeline(recording, 10, REUSE, "rotvec")
+        times = self.timeline.frame_times(views)
+        self.store = SimpleNamespace(
+            spec={"views": list(views)}, array={"vl/frame_time": times}.__getitem__
+        )
+        self.episode = SimpleNamespace(
+            id=recording.id,
+            path=recording.path.relative_to(root).as_posix(),
+            format=recording.format,
+            content=content_digest(recording, file_digest),
+        )
+
+    def frames(self, rows: Sequence[int], root: Path) -> EpisodeFrames:
+        return read_episode_frames(self.store, self.episode, rows, root)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="session")
+def recorded_demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("footage") / "recordings"
+    write_demo_recordings(root, 2, 3)
+    return root
+
+
+@pytest.fixture
+def root(recorded_demo: Path, tmp_path: Path) -> Path:
+    """A copy that a test may spoil."""
+    return shutil.copytree(recorded_demo, tmp_path / "recordings")
+
+
+def stored(root: Path, format: str, views: Sequence[str] | None = None) -> Stored:
+    """The second of the recordings of a format, extracted with these views."""
+    opened = open_recordings([Source(name=format, path=format)], root, views)
+    return Stored(opened.recordings[1], root, views or ("View1", "View2", "View5"))
+
+
+def expected(one: Stored, view: str, rows: Sequence[int]) -> list[np.ndarray]:
+    """The frames by their number on the timeline, not by their time."""
+    indices = one.timeline.frames[view][list(rows)].tolist()
+    return list(one.recording.cameras()[view].read(indices))
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_frames_are_those_that_the_rows_were_made_of(recorded_demo: Path, format: str) -> None:
+    one = stored(recorded_demo, format)
+    rows = [0, 4, 5, len(one.timeline.vl_time) - 1]
+    found = one.frames(rows, recorded_demo)
+    assert found.absence == ""
+    assert list(found.frames) == ["View1", "View2", "View5"]
+    for view, frames in found.frames.items():
+        for frame, right in zip(frames, expected(one, view, rows), strict=True):
+            np.testing.assert_array_equal(frame, right)
+    first, *_, last = found.frames["View2"]
+    assert (first != last).any()
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_only_the_views_of_the_store_are_shown(recorded_demo: Path, format: str) -> None:
+    one = stored(recorded_demo, format, ("View2",))
+    found = one.frames([2], recorded_demo)
+    assert (list(found.frames), found.absence) == (["View2"], "")
+    np.testing.assert_array_equal(found.frames["View2"][0], expected(one, "View2", [2])[0])
+
+
+def a_file(one: Stored) -> Path:
+    """One of the episode's own files that hold no frame."""
+    return next(
+        file for file in one.recording.files() if file.suffix in (".npz", ".pkl", ".csv", ".txt")
+    )
+
+
+@pytest.mark.parametrize("format", ["raw", "new", "lerobot"])
+def test_a_changed_recording_shows_nothing(root: Path, format: str) -> None:
+    one = stored(root, format)
+    file = a_file(one)
+    file.write_bytes(file.read_bytes() + b"\n")
+    found = one.frames([0], root)
+    assert found.frames == {}
+    assert found.absence == (
+        f"No frames: the recording at {root / one.episode.path} changed since the store was made "
+        "from it."
+    )
+
+
+def test_another_frame_under_the_same_name_is_not_shown(root: Path) -> None:
+    one = stored(root, "raw")
+    first, second, *_ = [file for file in one.recording.files() if file.suffix == ".jpg"]
+    shutil.copyfile(second, first)
+    assert one.frames([0], root).frames == {}
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_a_recording_that_is_gone_is_said(root: Path, format: str) -> None:
+    one = stored(root, format)
+    shutil.rmtree(one.recording.path)
+    found = one.frames([0], root)
+    assert found.frames == {}
+    assert f"no recording at {root / one.episode.path} any more" in found.absence
+
+
+def test_another_root_is_said_by_its_path(recorded_demo: Path, tmp_path: Path) -> None:
+    one = stored(recorded_demo, "new")
+    assert str(tmp_path / one.episode.path) in one.frames([0], tmp_path).absence
+
+
+@pytest.mark.parametrize(
+    ("format", "spoil"),
+    [
+        ("lerobot", lambda path: (path / "meta/info.json").write_text("{")),
+        ("lerobot", lambda path: (path / "meta/info.json").unlink()),
+        ("new", lambda path: [file.unlink() for file in path.iterdir() if file.is_file()]),
+    ],
+)
+def test_what_cannot_be_read_is_said_in_one_sentence(
+    root: Path, format: str, spoil: Callable[[Path], None]
+) -> None:
+    one = stored(root, format)
+    spoil(one.recording.path)
+    found = one.frames([0], root)
+    assert found.frames == {}
+    assert found.absence.startswith(
+        f"No frames: the recording at {one.recording.path} cannot be read ("
+    )
+    assert "\n" not in found.absence
+
+
+def test_a_time_between_two_frames_belongs_to_neither(recorded_demo: Path) -> None:
+    one = stored(recorded_demo, "raw")
+    one.store.array("vl/frame_time")[2, 1] += 1e-3
+    found = one.frames([2], recorded_demo)
+    assert found.frames == {}
+    assert "View2 has no frames at the times that the store has" in found.absence
+
+
+def test_a_view_that_the_episode_lacks_is_left_out(recorded_demo: Path) -> None:
+    one = stored(recorded_demo, "raw")
+    one.store.array("vl/frame_time")[:, 0] = np.nan
+    assert list(one.frames([0, 1], recorded_demo).frames) == ["View2", "View5"]
+
+
+def test_ticks_are_shown_where_their_frames_are_newest(store: FeatureStore) -> None:
+    ticks = np.arange(31, 60)
+    found = shown_ticks(store, ticks, 4)
+    assert found.tolist() == [33, 42, 48, 57]
+    assert (found % REUSE == 0).all()
+    assert shown_ticks(store, np.array([31, 32]), 4).tolist() == [31, 32]
+    assert shown_ticks(store, np.arange(30), 1).tolist() == [0]

@@ -1,0 +1,219 @@
+"""The one training loop with a model that learns in front."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+from torch import nn
+
+from pipeline.base.config import Params
+from pipeline.base.errors import CheckpointMismatch, ConfigError
+from pipeline.extract import extract
+from pipeline.policy.checkpoint import find_policy, load_policy
+from pipeline.policy.live_policy import LivePolicy
+from pipeline.store import FeatureStore
+from pipeline.train.batches import BatchIndices, Windows
+from pipeline.train.finetuning import LiveFeatures, head_params, out_of_memory_named
+from pipeline.train.loop import Trainer
+from pipeline.train.run import open_run
+from pipeline.train.scores import evaluate_policy
+from pipeline.train.split import check_store, held_out_ticks, split_by_episode
+
+CPU = torch.device("cpu")
+
+
+def trainer(params: Params) -> Trainer:
+    """A trainer that begins anew or goes on with what lies at `finetune.output`."""
+    store = FeatureStore.open(params.extract.store)
+    head = head_params(params)
+    front = LiveFeatures(store, params, CPU)
+    run = open_run(head, store, front.identity)
+    return Trainer(store, head, split_by_episode(store, head.val_fraction, 2), run, front)
+
+
+def learned(output: Path, which: str = "last") -> dict[str, torch.Tensor]:
+    adapter = load_file(output / which / "adapter" / "adapter_model.safetensors")
+    return adapter | load_file(output / which / "policy.safetensors")
+
+
+def weights(module: nn.Module) -> dict[str, torch.Tensor]:
+    return {n: p.detach().clone() for n, p in module.named_parameters() if p.requires_grad}
+
+
+def test_all_that_learns_does_at_its_own_rate_and_the_loss_falls(
+    params: Callable[..., Params],
+) -> None:
+    still = {"dim": 16, "layers": 1, "heads": 2, "dropout": 0.0}
+    given = params(
+        train_head={"expert": still, "lr_schedule": "constant"},
+        finetune={"batch_size": 12, "max_steps": 16, "eval_every": 16, "checkpoint_every": 16},
+    )
+    made = trainer(given)
+    names = {id(p): n for n, p in made.module.named_parameters()}
+    for group in made.optimizer.param_groups:
+        for parameter in group["params"]:
+            of_model = names[id(parameter)].startswith("vlm.")
+            section = given.finetune if of_model else given.train_head
+            assert group["peak_lr"] == section.lr
+    lora = {n for n in made.learning if n.startswith("vlm.")}
+    assert lora
+    assert all("lora_" in name for name in lora)
+    before = weights(made.module)
+    made.fit()
+    after = weights(made.module)
+    assert [n for n in before if torch.equal(before[n], after[n])] == []
+    losses = made.history.tensor()[:, made.history.columns.index("loss")]
+    assert losses[-4:].mean() < 0.7 * losses[:4].mean()
+
+
+def test_what_is_kept_is_the_averaged_model_that_was_judged(
+    params: Callable[..., Params], tmp_path: Path
+) -> None:
+    """Extracted with the adapter, features are the live ones, and the policy takes them."""
+    given = params(finetune={"max_steps": 4, "eval_every": 4, "eval_ticks": 100})
+    made = trainer(given)
+    made.fit()
+    output = given.finetune.output
+    assert {path.name for path in (output / "best" / "adapter").iterdir()} == {
+        "adapter_config.json",
+        "adapter_model.safetensors",
+    }
+    document = given.model_dump(mode="json")
+    document["vlm"]["adapter"] = str(output / "best" / "adapter")
+    document["extract"]["store"] = str(tmp_path / "tuned.zarr")
+    extract(Params.model_validate(document), say=lambda _: None)
+    store, base = FeatureStore.open(tmp_path / "tuned.zarr"), made.store
+    assert store.spec["digest"] != base.spec["digest"]
+
+    ticks = np.arange(0, store.ticks, 4)
+    averaged = made.averaged
+    assert isinstance(averaged, LivePolicy)
+    assert averaged.vlm is not None
+    with made.source.feed([BatchIndices(ticks)], Windows(2, 1, 1), CPU) as feed, torch.no_grad():
+        _, batch = next(iter(feed))
+        features, _ = averaged.vlm(batch.rows)
+    cached = store.gather(ticks, 2, 1, 1).features
+    torch.testing.assert_close(features[batch.row_of], cached, atol=5e-5, rtol=1e-3)
+    noise = (features[batch.row_of] - cached).abs().max()
+    assert (cached - base.gather(ticks, 2, 1, 1).features).abs().max() > 50 * noise
+
+    # The policy's checkpoint says whose features it takes, and is judged on them as in training.
+    best = load_policy(find_policy(output))
+    check_store(best, store)
+    with pytest.raises(CheckpointMismatch, match=r"feature_spec\.adapter"):
+        check_store(best, base)
+    ticks = held_out_ticks(store, best.held_out_ticks, best.held_out_content)
+    comparison, _ = evaluate_policy(
+        best.policy(), store, ticks, Windows.of(best.params), 64, best.normalization
+    )
+    assert comparison.overall("policy") == pytest.approx(best.metrics["val/error"], rel=1e-3)
+
+
+def test_a_run_goes_on_from_any_checkpoint_to_the_same_bits(
+    params: Callable[..., Params], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = trainer(params(finetune={"output": str(tmp_path / "whole")}))
+    whole.fit()
+    given = params(finetune={"output": str(tmp_path / "stopped")})
+    train = Trainer._train_step
+
+    def stopping(self: Trainer, *rest: Any) -> bool:
+        if self.step == 3:
+            raise RuntimeError("killed")
+        return train(self, *rest)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Trainer, "_train_step", stopping)
+        with pytest.raises(RuntimeError, match="killed"):
+            trainer(given).fit()
+    resumed = trainer(given)
+    assert (resumed.run.status, resumed.step) == ("resumed", 2)
+    resumed.fit()
+    assert torch.equal(resumed.history.tensor(), whole.history.tensor())
+    for which in ("best", "last"):
+        one, other = (learned(tmp_path / run, which) for run in ("whole", "stopped"))
+        assert one.keys() == other.keys()
+        assert all(torch.equal(one[name], other[name]) for name in one)
+
+
+def test_parts_of_a_step_give_the_whole_step(params: Callable[..., Params], tmp_path: Path) -> None:
+    losses = []
+    # Dropout differs from part to part.
+    still = {"tuning": {"lora_r": 4, "lora_alpha": 8, "lora_dropout": 0.0}}
+    for parts in (1, 3):
+        made = trainer(
+            params(
+                train_head={"expert": {"dim": 16, "layers": 1, "heads": 2, "dropout": 0.0}},
+                finetune={
+                    **still,
+                    "max_steps": 2,
+                    "grad_accumulation": parts,
+                    "output": str(tmp_path / f"parts{parts}"),
+                },
+            )
+        )
+        made.fit()
+        losses.append(made.history.tensor())
+    torch.testing.assert_close(losses[0], losses[1], atol=1e-4, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("changed", "another"),
+    [
+        ({"lr": 2e-3}, True),
+        ({"tuning": {"lora_r": 4, "lora_alpha": 8, "towers": ["vision"]}}, True),
+        ({"tuning": {"lora_r": 4, "lora_alpha": 8, "gradient_checkpointing": False}}, False),
+        ({"decode_threads": 1}, False),
+    ],
+)
+def test_a_setting_that_decides_the_numbers_is_another_run(
+    store: FeatureStore, params: Callable[..., Params], changed: dict[str, Any], another: bool
+) -> None:
+    before = LiveFeatures(store, params(), CPU).identity
+    after = LiveFeatures(store, params(finetune=changed), CPU).identity
+    assert (before != after) == another
+    json.dumps(before)
+
+
+def test_full_tuning_saves_a_checkpoint_to_extract_with(
+    params: Callable[..., Params], tmp_path: Path
+) -> None:
+    given = params(finetune={"tuning": {"method": "full"}, "max_steps": 1, "lr": 1e-4})
+    made = trainer(given)
+    made.fit()
+    best = given.finetune.output / "best"
+    document = given.model_dump(mode="json")
+    document["vlm"]["checkpoint"] = str(best / "checkpoint")
+    document["extract"]["store"] = str(tmp_path / "full.zarr")
+    extract(Params.model_validate(document), say=lambda _: None)
+    check_store(load_policy(best), FeatureStore.open(tmp_path / "full.zarr"))
+
+
+def test_a_gpu_that_is_too_small_ends_in_what_takes_less() -> None:
+    with pytest.raises(ConfigError, match=r"finetune\.grad_accumulation"), out_of_memory_named():
+        raise torch.cuda.OutOfMemoryError("tried to allocate 2.00 GiB")
+
+
+def test_what_is_not_used_of_a_store_is_said(params: Callable[..., Params], tmp_path: Path) -> None:
+    document = params().model_dump(mode="json")
+    document["vlm"]["variants"] = 2
+    document["extract"]["store"] = str(tmp_path / "variants.zarr")
+    given = Params.model_validate(document)
+    extract(given, say=lambda _: None)
+    store = FeatureStore.open(given.extract.store)
+    front = LiveFeatures(store, given, CPU)
+    assert any("1 augmented variant(s) of each row are not used" in s for s in front.summary())
+    draw = BatchIndices(np.arange(6), variants=np.ones(6, np.int64))
+    with front.feed([draw], Windows(2, 1, 1), CPU) as feed:
+        _, live = next(iter(feed))
+    with LiveFeatures(FeatureStore.open(params().extract.store), params(), CPU).feed(
+        [BatchIndices(np.arange(6))], Windows(2, 1, 1), CPU
+    ) as feed:
+        _, plain = next(iter(feed))
+    for one, other in zip(live.rows, plain.rows, strict=True):
+        assert np.array_equal(one.pixels, other.pixels)

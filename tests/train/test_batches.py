@@ -1,0 +1,186 @@
+"""Batches come in order, whole, and are not touched while they are in use."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import zarr
+
+from pipeline.base.config import TrainHeadParams
+from pipeline.store import Batch, FeatureStore
+from pipeline.train.batches import BatchIndices, Lags, Prefetch, Windows, cut_batches
+
+CPU = torch.device("cpu")
+WINDOWS = Windows(horizon=4, sensor_window=6, state_window=5)
+
+
+@pytest.fixture(scope="module")
+def store(
+    tiny_store: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory
+) -> FeatureStore:
+    return FeatureStore.open(tiny_store(tmp_path_factory.mktemp("batches")))
+
+
+def plan(store: FeatureStore, batches: int, size: int = 7) -> list[BatchIndices]:
+    rng = np.random.default_rng(0)
+    return [
+        BatchIndices(rng.integers(0, store.ticks, size), rng.integers(0, store.variants, size))
+        for _ in range(batches)
+    ]
+
+
+def at(*ticks: int) -> BatchIndices:
+    return BatchIndices(np.array(ticks))
+
+
+def fresh(store: FeatureStore, draw: BatchIndices, **lags: float) -> Batch:
+    sizes = {"horizon": 4, "sensor_window": 6, "state_window": 5}
+    return store.gather(draw.ticks, **sizes, **lags, variants=draw.variants)
+
+
+def equal(found: Batch, expected: Batch) -> bool:
+    return all(torch.equal(getattr(found, name), value) for name, value in vars(expected).items())
+
+
+def threads() -> int:
+    return sum(thread.name.startswith("prefetch") for thread in threading.enumerate())
+
+
+@pytest.mark.parametrize("buffers", [2, 3])
+def test_batches_are_those_of_gather_in_the_order_of_the_plan(
+    store: FeatureStore, buffers: int
+) -> None:
+    wanted = plan(store, 25)
+    with Prefetch(store, wanted, WINDOWS, CPU, buffers) as batches:
+        for draw, (found, batch) in zip(wanted, batches, strict=True):
+            assert found is draw
+            assert equal(batch, fresh(store, draw))
+
+
+def test_draws_are_the_ticks_in_order_and_the_plain_frames() -> None:
+    found = cut_batches(np.arange(20), 8)
+    assert [draw.ticks.tolist() for draw in found] == [
+        [*range(8)],
+        [*range(8, 16)],
+        [*range(16, 20)],
+    ]
+    assert all(draw.variants is None for draw in found)
+
+
+def test_lags_are_those_of_gather(store: FeatureStore) -> None:
+    wanted = plan(store, 2)
+    with Prefetch(store, wanted, WINDOWS, CPU, lags=Lags(2, 0.1, 0.2)) as batches:
+        for draw, batch in batches:
+            late = fresh(store, draw, feature_lag=2, sensor_lag_s=0.1, state_lag_s=0.2)
+            assert equal(batch, late)
+            assert not equal(batch, fresh(store, draw))
+
+
+def test_variants_reach_the_store(tiny_store: Callable[..., Path], tmp_path: Path) -> None:
+    path = tiny_store(tmp_path, slots=6)
+    zarr.open_group(path, mode="r+").attrs["feature_spec"] = {"digest": "two", "variants": 2}
+    store = FeatureStore.open(path)
+    assert store.variants == 2
+    wanted = plan(store, 4)
+    with Prefetch(store, wanted, WINDOWS, CPU) as batches:
+        for draw, batch in batches:
+            assert equal(batch, fresh(store, draw))
+            assert not equal(batch, fresh(store, BatchIndices(draw.ticks)))
+
+
+def test_a_batch_is_not_overwritten_before_the_next_is_asked_for(store: FeatureStore) -> None:
+    with Prefetch(store, plan(store, 6), WINDOWS, CPU) as batches:
+        for draw, batch in batches:
+            time.sleep(0.02)  # the thread has long filled what it may
+            assert torch.equal(batch.sensor, fresh(store, draw).sensor)
+
+
+def test_buffers_are_reused(store: FeatureStore) -> None:
+    with Prefetch(store, plan(store, 12), WINDOWS, CPU) as batches:
+        places = {batch.sensor.data_ptr() for _, batch in batches}
+    assert len(places) == 2
+
+
+def test_a_last_batch_may_be_smaller(store: FeatureStore) -> None:
+    with Prefetch(store, cut_batches(np.arange(20), 8), WINDOWS, CPU) as batches:
+        assert [len(batch) for _, batch in batches] == [8, 8, 4]
+
+
+def test_an_exception_comes_out_at_its_batch_and_ends_the_thread(store: FeatureStore) -> None:
+    wanted = [at(0, 1), at(2, 3), at(store.ticks)]
+    batches = Prefetch(store, wanted, WINDOWS, CPU)
+    assert next(batches)[0].ticks.tolist() == [0, 1]
+    assert next(batches)[0].ticks.tolist() == [2, 3]
+    with pytest.raises(IndexError, match="ticks lie in"):
+        next(batches)
+    with pytest.raises(StopIteration):
+        next(batches)
+    assert threads() == 0
+
+
+def test_an_exception_of_the_plan_is_handed_on(store: FeatureStore) -> None:
+    def failing() -> Iterator[BatchIndices]:
+        yield at(0)
+        raise RuntimeError("no more ticks")
+
+    with Prefetch(store, failing(), WINDOWS, CPU) as batches:
+        next(batches)
+        with pytest.raises(RuntimeError, match="no more ticks"):
+            next(batches)
+
+
+def test_leaving_early_ends_the_thread_and_an_endless_plan(store: FeatureStore) -> None:
+    def endless() -> Iterator[BatchIndices]:
+        while True:
+            yield at(1, 2, 3)
+
+    with Prefetch(store, endless(), WINDOWS, CPU) as batches:
+        draw, batch = next(batches)
+        assert threads() == 1
+    assert threads() == 0
+    assert torch.equal(batch.action, fresh(store, draw).action)
+
+
+def test_the_plan_is_consumed_no_further_ahead_than_there_are_buffers(store: FeatureStore) -> None:
+    taken: list[int] = []
+
+    def counted() -> Iterator[BatchIndices]:
+        for step in range(100):
+            taken.append(step)
+            yield at(step)
+
+    with Prefetch(store, counted(), WINDOWS, CPU) as batches:
+        next(batches)
+        time.sleep(0.05)
+        assert len(taken) <= 3
+
+
+def test_waiting_is_measured(store: FeatureStore) -> None:
+    def slow() -> Iterator[BatchIndices]:
+        for step in range(3):
+            time.sleep(0.03)
+            yield at(step)
+
+    with Prefetch(store, slow(), WINDOWS, CPU) as batches:
+        assert len(list(batches)) == 3
+        assert batches.waited_s > 0.06
+
+
+def test_a_disabled_encoder_costs_a_single_reading() -> None:
+    params = TrainHeadParams(sensor_enabled=False, sensor_window=650, state_window=10)
+    assert Windows.of(params) == Windows(horizon=8, sensor_window=1, state_window=10)
+    assert Windows.of(TrainHeadParams(robot_state_enabled=False)).state_window == 1
+
+
+@pytest.mark.gpu
+def test_on_a_gpu_batches_are_copies_that_stay(store: FeatureStore) -> None:
+    wanted = plan(store, 12)
+    with Prefetch(store, wanted, WINDOWS, torch.device("cuda")) as batches:
+        kept = [batch for _, batch in batches]
+    for draw, batch in zip(wanted, kept, strict=True):
+        assert batch.sensor.is_cuda
+        assert torch.equal(batch.sensor.cpu(), fresh(store, draw).sensor)

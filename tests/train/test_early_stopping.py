@@ -1,0 +1,100 @@
+"""A run ends when it has stopped getting better, wherever it is stopped on the way."""
+
+import csv
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.base.errors import ConfigError
+from pipeline.policy.checkpoint import load_policy
+from pipeline.store import FeatureStore
+from pipeline.train.loop import EVALUATION_TICKS, EarlyStopping, Trainer, evaluation_ticks
+
+Make = Callable[..., Any]
+
+
+class Stop(Exception):
+    """Stands for the end of the process."""
+
+
+def test_it_counts_since_the_best() -> None:
+    stopping = EarlyStopping(patience=2)
+    assert [stopping.take(error) for error in (3.0, 2.0, 2.0, 1.0)] == [True, True, False, True]
+    assert (stopping.best_error, stopping.stalled, stopping.exhausted) == (1.0, 0, False)
+    stopping.take(5.0)
+    assert not stopping.exhausted
+    stopping.take(1.5)
+    assert stopping.exhausted
+    assert not EarlyStopping(None, 1.0, stalled=10**6).exhausted
+
+
+def test_ticks_of_an_evaluation_are_spread_and_limited() -> None:
+    ticks = np.arange(5000)
+    found = evaluation_ticks(ticks, None)
+    assert (len(found), found[0], found[-1]) == (EVALUATION_TICKS, 0, 4999)
+    assert evaluation_ticks(ticks, 3).tolist() == [0, 2500, 4999]
+    assert evaluation_ticks(ticks[:2], 3).tolist() == [0, 1]
+    assert evaluation_ticks(ticks[:0], 3).tolist() == []
+
+
+def test_stopping_early_needs_something_held_out(
+    store: FeatureStore, params: Make, trainer: Make
+) -> None:
+    with pytest.raises(ConfigError, match="early_stopping is 3, but nothing is held out") as caught:
+        trainer(store, params(early_stopping=3, val_fraction=0))
+    assert "train_head.val_fraction is 0. Set it above 0" in str(caught.value)
+    assert not params().output.with_name("head.part").exists()
+
+
+@pytest.fixture
+def errors(monkeypatch: pytest.MonkeyPatch) -> dict[int, float]:
+    """What evaluations find, by step; the best is at step 4."""
+    found = {2: 0.9, 4: 0.5, 6: 0.8, 8: 0.6, 10: 0.7, 12: 0.1}
+    monkeypatch.setattr(
+        Trainer,
+        "_measure",
+        lambda self, log: (
+            log.write(self.step, {"val/error": found[self.step]}) or {"val/error": found[self.step]}
+        ),
+    )
+    return found
+
+
+@pytest.mark.parametrize("stopped", [None, 5, 7, 9, "finish"])
+def test_it_stops_early_also_when_it_was_interrupted(
+    store: FeatureStore,
+    params: Make,
+    trainer: Make,
+    errors: dict[int, float],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    stopped: int | str | None,
+) -> None:
+    chosen = params(early_stopping=3, eval_every=2, checkpoint_every=1, max_steps=100)
+    real = Trainer._train_step
+
+    def killed(self: Trainer, *rest: Any) -> bool:
+        if self.step == stopped:
+            raise Stop
+        return real(self, *rest)
+
+    def killed_at_the_end(*rest: Any) -> None:
+        raise Stop
+
+    if stopped is not None:
+        with monkeypatch.context() as patched:
+            patched.setattr(Trainer, "_train_step", killed)
+            if stopped == "finish":
+                patched.setattr("pipeline.train.run.TrainingRun.finish", killed_at_the_end)
+            with pytest.raises(Stop):
+                trainer(store, chosen).fit()
+    done = trainer(store, chosen)
+    done.fit()
+    assert done.step == 10
+    assert "stopped early at step 10: 3 evaluations without a better one" in capsys.readouterr().out
+    assert load_policy(done.run.output / "best").step == 4
+    assert load_policy(done.run.output / "last").step == 10
+    with (chosen.logs / "plots/metrics/train/loss.tsv").open() as file:
+        assert [row["step"] for row in csv.DictReader(file, delimiter="\t")] == ["10"]

@@ -1,0 +1,333 @@
+"""The loggers: the same rows to each, a stop that leaves no step twice, and what is missing."""
+
+import errno
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.base.config import TrainHeadParams
+from pipeline.base.durable import read_document, write_document
+from pipeline.base.errors import ConfigError, DiskFull
+from pipeline.base.ownership import MARKER
+from pipeline.store import FeatureStore
+from pipeline.train import log as loggers
+from pipeline.train.log import TrainingLog, check_loggers
+from pipeline.train.loop import Trainer
+from pipeline.train.run import open_run
+
+ROOT = Path(__file__).resolve().parents[2]
+LOGS = {MARKER, "plots", "metrics.json"}
+Make = Callable[..., Any]
+WANDB = """
+import sys
+from pathlib import Path
+from pipeline.base.config import TrainHeadParams
+from pipeline.train.log import WandB
+
+place = Path(sys.argv[1])
+params = TrainHeadParams(output=place / "head", wandb_project="needles")
+for resumed in (False, True):
+    run = WandB(place / "logs.wandb", params, resumed)
+    print(run.note, (place / "logs.wandb/id").read_text())
+    run.write(10, {"train/loss": 0.125})
+    run.write(10, {"val/error": 0.375})
+    run.close(finished=True)
+"""
+
+
+class Stop(Exception):
+    """Stands for the end of the process."""
+
+
+class Kept:
+    """A logger that keeps what it is handed."""
+
+    note = "live: here"
+
+    def __init__(self) -> None:
+        self.rows: list[tuple[int, dict[str, float]]] = []
+        self.closed: list[bool] = []
+
+    def write(self, step: int, metrics: Mapping[str, float]) -> None:
+        self.rows.append((step, dict(metrics)))
+
+    def close(self, finished: bool) -> None:
+        self.closed.append(finished)
+
+
+@pytest.fixture
+def stop_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[Trainer, int], None]:
+    """`stop_at(trainer, step)`: train until this step has begun, and end as a kill does."""
+    real = Trainer._train_step
+
+    def stop(trainer: Trainer, step: int) -> None:
+        def killed(self: Trainer, *rest: Any) -> bool:
+            if self.step == step:
+                raise Stop
+            return real(self, *rest)
+
+        with monkeypatch.context() as patched:
+            patched.setattr(Trainer, "_train_step", killed)
+            with pytest.raises(Stop):
+                trainer.fit()
+
+    return stop
+
+
+def scalars(folder: Path) -> dict[str, list[tuple[int, float]]]:
+    """What TensorBoard reads in a folder."""
+    accumulator = pytest.importorskip(
+        "tensorboard.backend.event_processing.event_accumulator",
+        reason="tensorboard is not installed: pip install 'vla-feature-cache[loggers]'",
+    )
+    events = accumulator.EventAccumulator(str(folder))
+    events.Reload()
+    return {
+        tag: [(one.step, one.value) for one in events.Scalars(tag)]
+        for tag in events.Tags()["scalars"]
+    }
+
+
+def curves(logs: Path) -> dict[str, list[tuple[int, float]]]:
+    root = logs / "plots" / "metrics"
+    found: dict[str, list[tuple[int, float]]] = {}
+    for file in root.rglob("*.tsv"):
+        lines = [line.split("\t") for line in file.read_text().splitlines()[1:]]
+        name = file.relative_to(root).with_suffix("").as_posix()
+        found[name] = [(int(step), float(value)) for step, value in lines]
+    return found
+
+
+@pytest.mark.extra
+def test_every_logger_has_the_curves_of_dvc_after_a_stop_too(
+    store: FeatureStore,
+    params: Make,
+    trainer: Make,
+    stop_at: Callable[[Trainer, int], None],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The stop comes at step 17, the last checkpoint is of step 15: 16 and 17 come again."""
+    pytest.importorskip("tensorboard", reason="tensorboard is not installed")
+    monkeypatch.setattr("pipeline.train.loop.LOG_EVERY", 1)
+    chosen = params(loggers=["tensorboard"])
+    events = chosen.logs.with_name("logs.tensorboard")
+    stop_at(trainer(store, chosen), 17)
+    assert f"live: tensorboard --logdir {events}" in capsys.readouterr().out
+    assert scalars(events)["train/loss"][-1][0] == 17
+    resumed = trainer(store, chosen)
+    assert (resumed.run.status, resumed.step) == ("resumed", 15)
+    resumed.fit()
+    expected = curves(chosen.logs)
+    assert [step for step, _ in expected["train/loss"]] == list(range(1, 21))
+    found = scalars(events)
+    assert found.keys() == expected.keys()
+    for name, points in expected.items():
+        assert [step for step, _ in found[name]] == [step for step, _ in points], name
+        assert [v for _, v in found[name]] == pytest.approx([v for _, v in points], rel=1e-6)
+    assert {path.name for path in chosen.logs.iterdir()} == LOGS
+
+
+@pytest.mark.extra
+def test_a_tensorboard_that_has_read_the_killed_start_forgets_it(tmp_path: Path) -> None:
+    """What it keeps in memory goes too, and it goes on with the newer file."""
+    accumulator = pytest.importorskip(
+        "tensorboard.backend.event_processing.event_accumulator", reason="no tensorboard"
+    )
+    first = loggers.TensorBoard(tmp_path)
+    for step in (10, 20, 30):
+        first.write(step, {"train/loss": 1.0})
+    first.close(finished=False)
+    watching = accumulator.EventAccumulator(str(tmp_path))
+    watching.Reload()
+    again = loggers.TensorBoard(tmp_path)
+    for step in (10, 20):
+        again.write(step, {"train/loss": 2.0})
+    again.close(finished=True)
+    watching.Reload()
+    assert [(one.step, one.value) for one in watching.Scalars("train/loss")] == [(10, 2), (20, 2)]
+
+
+def test_who_shows_the_curves_decides_no_number(
+    store: FeatureStore, params: Make, trainer: Make, stop_at: Callable[[Trainer, int], None]
+) -> None:
+    stop_at(trainer(store, params(loggers=[])), 11)
+    resumed = trainer(store, params(wandb_project="other"))
+    assert resumed.run.status == "resumed"
+    resumed.fit()
+    assert open_run(params(loggers=["tensorboard"]), store).status == "finished"
+    decides = read_document(params().output / "run.json")["decides"]["train_head"]
+    assert not {"loggers", "wandb_project"} & decides.keys(), "as a run of before knows them"
+
+
+EARLIER = {"loggers": ["report"], "scratch": None, "feed": "compressed"}
+"""Keys and values of `train_head` that there were."""
+
+
+@pytest.mark.parametrize("earlier", [{}, EARLIER], ids=["no loggers", "other loggers"])
+def test_a_run_of_an_earlier_version_goes_on(
+    store: FeatureStore,
+    params: Make,
+    trainer: Make,
+    stop_at: Callable[[Trainer, int], None],
+    earlier: dict[str, Any],
+) -> None:
+    stop_at(trainer(store, params()), 11)
+    written = params().output.with_name("head.part") / "last" / "policy.json"
+    document = read_document(written)
+    head = document["params"]["train_head"]
+    for key in ("loggers", "wandb_project"):
+        del head[key]
+    head |= earlier
+    write_document(written, document)
+    resumed = trainer(store, params())
+    assert (resumed.run.status, resumed.step) == ("resumed", 10)
+
+
+def test_a_missing_package_and_one_that_does_not_load_are_named(
+    tmp_path: Path, params: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is left of wandb is the folder it makes where it runs; tensorboard is half installed."""
+    for name in [
+        name for name in sys.modules if name.partition(".")[0] in ("wandb", "tensorboard")
+    ]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.delitem(sys.modules, "torch.utils.tensorboard", raising=False)
+    (tmp_path / "wandb").mkdir()
+    (tmp_path / "tensorboard").mkdir()
+    (tmp_path / "tensorboard" / "__init__.py").write_text("raise ImportError('no protobuf')")
+    monkeypatch.setattr("sys.path", [str(tmp_path)])
+    chosen = params(loggers=["tensorboard", "wandb"])
+    with pytest.raises(ConfigError, match=r"tensorboard \(no protobuf\), wandb \(No module named"):
+        check_loggers(chosen)
+    check_loggers(params(loggers=[]))
+
+
+def test_curves_are_those_that_dvc_plots(tmp_path: Path, params: Make) -> None:
+    chosen = params(max_steps=20)
+    for last in (30, 20):
+        opened = loggers.open_loggers(chosen, resumed=False)
+        with TrainingLog(chosen.logs, opened) as log:
+            for step in range(10, last + 10, 10):
+                log.write(step, {"train/loss": 1 / step, "lr": float("nan")})
+    assert opened[0].note == f"live: dvc plots show {chosen.logs}/plots/metrics"
+    assert {path.name for path in chosen.logs.iterdir()} == LOGS
+    metrics = chosen.logs / "plots" / "metrics"
+    # As dvclive writes them.
+    assert (metrics / "train" / "loss.tsv").read_text() == "step\tloss\n10\t0.1\n20\t0.05\n"
+    assert (metrics / "lr.tsv").read_text() == "step\tlr\n10\tnan\n20\tnan\n"
+    newest = json.loads((chosen.logs / "metrics.json").read_text())
+    assert newest == {"train": {"loss": 0.05}, "lr": "nan", "step": 20}
+
+
+def test_a_full_disk_is_named_and_every_logger_is_closed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept, full = Kept(), Kept()
+
+    def fail(step: int, metrics: Mapping[str, float]) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(full, "write", fail)
+    with pytest.raises(DiskFull), TrainingLog(tmp_path, [full, kept]) as log:
+        log.write(10, {"train/loss": 1.0})
+    assert kept.closed == full.closed == [False]
+
+
+def test_curves_that_find_no_room_are_a_full_disk(small_disk: Path) -> None:
+    curves = loggers.CurveFiles(small_disk)
+    (small_disk / "ballast").write_bytes(b"")
+    with pytest.raises(OSError, match="No space"), (small_disk / "ballast").open("wb") as file:
+        file.write(bytes(16 << 20))
+    with pytest.raises(DiskFull), TrainingLog(small_disk / "logs", [curves]) as log:
+        log.write(10, {f"train/{name}": 1.0 for name in range(100)})
+
+
+@pytest.mark.extra
+def test_weights_and_biases_keeps_a_run_offline_and_goes_on_under_its_id(tmp_path: Path) -> None:
+    # A folder `wandb`, as it leaves where it runs, is no package: it has none of its modules.
+    pytest.importorskip(
+        "wandb.sdk", reason="wandb is not installed: pip install 'vla-feature-cache[loggers]'"
+    )
+    private = {f"WANDB_{name}_DIR": str(tmp_path / name) for name in ("CONFIG", "CACHE", "DATA")}
+    ran = subprocess.run(
+        [sys.executable, "-c", WANDB, str(tmp_path)],
+        capture_output=True,
+        text=True,
+        timeout=100,
+        env=os.environ | private | {"WANDB_MODE": "offline", "PYTHONPATH": str(ROOT)},
+    )
+    assert (ran.returncode, ran.stderr) == (0, "")
+    first, again = ran.stdout.splitlines()
+    assert first.startswith(f"wandb is offline; wandb sync {tmp_path}/logs.wandb/")
+    identifier = (tmp_path / "logs.wandb/id").read_text()
+    assert first.split()[-1] == again.split()[-1] == identifier
+    for kept in (tmp_path / "logs.wandb").rglob("*.wandb"):
+        assert identifier in kept.name
+        content = kept.read_bytes()
+        for text in (b"needles", b"train/loss", b"0.125", b"val/error", b"0.375", b"max_steps"):
+            assert text in content, text
+
+
+def test_another_run_of_the_same_folder_has_another_id(tmp_path: Path) -> None:
+    first = loggers._run_id(tmp_path / "id", resumed=False)
+    assert loggers._run_id(tmp_path / "id", resumed=True) == first
+    assert loggers._run_id(tmp_path / "id", resumed=False) != first
+
+
+class Service:
+    """Stands for wandb: a run of which the service has rows up to `starting_step`."""
+
+    class Error(Exception):
+        pass
+
+    def __init__(self, starting_step: int = 0, refuses: str = "") -> None:
+        self.starting_step, self.refuses = starting_step, refuses
+        self.offline, self.url = False, "https://service/run"
+        self.logged: list[tuple[int, dict[str, float]]] = []
+        self.settings: Any = None
+        self.given: dict[str, Any] = {}
+
+    def Settings(self, **given: Any) -> dict[str, Any]:  # noqa: N802
+        return given
+
+    def init(self, **given: Any) -> "Service":
+        self.given = given
+        if self.refuses:
+            raise self.Error(self.refuses)
+        return self
+
+    def log(self, metrics: dict[str, float], step: int) -> None:
+        self.logged.append((step, metrics))
+
+    def finish(self, exit_code: int) -> None:
+        raise self.Error("the service is gone")
+
+
+def test_rows_that_the_service_has_are_not_sent_again_and_its_loss_stops_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    service = Service(starting_step=21)
+    monkeypatch.setitem(sys.modules, "wandb", service)
+    run = loggers.WandB(tmp_path, TrainHeadParams(wandb_project="needles"), resumed=True)
+    assert (service.given["project"], service.given["resume"]) == ("needles", "allow")
+    for step in (10, 20, 30):
+        run.write(step, {"train/loss": 1.0})
+    assert service.logged == [(30, {"train/loss": 1.0})]
+    run.close(finished=True)
+    assert "not everything could be sent (the service is gone)" in capsys.readouterr().out
+
+
+def test_a_service_that_takes_no_run_is_said_before_anything_is_done(
+    store: FeatureStore, params: Make, trainer: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "wandb", Service(refuses="no API key."))
+    with pytest.raises(ConfigError, match=r"no API key\. Log in with `wandb login`"):
+        trainer(store, params(loggers=["wandb"])).fit()
+    assert not params().output.with_name("head.part").exists()
