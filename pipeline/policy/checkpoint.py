@@ -193,6 +193,7 @@ def _params(document: Mapping[str, Any]) -> TrainHeadParams:
     )
 
 
+@cache
 def _note_without_digest(path: Path) -> None:
     """Say it once in a process: a checkpoint is read several times."""
     print(

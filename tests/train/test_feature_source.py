@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.durable import read_document
 from pipeline.policy.checkpoint import load_policy
-from pipeline.policy.policy import Policy
+from pipeline.policy.policy import Policy, Trainable
 from pipeline.store import FeatureStore
 from pipeline.train.batches import BatchIndices, Feed, Prefetch, Windows
 from pipeline.train.loop import Trainer
@@ -21,7 +21,7 @@ from pipeline.train.split import split_by_episode
 Make = Callable[..., Any]
 
 
-class Adapted(nn.Module):
+class Adapted(Trainable):
     """A policy whose features pass a large frozen matrix and a small one that learns."""
 
     def __init__(self, policy: Policy, dim: int) -> None:
