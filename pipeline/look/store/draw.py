@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 from pipeline.base.channels import PROFILE_CHANNELS, unnumbered
 from pipeline.base.format import size
 from pipeline.look.page.style import GRID, INK, PALETTE, canvas
-from pipeline.look.recording.facts import ChannelStatistics
+from pipeline.look.recording.channels import ChannelStatistics
 from pipeline.look.store.facts import Ages, ArraySize, EpisodeCoverage, StoreView
 
 _ABSENT, _PARTLY, _PRESENT = "#D55E00", "#E69F00", "#0072B2"

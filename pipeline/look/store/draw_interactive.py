@@ -1,5 +1,6 @@
 """The features of a store in a plane that can be zoomed and hovered."""
 
+import html
 from collections.abc import Mapping
 from typing import Any, Literal
 
@@ -8,7 +9,6 @@ import plotly.graph_objects as go
 from numpy.typing import NDArray
 
 from pipeline.look.page.style import PALETTE
-from pipeline.look.recording.draw_interactive import layout, plain
 from pipeline.look.store.draw_features import PROGRESS
 from pipeline.look.store.facts import StoreView
 
@@ -98,3 +98,28 @@ def _dots(
             ),
         )
     )
+
+
+def layout() -> dict[str, Any]:
+    """Of every chart: axes that are seen on white and on black, and no background."""
+    axis = {
+        "gridcolor": "rgba(136, 136, 136, 0.3)",
+        "linecolor": "#888888",
+        "zeroline": False,
+        "automargin": True,
+    }
+    return {
+        "template": "none",
+        "paper_bgcolor": "rgba(0, 0, 0, 0)",
+        "plot_bgcolor": "rgba(0, 0, 0, 0)",
+        "margin": {"l": 10, "r": 10, "t": 10, "b": 45},
+        "xaxis": axis,
+        "yaxis": axis,
+        "dragmode": "pan",
+        "hovermode": "closest",
+    }
+
+
+def plain(name: str) -> str:
+    """A recording's name for plotly, which reads texts as HTML."""
+    return html.escape(name, quote=False)

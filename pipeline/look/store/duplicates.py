@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.look.recording.runs import runs
+from pipeline.look.recording.episode import runs
 from pipeline.look.store.features import FeatureRows, SampledRows
 from pipeline.store import KEY_BYTES, FeatureStore, episode_name
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.base.config import InspectParams
-from pipeline.look.recording.facts import Flaw
+from pipeline.base.issue import Issue as Flaw
 from pipeline.look.store.coverage import Ages, EpisodeCoverage, ages, coverage
 from pipeline.look.store.duplicates import Duplicates, Still, Twins, find_duplicates
 from pipeline.look.store.feature_flaws import broken_rows, feature_flaws

@@ -6,7 +6,7 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.look.recording.facts import Flaw
+from pipeline.base.issue import Issue as Flaw
 from pipeline.look.store.coverage import EpisodeCoverage
 from pipeline.look.store.duplicates import Duplicates
 from pipeline.look.store.features import FeatureRows, Outlier, SampledRows
@@ -57,7 +57,7 @@ def _dead_slots(found: FeatureRows) -> Iterator[Flaw]:
     if dead:
         said = f"{listed(dead)}: the same in all {len(found.sampled.rows)} VL rows looked at; "
         said += "expected features that follow the scene (is a camera dead, or its view black?)"
-        yield Flaw("dead slot", "warning", "", "", "vl/features", None, None, said)
+        yield Flaw(kind="dead slot", severity="warning", stream="vl/features", message=said)
 
 
 def _still_episodes(episodes: Sequence[EpisodeCoverage], found: FeatureRows) -> Iterator[Flaw]:

@@ -6,8 +6,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.base.issue import Issue as Flaw
 from pipeline.data.timeline import COARSEST_S
-from pipeline.look.recording.facts import ChannelStatistics, Flaw
+from pipeline.look.recording.channels import ChannelStatistics
 from pipeline.look.store.coverage import Ages, EpisodeCoverage
 from pipeline.look.store.statistics import StreamStatistics
 from pipeline.store import FeatureStore
@@ -55,7 +56,16 @@ def flaw_of(
     error: bool = False,
 ) -> Flaw:
     """A flaw of an episode, all of it where no `span` is given."""
-    return Flaw(kind, "error" if error else "warning", one.source, one.id, stream, *span, message)
+    return Flaw(
+        kind=kind,
+        severity="error" if error else "warning",
+        source=one.source,
+        episode=one.id,
+        stream=stream,
+        start_s=span[0],
+        stop_s=span[1],
+        message=message,
+    )
 
 
 def listed(names: Sequence[str]) -> str:
@@ -118,8 +128,14 @@ def _missing(episodes: Sequence[EpisodeCoverage]) -> Iterator[Flaw]:
             if lacking:
                 found = f"{len(lacking)} of {len(ones)} episodes of this source lack it; others of "
                 found += "the store have it"
-                where = (source, listed(lacking), _stream(stream))
-                yield Flaw("missing", "warning", *where, None, None, found)
+                yield Flaw(
+                    kind="missing",
+                    severity="warning",
+                    source=source,
+                    episode=listed(lacking),
+                    stream=_stream(stream),
+                    message=found,
+                )
             for one in ones:
                 if 0 < one.covered[stream] < 1:
                     found = f"only {one.covered[stream]:.0%} of the ticks see it"
@@ -157,7 +173,7 @@ def _constant(statistics: Sequence[StreamStatistics]) -> Iterator[Flaw]:
         ]
         if still:
             found = f"{listed(still)}: one value in all {stream.looked_at} rows looked at"
-            yield Flaw("flat channel", "warning", "", "", stream.stream, None, None, found)
+            yield Flaw(kind="flat channel", severity="warning", stream=stream.stream, message=found)
 
 
 def _not_finite(statistics: Sequence[StreamStatistics]) -> Iterator[Flaw]:
@@ -165,14 +181,16 @@ def _not_finite(statistics: Sequence[StreamStatistics]) -> Iterator[Flaw]:
         bad = [one.name for one in stream.channels if not np.isfinite(one.mean)]
         if bad:
             found = f"{listed(bad)}: NaN or infinite in the {stream.looked_at} rows looked at"
-            yield Flaw("not finite", "error", "", "", stream.stream, None, None, found)
+            yield Flaw(kind="not finite", severity="error", stream=stream.stream, message=found)
 
 
 def _still(statistics: Sequence[StreamStatistics]) -> Iterator[Flaw]:
     for stream in statistics:
         if stream.still is not None:
-            where = ("", "", stream.stream, None, None)
-            yield Flaw("still channel", "warning", *where, stream.still[1])
+            message = stream.still[1]
+            yield Flaw(
+                kind="still channel", severity="warning", stream=stream.stream, message=message
+            )
 
 
 def _noise(statistics: Sequence[StreamStatistics]) -> Iterator[Flaw]:
@@ -192,4 +210,4 @@ def _noise(statistics: Sequence[StreamStatistics]) -> Iterator[Flaw]:
                 found += f"{most:.2g} {unit}, under {_NOISE:.0%} of the median of this unit's "
                 found += f"channels, {usual:.2g} {unit}; normalised, this noise weighs as much as "
                 found += "their signal"
-                yield Flaw("noise", "warning", "", "", stream.stream, None, None, found)
+                yield Flaw(kind="noise", severity="warning", stream=stream.stream, message=found)

@@ -19,9 +19,8 @@ from pipeline.look.page.blocks import (
     Table,
     Text,
 )
-from pipeline.look.recording.facts import ChannelStatistics
-from pipeline.look.recording.page_flaws import notices
-from pipeline.look.recording.page_statistics import statistics_table
+from pipeline.look.recording.channels import ChannelStatistics, statistics_table
+from pipeline.look.recording.issues import notices
 from pipeline.look.store import draw as pictures
 from pipeline.look.store.facts import EpisodeCoverage, StoreView
 from pipeline.look.store.page_features import duplicates, features

@@ -6,9 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data import Channels
-from pipeline.look.recording.channel_flaws import still_channels
-from pipeline.look.recording.facts import ChannelStatistics
-from pipeline.look.recording.statistics import statistics_of
+from pipeline.look.recording.channels import ChannelStatistics, statistics_of, still_channels
 from pipeline.store import FeatureStore
 
 SAMPLE_BYTES = 64 * 2**20
