@@ -117,13 +117,13 @@ class _Looked:
     """What was seen of a camera.
 
     `index` (frame,) are the frames that were compared, `equal` (frame - 1,) says whether one is
-    that before; `levels` are `_level` by frame, of those that were looked at for one colour;
-    `sizes` (height, width) by frame, of those that were decoded or that a VL row sees.
+    that before; `blank` says by frame whether it shows nothing, of those that were looked at for
+    that; `sizes` (height, width) by frame, of those that were decoded or that a VL row sees.
     """
 
     index: NDArray[np.int64]
     equal: NDArray[np.bool_]
-    levels: dict[int, tuple[float, float]]
+    blank: dict[int, bool]
     noisy: bool
     sizes: dict[int, tuple[int, ...]]
 
@@ -138,9 +138,8 @@ def find_frame_issues(view: EpisodeView) -> Iterator[Issue]:
             yield view.issue("unreadable", f"view {name}", str(error), severity="error")
     for name, seen in looked.items():
         yield from _resized(view, name, seen)
-        blank = np.array([spread <= ONE_COLOUR for _, spread in seen.levels.values()], np.bool_)
-        yield from _dead(view, name, seen, blank)
-        if not blank.all():
+        yield from _dead(view, name, seen.blank)
+        if not all(seen.blank.values()):
             yield from _duplicates(view, name, looked)
 
 
@@ -156,21 +155,21 @@ def _look(view: EpisodeView, name: str, camera: CameraStream) -> _Looked:
     compared = index if repeats is None else np.arange(frames)
     equal = np.zeros(max(0, len(index) - 1), np.bool_) if repeats is None else repeats
     sizes: dict[int, tuple[int, ...]] = {}
-    levels: dict[int, tuple[float, float]] = {}
+    blank: dict[int, bool] = {}
     if repeats is not None and view.timeline is not None:
         served = np.unique(view.timeline.frames[name]).tolist()
         if (thumbnails := camera.check(served)) is not None:
-            levels = dict(zip(served, map(_level, thumbnails), strict=True))
+            blank = dict(zip(served, map(_is_blank, thumbnails), strict=True))
         if (told := camera.sizes(served)) is not None:
             sizes |= zip(served, map(tuple, told.tolist()), strict=True)
-    wanted = not levels
+    wanted = not blank
     differing: list[float] = []
     before: NDArray[np.uint8] | None = None
     for place, frame in enumerate(camera.read(index.tolist())):
         number = int(index[place])
         sizes[number] = frame.shape[:2]
         if wanted:
-            levels[number] = _level(frame)
+            blank[number] = _is_blank(frame)
         if before is not None and before.shape == frame.shape:
             differs = _share_differing(before, frame)
             if compared is index:
@@ -181,12 +180,11 @@ def _look(view: EpisodeView, name: str, camera: CameraStream) -> _Looked:
     noisy = bool(differing) and float(np.percentile(differing, 10)) > NOISY
     if noisy and compared is not index:
         noisy = min(_beside(camera, equal), default=1.0) > NOISY
-    return _Looked(compared, equal, levels, noisy, dict(sorted(sizes.items())))
+    return _Looked(compared, equal, blank, noisy, dict(sorted(sizes.items())))
 
 
-def _level(frame: NDArray[np.uint8]) -> tuple[float, float]:
-    """Mean of all values, and the standard deviation of the colour that varies most."""
-    return float(frame.mean()), float(frame.std(axis=(0, 1)).max())
+def _is_blank(frame: NDArray[np.uint8]) -> bool:
+    return bool(frame.std(axis=(0, 1)).max() <= ONE_COLOUR)
 
 
 def _share_differing(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> float:
@@ -213,43 +211,32 @@ def _neighbours(frames: int, most: int) -> NDArray[np.int64]:
 
 def _resized(view: EpisodeView, name: str, seen: _Looked) -> Iterator[Issue]:
     """Where a view's frames change in size, in one line."""
-    time = view.cameras[name].time
-    changes = [
-        (before, frame)
-        for before, frame in itertools.pairwise(seen.sizes)
-        if seen.sizes[before] != seen.sizes[frame]
-    ]
-    if not changes:
+    time, sizes = view.cameras[name].time, seen.sizes
+    changes = [pair for pair in itertools.pairwise(sizes) if sizes[pair[0]] != sizes[pair[1]]]
+    if changes:
+        old, new = (f"{sizes[at][1]} x {sizes[at][0]} (frame {at})" for at in changes[0])
+        span = float(time[changes[0][1]]), float(time[changes[-1][1]])
+        more = f"; {len(changes)} changes in all" if len(changes) > 1 else ""
+        message = f"frames change from {old} to {new} at {span[0] - view.zero:.2f} s{more}"
+        yield view.issue("frame size", f"view {name}", f"{message}; expected one size", *span)
+
+
+def _dead(view: EpisodeView, name: str, blank: Mapping[int, bool]) -> Iterator[Issue]:
+    kind, stream, time = "dead camera", f"view {name}", view.cameras[name].time
+    frames = list(blank)
+    if frames and all(blank.values()):
+        message = f"all {len(frames)} frames looked at are of one colour; expected a picture"
+        yield view.issue(kind, stream, message)
         return
-    before, frame = changes[0]
-    old, new = (f"{seen.sizes[at][1]} x {seen.sizes[at][0]} (frame {at})" for at in (before, frame))
-    more = f"; {len(changes)} changes in all" if len(changes) > 1 else ""
-    yield view.issue(
-        "frame size",
-        f"view {name}",
-        f"frames change from {old} to {new} at {time[frame] - view.zero:.2f} s{more}; "
-        "expected one size",
-        float(time[frame]),
-        float(time[changes[-1][1]]),
-    )
-
-
-def _dead(view: EpisodeView, name: str, seen: _Looked, blank: NDArray[np.bool_]) -> Iterator[Issue]:
-    time, frames = view.cameras[name].time, list(seen.levels)
-    for first, stop in runs(blank):
-        dead = frames[first:stop]
-        level = float(np.mean([seen.levels[frame][0] for frame in dead]))
-        colour = f"of one colour (mean {level:.0f} of 255)"
-        if len(dead) == len(frames):
-            message = f"all {len(frames)} frames looked at are {colour}; expected a picture"
-            yield view.issue("dead camera", f"view {name}", message)
-            return
-        begin, end = float(time[dead[0]]), float(time[dead[-1]])
+    for first, stop in runs(np.array(list(blank.values()), np.bool_)):
+        start, last = frames[first], frames[stop - 1]
+        span = float(time[start]), float(time[last])
         message = (
-            f"{len(dead)} of the {len(frames)} frames looked at are {colour}: frames {dead[0]} to "
-            f"{dead[-1]}, {begin - view.zero:.2f} to {end - view.zero:.2f} s; expected a picture"
+            f"{stop - first} of the {len(frames)} frames looked at are of one colour: frames "
+            f"{start} to {last}, {span[0] - view.zero:.2f} to {span[1] - view.zero:.2f} s; "
+            "expected a picture"
         )
-        yield view.issue("dead camera", f"view {name}", message, begin, end)
+        yield view.issue(kind, stream, message, *span)
 
 
 def _duplicates(view: EpisodeView, name: str, looked: Mapping[str, _Looked]) -> Iterator[Issue]:

@@ -1,6 +1,6 @@
 """Every recording looked over, one in memory at a time."""
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import blake2b
@@ -23,9 +23,8 @@ from pipeline.look.recording.issues import find_issues
 class EpisodeSummary:
     """One episode in a line.
 
-    `zero` is the first instant of all clocks, which times of issues are shown from; `frames` are
-    counts by view, `readings` the sensor's; `streams` are the clocks that it has, `digests` what
-    its motion comes to (`_digest_motion`).
+    `zero` is the first instant of all clocks, which times of issues are shown from; `counts` are
+    entries by clock (`EpisodeView.clocks`), `digests` what its motion comes to (`_digest_motion`).
     """
 
     source: str
@@ -37,12 +36,15 @@ class EpisodeSummary:
     duration_s: float
     ticks: int
     vl_rows: int
-    frames: Mapping[str, int]
-    readings: int
-    states: int
-    streams: frozenset[str]
+    counts: Mapping[str, int]
     digests: Mapping[str, str]
     issues: list[Issue]
+
+    @property
+    def frames(self) -> dict[str, int]:
+        """How many there are by view."""
+        views = {name: count for name, count in self.counts.items() if name.startswith("view ")}
+        return {name.removeprefix("view "): count for name, count in views.items()}
 
     @property
     def errors(self) -> int:
@@ -145,10 +147,7 @@ def _summarise(view: EpisodeView) -> EpisodeSummary:
         duration_s=view.duration_s,
         ticks=0 if line is None else len(line.time),
         vl_rows=0 if line is None else len(line.vl_time),
-        frames={name: len(camera.time) for name, camera in view.cameras.items()},
-        readings=0 if view.sensor is None else len(view.sensor.time),
-        states=0 if view.state is None else len(view.state.time),
-        streams=frozenset(view.clocks),
+        counts={name: len(time) for name, time in view.clocks.items()},
         digests=_digest_motion(view),
         issues=list(find_issues(view)),
     )
@@ -160,15 +159,15 @@ def _warn_of_missing(summaries: Sequence[EpisodeSummary]) -> None:
     for one in summaries:
         alike[one.source, one.format].append(one)
     for group in alike.values():
-        every = frozenset().union(*(one.streams for one in group))
-        usual = {name for name in every if 2 * sum(name in o.streams for o in group) > len(group)}
+        held = Counter(name for one in group for name in one.counts)
+        usual = {name for name, count in held.items() if 2 * count > len(group)}
         for one in group:
             told = {name for issue in one.issues for name in issue.stream.split(", ")}
             if "cameras" in told:
                 told |= {name for name in usual if name.startswith("view ")}
             if "state" in told:
                 told.add("poses")  # its columns
-            if lacking := sorted(usual - one.streams - told):
+            if lacking := sorted(usual - one.counts.keys() - told):
                 message = "not there; most episodes of this source have it"
                 one.warn("missing", ", ".join(lacking), message)
 

@@ -105,14 +105,7 @@ def _episodes(overview: RecordingsOverview, chosen: Sequence[int]) -> list[Block
         *source, "episode", "errors", "warnings", "length [s]", "ticks", "VL rows", "frames",
         "readings", "states", "format", "instruction",
     ]  # fmt: skip
-    rows = [
-        [
-            *([one.source] if source else []), one.episode, one.errors, one.warnings,
-            one.duration_s, one.ticks, one.vl_rows, _frames(one.frames), one.readings, one.states,
-            one.format, one.instruction,
-        ]
-        for one in (summaries[index] for index in shown)
-    ]  # fmt: skip
+    rows = [[one.source][: len(source)] + _cells(one) for one in (summaries[at] for at in shown)]
     caption = "Those in bold are shown in detail below. Readings are the sensor's."
     if len(shown) < len(summaries):
         caption += (
@@ -121,6 +114,14 @@ def _episodes(overview: RecordingsOverview, chosen: Sequence[int]) -> list[Block
         )
     strong = frozenset(row for row, index in enumerate(shown) if index in chosen)
     return [Table(heads, rows, caption, strong)]
+
+
+def _cells(one: EpisodeSummary) -> list[object]:
+    readings, states = (one.counts.get(name, 0) for name in ("sensor", "state"))
+    return [
+        one.episode, one.errors, one.warnings, one.duration_s, one.ticks, one.vl_rows,
+        _frames(one.frames), readings, states, one.format, one.instruction,
+    ]  # fmt: skip
 
 
 def _several(overview: RecordingsOverview) -> bool:

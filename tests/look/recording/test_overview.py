@@ -54,7 +54,7 @@ def test_healthy_recordings_of_every_format(healthy: Path) -> None:
         assert one.ticks > 30 and one.vl_rows == -(-one.ticks // 3)
         assert one.duration_s == pytest.approx(one.ticks / 10, abs=0.5)
         assert set(one.frames) == {"View1", "View2", "View5"} and min(one.frames.values()) > 30
-        assert one.readings and one.states and one.instruction
+        assert one.counts["sensor"] and one.counts["state"] and one.instruction
         assert one.issues == []
 
 
@@ -65,7 +65,7 @@ def test_one_broken_episode_hides_no_other(many: Path) -> None:
     assert [one.episode for one in found.summaries] == ["a", "b", "c"]
     assert [one.errors for one in found.summaries] == [0, 1, 0]
     broken = found.summaries[1]
-    assert (broken.ticks, broken.frames, broken.readings, broken.instruction) == (0, {}, 0, None)
+    assert (broken.ticks, broken.counts, broken.instruction) == (0, {}, None)
     # The file is the issue; that its streams are absent follows and is not told again.
     (issue,) = found.issues
     assert broken.issues == [issue] and issue.severity == "error"
