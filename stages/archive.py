@@ -1,9 +1,8 @@
 """Make a small copy of a store for keeping and sharing, or the store from such a copy.
 
 The archive is a plain zarr v3 group with the same arrays under the same names: compressed, in few,
-large files, every piece of them checksummed. Each array's codec is the one that makes the least of
-samples of that very array. --restore gives back the store, equal in every byte; what is damaged in
-an archive is named and never restored.
+large files, every piece of them checksummed. --restore gives back the store, equal in every byte;
+what is damaged in an archive is named and never restored.
 
   python -m stages.archive                       extract.store -> <its name>.archive.zarr beside it
   python -m stages.archive --restore             the store from that archive
@@ -26,28 +25,49 @@ from pathlib import Path
 
 from pipeline.base.config import Params
 from pipeline.base.errors import ConfigError
-from pipeline.store.archive import archive, restore
+from pipeline.base.table import Table
+from pipeline.store.archive import Manifest, archive, restore
+
+SMALL = 0.01
+"""Share of the bytes up to which an array has no line: of a tiny one, padding makes the ratio."""
 
 
 def main(params: Params) -> None:
     """Archive or restore, and report."""
     store, output = _places(params)
+    begun = time.perf_counter()
     if params.archive.restore:
-        begun = time.perf_counter()
         restore(output, store, params.archive.threads)
         print(f"{store}: as archived in {output}, {time.perf_counter() - begun:.1f} s")
         return
-    report = archive(store, output, params.archive.level, params.archive.threads)
-    if report.seconds is None:
+    manifest = archive(store, output, params.archive.level, params.archive.threads)
+    if manifest is None:
         print(f"{output}: there already, of this very store; nothing to do")
         return
-    print("\n".join(report.lines()))
-    ratio = report.raw_bytes / max(1, report.stored_bytes)
-    rate = report.raw_bytes / 1e6 / report.seconds
+    seconds = time.perf_counter() - begun
+    raw, stored = manifest.raw_bytes / 1e6, manifest.stored_bytes / 1e6
+    print(*_table(manifest).text(), sep="\n")
     print(
-        f"{output}: {report.raw_bytes / 1e6:.1f} MB in {report.stored_bytes / 1e6:.1f} MB "
-        f"({ratio:.2f} : 1), {report.seconds:.1f} s ({rate:.0f} MB/s)"
+        f"{output}: {raw:.1f} MB in {stored:.1f} MB ({raw / stored:.2f} : 1), {seconds:.1f} s "
+        f"({raw / seconds:.0f} MB/s)"
     )
+
+
+def _table(manifest: Manifest) -> Table:
+    """The large arrays: size, how much smaller they became, codec; then all of them."""
+    arrays = [
+        (name, array.raw_bytes, sum(array.shard_bytes), array.codec)
+        for name, array in manifest.arrays.items()
+        if array.raw_bytes > SMALL * manifest.raw_bytes
+    ]
+    rows = [
+        (name, raw / 1e6, raw / stored if stored else None, codec)  # zeros take no shard
+        for name, raw, stored, codec in [
+            *arrays,
+            ("all", manifest.raw_bytes, manifest.stored_bytes, ""),
+        ]
+    ]
+    return Table(("array", "MB", "ratio", "codec"), rows)
 
 
 def _places(params: Params) -> tuple[Path, Path]:

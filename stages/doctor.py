@@ -1,8 +1,8 @@
 """Look at this machine: what is there, what is missing, and what to install or set.
 
-Checks Python and packages, the GPU and torch's build, attention backends, video decoders, the
-checkpoint, the recordings, the room for the store, DVC's cache and the kernel's limits, for the
-params given. Downloads nothing, loads no model, changes nothing; takes some seconds.
+Checks Python and packages, the GPU, torch's build and the attention backend, the checkpoint, the
+recordings and video decoders, and the room for the store, for the params given. Downloads nothing,
+loads no model, changes nothing; takes some seconds. What DVC has and how it links: dvc doctor.
 
   python -m stages.doctor                                        as params.yaml stands
   python -m stages.doctor --set vlm.checkpoint=Qwen/Qwen2.5-VL-3B-Instruct --set data.root=/lab
@@ -23,17 +23,18 @@ if __name__ == "__main__":  # here, for --help waits for no import below
 
 from pipeline.base.config import Params
 from pipeline.base.errors import PipelineError
-from pipeline.look.doctor import Finding, described, examine
+from pipeline.base.issue import Issue
+from pipeline.look.doctor import described, examine
 
 
 def main(params: Params) -> None:
-    """Print every group of findings; refuse where one is missing."""
-    lacking: list[Finding] = []
-    for title, findings in examine(params):
-        print("\n".join(described(title, findings)), flush=True)
-        lacking += [finding for finding in findings if finding.level == "missing"]
+    """Print every group of issues; refuse where something is missing."""
+    lacking: list[Issue] = []
+    for title, issues in examine(params):
+        print("\n".join(described(title, issues)), flush=True)
+        lacking += [issue for issue in issues if issue.severity == "error"]
     if lacking:
-        subjects = ", ".join(dict.fromkeys(finding.subject for finding in lacking))
+        subjects = ", ".join(dict.fromkeys(issue.kind for issue in lacking))
         raise PipelineError(
             f"{len(lacking)} thing(s) are missing: {subjects}. Do what stands behind -> there, "
             "then run python -m stages.doctor again."

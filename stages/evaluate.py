@@ -5,7 +5,6 @@ Writes metrics.json, tables (CSV) and a page with its pictures (report.html, PNG
 `evaluate.output`, and judged.json, which says what was judged on what. With `evaluate.modalities`,
 judges again with each stream spoilt. The page shows the frames of the best and the worst episode
 where their recordings still lie below `data.root`.
-An archive of a store serves as well: it is restored once, to `train_head.scratch`.
 """
 
 from stages.command import run
@@ -27,7 +26,6 @@ from pipeline.look.evaluation.page import evaluation_report
 from pipeline.look.page.writing import write_report
 from pipeline.policy.checkpoint import PolicyCheckpoint, find_policy, load_policy
 from pipeline.store import FeatureStore, check_trailers
-from pipeline.train.batches import open_store
 from pipeline.train.held_out import check_store
 
 
@@ -51,7 +49,7 @@ def main(params: Params) -> None:
 def _store_for(checkpoint: PolicyCheckpoint, params: Params) -> FeatureStore:
     """The store that is named, or else trained from, which this policy fits."""
     path = params.evaluate.store or params.train_head.store or params.extract.store
-    store = open_store(path, "auto", params.train_head.scratch, print)
+    store = FeatureStore.open(path)
     check_store(checkpoint, store)
     if params.train_head.check_store:
         check_trailers(store.path)

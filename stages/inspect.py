@@ -32,16 +32,15 @@ from collections.abc import Iterator
 
 from pipeline.base.config import Params
 from pipeline.base.ownership import REPORT, claim
-from pipeline.look.page.blocks import Notice, Notices, Report
-from pipeline.look.page.findings import FINDINGS
+from pipeline.look.page.blocks import Issues, Report
+from pipeline.look.page.issues import FINDINGS, group_issues, place_of
 from pipeline.look.page.style import boxes
 from pipeline.look.page.writing import write_report
 from pipeline.look.recording.page import recordings_report
 from pipeline.look.recording.subject import Subject, subject_of
-from pipeline.look.store.facts import inspect_store
-from pipeline.look.store.page import store_report
+from pipeline.look.store.page import inspect_store, store_report
 
-SAID = 8
+SHOWN = 8
 """Findings that the terminal shows."""
 
 
@@ -50,9 +49,9 @@ def main(params: Params) -> None:
     subject = subject_of(params)
     report = _report(subject, params)
     claim(subject.folder, REPORT)
-    with boxes() as said:
+    with boxes() as notes:
         page, *beside = write_report(subject.folder, report)
-    print("\n".join([*summary(report), *said]))
+    print("\n".join([*summary(report), *notes]))
     pictures = sum(file.suffix == ".png" for file in beside)
     print(f"{page}: the page, with {pictures} pictures and {FINDINGS} beside it")
 
@@ -62,25 +61,20 @@ def summary(report: Report) -> Iterator[str]:
     yield report.title
     yield " · ".join(f"{label} {value}" for label, value in report.tiles)
     # The first are those of all: those of single parts come later.
-    found = next(report.blocks(Notices), None)
-    if found is None:
-        return
-    if not found.notices:
-        yield found.none
-    worst_first = sorted(found.notices, key=lambda one: one.severity != "error")
-    for one in worst_first[:SAID]:
-        first = f", the first {one.places[0]}" if len(one.places) > 1 else ""
-        yield f"{one.severity}: {one.kind}: {one.where}{first}"
-        yield f"    {_line(one)}"
-    if len(found.notices) > SAID:
-        yield f"… and {len(found.notices) - SAID} more on the page and in {FINDINGS}"
+    issues = next(report.blocks(Issues))
+    groups = group_issues(issues.issues)
+    if not groups:
+        yield issues.none
+    for group in groups[:SHOWN]:
+        first = group.issues[0]
+        place = f", the first {place_of(first)}" if len(group.issues) > 1 else ""
+        yield f"{group.severity}: {group.kind}: {group.where}{place}"
+        yield f"    {' '.join(first.message.split())}"
+    if len(groups) > SHOWN:
+        yield f"… and {len(groups) - SHOWN} more on the page and in {FINDINGS}"
 
 
 def _report(subject: Subject, params: Params) -> Report:
     if subject.store is not None:
         return store_report(inspect_store(subject.store, params.inspect))
     return recordings_report(subject.recordings(params.data.views), params, subject.name)
-
-
-def _line(notice: Notice) -> str:
-    return " ".join(notice.message.split())

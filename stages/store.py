@@ -39,14 +39,14 @@ from pipeline.base.config import Params, StoresParams
 from pipeline.base.errors import ConfigError, PipelineError, StoreLocked
 from pipeline.base.format import size
 from pipeline.store import FeatureStore
-from pipeline.store.housekeeping import (
+from pipeline.store.admin import (
     Inventory,
     Leftover,
-    kept_back,
-    leftovers,
-    named,
-    remove,
-    table,
+    describe_inventory,
+    describe_kept,
+    find_leftovers,
+    find_named,
+    remove_leftover,
     take_inventory,
 )
 from pipeline.store.merging import merge
@@ -55,49 +55,47 @@ from pipeline.train.dependents import find_trained
 
 def main(params: Params) -> None:
     """Do what `stores.action` says."""
-    wanted = params.stores
-    match wanted.action:
+    match params.stores.action:
         case "list":
-            _list(wanted)
+            _list(params.stores)
         case "merge":
-            _merge(wanted)
+            _merge(params.stores)
         case "gc":
-            _gc(wanted)
+            _gc(params.stores)
 
 
-def _list(wanted: StoresParams) -> None:
-    if wanted.inputs:
+def _list(params: StoresParams) -> None:
+    if params.inputs:
         raise ConfigError(
-            f"stores.inputs: list takes no paths, found {', '.join(map(str, wanted.inputs))}. It "
+            f"stores.inputs: list takes no paths, found {', '.join(map(str, params.inputs))}. It "
             "lists all of stores.folder: name another with --set stores.folder=…"
         )
-    inventory = take_inventory(wanted.folder)
-    for line in table(inventory, _dependents(inventory, wanted)):
-        print(line)
+    inventory = take_inventory(params.folder)
+    print(*describe_inventory(inventory, _dependents(inventory, params)), sep="\n")
 
 
-def _dependents(inventory: Inventory, wanted: StoresParams) -> dict[Path, list[str]]:
+def _dependents(inventory: Inventory, params: StoresParams) -> dict[Path, list[str]]:
     """What trained policies say of each store; those that say nothing readable go to stderr."""
-    trained = find_trained(wanted.checkpoints)
-    for one in trained:
-        if one.damage:
-            print(f"not read: {one.damage}", file=sys.stderr)
-    found: dict[Path, list[str]] = {}
-    for entry in inventory.of_kind("store"):
-        if entry.damage is None:
+    trained = find_trained(params.checkpoints)
+    for policy in trained:
+        if policy.damage:
+            print(f"not read: {policy.damage}", file=sys.stderr)
+    dependents: dict[Path, list[str]] = {}
+    for entry in inventory.entries:
+        if entry.kind == "store" and entry.damage is None:
             store = FeatureStore.open(entry.path)
-            said = ((one.folder, one.depends_on(store)) for one in trained)
-            found[entry.path] = [f"{folder}: {how}" for folder, how in said if how]
-    return found
+            depends = ((policy.folder, policy.depends_on(store)) for policy in trained)
+            dependents[entry.path] = [f"{folder}: {how}" for folder, how in depends if how]
+    return dependents
 
 
-def _merge(wanted: StoresParams) -> None:
-    if wanted.output is None:
+def _merge(params: StoresParams) -> None:
+    if params.output is None:
         raise ConfigError(
             "stores.output: expected the store to merge into, found none. Name it: "
             "python -m stages.store merge A.zarr B.zarr --into C.zarr"
         )
-    report = merge([_input(path, wanted.folder) for path in wanted.inputs], wanted.output)
+    report = merge([_input(path, params.folder) for path in params.inputs], params.output)
     if report is not None:
         print(
             f"{report.store}: {report.episodes} episodes, {report.rows} rows, none computed; "
@@ -114,46 +112,51 @@ def _input(path: Path, folder: Path) -> Path:
     return inside
 
 
-def _gc(wanted: StoresParams) -> None:
-    found = _selected(wanted) if wanted.inputs else _unneeded(wanted)
+def _gc(params: StoresParams) -> None:
+    leftovers = _selected(params) if params.inputs else _unneeded(params)
     done: list[Leftover] = []
     locked: list[PipelineError] = []
-    for one in found:
+    for leftover in leftovers:
         try:
-            if wanted.remove:
-                remove(one)
-            done.append(one)
+            if params.remove:
+                remove_leftover(leftover)
+            done.append(leftover)
         except StoreLocked as error:
             locked.append(error)
-    word = "removed" if wanted.remove else "unneeded"
-    for one in done:
-        if not one.idle_lock:
-            print(f"{word}: {one.path}, {size(one.bytes)}: {one.why}")
-    if idle := sum(one.idle_lock for one in done):
+    word = "removed" if params.remove else "unneeded"
+    for leftover in done:
+        if not _is_idle_lock(leftover):
+            print(f"{word}: {leftover.entry.path}, {size(leftover.bytes)}: {leftover.why}")
+    if idle := sum(_is_idle_lock(leftover) for leftover in done):
         print(f"{word}: {idle} empty lock file(s), held by no process")
-    if not found:
-        print(f"{wanted.folder}: nothing to remove")
-    elif not wanted.remove:
-        freed = size(sum(one.bytes for one in found))
-        print(f"{freed} in {len(found)} place(s); --remove removes them")
+    if not leftovers:
+        print(f"{params.folder}: nothing to remove")
+    elif not params.remove:
+        freed = size(sum(leftover.bytes for leftover in leftovers))
+        print(f"{freed} in {len(leftovers)} place(s); --remove removes them")
     if locked:
         raise locked[0]
 
 
-def _unneeded(wanted: StoresParams) -> list[Leftover]:
-    inventory = take_inventory(wanted.folder)
-    for line in kept_back(inventory):
+def _is_idle_lock(leftover: Leftover) -> bool:
+    """An empty lock file, of which there may be many."""
+    return leftover.entry.kind == "lock" and not leftover.bytes
+
+
+def _unneeded(params: StoresParams) -> list[Leftover]:
+    inventory = take_inventory(params.folder)
+    for line in describe_kept(inventory):
         print(f"kept: {line}")
-    return leftovers(inventory)
+    return find_leftovers(inventory)
 
 
-def _selected(wanted: StoresParams) -> list[Leftover]:
+def _selected(params: StoresParams) -> list[Leftover]:
     """What is named, wherever it lies; only what lies beside it is looked at."""
     by_folder: dict[Path, list[Path]] = {}
-    for path in wanted.inputs:
+    for path in params.inputs:
         by_folder.setdefault(path.parent, []).append(path)
     return [
-        one
+        leftover
         for folder, paths in by_folder.items()
-        for one in named(take_inventory(folder, subfolders=False), paths)
+        for leftover in find_named(take_inventory(folder, subfolders=False), paths)
     ]

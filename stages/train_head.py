@@ -1,8 +1,8 @@
 """Train a policy head from the store alone: no image, no vision-language model.
 
-Reads train_head.store (extract.store where null), or an archive of one, which is restored once, to
-train_head.scratch. Writes the best and the last checkpoint to train_head.output and curves to
-train_head.logs; while it runs, open report.html there. Some episodes are held out to judge it by.
+Reads train_head.store (extract.store where null). Writes the best and the last checkpoint to
+train_head.output and curves to train_head.logs; while it runs, open report.html there. Some
+episodes are held out to judge it by.
 
   python -m stages.train_head                                      what params.yaml says
   python -m stages.train_head --set train_head.model_type=diffusion    or regression, flow_matching
@@ -25,7 +25,7 @@ if __name__ == "__main__":  # here, for --help waits for no import below
     raise SystemExit(run(__doc__ or "", "stages.train_head", sections=("train_head",)))
 
 from pipeline.base.config import Params
-from pipeline.store import build_lock, check_trailers
+from pipeline.store import FeatureStore, build_lock, check_trailers
 from pipeline.train.run import finished_run, open_run
 from pipeline.train.split import split_by_episode
 
@@ -41,7 +41,6 @@ def main(params: Params) -> None:
 
 def _train(params: Params) -> None:
     # With torch, which takes over a second to import.
-    from pipeline.train.batches import open_store
     from pipeline.train.loggers import check_loggers
     from pipeline.train.loop import Trainer
     from pipeline.train.world import process_group
@@ -50,7 +49,7 @@ def _train(params: Params) -> None:
     with process_group(head.device) as world:
         world.shared(lambda: check_loggers(head))
         path = head.store or params.extract.store
-        store = open_store(path, head.feed, head.scratch, world.say)
+        store = FeatureStore.open(path)
         with world.holding(build_lock(head.output)):
             opened = world.shared(lambda: open_run(head, store))
             world.say(*opened.notes)

@@ -26,7 +26,6 @@ ONLY_IN = {
     "numcodecs": {"store"},
     "yaml": {"base"},
     "matplotlib": {"look"},
-    "plotly": {"look"},
     "jinja2": {"look"},
 }
 WITHOUT_TORCH = {"data"}

@@ -54,7 +54,7 @@ NAMES = {
 
 IMPORTED = """
 import json, os, sys
-import dask.distributed, dvclive, matplotlib.pyplot, peft, plotly, scipy.special, torch, zarr
+import dask.distributed, dvclive, matplotlib.pyplot, peft, scipy.special, torch, zarr
 import transformers.models.qwen2_5_vl.modeling_qwen2_5_vl
 for module, names in json.loads(sys.argv[1]).items():
     if os.fork():

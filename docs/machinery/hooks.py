@@ -71,19 +71,19 @@ def on_page_content(content: str, page: Page, config: MkDocsConfig, files: Files
 
     def inline(match: re.Match[str]) -> str:
         path = Path(config.docs_dir) / "figures" / posixpath.basename(match[1])
-        return _figure(path)
+        return _figure(path, match[1])
 
     return IMAGE.sub(inline, content)
 
 
-def _figure(path: Path) -> str:
-    """The drawing as an element of a page, without the colours that it has on its own."""
+def _figure(path: Path, link: str) -> str:
+    """The drawing as an element of a page, without its own colours; it leads to the file."""
     text = path.read_text(encoding="utf-8")
     drawing = re.sub(r"<style>.*?</style>\n?", "", text, flags=re.DOTALL)
     # A page may hold the same drawing's parts under one name each.
     for name in _ids(text):
         drawing = re.sub(rf'(id="|url\(#){name}\b', rf"\g<1>{path.stem}-{name}", drawing)
-    return f'<figure class="drawing" tabindex="0">{drawing}</figure>'
+    return f'<figure class="drawing"><a href="{link}">{drawing}</a></figure>'
 
 
 def _ids(text: str) -> Iterator[str]:

@@ -10,20 +10,9 @@ from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-LEFT_OUT = {"config"}
+LEFT_OUT = "pipeline.base.config"
 """`params.md` says it better."""
-IN_FULL = {
-    "recordings": ("reader", "recording"),
-    "models": ("expert", "policy"),
-    "store": ("schema", "reader", "batch"),
-    "plots": ("interactive", "recording.lanes", "store", "store_features"),
-    "report": (
-        "evaluation.comparison",
-        "evaluation.evaluation",
-        "inspection.recording",
-        "inspection.store",
-    ),
-}
+IN_FULL = {"data": ("reader", "recording", "timeline"), "store": ("schema", "reader", "batch")}
 """Modules of a package that are shown in full, beside what its `__all__` offers."""
 
 
@@ -35,31 +24,19 @@ def reference_pages() -> dict[str, str]:
 
 
 def rooms() -> list[str]:
-    """Packages and modules of `pipeline` that have a page."""
-    found = (
-        path.stem
-        for path in sorted((ROOT / "pipeline").iterdir())
-        if path.suffix == ".py" or (path / "__init__.py").exists()
-    )
-    return [name for name in found if name != "__init__" and name not in LEFT_OUT]
+    """Packages of `pipeline`: each has a page."""
+    return sorted(path.parent.name for path in (ROOT / "pipeline").glob("*/__init__.py"))
 
 
 def _room_page(room: str) -> str:
-    package = ROOT / "pipeline" / room / "__init__.py"
-    title = f"# {room}\n"
-    if not package.exists():
-        return f"{title}\n{_block(f'pipeline.{room}', nested=False)}"
-    modules = _modules(package.parent)
-    offered = _offered(package.parent)
-    in_full = IN_FULL.get(room, ()) if offered else tuple(_public(modules))
-    blocks = [_block(f"pipeline.{room}", docstring_only=True)]
-    for name in in_full:
-        blocks.append(_block(f"pipeline.{room}.{name}"))
-    for name in offered:
-        module = _home(name, modules)
-        if module is not None and module not in in_full:
-            blocks.append(_block(".".join(filter(None, ["pipeline", room, module, name]))))
-    return "\n".join([title, *blocks])
+    package = ROOT / "pipeline" / room
+    homes = _offered(package / "__init__.py")
+    in_full = [f"pipeline.{room}.{name}" for name in IN_FULL.get(room, ())]
+    if not homes:
+        in_full = [name for name in _modules(package) if not name.startswith(LEFT_OUT)]
+    blocks = [_block(f"pipeline.{room}", docstring_only=True), *map(_block, in_full)]
+    blocks += [_block(f"{home}.{name}") for name, home in homes.items() if home not in in_full]
+    return "\n".join([f"# {room}\n", *blocks])
 
 
 def _commands_page() -> str:
@@ -77,55 +54,35 @@ def _commands_page() -> str:
     return "\n".join(["# commands\n", introduction, *blocks])
 
 
-def _block(path: str, *, docstring_only: bool = False, nested: bool = True) -> str:
+def _block(path: str, *, docstring_only: bool = False) -> str:
     """What mkdocstrings replaces by the documentation of an object."""
     options = ["heading_level: 2"]
-    if docstring_only or not nested:
-        options += ["show_root_heading: false", "show_root_toc_entry: false"]
     if docstring_only:
-        options.append("members: false")
+        options += ["show_root_heading: false", "show_root_toc_entry: false", "members: false"]
     lines = "".join(f"        {option}\n" for option in options)
     return f"::: {path}\n    options:\n{lines}"
 
 
-def _modules(package: Path) -> dict[str, set[str]]:
-    """What each module defines at its top level, by its dotted name; the package's own is ''."""
-    return {
-        _dotted(path.relative_to(package)): set(_defined(path))
-        for path in sorted(package.rglob("*.py"))
+def _modules(package: Path) -> Iterator[str]:
+    """The dotted names of a package's modules, those of packages in it too."""
+    for path in sorted(package.rglob("*.py")):
+        if path.stem != "__init__":
+            yield ".".join(path.relative_to(ROOT).with_suffix("").parts)
+
+
+def _offered(init: Path) -> dict[str, str]:
+    """The names in a package's `__all__`, and the module that each is imported from."""
+    tree = ast.parse(init.read_text(encoding="utf-8"))
+    imported = {
+        alias.asname or alias.name: node.module
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and node.module
+        for alias in node.names
     }
-
-
-def _dotted(path: Path) -> str:
-    parts = path.parent.parts if path.stem == "__init__" else path.with_suffix("").parts
-    return ".".join(parts)
-
-
-def _public(modules: dict[str, set[str]]) -> Iterator[str]:
-    return (name for name in modules if name and not name.startswith("_"))
-
-
-def _home(name: str, modules: dict[str, set[str]]) -> str | None:
-    """The module that defines a name; None where it comes from another room."""
-    return next((module for module, defined in modules.items() if name in defined), None)
-
-
-def _defined(path: Path) -> Iterator[str]:
-    for node in ast.parse(path.read_text(encoding="utf-8")).body:
-        if isinstance(node, ast.ClassDef | ast.FunctionDef):
-            yield node.name
-        elif isinstance(node, ast.Assign):
-            yield from (target.id for target in node.targets if isinstance(target, ast.Name))
-        elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
-            yield node.target.id
-
-
-def _offered(package: Path) -> list[str]:
-    """The names in `__all__` of a package, and of packages in it."""
-    return [
+    names = [
         name
-        for path in sorted(package.rglob("__init__.py"))
-        for node in ast.parse(path.read_text(encoding="utf-8")).body
+        for node in tree.body
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__"
         for name in ast.literal_eval(node.value)
     ]
+    return {name: imported[name] for name in names if name in imported}

@@ -185,7 +185,11 @@ def _described(folder: Path) -> dict[str, Any]:
 
 
 def _params(document: Mapping[str, Any]) -> TrainHeadParams:
-    return TrainHeadParams.model_validate_json(json.dumps(document["params"]["train_head"]))
+    said = dict(document["params"]["train_head"])
+    said.pop("scratch", None)  # of earlier versions, which trained from archives, too
+    if said.get("feed") == "compressed":
+        del said["feed"]
+    return TrainHeadParams.model_validate_json(json.dumps(said))
 
 
 def _strange(folder: Path, error: Exception) -> CheckpointIncomplete:

@@ -11,6 +11,8 @@ from pipeline.store.repair_hints import start_over
 
 MERGED = "merge-"
 """How the plan of a store begins that was not extracted but merged."""
+LEDGER = ".files.sqlite"
+"""What is added to a store's name for the file that remembers the digests of recordings."""
 
 
 def part_path(target: Path) -> Path:

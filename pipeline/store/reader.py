@@ -76,9 +76,8 @@ class FeatureStore:
             ) from None
         if "archive" in attrs:
             raise StoreMismatch(
-                f"{root}: expected a store, found an archive of one. stages.train_head and "
-                "stages.evaluate restore it where train_head.feed is auto or compressed; to make "
-                f"the store of it: {restore_command(root)}"
+                f"{root}: expected a store, found an archive of one. Restore it first: "
+                f"{restore_command(root)}"
             )
         if "schema" not in attrs:
             raise StoreMismatch(_foreign(root))

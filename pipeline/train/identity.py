@@ -22,7 +22,6 @@ FREE_PARAMS = {
     "device",
     "feed",
     "check_store",
-    "scratch",
     "output",
     "logs",
     "loggers",

@@ -40,7 +40,6 @@ from pipeline.policy.checkpoint import (
     source_differences,
 )
 from pipeline.store import FeatureStore, build_lock
-from pipeline.store.archive import is_archive
 from pipeline.train.identity import NOTHING, run_identity
 
 RUN, BEST, LAST = "run.json", "best", "last"
@@ -176,10 +175,10 @@ def finished_run(params: TrainHeadParams, path: Path) -> Run | None:
     """The run of these params on the store at `path` where it is finished, else None.
 
     What `open_run` gives, without torch, which takes over a second to import; None where several
-    processes train together, or the store has to be restored first.
+    processes train together.
     """
     together = int(os.environ.get("WORLD_SIZE", "1")) > 1
-    if together or not (params.output / RUN).exists() or is_archive(path):
+    if together or not (params.output / RUN).exists():
         return None
     with build_lock(params.output):
         run = open_run(params, FeatureStore.open(path))

@@ -21,8 +21,8 @@ ROOT = Path(__file__).resolve().parents[2]
 RECIPES = ROOT / "docs" / "recipes"
 GOLDEN = Path("tests/vlm/golden_features.json")
 TESTS = (
-    "tests/recordings/test_contract.py",
-    "tests/models/test_expert.py",
+    "tests/data/test_contract.py",
+    "tests/policy/test_expert.py",
     "tests/vlm/test_golden_features.py",
     "tests/vlm/test_pooling.py",
 )

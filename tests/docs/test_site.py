@@ -9,6 +9,9 @@ import pytest
 
 pytestmark = pytest.mark.extra
 DESKTOP, PHONE = (1280, 900), (390, 844)
+SIDEWAYS = """[...document.querySelectorAll('figure.drawing')]
+    .filter(figure => figure.scrollWidth > figure.clientWidth).map(figure => figure.outerHTML)"""
+"""The figures that a reader has to push sideways to see whole."""
 PAGES = ("index", "concepts", "store", "params", "data/errors", "reference/store", "faq")
 
 
@@ -117,6 +120,7 @@ def test_page_and_figures_take_the_colours_of_the_system(site, reader, size, sch
     assert page.evaluate("document.body.getAttribute('data-md-color-scheme')") == shown
     assert width(visitor) <= size[0]
     assert page.locator("figure.drawing svg").count() >= 6
+    assert page.evaluate(SIDEWAYS) == []
     text = page.locator("figure.drawing svg text").first
     colour = {"default": "rgb(31, 35, 40)", "slate": "rgb(230, 233, 238)"}[shown]
     assert text.evaluate("node => getComputedStyle(node).fill") == colour

@@ -4,7 +4,7 @@ import signal
 from pathlib import Path
 
 from pipeline.store import FeatureStore
-from pipeline.store.housekeeping.inventory import take_inventory
+from pipeline.store.admin import take_inventory
 
 SLOWED = """
 import sys, time

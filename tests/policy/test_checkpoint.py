@@ -167,6 +167,17 @@ def test_a_description_of_before_digests_is_taken_and_told(
     assert f"{path}: it has no document_sha256" in line
 
 
+def test_a_policy_that_was_trained_from_an_archive_is_taken(
+    checkpoint: PolicyCheckpoint, tmp_path: Path
+) -> None:
+    save_policy(tmp_path / "best", checkpoint)
+    path = tmp_path / "best/policy.json"
+    document = read_document(path)
+    document["params"]["train_head"] |= {"feed": "compressed", "scratch": None}
+    write_with_digest(path, document)
+    assert load_policy(tmp_path / "best").params == checkpoint.params
+
+
 def test_weights_of_another_policy_are_refused(
     checkpoint: PolicyCheckpoint, tmp_path: Path
 ) -> None:

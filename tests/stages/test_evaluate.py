@@ -7,6 +7,7 @@ from collections.abc import Callable
 from contextlib import redirect_stdout
 from io import StringIO
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -268,16 +269,15 @@ def test_a_sampling_policy_is_judged_on_the_mean_of_samples(trained: Path, tmp_p
     assert errors[1] == errors[2] != errors[0]
 
 
-@pytest.mark.usefixtures("reports")
-def test_an_archive_does_what_its_store_does(
-    trained: Path, judged: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("stage", [train_head, evaluate])
+def test_an_archive_has_to_be_restored_first(
+    stage: ModuleType, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    packed, output = tmp_path / "tiny.archive.zarr", tmp_path / "report"
+    packed = tmp_path / "tiny.archive.zarr"
     archive(trained.parent / "tiny.zarr", packed, level=1, threads=1)
-    own = (f"train_head.scratch={tmp_path / 'scratch'}", f"extract.store={packed}")
-    assert run("", train_head.main, arguments(trained, output, *own)) == 0
-    said = capsys.readouterr().out
-    assert "feed: compressed" in said and "nothing to do" in said
-    assert run("", evaluate.main, arguments(trained, output, *own)) == 0
-    for file in ("metrics.json", "judged.json"):
-        assert (output / file).read_bytes() == (judged[0] / file).read_bytes()
+    told = arguments(trained, tmp_path / "report", f"extract.store={packed}")
+    assert run("", stage.main, told) == 2
+    command = f"python -m stages.archive --restore --set archive.output={packed}"
+    complained = capsys.readouterr().err
+    assert "found an archive of one" in complained
+    assert command in complained

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 import zarr
 
-from pipeline.look.page.blocks import Notice, Notices, Place, Report, Section
+from pipeline.base.issue import Issue
+from pipeline.look.page.blocks import Issues, Report, Section
 from pipeline.look.page.style import RC
 from stages import inspect
 from stages.command import run
@@ -131,20 +132,34 @@ def test_what_cannot_be_looked_at_is_refused(
 
 
 def test_the_summary_says_the_worst_first_and_how_much_more_there_is() -> None:
-    found = [Notice("warning", "gap", f"e{index} 1.00 s", "x") for index in range(9)]
-    found.append(Notice("error", "unreadable", "e9", "two\n  lines"))
-    report = Report("R", "", [("episodes", "9")], [Section("S", [Notices(found, "fine")])])
+    found = [
+        Issue(severity="warning", kind=f"gap {kind}", message="x", episode="e1", start_s=1.0)
+        for kind in range(9)
+    ]
+    broken = "two\n  lines"
+    found.append(Issue(severity="error", kind="unreadable", message=broken, episode="e9"))
+    report = Report("R", "", [("episodes", "9")], [Section("S", [Issues(found, "fine")])])
     lines = list(inspect.summary(report))
     assert lines[:4] == ["R", "episodes 9", "error: unreadable: e9", "    two lines"]
-    assert lines[4:6] == ["warning: gap: e0 1.00 s", "    x"]
+    assert lines[4:6] == ["warning: gap 0: e1 1.00 s", "    x"]
     assert lines[-1] == "… and 2 more on the page and in findings.csv"
-    assert len(lines) == 2 + 2 * inspect.SAID + 1
+    assert len(lines) == 2 + 2 * inspect.SHOWN + 1
 
 
 def test_the_summary_says_one_place_and_what_was_found_there() -> None:
-    places = [Place(f"e{index}", "sensor", 1.0, 2.0, f"found {index}") for index in range(4)]
-    found = Notice("warning", "gap", "sensor · 4 episodes", "found 0", places)
-    report = Report("R", "", [], [Section("S", [Notices([found], "fine")])])
+    found = [
+        Issue(
+            severity="warning",
+            kind="gap",
+            message=f"found {index}",
+            episode=f"e{index}",
+            stream="sensor",
+            start_s=1.0,
+            stop_s=2.0,
+        )
+        for index in range(4)
+    ]
+    report = Report("R", "", [], [Section("S", [Issues(found, "fine")])])
     assert list(inspect.summary(report))[2:] == [
         "warning: gap: sensor · 4 episodes, the first e0 1.00–2.00 s",
         "    found 0",

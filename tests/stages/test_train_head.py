@@ -36,7 +36,7 @@ import sys
 from stages.command import run
 
 assert run("", "stages.train_head", sys.argv[1:]) == 0
-heavy = "torch transformers dask distributed scipy matplotlib plotly dvclive pandas"
+heavy = "torch transformers dask distributed scipy matplotlib dvclive pandas"
 print(sorted(set(heavy.split()) & sys.modules.keys()))
 """
 """A finished training, which says what it imported of what takes long."""

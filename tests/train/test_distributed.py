@@ -32,15 +32,15 @@ import contextlib, io, json, os, sys, time
 from datetime import timedelta
 from pathlib import Path
 import torch.distributed as dist
-import pipeline.train.batches
 import pipeline.train.loop as loop
 from pipeline.base.errors import StoreIncomplete
+from pipeline.store import FeatureStore
 from pipeline.train import speaker
 from stages import train_head
 from stages.command import run
 
 loop.LOG_EVERY = 1
-step, fitted, opened = loop.Trainer._train_step, loop.Trainer.fit, pipeline.train.batches.open_store
+step, fitted, opened = loop.Trainer._train_step, loop.Trainer.fit, FeatureStore.open
 rank = os.environ["RANK"]
 
 def train_step(self, batches, interrupted):
@@ -65,7 +65,7 @@ def train(arguments, fails="", holds=None):
     # Rank 0 is waited for where it fails too, however late; where it does not, for a moment.
     alone = fails.endswith("1")
     speaker.PRECEDENCE = timedelta(seconds=0.2 if alone else 200)
-    pipeline.train.batches.open_store = fail if fails == f"open {rank}" else opened
+    FeatureStore.open = fail if fails == f"open {rank}" else opened
     loop.Trainer.fit = fit if fails == f"step {rank}" else fitted
     return run("", train_head.main, arguments)
 

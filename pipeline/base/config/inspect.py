@@ -25,8 +25,6 @@ class InspectParams(Section):
     """Training samples shown side by side."""
     points: int = Field(default=4000, ge=100)
     """VL rows of a store that pictures show at most, evenly spread."""
-    duplicate_similarity: float = Field(default=0.9999, gt=0, le=1)
-    """Cosine similarity, of features less their mean, from which VL rows are near-duplicates."""
     seed: Seed = 0
     """Of the choice of samples."""
     output: Path = Path("reports/inspect")

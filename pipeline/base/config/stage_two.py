@@ -109,14 +109,12 @@ class TrainHeadParams(Section):
     """Of weights, order and dropout."""
     device: str = "auto"
     """auto, cpu, cuda or cuda:N."""
-    feed: Literal["auto", "mapped", "device", "compressed"] = "auto"
-    """How batches are made: gathered from the mapped store; on the device, which holds the streams
-    that fit; or from an archive, restored once to `scratch`. `auto` picks and says why."""
+    feed: Literal["auto", "mapped", "device"] = "auto"
+    """How batches are made: gathered from the mapped store, or on the device, which holds the
+    streams that fit. `auto` picks and says why."""
     check_store: bool = True
     """Read the store once before training, tuning and evaluation, and refuse a chunk that does not
     give its checksum; false where that takes too long."""
-    scratch: Path | None = None
-    """Folder for the restored archive; the system's temporary folder where null."""
     store: Path | None = None
     """The store to train from; `extract.store` where null. Another one DVC does not watch."""
     output: Path = Path("models/head")

@@ -2,14 +2,15 @@
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from pipeline.base.config import Params, VLMParams
 from pipeline.base.errors import VLMError
 from pipeline.base.format import size
-from pipeline.look.doctor.findings import Finding, missing, note, ok
-from pipeline.look.doctor.gpu import GPU, read_accelerator, usable_device
+from pipeline.base.issue import Issue
+from pipeline.look.doctor.gpu import GPU, read_gpus, usable_device
+from pipeline.look.doctor.issues import missing, note, ok
 from pipeline.simulation.demo_recordings import MARKER
 from pipeline.store.memory import available_bytes
 from pipeline.vlm.checkpoint_folder import (
@@ -23,38 +24,41 @@ from pipeline.vlm.checkpoint_folder import (
 
 _BYTES = {"float32": 4, "float16": 2, "bfloat16": 2}
 _EXAMPLE = "set vlm.checkpoint to a folder or a hub id, such as Qwen/Qwen2.5-VL-3B-Instruct"
-_RANDOM = "the demo's random weights: to look at the machinery, not to learn from"
 _BESIDE = 2 * 2**30
 """Roughly what else a GPU holds while the model works: CUDA itself and a batch's activations."""
 
 
-def check_checkpoint(params: Params) -> list[Finding]:
+def check(params: Params) -> Iterator[Issue]:
     """`vlm.checkpoint` and `vlm.adapter`; nothing is downloaded, no weight is read."""
     vlm = params.vlm
     folder = local_folder(vlm.checkpoint, vlm.revision)
     if folder is None:
-        return [absent_checkpoint(params)]
+        yield absent_checkpoint(params)
+        return
     try:
         files = weight_files(folder)
         tokenizer_files(folder)
-        count = parameter_count(files)
+        weights = [path for path in files if path.suffix == ".safetensors"]
+        shapes = [shape for path in weights for _, shape in tensor_headers(path).values()]
     except VLMError as error:
         own = Path(vlm.checkpoint).expanduser().is_dir()
         remedy = "copy it again" if own else f"hf download --force-download {vlm.checkpoint}"
-        return [missing("vlm.checkpoint", str(error), remedy)]
+        yield missing("vlm.checkpoint", str(error), remedy)
+        return
+    count = sum(map(math.prod, shapes))
     here = f"{vlm.checkpoint}, whole, {count:,} parameters"
     if str(folder) != vlm.checkpoint:
         here += " (in the hub's cache)"
-    findings = [
-        note("vlm.checkpoint", f"{here}; {_RANDOM}", f"{_EXAMPLE}; docs/real-model.md")
-        if (folder / MARKER).exists()
-        else ok("vlm.checkpoint", here)
-    ]
+    if (folder / MARKER).exists():
+        here += "; the demo's random weights: to look at the machinery, not to learn from"
+        yield note("vlm.checkpoint", here, f"{_EXAMPLE}; docs/real-model.md")
+    else:
+        yield ok("vlm.checkpoint", here)
     if vlm.adapter is not None:
-        findings.append(check_adapter(vlm.adapter))
+        yield check_adapter(vlm.adapter)
     device = usable_device(params.extract.device)
-    gpus = read_accelerator().gpus if device is not None and device.type == "cuda" else ()
-    return [*findings, check_fit(count, vlm, gpus, available_bytes())]
+    gpus = read_gpus() if device is not None and device.type == "cuda" else ()
+    yield check_fit(count, vlm, gpus, available_bytes())
 
 
 def local_folder(checkpoint: str, revision: str | None) -> Path | None:
@@ -65,29 +69,29 @@ def local_folder(checkpoint: str, revision: str | None) -> Path | None:
     return cached_checkpoint(checkpoint, revision) if could_be_hub_id(checkpoint) else None
 
 
-def absent_checkpoint(params: Params) -> Finding:
+def absent_checkpoint(params: Params) -> Issue:
     """What is said of a checkpoint that is not on this machine."""
     checkpoint = params.vlm.checkpoint
     if Path(checkpoint) == params.demo.checkpoint:
-        said = f"{checkpoint}: the demo's checkpoint is not written yet"
-        return missing("vlm.checkpoint", said, "python -m stages.demo (or dvc repro)")
+        text = f"{checkpoint}: the demo's checkpoint is not written yet"
+        return missing("vlm.checkpoint", text, "python -m stages.demo (or dvc repro)")
     if not could_be_hub_id(checkpoint):
-        said = f"{checkpoint}: no such folder, and no hub id"
-        return missing("vlm.checkpoint", said, _EXAMPLE)
-    said = f"{checkpoint}: no such folder, and no complete copy in the hub's cache"
+        text = f"{checkpoint}: no such folder, and no hub id"
+        return missing("vlm.checkpoint", text, _EXAMPLE)
+    text = f"{checkpoint}: no such folder, and no complete copy in the hub's cache"
     remedy = f"hf download {checkpoint}"
     if os.environ.get("HF_HUB_OFFLINE", "0").lower() in ("1", "true", "yes", "on"):
-        said += "; HF_HUB_OFFLINE forbids to fetch it"
-        return missing("vlm.checkpoint", said, f"{remedy}, where there is network")
-    return note("vlm.checkpoint", f"{said}; the first extraction downloads it", remedy)
+        text += "; HF_HUB_OFFLINE forbids to fetch it"
+        return missing("vlm.checkpoint", text, f"{remedy}, where there is network")
+    return note("vlm.checkpoint", f"{text}; the first extraction downloads it", remedy)
 
 
-def check_adapter(adapter: str) -> Finding:
+def check_adapter(adapter: str) -> Issue:
     """`vlm.adapter`."""
     folder = local_folder(adapter, None)
     if folder is None:
-        said = f"{adapter}: not on this machine"
-        return missing("vlm.adapter", said, "set vlm.adapter to its folder, or to null")
+        text = f"{adapter}: not on this machine"
+        return missing("vlm.adapter", text, "set vlm.adapter to its folder, or to null")
     try:
         adapter_files(folder)
     except VLMError as error:
@@ -95,28 +99,15 @@ def check_adapter(adapter: str) -> Finding:
     return ok("vlm.adapter", adapter)
 
 
-def check_fit(count: int, vlm: VLMParams, gpus: Sequence[GPU], available: int) -> Finding:
+def check_fit(count: int, vlm: VLMParams, gpus: Sequence[GPU], available: int) -> Issue:
     """Whether the weights fit: on the smallest GPU, else into the memory that is free."""
     weights = count * _BYTES[vlm.dtype]
     where, room, needed = "memory", available, weights
     if gpus:
         smallest = min(gpus, key=lambda gpu: gpu.memory)
         where, room, needed = smallest.name, smallest.memory, weights + _BESIDE
-    said = f"{size(weights)} in {vlm.dtype}, {where} has {size(room)}"
+    text = f"{size(weights)} in {vlm.dtype}, {where} has {size(room)}"
     if needed <= room:
-        return ok("it fits", said)
+        return ok("it fits", text)
     half = "set vlm.dtype to bfloat16, or " if vlm.dtype == "float32" else ""
-    remedy = f"{half}take a smaller checkpoint, or a machine with more memory"
-    if gpus:
-        remedy += ", or set extract.device to cpu"
-    return note("it may not fit", said, remedy)
-
-
-def parameter_count(files: Sequence[Path]) -> int:
-    """How many numbers these safetensors files hold, by their headers.
-
-    Raises `VLMError` where one is cut off.
-    """
-    weights = (path for path in files if path.suffix == ".safetensors")
-    shapes = (shape for path in weights for _, shape in tensor_headers(path).values())
-    return sum(map(math.prod, shapes))
+    return note("it may not fit", text, f"{half}take a smaller checkpoint, or a larger machine")

@@ -1,93 +1,91 @@
 """Whether the recordings are there, and can be read."""
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import av
 
 from pipeline.base.config import Params, Source
 from pipeline.base.errors import RecordingError
-from pipeline.data import Opened, Recording, open_recordings
-from pipeline.look.doctor.decoders import CLIPS, decoding_trouble
-from pipeline.look.doctor.findings import Finding, missing, note, ok
+from pipeline.base.issue import Issue
+from pipeline.data import Opened, open_recordings
+from pipeline.look.doctor.issues import missing, note, ok
 
-_CODECS = {"av1": "AV1", "h264": "H.264", "hevc": "HEVC"}
+DECODERS = {"AV1": "libdav1d", "H.264": "h264", "HEVC": "hevc"}
+"""What decodes the codecs that LeRobot data sets come in, AV1 by default."""
+_WHEEL = "pip install --upgrade --force-reinstall --only-binary av av"
 _VIDEOS = {".mp4", ".mkv", ".avi", ".mov", ".webm"}
 
 
-def check_data(params: Params) -> list[Finding]:
-    """`data.root` and each source; metadata is read, no stream and no frame."""
+def check(params: Params) -> Iterator[Issue]:
+    """`data.root` and each source; metadata is read, and one frame of a video."""
+    yield check_decoders(av.codecs_available)
     data = params.data
     demo = "python -m stages.demo (or dvc repro)" if data.root == params.demo.recordings else ""
-    relative = any(not Path(path).is_absolute() for one in data.sources for path in one.paths)
+    relative = any(not Path(path).is_absolute() for source in data.sources for path in source.paths)
     if relative and not data.root.is_dir():
-        said = f"{data.root}: no such folder"
-        return [missing("data.root", said, demo or "set data.root to the folder of recordings")]
-    findings = [ok("data.root", str(data.root))]
+        text = f"{data.root}: no such folder"
+        yield missing("data.root", text, demo or "set data.root to the folder of recordings")
+        return
+    yield ok("data.root", str(data.root))
     for source in data.sources:
         try:
             opened = open_recordings([source], data.root, data.views)
         except RecordingError as error:
-            findings.append(missing(source.name, str(error), demo or "mend data.sources"))
-            continue
-        findings += check_source(source, opened, data.on_bad_episode, decoding_trouble)
-    return findings
+            yield missing(source.name, str(error), demo or "mend data.sources")
+        else:
+            yield from check_source(source, opened, data.on_bad_episode)
 
 
-def check_source(
-    source: Source, opened: Opened, on_bad: str, trouble: Callable[[str], str | None]
-) -> list[Finding]:
+def check_decoders(available: set[str]) -> Issue:
+    """The video codecs; without AV1, most LeRobot data sets cannot be read."""
+    lacking = [codec for codec, decoder in DECODERS.items() if decoder not in available]
+    if lacking:
+        text = f"PyAV {av.__version__} does not decode {', '.join(lacking)}"
+        return note("video", text, f"{_WHEEL} (a wheel, which has libdav1d)")
+    return ok("video", f"PyAV {av.__version__} decodes {', '.join(DECODERS)}")
+
+
+def check_source(source: Source, opened: Opened, on_bad: str) -> Iterator[Issue]:
     """What a source holds, what of it cannot be read, and whether DVC sees it."""
     formats = Counter(recording.format for recording in opened.recordings)
-    said = ", ".join(f"{count} episode(s), {name}" for name, count in formats.items())
-    findings = [ok(source.name, f"{said or 'no episode'}{_first_instruction(opened.recordings)}")]
+    text = ", ".join(f"{count} episode(s), {name}" for name, count in formats.items())
+    # The old format keeps its instruction in a pickle, which takes long to open.
+    quick = [recording for recording in opened.recordings if recording.format != "old"]
+    told = f', told "{quick[0].instruction}"' if quick else ""
+    yield ok(source.name, f"{text or 'no episode'}{told}")
     if opened.bad:
         first = f"{len(opened.bad)} episode(s) cannot be read, first: {opened.bad[0].reason}"
-        findings.append(unusable(source.name, first, on_bad))
+        yield unusable(source.name, first, on_bad)
     if opened.missing:
-        said = f"{len(opened.missing)} listed episode(s) are not there: {opened.missing[0]}"
-        findings.append(note(source.name, said, "copy them too, or leave them out"))
+        text = f"{len(opened.missing)} listed episode(s) are not there: {opened.missing[0]}"
+        yield note(source.name, text, "copy them too, or leave them out")
     outside = [path for path in source.paths if Path(path).is_absolute()]
     if outside:
-        said = f"{outside[0]} is absolute, so DVC does not watch it"
-        findings.append(note(source.name, said, "lay it below data.root, for dvc repro"))
-    video = _first_video(opened.recordings)
-    return findings if video is None else [*findings, check_video(source.name, video, trouble)]
+        text = f"{outside[0]} is absolute, so DVC does not watch it"
+        yield note(source.name, text, "lay it below data.root, for dvc repro")
+    lerobot = [episode for episode in opened.recordings if episode.format == "lerobot"]
+    videos = [file for episode in lerobot[:1] for file in episode.files() if file.suffix in _VIDEOS]
+    if videos:
+        yield check_video(source.name, videos[0])
 
 
-def unusable(subject: str, found: str, on_bad: str) -> Finding:
+def unusable(subject: str, message: str, on_bad: str) -> Issue:
     """What is said of episodes that cannot be used: they are left out, or nothing runs."""
     if on_bad == "skip":
-        return note(subject, found, "left out, as data.on_bad_episode says")
-    return missing(subject, found, "mend or remove them, or set data.on_bad_episode=skip")
+        return note(subject, message, "left out, as data.on_bad_episode says")
+    return missing(subject, message, "mend or remove them, or set data.on_bad_episode=skip")
 
 
-def check_video(source: str, path: Path, trouble: Callable[[str], str | None]) -> Finding:
-    """Whether this PyAV decodes the codec of a video."""
+def check_video(source: str, path: Path) -> Issue:
+    """Whether this PyAV decodes the first frame of a video."""
+    codec = "unknown codec"
     try:
         with av.open(str(path)) as container:
-            name = container.streams.video[0].codec_context.codec.canonical_name
-    except (av.FFmpegError, OSError, IndexError) as error:
-        return missing(source, f"{path}: cannot be read as video: {error}", "copy it again")
-    codec = _CODECS.get(name, name)
-    why = trouble(codec) if codec in CLIPS else None
-    if why is None:
-        return ok(source, f"its videos are {codec}")
-    said = f"its videos are {codec}, which this PyAV does not decode: {why}"
-    return missing(source, said, "pip install --upgrade --force-reinstall --only-binary av av")
-
-
-def _first_instruction(recordings: Sequence[Recording]) -> str:
-    # The old format keeps it in a pickle, which takes long to open.
-    for recording in recordings:
-        if recording.format != "old":
-            return f', told "{recording.instruction}"'
-    return ""
-
-
-def _first_video(recordings: Sequence[Recording]) -> Path | None:
-    for recording in recordings:
-        if recording.format == "lerobot":
-            return next((file for file in recording.files() if file.suffix in _VIDEOS), None)
-    return None
+            codec = container.streams.video[0].codec_context.codec.canonical_name
+            next(container.decode(video=0))
+    except (av.FFmpegError, OSError, IndexError, StopIteration) as error:
+        text = f"{path}: its video ({codec}) is not decoded: {error or 'it has no frame'}"
+        return missing(source, text, f"copy it again, or {_WHEEL}")
+    return ok(source, f"its videos are {codec}")

@@ -1,21 +1,25 @@
-"""Whether torch can use the GPU that is there, and which install would."""
+"""Whether torch can use the GPU that is there, and which attention the model would take."""
 
 import os
 import shutil
-import subprocess
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
-from pipeline.base.config import Params
+from pipeline.base.config import Params, VLMParams
 from pipeline.base.device import resolve_device
 from pipeline.base.errors import ConfigError
 from pipeline.base.format import size
-from pipeline.look.doctor.findings import Finding, missing, note, ok
+from pipeline.base.issue import Issue
+from pipeline.look.doctor.issues import missing, note, ok
+from pipeline.store.memory import memory_bytes
+from pipeline.vlm.loading import attention_backend
 
-_WHEELS = ((13.0, "cu130"), (12.8, "cu128"), (12.0, "cu126"))
-"""The newest CUDA build of torch that a driver of at least this CUDA version runs."""
+FLASH = "pip install flash-attn --no-build-isolation"
+_DRIVERS = ("/proc/driver/nvidia/version", "/dev/kfd")
+"""There where an NVIDIA or an AMD driver is."""
 
 
 @dataclass(frozen=True)
@@ -29,144 +33,84 @@ class GPU:
     """Whether it computes in bfloat16 itself."""
 
 
-@dataclass(frozen=True)
-class Accelerator:
-    """What this build of torch is made for, what it sees, and what the machine has."""
-
-    torch: str
-    """Version."""
-    cuda: str | None
-    """CUDA version that torch was built with; None for a build without."""
-    hip: str | None
-    """ROCm version that torch was built with."""
-    gpus: tuple[GPU, ...]
-    driver: str | None
-    """Version of the NVIDIA driver; "" where it is there but does not answer."""
-    driver_cuda: float | None
-    """Newest CUDA version that the driver runs."""
-    amd: bool
-    """Whether there is an AMD GPU with its driver."""
-    hidden: bool
-    """Whether CUDA_VISIBLE_DEVICES hides every GPU."""
-
-    @property
-    def build(self) -> str:
-        """In words."""
-        made_for = f"CUDA {self.cuda}" if self.cuda else f"ROCm {self.hip}" if self.hip else ""
-        return f"torch {self.torch}, built for {made_for or 'the CPU only'}"
-
-
-def check_gpu(params: Params) -> list[Finding]:
-    """The GPU of this machine under these params."""
-    asked = {
-        "extract.device": params.extract.device,
-        "train_head.device": params.train_head.device,
-        "evaluate.device": params.evaluate.device,
-    }
-    absent = [
-        missing(key, f"{name}: torch cannot use it here, see GPU", f"mend that, or set {key}=auto")
-        for key, name in asked.items()
-        if usable_device(name) is None
-    ]
-    return [*check_accelerator(read_accelerator(), params.vlm.dtype), *absent]
+def check(params: Params) -> Iterator[Issue]:
+    """The machine, its GPU and the attention backend under these params."""
+    yield ok("machine", f"{len(os.sched_getaffinity(0))} cores, {size(memory_bytes())} of memory")
+    driver = shutil.which("nvidia-smi") is not None or any(Path(path).exists() for path in _DRIVERS)
+    yield from check_gpus(read_gpus(), driver, params.vlm.dtype)
+    for section in ("extract", "train_head", "evaluate"):
+        name = getattr(params, section).device
+        if usable_device(name) is None:
+            key = f"{section}.device"
+            text = f"{name}: torch cannot use it here, see GPU"
+            yield missing(key, text, f"mend that, or set {key}=auto")
+    device = usable_device(params.extract.device)
+    if device is not None:
+        yield check_attention(params.vlm, device)
 
 
 def usable_device(name: str) -> torch.device | None:
-    """The device of a param; None where torch cannot use it here, which `check_gpu` says."""
+    """The device of a param; None where torch cannot use it here, which `check` says."""
     try:
         return resolve_device(name)
     except ConfigError:
         return None
 
 
-def check_accelerator(here: Accelerator, dtype: str) -> list[Finding]:
-    """Whether torch sees the GPU, why not, and what it can do."""
-    if not here.gpus:
-        return [_unseen(here)]
-    findings = [ok("build", here.build)]
-    for index, gpu in enumerate(here.gpus):
-        said = f"{gpu.name}, {size(gpu.memory)}"
-        if dtype != "bfloat16" or gpu.bfloat16:
-            findings.append(ok(f"cuda:{index}", said))
-        else:
-            said += "; it only emulates bfloat16, which vlm.dtype asks for"
-            findings.append(note(f"cuda:{index}", said, "set vlm.dtype to float16 or float32"))
-    return findings
-
-
-def read_accelerator() -> Accelerator:
-    """The facts, none of which raises."""
-    gpus: list[GPU] = []
+def read_gpus() -> tuple[GPU, ...]:
+    """What torch sees."""
     # A count of 0 without a warning where the driver does not answer.
-    if torch.cuda.device_count() and torch.cuda.is_available():
-        for index in range(torch.cuda.device_count()):
-            told = torch.cuda.get_device_properties(index)
-            native = torch.version.hip is not None or told.major >= 8
-            gpus.append(GPU(told.name, told.total_memory, native))
-    driver, cuda = _nvidia_driver()
-    return Accelerator(
-        torch=torch.__version__,
-        cuda=torch.version.cuda,
-        hip=torch.version.hip,
-        gpus=tuple(gpus),
-        driver=driver,
-        driver_cuda=cuda,
-        amd=Path("/dev/kfd").exists(),
-        hidden=os.environ.get("CUDA_VISIBLE_DEVICES", "all").strip() in ("", "-1"),
-    )
+    if not (torch.cuda.device_count() and torch.cuda.is_available()):
+        return ()
+    seen = [torch.cuda.get_device_properties(at) for at in range(torch.cuda.device_count())]
+    amd = torch.version.hip is not None
+    return tuple(GPU(device.name, device.total_memory, amd or device.major >= 8) for device in seen)
 
 
-def _unseen(here: Accelerator) -> Finding:
-    """Why there is no GPU to use."""
-    if here.driver is None and not here.amd:
-        said = f"{here.build}; this machine has no GPU driver, so everything runs on the CPU: "
-        return note("GPU", f"{said}well enough for the demo, not for a 3B or 7B checkpoint")
-    if here.hidden:
-        return note("GPU", "CUDA_VISIBLE_DEVICES hides every GPU", "unset CUDA_VISIBLE_DEVICES")
-    if here.amd and here.driver is None:
-        said = f"{here.build}, but this machine has an AMD GPU that it does not see"
-        return note("GPU", said, "install torch's ROCm build, see pytorch.org/get-started")
-    if here.driver_cuda is not None and here.driver_cuda < 12:
-        said = f"the NVIDIA driver {here.driver} runs CUDA {here.driver_cuda:g} at most"
-        return note("GPU", said, "update the driver to 525 or newer, then run this again")
-    driver = f"an NVIDIA driver{f' {here.driver}' if here.driver else ''}"
-    if here.cuda is None:
-        said = f"{here.build}, but this machine has {driver}"
-        return note("GPU", said, pip_line(here.driver_cuda))
-    if here.driver_cuda is not None and float(here.cuda) > here.driver_cuda:
-        said = f"{here.build}, newer than the CUDA {here.driver_cuda:g} that {driver} runs"
-        return note("GPU", said, pip_line(here.driver_cuda))
-    said = f"{here.build}; there is {driver}, but no GPU answers"
-    return note("GPU", said, "look at nvidia-smi; in a container, start it with --gpus all")
+def check_gpus(gpus: Sequence[GPU], driver: bool, dtype: str) -> Iterator[Issue]:
+    """What torch sees and can do; where it sees nothing, why."""
+    made_for = f"CUDA {torch.version.cuda}" if torch.version.cuda else "the CPU only"
+    made_for = f"ROCm {torch.version.hip}" if torch.version.hip else made_for
+    build = f"torch {torch.__version__}, built for {made_for}"
+    if gpus:
+        yield ok("build", build)
+    elif not driver:
+        text = f"{build}; this machine has no GPU driver, so everything runs on the CPU: "
+        yield note("GPU", f"{text}well enough for the demo, not for a 3B or 7B checkpoint")
+    else:
+        text = f"{build}; this machine has a GPU driver, but torch says: {_why_unseen()}"
+        remedy = (
+            "look at CUDA_VISIBLE_DEVICES and nvidia-smi (in a container, start it with --gpus "
+            "all); then update the driver, or pip install --force-reinstall torch from the index "
+            "that pytorch.org/get-started names for the driver's CUDA version"
+        )
+        yield note("GPU", text, remedy)
+    for index, gpu in enumerate(gpus):
+        text = f"{gpu.name}, {size(gpu.memory)}"
+        if dtype != "bfloat16" or gpu.bfloat16:
+            yield ok(f"cuda:{index}", text)
+        else:
+            text += "; it only emulates bfloat16, which vlm.dtype asks for"
+            yield note(f"cuda:{index}", text, "set vlm.dtype to float16 or float32")
 
 
-def pip_line(driver_cuda: float | None) -> str:
-    """How to install a torch whose CUDA a driver of this CUDA version runs; None is not known."""
-    wheel = next((name for least, name in _WHEELS if (driver_cuda or 12.6) >= least), "cu126")
-    return (
-        f"pip install --force-reinstall torch, from the index that pytorch.org/get-started "
-        f"names for {wheel}"
-    )
-
-
-def _nvidia_driver() -> tuple[str | None, float | None]:
-    """The driver's version and the newest CUDA version that it runs."""
-    there = Path("/proc/driver/nvidia/version").exists()
-    if shutil.which("nvidia-smi") is None:
-        return ("", None) if there else (None, None)
+def _why_unseen() -> str:
     try:
-        said = subprocess.run(
-            ["nvidia-smi"], capture_output=True, text=True, timeout=8, check=True
-        ).stdout
-    except (OSError, subprocess.SubprocessError):
-        return "", None
-    return parse_nvidia_smi(said)
+        torch.cuda.init()
+    except (RuntimeError, AssertionError) as error:
+        return str(error).splitlines()[0]
+    return "no device answers"
 
 
-def parse_nvidia_smi(said: str) -> tuple[str, float | None]:
-    """Driver and CUDA version from the head of nvidia-smi's table."""
-    words = said.replace(":", " ").split()
-    after = {"".join(words[at : at + 2]): words[at + 2] for at in range(len(words) - 2)}
-    cuda = after.get("CUDAVersion", "")
-    known = cuda.replace(".", "", 1).isdigit()
-    return after.get("DriverVersion", ""), float(cuda) if known else None
+def check_attention(vlm: VLMParams, device: torch.device) -> Issue:
+    """What `vlm.attention` comes to."""
+    best = attention_backend(vlm.model_copy(update={"attention": "auto"}), device)
+    if vlm.attention == "flash_attention_2" != best:
+        text = f"vlm.attention asks for flash-attention, which {device} with vlm.dtype {vlm.dtype} "
+        text += "has not: it needs CUDA, half precision and the package flash-attn"
+        return missing("attention", text, f"set vlm.attention to auto, or {FLASH}")
+    taken = attention_backend(vlm, device)
+    text = f"vlm.attention: {vlm.attention} takes {taken} on {device}"
+    if device.type == "cuda" and vlm.dtype != "float32" and best == "sdpa":
+        return note("attention", f"{text}; flash-attention is optional", FLASH)
+    return ok("attention", text)

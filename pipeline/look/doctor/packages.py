@@ -2,112 +2,71 @@
 
 import sys
 import tomllib
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
 from importlib.metadata import PackageNotFoundError, version
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 from packaging.requirements import Requirement
-from packaging.specifiers import SpecifierSet
 
 from pipeline.base.config import Params
-from pipeline.look.doctor.findings import Finding, missing, ok
+from pipeline.base.issue import Issue
+from pipeline.look.doctor.issues import missing, ok
 
-PROJECT = "vla-feature-cache"
-_SHOWN = ("torch", "transformers", "peft", "zarr", "numpy", "av", "dvc")
-VersionOf = Callable[[str], str | None]
-
-
-@dataclass(frozen=True)
-class Wanted:
-    """What the project asks of an environment."""
-
-    python: str
-    """Range of versions."""
-    packages: Sequence[str]
-    """Requirements, as in pyproject.toml."""
-    loggers: Sequence[str]
-    """Those of the extra."""
+_SHOWN = ("python", "torch", "transformers", "peft", "zarr", "numpy", "av", "dvc")
 
 
-def check_packages(params: Params) -> list[Finding]:
-    """Python, the packages that are needed and those of loggers, as they are here."""
-    wanted = read_wanted(Path(__file__).parents[2] / "pyproject.toml")
-    python = ".".join(map(str, sys.version_info[:3]))
-    return [
-        check_python(wanted.python, python),
-        *check_required(wanted.packages, installed_version),
-        check_loggers(wanted.loggers, params.train_head.loggers, installed_version),
-    ]
+def check(params: Params) -> Iterator[Issue]:
+    """Python, the packages that are needed and those of the loggers that the params name.
 
-
-def read_wanted(pyproject: Path) -> Wanted:
-    """What pyproject.toml of the checkout says: what was installed may be older than it."""
-    project: dict[str, Any] = tomllib.loads(pyproject.read_text(encoding="utf-8"))["project"]
+    Asked for is what pyproject.toml of the checkout says: what was installed may be older than it.
+    """
+    pyproject = Path(__file__).parents[3] / "pyproject.toml"
+    project = tomllib.loads(pyproject.read_text(encoding="utf-8"))["project"]
     loggers = project["optional-dependencies"]["loggers"]
-    return Wanted(project["requires-python"], project["dependencies"], loggers)
+    lines = [
+        f"python{project['requires-python']}",
+        *project["dependencies"],
+        *(line for line in loggers if Requirement(line).name in params.train_head.loggers),
+    ]
+    return check_required(lines, installed_version)
 
 
 def installed_version(name: str) -> str | None:
-    """The version of an installed package; None where there is none."""
+    """The version of Python or of an installed package; None where there is none."""
+    if name == "python":
+        return ".".join(map(str, sys.version_info[:3]))
     try:
         return version(name)
     except PackageNotFoundError:
         return None
 
 
-def check_python(wanted: str, found: str) -> Finding:
-    """The interpreter."""
-    if SpecifierSet(wanted).contains(found):
-        return ok("python", f"{found} ({sys.executable})")
-    remedy = "make a virtual environment with a newer Python and install again"
-    return missing("python", f"{found}; expected {wanted}", remedy)
-
-
-def check_required(packages: Sequence[str], version_of: VersionOf) -> list[Finding]:
+def check_required(
+    lines: Sequence[str], version_of: Callable[[str], str | None]
+) -> Iterator[Issue]:
     """One line for all that are as they should be, and one for each that is not."""
-    found = {line: version_of(Requirement(line).name) for line in packages}
-    good = [line for line in packages if _fits(line, found[line])]
-    shown = ", ".join(
-        f"{name} {found[line]}" for line in good if (name := Requirement(line).name) in _SHOWN
-    )
-    findings = [ok("packages", f"{len(good)} of {len(packages)} as pyproject.toml asks: {shown}")]
-    for line in packages:
-        if line not in good:
-            name = Requirement(line).name
-            said = f"expected {line}, found {found[line] or 'none'}"
-            findings.append(missing(name, said, f"pip install '{line}'"))
-    return findings
-
-
-def check_loggers(extra: Sequence[str], loggers: Sequence[str], version_of: VersionOf) -> Finding:
-    """The packages of the extra `loggers`, of which those that the params name are needed."""
-    absent = {
-        Requirement(line).name
-        for line in extra
-        if not _fits(line, version_of(Requirement(line).name))
+    wanted = {line: Requirement(line) for line in lines}
+    versions = {requirement.name: version_of(requirement.name) for requirement in wanted.values()}
+    bad = {
+        line: requirement.name
+        for line, requirement in wanted.items()
+        if not _fits(requirement, versions[requirement.name])
     }
-    asked = sorted(absent & {*loggers})
-    remedy = f"pip install '{PROJECT}[loggers]', or in a checkout: pip install -e '.[loggers]'"
-    if asked:
-        said = f"train_head.loggers asks for {', '.join(asked)}, which is not installed"
-        return missing("loggers", said, remedy)
-    if absent:
-        said = f"{', '.join(sorted(absent))} not installed; not needed with these params"
-        return ok("loggers", said)
-    return ok("loggers", "tensorboard and wandb are there for train_head.loggers")
+    shown = ", ".join(
+        f"{name} {versions[name]}"
+        for name in _SHOWN
+        if name in versions and name not in bad.values()
+    )
+    yield ok("packages", f"{len(wanted) - len(bad)} of {len(wanted)} as they should be: {shown}")
+    for line, name in bad.items():
+        remedy = f"pip install '{line}'"
+        if name == "python":
+            remedy = "make a virtual environment with another Python and install again"
+        yield missing(name, f"expected {line}, found {versions[name] or 'none'}", remedy)
 
 
-def importable(name: str) -> bool:
-    """Whether a module of this name is installed; a bare folder is none."""
-    spec = find_spec(name)
-    return spec is not None and spec.origin is not None
-
-
-def _fits(line: str, found: str | None) -> bool:
-    if found is None:
-        return False
+def _fits(wanted: Requirement, version: str | None) -> bool:
     # A build such as 2.13.0+cpu, or a nightly, is what its number says.
-    return Requirement(line).specifier.contains(found.split("+")[0], prereleases=True)
+    return version is not None and wanted.specifier.contains(
+        version.split("+")[0], prereleases=True
+    )

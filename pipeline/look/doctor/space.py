@@ -1,182 +1,147 @@
-"""Whether the store that these params describe has room: on the disk, in memory, in maps."""
+"""Whether the store that these params describe has room: on the disk and in memory."""
 
 import math
 import os
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence, Sized
 from pathlib import Path
 
 from pipeline.base.config import Params
 from pipeline.base.durable import free_bytes
-from pipeline.base.errors import RecordingError, StoreMismatch, VLMError
+from pipeline.base.errors import RecordingError
 from pipeline.base.format import size
-from pipeline.data import Recording, open_recordings
-from pipeline.data.embodiment import Embodiment
-from pipeline.data.timeline import ActionRotation, build_timeline, choose_action_rotation
-from pipeline.extract.check import CheckedEpisode
-from pipeline.extract.layout import build_arrays
-from pipeline.extract.plan import store_bytes
-from pipeline.extract.survey import Survey, SurveyedEpisode
+from pipeline.base.issue import Issue
+from pipeline.data import Recording, Stream, open_recordings
+from pipeline.data.timeline import Timeline, build_timeline, choose_action_rotation
 from pipeline.look.doctor.checkpoint import local_folder
 from pipeline.look.doctor.data import unusable
-from pipeline.look.doctor.findings import Finding, missing, note, ok
-from pipeline.look.doctor.links import links_here
-from pipeline.store import part_path
+from pipeline.look.doctor.issues import missing, note, ok
+from pipeline.store import Sizes, arrays, part_path
 from pipeline.store.memory import memory_bytes
 from pipeline.vlm.feature_spec import feature_spec
 
 BUDGET_S = 2.0
 """How long episodes are read for the estimate; the rest is taken to be like them."""
 MOST_READ = 100
+_TEXT_BYTES = 400
+"""Roughly what an episode's instruction and path take."""
+
+Streams = tuple[Timeline, Stream | None, Stream | None]
+"""Ticks, sensor and state of an episode."""
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """What a store will take."""
-
-    bytes: int
-    maps: int
-    """Chunk files, each of which a process maps."""
-    episodes: int
-    read: int
-    """Episodes that were read; the others are taken to be as long."""
-
-    def __str__(self) -> str:
-        known = "" if self.read == self.episodes else f", judged by {self.read} of them"
-        return f"about {size(self.bytes)} for {self.episodes} episodes{known}"
-
-
-def check_space(params: Params) -> list[Finding]:
+def check(params: Params) -> Iterator[Issue]:
     """The store of `params`, without loading the model or decoding a frame."""
-    target = params.extract.store
+    data, target = params.data, params.extract.store
     if local_folder(params.vlm.checkpoint, params.vlm.revision) is None:
-        return [note("size", "not known before vlm.checkpoint is here; see above")]
+        yield note("size", "not known before vlm.checkpoint is here; see above")
+        return
     try:
-        estimate, bad = estimate_store(params)
+        recordings = open_recordings(data.sources, data.root, data.views).recordings
     except RecordingError:
-        return [note("size", "not known before the recordings can be read; see above")]
-    except (VLMError, StoreMismatch) as error:
-        return [missing("size", f"not known: {error}", "mend that, and run this again")]
-    findings: list[Finding] = []
+        yield note("size", "not known before the recordings can be read; see above")
+        return
+    counts, bad = measure(recordings, params)
     if bad:
-        said = f"{len(bad)} episode(s) read for the size cannot be used, first: {bad[0]}"
-        findings.append(unusable("episodes", said, params.data.on_bad_episode))
-    if estimate is None:
-        return [*findings, note("size", "not known: no episode could be read; see above")]
-    begun, finished = used_bytes(part_path(target)), used_bytes(target)
-    free = free_bytes(target)
-    findings.append(check_disk(estimate, target, free, begun, finished=finished > 0))
-    if links_here() == "copy":
-        findings.append(check_cached_copy(estimate, free, begun, finished))
-    findings.append(check_page_cache(estimate, memory_bytes()))
-    limit = Path("/proc/sys/vm/max_map_count")
-    if limit.exists():
-        findings.append(check_maps(estimate, int(limit.read_text(encoding="ascii"))))
-    return findings
+        text = f"{len(bad)} episode(s) read for the size cannot be used, first: {bad[0]}"
+        yield unusable("episodes", text, data.on_bad_episode)
+    if not counts:
+        yield note("size", "not known: no episode could be read; see above")
+        return
+    episodes = len(recordings) - len(bad)
+    taken = estimated_bytes(counts, episodes, params)
+    estimate = f"about {size(taken)} for {episodes} episodes"
+    if len(counts) < episodes:
+        estimate += f", judged by {len(counts)} of them"
+    yield check_disk(taken, estimate, target, free_bytes(target), used_bytes(part_path(target)))
+    yield check_page_cache(taken, memory_bytes())
 
 
-def check_disk(
-    estimate: Estimate, target: Path, free: int, begun: int, *, finished: bool
-) -> Finding:
+def check_disk(taken: int, estimate: str, target: Path, free: int, begun: int) -> Issue:
     """Room for the store, less what an unfinished build of it has already."""
-    said = f"{estimate}; {size(free)} free in {target.parent}"
+    text = f"{estimate}; {size(free)} free in {target.parent}"
     if begun:
-        said += f", {size(begun)} of it written by an unfinished build"
-    if estimate.bytes - begun <= free:
-        return ok("disk", f"{said}; {target} is finished" if finished else said)
+        text += f", {size(begun)} of it written by an unfinished build"
+    if target.exists():
+        text += f"; {target} is finished"
+    if taken - begun <= free:
+        return ok("disk", text)
     remedy = (
         "make room, set extract.store to another disk, extract.dtype to float16, or fewer "
         "vlm.pooling slots"
     )
-    if finished:
-        return note("disk", f"{said}; {target} is there, but another has no room beside it", remedy)
-    return missing("disk", said, remedy)
+    return (note if target.exists() else missing)("disk", text, remedy)
 
 
-def check_cached_copy(estimate: Estimate, free: int, begun: int, finished: int) -> Finding:
-    """Room for the second store that DVC keeps where it can only copy, less what is written."""
-    written = min(finished or begun, estimate.bytes)
-    said = f"DVC can only copy into its cache: {size(2 * estimate.bytes)} with its copy"
-    if written:
-        said += f", {size(written)} of it written"
-    if finished:
-        said += ", and the copy too if DVC has seen this store"
-    if 2 * estimate.bytes - written <= free:
-        return ok("DVC's copy", said)
-    remedy = "put .dvc/cache on the same disk (dvc cache dir), or call the stages without DVC"
-    return note("DVC's copy", said, remedy)
-
-
-def check_page_cache(estimate: Estimate, memory: int) -> Finding:
+def check_page_cache(taken: int, memory: int) -> Issue:
     """Whether training reads the store at memory speed after its first epoch."""
-    if estimate.bytes <= 0.7 * memory:
+    if taken <= 0.7 * memory:
         return ok("page cache", f"the store fits into memory ({size(memory)})")
-    said = f"the store is larger than what {size(memory)} of memory keeps, so it is read from disk"
+    text = f"the store is larger than what {size(memory)} of memory keeps, so it is read from disk"
     remedy = "keep it on a local NVMe disk, or set extract.dtype to float16"
-    return note("page cache", said, remedy)
+    return note("page cache", text, remedy)
 
 
-def check_maps(estimate: Estimate, limit: int) -> Finding:
-    """Room among the maps of a process."""
-    said = f"{estimate.maps} chunk files; vm.max_map_count is {limit}"
-    if estimate.maps < 0.8 * limit:
-        return ok("maps", said)
-    return missing("maps", said, f"sudo sysctl vm.max_map_count={4 * max(estimate.maps, limit)}")
+def measure(recordings: Sequence[Recording], params: Params) -> tuple[list[Streams], list[str]]:
+    """Timeline, sensor and state of a few episodes, read within `BUDGET_S`.
 
-
-def estimate_store(params: Params) -> tuple[Estimate | None, list[str]]:
-    """What `extract.plan=true` computes, from a few episodes within `BUDGET_S`.
-
-    And why some of these cannot be used; they count as left out. None where that is all of them.
-    Raises `RecordingError` where a source cannot be opened, `VLMError` where the checkpoint
-    does not fit the params, `StoreMismatch` where two sources are not of one embodiment.
+    And why others of them cannot be used.
     """
-    opened = open_recordings(params.data.sources, params.data.root, params.data.views)
-    rotation = choose_action_rotation(params.data.action_rotation, opened.recordings)
-    checked: list[CheckedEpisode] = []
+    data = params.data
+    rotation = choose_action_rotation(data.action_rotation, recordings)
+    # An order whose every beginning comes from all over: the golden ratio's.
+    order = sorted(range(len(recordings)), key=lambda at: at * 0.6180339887498949 % 1)
+    read: list[Streams] = []
     bad: list[str] = []
     until = time.monotonic() + BUDGET_S
-    for recording in _spread(opened.recordings)[:MOST_READ]:
-        if (checked or bad) and time.monotonic() > until:
+    for recording in (recordings[at] for at in order[:MOST_READ]):
+        if (read or bad) and time.monotonic() > until:
             break
         try:
-            checked.append(_read(recording, params, rotation))
+            state, sensor = recording.state(), recording.sensor()
+            line = build_timeline(
+                recording, data.action_hz, data.vlm_reuse_count, rotation, state, sensor
+            )
+            read.append((line, sensor, state))
         except RecordingError as error:
             bad.append(str(error))
-    if not checked:
-        return None, bad
-    views = sorted({view for one in checked for view in one.surveyed.recording.view_names()})
+    return read, bad
+
+
+def estimated_bytes(read: Sequence[Streams], episodes: int, params: Params) -> int:
+    """About what `extract.plan=true` computes, where all episodes are like those read.
+
+    Raises `VLMError` where the checkpoint does not fit the params.
+    """
+    views = {view for line, _, _ in read for view in line.frames}
     # A digest decides nothing of a size, and reading every weight for it takes long.
-    spec = feature_spec(params.vlm, params.extract.dtype, views, lambda path: "")
-    survey = Survey(tuple(one.surveyed for one in checked), (), (), spec, rotation, "")
-    episodes = len(opened.recordings) - len(bad)
-    times = episodes / len(checked)
-    specs = {
-        name: replace(one, shape=(math.ceil(one.shape[0] * times), *one.shape[1:]))
-        for name, one in build_arrays(checked, survey, params).items()
-    }
-    maps = sum(one.chunk_count for one in specs.values())
-    return Estimate(store_bytes(specs), maps, episodes, len(checked)), bad
+    spec = feature_spec(params.vlm, params.extract.dtype, sorted(views), lambda path: "")
+    lines = [line for line, _, _ in read]
+    sensors = [sensor for _, sensor, _ in read if sensor]
+    states = [state for _, _, state in read if state]
+
+    def in_all(times: Iterator[Sized]) -> int:
+        return math.ceil(sum(map(len, times)) * episodes / len(read))
+
+    sizes = Sizes(
+        episodes=episodes,
+        ticks=in_all(line.time for line in lines),
+        vl_rows=in_all(line.vl_time for line in lines),
+        readings=in_all(stream.time for stream in sensors),
+        states=in_all(stream.time for stream in states),
+        text_bytes=_TEXT_BYTES * episodes,
+        slots=len(spec.slots) * spec.variants,
+        dim=spec.dim,
+        views=len(views),
+        action_dim=len(lines[0].action_channels.names),
+        sensor_channels=max((len(stream.channels.names) for stream in sensors), default=0),
+        state_dim=max((len(stream.channels.names) for stream in states), default=0),
+    )
+    specs = arrays(sizes, params.extract.dtype, params.extract.sensor_dtype).values()
+    return sum(spec.data_bytes for spec in specs)
 
 
 def used_bytes(folder: Path) -> int:
     """Bytes on the disk of the files below a folder; 0 where there is none."""
     files = (Path(root, name) for root, _, names in os.walk(folder) for name in names)
     return sum(file.lstat().st_blocks * 512 for file in files)
-
-
-def _spread(recordings: Sequence[Recording]) -> list[Recording]:
-    """All of them, in an order whose every beginning comes from all over: the golden ratio's."""
-    order = sorted(range(len(recordings)), key=lambda at: at * 0.6180339887498949 % 1)
-    return [recordings[at] for at in order]
-
-
-def _read(recording: Recording, params: Params, rotation: ActionRotation) -> CheckedEpisode:
-    _ = recording.instruction  # some formats read it when asked; remembered
-    state, sensor = recording.state(), recording.sensor()
-    hz, reuse = params.data.action_hz, params.data.vlm_reuse_count
-    line = build_timeline(recording, hz, reuse, rotation, state, sensor)
-    embodiment = Embodiment.of(line.action_channels, line.action_kind, sensor, state)
-    readings, states = (len(one.time) if one else 0 for one in (sensor, state))
-    return CheckedEpisode(SurveyedEpisode(recording, "", ""), line, embodiment, readings, states)

@@ -1,22 +1,38 @@
-"""The page of several evaluations side by side."""
+"""The page of several evaluations side by side; it knows no recordings, as that of one does."""
 
 from collections.abc import Sequence
 from functools import partial
 
+from pipeline.base.table import Table
 from pipeline.evaluate.experiment_tables import experiment_errors
 from pipeline.evaluate.experiments import Experiment
 from pipeline.evaluate.tables import FOOTNOTE
 from pipeline.look.evaluation import pictures as plots
-from pipeline.look.page.blocks import Picture, Report, Section, Table
-from pipeline.look.page.cells import sentence
+from pipeline.look.page.blocks import Picture, Report, Section
+from pipeline.look.page.writing import sentence
 
 
 def comparison_report(experiments: Sequence[Experiment]) -> Report:
     """The page of these experiments, of which the first are no better than the last."""
-    best = min(experiments, key=lambda one: one.error)
+    best = min(experiments, key=lambda experiment: experiment.error)
     columns, rows = experiment_errors(experiments)
     edge = columns.index("expert")
-    own = [(row[0], *row[edge:]) for row in rows[: len(experiments)]]
+    errors = Table(
+        columns[:edge],
+        [row[:edge] for row in rows],
+        f"Mean absolute errors. {sentence(FOOTNOTE)}",
+        frozenset({experiments.index(best)}),
+    )
+    picture = Picture(
+        "experiments",
+        "Held-out error of each experiment, coloured by expert; the baselines are lines.",
+        partial(plots.comparison_of_experiments, experiments),
+    )
+    own = Table(
+        [columns[0], *columns[edge:]],
+        [(row[0], *row[edge:]) for row in rows[: len(experiments)]],
+        "What they are; samples: chunks a tick whose mean was judged.",
+    )
     return Report(
         title="Experiments side by side",
         summary=(
@@ -24,28 +40,5 @@ def comparison_report(experiments: Sequence[Experiment]) -> Report:
             "of all of them."
         ),
         tiles=(("lowest held-out error [training std]", f"{best.error:.3f}"), ("by", best.name)),
-        sections=(
-            Section(
-                "Errors",
-                (
-                    Table(
-                        columns[:edge],
-                        [row[:edge] for row in rows],
-                        caption=f"Mean absolute errors. {sentence(FOOTNOTE)}",
-                        strong=frozenset({experiments.index(best)}),
-                    ),
-                    Picture(
-                        "experiments",
-                        "Held-out error of each experiment, coloured by expert; the baselines are "
-                        "lines.",
-                        partial(plots.comparison_of_experiments, experiments),
-                    ),
-                    Table(
-                        [columns[0], *columns[edge:]],
-                        own,
-                        caption="What they are; samples: chunks a tick whose mean was judged.",
-                    ),
-                ),
-            ),
-        ),
+        sections=(Section("Errors", (errors, picture, own)),),
     )

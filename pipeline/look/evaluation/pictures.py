@@ -1,34 +1,437 @@
-"""Figures of merit -> pictures; the same numbers give the same bytes.
+"""Figures of merit -> pictures; the same numbers give the same bytes."""
 
-Those of a probe, of recordings and of stores are in modules apart from these: they know other
-rooms.
-"""
+import math
+import textwrap
+from collections.abc import Mapping, Sequence
+from typing import Any
 
-from pipeline.look.evaluation.draw_ablation import modalities
-from pipeline.look.evaluation.draw_chunks import chunks
-from pipeline.look.evaluation.draw_curves import curves
-from pipeline.look.evaluation.draw_errors import dimension_horizon, dimensions
-from pipeline.look.evaluation.draw_experiments import comparison_of_experiments
-from pipeline.look.evaluation.draw_predictions import (
-    EPISODE_LINES,
-    episodes,
-    horizon,
-    scatter,
-    timeline,
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+
+from pipeline.evaluate.ablation import Ablated, ModalityStudy
+from pipeline.evaluate.ablation_tables import FOOTNOTE as MODALITY_FOOTNOTE
+from pipeline.evaluate.ablation_tables import best_baseline
+from pipeline.evaluate.curves import Curve, Curves
+from pipeline.evaluate.experiments import Experiment
+from pipeline.evaluate.names import with_unit
+from pipeline.look.page.style import (
+    GRID,
+    INK,
+    LABELS,
+    PALETTE,
+    RECORDED,
+    STYLES,
+    canvas,
+    legend_below,
+    logarithmic,
 )
-from pipeline.look.page.style import LABELS
+from pipeline.store import Episode, FeatureStore, episode_name
+from pipeline.train.predictions import BASELINES, METHODS, Predictions
+from pipeline.train.scores import Comparison, Group
 
-__all__ = [
-    "EPISODE_LINES",
-    "LABELS",
-    "chunks",
-    "comparison_of_experiments",
-    "curves",
-    "dimension_horizon",
-    "dimensions",
-    "episodes",
-    "horizon",
-    "modalities",
-    "scatter",
-    "timeline",
-]
+SCATTER_POINTS = 4000
+EPISODE_LINES = 40
+_TITLE_WIDTH = 34
+"""Characters for which a panel of an action group has room."""
+_CHUNKS_WIDTH = 11.0
+_CHUNK = PALETTE[5]
+"""Of whole chunks."""
+_NUMBERED_STEPS = 16
+"""Steps of a chunk up to which a cell has room for its number."""
+_DARK, _LIGHT = "#111111", "#ffffff"
+"""Ink on a coloured cell, which is the same in light and in dark."""
+_POLICY = STYLES["policy"]["color"]
+_CURVES = {
+    "train/loss": ("training loss", PALETTE[0], True),
+    "val/error": ("held-out error [training std]", PALETTE[5], False),
+    "lr": ("learning rate", PALETTE[2], False),
+}
+"""Curve -> what its axis says, colour, and whether to draw decades of it logarithmic."""
+_ABLATIONS = {
+    "zeroed": "#0072B2",
+    "missing": "#56B4E9",
+    "shuffled": "#D55E00",
+    "delayed": "#999999",
+}
+_EXPERTS = ("#0072B2", "#D55E00", "#56B4E9", "#F0E442", "#999999")
+"""In the order in which they come."""
+
+
+def dimensions(comparison: Comparison) -> Figure:
+    """Mean absolute error of each dimension that varies, in units of its training deviation."""
+    shown = comparison.varying()
+    figure = canvas(9.0, 0.42 * len(shown) + 2.0)
+    axis = figure.subplots()
+    lines = np.arange(len(shown))
+    for method in METHODS:
+        errors = comparison.in_training_std(comparison.scores[method].mae)
+        axis.plot(errors, lines, **_marked(method, linestyle=""))
+    axis.set_yticks(lines, _dimension_names(comparison))
+    axis.set_ylim(len(shown) - 0.5, -0.5)
+    axis.set_xlim(left=0)
+    axis.set_xlabel("mean absolute error [training std] (left is better)")
+    legend_below(figure, axis, 2)
+    figure.suptitle("Error of each action dimension on held-out ticks")
+    return figure
+
+
+def dimension_horizon(comparison: Comparison) -> Figure:
+    """The policy's error over dimensions and steps ahead, each in its training deviation."""
+    errors = comparison.in_training_std(comparison.scores["policy"].mae_horizon).T
+    figure = canvas(9.0, 0.42 * len(errors) + 1.9)
+    axis = figure.subplots()
+    axis.grid(visible=False)
+    worst = float(np.nanmax(errors)) or 1.0
+    colours = mpl.colormaps["viridis_r"]
+    image = axis.imshow(errors, colours, vmin=0, vmax=worst, aspect="auto", interpolation="nearest")
+    bar = figure.colorbar(image, ax=axis, pad=0.02)
+    bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
+    bar.set_label("error [training std]")
+    if errors.shape[1] <= _NUMBERED_STEPS:
+        for (row, step), error in np.ndenumerate(errors):
+            if np.isfinite(error):
+                ink = _LIGHT if error > 0.55 * worst else _DARK
+                axis.text(step, row, f"{error:.2f}", ha="center", va="center", color=ink)
+    axis.set_yticks(range(len(errors)), _dimension_names(comparison))
+    axis.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axis.set_xlabel("steps ahead")
+    figure.suptitle("Error of the policy by dimension and step of the chunk (light is better)")
+    return figure
+
+
+def horizon(comparison: Comparison, action_hz: float | None) -> Figure:
+    """Mean absolute error by how far ahead an action lies, a panel an action group."""
+    groups = comparison.varying_groups()
+    figure = canvas(max(4.6 * len(groups), 9.4), 4.4)
+    axes = figure.subplots(1, len(groups), squeeze=False)[0]
+    for axis, group in zip(axes, groups, strict=True):
+        for method in METHODS:
+            errors = group.mean(comparison.scores[method].mae_horizon)
+            axis.plot(np.arange(len(errors)), errors, **_marked(method))
+        axis.set_title(_group_title(comparison, group))
+        axis.set_xlabel(
+            "steps ahead" if action_hz is None else f"steps ahead [{1000 / action_hz:.0f} ms each]"
+        )
+        axis.set_ylabel(with_unit("mean absolute error", group.unit))
+        axis.set_ylim(bottom=0)
+        axis.xaxis.get_major_locator().set_params(integer=True)
+    legend_below(figure, axes[0], len(METHODS))
+    figure.suptitle("Error over the action chunk on held-out ticks (lower is better)")
+    return figure
+
+
+def episodes(comparison: Comparison, store: FeatureStore) -> Figure:
+    """Mean absolute error of each held-out episode, a panel an action group, worst on top."""
+    order = np.array(comparison.ranked())
+    title = "Error of each held-out episode"
+    if len(order) > EPISODE_LINES:
+        order = order[np.linspace(0, len(order) - 1, EPISODE_LINES).round().astype(int)]
+        title += f" ({len(order)} of {len(comparison.episodes)})"
+    groups = comparison.varying_groups()
+    figure = canvas(max(3.6 * len(groups) + 3, 9.0), 0.3 * len(order) + 2)
+    axes = figure.subplots(1, len(groups), squeeze=False, sharey=True)[0]
+    lines = np.arange(len(order))
+    for axis, group in zip(axes, groups, strict=True):
+        for method in METHODS:
+            errors = group.mean(comparison.scores[method].mae_episode)[order]
+            axis.plot(errors, lines, **_marked(method, linestyle=""))
+        axis.set_title(_group_title(comparison, group))
+        axis.set_xlabel(with_unit("mean absolute error", group.unit))
+        axis.set_xlim(left=0)
+    axes[0].set_yticks(lines, [_short_name(store.episodes[comparison.episodes[i]]) for i in order])
+    axes[0].set_ylim(-0.6, len(order) - 0.4)
+    legend_below(figure, axes[0], len(METHODS))
+    figure.suptitle(f"{title}, worst by overall error on top (left is better)")
+    return figure
+
+
+def scatter(comparison: Comparison, predictions: Predictions) -> Figure:
+    """Predicted against recorded next action, a panel a dimension; on the diagonal it is right."""
+    shown = comparison.varying()
+    columns = min(4, len(shown))
+    lines = math.ceil(len(shown) / columns)
+    figure = canvas(3.1 * columns, 3.1 * lines + 0.5)
+    axes = figure.subplots(lines, columns, squeeze=False).ravel()
+    step = math.ceil(len(predictions.ticks) / SCATTER_POINTS)
+    for axis in axes[len(shown) :]:
+        axis.set_axis_off()
+    for index, axis in zip(shown, axes, strict=False):
+        recorded = predictions.recorded[::step, 0, index]
+        predicted = predictions.predicted[::step, 0, index]
+        both = np.concatenate([recorded, predicted])
+        low, high = float(both.min()), float(both.max())
+        margin = max(0.05 * (high - low), 0.02 * max(abs(low), abs(high)), 1e-6)
+        low, high = low - margin, high + margin
+        axis.plot([low, high], [low, high], color=RECORDED, lw=1, zorder=1)
+        axis.scatter(recorded, predicted, s=9, alpha=0.35, linewidths=0, color=_POLICY)
+        axis.set(xlim=(low, high), ylim=(low, high), aspect="equal")
+        axis.locator_params(nbins=4)
+        axis.ticklabel_format(scilimits=(-2, 4), useOffset=False)
+        unit = comparison.units[index]
+        axis.set_title(with_unit(comparison.names[index], unit))
+        axis.set_xlabel(with_unit("recorded", unit))
+        axis.set_ylabel(with_unit("policy", unit))
+    figure.suptitle("Next action at held-out ticks: on the line, the policy does what was recorded")
+    return figure
+
+
+def timeline(comparison: Comparison, predictions: Predictions, store: FeatureStore) -> Figure:
+    """Recorded and predicted action over time, a row a dimension, a column an episode."""
+    shown = comparison.extremes()
+    rows = len(comparison.names)
+    figure = canvas(max(5.8 * len(shown) + 0.4, 8.0), 1.15 * rows + 1.4)
+    axes = figure.subplots(rows, len(shown), squeeze=False, sharex="col", sharey="row")
+    for column, (title, index) in enumerate(shown):
+        time_s = _episode_time(store, store.episodes[index])
+        for row, axis in enumerate(axes[:, column]):
+            _plot_next_actions(axis, row, predictions, store.episodes[index], time_s)
+        axes[0, column].set_title(f"{title}: {_short_name(store.episodes[index])}")
+        axes[-1, column].set_xlabel("time since the episode began [s]")
+    for row, axis in enumerate(axes[:, 0]):
+        axis.set_ylabel(with_unit(comparison.names[row], comparison.units[row]))
+        if comparison.scale[row] == 0:
+            _widen_range(axis)
+    figure.align_ylabels(axes[:, 0])
+    legend_below(figure, axes[0, 0], 2)
+    figure.suptitle("Held-out episodes: the recorded action, and what the policy would do next")
+    return figure
+
+
+def chunks(
+    comparison: Comparison,
+    predictions: Predictions,
+    store: FeatureStore,
+    episode: Episode,
+    instants: NDArray[np.int64],
+    frames: Mapping[str, Sequence[NDArray[np.uint8]]],
+) -> Figure:
+    """Frames at `instants` above, and below them recorded and predicted actions over time.
+
+    `instants` are held-out ticks of the episode, store-global; `frames` has one a view for each, or
+    no view at all. Drawn are the next action at every tick, and the whole chunk at the instants.
+    """
+    time_s = _episode_time(store, episode)
+    shown = comparison.varying()
+    tall = 1.15 * len(shown) + 1.2
+    width = _CHUNKS_WIDTH / max(3, len(instants))
+    shapes = [[image.shape for image in images] for images in frames.values()]
+    heights = [width * max(shape[0] / shape[1] for shape in view) for view in shapes]
+    above_in = [sum(heights) + 0.5] if heights else []
+    figure = canvas(_CHUNKS_WIDTH, sum(above_in) + tall)
+    parts = figure.subfigures(len(above_in) + 1, 1, height_ratios=[*above_in, tall], squeeze=False)
+    below: SubFigure = parts[-1, 0]
+    if heights:
+        _show_frames(parts[0, 0], frames, time_s[instants - episode.ticks.start])
+    axes = below.subplots(len(shown), 1, squeeze=False, sharex=True)[:, 0]
+    for axis, dimension in zip(axes, shown, strict=True):
+        _plot_next_actions(axis, dimension, predictions, episode, time_s)
+        _plot_chunks(axis, dimension, predictions, episode, time_s, instants)
+        axis.set_ylabel(with_unit(comparison.names[dimension], comparison.units[dimension]))
+    axes[-1].set_xlabel("time since the episode began [s]")
+    below.align_ylabels(axes)
+    handles, labels = axes[0].get_legend_handles_labels()
+    below.legend(handles, labels, loc="outside lower center", ncols=3)
+    error = comparison.overall_by_episode("policy")[comparison.episodes.index(episode.index)]
+    figure.suptitle(f"{_short_name(episode)}: overall error {error:.3f} [training std]")
+    return figure
+
+
+def _show_frames(
+    figure: SubFigure, frames: Mapping[str, Sequence[NDArray[np.uint8]]], times: NDArray[Any]
+) -> None:
+    axes = figure.subplots(len(frames), len(times), squeeze=False)
+    for row, (view, images) in zip(axes, frames.items(), strict=True):
+        for axis, image in zip(row, images, strict=True):
+            axis.imshow(image)
+            axis.set(xticks=[], yticks=[])
+            axis.grid(visible=False)
+            axis.spines[:].set_visible(False)
+        row[0].set_ylabel(view)
+    for axis, time_s in zip(axes[0], times, strict=True):
+        axis.set_title(f"{time_s:.1f} s")
+
+
+def _plot_next_actions(
+    axis: Axes,
+    dimension: int,
+    predictions: Predictions,
+    episode: Episode,
+    time_s: NDArray[np.float64],
+) -> None:
+    here = predictions.episodes == episode.index
+    at = time_s[predictions.ticks[here] - episode.ticks.start]
+    recorded, predicted = predictions.recorded[here, 0], predictions.predicted[here, 0]
+    axis.plot(at, recorded[:, dimension], color=RECORDED, lw=2.2, label="recorded")
+    axis.plot(at, predicted[:, dimension], color=_POLICY, lw=1.6, label="policy, next action")
+
+
+def _plot_chunks(
+    axis: Axes,
+    dimension: int,
+    predictions: Predictions,
+    episode: Episode,
+    time_s: NDArray[np.float64],
+    instants: NDArray[np.int64],
+) -> None:
+    label = "policy, whole chunk at the dotted ticks"
+    for place in np.flatnonzero(np.isin(predictions.ticks, instants)):
+        chunk = predictions.predicted[place, predictions.valid[place], dimension]
+        ahead = time_s[predictions.ticks[place] - episode.ticks.start :][: len(chunk)]
+        axis.axvline(ahead[0], color=INK, lw=0.8, ls=":", zorder=1)
+        axis.plot(ahead, chunk, color=_CHUNK, lw=2, zorder=6, label=label)
+        axis.plot(ahead[:1], chunk[:1], color=_CHUNK, marker="o", ms=5, zorder=6)
+        label = ""
+
+
+def curves(logged: Curves, step: int) -> Figure:
+    """Loss, held-out error and learning rate over the steps; a line marks the step judged here."""
+    shown = [name for name in _CURVES if name in logged.curves] or sorted(logged.curves)[:3]
+    figure = canvas(max(4.2 * len(shown), 8.4), 3.4)
+    axes = figure.subplots(1, len(shown), squeeze=False, sharex=True)[0]
+    for axis, name in zip(axes, shown, strict=True):
+        _plot_curve(axis, name, logged.curves[name])
+        axis.axvline(step, color=INK, lw=1, ls="--")
+    figure.suptitle(f"Course of the training; the checkpoint judged here is of step {step}")
+    return figure
+
+
+def _plot_curve(axis: Axes, name: str, curve: Curve) -> None:
+    title, colour, by_decades = _CURVES.get(name, (name, PALETTE[4], False))
+    marker = "o" if len(curve.step) <= 30 else ""
+    axis.plot(curve.step, curve.value, color=colour, marker=marker, markersize=4)
+    # Within a decade a logarithmic axis has nothing but odd numbers to show.
+    if by_decades and 0 < 10 * curve.value.min() <= curve.value.max():
+        logarithmic(axis)
+        axis.grid(which="minor", lw=0.4)
+    else:
+        axis.set_ylim(bottom=min(0.0, float(curve.value.min())))
+    axis.set_title(title)
+    axis.set_xlabel("step")
+
+
+def modalities(study: ModalityStudy) -> Figure:
+    """The error with each stream spoilt as a multiple of the intact one, a panel a stream.
+
+    The error itself, in units of the training standard deviation, where the intact one is 0.
+    """
+    panels = [
+        [ablated for ablated in study.spoilt if ablated.stream == name] for name in study.streams
+    ]
+    widths = [len(panel) for panel in panels]
+    figure = canvas(max(0.95 * sum(widths) + 1.5, 7.5), 4.6)
+    axes = figure.subplots(
+        1, len(panels), squeeze=False, sharey=True, gridspec_kw={"width_ratios": widths}
+    )[0]
+    for axis, panel in zip(axes, panels, strict=True):
+        _plot_ablations(axis, panel, study)
+    axes[0].set_ylabel("held-out error / error with all streams intact")
+    axes[0].set_ylim(0, 1.12 * axes[0].get_ylim()[1])
+    legend_below(figure, axes[0], 2)
+    figure.legends[0].set_title(MODALITY_FOOTNOTE)
+    figure.suptitle(
+        f"What the policy loses with one stream spoilt, on {study.intact.ticks} held-out ticks, "
+        f"{study.samples} chunk(s) a tick\n"
+        "(well above 1: the stream is used; delays fade where a stream changes slowly)"
+    )
+    return figure
+
+
+def _plot_ablations(axis: Axes, panel: Sequence[Ablated], study: ModalityStudy) -> None:
+    unit = study.intact.overall("policy") or 1.0
+    heights = [ablated.comparison.overall("policy") / unit for ablated in panel]
+    colours = [_ABLATIONS[ablated.how.split()[0]] for ablated in panel]
+    bars = axis.bar(range(len(panel)), heights, color=colours, width=0.7)
+    # On a ground of its own, for a line may pass behind a number.
+    ground = {"facecolor": GRID, "edgecolor": "none", "pad": 1}
+    axis.bar_label(bars, fmt="%.2f", padding=3, bbox=ground)
+    best = best_baseline(study.intact)
+    intact, blind = (study.intact.overall(method) / unit for method in ("policy", best))
+    axis.axhline(intact, color=_POLICY, lw=1.8, label="policy, all streams intact")
+    label = f"best {LABELS[best]}, which sees nothing"
+    axis.axhline(blind, color=INK, lw=1.8, ls="--", label=label)
+    axis.set_xticks(range(len(panel)), [ablated.how.replace(" ", "\n", 1) for ablated in panel])
+    axis.grid(axis="x", visible=False)
+    axis.set_title(panel[0].stream)
+
+
+def comparison_of_experiments(experiments: Sequence[Experiment]) -> Figure:
+    """Held-out error of each experiment, coloured by expert, and the baselines as lines."""
+    figure = canvas(9.0, 0.36 * len(experiments) + 2.6)
+    axis = figure.subplots()
+    for index, expert in enumerate(
+        dict.fromkeys(experiment.model_type for experiment in experiments)
+    ):
+        places = [
+            at for at, experiment in enumerate(experiments) if experiment.model_type == expert
+        ]
+        errors = [experiments[at].error for at in places]
+        colour = _EXPERTS[index % len(_EXPERTS)]
+        axis.barh(places, errors, color=colour, height=0.72, label=expert.replace("_", " "))
+    for method in BASELINES:
+        error, style = experiments[0].overall[method], STYLES[method]
+        line = {"color": style["color"], "ls": style["linestyle"]}
+        axis.axvline(error, lw=2, label=LABELS[method], **line)
+    for place, experiment in enumerate(experiments):
+        # Beside the panel: at its bar's end a number would lie on the baselines that are near.
+        axis.annotate(
+            f"{experiment.error:.3f}",
+            (1, place),
+            xycoords=axis.get_yaxis_transform(),
+            xytext=(6, 0),
+            textcoords="offset points",
+            va="center",
+        )
+    axis.set_yticks(range(len(experiments)), [experiment.name for experiment in experiments])
+    axis.invert_yaxis()
+    axis.grid(axis="y", visible=False)
+    axis.set_xlabel("mean absolute error on held-out ticks [training std] (left is better)")
+    legend_below(figure, axis, 3)
+    figure.suptitle("Held-out error by expert and fusion, trained from one store")
+    return figure
+
+
+def _marked(method: str, **changed: Any) -> dict[str, Any]:
+    """How a way of acting is drawn where its points are marked."""
+    # An open, larger square stays visible where the mean action is next to no motion.
+    size = {"policy": 6.5, "zero_action": 8.5}.get(method, 5)
+    width = 2.4 if method == "policy" else 1.5
+    style = {"linewidth": width, "markersize": size, "label": LABELS[method]}
+    return STYLES[method] | style | changed
+
+
+def _dimension_names(comparison: Comparison) -> list[str]:
+    return [with_unit(comparison.names[i], comparison.units[i]) for i in comparison.varying()]
+
+
+def _group_title(comparison: Comparison, group: Group) -> str:
+    """The group and its dimensions, as the width of a panel allows."""
+    names = [comparison.names[index] for index in group.dimensions]
+    title = f"{group.name} ({', '.join(names)})"
+    if len(title) <= _TITLE_WIDTH:
+        return title
+    ends = textwrap.fill(f"{names[0]} … {names[-1]}", _TITLE_WIDTH)
+    return f"{group.name}, {len(names)} dimensions\n{ends}"
+
+
+def _short_name(episode: Episode) -> str:
+    """`episode_name`, its middle left out where it is too long for a title."""
+    name = episode_name(episode)
+    return name if len(name) <= 44 else f"{name[:14]}…{name[-28:]}"
+
+
+def _episode_time(store: FeatureStore, episode: Episode) -> NDArray[np.float64]:
+    """(tick,) s since the episode began."""
+    time_s = store.array("tick/time")[episode.ticks.start : episode.ticks.stop]
+    return time_s - time_s[0]
+
+
+def _widen_range(axis: Axes) -> None:
+    """Keep a channel that never varies from filling its panel with rounding noise."""
+    low, high = axis.get_ylim()
+    middle = (low + high) / 2
+    half = max((high - low) / 2, 0.1 * max(1.0, abs(middle)))
+    axis.set_ylim(middle - half, middle + half)

@@ -1,10 +1,13 @@
 """What a page is made of, before it is HTML."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
 from matplotlib.figure import Figure
+
+from pipeline.base.issue import Issue
+from pipeline.base.table import Table
 
 
 @dataclass(frozen=True)
@@ -12,17 +15,6 @@ class Text:
     """A paragraph of plain words; backticks make code."""
 
     words: str
-
-
-@dataclass(frozen=True)
-class Table:
-    """Rows of cells under column heads; numbers stand right, in as many digits as they deserve."""
-
-    columns: Sequence[str]
-    rows: Sequence[Sequence[Any]]
-    caption: str = ""
-    strong: frozenset[int] = frozenset()
-    """Rows that stand out."""
 
 
 @dataclass(frozen=True)
@@ -37,58 +29,19 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Chart:
-    """A plotly figure that can be zoomed and hovered, and the same figure for paper."""
+class Issues:
+    """What looks wrong, of which times are seconds as the page counts them.
 
-    picture: Picture
-    """Writes the PNG, and stands in where scripts are off."""
-    figure: Any
-    """`plotly.graph_objects.Figure`."""
+    The page shows the same issue at several places once (`group_issues`), and says `none` where
+    there is no issue.
+    """
 
-
-@dataclass(frozen=True)
-class Place:
-    """One place of a notice: `str` says the episode and the time."""
-
-    episode: str
-    stream: str
-    start_s: float | None
-    """Since the instant from which the page counts; None where it is all of the stream."""
-    stop_s: float | None
-    message: str
-    """What was found there."""
-
-    def __str__(self) -> str:
-        if self.start_s is None:
-            return self.episode
-        start = f"{self.start_s:.2f}"
-        stop = start if self.stop_s is None else f"{self.stop_s:.2f}"
-        return f"{self.episode} {start if stop == start else f'{start}–{stop}'} s".lstrip()
-
-
-@dataclass(frozen=True)
-class Notice:
-    """One thing that looks wrong: how bad, where (episode, stream, time), and what."""
-
-    severity: Literal["error", "warning"]
-    kind: str
-    where: str
-    message: str
-    """Of several places, what was found at the first."""
-    places: Sequence[Place] = ()
-    """All of them; where they are several, `where` says how many and names none."""
-
-
-@dataclass(frozen=True)
-class Notices:
-    """What looks wrong, worst first; `none` is said where there is nothing."""
-
-    notices: Sequence[Notice]
+    issues: Sequence[Issue]
     none: str
 
 
 @dataclass(frozen=True)
-class Run:
+class TokenRun:
     """Consecutive tokens of one kind: `text` as the model has them, `note` such as "48 tokens"."""
 
     text: str
@@ -100,7 +53,7 @@ class Run:
 class Tokens:
     """A prompt in reading order, special tokens and folded runs of image tokens marked."""
 
-    runs: Sequence[Run]
+    runs: Sequence[TokenRun]
 
 
 @dataclass(frozen=True)
@@ -111,7 +64,7 @@ class Document:
     content: Mapping[str, Any]
 
 
-Block = Text | Table | Picture | Chart | Notices | Tokens | Document
+Block = Text | Table | Picture | Issues | Tokens | Document
 
 
 @dataclass(frozen=True)
@@ -123,7 +76,7 @@ class Section:
     parts: Sequence["Section"] = ()
 
 
-_Kind = TypeVar("_Kind")
+BlockKind = TypeVar("BlockKind", bound=Block)
 
 
 @dataclass(frozen=True)
@@ -134,16 +87,14 @@ class Report:
     summary: str
     tiles: Sequence[tuple[str, str]] = ()
     """(label, value), shown large at the top."""
-    sections: Sequence[Section] = field(default_factory=tuple)
+    sections: Sequence[Section] = ()
 
-    def blocks(self, *kinds: type[_Kind]) -> Iterator[_Kind]:
-        """Its blocks of these kinds, in reading order."""
-        return _blocks(self.sections, kinds)
+    def blocks(self, kind: type[BlockKind]) -> Iterator[BlockKind]:
+        """Its blocks of this kind, in reading order."""
+        return _blocks(self.sections, kind)
 
 
-def _blocks(sections: Sequence[Section], kinds: tuple[type[_Kind], ...]) -> Iterator[_Kind]:
+def _blocks(sections: Sequence[Section], kind: type[BlockKind]) -> Iterator[BlockKind]:
     for section in sections:
-        for block in section.blocks:
-            if isinstance(block, kinds):
-                yield block
-        yield from _blocks(section.parts, kinds)
+        yield from (block for block in section.blocks if isinstance(block, kind))
+        yield from _blocks(section.parts, kind)

@@ -41,16 +41,9 @@ RECORDED = INK
 PALETTE = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
 """Of what has no colour of its own; Okabe and Ito's, less what is lost on white or on black."""
 _CJK = (
-    "Noto Sans CJK KR",
-    "Noto Sans CJK JP",
-    "Noto Sans CJK SC",
-    "NanumGothic",
-    "Malgun Gothic",
-    "Apple SD Gothic Neo",
-    "Hiragino Sans",
-    "Yu Gothic",
-    "PingFang SC",
-    "Microsoft YaHei",
+    *("Noto Sans CJK KR", "Noto Sans CJK JP", "Noto Sans CJK SC"),
+    *("NanumGothic", "Malgun Gothic", "Microsoft YaHei", "Yu Gothic"),
+    *("Apple SD Gothic Neo", "Hiragino Sans", "PingFang SC"),
 )
 """Fonts of Debian, Windows and macOS with what Chinese, Japanese and Korean names are made of."""
 NO_FONT = (
@@ -103,13 +96,13 @@ def write(folder: Path, pictures: Mapping[str, Callable[[], Figure]]) -> list[Pa
 
     Warns once, with `NO_FONT`, of letters that cannot be drawn. Raises `DiskFull`.
     """
-    with mpl.rc_context(RC), boxes() as said:
+    with mpl.rc_context(RC), boxes() as notes:
         for name, draw in pictures.items():
             figure = draw()
             # Without its `Software` entry the file does not change with matplotlib's version.
             with disk_full_named(folder):
                 figure.savefig(fresh(folder / name), dpi=120, metadata={"Software": None})
-    if said:
+    if notes:
         warnings.warn(NO_FONT, stacklevel=2)
     return [folder / name for name in pictures]
 
@@ -117,19 +110,19 @@ def write(folder: Path, pictures: Mapping[str, Callable[[], Figure]]) -> list[Pa
 @contextmanager
 def boxes() -> Generator[set[str]]:
     """A set that holds `NO_FONT` once a letter was drawn as a box; no letter warns of itself."""
-    said: set[str] = set()
+    notes: set[str] = set()
     show = warnings.showwarning
 
     def note(message: Warning | str, *where: Any, **more: Any) -> None:
         if _NO_GLYPH.match(str(message)):
-            said.add(NO_FONT)
+            notes.add(NO_FONT)
         else:
             show(message, *where, **more)
 
     with warnings.catch_warnings():
         warnings.filterwarnings("always", _NO_GLYPH.pattern, UserWarning)
         warnings.showwarning = note
-        yield said
+        yield notes
 
 
 def canvas(width: float, height: float) -> Figure:

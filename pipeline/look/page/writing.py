@@ -1,50 +1,45 @@
 """`Report` -> `report.html`, one file that needs nothing beside itself, and PNG files.
 
-The page makes no request: styles, scripts, pictures and plotly.js stand in it, and its content
-security policy forbids the rest. The same report gives the same bytes.
+The page makes no request: styles, script and pictures stand in it, and its content security policy
+forbids the rest. The same report gives the same bytes.
 """
 
 import json
 import re
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 from tqdm import tqdm
 
 from pipeline.base.durable import disk_full_named, sync
 from pipeline.base.ownership import REPORT, OutputKind, begin_folder, release, remove_folder
+from pipeline.base.table import Table
 from pipeline.look.page.blocks import (
     Block,
-    Chart,
     Document,
-    Notices,
+    Issues,
     Picture,
     Report,
     Section,
-    Table,
     Text,
     Tokens,
 )
-from pipeline.look.page.cells import breakable, columns_of, prose
-from pipeline.look.page.charts import chart_json, plotly_script
-from pipeline.look.page.findings import FINDINGS, findings_csv
+from pipeline.look.page.issues import FINDINGS, findings_csv, group_issues, place_of
 from pipeline.look.page.style import NO_FONT, RC, boxes, write
 from pipeline.look.page.svg import inline_svg
 
 PAGE = "report.html"
-OPEN_NOTICES = 12
-"""Notices that show at once; the rest unfold."""
+OPEN_GROUPS = 12
+"""Groups of issues that show at once; the rest unfold."""
 NAMED_PLACES = 3
-"""Of a notice, those that show at once; all of them unfold."""
+"""Of a group, those that show at once; all of them unfold."""
 MOST_PLACES = 300
-"""Of a notice, those that the page lists; more stand in `findings.csv` only."""
-_TEMPLATES = Path(__file__).parent / "templates"
+"""Of a group, those that the page lists; more stand in `findings.csv` only."""
 _WRITTEN = re.compile(r'<meta name="pictures" content="([^"]*)">')
 _TEMPORARY = OutputKind("a page in the making", Path.is_dir)
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
@@ -60,59 +55,46 @@ def write_report(folder: Path, report: Report) -> list[Path]:
     page in place, and `ValueError` for a picture's name that is twice in the report or no plain
     file stem.
     """
-    names = [picture.name for picture in _pictures(report)]
+    names = [picture.name for picture in report.blocks(Picture)]
     _check_names(names)
     temporary = folder / f".{PAGE}.new"
     with disk_full_named(folder):
         folder.mkdir(parents=True, exist_ok=True)
         try:
             begin_folder(temporary, _TEMPORARY)
-            page = _Page(report, temporary, names).html()
-            # A file's name need not be text: what is none is shown as \udcXX.
-            texts = {**_findings(report), PAGE: page}
+            texts = {PAGE: _PageWriter(temporary).html(report, names)}
+            # The first issues are those of all; those of single parts come later.
+            if issues := next(report.blocks(Issues), None):
+                texts = {FINDINGS: findings_csv(issues.issues), **texts}
             for name, text in texts.items():
+                # A file's name need not be text: what is none is shown as \udcXX.
                 (temporary / name).write_text(text, encoding="utf-8", errors="backslashreplace")
-            return _put_in_place(temporary, folder, names, texts)
+            return _put_in_place(temporary, folder, [*(f"{name}.png" for name in names), *texts])
         finally:
             remove_folder(temporary, _TEMPORARY)
             release(folder, REPORT)
 
 
-def _put_in_place(
-    temporary: Path, folder: Path, names: Sequence[str], texts: Iterable[str]
-) -> list[Path]:
-    page = folder / PAGE
-    files = [*(f"{name}.png" for name in names), *texts]
+def _put_in_place(temporary: Path, folder: Path, files: Sequence[str]) -> list[Path]:
     for file in files:
         sync(temporary / file)
-    before = _pictures_of(page)
+    before = _pictures_of(folder / PAGE)
     for file in files:
         (temporary / file).replace(folder / file)
-    for name in before - set(names):
-        (folder / f"{name}.png").unlink(missing_ok=True)
+    for name in before - {*files}:
+        (folder / name).unlink(missing_ok=True)
     sync(folder)
-    return [page, *(folder / file for file in files[:-1])]
-
-
-def _findings(report: Report) -> dict[str, str]:
-    """The first notices are those of all; those of single parts come later."""
-    found = next(report.blocks(Notices), None)
-    return {} if found is None else {FINDINGS: findings_csv(found)}
+    return [folder / file for file in (PAGE, *files[:-1])]
 
 
 def _pictures_of(page: Path) -> set[str]:
-    """Names of the pictures that were written with a page; of no page, none."""
+    """Files of the pictures that were written with a page; of no page, none."""
     if not page.is_file():
         return set()
     with page.open(encoding="utf-8", errors="replace") as file:
-        found = _WRITTEN.search(file.read(2**16))
-    names = found[1].split() if found else []
-    return {name for name in names if _NAME.fullmatch(name)}
-
-
-def _pictures(report: Report) -> Iterator[Picture]:
-    for block in report.blocks(Picture, Chart):
-        yield block.picture if isinstance(block, Chart) else block
+        written = _WRITTEN.search(file.read(2**16))
+    names = written[1].split() if written else []
+    return {f"{name}.png" for name in names if _NAME.fullmatch(name)}
 
 
 def _check_names(names: Sequence[str]) -> None:
@@ -123,44 +105,38 @@ def _check_names(names: Sequence[str]) -> None:
             raise ValueError(f"the picture {name!r} stands twice in the report")
 
 
-class _Page:
-    """One page in the making: its pictures' folder, the anchors taken, whether it has charts."""
+class _PageWriter:
+    """One page in the making: where its pictures go, and which anchors are taken."""
 
-    def __init__(self, report: Report, pictures: Path, names: Sequence[str]) -> None:
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._anchors: set[str] = {"top"}
         self._jinja = Environment(
-            loader=FileSystemLoader(_TEMPLATES),
+            loader=FileSystemLoader(Path(__file__).parent / "templates"),
             autoescape=True,
             undefined=StrictUndefined,
             trim_blocks=True,
             lstrip_blocks=True,
         )
-        self._jinja.filters |= {"prose": prose, "breakable": breakable}
-        limits = {"named": NAMED_PLACES, "listed": MOST_PLACES, "findings": FINDINGS}
+        self._jinja.filters |= {"prose": prose, "breakable": breakable, "place": place_of}
+        limits = {
+            "open": OPEN_GROUPS,
+            "named": NAMED_PLACES,
+            "listed": MOST_PLACES,
+            "findings": FINDINGS,
+        }
         self._blocks: Any = self._jinja.get_template("blocks.html", globals=limits).module
-        self._report, self._pictures, self._names = report, pictures, names
-        self._anchors: set[str] = {"top"}
-        self._charts = 0
 
-    def html(self) -> str:
-        """The whole page."""
-        bar = tqdm(total=len(self._names), desc="pictures", unit="", disable=None)
-        with bar as self._bar, boxes() as said:
-            sections = [self._section(section) for section in self._report.sections]
-        if said:
+    def html(self, report: Report, pictures: Sequence[str]) -> str:
+        """The whole page; its pictures are written on the way."""
+        bar = tqdm(total=len(pictures), desc="pictures", unit="", disable=None)
+        with bar as self._bar, boxes() as notes:
+            sections = [self._section(section) for section in report.sections]
+        if notes:
             warnings.warn(NO_FONT, stacklevel=3)
         return self._jinja.get_template("page.html").render(
-            report=self._report,
-            said=said,
-            sections=sections,
-            pictures=" ".join(self._names),
-            style=self._inlined("page.css"),
-            script=self._inlined("page.js"),
-            plotly=plotly_script() if self._charts else "",
-            chart_script=self._inlined("charts.js") if self._charts else "",
+            report=report, notes=notes, sections=sections, pictures=" ".join(pictures)
         )
-
-    def _inlined(self, name: str) -> Markup:
-        return Markup((_TEMPLATES / name).read_text(encoding="utf-8"))
 
     def _section(self, section: Section) -> dict[str, Any]:
         return {
@@ -184,34 +160,39 @@ class _Page:
             case Text():
                 return self._blocks.text(block.words)
             case Table():
-                columns = columns_of(block.columns, block.rows)
-                return self._blocks.table(block, columns)
+                return self._blocks.table(block, block.words())
             case Picture():
                 return self._blocks.picture(block, self._draw(block))
-            case Chart():
-                return self._chart(block)
-            case Notices():
-                order = sorted(block.notices, key=lambda one: one.severity != "error")
-                return self._blocks.notices(order, OPEN_NOTICES, block.none)
+            case Issues():
+                return self._blocks.issues(group_issues(block.issues), block.none)
             case Tokens():
-                return self._blocks.tokens([asdict(run) for run in block.runs])
+                return self._blocks.tokens(block.runs)
             case Document():
                 return self._blocks.document(block.title, document_lines(block.content))
-
-    def _chart(self, chart: Chart) -> Markup:
-        self._charts += 1
-        height = chart.figure.layout.height or 480
-        svg = self._draw(chart.picture)
-        return self._blocks.chart(chart.picture, svg, chart_json(chart.figure), height)
 
     def _draw(self, picture: Picture) -> Markup:
         """The picture as SVG; its PNG is written on the way, from the same figure."""
         with mpl.rc_context(RC):
             figure = picture.draw()
-            write(self._pictures, {f"{picture.name}.png": lambda: figure})
+            write(self._folder, {f"{picture.name}.png": lambda: figure})
             svg = inline_svg(figure, picture.name, picture.caption)
         self._bar.update()
         return Markup(svg)
+
+
+def sentence(words: str) -> str:
+    """Words of a table or a terminal with a capital and a full stop, to stand in a text."""
+    return f"{words[0].upper()}{words[1:]}."
+
+
+def prose(words: str) -> Markup:
+    """Plain words with what stands in backticks as code."""
+    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(words))))
+
+
+def breakable(words: str) -> Markup:
+    """Words, a path or an id, that may go on in a new line after a `/` or `_` inside it."""
+    return Markup(re.sub(r"(?<=\w)([/_])", r"\1<wbr>", str(escape(words))))
 
 
 def document_lines(content: Mapping[str, Any], depth: int = 0) -> list[tuple[int, str, str]]:
@@ -222,21 +203,16 @@ def document_lines(content: Mapping[str, Any], depth: int = 0) -> list[tuple[int
     return lines
 
 
-def _item(depth: int, value: Any) -> list[tuple[int, str, str]]:
-    """An entry of a list: a flat mapping in one line."""
-    if not isinstance(value, Mapping):
-        return _entry(depth, "-", value)
-    lines = document_lines(value)
-    if any(inner for inner, _, _ in lines):
-        return _entry(depth, "-", value)
-    return [(depth, "-", ", ".join(f"{key}: {said}" for _, key, said in lines))]
-
-
 def _entry(depth: int, key: str, value: Any) -> list[tuple[int, str, str]]:
     if isinstance(value, Mapping) and value:
-        return [(depth, key, ""), *document_lines(value, depth + 1)]
-    if isinstance(value, list | tuple) and any(isinstance(one, Mapping | list) for one in value):
-        return [(depth, key, ""), *(line for one in value for line in _item(depth + 1, one))]
+        inside = document_lines(value, depth + 1)
+        # An entry of a list that is a flat mapping stands in one line.
+        if key == "-" and all(inner == depth + 1 for inner, _, _ in inside):
+            return [(depth, key, ", ".join(f"{name}: {text}" for _, name, text in inside))]
+        return [(depth, key, ""), *inside]
+    if isinstance(value, list | tuple) and any(isinstance(item, Mapping | list) for item in value):
+        inside = [line for item in value for line in _entry(depth + 1, "-", item)]
+        return [(depth, key, ""), *inside]
     if isinstance(value, str) and value.isprintable() and value == value.strip() != "":
         return [(depth, key, value)]
     return [(depth, key, json.dumps(value, ensure_ascii=False, default=str))]

@@ -14,8 +14,9 @@ from scipy.ndimage import median_filter
 from pipeline.base.channels import PROFILE_CHANNELS, hardly_moving, named, unnumbered
 from pipeline.base.config import Params
 from pipeline.base.issue import Issue
+from pipeline.base.table import Table
 from pipeline.data import Channels, Stream
-from pipeline.look.page.blocks import Block, Table
+from pipeline.look.page.blocks import Block
 from pipeline.look.recording.clocks import usual_step
 from pipeline.look.recording.contact import force_columns
 from pipeline.look.recording.episode import Draw, EpisodeView, runs

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 from pipeline.base.config import Params
 from pipeline.base.issue import Issue
+from pipeline.base.table import Table
 from pipeline.data.recording import Nominal
 from pipeline.data.timeline import Timeline
-from pipeline.look.page.blocks import Block, Table
+from pipeline.look.page.blocks import Block
 from pipeline.look.page.style import GRID, INK, PALETTE, canvas
 from pipeline.look.recording.episode import Draw, EpisodeView
 
@@ -173,8 +174,8 @@ def find_clock_issues(view: EpisodeView, nominal: Nominal) -> Iterator[Issue]:
         yield from _gaps(view, clock, _find_jumps(clock, recorded))
         yield from _repeated(view, clock)
         if clock.name.startswith("view "):
-            told = f", {expected[0]:.3g} Hz by {nominal.where}" if expected else ""
-            yield from _dropped(view, clock, told)
+            promised = f", {expected[0]:.3g} Hz by {nominal.where}" if expected else ""
+            yield from _dropped(view, clock, promised)
         if expected and len(clock.time) > 2:
             yield from _rate(view, clock, expected[0], nominal.where)
     if len(recorded) > 1:
@@ -259,7 +260,7 @@ def _repeated(view: EpisodeView, clock: Clock) -> Iterator[Issue]:
         yield view.issue("repeated times", clock.name, message)
 
 
-def _dropped(view: EpisodeView, clock: Clock, expected: str) -> Iterator[Issue]:
+def _dropped(view: EpisodeView, clock: Clock, promised: str) -> Iterator[Issue]:
     """A camera that loses frames one by one; gaps are told apart.
 
     Its place is the shortest span that holds half of the long steps.
@@ -282,7 +283,7 @@ def _dropped(view: EpisodeView, clock: Clock, expected: str) -> Iterator[Issue]:
         f"{long} of {len(steps)} steps take at least {DROPPED_STEP:g} times the usual "
         f"{1e3 * clock.step_s:.0f} ms (up to {1e3 * steps.max():.0f} ms), half of them from "
         f"{span[0] - view.zero:.2f} to {span[1] - view.zero:.2f} s: there is time for {lost:.0f} "
-        f"more frames; {len(steps) / steps.sum():.1f} Hz on average{expected}"
+        f"more frames; {len(steps) / steps.sum():.1f} Hz on average{promised}"
     )
     yield view.issue("dropped frames", clock.name, message, *span)
 
@@ -444,8 +445,8 @@ def draw_lanes(view: EpisodeView) -> Figure:
         _draw_reuse(detail, view.timeline, view.zero, lanes, near)
     detail.set_title(f"from near: {near[1] - near[0]:.2f} s", loc="left", fontsize=10)
     detail.set_xlabel("time since the recording began [s]")
-    told = _MEANINGS if view.timeline is not None else _MEANINGS[:2]
-    patches = [Patch(color=_COLOURS[kind], label=label) for label, kind in told]
+    meanings = _MEANINGS if view.timeline is not None else _MEANINGS[:2]
+    patches = [Patch(color=_COLOURS[kind], label=label) for label, kind in meanings]
     patches.append(Patch(facecolor="none", edgecolor=GAP_COLOUR, hatch="////", label="gap"))
     figure.legend(handles=patches, loc="outside lower center", ncols=3, fontsize=8.5)
     return figure
@@ -545,7 +546,7 @@ def _draw_reuse(
         ticks = line.time[served[row]] - zero
         across, low = [ticks[0], ticks[0], ticks[-1], ticks[-1]], tick_lane - 0.5
         axis.plot(across, [row_lane + _HALF, low, low, tick_lane - _HALF], color=colour, lw=1.6)
-        if len(rows) <= _ROW_LABELS:
+        if len(rows) <= _ROW_LABELS and line.vl_time[row] >= near[0]:
             newest = max((time[row] for time in line.frame_time.values()), default=None)
             age = "" if newest is None else f", {1000 * (line.vl_time[row] - newest):.0f} ms old"
             place = line.vl_time[row] - zero, row_lane

@@ -150,7 +150,7 @@ def _unreadable(view: EpisodeView, broken: Mapping[str, str]) -> list[Issue]:
     return [
         view.issue(
             "unreadable",
-            ", ".join(stream for stream, said in broken.items() if said == message),
+            ", ".join(stream for stream, reason in broken.items() if reason == message),
             message,
             severity="error",
         )

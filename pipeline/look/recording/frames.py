@@ -160,8 +160,8 @@ def _look(view: EpisodeView, name: str, camera: CameraStream) -> _Looked:
         served = np.unique(view.timeline.frames[name]).tolist()
         if (thumbnails := camera.check(served)) is not None:
             blank = dict(zip(served, map(_is_blank, thumbnails), strict=True))
-        if (told := camera.sizes(served)) is not None:
-            sizes |= zip(served, map(tuple, told.tolist()), strict=True)
+        if (known := camera.sizes(served)) is not None:
+            sizes |= zip(served, map(tuple, known.tolist()), strict=True)
     wanted = not blank
     differing: list[float] = []
     before: NDArray[np.uint8] | None = None

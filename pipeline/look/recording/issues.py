@@ -1,18 +1,16 @@
-"""Everything that looks wrong in one episode, and how a page lists it.
+"""Everything that looks wrong in one episode.
 
 Each kind's rule and thresholds stand in `clocks`, `channels` and `frames`; what is not there at
 all, here. Most rules look for what is unlike the rest of the same episode, so that no expectation
 about the robot is needed.
 """
 
-from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 
 from pipeline.base.errors import RecordingError
 from pipeline.base.issue import Issue
 from pipeline.data.reader import FileRecording
 from pipeline.data.recording import Nominal
-from pipeline.look.page.blocks import Notice, Place
 from pipeline.look.recording.channels import find_channel_issues
 from pipeline.look.recording.clocks import find_clock_issues, usual_step
 from pipeline.look.recording.episode import EpisodeView
@@ -31,19 +29,6 @@ def find_issues(view: EpisodeView) -> tuple[Issue, ...]:
     return tuple(
         sorted(issues, key=lambda one: (one.severity != "error", one.start_s or float("-inf")))
     )
-
-
-def notices(issues: Sequence[Issue], zeros: Mapping[tuple[str, str], float]) -> list[Notice]:
-    """Issues of one kind and stream as one notice; errors first, then what stands most often.
-
-    `zeros` has, by source and episode, the instant from which pictures count time.
-    """
-    alike: dict[tuple[str, str, str], list[Issue]] = defaultdict(list)
-    for issue in issues:
-        alike[issue.severity, issue.kind, issue.stream].append(issue)
-    groups = sorted(alike.values(), key=lambda group: (group[0].severity != "error", -len(group)))
-    several = len({issue.source for issue in issues}) > 1
-    return [_notice(group, zeros, several) for group in groups]
 
 
 def _beside_nominal(view: EpisodeView) -> Iterator[Issue]:
@@ -110,22 +95,3 @@ def _frame_counts(view: EpisodeView, nominal: Nominal) -> Iterator[Issue]:
 
 def _too_few(count: int, expected: int) -> bool:
     return expected - count > max(2, COUNT_TOLERANCE * expected)
-
-
-def _notice(
-    group: Sequence[Issue], zeros: Mapping[tuple[str, str], float], several: bool
-) -> Notice:
-    first, places = group[0], tuple(_place(issue, zeros, several) for issue in group)
-    episodes = len({(issue.source, issue.episode) for issue in group})
-    among = "1 episode" if episodes == 1 else f"{episodes:,} episodes"
-    count = among if len(places) == episodes else f"{len(places):,} places in {among}"
-    where = " · ".join(filter(None, (first.stream, str(places[0]) if len(places) == 1 else count)))
-    severity = "error" if first.severity == "error" else "warning"
-    return Notice(severity, first.kind, where, first.message, places)
-
-
-def _place(issue: Issue, zeros: Mapping[tuple[str, str], float], several: bool) -> Place:
-    episode = f"{issue.source}/{issue.episode}" if several and issue.episode else issue.episode
-    zero = zeros.get((issue.source, issue.episode), 0.0)
-    start, stop = (None if at is None else at - zero for at in (issue.start_s, issue.stop_s))
-    return Place(episode or issue.source, issue.stream, start, stop, issue.message)

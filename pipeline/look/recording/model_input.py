@@ -19,9 +19,10 @@ from tqdm import tqdm
 from pipeline.base.config import Params, VLMParams
 from pipeline.base.digests import ContentDigests
 from pipeline.base.errors import PipelineError, RecordingError
+from pipeline.base.table import Table
 from pipeline.data import Channels
 from pipeline.extract.places import ledger_path
-from pipeline.look.page.blocks import Block, Document, Run, Table, Text, Tokens
+from pipeline.look.page.blocks import Block, Document, Text, TokenRun, Tokens
 from pipeline.look.page.style import INK, canvas
 from pipeline.look.recording.episode import BROKEN, Draw, EpisodeView
 from pipeline.look.recording.frames import read_frames
@@ -341,16 +342,16 @@ def describe_stretch(recorded: tuple[int, ...], pixels: tuple[int, int]) -> str 
     return f"{more:.0%} in {'width' if wider > 1 else 'height'}" if more > _STRETCHED else None
 
 
-def fold_tokens(tokens: Sequence[PromptToken]) -> list[Run]:
+def fold_tokens(tokens: Sequence[PromptToken]) -> list[TokenRun]:
     """Text as one run, special tokens one by one, those of an image folded to a count."""
-    folded: list[Run] = []
+    folded: list[TokenRun] = []
     for (kind, view), like in groupby(tokens, lambda token: (token.kind, token.view)):
         texts = [token.text for token in like]
         if kind == "image":
-            folded.append(Run(texts[0], kind, f"× {len(texts):,}, {view}"))
+            folded.append(TokenRun(texts[0], kind, f"× {len(texts):,}, {view}"))
         else:
             texts = texts if kind == "special" else ["".join(texts)]
-            folded += [Run(text, kind) for text in texts]
+            folded += [TokenRun(text, kind) for text in texts]
     return folded
 
 

@@ -1,8 +1,8 @@
 """Every recording looked over, one in memory at a time."""
 
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from hashlib import blake2b
 from pathlib import Path
 
@@ -85,10 +85,17 @@ class RecordingsOverview:
         """Of any recording, sorted."""
         return tuple(sorted({view for one in self.summaries for view in one.frames}))
 
-    @property
-    def zeros(self) -> dict[tuple[str, str], float]:
-        """The instant from which an episode's times count, by source and episode."""
-        return {(one.source, one.episode): one.zero for one in self.summaries}
+    def since_start(self, issues: Iterable[Issue]) -> list[Issue]:
+        """The issues with times as a page counts them: from the first instant of their episode."""
+        zeros = {(one.source, one.episode): one.zero for one in self.summaries}
+        shifted: list[Issue] = []
+        for issue in issues:
+            zero = zeros.get((issue.source, issue.episode), 0.0)
+            start_s, stop_s = (
+                None if at is None else at - zero for at in (issue.start_s, issue.stop_s)
+            )
+            shifted.append(replace(issue, start_s=start_s, stop_s=stop_s))
+        return shifted
 
     def choose(self, count: int) -> tuple[int, ...]:
         """At most `count` places in `summaries` to look at closely, in their order.
@@ -162,12 +169,12 @@ def _warn_of_missing(summaries: Sequence[EpisodeSummary]) -> None:
         held = Counter(name for one in group for name in one.counts)
         usual = {name for name, count in held.items() if 2 * count > len(group)}
         for one in group:
-            told = {name for issue in one.issues for name in issue.stream.split(", ")}
-            if "cameras" in told:
-                told |= {name for name in usual if name.startswith("view ")}
-            if "state" in told:
-                told.add("poses")  # its columns
-            if lacking := sorted(usual - one.counts.keys() - told):
+            explained = {name for issue in one.issues for name in issue.stream.split(", ")}
+            if "cameras" in explained:
+                explained |= {name for name in usual if name.startswith("view ")}
+            if "state" in explained:
+                explained.add("poses")  # its columns
+            if lacking := sorted(usual - one.counts.keys() - explained):
                 message = "not there; most episodes of this source have it"
                 one.warn("missing", ", ".join(lacking), message)
 

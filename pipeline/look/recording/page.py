@@ -8,13 +8,13 @@ from matplotlib.figure import Figure
 
 from pipeline.base.config import Params
 from pipeline.base.format import duration
+from pipeline.base.table import Table
 from pipeline.data import Opened
-from pipeline.look.page.blocks import Block, Notices, Picture, Report, Section, Table, Text
+from pipeline.look.page.blocks import Block, Issues, Picture, Report, Section, Text
 from pipeline.look.recording.channels import statistics_blocks
 from pipeline.look.recording.clocks import clock_blocks
 from pipeline.look.recording.episode import EpisodeView, view_episode
 from pipeline.look.recording.frames import camera_blocks
-from pipeline.look.recording.issues import notices
 from pipeline.look.recording.model_input import prompt_blocks, sample_blocks
 from pipeline.look.recording.overview import (
     EpisodeSummary,
@@ -56,7 +56,7 @@ def recordings_report(opened: Opened, params: Params, name: str) -> Report:
     model = min(chosen, key=lambda index: (not summaries[index].ticks, summaries[index].errors))
     draw = partial(_picture, "", partial(view_of, model))
     sections = [
-        Section("What looks wrong", [Notices(notices(overview.issues, overview.zeros), nothing)]),
+        Section("What looks wrong", [Issues(overview.since_start(overview.issues), nothing)]),
         Section("Episodes", _episodes(overview, chosen)),
         *(
             _episode_section(overview, index, f"episode{place}-", partial(view_of, index), params)
@@ -149,8 +149,8 @@ def _episode_section(
     draw = partial(_picture, f"{prefix}{plain}-", view_of)
     blocks: list[Block] = [Text(f"`{one.path}`, format {one.format}: “{one.instruction or '–'}”")]
     if len(overview.summaries) > 1:
-        listed = notices(one.issues, overview.zeros)
-        blocks.append(Notices(listed, "Nothing looks wrong in this episode."))
+        listed = overview.since_start(one.issues)
+        blocks.append(Issues(listed, "Nothing looks wrong in this episode."))
     return Section(
         f"{one.source} / {one.episode}" if _several(overview) else one.episode,
         blocks,

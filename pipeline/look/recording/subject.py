@@ -56,8 +56,8 @@ def subject_of(params: Params) -> Subject:
     _check_output(wanted.output)
     if not places:
         refuse_foreign(wanted.output, REPORT)
-        said = ", ".join(source.name for source in params.data.sources)
-        return Subject(said, wanted.output, None, params.data.sources, params.data.root)
+        names = ", ".join(source.name for source in params.data.sources)
+        return Subject(names, wanted.output, None, params.data.sources, params.data.root)
     for place in places:
         _check(place, params.data.root)
     matches = [Path(match) for place in places for match in sorted(_matches(place))]

@@ -1,57 +1,137 @@
-"""A store -> its page: what is in it, what looks wrong, and where its features lie."""
+"""A store -> its page: what is in it, what looks wrong, and what it was made of."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from functools import partial
+from collections.abc import Mapping
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from pipeline.base.config import InspectParams
+from pipeline.base.errors import StoreIncomplete
 from pipeline.base.format import duration, size
-from pipeline.look.page.blocks import (
-    Block,
-    Document,
-    Notices,
-    Picture,
-    Report,
-    Section,
-    Table,
-    Text,
+from pipeline.base.issue import Issue
+from pipeline.look.page.blocks import Block, Document, Issues, Report, Section, Text
+from pipeline.look.store.ages import Ages, find_age_issues, read_ages, show_ages
+from pipeline.look.store.channels import (
+    StreamSummary,
+    find_channel_issues,
+    show_channels,
+    summarize_streams,
 )
-from pipeline.look.recording.channels import ChannelStatistics, statistics_table
-from pipeline.look.recording.issues import notices
-from pipeline.look.store import draw as pictures
-from pipeline.look.store.facts import EpisodeCoverage, StoreView
-from pipeline.look.store.page_features import duplicates, features
+from pipeline.look.store.duplicates import (
+    Duplicates,
+    find_duplicate_issues,
+    find_duplicates,
+    show_duplicates,
+)
+from pipeline.look.store.episodes import (
+    EpisodeCoverage,
+    find_episode_issues,
+    read_coverage,
+    show_coverage,
+)
+from pipeline.look.store.features import (
+    FeatureNorms,
+    check_rows,
+    find_feature_issues,
+    look_at_features,
+    sample_rows,
+    show_features,
+)
+from pipeline.look.store.sizes import ArraySize, read_sizes, tabulate_sizes
+from pipeline.store import FeatureStore
+from pipeline.store.chunks import ChunkFiles
+from pipeline.store.gather import WIDE
+from pipeline.store.metadata import check_metadata
+from pipeline.store.repair_hints import extract_command
+from pipeline.store.schema import read_specs
 
-ROWS = 100
-"""Episodes in the table of all; of more, the first."""
 _CHANNELS = 16
 """Of a stream, that its description names."""
 
 
+@dataclass(frozen=True, eq=False)
+class StoreView:
+    """A store as one looks at it; times are seconds since the first tick of their episode."""
+
+    store: FeatureStore
+    episodes: tuple[EpisodeCoverage, ...]
+    ages: Ages
+    sizes: tuple[ArraySize, ...]
+    features: FeatureNorms
+    duplicates: Duplicates
+    statistics: tuple[StreamSummary, ...]
+    issues: tuple[Issue, ...]
+    """One of the whole store names no episode."""
+
+
+def inspect_store(path: str | Path, params: InspectParams) -> StoreView:
+    """Everything that is said of a finished store; it is only read.
+
+    In bounded memory, whatever its size: whole only what is a few bytes a tick or VL row, evenly
+    spread samples of all that is wide, of features `params.points` VL rows at most. The checksums
+    of these rows are checked, and those of metadata and of every narrow array; the rest is for
+    stages.verify.
+
+    Raises `StoreIncomplete` where it is not there, unfinished, damaged or without an episode,
+    `StoreMismatch` where it is an archive or follows another schema, each saying what to run.
+    """
+    store = _open_checked(Path(path))
+    sampled = sample_rows(store, params.points)
+    check_rows(store, sampled.rows)
+    episodes, age, statistics = read_coverage(store), read_ages(store), summarize_streams(store)
+    features, duplicates = look_at_features(store, sampled), find_duplicates(store)
+    issues = [
+        *find_episode_issues(store, episodes),
+        *find_age_issues(store, episodes, age),
+        *find_channel_issues(statistics),
+        *find_feature_issues(features, episodes),
+        *find_duplicate_issues(duplicates, episodes),
+    ]
+    sizes = read_sizes(store.path)
+    return StoreView(store, episodes, age, sizes, features, duplicates, statistics, tuple(issues))
+
+
+def _open_checked(path: Path) -> FeatureStore:
+    """A finished store with something in it, of which all but the wide arrays is as it was written.
+
+    All that is said of a store rests on its metadata and its narrow arrays.
+    """
+    store = FeatureStore.open(path)
+    check_metadata(path)
+    for name, spec in read_specs(path).items():
+        if name not in WIDE.values():
+            with closing(ChunkFiles(path, spec, writable=False)) as files:
+                files.check()
+    if not len(store.array("vl/time")):
+        raise StoreIncomplete(
+            f"{path}: expected VL rows to look at, found none. Run {extract_command(path)}."
+        )
+    return store
+
+
 def store_report(view: StoreView) -> Report:
     """The page of a store, by what `inspect_store` found; the same store gives the same page."""
-    rate = "as recorded" if view.action_hz is None else f"at {view.action_hz:g} Hz"
-    reuse = view.vlm_reuse_count
+    store = view.store
+    rate = "as recorded" if store.action_hz is None else f"at {store.action_hz:g} Hz"
+    reuse = store.vlm_reuse_count
     return Report(
-        title=f"Store: {view.path.name}",
+        title=f"Store: {store.path.name}",
         summary=(
             f"Ticks {rate}, features of the model (a VL row) at "
             f"{'each of them' if reuse == 1 else f'one in {reuse}'}; feature spec "
-            f"`{view.spec['digest']}`. Times count from the first tick of their episode."
+            f"`{store.spec['digest']}`. Times count from the first tick of their episode."
         ),
         tiles=_tiles(view),
         sections=(
-            Section("What looks wrong", [_notices(view), _checked(view)]),
-            Section("Coverage", _coverage(view)),
-            Section("Age of the features", _ages(view)),
-            Section("Size", _sizes(view)),
-            Section("Features", features(view)),
-            Section("Near-duplicates", duplicates(view)),
-            Section("Channels", _channels(view)),
-            Section("What it was made of", _documents(view)),
+            Section("What looks wrong", [_issues(view), _checked(view)]),
+            Section("Coverage", show_coverage(view.episodes)),
+            Section("Age of the features", show_ages(view.ages)),
+            Section("Size", [tabulate_sizes(view.sizes)]),
+            Section("Features", show_features(view.features, view.episodes)),
+            Section("Duplicates", show_duplicates(view.duplicates, view.episodes)),
+            Section("Channels", show_channels(view.statistics)),
+            Section("What it was made of", _documents(store)),
         ),
     )
 
@@ -59,184 +139,57 @@ def store_report(view: StoreView) -> Report:
 def _tiles(view: StoreView) -> list[tuple[str, str]]:
     return [
         ("episodes", f"{len(view.episodes):,}"),
-        ("length", duration(view.seconds)),
-        ("ticks", f"{view.ticks:,}"),
-        ("VL rows", f"{view.sampled.total:,}"),
-        ("on the disk", size(view.disk_bytes)),
-        ("findings", f"{len(view.flaws):,}"),
+        ("length", duration(sum(episode.seconds for episode in view.episodes))),
+        ("ticks", f"{view.store.ticks:,}"),
+        ("VL rows", f"{view.features.sampled.total:,}"),
+        ("on the disk", size(sum(array.disk_bytes for array in view.sizes))),
+        ("findings", f"{len(view.issues):,}"),
     ]
 
 
-def _notices(view: StoreView) -> Notices:
-    return Notices(
-        notices(view.flaws, {}),
-        "Nothing: clocks ascend, every stream is where others of its kind are, channels move, "
-        "features follow the scene, and no recording is there twice.",
+def _issues(view: StoreView) -> Issues:
+    return Issues(
+        view.issues,
+        "Nothing: clocks have no gaps, every stream is where others of its kind are, channels "
+        "move, features follow the scene, and no recording is there twice.",
     )
 
 
 def _checked(view: StoreView) -> Text:
-    looked, total = view.sampled.looked_at, view.sampled.total
-    rows = f"all {total:,}" if looked == total else f"{looked:,} of {total:,}"
-    command = f"python -m stages.verify --set verify.store={view.path}"
+    looked_at, total = len(view.features.sampled.rows), view.features.sampled.total
+    rows = f"all {total:,}" if looked_at == total else f"{looked_at:,} of {total:,}"
+    command = f"python -m stages.verify --set verify.store={view.store.path}"
     return Text(
         f"Metadata, clocks, offsets and the features of {rows} VL rows give the checksums that "
         "were written with them. Those of sensor, state and actions were not read"
-        f"{'' if looked == total else ', nor those of the other rows'}: `{command}` reads every "
+        f"{'' if looked_at == total else ', nor those of the other rows'}: `{command}` reads every "
         "byte."
     )
 
 
-def _coverage(view: StoreView) -> list[Block]:
-    episodes = view.episodes
-    blocks: list[Block] = [
-        _sources(view),
-        Picture(
-            "coverage",
-            "Length of each episode, and below it which streams and views its ticks see.",
-            partial(pictures.coverage, view),
-        ),
-    ]
-    heads = ("source", "episode", "instruction", "ticks", "length [s]", "VL rows", "ticks see")
-    said = "Ticks see all streams and views, none of one (no …), or one in a share of them."
-    if len(episodes) > ROWS:
-        said += f" The first {ROWS} of {len(episodes)} episodes."
-    return [*blocks, Table(heads, [_episode(one) for one in episodes[:ROWS]], said)]
-
-
-def _sources(view: StoreView) -> Table:
-    rows: list[tuple[object, ...]] = []
-    for source in view.sources:
-        own = [one for one in view.episodes if one.source == source]
-        formats = ", ".join(sorted({one.format for one in own}))
-        rows.append((source, formats, len({one.instruction for one in own}), *_sums(own)))
-    if len(rows) > 1:
-        said = len({one.instruction for one in view.episodes})
-        rows.append(("all", "", said, *_sums(view.episodes)))
-    heads = ("source", "format", "instructions", "episodes", "ticks", "length [s]", "VL rows")
-    total = frozenset({len(rows) - 1}) if len(rows) > 1 else frozenset[int]()
-    return Table((*heads, "sensor readings", "state readings"), rows, strong=total)
-
-
-def _sums(own: Sequence[EpisodeCoverage]) -> tuple[object, ...]:
-    return (
-        len(own),
-        sum(one.ticks for one in own),
-        round(sum(one.seconds for one in own), 1),
-        sum(one.vl_rows for one in own),
-        *(sum(one.readings[name] for one in own) for name in ("sensor", "state")),
-    )
-
-
-def _episode(one: EpisodeCoverage) -> tuple[object, ...]:
-    return (
-        one.source,
-        one.id,
-        one.instruction,
-        one.ticks,
-        round(one.seconds, 2),
-        one.vl_rows,
-        _seen(one.covered),
-    )
-
-
-def _seen(covered: Mapping[str, float]) -> str:
-    """What not all ticks see; a partial share is never rounded to all or none."""
-    lacking = [
-        f"{min(max(share, 0.01), 0.99):.0%} {name}" if share else f"no {name}"
-        for name, share in covered.items()
-        if share < 1
-    ]
-    return ", ".join(lacking) or "all"
-
-
-def _ages(view: StoreView) -> list[Block]:
-    newest = view.ages.newest
-    rows = [("newest frame", *_spread(newest))]
-    for name, age in zip(view.ages.views, view.ages.by_view.T, strict=True):
-        shown = age[np.isfinite(age)]
-        if len(shown):
-            rows.append((name, *_spread(shown)))
-    return [
-        Text(
-            "Ticks between two VL rows reuse the last, so what the model saw grows older until the "
-            "next; a camera slower than the ticks adds to it. The policy is given the age of the "
-            "newest frame as `feature_age`."
-        ),
-        Picture(
-            "ages",
-            "Share of the ticks by the age of what they see: of the newest frame, filled, and of "
-            "each view's; the dashed line is the time of one VL row.",
-            partial(pictures.ages, view),
-        ),
-        Table(("age [s] of", "1 %", "median", "99 %", "oldest"), rows),
-    ]
-
-
-def _spread(age: NDArray[np.float32]) -> list[float]:
-    return [*np.quantile(age, (0.01, 0.5, 0.99)).tolist(), float(age.max())]
-
-
-def _sizes(view: StoreView) -> list[Block]:
-    rows = [
-        (
-            one.name,
-            " × ".join(f"{count:,}" for count in one.shape),
-            one.dtype,
-            one.chunks,
-            one.disk_bytes / 2**20,
-            100 * one.disk_bytes / max(1, view.disk_bytes),
-        )
-        for one in view.sizes
-    ]
-    return [
-        Picture("sizes", "Bytes on the disk by array.", partial(pictures.sizes, view)),
-        Table(("array", "shape", "dtype", "chunks", "on the disk [MiB]", "share [%]"), rows),
-    ]
-
-
-def _channels(view: StoreView) -> list[Block]:
-    channels: list[ChannelStatistics] = [one for each in view.statistics for one in each.channels]
-    looked = ", ".join(
-        f"{one.stream}: {_of_rows(one.looked_at, one.rows)}" for one in view.statistics
-    )
-    table = statistics_table(channels)
-    blocks: list[Block] = [
-        Text(f"Over the whole store, before any normalisation. Looked at: {looked}."),
-        replace(table, caption=table.caption.replace("Over the whole episode", "Physical units")),
-    ]
-    if any(pictures.numbered(view)):
-        said = "Numbered channels side by side: median, 1 to 99 %, least and greatest."
-        picture = Picture("wide_channels", said, partial(pictures.wide_channels, view))
-        blocks.insert(1, picture)
-    return blocks
-
-
-def _of_rows(looked: int, rows: int) -> str:
-    return f"all {rows:,} rows" if looked == rows else f"{looked:,} of {rows:,}, evenly spread"
-
-
-def _documents(view: StoreView) -> list[Block]:
+def _documents(store: FeatureStore) -> list[Block]:
     computed = {
-        f"VL rows {one['rows'][0]} to {one['rows'][1] - 1}": {
-            name: value for name, value in one.items() if name != "rows"
+        f"VL rows {entry['rows'][0]} to {entry['rows'][1] - 1}": {
+            name: value for name, value in entry.items() if name != "rows"
         }
-        for one in view.environments
+        for entry in store.attrs["environment"]
     }
-    streams = {name: said for name, said in view.streams.items() if name != "views"}
-    described = {name: _described(said) for name, said in streams.items()}
+    streams = {
+        name: document if name == "views" else _stream(document)
+        for name, document in store.streams.items()
+    }
     return [
-        Document("Feature spec", view.spec),
-        Document("Streams", {**described, "views": view.streams["views"]}),
+        Document("Feature spec", store.spec),
+        Document("Streams", streams),
         Document("Computed with", computed),
     ]
 
 
-def _described(said: Mapping[str, Any]) -> dict[str, Any]:
+def _stream(document: Mapping[str, Any]) -> dict[str, Any]:
     """Channels with their units; of a thousand, the first."""
-    pairs = list(zip(said["names"], said["units"], strict=True))
+    pairs = list(zip(document["names"], document["units"], strict=True))
     channels = {name: unit or "no unit" for name, unit in pairs[:_CHANNELS]}
     if len(pairs) > _CHANNELS:
         channels["…"] = f"{len(pairs) - _CHANNELS:,} more"
-    kind = {"kind": said["kind"]} if "kind" in said else {}
+    kind = {"kind": document["kind"]} if "kind" in document else {}
     return {**kind, "channels": channels}

@@ -1,9 +1,11 @@
 """What each array of a store takes on the disk."""
 
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipeline.base.table import Table
 from pipeline.store.schema import read_specs
 
 METADATA = "metadata"
@@ -23,14 +25,15 @@ class ArraySize:
     """Blocks that its files take: values, padding of the last chunk, and trailers."""
 
 
-def array_sizes(path: Path) -> tuple[ArraySize, ...]:
+def read_sizes(path: Path) -> tuple[ArraySize, ...]:
     """Every array, the largest on the disk first; together they are all files below `path`."""
-    specs = read_specs(path)
     disk: dict[str, int] = defaultdict(int)
     for file in path.rglob("*"):
         if file.is_file():
-            disk[_owner(file.relative_to(path))] += file.stat().st_blocks * 512
-    found = [
+            # The first two folders of a chunk's path name its array.
+            owner = "/".join(file.relative_to(path).parts[:2])
+            disk[METADATA if file.name == "zarr.json" else owner] += file.stat().st_blocks * 512
+    sizes = [
         ArraySize(
             name,
             spec.shape,
@@ -38,12 +41,22 @@ def array_sizes(path: Path) -> tuple[ArraySize, ...]:
             spec.chunk_count,
             disk[name],
         )
-        for name, spec in specs.items()
+        for name, spec in read_specs(path).items()
     ]
-    found.append(ArraySize(METADATA, (), "", 0, disk[METADATA]))
-    return tuple(sorted(found, key=lambda one: one.disk_bytes, reverse=True))
+    sizes.append(ArraySize(METADATA, (), "", 0, disk[METADATA]))
+    return tuple(sorted(sizes, key=lambda array: array.disk_bytes, reverse=True))
 
 
-def _owner(inside: Path) -> str:
-    """The array that a file is a chunk of: its first two folders; metadata are not chunks."""
-    return METADATA if inside.name == "zarr.json" else "/".join(inside.parts[:2])
+def tabulate_sizes(sizes: Sequence[ArraySize]) -> Table:
+    """A row an array."""
+    total = max(1, sum(array.disk_bytes for array in sizes))
+    rows = [
+        (
+            array.name,
+            " × ".join(f"{count:,}" for count in array.shape),
+            *(array.dtype, array.chunks, array.disk_bytes / 2**20, 100 * array.disk_bytes / total),
+        )
+        for array in sizes
+    ]
+    heads = ("array", "shape", "dtype", "chunks", "on the disk [MiB]", "share [%]")
+    return Table(heads, rows, "Bytes on the disk by array.")

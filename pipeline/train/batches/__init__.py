@@ -1,8 +1,7 @@
 """Batches of a store on their way to a policy.
 
 `draw` says what a batch is made of; `prefetch` gathers ahead of time; `resident` holds streams on
-the device; `choice` opens a store or an archive and picks between these ways; `scratch` is where an
-archive is restored to.
+the device; `choice` picks between these ways.
 """
 
 from pipeline.train.batches.batch_indices import (
@@ -14,7 +13,7 @@ from pipeline.train.batches.batch_indices import (
     Windows,
     draws,
 )
-from pipeline.train.batches.choice import Choice, FeedName, choose_feed, open_store
+from pipeline.train.batches.choice import Choice, FeedName, choose_feed
 from pipeline.train.batches.device_store import DeviceStore
 from pipeline.train.batches.prefetch import Prefetch
 
@@ -31,5 +30,4 @@ __all__ = [
     "Windows",
     "choose_feed",
     "draws",
-    "open_store",
 ]

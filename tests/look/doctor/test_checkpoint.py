@@ -9,7 +9,7 @@ import torch
 from safetensors.torch import save_file
 
 from pipeline.base.config import Params
-from pipeline.look.doctor.checkpoint import check_adapter, check_checkpoint, check_fit
+from pipeline.look.doctor.checkpoint import check, check_adapter, check_fit
 from pipeline.look.doctor.gpu import GPU
 from pipeline.simulation.demo_recordings import MARKER
 
@@ -35,10 +35,10 @@ def params(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Make:
 
 
 def test_a_whole_folder(params: Make, demo_checkpoint: Path) -> None:
-    here, fits = check_checkpoint(params(demo_checkpoint))
-    assert (here.level, fits.level) == ("ok", "ok")
-    assert "whole, 2,519,424 parameters" in here.found
-    assert fits.found.startswith("9.6 MiB in float32, memory has")
+    here, fits = check(params(demo_checkpoint))
+    assert (here.severity, fits.severity) == ("ok", "ok")
+    assert "whole, 2,519,424 parameters" in here.message
+    assert fits.message.startswith("9.6 MiB in float32, memory has")
 
 
 def test_the_demos_random_weights_are_nothing_to_learn_from(
@@ -47,18 +47,18 @@ def test_the_demos_random_weights_are_nothing_to_learn_from(
     """Wherever the folder that stages.demo marks lies."""
     mine = shutil.copytree(demo_checkpoint, tmp_path / "mine")
     (mine / MARKER).write_text('{"seed": 0}')
-    here, fits = check_checkpoint(params(mine))
-    assert (here.level, fits.level) == ("note", "ok")
-    assert "whole, " in here.found and "random weights" in here.found
+    here, fits = check(params(mine))
+    assert (here.severity, fits.severity) == ("note", "ok")
+    assert "whole, " in here.message and "random weights" in here.message
     assert "Qwen/Qwen2.5-VL-3B-Instruct" in here.remedy and "docs/real-model.md" in here.remedy
 
 
 def test_a_folder_with_a_hole(params: Make, demo_checkpoint: Path, tmp_path: Path) -> None:
     broken = shutil.copytree(demo_checkpoint, tmp_path / "broken")
     next(broken.glob("*.safetensors")).unlink()
-    (finding,) = check_checkpoint(params(broken))
-    assert finding.level == "missing"
-    assert str(broken) in finding.found
+    (issue,) = check(params(broken))
+    assert issue.severity == "error"
+    assert str(broken) in issue.message
 
 
 def test_a_file_that_is_cut_off(params: Make, demo_checkpoint: Path, tmp_path: Path) -> None:
@@ -67,43 +67,43 @@ def test_a_file_that_is_cut_off(params: Make, demo_checkpoint: Path, tmp_path: P
     whole = weights.read_bytes()
     for kept in (whole[:-1], whole[:5], b"\x08" + bytes(7) + b"garbage!"):
         weights.write_bytes(kept)
-        (finding,) = check_checkpoint(params(broken))
-        assert (finding.level, finding.remedy) == ("missing", "copy it again")
-        assert f"{weights}: cut off or damaged: " in finding.found
+        (issue,) = check(params(broken))
+        assert (issue.severity, issue.remedy) == ("error", "copy it again")
+        assert f"{weights}: cut off or damaged: " in issue.message
 
 
 def test_what_is_not_here(params: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    (folder,) = check_checkpoint(params("/no/such/folder"))
-    assert folder.level == "missing" and "no hub id" in folder.found
+    (folder,) = check(params("/no/such/folder"))
+    assert folder.severity == "error" and "no hub id" in folder.message
     hub = params("Qwen/Qwen2.5-VL-3B-Instruct")
-    (fetched,) = check_checkpoint(hub)
-    assert fetched.level == "note" and "first extraction downloads it" in fetched.found
+    (fetched,) = check(hub)
+    assert fetched.severity == "note" and "first extraction downloads it" in fetched.message
     assert fetched.remedy == "hf download Qwen/Qwen2.5-VL-3B-Instruct"
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
-    (offline,) = check_checkpoint(hub)
-    assert offline.level == "missing" and "HF_HUB_OFFLINE forbids" in offline.found
+    (offline,) = check(hub)
+    assert offline.severity == "error" and "HF_HUB_OFFLINE forbids" in offline.message
 
 
 def test_the_demos_own_checkpoint_is_written_by_its_stage(params: Make, tmp_path: Path) -> None:
     absent = tmp_path / "demo_vlm"
     given = params(absent)
     given = given.model_copy(update={"demo": given.demo.model_copy(update={"checkpoint": absent})})
-    (finding,) = check_checkpoint(given)
-    assert finding.level == "missing"
-    assert "stages.demo" in finding.remedy
+    (issue,) = check(given)
+    assert issue.severity == "error"
+    assert "stages.demo" in issue.remedy
 
 
 def test_an_adapter(tmp_path: Path) -> None:
-    assert check_adapter("/no/such/adapter").level == "missing"
+    assert check_adapter("/no/such/adapter").severity == "error"
     (tmp_path / "adapter_config.json").write_text("{}")
     half = check_adapter(str(tmp_path))
-    assert half.level == "missing" and "adapter_model.safetensors" in half.found
+    assert half.severity == "error" and "adapter_model.safetensors" in half.message
     weights = tmp_path / "adapter_model.safetensors"
     weights.write_bytes(b"")
     damaged = check_adapter(str(tmp_path))
-    assert damaged.level == "missing" and "cut off or damaged" in damaged.found
+    assert damaged.severity == "error" and "cut off or damaged" in damaged.message
     save_file({"lora_A.weight": torch.zeros(2, 2)}, weights)
-    assert check_adapter(str(tmp_path)).level == "ok"
+    assert check_adapter(str(tmp_path)).severity == "ok"
 
 
 @pytest.mark.parametrize(
@@ -120,7 +120,7 @@ def test_seven_billion_parameters_fit_or_not(
     params: Make, dtype: str, gpus: list[int], available: int, level: str
 ) -> None:
     found = [GPU(f"GPU {gib}", gib * GIB, True) for gib in gpus]
-    finding = check_fit(7_000_000_000, params("a/b", dtype=dtype).vlm, found, available * GIB)
-    assert finding.level == level
+    issue = check_fit(7_000_000_000, params("a/b", dtype=dtype).vlm, found, available * GIB)
+    assert issue.severity == level
     if level == "note":
-        assert ("vlm.dtype to bfloat16" in finding.remedy) == (dtype == "float32")
+        assert ("vlm.dtype to bfloat16" in issue.remedy) == (dtype == "float32")

@@ -4,7 +4,6 @@ import json
 import pickle
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,6 @@ from pipeline.data import open_recordings
 from pipeline.look.recording.channels import find_channel_issues
 from pipeline.look.recording.clocks import find_clock_issues
 from pipeline.look.recording.episode import EpisodeView, view_episode
-from pipeline.look.recording.issues import notices
 
 Find = Callable[..., tuple[Issue, ...]]
 Copied = Callable[[str], Path]
@@ -541,27 +539,6 @@ class TestChannels:
         assert named(names, [3]) == "c3"
         assert named(names, [1, 2, 3, 7]) == "c1–c3, c7"
         assert named(names, list(range(0, 40, 2))) == "c0, c2, c4, c6 and 16 more"
-
-
-def test_an_issue_of_many_episodes_is_one_notice() -> None:
-    gap = Issue(
-        kind="gap",
-        severity="warning",
-        source="lab",
-        stream="view View1",
-        start_s=100.5,
-        stop_s=101.0,
-        message="",
-    )
-    issues = [replace(gap, episode=f"e{n}", message=f"found {n}") for n in range(200)]
-    broken = Issue(kind="unreadable", severity="error", source="lab", episode="e7", message="")
-    zeros = {("lab", f"e{n}"): 100.0 for n in range(200)}
-    error, many = notices([*issues, broken], zeros)
-    assert (error.severity, error.kind, error.where) == ("error", "unreadable", "e7")
-    assert many.where == "view View1 · 200 episodes"
-    assert many.message == "found 0"
-    assert [str(one) for one in many.places] == [f"e{n} 0.50–1.00 s" for n in range(200)]
-    assert [one.message for one in many.places] == [f"found {n}" for n in range(200)]
 
 
 def test_a_recording_may_be_very_short(copied: Copied, look: Callable[..., EpisodeView], issues_of):

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from pipeline.base.config import Params, load_params
-from pipeline.look.page.blocks import Document, Notices, Picture, Report, Table, Text, Tokens
+from pipeline.base.table import Table
+from pipeline.look.page.blocks import Document, Issues, Picture, Report, Text, Tokens
 from pipeline.look.page.writing import write_report
 from pipeline.look.recording.page import recordings_report
 from pipeline.look.recording.subject import subject_of
@@ -76,9 +77,9 @@ def test_what_is_missing_is_said(
     assert "No sample can be made" in said
     assert ".. " not in said
     assert "nowhere" in said and "python -m stages.demo" in said
-    first = next(report.blocks(Notices))
-    assert [one.severity for one in first.notices] == ["error"]
-    assert folder.name in first.notices[0].where
+    first = next(report.blocks(Issues))
+    assert [one.severity for one in first.issues] == ["error"]
+    assert folder.name in first.issues[0].episode
 
 
 def test_all_episodes_are_checked_and_some_are_shown(

@@ -13,8 +13,9 @@ from PIL import Image
 
 from pipeline.base.channels import unnumbered
 from pipeline.base.config import Params
+from pipeline.base.table import Table
 from pipeline.data import Channels, Stream
-from pipeline.look.page.blocks import Picture, Table, Text
+from pipeline.look.page.blocks import Picture, Text
 from pipeline.look.recording.channels import statistics_blocks
 from pipeline.look.recording.clocks import Clock, clock_blocks, clock_table, draw_lanes
 from pipeline.look.recording.contact import contacts

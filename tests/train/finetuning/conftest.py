@@ -52,7 +52,7 @@ def _write_episode(folder: Path, seed: int, views: tuple[str, ...] = VIEWS) -> N
         for frame in range(21):
             image = Image.new("RGB", (64, 48), (40, 60, 30 + 20 * (view == "View2")))
             x = 32 + 20 * place(frame / 10)
-            ImageDraw.BatchIndices(image).ellipse((x - 8, 16, x + 8, 32), fill=(230, 80, 60))
+            ImageDraw.Draw(image).ellipse((x - 8, 16, x + 8, 32), fill=(230, 80, 60))
             image.save(folder / "images" / view / f"{start + frame / 10:.3f}.jpg")
     poses = np.zeros((201, 6))
     poses[1:, 0] = np.cumsum(place(np.arange(200) / 100)) * 0.1

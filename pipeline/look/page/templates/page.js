@@ -8,20 +8,17 @@
   const key = "theme:" + location.pathname;
   const stored = (work) => { try { return work(localStorage); } catch { return null; } };
   const dark = () => (root.dataset.theme ?? (system.matches ? "dark" : "light")) === "dark";
-  const changed = () => {
-    button.textContent = dark() ? "Light" : "Dark";
-    document.dispatchEvent(new Event("theme"));
-  };
+  const label = () => { button.textContent = dark() ? "Light" : "Dark"; };
   const chosen = stored((storage) => storage.getItem(key));
   if (chosen === "light" || chosen === "dark") root.dataset.theme = chosen;
   button.hidden = false;
   button.addEventListener("click", () => {
     root.dataset.theme = dark() ? "light" : "dark";
     stored((storage) => storage.setItem(key, root.dataset.theme));
-    changed();
+    label();
   });
-  system.addEventListener("change", changed);
-  changed();
+  system.addEventListener("change", label);
+  label();
 
   // On a phone the contents begin folded, and fold again once one is chosen.
   const nav = document.querySelector("nav");

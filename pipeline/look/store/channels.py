@@ -1,0 +1,153 @@
+"""The channels of state, sensor and action over a whole store, in bounded memory."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import groupby
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from pipeline.base.channels import PROFILE_CHANNELS, named, unnumbered
+from pipeline.base.issue import Issue
+from pipeline.data import Channels
+from pipeline.look.page.blocks import Block, Picture, Text
+from pipeline.look.page.style import GRID, PALETTE, canvas
+from pipeline.look.recording.channels import (
+    ChannelStatistics,
+    statistics_of,
+    statistics_table,
+    still_channels,
+)
+from pipeline.store import FeatureStore
+
+SAMPLE_BYTES = 64 * 2**20
+"""Of float32 values that are in memory at a time."""
+_ARRAYS = {"action": "tick/action", "state": "state/values", "sensor": "sensor/values"}
+
+
+@dataclass(frozen=True)
+class StreamSummary:
+    """One stream over all episodes."""
+
+    stream: str
+    rows: int
+    """Readings (ticks, of the action) in the store."""
+    looked_at: int
+    """Of these, evenly spread; what the statistics are of."""
+    channels: tuple[ChannelStatistics, ...]
+    still: str
+    """What is wrong with channels that hardly move, as of a recording; never of the sensor."""
+
+
+def summarize_streams(
+    store: FeatureStore, sample_bytes: int = SAMPLE_BYTES
+) -> tuple[StreamSummary, ...]:
+    """Of action, state and sensor, those that the store has.
+
+    Of a stream that is larger than `sample_bytes` as float32, evenly spread readings are looked at:
+    extremes that last shorter than the step between two can be missed.
+    """
+    statistics: list[StreamSummary] = []
+    for stream, name in _ARRAYS.items():
+        values = store.array(name)
+        total = len(values)
+        if values.size:
+            document = store.streams[stream]
+            channels = Channels(tuple(document["names"]), tuple(document["units"]))
+            rows = evenly(total, max(2, sample_bytes // (4 * values.shape[1])))
+            values = values[rows]
+            by_channel = tuple(statistics_of(stream, channels.names, channels.units, values))
+            still = None if stream == "sensor" else still_channels(channels, values)
+            text = "" if still is None else still[1]
+            statistics.append(StreamSummary(stream, total, len(rows), by_channel, text))
+    return tuple(statistics)
+
+
+def evenly(total: int, most: int) -> NDArray[np.int64]:
+    """At most `most` of `total` indices, ascending and evenly spread."""
+    count = min(total, most)
+    return np.arange(count, dtype=np.int64) * total // max(1, count)
+
+
+def show_channels(statistics: Sequence[StreamSummary]) -> list[Block]:
+    """How much was looked at, the profiles as a picture, and every channel in a table."""
+    looked_at = ", ".join(
+        f"{summary.stream}: all {summary.rows:,} rows"
+        if summary.looked_at == summary.rows
+        else f"{summary.stream}: {summary.looked_at:,} of {summary.rows:,}, evenly spread"
+        for summary in statistics
+    )
+    table = statistics_table([channel for summary in statistics for channel in summary.channels])
+    blocks: list[Block] = [
+        Text(f"Over the whole store, before any normalisation. Looked at: {looked_at}."),
+        replace(table, caption=table.caption.replace("Over the whole episode", "Physical units")),
+    ]
+    if profiles := list(find_profiles(statistics)):
+        caption = "Numbered channels side by side: median, 1 to 99 %, least and greatest."
+        blocks.insert(1, Picture("wide_channels", caption, partial(draw_profiles, profiles)))
+    return blocks
+
+
+def find_profiles(
+    statistics: Sequence[StreamSummary],
+) -> Iterator[tuple[ChannelStatistics, ...]]:
+    """Runs of channels that make a profile, such as an A-scan."""
+    for stream in statistics:
+        for _, run in groupby(
+            stream.channels, key=lambda channel: (unnumbered(channel.name), channel.unit)
+        ):
+            channels = tuple(run)
+            if len(channels) >= PROFILE_CHANNELS:
+                yield channels
+
+
+def draw_profiles(profiles: Sequence[Sequence[ChannelStatistics]]) -> Figure:
+    """Every channel of each profile: median, 1 to 99 %, and extremes."""
+    figure = canvas(8.5, 0.6 + 2.6 * len(profiles))
+    axes = figure.subplots(len(profiles), 1, squeeze=False)[:, 0]
+    for axis, channels in zip(axes, profiles, strict=True):
+        _band(axis, channels)
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3)
+    return figure
+
+
+def _band(axis: Axes, channels: Sequence[ChannelStatistics]) -> None:
+    at, first = np.arange(len(channels)), channels[0]
+    lines = [
+        (channel.minimum, channel.low, channel.median, channel.high, channel.maximum)
+        for channel in channels
+    ]
+    minimum, low, median, high, maximum = np.array(lines).T
+    axis.fill_between(at, minimum, maximum, color=GRID, label="least to greatest")
+    axis.fill_between(at, low, high, color=PALETTE[4], alpha=0.5, lw=0, label="1 to 99 %")
+    axis.plot(at, median, color=PALETTE[0], lw=1.2, label="median")
+    axis.set_ylabel(f"{first.stream} [{first.unit}]" if first.unit else first.stream)
+    axis.set_xlabel(f"channel: {first.name} to {channels[-1].name}")
+    axis.margins(x=0)
+
+
+def find_channel_issues(statistics: Sequence[StreamSummary]) -> Iterator[Issue]:
+    """Channels that never change, hardly move, or hold what is no number."""
+    for stream in statistics:
+        issue = partial(Issue, stream=stream.stream)
+        channels, names = stream.channels, [channel.name for channel in stream.channels]
+        # The gripper of pose-derived actions is 1 by definition.
+        flat = [
+            at
+            for at, channel in enumerate(channels)
+            if channel.minimum == channel.maximum
+            and (channel.name, channel.minimum) != ("gripper", 1)
+        ]
+        if flat:
+            text = f"{named(names, flat)}: one value in all {stream.looked_at} rows looked at"
+            yield issue(severity="warning", kind="flat channel", message=text)
+        if stream.still:
+            yield issue(severity="warning", kind="still channel", message=stream.still)
+        broken = [at for at, channel in enumerate(channels) if not np.isfinite(channel.mean)]
+        if broken:
+            text = f"{named(names, broken)}: NaN or infinite in {stream.looked_at} rows looked at"
+            yield issue(severity="error", kind="not finite", message=text)

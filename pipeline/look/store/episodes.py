@@ -1,0 +1,261 @@
+"""What each episode of a store has: how long it is, which streams and views its ticks see."""
+
+from collections import Counter, defaultdict
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import BoundaryNorm, ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+
+from pipeline.base.issue import Issue, Severity
+from pipeline.base.table import Table
+from pipeline.look.page.blocks import Block, Picture
+from pipeline.look.page.style import INK, PALETTE, canvas
+from pipeline.store import Episode, FeatureStore, episode_name
+
+ROWS = 100
+"""Episodes in the table of all; of more, the first."""
+FEW_TICKS = 10
+_GAP_STEPS = 5
+_RARE, _USUAL = 0.05, 0.8
+_SEEN = (("#D55E00", "absent"), ("#E69F00", "by some"), ("#0072B2", "seen by all ticks"))
+_NAMED_EPISODES = 16
+_NAME_ENDS = 6, 15
+"""Characters of a long name's begin and end that are shown."""
+
+
+@dataclass(frozen=True)
+class EpisodeCoverage:
+    """One episode: how long it is, and which streams it has for how much of it."""
+
+    episode: Episode
+    seconds: float
+    """From the first tick to the last."""
+    covered: Mapping[str, float]
+    """`sensor`, `state`, and each view -> share of the episode's ticks that see it, 0 to 1."""
+
+    @property
+    def name(self) -> str:
+        """`source/id`."""
+        return episode_name(self.episode)
+
+    @property
+    def ticks(self) -> slice:
+        """Of the store's ticks."""
+        return slice(self.episode.ticks.start, self.episode.ticks.stop)
+
+    def issue(
+        self,
+        kind: str,
+        stream: str,
+        message: str,
+        span: tuple[float | None, float | None] = (None, None),
+        severity: Severity = "warning",
+    ) -> Issue:
+        """An issue of this episode; `span` is (start, stop) in s since its first tick."""
+        return Issue(
+            severity=severity,
+            kind=kind,
+            message=message,
+            source=self.episode.source,
+            episode=self.episode.id,
+            stream=stream,
+            start_s=span[0],
+            stop_s=span[1],
+        )
+
+
+def read_coverage(store: FeatureStore) -> tuple[EpisodeCoverage, ...]:
+    """Every episode, in the order of the store."""
+    return tuple(_coverage_of(store, episode) for episode in store.episodes)
+
+
+def _coverage_of(store: FeatureStore, episode: Episode) -> EpisodeCoverage:
+    ticks = slice(episode.ticks.start, episode.ticks.stop)
+    time = store.array("tick/time")[ticks]
+    seen = {
+        "sensor": store.array("tick/sensor_end")[ticks] > episode.readings.start,
+        "state": store.array("tick/state_end")[ticks] > episode.states.start,
+    }
+    shown = np.isfinite(store.array("vl/frame_time")[store.array("tick/vl_row")[ticks]])
+    seen |= dict(zip(store.streams["views"], shown.T, strict=True))
+    covered = {name: float(there.mean()) if len(time) else 0.0 for name, there in seen.items()}
+    return EpisodeCoverage(episode, float(np.ptp(time)) if len(time) else 0.0, covered)
+
+
+def show_coverage(episodes: Sequence[EpisodeCoverage]) -> list[Block]:
+    """A row a source, the picture, and a row an episode."""
+    caption = "Ticks see all streams and views, none of one (no …), or one in a share of them."
+    if len(episodes) > ROWS:
+        caption += f" The first {ROWS} of {len(episodes)} episodes."
+    heads = ("source", "episode", "instruction", "ticks", "length [s]", "VL rows", "ticks see")
+    rows: list[tuple[object, ...]] = []
+    for part in episodes[:ROWS]:
+        own = part.episode
+        counts = len(own.ticks), round(part.seconds, 2), len(own.vl_rows)
+        rows.append((own.source, own.id, own.instruction, *counts, _lacking(part.covered)))
+    return [
+        _sources(episodes),
+        Picture(
+            "coverage",
+            "Length of each episode, and below it which streams and views its ticks see.",
+            partial(draw_coverage, episodes),
+        ),
+        Table(heads, rows, caption),
+    ]
+
+
+def _sources(episodes: Sequence[EpisodeCoverage]) -> Table:
+    parts: dict[str, list[EpisodeCoverage]] = defaultdict(list)
+    for episode in episodes:
+        parts[episode.episode.source].append(episode)
+    if len(parts) > 1:
+        parts["all"] = [*episodes]
+    rows: list[tuple[object, ...]] = []
+    for name, part in parts.items():
+        own = [coverage.episode for coverage in part]
+        seconds = round(sum(coverage.seconds for coverage in part), 1)
+        formats = ", ".join(sorted({episode.format for episode in own}))
+        instructions = len({episode.instruction for episode in own})
+        ticks, *counts = (
+            sum(len(getattr(episode, kind)) for episode in own)
+            for kind in ("ticks", "vl_rows", "readings", "states")
+        )
+        rows.append((name, formats, instructions, len(own), ticks, seconds, *counts))
+    heads = ("source", "format", "instructions", "episodes", "ticks", "length [s]", "VL rows")
+    strong = frozenset({len(rows) - 1} if len(parts) > 1 else ())
+    return Table((*heads, "sensor readings", "state readings"), rows, strong=strong)
+
+
+def _lacking(covered: Mapping[str, float]) -> str:
+    """What not all ticks see; a partial share is never rounded to all or none."""
+    lacking = [
+        f"{min(max(share, 0.01), 0.99):.0%} {name}" if share else f"no {name}"
+        for name, share in covered.items()
+        if share < 1
+    ]
+    return ", ".join(lacking) or "all"
+
+
+def draw_coverage(episodes: Sequence[EpisodeCoverage]) -> Figure:
+    """Length of each episode above, and below which streams and views its ticks see."""
+    streams = list(episodes[0].covered)
+    source_of = [episode.episode.source for episode in episodes]
+    sources = list(dict.fromkeys(source_of))
+    figure = canvas(9.0, 3.8 + 0.3 * len(streams))
+    ratios = (2.2, 0.3 * len(streams) + 0.2)
+    above, below = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": ratios})
+    for number, source in enumerate(sources):
+        own = [at for at, name in enumerate(source_of) if name == source]
+        seconds = [episodes[at].seconds for at in own]
+        above.bar(own, seconds, 0.9, color=PALETTE[number % len(PALETTE)], label=source)
+    above.set_ylabel("length [s]")
+    above.grid(axis="x", visible=False)
+    shares = np.array([[episode.covered[name] for episode in episodes] for name in streams])
+    # 0 absent, 1 seen by some ticks, 2 by all.
+    levels = (shares > 0) + np.floor(shares)
+    mesh = below.pcolormesh(
+        np.arange(-0.5, len(episodes)),
+        np.arange(-0.5, len(streams)),
+        levels,
+        cmap=ListedColormap([colour for colour, _ in _SEEN]),
+        norm=BoundaryNorm([-0.5, 0.5, 1.5, 2.5], 3),
+        rasterized=True,
+    )
+    mesh.set_edgecolor("face")
+    below.set_yticks(range(len(streams)), streams)
+    below.invert_yaxis()
+    below.grid(visible=False)
+    mark_sources(below, episodes)
+    patches = [Patch(color=colour, label=label) for colour, label in reversed(_SEEN)]
+    figure.legend(handles=patches, loc="outside lower center", ncols=3)
+    if len(sources) > 1:
+        above.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=len(sources))
+    return figure
+
+
+def mark_sources(axis: Axes, episodes: Sequence[EpisodeCoverage], line: str = INK) -> None:
+    """Sources below an axis of episodes, parted by lines; the episodes' names where few."""
+    sources = [episode.episode.source for episode in episodes]
+    starts = [at for at, source in enumerate(sources) if not at or source != sources[at - 1]]
+    for start in starts[1:]:
+        axis.axvline(start - 0.5, color=line, lw=1.0)
+    if len(episodes) <= _NAMED_EPISODES:
+        names = [
+            _short(episode.episode.id if len(starts) == 1 else episode.name) for episode in episodes
+        ]
+        axis.set_xticks(range(len(episodes)), names, rotation=45, ha="right")
+        return
+    spans = list(zip(starts, [*starts[1:], len(episodes)], strict=True))
+    middles = [(start + stop - 1) / 2 for start, stop in spans]
+    axis.set_xticks(middles, [f"{sources[start]}\n{stop - start}" for start, stop in spans])
+    axis.set_xlabel("episodes, by source")
+
+
+def _short(name: str) -> str:
+    """Of a long name, both ends: where it belongs and what tells it from its neighbours."""
+    begin, end = _NAME_ENDS
+    return name if len(name) <= begin + end + 1 else f"{name[:begin]}…{name[-end:]}"
+
+
+def find_episode_issues(
+    store: FeatureStore, episodes: Sequence[EpisodeCoverage]
+) -> Iterator[Issue]:
+    """Gaps, short episodes, missing streams and views, instructions that stand out."""
+    there = {name for episode in episodes for name, share in episode.covered.items() if share}
+    for episode in episodes:
+        time = store.array("tick/time")[episode.ticks]
+        yield from _gaps(episode, time)
+        if len(time) < FEW_TICKS:
+            text = f"{len(time)} ticks ({episode.seconds:.1f} s); expected at least {FEW_TICKS}"
+            yield episode.issue("short episode", "ticks", text)
+        if len(time):
+            yield from _missing(episode, there)
+    yield from _instructions(episodes)
+
+
+def _gaps(episode: EpisodeCoverage, time: NDArray[np.float64]) -> Iterator[Issue]:
+    """The widest gap of an episode's ticks."""
+    steps = np.diff(time)
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    gaps = np.flatnonzero(steps > _GAP_STEPS * usual)
+    if usual > 0 and len(gaps):
+        at = int(steps.argmax())
+        text = f"{len(gaps)} gap{'s' * (len(gaps) > 1)}, the widest {steps[at]:.2f} s without a "
+        text += f"tick; a step is usually {usual:.3f} s"
+        span = (float(time[at] - time[0]), float(time[at + 1] - time[0]))
+        yield episode.issue("gap", "ticks", text, span)
+
+
+def _missing(episode: EpisodeCoverage, there: Collection[str]) -> Iterator[Issue]:
+    """Streams and views that others have, and this episode has not or not for all its ticks."""
+    for name, share in episode.covered.items():
+        stream = name if name in ("sensor", "state") else f"view {name}"
+        if name in there and not share:
+            yield episode.issue("missing", stream, "no tick sees it; other episodes have it")
+        elif 0 < share < 1:
+            yield episode.issue("partly missing", stream, f"only {share:.0%} of the ticks see it")
+
+
+def _instructions(episodes: Sequence[EpisodeCoverage]) -> Iterator[Issue]:
+    """No instruction, or one that stands out in its source."""
+    by_source: dict[str, Counter[str]] = defaultdict(Counter)
+    for episode in episodes:
+        by_source[episode.episode.source][episode.episode.instruction] += 1
+    usual = {source: counts.most_common(1)[0] for source, counts in by_source.items()}
+    totals = {source: counts.total() for source, counts in by_source.items()}
+    for episode in episodes:
+        source, words = episode.episode.source, episode.episode.instruction
+        (most, often), total = usual[source], totals[source]
+        rare = by_source[source][words] <= max(1, _RARE * total) < often
+        if not words.strip():
+            text = "the prompt says nothing of the task; set `instruction` of its data source"
+            yield episode.issue("no instruction", "instruction", text)
+        elif rare and often >= _USUAL * total:
+            text = f"{words!r}; {often} of {total} episodes of this source say {most!r}"
+            yield episode.issue("other instruction", "instruction", text)

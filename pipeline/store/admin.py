@@ -1,0 +1,452 @@
+"""What lies in a folder of stores, as a table for people, and what of it nothing needs any more.
+
+Metadata and a few small arrays are read, whatever the size. A damaged store is listed with the
+reason and stops nothing. A finished store is never removed, nor anything that a living process is
+building, nor what lies behind a symbolic link. An unfinished build that holds feature rows is work
+that the next run resumes or takes over: it goes only where it is named.
+"""
+
+import re
+import stat
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from textwrap import shorten
+from typing import Any, Literal
+
+import numpy as np
+import zarr
+
+from pipeline.base.digests import is_ledger
+from pipeline.base.durable import HELD, KEPT
+from pipeline.base.errors import ConfigError, PipelineError, StoreIncomplete, StoreLocked
+from pipeline.base.format import size
+from pipeline.base.ownership import OutputKind, remove_folder
+from pipeline.base.table import Table
+from pipeline.store.archive import ARCHIVE, is_archive, read_manifest
+from pipeline.store.chunks import read_rows
+from pipeline.store.lock import build_lock, lock_holder
+from pipeline.store.paths import LEDGER, MERGED, STORE, read_plan
+from pipeline.store.reader import FeatureStore
+from pipeline.store.repair_hints import gc_command
+from pipeline.store.schema import CHECKSUMS, FEATURES, ArraySpec, read_specs
+
+Fate = Literal["unneeded", "work", "kept", "in place"]
+"""`work` goes where it is named; what is `kept` looks like a leftover and is none."""
+
+GROUPS = ("features", "sensor", "state", "rest")
+_KINDS = {
+    None: "store",
+    ".part": "build",
+    ".repair.part": "repair",
+    ".known": "set aside",
+    ".old": "replaced",
+    ".replaced": "replaced",
+    ".keeping": "replaced",
+    ".previous": "previous",
+    ".lock": "lock",
+    ".wait": "lock",  # of a version that restored archives while it trained
+    LEDGER: "ledger",
+}
+"""What a name is that ends so behind a store's; a store may turn out to be an `archive`."""
+_NAME = re.compile(r"(?P<base>.+?\.zarr)(?P<suffix>\.[a-z.]+?)?(?:-(?:\d+|wal|shm))?")
+_BUILDS = ("build", "set aside", "replaced", "previous")
+_UNREADABLE = (PipelineError, OSError, ValueError, KeyError, TypeError, AttributeError, IndexError)
+
+
+@dataclass(frozen=True)
+class StoreContents:
+    """What a store, an archive of one or a build says it holds."""
+
+    plan: str | None
+    attrs: Mapping[str, Any]
+    specs: Mapping[str, ArraySpec]
+    done: int
+    """Feature rows that are there; fewer than `rows` in a build."""
+
+    @property
+    def rows(self) -> int:
+        """Feature rows."""
+        return self.specs[FEATURES].shape[0]
+
+    @property
+    def digest(self) -> str:
+        """The beginning of the feature spec's."""
+        return str(self.attrs["feature_spec"].get("digest", "?"))[:8]
+
+
+@dataclass(frozen=True)
+class StoreEntry:
+    """One thing in a folder of stores."""
+
+    path: Path
+    kind: str
+    base: Path
+    """The store that it is, or belongs to."""
+    sizes: Mapping[str, int]
+    """Bytes on the disk by group of arrays; files that are hard links counted like others."""
+    files: Mapping[tuple[int, int], int] = field(repr=False)
+    """Bytes on the disk of each file, by device and inode."""
+    contents: StoreContents | None
+    damage: str | None
+    """Why it cannot be used, if so."""
+
+    @property
+    def bytes(self) -> int:
+        """On the disk."""
+        return sum(self.sizes.values())
+
+
+@dataclass(frozen=True)
+class Inventory:
+    """Everything in a folder that belongs to a store, by path."""
+
+    folder: Path
+    entries: tuple[StoreEntry, ...]
+
+    @property
+    def bytes(self) -> int:
+        """On the disk, each hard-linked file once."""
+        files = {key: size for entry in self.entries for key, size in entry.files.items()}
+        return sum(files.values())
+
+    def shared(self, entry: StoreEntry) -> dict[Path, int]:
+        """Other entries that share files with this one by hard links -> bytes shared."""
+        shared = {
+            other.path: sum(entry.files[key] for key in entry.files.keys() & other.files.keys())
+            for other in self.entries
+            if other is not entry
+        }
+        return {path: count for path, count in shared.items() if count}
+
+    @cached_property
+    def holders(self) -> dict[Path, str]:
+        """Stores that a living process is building -> that process, as its lock says."""
+        locks = (entry for entry in self.entries if entry.kind == "lock")
+        holders = ((lock.base, lock_holder(lock.path)) for lock in locks)
+        return {base: holder for base, holder in holders if holder is not None}
+
+
+@dataclass(frozen=True)
+class Leftover:
+    """Something that may be removed."""
+
+    entry: StoreEntry
+    why: str
+    bytes: int
+    """On the disk; what hard links elsewhere hold on to is not counted."""
+
+
+def take_inventory(folder: Path, *, subfolders: bool = True) -> Inventory:
+    """Everything in `folder` and its subfolders that belongs to a store.
+
+    Raises `ConfigError` where there is no such folder.
+    """
+    if not folder.is_dir():
+        raise ConfigError(
+            f"stores.folder: expected a folder of stores, found none at {folder}. Name it with "
+            "--set stores.folder=…"
+        )
+    return Inventory(folder, tuple(_entry(*place) for place in _walk(folder, subfolders)))
+
+
+def describe_inventory(inventory: Inventory, dependents: Mapping[Path, Sequence[str]]) -> list[str]:
+    """Sizes and counts, a line each; below each store what depends on it, then the specs.
+
+    `dependents`: store -> what trained policies depend on it, a line each.
+    """
+    beside = ("lock", "ledger")  # shown with the store that they lie beside
+    bases = {entry.base for entry in inventory.entries if entry.kind not in beside}
+    shown = [e for e in inventory.entries if e.kind not in beside or e.base not in bases]
+    if not shown:
+        return [f"{inventory.folder}: no store in it"]
+    heads = ("", "what", "on disk", *GROUPS, "episodes", "ticks", "VL rows", "spec")
+    header, *rows = Table(heads, [_row(inventory, entry) for entry in shown]).text()
+    lines = [header]
+    for entry, row in zip(shown, rows, strict=True):
+        lines += [row, *(f"    {line}" for line in _details(inventory, entry))]
+        lines += [f"    {line}" for line in dependents.get(entry.path, ())]
+    specs = {entry.contents.digest: entry.contents for entry in shown if entry.contents}
+    apart, once = sum(entry.bytes for entry in inventory.entries), inventory.bytes
+    linked = f", {size(apart - once)} of hard links counted once" if apart > once else ""
+    return [
+        *lines,
+        "",
+        *(f"spec {digest}: {_spec(contents)}" for digest, contents in specs.items()),
+        f"{inventory.folder}: {size(once)} on the disk{linked}",
+    ]
+
+
+def find_leftovers(inventory: Inventory) -> list[Leftover]:
+    """What nothing needs, with the reason, by path."""
+    fates = [(entry, *_fate(inventory, entry)) for entry in inventory.entries]
+    unneeded = ((entry, why) for entry, fate, why in fates if fate == "unneeded")
+    return [Leftover(entry, why, _freed(inventory, entry)) for entry, why in unneeded]
+
+
+def find_named(inventory: Inventory, paths: Sequence[Path]) -> list[Leftover]:
+    """These very leftovers, unfinished builds with their rows among them.
+
+    Raises `ConfigError` for a path that is none, with the reason.
+    """
+    known = {entry.path.absolute(): entry for entry in inventory.entries}
+    named: list[Leftover] = []
+    for path in paths:
+        entry = known.get(path.absolute())
+        fate, why = _fate(inventory, entry) if entry else ("kept", "no leftover of a build")
+        if entry is None or fate in ("kept", "in place"):
+            raise ConfigError(
+                f"stores.inputs: {path}: {why}. Nothing was removed; "
+                "python -m stages.store gc lists what may be."
+            )
+        named.append(Leftover(entry, why, _freed(inventory, entry)))
+    return named
+
+
+def describe_kept(inventory: Inventory) -> list[str]:
+    """What looks like a leftover and is none, with the reason, a line each."""
+    lines: list[str] = []
+    for entry in inventory.entries:
+        fate, why = _fate(inventory, entry)
+        if fate == "work":
+            lines.append(f"{entry.path}: {why}, and {gc_command(entry.path)} removes it")
+        elif fate == "kept" and entry.kind != "lock":
+            lines.append(f"{entry.path}: {why}")
+    return lines
+
+
+def remove_leftover(leftover: Leftover) -> None:
+    """Remove it, holding the lock of its store; nothing behind a symbolic link is touched.
+
+    Raises `StoreLocked` where a build has begun since.
+    """
+    path, base = leftover.entry.path, leftover.entry.base
+    lock = base.with_name(base.name + ".lock")
+    there = lock.exists()
+    try:
+        with build_lock(base):
+            # Looked at again under the lock: a killed replacement leaves the only copy as `.old`.
+            only_copy = _KINDS.get(path.suffix) == "replaced" and not base.exists()
+            if path.is_symlink() or only_copy:
+                return
+            if path.is_dir():
+                remove_folder(path, _owner(path) or STORE)
+            else:
+                path.unlink(missing_ok=True)
+            if not there:
+                lock.unlink(missing_ok=True)
+    except StoreLocked as error:
+        raise StoreLocked(f"{path}: not removed. {error}") from None
+
+
+def _walk(folder: Path, subfolders: bool) -> Iterator[tuple[Path, str, Path]]:
+    """What belongs to a store, at or below a folder; links to folders are not followed."""
+    for path in sorted(folder.iterdir()):
+        name = _NAME.fullmatch(path.name)
+        if name and name["suffix"] in _KINDS:
+            yield path, _KINDS[name["suffix"]], path.with_name(name["base"])
+        elif subfolders and path.is_dir() and not path.is_symlink():
+            yield from _walk(path, subfolders)
+
+
+def _entry(path: Path, kind: str, base: Path) -> StoreEntry:
+    contents, damage = None, None
+    try:
+        if kind == "store" and is_archive(path):
+            kind = "archive"
+        elif kind == "store":
+            FeatureStore.open(path)
+        if kind in ("store", "archive") or (kind in _BUILDS and read_plan(path) is not None):
+            contents = _contents(path, kind)
+    except _UNREADABLE as error:
+        damage = str(error) if isinstance(error, PipelineError) else f"{path}: {error!r}"
+    return StoreEntry(path, kind, base, *_disk(path), contents, damage)
+
+
+def _contents(path: Path, kind: str) -> StoreContents:
+    specs = read_specs(path)
+    attrs: dict[str, Any] = zarr.open_group(path, mode="r").attrs.asdict()
+    if not {"feature_spec", "streams", "sources", "action_hz", "vlm_reuse_count"} <= set(attrs):
+        raise StoreIncomplete(f"{path}: its attributes lack what a store says of itself")
+    if kind == "archive":
+        return StoreContents(read_manifest(path).plan, attrs, specs, specs[CHECKSUMS].shape[0])
+    done = np.count_nonzero(read_rows(path, specs[CHECKSUMS]))
+    return StoreContents(read_plan(path), attrs, specs, int(done))
+
+
+def _disk(path: Path) -> tuple[dict[str, int], dict[tuple[int, int], int]]:
+    """Bytes on the disk by group and by file."""
+    sizes, files = dict[str, int].fromkeys(GROUPS, 0), dict[tuple[int, int], int]()
+    for file in path.rglob("*") if path.is_dir() else [path]:
+        try:
+            status = file.stat()  # of the file itself where a cache hands out symbolic links
+        except FileNotFoundError:
+            continue  # removed meanwhile, or a link into a cache that was emptied
+        if not stat.S_ISDIR(status.st_mode):
+            inside = file.relative_to(path).as_posix().removeprefix("vl/").split("/")[0]
+            sizes[inside if inside in GROUPS else "rest"] += status.st_blocks * 512
+            files[status.st_dev, status.st_ino] = status.st_blocks * 512
+    return sizes, files
+
+
+def _row(inventory: Inventory, entry: StoreEntry) -> tuple[object, ...]:
+    name = entry.path.relative_to(inventory.folder).as_posix()
+    sizes = (entry.bytes, *(entry.sizes[group] for group in GROUPS))
+    row = (name, "damaged" if entry.damage else entry.kind, *map(size, sizes))
+    held = entry.contents
+    if held is None:
+        return (*row, None, None, None, None)
+    rows = held.rows if held.done == held.rows else f"{held.done:,} of {held.rows:,}"
+    counts = (held.specs[array].shape[0] for array in ("episode/source", "tick/time"))
+    return (*row, *counts, rows, held.digest)
+
+
+def _details(inventory: Inventory, entry: StoreEntry) -> Iterator[str]:
+    if entry.damage:
+        yield f"damaged: {_clause(entry.damage)}"
+    if entry.contents is not None and entry.kind == "store":
+        yield _embodiment(entry.contents)
+    if entry.path.is_symlink():
+        yield f"a link to {entry.path.resolve()}"
+    if entry.kind in (*_BUILDS, "repair"):
+        begun = entry.contents is not None or entry.damage is not None
+        yield f"belongs to {entry.base.name}{'' if begun else '; of no use unfinished'}"
+    holder = inventory.holders.get(entry.base)
+    if holder and entry.kind != "archive":
+        yield f"being built by {holder}" if entry.kind == "build" else f"locked by {holder}"
+    for path, count in inventory.shared(entry).items():
+        yield f"shares {size(count)} with {path.name} by hard links"
+    if entry.kind == "store":
+        yield from _company(inventory, entry)
+
+
+def _company(inventory: Inventory, store: StoreEntry) -> Iterator[str]:
+    """The archives of a store, its lock and its ledger."""
+    plan = store.contents.plan if store.contents else None
+    for other in inventory.entries:
+        of_it = other.contents is not None and other.contents.plan == plan is not None
+        if other.kind == "archive" and of_it:
+            yield f"archived as {other.path.name}"
+        elif other.kind in ("lock", "ledger") and other.base == store.base:
+            yield f"beside it: {other.path.name} ({size(other.bytes)})"
+
+
+def _embodiment(held: StoreContents) -> str:
+    attrs = held.attrs
+    action = f"{attrs['streams']['action'].get('kind', '')} action".strip()
+    arrays = {action: "tick/action", "sensor": "sensor/values", "state": "state/values"}
+    widths = {stream: held.specs[name].shape[1] for stream, name in arrays.items()}
+    words = [f"{stream} {width}" if width else f"no {stream}" for stream, width in widths.items()]
+    rate = "recorded rows" if attrs["action_hz"] is None else f"{attrs['action_hz']:g} Hz"
+    return (
+        f"{', '.join(words)}; {rate}, an answer every {attrs['vlm_reuse_count']} ticks; "
+        f"sources {', '.join(attrs['sources'])}"
+    )
+
+
+def _spec(held: StoreContents) -> str:
+    """The main entries of a feature spec: what tells two specs apart at a glance."""
+    spec, features = held.attrs["feature_spec"], held.specs[FEATURES]
+    _, slots, dim = features.shape
+    pooled = [slot for slot in spec.get("slots", ()) if isinstance(slot, Mapping)]
+    kinds = dict.fromkeys(f"{slot.get('pooling')} of layer {slot.get('layer')}" for slot in pooled)
+    entries = {
+        "": " + ".join(kinds),
+        "weights ": str(spec.get("weights") or "")[:8],
+        "adapter ": str(spec.get("adapter") or "")[:8],
+        "pixels ": " x ".join(map(str, spec.get("processor", {}).get("image_size", ()))),
+        "computed in ": spec.get("compute_dtype"),
+        "variants ": spec.get("variants"),
+        "prompt ": "prompt" in spec and repr(shorten(spec["prompt"], 40, placeholder="…")),
+    }
+    stored = features.attributes.get("dtype", features.dtype.name)
+    sensor = held.specs["sensor/values"].dtype.name
+    words = [f"{name}{value}" for name, value in entries.items() if value]
+    return ", ".join([f"{slots} slots x {dim} in {stored}", f"sensor in {sensor}", *words])
+
+
+def _clause(damage: str) -> str:
+    """What is wrong, without what to run about it."""
+    return damage.split(". ", 1)[0].splitlines()[0]
+
+
+def _fate(inventory: Inventory, entry: StoreEntry) -> tuple[Fate, str]:
+    """Whether it may be removed, and why, or why not."""
+    if entry.kind in ("store", "archive"):
+        return "in place", f"a finished {entry.kind}, which is never removed here"
+    if entry.path.is_symlink():
+        return "kept", "a symbolic link, left alone"
+    if _is_foreign(entry):
+        return "kept", "this project did not write it, left alone"
+    if holder := inventory.holders.get(entry.base):
+        return "kept", f"in use by {holder}"
+    if work := _work(entry):
+        return "work", work
+    beside = [other for other in inventory.entries if other.base == entry.base]
+    match entry.kind:
+        case "build":
+            why = "a build that was stopped before any row was done; there is nothing to resume"
+        case "repair":
+            why = "a repair that was stopped before it was a build; the next begins anew"
+        case "set aside":
+            why = "an interrupted build of which no row was done"
+        case "replaced":
+            sound = [other.kind for other in beside if other.damage is None]
+            if "store" not in sound and "archive" not in sound:
+                return "kept", (
+                    f"the only copy of {entry.base.name}, set aside by a replacement that was "
+                    "killed; the next stages.extract puts it back"
+                )
+            why = f"{entry.base.name} has taken its place"
+        case "ledger":
+            if any(other.kind not in ("lock", "ledger") for other in beside):
+                return "in place", "content digests for a store that is there"
+            why = "content digests for a store that is not there"
+        case _:
+            why = "held by no process"
+    return "unneeded", why
+
+
+def _work(entry: StoreEntry) -> str | None:
+    """What would be lost with an unfinished build; None where that holds no row."""
+    if entry.kind == "previous":
+        return "the store of before, kept for its rows until the next successful stages.extract"
+    if entry.kind not in ("build", "set aside"):
+        return None
+    if entry.damage is not None:
+        return f"unfinished build that cannot be read: {_clause(entry.damage)}"
+    held = entry.contents
+    if held is None or not held.done:
+        return None
+    resumes = "stages.extract resumes"
+    if entry.kind == "set aside":
+        resumes = "stages.extract takes rows from"
+    elif held.plan and held.plan.startswith(MERGED):
+        resumes = "the same stages.store merge resumes"
+    return f"unfinished build, {held.done} of {held.rows} rows done; {resumes} it"
+
+
+def _is_foreign(entry: StoreEntry) -> bool:
+    if entry.path.name.endswith(LEDGER):
+        return not is_ledger(entry.path)
+    return entry.path.is_dir() and _owner(entry.path) is None
+
+
+def _owner(path: Path) -> OutputKind | None:
+    """The kind that a folder is of, None where it is not ours.
+
+    The marker decides: removed as another kind and killed meanwhile, it would be foreign to the
+    command that looks for its own kind there.
+    """
+    kinds = (STORE, ARCHIVE, KEPT, HELD)
+    try:
+        marked = next((kind for kind in kinds if kind.marks(path)), None)
+        return marked or next((kind for kind in kinds if kind.owns(path)), None)
+    except StoreIncomplete:  # a group's metadata, but damaged
+        return OutputKind(STORE.name, lambda _: True)
+
+
+def _freed(inventory: Inventory, entry: StoreEntry) -> int:
+    """Bytes that its removal gives back."""
+    return entry.bytes - sum(inventory.shared(entry).values())

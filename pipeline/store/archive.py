@@ -1,0 +1,432 @@
+"""A compressed, sharded, checksummed copy of a store, for keeping and sharing.
+
+A plain zarr v3 group of the same arrays under the same names, but in few, large files (shards), in
+which inner chunks of some MB are compressed and checksummed one by one, so that a part can be read
+without the whole. A shard holds whole chunk files of the store: both copies are read and written
+once, in order, with a shard in memory at a time.
+
+Its root's attributes are those of the store and a manifest: the text of every `zarr.json` of the
+store and the checksum of each of its chunk files. That is what proves an archive and rebuilds the
+store to the byte. The manifest is written last: a folder that has one is a complete archive.
+"""
+
+import hashlib
+import json
+import math
+import os
+import warnings
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import google_crc32c
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+from pydantic import BaseModel
+from tqdm import tqdm
+from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec
+from zarr.errors import ZarrUserWarning
+
+from pipeline.base.digests import file_digest
+from pipeline.base.durable import disk_full_named, put_in_place, sync
+from pipeline.base.errors import StoreIncomplete, StoreMismatch
+from pipeline.base.ownership import OutputKind, begin_folder, remove_folder
+from pipeline.store.chunks import ChunkFiles, check_row_checksums, check_trailers, read_rows
+from pipeline.store.lock import build_lock
+from pipeline.store.metadata import ATTRIBUTE as METADATA_DIGEST
+from pipeline.store.metadata import check_metadata
+from pipeline.store.paths import STORE, part_path, read_plan, recover
+from pipeline.store.reader import FeatureStore
+from pipeline.store.repair_hints import extract_command, gc_command
+from pipeline.store.replacement import inode_of, refuse_replaced
+from pipeline.store.schema import CHECKSUMS, FEATURES, ArraySpec, chunk_paths, read_spec, read_specs
+from pipeline.store.writer import StoreBuild
+
+_SCHEMA = 1
+_ZARR_JSON = "zarr.json"
+_MANIFEST = "archive"
+"""The attribute of the root that holds the manifest."""
+SHARD_BYTES = 256 * 2**20
+"""Raw bytes of a shard at most, where one chunk file of the store is not larger."""
+INNER_BYTES = 4 * 2**20
+"""Raw bytes of an inner chunk at most, where one row is not larger."""
+_OF_A_STORE = ("schema", "plan", METADATA_DIGEST)
+"""Attributes of the root that would be false of an archive."""
+
+
+class ArchivedArray(BaseModel, frozen=True):
+    """What the manifest says of one array."""
+
+    codec: str
+    ratios: dict[str, float | None] = {}
+    """What each codec made of samples, where an earlier version chose among several."""
+    raw_bytes: int
+    """Of its rows."""
+    shard_bytes: tuple[int, ...]
+    """Size of each shard's file; 0 where all is zero, for which zarr writes no file."""
+    crc32c: tuple[int, ...]
+    """Checksum of the data of each chunk file of the store, in order."""
+    metadata: str
+    """Digest of this array's metadata in the archive."""
+
+
+class Manifest(BaseModel, frozen=True):
+    """The content of an archive."""
+
+    metadata: dict[str, str]
+    """Every `zarr.json` of the store, as text, by its path."""
+    arrays: dict[str, ArchivedArray]
+
+    @property
+    def plan(self) -> str | None:
+        """The plan of the store."""
+        return json.loads(self.metadata[_ZARR_JSON])["attributes"].get("plan")
+
+    @property
+    def raw_bytes(self) -> int:
+        """Of the rows of all arrays."""
+        return sum(array.raw_bytes for array in self.arrays.values())
+
+    @property
+    def stored_bytes(self) -> int:
+        """Of all shards."""
+        return sum(sum(array.shard_bytes) for array in self.arrays.values())
+
+    def document(self) -> dict[str, Any]:
+        """The manifest as JSON, with a digest of itself."""
+        body = {"schema": _SCHEMA, **self.model_dump(mode="json")}
+        return {**body, "digest": _digest_of(body)}
+
+
+def is_archive(path: Path) -> bool:
+    """Whether a complete archive lies there; reads the group's metadata only."""
+    return _manifest_document(path) is not None
+
+
+ARCHIVE = OutputKind("an archive of a store", is_archive)
+
+
+def read_manifest(path: Path) -> Manifest:
+    """The manifest of an archive.
+
+    Raises `StoreMismatch` where there is something else, `StoreIncomplete` where it is damaged.
+    """
+    document = _manifest_document(path)
+    if document is None:
+        found = "something else" if path.exists() else "nothing"
+        raise StoreMismatch(
+            f"{path}: expected an archive, found {found}. Name one with archive.output, or make "
+            "it with stages.archive."
+        )
+    if document.get("schema") != _SCHEMA:
+        raise StoreMismatch(
+            f"{path}: expected an archive of schema {_SCHEMA}, found "
+            f"{document.get('schema')!r}. Restore it with the version that made it."
+        )
+    if document.pop("digest", None) != _digest_of(document):
+        raise _damaged(path / _ZARR_JSON, "its manifest does not give its digest")
+    return Manifest.model_validate(document)
+
+
+def archive(store: Path, output: Path, level: int, threads: int) -> Manifest | None:
+    """Write the archive of a finished store to `output` and prove that it gives the store back.
+
+    `level` is zstd's, 1 to 22. Every shard is read back and compared with the trailers of the
+    store's chunk files. What is written lies in `<output>.part` until it is complete; stopped or
+    killed, it is begun anew. Returns None where an archive of this very store is there already.
+
+    Raises `StoreIncomplete` naming the file where the store is not finished or is damaged,
+    `StoreMismatch` where something else lies at `output`, `StoreLocked` and `DiskFull`.
+    """
+    FeatureStore.open(store)  # says what is wrong with something that is no finished store
+    check_metadata(store)
+    with build_lock(output):
+        if output.exists():
+            if is_archive(output) and _holds(read_manifest(output), store):
+                return None
+            raise StoreMismatch(
+                f"{output}: there already, and not an archive of {store} as it is now. Move it "
+                "away, or name another place with archive.output."
+            )
+        with _begun(output, ARCHIVE, threads) as part:
+            manifest = _write(store, part, level)
+        put_in_place(part, output, ARCHIVE)
+        return manifest
+
+
+def restore(archive: Path, target: Path, threads: int) -> None:
+    """Make the store that an archive was made from, equal in every byte of every file.
+
+    Built in `<target>.part` like any store and renamed when complete; stopped or killed, it is
+    begun anew. Where that very store is there already, nothing is done.
+
+    Raises `StoreIncomplete` naming file and array where the archive is damaged, `StoreMismatch`
+    where another store lies at `target` or is being built there, `ConfigError` where something
+    else does, `StoreLocked` and `DiskFull`.
+    """
+    manifest = read_manifest(archive)
+    with build_lock(target):
+        recover(target)
+        if target.exists():
+            if not _holds(manifest, target):
+                raise StoreMismatch(
+                    f"{target}: there already, and not the archived store. It was left as it is: "
+                    "remove or rename it, or restore to another place with archive.store."
+                )
+            check_trailers(target)
+            return
+        _refuse_build(target)
+        with _begun(target, STORE, threads) as part:
+            _rebuild(manifest, archive, target, part)
+
+
+@contextmanager
+def _begun(target: Path, kind: OutputKind, threads: int) -> Generator[Path]:
+    """A new folder beside `target`, removed where what is done in it fails."""
+    part = part_path(target)
+    try:
+        with disk_full_named(target), zarr.config.set({"async.concurrency": threads}):
+            begin_folder(part, kind)
+            yield part
+    except BaseException:
+        remove_folder(part, kind)
+        raise
+
+
+def _write(store: Path, part: Path, level: int) -> Manifest:
+    """Everything of an archive, its manifest last, all of it on the disk."""
+    inode, specs, metadata = inode_of(store), read_specs(store), _read_metadata(store)
+    for name in ("", *sorted({name.split("/")[0] for name in specs})):
+        attributes = zarr.open_group(store, path=name, mode="r").attrs.asdict()
+        if not name:
+            attributes = {k: v for k, v in attributes.items() if k not in _OF_A_STORE}
+        zarr.create_group(part, path=name, attributes=attributes)
+    with _progress("archive", sum(spec.data_bytes for spec in specs.values())) as progress:
+        arrays = {
+            name: _write_array(store, part, spec, level, progress) for name, spec in specs.items()
+        }
+    refuse_replaced(store, inode)
+    manifest = Manifest(metadata=metadata, arrays=arrays)
+    group = zarr.open_group(part, mode="r+")
+    group.attrs.put({**group.attrs.asdict(), _MANIFEST: manifest.document()})
+    for folder, _, files in os.walk(part):
+        if _ZARR_JSON in files:  # shards were synced as they were written
+            sync(Path(folder, _ZARR_JSON))
+        sync(Path(folder))
+    return manifest
+
+
+def _write_array(
+    store: Path, part: Path, spec: ArraySpec, level: int, progress: "tqdm[Any]"
+) -> ArchivedArray:
+    """Copy an array shard by shard; each has to give the store's trailers before the next."""
+    array = _create_array(part, spec, level)
+    trailers = _trailers(store, spec)
+    sizes: list[int] = []
+    for shard, rows in _shards(part, spec, array):
+        values = read_rows(store, spec, rows.start, rows.stop)
+        if spec.name == FEATURES:
+            wanted = read_rows(store, read_spec(store, CHECKSUMS), rows.start, rows.stop)
+            check_row_checksums(store, spec, rows.start, values, wanted)
+        array[rows.start : rows.stop] = values
+        del values  # a shard may be large: what is read back takes its place
+        if shard.exists():
+            sync(shard)
+        try:
+            _checked_rows(spec, array, shard, rows, trailers)
+        except StoreIncomplete:
+            with closing(ChunkFiles(store, spec, writable=False)) as files:
+                files.check()  # says so where it is the store that is damaged
+            raise
+        sizes.append(shard.stat().st_size if shard.exists() else 0)
+        progress.update(len(rows) * spec.row_bytes)
+    return ArchivedArray(
+        codec=f"zstd+{codec_for(spec.dtype, 0, level).shuffle.value}",
+        raw_bytes=spec.data_bytes,
+        shard_bytes=tuple(sizes),
+        crc32c=trailers,
+        metadata=file_digest(part / spec.name / _ZARR_JSON),
+    )
+
+
+def _rebuild(manifest: Manifest, archive: Path, target: Path, part: Path) -> None:
+    for name, text in manifest.metadata.items():
+        if name != _ZARR_JSON:
+            _write_text(part / name, text)
+    with closing(StoreBuild(target, read_specs(part), manifest.plan or "")) as build:
+        build.allocate()
+        with _progress("restore", manifest.raw_bytes) as progress:
+            for name, record in manifest.arrays.items():
+                spec, array = build.specs[name], _open_array(archive, name, record)
+                for shard, rows in _shards(archive, spec, array):
+                    values = _checked_rows(spec, array, shard, rows, record.crc32c)
+                    build.write(name, rows.start, values)
+                    progress.update(len(rows) * spec.row_bytes)
+                build.files(name).write_trailers()
+        build.finish()
+        # With the root's attributes, which hold the plan, it is what an extraction would go on
+        # with, or an earlier one have left, and so nothing that another restoration may remove.
+        _write_text(part / _ZARR_JSON, manifest.metadata[_ZARR_JSON])
+        sync(part / _ZARR_JSON)
+        sync(part)
+        build.put_in_place()
+
+
+def _checked_rows(
+    spec: ArraySpec, array: "zarr.Array[Any]", shard: Path, rows: range, crc32c: Sequence[int]
+) -> NDArray[Any]:
+    """The rows of one shard.
+
+    Raises `StoreIncomplete` where they do not give the checksums of the store's chunk files.
+    """
+    try:
+        values = np.ascontiguousarray(array[rows.start : rows.stop])
+    except (ValueError, RuntimeError) as error:
+        raise _damaged(shard, f"{spec.name} cannot be read: {error}") from None
+    raw = values.reshape(-1).view(np.uint8)
+    expected = crc32c[rows.start // spec.chunk_rows :]
+    for start, crc in zip(range(0, len(raw), spec.chunk_bytes), expected, strict=False):
+        data = raw[start : start + spec.chunk_bytes]
+        padding = bytes(spec.chunk_bytes - len(data))
+        if google_crc32c.extend(google_crc32c.value(data), padding) != crc:
+            said = f"rows {rows.start} to {rows.stop - 1} of {spec.name} are other ones"
+            raise _damaged(shard, said)
+    return values
+
+
+def _create_array(root: Path, spec: ArraySpec, level: int) -> "zarr.Array[Any]":
+    """The array in an archive, without data, with the attributes it has in the store."""
+    widths = tuple(max(1, size) for size in spec.shape[1:])
+    inner = inner_rows(spec)
+    codec = codec_for(spec.dtype, inner * spec.row_bytes, level)
+    return zarr.create_array(
+        store=root,
+        name=spec.name,
+        shape=spec.shape,
+        shards=(_chunks_a_shard(spec) * spec.chunk_rows, *widths),
+        chunks=(inner, *widths),
+        dtype=spec.dtype,
+        compressors=[codec, Crc32cCodec()],
+        fill_value=0,
+        dimension_names=spec.dimensions,
+        attributes=dict(spec.attributes),
+    )
+
+
+def codec_for(dtype: np.dtype[Any], chunk_bytes: int, level: int) -> BloscCodec:
+    """The codec of inner chunks of `chunk_bytes`; `level` is zstd's, 1 to 22.
+
+    `python -m benchmarks.compression` holds the rule against other codecs: A-scans and features in
+    float32 and float16 are smallest with their bytes shuffled, clocks, row numbers and bfloat16
+    (as integers) with their bits. Blosc is given the whole chunk as one block: in blocks of its own
+    choice, features take a tenth more.
+    """
+    shuffle = BloscShuffle.shuffle
+    if dtype.itemsize == 1:
+        shuffle = BloscShuffle.noshuffle
+    elif dtype.kind in "iu" or dtype.itemsize == 8:
+        shuffle = BloscShuffle.bitshuffle
+    # Blosc numbers its levels 1 to 9 and runs zstd at 1, 3, 5, …, 15 and 22 for them.
+    clevel = 9 if level >= 22 else min(8, (level + 1) // 2)
+    return BloscCodec(cname="zstd", clevel=clevel, shuffle=shuffle, blocksize=chunk_bytes)
+
+
+def inner_rows(spec: ArraySpec) -> int:
+    """Rows of an inner chunk: the most that divide a chunk of the store and are not too large."""
+    parts = min(spec.chunk_rows, max(1, math.ceil(spec.chunk_bytes / INNER_BYTES)))
+    return spec.chunk_rows // next(part for part in count(parts) if not spec.chunk_rows % part)
+
+
+def _chunks_a_shard(spec: ArraySpec) -> int:
+    """As few shards as can be, all but the last of one size."""
+    most = max(1, SHARD_BYTES // max(1, spec.chunk_bytes))
+    return math.ceil(spec.chunk_count / max(1, math.ceil(spec.chunk_count / most))) or 1
+
+
+def _shards(root: Path, spec: ArraySpec, array: "zarr.Array[Any]") -> Generator[tuple[Path, range]]:
+    """The file of each shard of an array with data, and the rows in it."""
+    assert array.shards is not None, "an archive is sharded"
+    rows = spec.shape[0] if spec.data_bytes else 0
+    for index, start in enumerate(range(0, rows, array.shards[0])):
+        key = array.metadata.encode_chunk_key((index, *(0,) * (array.ndim - 1)))
+        yield root / spec.name / key, range(start, min(start + array.shards[0], rows))
+
+
+def _open_array(archive: Path, name: str, record: ArchivedArray) -> "zarr.Array[Any]":
+    """An array of an archive; raises `StoreIncomplete` where its metadata are not as written."""
+    metadata = archive / name / _ZARR_JSON
+    if not metadata.exists():
+        raise _damaged(metadata, f"the file is missing, and with it {name}")
+    if file_digest(metadata) != record.metadata:
+        raise _damaged(metadata, f"the metadata of {name} are not those that were written")
+    with warnings.catch_warnings():  # earlier versions took numcodecs' Delta for some integers
+        warnings.filterwarnings("ignore", "Numcodecs codecs are not in the Zarr", ZarrUserWarning)
+        return zarr.open_array(archive, path=name, mode="r")
+
+
+def _holds(manifest: Manifest, store: Path) -> bool:
+    """Whether an archive is of this store, by metadata and trailers."""
+    if _read_metadata(store) != manifest.metadata:
+        return False
+    try:
+        found = {name: _trailers(store, spec) for name, spec in read_specs(store).items()}
+    except (OSError, IndexError):
+        return False
+    return found == {name: array.crc32c for name, array in manifest.arrays.items()}
+
+
+def _trailers(store: Path, spec: ArraySpec) -> tuple[int, ...]:
+    """The checksum at the end of each chunk file."""
+    trailers = [np.fromfile(p, "<u4", 1, offset=spec.chunk_bytes) for p in chunk_paths(store, spec)]
+    return tuple(int(trailer[0]) for trailer in trailers)
+
+
+def _refuse_build(target: Path) -> None:
+    """An unfinished extraction or repair may hold rows that exist nowhere else, of any plan."""
+    part = part_path(target)
+    if read_plan(part) is not None:
+        raise StoreMismatch(
+            f"{part}: expected nothing there, found an unfinished build. Finish it with "
+            f"{extract_command(target)}, remove it with {gc_command(part)}, or restore to another "
+            "place with archive.store."
+        )
+
+
+def _read_metadata(store: Path) -> dict[str, str]:
+    """Every `zarr.json` of a store as text, by its path in it."""
+    paths = sorted(store.rglob(_ZARR_JSON))
+    return {path.relative_to(store).as_posix(): path.read_bytes().decode() for path in paths}
+
+
+def _progress(label: str, total: int) -> "tqdm[Any]":
+    return tqdm(total=total, unit="B", unit_scale=True, desc=label, disable=None)
+
+
+def _write_text(path: Path, text: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(text.encode())
+
+
+def _manifest_document(path: Path) -> dict[str, Any] | None:
+    try:
+        attributes = json.loads((path / _ZARR_JSON).read_text(encoding="utf-8"))["attributes"]
+        document = attributes[_MANIFEST]
+    except (FileNotFoundError, NotADirectoryError, ValueError, KeyError, TypeError):
+        return None
+    return document if isinstance(document, dict) else None
+
+
+def _digest_of(body: Mapping[str, Any]) -> str:
+    text = json.dumps(body, sort_keys=True, ensure_ascii=False)
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+def _damaged(path: Path, why: str) -> StoreIncomplete:
+    """The error for a file of an archive that is not as it was written."""
+    return StoreIncomplete(
+        f"{path}: the archive is damaged: {why}. Nothing was restored from it; take another copy "
+        "of the archive, or make it anew with stages.archive where the store still is."
+    )

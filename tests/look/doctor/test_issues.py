@@ -1,0 +1,74 @@
+"""How issues read, and that a group that cannot be looked at is one."""
+
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from pipeline.base.config import Params
+from pipeline.base.errors import ConfigError
+from pipeline.look import doctor as machine
+from pipeline.look.doctor.issues import WIDTH, described, missing, note, ok
+
+
+@pytest.fixture
+def params() -> Params:
+    return Params.model_validate(
+        {"data": {"sources": [{"name": "a", "path": "."}]}, "vlm": {"checkpoint": "x/y"}}
+    )
+
+
+@pytest.fixture
+def only(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], None]:
+    """`only(check)`: one group, whose check this is; an error stands for a failing import."""
+
+    def set_check(check: Any) -> None:
+        def load(name: str) -> Any:
+            if isinstance(check, Exception):
+                raise check
+            return SimpleNamespace(check=check)
+
+        monkeypatch.setattr(machine, "import_module", load)
+        monkeypatch.setattr(machine, "GROUPS", {"A group": "one"})
+
+    return set_check
+
+
+def test_lines_stay_within_the_width_and_words_whole() -> None:
+    command = "pip install --force-reinstall torch --index-url https://a.example/" + "x" * 20
+    lines = described(
+        "A group", [ok("subject", "word " * 40), note("other", "found", command), ok("s", "")]
+    )
+    assert lines[0] == "A group" and lines[-1] == ""
+    assert all(len(line) <= WIDTH for line in lines)
+    assert sum(line.startswith("  ok ") for line in lines) == 2
+    assert "https://a.example/" + "x" * 20 in "\n".join(lines)
+    starts = {line.index("word") for line in lines if "word" in line}
+    assert starts == {30}, "found stands in one column"
+
+
+@pytest.mark.parametrize(
+    ("check", "level", "said"),
+    [
+        (ImportError("No module named 'av'"), "error", "No module named 'av'"),
+        (lambda params: _raise(ConfigError("device: cuda:7")), "error", "device: cuda:7"),
+        (lambda params: _raise(OSError("stale handle")), "note", "stale handle"),
+        (lambda params: [missing("it", "is not there", "get it")], "error", "is not there"),
+    ],
+)
+def test_what_cannot_be_looked_at_is_a_issue(
+    params: Params,
+    only: Callable[[Any], None],
+    check: Any,
+    level: str,
+    said: str,
+) -> None:
+    only(check)
+    ((title, (issue,)),) = machine.examine(params)
+    assert (title, issue.severity) == ("A group", level)
+    assert said in issue.message
+
+
+def _raise(error: Exception) -> None:
+    raise error

@@ -1,0 +1,225 @@
+"""The page of an evaluation says what was judged, and a browser finds nothing wrong with it."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.base.config import TrainHeadParams
+from pipeline.base.table import Table
+from pipeline.evaluate.ablation import judge_modalities
+from pipeline.evaluate.curves import Curve, Curves
+from pipeline.evaluate.episode_frames import Footage
+from pipeline.evaluate.evaluation import Evaluation, judged_document
+from pipeline.evaluate.experiments import Experiment
+from pipeline.look.evaluation import page as evaluation_page
+from pipeline.look.evaluation.comparison import comparison_report
+from pipeline.look.evaluation.page import evaluation_report
+from pipeline.look.page.blocks import Document, Picture, Report, Section
+from pipeline.look.page.writing import PAGE, write_report
+from pipeline.policy.checkpoint import PolicyCheckpoint
+from pipeline.policy.normalization import ChannelStatistics, Normalization
+from pipeline.policy.policy import Policy
+from pipeline.store import FeatureStore
+from pipeline.train.batches import Windows
+from pipeline.train.held_out import held_out_contents, held_out_ranges, judge
+from pipeline.train.identity import policy_shape, source_of
+from pipeline.train.predictions import BASELINES
+
+Sound = Callable[[Path], None]
+PARAMS = TrainHeadParams.model_validate(
+    {
+        "sensor_encoder": {"channels": [8], "layers": 0, "heads": 1, "output_dim": 8},
+        "state_encoder": {"dim": 8, "layers": 0, "heads": 1, "output_dim": 8},
+        "expert": {"dim": 8, "layers": 1, "heads": 1},
+        "horizon": 4,
+        "sensor_window": 6,
+        "state_window": 5,
+    }
+)
+CURVES = Curves({"train/loss": Curve(np.array([10, 20]), np.array([1.0, 0.1]))})
+
+
+@pytest.fixture(scope="module")
+def judgement(
+    tiny_store: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory
+) -> Evaluation:
+    """An untrained policy on three held-out episodes whose recordings are nowhere."""
+    store = FeatureStore.open(tiny_store(tmp_path_factory.mktemp("judged"), sensor_channels=40))
+
+    def statistics(name: str) -> ChannelStatistics:
+        values = store.array(name).astype(np.float64)
+        return ChannelStatistics(values.mean(0), values.std(0), len(values))
+
+    normalization = Normalization(
+        statistics("tick/action"),
+        statistics("vl/features"),
+        statistics("sensor/values"),
+        statistics("state/values"),
+    )
+    shape = policy_shape(store, normalization)
+    policy = Policy(PARAMS, shape, normalization).eval()
+    ticks = np.arange(90, 180)
+    ranges = held_out_ranges(store, ticks)
+    checkpoint = PolicyCheckpoint(
+        params=PARAMS,
+        shape=shape,
+        normalization=normalization,
+        source=source_of(store),
+        held_out_ticks=ranges,
+        held_out_content=held_out_contents(store, ranges),
+        step=20,
+        weights=policy.state_dict(),
+    )
+    windows = Windows.of(PARAMS)
+    comparison, predictions = judge(policy, store, ticks, windows, 64, normalization)
+    return Evaluation(
+        name="models/head",
+        checkpoint=checkpoint,
+        store=store,
+        comparison=comparison,
+        predictions=predictions,
+        study=judge_modalities(checkpoint, policy, store, ticks, 64),
+        judged=judged_document(checkpoint, policy, store, 1, 64),
+        curves=CURVES,
+        recordings=Path("data/nowhere"),
+    )
+
+
+def section(report: Report, title: str) -> Section:
+    (found,) = (one for one in report.sections if one.title == title)
+    return found
+
+
+def test_tables_say_what_the_comparison_says(judgement: Evaluation) -> None:
+    comparison = judgement.comparison
+    report = evaluation_report(judgement)
+    errors, dimensions, steps, episodes, streams = report.blocks(Table)
+    assert errors.rows[-1][1] == comparison.overall("policy")
+    assert errors.rows[-1][-1] == comparison.relative()
+    assert errors.strong == {len(errors.rows) - 1}
+    assert errors.caption.startswith("Repeat last: ") and errors.caption.endswith(".")
+    assert [row[0] for row in dimensions.rows] == list(comparison.names)
+    assert dimensions.rows[1][2] == comparison.scores["policy"].mae[1]
+    assert [row[:2] for row in steps.rows] == [(0, 0), (1, 100), (2, 200), (3, 300)]
+    group = comparison.groups[0]
+    assert [row[2] for row in steps.rows] == pytest.approx(
+        group.mean(comparison.scores["policy"].mae_horizon).tolist()
+    )
+    worst_first = [row[2] for row in episodes.rows]
+    assert worst_first == sorted(comparison.overall_by_episode("policy"), reverse=True)
+    assert [row[1] for row in episodes.rows] == [30, 30, 30]
+    assert streams.rows[0][:2] == ("all", "intact") and len(streams.rows) > 5
+    assert dict(report.tiles)["held-out episodes"] == "3"
+
+
+def test_groups_in_which_a_baseline_is_better_stand_at_the_top(judgement: Evaluation) -> None:
+    comparison = judgement.comparison
+    group, *_ = comparison.varying_groups()
+    places = list(group.dimensions)
+    best = min((comparison.scores[one].mae for one in BASELINES), key=group.mean)
+    lowest = np.min([comparison.scores[one].mae for one in BASELINES], axis=0)
+    # 1.002 times would read "1.00 times", which is no better.
+    for factor, times in ((0.5, ""), (1.002, ""), (1.008, "1.01"), (1.72, "1.72")):
+        mae = 0.5 * lowest
+        mae[places] = factor * best[places]
+        policy = replace(comparison.scores["policy"], mae=mae)
+        scores = {**comparison.scores, "policy": policy}
+        found = replace(judgement, comparison=replace(comparison, scores=scores))
+        said = f"A baseline is better in {group.name} ({times} times the best baseline's error)."
+        summary = evaluation_report(found).summary
+        assert (said in summary) == ("A baseline is better" in summary) == bool(times)
+
+
+def test_dimensions_that_hardly_move_stand_at_the_top(judgement: Evaluation) -> None:
+    comparison = judgement.comparison
+    names = tuple(f"joint_{index}" for index in range(5))
+    still = replace(
+        comparison, names=names, units=("",) * 5, scale=np.array([1.0, 1.0, 1.0, 0.001, 0.0])
+    )
+    report = evaluation_report(replace(judgement, comparison=still))
+    assert "Hardly moving: joint_3 (training std at most 0.001, where 1 is usual" in report.summary
+    said = {label.split(" (")[0]: value for label, value in report.tiles}
+    relative = still.without_still().relative()
+    assert relative is not None and relative != still.relative()
+    assert said["the same, without what hardly moves"] == f"{100 * relative:.0f} %"
+    report = evaluation_report(judgement)
+    assert "ardly mov" not in f"{report.summary} {report.tiles}"
+
+
+def test_params_spec_and_what_was_judged_are_there(judgement: Evaluation) -> None:
+    trained, spec, source, judged = evaluation_report(judgement).blocks(Document)
+    assert trained.content["horizon"] == 4
+    assert spec.content["digest"] == "tiny-spec"
+    sensor = source.content["streams"]["sensor"]["names"]
+    assert sensor[-1] == "… 40 in all" and len(sensor) == 9
+    assert source.content["streams"]["action"]["names"] == ["dx", "dy", "dz", "da", "gripper"]
+    assert judged.content["on"]["horizon"] == 4
+
+
+def test_a_page_with_frames_and_without_is_sound(
+    judgement: Evaluation,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    assert_page_is_sound: Sound,
+) -> None:
+    """Frames of the best episode; the worst one's recording is where no recording is."""
+    (_, best), (_, worst) = judgement.comparison.extremes()
+    look = evaluation_page.footage
+
+    def half(store: FeatureStore, episode: Any, rows: list[int], *rest: Any) -> Footage:
+        if episode.index != best:
+            return look(store, episode, rows, *rest)
+        assert all(row in episode.vl_rows for row in rows) and len(rows) == 5
+        shades = np.linspace(0, 255, len(rows)).astype(np.uint8)
+        return Footage({"View1": [np.full((12, 16, 3), shade, np.uint8) for shade in shades]})
+
+    monkeypatch.setattr(evaluation_page, "footage", half)
+    files = write_report(tmp_path, evaluation_report(judgement))
+    assert {file.stem for file in files} == {
+        *("report", "dimensions", "scatter", "horizon", "dimension_horizon", "episodes"),
+        *("timeline", "episode_best", "episode_worst", "modalities", "curves"),
+    }
+    page = (tmp_path / PAGE).read_text()
+    gone = judgement.store.episodes[worst].path
+    assert page.count("No frames:") == 1
+    assert f"No frames: there is no recording at data/nowhere/{gone} any more." in page
+    assert page.count("Above, the frames that the features") >= 1
+    assert_page_is_sound(tmp_path / PAGE)
+
+
+def test_what_is_missing_is_said(judgement: Evaluation) -> None:
+    bare = replace(judgement, study=None, curves=Curves({}, "No training curves: gone."))
+    report = evaluation_report(bare)
+    assert {one.name for one in report.blocks(Picture)}.isdisjoint({"modalities", "curves"})
+    (training,) = section(report, "Training").blocks
+    assert training.words == "No training curves: gone."
+    (streams,) = section(report, "Which streams are used").blocks
+    assert streams.words.startswith("Not judged: `evaluate.modalities` is off")
+
+
+def test_experiments_are_one_page(tmp_path: Path, assert_page_is_sound: Sound) -> None:
+    rules = {"zero_action": 0.5, "mean_action": 0.4, "repeat_last": 0.45}
+    experiments = [
+        Experiment(
+            f"{expert}-concat", expert, "concat", 10, 1000, 1,
+            {
+                ("overall", "training std"): {"policy": error, **rules},
+                ("translation", "mm"): {"policy": 0.1, **rules},
+            }, 7.0,
+        )
+        for expert, error in (("regression", 0.3), ("diffusion", 0.2))
+    ]  # fmt: skip
+    report = comparison_report(experiments)
+    table, own = report.blocks(Table)
+    assert own.columns == ["experiment", "expert", "fusion", "samples", "parameters"]
+    assert [row[1] for row in own.rows] == ["regression", "diffusion"]
+    assert table.strong == {1}
+    assert table.columns[:3] == ["experiment", "overall [training std]", "translation [mm]"]
+    assert [row[1] for row in table.rows] == [0.3, 0.2, 0.5, 0.4, 0.45]
+    assert dict(report.tiles)["by"] == "diffusion-concat"
+    write_report(tmp_path, report)
+    assert_page_is_sound(tmp_path / PAGE)

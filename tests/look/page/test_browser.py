@@ -1,0 +1,156 @@
+"""The page as a reader has it: sound at every width, with and without scripts, on paper."""
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.base.issue import Issue
+from pipeline.look.page.blocks import Issues, Report, Section, Text
+from pipeline.look.page.writing import write_report
+
+
+def test_a_browser_finds_every_block_sound(
+    every_page: Path, assert_page_is_sound: Callable[[Path], None]
+) -> None:
+    assert_page_is_sound(every_page)
+
+
+def test_an_empty_report_is_a_page(
+    tmp_path: Path, assert_page_is_sound: Callable[[Path], None], every_block: Report
+) -> None:
+    bare = replace(every_block, tiles=(), sections=[Section("Nothing", [])])
+    assert_page_is_sound(write_report(tmp_path, bare)[0])
+
+
+PLANTED = (
+    '<img src="https://example.org/a.png">',
+    '<script src="b.js"></script>',
+    '<iframe src="https://example.org"></iframe>',
+    "<script>fetch('https://example.org/a')</script>",
+    "<script>throw new Error('no request, but wrong')</script>",
+)
+
+
+@pytest.mark.parametrize("guarded", [True, False])
+def test_a_page_that_asks_for_anything_is_not_sound(
+    guarded: bool, tmp_path: Path, browser_page: Callable[..., Any]
+) -> None:
+    sound = Report("Sound", "", sections=[Section("All", [Text("words")])])
+    page = write_report(tmp_path, sound)[0]
+    assert browser_page(page).trouble == []
+    text = page.read_text()
+    # Its policy stops each; without one, it is the browser's route that does.
+    text = text if guarded else text.replace("Content-Security-Policy", "x-none")
+    for planted in PLANTED:
+        page.write_text(text.replace("<main", f"{planted}<main"))
+        visit = browser_page(page)
+        until = time.monotonic() + 30
+        while not visit.trouble and time.monotonic() < until:
+            visit.page.wait_for_timeout(10)
+        assert visit.trouble, planted
+
+
+def test_a_picture_opens_large_and_goes_back(every_page: Path, browser_page) -> None:
+    page = browser_page(every_page).page
+    small = page.locator("#picture-one svg").bounding_box()
+    page.locator("#picture-one svg").click()
+    large = page.locator("dialog[open] svg").bounding_box()
+    assert large["width"] > small["width"]
+    page.keyboard.press("Escape")
+    assert page.locator("#picture-one svg").bounding_box()["width"] == small["width"]
+    assert page.locator("dialog[open]").count() == 0
+    for key in ("Enter", " "):
+        page.get_by_role("button", name="Enlarge: A sine").press(key)
+        assert page.locator("dialog[open] svg").count() == 1
+        page.keyboard.press("Escape")
+        assert page.locator("dialog[open]").count() == 0
+
+
+# A browser hands over what it stored in its own time: here the test is what keeps it.
+STORAGE = """
+const kept = %s;
+const storage = { getItem: (key) => kept[key] ?? null, setItem: (key, value) => kept[key] = value };
+Object.defineProperty(window, "localStorage", { get: () => { %s return storage; } });
+Object.defineProperty(window, "kept", { value: kept });
+"""
+
+
+def test_light_and_dark_can_be_chosen_and_are_remembered(
+    every_page: Path, browser_page: Callable[..., Any]
+) -> None:
+    page = every_page
+    first = browser_page(page, script=STORAGE % ("{}", ""))
+    first.page.locator("#theme").click()
+    kept = first.page.evaluate("() => kept")
+    assert kept == {f"theme:{page.resolve().as_posix()}": "dark"}
+    again = browser_page(page, script=STORAGE % (json.dumps(kept), ""))
+    assert again.page.evaluate("() => document.documentElement.dataset.theme") == "dark"
+    assert first.trouble == again.trouble == []
+
+
+def test_light_and_dark_can_be_chosen_where_nothing_may_be_stored(
+    every_page: Path, browser_page: Callable[..., Any]
+) -> None:
+    refused = "throw new DOMException('denied', 'SecurityError');"
+    visit = browser_page(every_page, script=STORAGE % ("{}", refused))
+    for chosen in ("dark", "light"):
+        visit.page.locator("#theme").click()
+        assert visit.page.evaluate("() => document.documentElement.dataset.theme") == chosen
+    assert visit.trouble == []
+
+
+def test_without_scripts_and_on_paper_all_is_there(
+    every_page: Path, browser_page: Callable[..., Any]
+) -> None:
+    still = browser_page(every_page, java_script_enabled=False).page
+    assert still.locator("figure svg").count() == 2
+    assert still.locator("#picture-one svg").is_visible()
+    drawn = browser_page(every_page, scheme="dark").page
+    drawn.emulate_media(media="print")
+    # What is folded on a screen cannot be unfolded on paper.
+    assert drawn.locator("details.document pre").bounding_box()["height"] > 20
+    assert drawn.pdf()[:5] == b"%PDF-"
+
+
+def test_the_contents_are_folded_on_a_phone_only(every_page: Path, browser_page) -> None:
+    assert browser_page(every_page).page.locator("nav a").first.is_visible()
+    phone = browser_page(every_page, (390, 844)).page
+    assert not phone.locator("nav a").first.is_visible()
+    phone.locator("nav summary").click()
+    phone.locator("nav a", has_text="Prompt").click()
+    assert phone.evaluate("() => location.hash") == "#prompt"
+    assert not phone.locator("nav a").first.is_visible()
+
+
+def test_the_contents_scroll_to_where_the_reader_is(
+    tmp_path: Path, browser_page: Callable[..., Any]
+) -> None:
+    said = [Section(f"Part {index}", [Text("word " * 2000)]) for index in range(60)]
+    page = browser_page(write_report(tmp_path, Report("Long", "", sections=said))[0]).page
+    page.evaluate("document.getElementById('part-50').scrollIntoView()")
+    here = page.locator("nav a[aria-current]", has_text="Part 50")
+    here.wait_for()
+    box = here.bounding_box()
+    assert 0 < box["y"] < 900
+
+
+def test_labels_of_tiles_end_at_one_height_and_a_cut_list_has_a_shade(
+    tmp_path: Path, browser_page: Callable[..., Any]
+) -> None:
+    gap = Issue(severity="warning", kind="gap", message="a gap there " * 9, stream="sensor")
+    found = Issues([replace(gap, episode=f"e{index}") for index in range(40)], "fine")
+    tiles = [("lowest held-out error [training std]", "0.1"), ("by", "a name that " * 4)]
+    report = Report("Tiles", "", tiles, [Section("All", [found])])
+    page = browser_page(write_report(tmp_path, report)[0], (390, 844)).page
+    labels = [one.bounding_box() for one in page.locator(".tiles dt").all()]
+    assert len({round(one["y"] + one["height"]) for one in labels}) == 1
+    page.locator("details.places > summary").click()
+    scroller = page.locator(".places > ul")
+    assert scroller.evaluate("one => one.scrollHeight > one.clientHeight")
+    shades = scroller.evaluate("one => getComputedStyle(one).backgroundAttachment")
+    assert shades == "local, local, scroll, scroll"

@@ -1,0 +1,191 @@
+"""One page, whole, safe, the same each time; a browser finds nothing wrong with it."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from PIL import Image
+
+from pipeline.base.errors import DiskFull
+from pipeline.base.issue import Issue
+from pipeline.look.page.blocks import Issues, Picture, Report, Section, Text
+from pipeline.look.page.issues import group_issues, place_of
+from pipeline.look.page.style import GRID, INK, canvas
+from pipeline.look.page.svg import inline_svg
+from pipeline.look.page.writing import MOST_PLACES, PAGE, write_report
+
+
+def words(*said: str) -> Report:
+    return Report("Words", "", sections=[Section("All", [Text(one) for one in said])])
+
+
+def pictures(*names: str, draw: Callable[[], Figure] = lambda: canvas(2, 2)) -> Report:
+    blocks = [Picture(name, f"The picture {name}.", draw) for name in names]
+    return Report("Pictures", "", sections=[Section("All", blocks)])
+
+
+def test_the_same_report_gives_the_same_bytes(
+    every_block: Report, every_page: Path, tmp_path: Path
+) -> None:
+    files = write_report(tmp_path, every_block)
+    names = [file.name for file in files]
+    assert names == [PAGE, "one.png", "two.png", "findings.csv"]
+    assert {file.name for file in tmp_path.iterdir()} == set(names)
+    for file in files:
+        assert file.read_bytes() == every_page.with_name(file.name).read_bytes(), file.name
+
+
+def test_what_is_said_cannot_become_markup(every_page: Path) -> None:
+    page = every_page.read_text()
+    assert "<title>A page &lt;of&gt; every block</title>" in page
+    assert "<code>code</code> &amp; &lt;script&gt;alert(1)" in page
+
+
+def test_pictures_have_no_ink_of_their_own(every_page: Path) -> None:
+    svg = re.findall(r"<svg viewBox=.*? role=\"img\".*?</svg>", every_page.read_text(), re.DOTALL)
+    assert len(svg) == 2
+    for one in svg:
+        assert INK not in one and GRID not in one
+        assert "#0072b2" not in one.lower()
+        for name in ("ink", "grid", "blue"):
+            assert f"var(--{name})" in one
+        assert 'xlink:href="data:image/png;base64' in one
+
+
+def test_photographs_are_small_and_maps_are_exact() -> None:
+    rng = np.random.default_rng(0)
+    coarse = Image.fromarray(rng.integers(0, 255, (8, 8, 3), np.uint8))
+    noise = rng.integers(0, 12, (480, 640, 3), np.uint8)
+    photograph = np.asarray(coarse.resize((640, 480), Image.Resampling.BICUBIC)) // 2 + noise
+    for image, kind in ((photograph, "jpeg"), (np.arange(4800.0).reshape(60, 80), "png")):
+        figure = canvas(7, 6)
+        figure.subplots().imshow(image)
+        svg = inline_svg(figure, "one", "An image.")
+        assert f"data:image/{kind};base64" in svg
+
+
+def test_names_that_are_no_text_are_shown(tmp_path: Path) -> None:
+    page = write_report(tmp_path, words("caf\udce9"))[0]
+    assert "<p>caf\\udce9</p>" in page.read_text(encoding="utf-8")
+
+
+def test_a_page_of_words_is_small(tmp_path: Path) -> None:
+    page = write_report(tmp_path, words("no picture"))[0]
+    assert page.stat().st_size < 30_000
+
+
+def test_pictures_of_an_earlier_page_go_and_nothing_else(tmp_path: Path) -> None:
+    (tmp_path / "metrics.json").write_text("{}")
+    (tmp_path / "mine.png").write_bytes(b"mine")
+    write_report(tmp_path, pictures("one", "two"))
+    write_report(tmp_path, pictures("two", "three"))
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"metrics.json", "mine.png", PAGE, "two.png", "three.png"}
+
+
+def test_a_page_that_cannot_be_finished_leaves_the_old_one(tmp_path: Path) -> None:
+    def broken() -> Figure:
+        raise KeyboardInterrupt
+
+    write_report(tmp_path, pictures("one"))
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    other = pictures("one", "two", draw=lambda: canvas(5, 5))
+    stopped = Report(
+        "Stopped", "", sections=[*other.sections, *pictures("x", draw=broken).sections]
+    )
+    with pytest.raises(KeyboardInterrupt):
+        write_report(tmp_path, stopped)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_what_a_kill_left_is_cleared_away(tmp_path: Path) -> None:
+    left = tmp_path / f".{PAGE}.new"
+    left.mkdir()
+    (left / "one.png").write_bytes(b"half")
+    write_report(tmp_path, words("whole"))
+    assert [path.name for path in tmp_path.iterdir()] == [PAGE]
+
+
+def test_a_full_disk_keeps_the_old_page(small_disk: Path) -> None:
+    write_report(small_disk, words("old"))
+    with pytest.raises(DiskFull, match="make room"):
+        write_report(small_disk, words("x" * 9_000_000))
+    assert "<p>old</p>" in (small_disk / PAGE).read_text()
+    assert [path.name for path in small_disk.iterdir()] == [PAGE]
+
+
+def test_names_of_pictures_are_file_stems_each_once(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="twice"):
+        write_report(tmp_path, pictures("one", "one"))
+    with pytest.raises(ValueError, match="plain file stem"):
+        write_report(tmp_path, pictures("../one"))
+
+
+def test_equal_titles_have_anchors_of_their_own(every_page: Path) -> None:
+    page = every_page.read_text()
+    assert page.count('<section id="words">') == page.count('<section id="words-2">') == 1
+
+
+def test_every_place_of_a_finding_is_there(tmp_path: Path) -> None:
+    count = MOST_PLACES + 40
+    gaps = [
+        Issue(
+            severity="warning",
+            kind="gap",
+            message=f"found {index}",
+            episode=f"e{index}",
+            stream="view V",
+            start_s=index / 4,
+            stop_s=index / 4 + 1,
+        )
+        for index in range(count)
+    ]
+    alone = Issue(severity="error", kind="unreadable", message="no `file`", episode="e7")
+    found = Issues([*gaps, alone], "fine")
+    write_report(tmp_path, Report("R", "", sections=[Section("S", [found])]))
+    page = (tmp_path / PAGE).read_text()
+    named = "e0 0.00–1.00 s; e1 0.25–1.25 s; e2 0.50–1.50 s; and 337 more"
+    assert f"view V · {count} episodes · {named}</span>" in page
+    assert "<p>The first: found 0</p>" in page and "Each of the 340" in page
+    for index in range(MOST_PLACES):
+        place = place_of(gaps[index])
+        assert f'<span class="where">{place}</span> found {index}</li>' in page
+    assert f"found {MOST_PLACES}<" not in page
+    assert 'The other 40 stand in <a href="findings.csv">' in page
+    assert page.count('<details class="places">') == 1
+    table = (tmp_path / "findings.csv").read_text().splitlines()
+    assert table[0] == "severity,kind,stream,episode,start_s,stop_s,message"
+    assert table[1] == "error,unreadable,,e7,,,no `file`"
+    assert table[-1] == (
+        f"warning,gap,view V,e{count - 1},{(count - 1) / 4:.3f},{(count + 3) / 4:.3f},"
+        f"found {count - 1}"
+    )
+    assert len(table) == count + 2
+
+
+def test_the_same_issue_is_told_once_the_worst_first() -> None:
+    def issue(kind: str, source: str, episode: str, start_s: float | None = None) -> Issue:
+        return Issue(
+            severity="error" if kind == "unreadable" else "warning",
+            kind=kind,
+            message=f"{kind} of {episode}",
+            source=source,
+            episode=episode,
+            stream="sensor",
+            start_s=start_s,
+        )
+
+    issues = [
+        *(issue("rate", "a", "e0"), issue("gap", "a", "e1", 1.0), issue("gap", "a", "e1", 2.0)),
+        *(issue("gap", "b", "e1", 2.0), issue("unreadable", "b", "e4", 0.5)),
+    ]
+    error, gap, rate = group_issues(issues)
+    assert (error.kind, error.where) == ("unreadable", "sensor · b/e4 0.50 s")
+    assert (gap.kind, gap.where) == ("gap", "sensor · 3 places in 2 episodes")
+    assert [place_of(one) for one in gap.issues] == ["a/e1 1.00 s", "a/e1 2.00 s", "b/e1 2.00 s"]
+    assert rate.where == "sensor · a/e0"
+    (alone,) = group_issues(issues[:1])
+    assert alone.where == "sensor · e0"

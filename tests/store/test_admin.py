@@ -1,0 +1,326 @@
+"""What lies in a folder of stores, and what of it may go."""
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from pipeline.base.durable import KEPT, previous_path
+from pipeline.base.errors import ConfigError, StoreLocked
+from pipeline.base.ownership import MARKER, mark
+from pipeline.store import FeatureStore, StoreBuild, build_lock
+from pipeline.store.admin import (
+    Inventory,
+    StoreEntry,
+    describe_inventory,
+    describe_kept,
+    find_leftovers,
+    find_named,
+    remove_leftover,
+    take_inventory,
+)
+from pipeline.store.archive import archive
+from pipeline.store.paths import STORE
+from pipeline.store.schema import read_specs
+
+Make = Callable[..., Path]
+HOLD = """
+import sys
+from pathlib import Path
+from pipeline.store import build_lock
+with build_lock(Path(sys.argv[1])):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+@contextmanager
+def held(target: Path) -> Iterator[int]:
+    """Another process holds the lock of a store; gives its number."""
+    code = [sys.executable, "-c", HOLD, str(target)]
+    with subprocess.Popen(code, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"held\n"
+        try:
+            yield process.pid
+        finally:
+            process.kill()
+
+
+def entry(inventory: Inventory, name: str) -> StoreEntry:
+    return next(one for one in inventory.entries if one.path.name == name)
+
+
+def unfinish(store: Path, done: int) -> Path:
+    """Make a finished store a build of which some rows are done."""
+    part = store.rename(store.with_name(f"{store.name}.part"))
+    build = StoreBuild(store, read_specs(part), "plan")
+    rows = build.specs["vl/checksum"].shape[0]
+    build.write("vl/checksum", done, build.files("vl/checksum").read(done, rows - done) * 0)
+    build.close()
+    return part
+
+
+class TestInventory:
+    def test_a_store(self, tiny_store: Make, tmp_path: Path) -> None:
+        path = tiny_store(tmp_path)
+        found = entry(take_inventory(tmp_path), "tiny.zarr")
+        assert (found.kind, found.damage) == ("store", None)
+        held = found.contents
+        assert held is not None
+        assert (held.plan, held.rows, held.done) == (FeatureStore.open(path).attrs["plan"], 60, 60)
+        assert held.specs["vl/features"].shape == (60, 3, 8)
+        used = sum(file.stat().st_blocks * 512 for file in path.rglob("*") if file.is_file())
+        assert found.bytes == used
+        chunks = (path / "vl/features").rglob("*")
+        assert found.sizes["features"] == sum(
+            file.stat().st_blocks * 512 for file in chunks if file.is_file()
+        )
+        assert found.sizes["sensor"] > found.sizes["state"] > 0
+
+    def test_a_build_says_how_much_of_it_is_done(self, tiny_store: Make, tmp_path: Path) -> None:
+        unfinish(tiny_store(tmp_path), 25)
+        found = entry(take_inventory(tmp_path), "tiny.zarr.part")
+        assert found.kind == "build"
+        assert found.contents is not None
+        assert (found.contents.done, found.contents.rows) == (25, 60)
+        assert "25 of 60" in "\n".join(describe_inventory(take_inventory(tmp_path), {}))
+
+    def test_hard_links_are_counted_once_and_said(self, tiny_store: Make, tmp_path: Path) -> None:
+        path = tiny_store(tmp_path)
+        twin = path.with_name("twin.zarr")
+        shutil.copytree(path, twin, copy_function=os.link)
+        inventory = take_inventory(tmp_path)
+        one = entry(inventory, "twin.zarr")
+        assert inventory.bytes == one.bytes
+        assert inventory.shared(one) == {path: one.bytes}
+        said = "\n".join(describe_inventory(inventory, {}))
+        assert "with tiny.zarr by hard links" in said
+        assert "of hard links counted once" in said
+
+    @pytest.mark.parametrize(
+        ("harm", "said"),
+        [
+            (lambda store: (store / "zarr.json").write_text("{"), "not a zarr group"),
+            (lambda store: (store / "zarr.json").unlink(), "no finished store"),
+            (lambda store: shutil.rmtree(store / "tick/action"), "tick/action is missing"),
+            (lambda store: (store / "state/values/c/0/0").unlink(), "found no file"),
+            (lambda store: os.truncate(store / "vl/features/c/0/0/0", 99), "found 99 bytes"),
+        ],
+    )
+    def test_a_damaged_store_is_listed_and_stops_nothing(
+        self, tiny_store: Make, tmp_path: Path, harm, said
+    ) -> None:
+        harm(tiny_store(tmp_path, name="damaged"))
+        tiny_store(tmp_path, name="sound")
+        inventory = take_inventory(tmp_path)
+        assert said in (entry(inventory, "damaged.zarr").damage or "")
+        assert entry(inventory, "sound.zarr").damage is None
+        lines = describe_inventory(inventory, {})
+        assert any(line.startswith("damaged.zarr  damaged") for line in lines)
+        assert any(said in line for line in lines)
+
+    def test_an_archive_and_what_it_was_made_of(self, tiny_store: Make, tmp_path: Path) -> None:
+        path = tiny_store(tmp_path)
+        tiny_store(tmp_path, name="other", seed=1)
+        archive(path, tmp_path / "tiny.archive.zarr", level=1, threads=1)
+        inventory = take_inventory(tmp_path)
+        found = entry(inventory, "tiny.archive.zarr")
+        assert found.kind == "archive"
+        lines = describe_inventory(inventory, {})
+        (archived,) = (index for index, line in enumerate(lines) if "archived as" in line)
+        assert lines[archived] == "    archived as tiny.archive.zarr"
+        assert archived > next(i for i, line in enumerate(lines) if line.startswith("tiny.zarr "))
+
+    def test_who_builds(self, tiny_store: Make, tmp_path: Path) -> None:
+        part = unfinish(tiny_store(tmp_path), 0)
+        target = part.with_name("tiny.zarr")
+        with held(target) as process:
+            assert take_inventory(tmp_path).holders[target].startswith(f"process {process} on")
+            said = "\n".join(describe_inventory(take_inventory(tmp_path), {}))
+            assert f"being built by process {process}" in said
+        assert take_inventory(tmp_path).holders == {}
+
+    def test_asking_does_not_stand_in_a_builders_way(self, tmp_path: Path) -> None:
+        with build_lock(tmp_path / "s.zarr"):
+            pass
+        take_inventory(tmp_path).holders  # noqa: B018
+        with build_lock(tmp_path / "s.zarr"):
+            assert list(take_inventory(tmp_path).holders) == [tmp_path / "s.zarr"]
+
+    def test_subfolders_are_looked_into_but_not_stores(
+        self, tiny_store: Make, tmp_path: Path
+    ) -> None:
+        inner = tiny_store(tmp_path / "deep" / "er")
+        (inner / "inside.zarr").mkdir()
+        assert [one.path for one in take_inventory(tmp_path).entries] == [inner]
+
+    def test_no_folder(self, tmp_path: Path) -> None:
+        with pytest.raises(ConfigError, match=r"stores\.folder"):
+            take_inventory(tmp_path / "nowhere")
+        assert describe_inventory(take_inventory(tmp_path), {}) == [f"{tmp_path}: no store in it"]
+
+
+class TestLeftovers:
+    def test_a_finished_store_and_its_archive_are_never_among_them(
+        self, tiny_store: Make, tmp_path: Path
+    ) -> None:
+        path = tiny_store(tmp_path)
+        archive(path, tmp_path / "tiny.archive.zarr", level=1, threads=1)
+        os.truncate(tiny_store(tmp_path, name="bad") / "vl/features/c/0/0/0", 99)
+        kinds = {one.entry.path.suffix for one in find_leftovers(take_inventory(tmp_path))}
+        assert kinds <= {".lock"}
+
+    def test_each_is_named_with_its_reason_and_removed(
+        self, tiny_store: Make, tmp_path: Path
+    ) -> None:
+        tiny_store(tmp_path)
+        unfinish(tiny_store(tmp_path, name="none"), 0)
+        (tmp_path / "new.zarr.part").mkdir()
+        shutil.copytree(tmp_path / "tiny.zarr", tmp_path / "tiny.zarr.repair.part")
+        shutil.copytree(tmp_path / "tiny.zarr", tmp_path / "tiny.zarr.old")
+        for name in (
+            "gone.zarr.files.sqlite",
+            "tiny.zarr.files.sqlite",
+            "tiny.zarr.lock",
+            "b.zarr.wait",
+        ):
+            (tmp_path / name).touch()
+        found = find_leftovers(take_inventory(tmp_path))
+        assert {one.entry.path.name: one.why for one in found} == {
+            "gone.zarr.files.sqlite": "content digests for a store that is not there",
+            "new.zarr.part": "a build that was stopped before any row was done; there is nothing "
+            "to resume",
+            "none.zarr.part": "a build that was stopped before any row was done; there is nothing "
+            "to resume",
+            "tiny.zarr.lock": "held by no process",
+            "tiny.zarr.old": "tiny.zarr has taken its place",
+            "tiny.zarr.repair.part": "a repair that was stopped before it was a build; the next "
+            "begins anew",
+            "b.zarr.wait": "held by no process",
+        }
+        for one in found:
+            remove_leftover(one)
+        assert sorted(os.listdir(tmp_path)) == ["tiny.zarr", "tiny.zarr.files.sqlite"]
+        assert FeatureStore.open(tmp_path / "tiny.zarr").ticks == 180
+
+    def test_work_is_kept_unless_it_is_named(self, tiny_store: Make, tmp_path: Path) -> None:
+        begun = unfinish(tiny_store(tmp_path, name="begun"), 12)
+        store = tiny_store(tmp_path)
+        aside = Path(shutil.copytree(store, tmp_path / "tiny.zarr.known-0"))
+        unread = Path(shutil.copytree(begun, tmp_path / "unread.zarr.part"))
+        (unread / "vl" / "key" / "zarr.json").write_text("{")
+        inventory = take_inventory(tmp_path)
+        assert find_leftovers(inventory) == []
+        lines = describe_kept(inventory)
+        assert lines[0] == (
+            f"{begun}: unfinished build, 12 of 60 rows done; stages.extract resumes it, and "
+            f"python -m stages.store gc {begun} --remove removes it"
+        )
+        assert f"{aside}: unfinished build, 60 of 60 rows done; stages.extract takes" in lines[1]
+        assert f"{unread}: unfinished build that cannot be read" in lines[2]
+        for path in (store, tmp_path / "gone.zarr.part"):
+            with pytest.raises(ConfigError, match=rf"{path}: .*Nothing was removed"):
+                find_named(inventory, [begun, path])
+        for one in find_named(inventory, [begun, aside, unread]):
+            remove_leftover(one)
+        assert os.listdir(tmp_path) == ["tiny.zarr"]
+
+    def test_the_only_copy_of_a_store_is_no_leftover(
+        self, tiny_store: Make, tmp_path: Path
+    ) -> None:
+        """A kill between the two renames of a replacement leaves it under `.old`."""
+        path = tiny_store(tmp_path)
+        shutil.copytree(path, tmp_path / "tiny.zarr.old")
+        found = find_leftovers(take_inventory(tmp_path))
+        listed = next(one for one in found if one.entry.path.suffix == ".old")
+        shutil.rmtree(path)
+        assert find_leftovers(take_inventory(tmp_path)) == []
+        assert "the only copy of tiny.zarr" in describe_kept(take_inventory(tmp_path))[0]
+        remove_leftover(listed)  # found while the store was still there
+        assert (tmp_path / "tiny.zarr.old").exists()
+
+    def test_what_is_being_built_is_not_touched(self, tiny_store: Make, tmp_path: Path) -> None:
+        part = unfinish(tiny_store(tmp_path), 5)
+        (listed,) = find_named(take_inventory(tmp_path), [part])
+        with held(tmp_path / "tiny.zarr") as process:
+            inventory = take_inventory(tmp_path)
+            with pytest.raises(ConfigError, match="in use by process"):
+                find_named(inventory, [part])
+            assert describe_kept(inventory)[0].startswith(f"{part}: in use by process {process}")
+            with pytest.raises(StoreLocked, match="not removed"):
+                remove_leftover(listed)
+        assert part.exists()
+
+    @pytest.mark.parametrize("damaged", [False, True])
+    def test_a_removal_that_was_killed_leaves_what_the_next_build_takes(
+        self,
+        tiny_store: Make,
+        tmp_path: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        damaged: bool,
+    ) -> None:
+        part = unfinish(tiny_store(tmp_path / "stores"), 0)
+        (leftover,) = find_leftovers(take_inventory(part.parent))
+        if damaged:
+            (part / "zarr.json").write_text("{")
+
+        def killed(path: Path) -> None:
+            (part / "zarr.json").unlink(missing_ok=True)
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr("pipeline.base.ownership.shutil.rmtree", killed)
+        with pytest.raises(KeyboardInterrupt):
+            remove_leftover(leftover)
+        assert any(part.iterdir())
+        assert STORE.owns(part)
+
+    def test_what_was_kept_stays_known_as_that(
+        self, tiny_store: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        kept = previous_path(tmp_path / "stores" / "tiny.zarr")
+        tiny_store(tmp_path / "stores").rename(kept)
+        mark(kept, KEPT)
+        (leftover,) = find_named(take_inventory(kept.parent), [kept])
+
+        def killed(path: Path) -> None:
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr("pipeline.base.ownership.shutil.rmtree", killed)
+        with pytest.raises(KeyboardInterrupt):
+            remove_leftover(leftover)
+        assert KEPT.owns(kept)
+
+    def test_a_foreign_file_at_a_ledger_is_no_leftover(self, tmp_path: Path) -> None:
+        ledger = tmp_path / "gone.zarr.files.sqlite"
+        ledger.write_text("years of work")
+        inventory = take_inventory(tmp_path)
+        assert find_leftovers(inventory) == []
+        with pytest.raises(ConfigError, match="did not write"):
+            find_named(inventory, [ledger])
+
+    def test_nothing_behind_a_symbolic_link_is_touched(
+        self, tiny_store: Make, tmp_path: Path
+    ) -> None:
+        outside = unfinish(tiny_store(tmp_path / "outside"), 5)
+        folder = tmp_path / "stores"
+        folder.mkdir()
+        (folder / "tiny.zarr.part").symlink_to(outside)
+        (folder / "more").symlink_to(outside.parent)
+        inventory = take_inventory(folder)
+        assert find_leftovers(inventory) == []
+        assert "a symbolic link" in describe_kept(inventory)[0]
+        part = folder / "own.zarr.part"
+        part.mkdir()
+        (part / MARKER).write_text("a feature store\n")
+        (part / "inside").symlink_to(outside)
+        for one in find_leftovers(take_inventory(folder)):
+            remove_leftover(one)
+        assert not part.exists()
+        assert outside.exists()
+        assert (outside / "zarr.json").exists()
