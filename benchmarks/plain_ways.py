@@ -21,7 +21,7 @@ from torch import Tensor
 from transformers import AutoImageProcessor, AutoTokenizer
 
 from benchmarks.workload import Frames, Workload
-from pipeline.vlm.prompt import PromptRenderer
+from pipeline.vlm.processor import PromptRenderer
 
 Row = tuple[str, Frames]
 

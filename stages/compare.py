@@ -17,9 +17,7 @@ if __name__ == "__main__":  # here, for --help waits for no import below
 from pipeline.base.config import Params
 from pipeline.base.durable import disk_full_named, fresh
 from pipeline.base.ownership import REPORT, OutputKind, begins_with, claim, refuse_foreign
-from pipeline.evaluate.cells import write_rows
-from pipeline.evaluate.experiment_tables import experiment_rows, experiments_table
-from pipeline.evaluate.experiments import read_experiments
+from pipeline.evaluate.experiments import experiment_csv, experiment_table, read_experiments
 from pipeline.look.evaluation.comparison import comparison_report
 from pipeline.look.page.writing import write_report
 
@@ -34,11 +32,12 @@ def main(params: Params) -> None:
     refuse_foreign(output, REPORT)
     experiments = read_experiments(params.compare.reports)
     claim(output, REPORT)
-    files = [write_rows(output / "experiments.csv", experiment_rows(experiments))]
+    files = [experiment_csv(experiments).write_csv(output / "experiments.csv")]
     files += write_report(output, comparison_report(experiments))
+    table = experiment_table(experiments, trained=True)
     with disk_full_named(markdown):
-        fresh(markdown).write_text(experiments_table(experiments, markdown=True), encoding="utf-8")
-    print(experiments_table(experiments))
-    best = min(experiments, key=lambda one: one.error)
+        fresh(markdown).write_text("\n".join(table.markdown()) + "\n", encoding="utf-8")
+    print("\n".join(table.text()))
+    best = min(experiments, key=lambda experiment: experiment.error)
     print(f"lowest held-out error: {best.name}")
     print(f"{', '.join(str(file) for file in [*files, markdown])}")

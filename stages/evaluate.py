@@ -1,10 +1,10 @@
-"""Judge a trained policy on the episodes it has not seen, beside three baselines.
+"""Evaluate a trained policy on the episodes it has not seen, beside three baselines.
 
-Judged is what stages.train_head wrote to train_head.output, or evaluate.checkpoint if it is given.
+Takes what stages.train_head wrote to train_head.output, or evaluate.checkpoint if it is given.
 Writes metrics.json, tables (CSV) and a page with its pictures (report.html, PNG) into
-`evaluate.output`, and judged.json, which says what was judged on what. With `evaluate.modalities`,
-judges again with each stream spoilt. The page shows the frames of the best and the worst episode
-where their recordings still lie below `data.root`.
+`evaluate.output`, and judged.json, which says what was evaluated on what. With
+`evaluate.modalities`, evaluates again with each stream ablated. The page shows the frames of the
+best and the worst episode where their recordings still lie below `data.root`.
 """
 
 from stages.command import run
@@ -19,9 +19,8 @@ from pipeline.base.config import Params
 from pipeline.base.device import resolve_device
 from pipeline.base.durable import write_document
 from pipeline.base.ownership import REPORT, claim, refuse_foreign
-from pipeline.evaluate.ablation_tables import modality_table
-from pipeline.evaluate.evaluation import JUDGED, Evaluation, judgement
-from pipeline.evaluate.tables import table, write_tables
+from pipeline.evaluate.evaluation import JUDGED, Evaluation, evaluate_checkpoint
+from pipeline.evaluate.tables import ablation_text, error_text, write_tables
 from pipeline.look.evaluation.page import evaluation_report
 from pipeline.look.page.writing import write_report
 from pipeline.policy.checkpoint import PolicyCheckpoint, find_policy, load_policy
@@ -30,19 +29,21 @@ from pipeline.train.held_out import check_store
 
 
 def main(params: Params) -> None:
-    """Judge the checkpoint that `evaluate` names, else what `train_head` wrote."""
+    """Evaluate the checkpoint that `evaluate` names, else what `train_head` wrote."""
     refuse_foreign(params.evaluate.output, REPORT)
     folder = params.evaluate.checkpoint or params.train_head.output
     checkpoint = load_policy(find_policy(folder))
     store = _store_for(checkpoint, params)
     device, say = resolve_device(params.evaluate.device), partial(print, flush=True)
-    found = judgement(folder, checkpoint, store, params.evaluate, device, params.data.root, say)
-    files = _write(params.evaluate.output, found)
-    print(table(found.comparison))
-    if found.study is not None:
-        print(f"\n{modality_table(found.study)}")
+    evaluation = evaluate_checkpoint(
+        folder, checkpoint, store, params.evaluate, device, params.data.root, say
+    )
+    files = _write(params.evaluate.output, evaluation)
+    print(error_text(evaluation.comparison))
+    if evaluation.study is not None:
+        print(f"\n{ablation_text(evaluation.study)}")
     elif params.evaluate.modalities:
-        print("streams were not spoilt: no held-out tick lies 200 ms into its episode")
+        print("streams were not ablated: no held-out tick lies 200 ms into its episode")
     print(f"{params.evaluate.output}: {', '.join(file.name for file in files)}")
 
 
@@ -56,9 +57,15 @@ def _store_for(checkpoint: PolicyCheckpoint, params: Params) -> FeatureStore:
     return store
 
 
-def _write(folder: Path, found: Evaluation) -> list[Path]:
-    """The tables, the page with its pictures, and what was judged; returns their paths."""
+def _write(folder: Path, evaluation: Evaluation) -> list[Path]:
+    """The tables, the page with its pictures, and what was evaluated; returns their paths."""
     claim(folder, REPORT)
-    files = write_tables(folder, found.comparison, found.predictions, found.store, found.study)
-    write_document(folder / JUDGED, found.judged)
-    return [*files, folder / JUDGED, *write_report(folder, evaluation_report(found))]
+    files = write_tables(
+        folder,
+        evaluation.comparison,
+        evaluation.predictions,
+        evaluation.store,
+        evaluation.study,
+    )
+    write_document(folder / JUDGED, evaluation.judged)
+    return [*files, folder / JUDGED, *write_report(folder, evaluation_report(evaluation))]

@@ -20,8 +20,6 @@ from stages.command import run
 if __name__ == "__main__":  # here, for --help waits for no import below
     raise SystemExit(run(__doc__ or "", "stages.probe", sections=("probe",)))
 
-from functools import partial
-
 from pipeline.base.config import Params
 from pipeline.base.ownership import REPORT, claim, refuse_foreign, release
 from pipeline.evaluate.probe import advice, probe, table, write_tables
@@ -38,7 +36,7 @@ def main(params: Params) -> None:
     print(f"{store.path}: {slots} slots of {dim} channels at {store.ticks} ticks", flush=True)
     if params.train_head.check_store:
         check_trailers(store.path)
-    study = probe(store, wanted, partial(print, flush=True))
+    study = probe(store, wanted)
     claim(wanted.output, REPORT)
     files = [*write_tables(wanted.output, study), *write_probe_plots(wanted.output, study)]
     release(wanted.output, REPORT)

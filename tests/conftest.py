@@ -13,17 +13,49 @@ import re
 import shutil
 import signal
 import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from multiprocessing import forkserver, get_context
 from multiprocessing.context import ForkServerContext
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import Any, get_args
 
 import numpy as np
 import pytest
 import torch
-from jaxtyping import install_import_hook
+from beartype import beartype
+from jaxtyping import AbstractArray, install_import_hook
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def check_shapes(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function, checking those of its annotations that name a shape; pyright has the rest."""
+    shapes = {name: hint for name, hint in function.__annotations__.items() if names_shape(hint)}
+    function.__annotations__ = shapes
+    return beartype(function) if shapes else function
+
+
+def names_shape(hint: Any) -> bool:
+    """Whether a type is that of tensors of a shape, or holds such a type."""
+    named = isinstance(hint, type) and issubclass(hint, AbstractArray)
+    return named or any(map(names_shape, get_args(hint)))
+
+
+# Before anything imports them: every shape that an annotation names is checked in tests. The hook
+# imports the checker by its name, and a conftest has none.
+sys.modules["shape_checks"] = ModuleType("shape_checks")
+sys.modules["shape_checks"].check_shapes = check_shapes  # type: ignore
+install_import_hook(
+    [
+        ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        for path in sorted(ROOT.glob("pipeline/**/*.py"))
+        if re.search(r"jaxtyping|policy\.tensors import", path.read_text(encoding="utf-8"))
+    ],
+    "shape_checks.check_shapes",
+)
 
 from pipeline.simulation.insertion_formats import write_raw
 from pipeline.simulation.recorder import simulate_episode
@@ -32,9 +64,6 @@ from pipeline.store.chunks import ChunkFiles, row_checksums
 from pipeline.store.metadata import note_metadata
 from pipeline.store.schema import read_specs
 from pipeline.vlm.demo_checkpoint import write_demo_checkpoint
-
-# Before anything imports them: every shape annotation of the models is checked in tests.
-install_import_hook("pipeline.policy", "beartype.beartype")
 
 # A shell that runs tests in the background has them ignore Ctrl-C, and so would every process that
 # they start to see it stop.
@@ -61,7 +90,6 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     return min(MOST_WORKERS, len(os.sched_getaffinity(0)))
 
 
-ROOT = Path(__file__).resolve().parents[1]
 MODEL = "transformers.models.qwen2_5_vl.modeling_qwen2_5_vl"
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 

@@ -25,6 +25,7 @@ ONLY_IN = {
     "zarr": {"store"},
     "numcodecs": {"store"},
     "yaml": {"base"},
+    "sklearn": {"evaluate"},
     "matplotlib": {"look"},
     "jinja2": {"look"},
 }

@@ -32,9 +32,10 @@ from pipeline.store import FeatureStore
 from pipeline.train.identity import policy_shape
 from pipeline.train.split import split_by_episode
 from pipeline.train.statistics import fit_normalization
-from pipeline.vlm.feature_spec import FeatureSpec, Slot, feature_spec, row_key
+from pipeline.vlm.feature_spec import FeatureSpec, feature_spec, row_key
 from pipeline.vlm.pooling import batch_weights, pool
-from pipeline.vlm.preparation import Layout
+from pipeline.vlm.preparation import TokenLayout
+from pipeline.vlm.slots import Slot
 
 SMALL = {
     "sensor_encoder": {"channels": [16], "layers": 1, "heads": 2, "output_dim": 16},
@@ -104,7 +105,7 @@ def test_1_a_feature_does_not_depend_on_its_batch_mates() -> None:
     hidden = torch.randn(1, 4, 8)
     padding = torch.randn(1, 3, 8)  # what the model says over padding is anything
     padded = torch.cat([hidden, padding], dim=1)
-    layouts = [Layout(4, (), (1, 1))]
+    layouts = [TokenLayout(4, (), (1, 1))]
     weights = batch_weights((Slot(-1, True, "mean"),), layouts, 7)
     real = torch.tensor([[True] * 4 + [False] * 3])
 

@@ -41,11 +41,17 @@ def differences(expected: Any, actual: Any, place: str = "") -> Differences:
 
 
 def describe(differing: Differences, arrow: str = " -> ") -> list[str]:
-    """A line for each place, `prompt: "x" -> "y"`; long values are cut around where they differ."""
+    """A line for each place, `prompt: "x" -> "y"`; long values are cut around where they differ.
+
+    Of two lists of mappings, which differ in length, a line says how many entries they have.
+    """
     return [f"{place}: {_short(a, b)}{arrow}{_short(b, a)}" for place, (a, b) in differing.items()]
 
 
 def _short(value: Any, other: Any, most: int = 80) -> str:
+    # Entries of lists of one length are compared: these lists differ in theirs.
+    if isinstance(value, list) and any(isinstance(entry, Mapping) for entry in value):
+        return f"{len(value)} entries"
     text, beside = (json.dumps(one, ensure_ascii=False) for one in (value, other))
     if len(text) <= most:
         return text

@@ -80,7 +80,7 @@ def unified_collate_fn(samples: Sequence[Sample] | UnifiedBatch) -> UnifiedBatch
             f"a batch has features or frames, but {cached} of its {len(samples)} samples have "
             "features of a store. Give all data sets a store, or none"
         )
-    return UnifiedBatch(**{name: _together([one[name] for one in samples]) for name in names})
+    return UnifiedBatch(**{name: _together([sample[name] for sample in samples]) for name in names})
 
 
 def _together(values: list[Any]) -> Any:

@@ -109,21 +109,21 @@ class UnifiedVLADataset(Dataset[Sample]):
         batch = self.store.gather(ticks, *astuple(self.windows))
         rows = self.store.array("tick/vl_row")[ticks]
         episodes = self.store.episode_of(ticks)
-        said = [self.store.episodes[episode].instruction for episode in episodes.tolist()]
+        instructions = [self.store.episodes[episode].instruction for episode in episodes.tolist()]
         return UnifiedBatch(
             **vars(batch),
             tick=torch.from_numpy(ticks),
             time=torch.from_numpy(self.store.array("tick/time")[ticks]),
             episode=torch.from_numpy(episodes),
             vl_row=torch.from_numpy(rows),
-            instruction=said,
+            instruction=instructions,
             **self._seen(rows),
         )
 
     def items_by(self, trait: Literal["source", "format"]) -> dict[str, NDArray[np.int64]]:
         """The items of each source, or of each format, by its name."""
-        names = np.array([getattr(one, trait) for one in self.episodes])
-        of_item = np.repeat(names, [len(one.ticks) for one in self.episodes])
+        names = np.array([getattr(episode, trait) for episode in self.episodes])
+        of_item = np.repeat(names, [len(episode.ticks) for episode in self.episodes])
         return {name: np.flatnonzero(of_item == name) for name in dict.fromkeys(names.tolist())}
 
     def split(self, val_fraction: float = 0.15) -> tuple[Subset[Sample], Subset[Sample]]:
@@ -163,7 +163,7 @@ class UnifiedVLADataset(Dataset[Sample]):
                 if self._sources or self._given is not None
                 else episodes_of_format(self.store, self._format)
             )
-        ranges = [np.arange(one.ticks.start, one.ticks.stop) for one in self.episodes]
+        ranges = [np.arange(episode.ticks.start, episode.ticks.stop) for episode in self.episodes]
         self.ticks = np.concatenate(ranges, dtype=np.int64)
 
     def _read(self, recordings: Sequence[Recording]) -> None:
@@ -183,7 +183,7 @@ class UnifiedVLADataset(Dataset[Sample]):
             )
         opened = open_recordings(self._sources, views=self._views)
         if opened.bad:
-            lines = [f"  {one.source}: {one.reason}" for one in opened.bad]
+            lines = [f"  {bad.source}: {bad.reason}" for bad in opened.bad]
             raise RecordingError(
                 "\n".join([f"{len(lines)} episodes cannot be used; mend or remove them:", *lines])
             )
@@ -231,5 +231,5 @@ def _sources(
         name = "recordings" if format == "auto" else format
         named.append(Source(name=name, path=paths, format=format))
     if instruction is not None:
-        named = [one.model_copy(update={"instruction": instruction}) for one in named]
+        named = [source.model_copy(update={"instruction": instruction}) for source in named]
     return tuple(named)

@@ -40,8 +40,8 @@ class MixtureBatches(Sampler[list[int]]):
         sizes = {name: len(items) for name, items in by_source.items()}
         _check(sizes, weights, batch_size)
         # TickSampler weighs items; divided by their number, weights are those of sources.
-        each = {name: weights.get(name, 1.0) / max(1, size) for name, size in sizes.items()}
-        self._sampler = TickSampler(by_source, each, batch_size, seed)
+        of_items = {name: weights.get(name, 1.0) / max(1, size) for name, size in sizes.items()}
+        self._sampler = TickSampler(by_source, of_items, batch_size, seed)
         self.steps_per_epoch = -(-sum(sizes.values()) // batch_size)
         self.first_step = 0
 

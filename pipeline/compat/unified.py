@@ -9,33 +9,23 @@ from collections.abc import Mapping, Sequence
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from pipeline.base.config import FusionStrategy, ModelType, TrainHeadParams, TuningParams, VLMParams
 from pipeline.base.errors import ObservationError
-from pipeline.compat.unchanged import Unchanged
-from pipeline.policy.live_observation import LiveObservation, Seen, observation_of, target_of
 from pipeline.policy.live_policy import LivePolicy
-from pipeline.policy.normalizer import StreamStatistics
-from pipeline.policy.observation import PolicyShape
+from pipeline.policy.normalization import ChannelStatistics, Normalization
+from pipeline.policy.observation import LiveObservation, PolicyShape, check_axes
 from pipeline.policy.policy import Policy
-from pipeline.vlm.shape import feature_shape
-
-__all__ = [
-    "LiveObservation",
-    "Not_freeze_QwenVLAWithSensor",
-    "QwenVLAUnified",
-    "QwenVLAWithSensor",
-    "QwenVLAWithSensorDiffusion",
-]
+from pipeline.vlm.feature_spec import feature_shape
 
 if TYPE_CHECKING:
-    from pipeline.vlm.distinct import Frames
     from pipeline.vlm.live import LiveVLM
-    from pipeline.vlm.preparation import PreparedRow, Preparer
+    from pipeline.vlm.preparation import FramesByView, PreparedRow, Preparer
 else:  # a model that only ever sees cached features needs no transformers
-    Frames = PreparedRow = Preparer = Any
+    FramesByView = PreparedRow = Preparer = Any
     LiveVLM = nn.Module
 
 _SEED_PARTS: Mapping[str, Mapping[str, Any]] = {
@@ -68,33 +58,29 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
         fusion_strategy: FusionStrategy = "concat",
         *,
         vl_model_name: str = "Qwen/Qwen2.5-VL-3B-Instruct",
-        sensor_enabled: bool = True,
-        robot_state_enabled: bool = True,
         finetune_vl: Literal["none", "lora", "full"] = "none",
         lora_r: int = 16,
         lora_alpha: int = 32,
         lora_dropout: float = 0.05,
         image_resize_height: int = 360,
         image_resize_width: int = 640,
-        horizon: int = 8,
         action_dim: int = 7,
         sensor_channels: int = 1026,
-        sensor_window: int = 65,
         state_dim: int = 12,
-        state_window: int = 100,
         views: Sequence[str] = ("View1", "View2", "View3", "View4", "View5"),
         prompt: str = "{instruction}\n{images}\n{instruction}",
         pooling: Sequence[str] = ("mean",),
         feature_dim: int | None = None,
-        normalization: StreamStatistics | None = None,
+        normalization: Normalization | None = None,
         vlm: Mapping[str, Any] | None = None,
         tuning: Mapping[str, Any] | None = None,
         **head: Any,
     ) -> None:
         """Build the policy; `vlm`, `tuning` and `head` are more params of those sections.
 
-        Of a part of the policy, such as `sensor_encoder`, what `head` does not name stays as this
-        class has always had it.
+        `head` is that of `train_head`: `sensor_enabled` and `robot_state_enabled` (True), `horizon`
+        (8), `sensor_window` (65), `state_window` (100) and all others. Of a part of the policy,
+        such as `sensor_encoder`, what `head` does not name stays as this class has always had it.
 
         `feature_dim` is the width of the checkpoint's hidden states: by default what a checkpoint
         folder says of itself, and 2048 (that of Qwen2.5-VL-3B) for a hub id. Of seven action
@@ -104,32 +90,24 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
         WARNING: without `normalization` every stream is taken as it is. Physical units (degrees,
         millimetres, raw A-scans) train badly: give the `pipeline.policy.normalization` of the data.
         """
-        said = {"checkpoint": vl_model_name, "prompt": prompt, "pooling": tuple(pooling)}
-        size = {
+        seen = {
+            "checkpoint": vl_model_name,
+            "prompt": prompt,
+            "pooling": tuple(pooling),
             "image_resize_height": image_resize_height,
             "image_resize_width": image_resize_width,
         }
         lora = {"lora_r": lora_r, "lora_alpha": lora_alpha, "lora_dropout": lora_dropout}
-        vlm_params = VLMParams.model_validate({**said, **size, **(vlm or {})})
+        vlm_params = VLMParams.model_validate({**seen, **(vlm or {})})
         tuned = TuningParams.model_validate({"method": finetune_vl, **lora, **(tuning or {})})
+        kinds = {"model_type": model_type, "fusion_strategy": fusion_strategy}
+        params = TrainHeadParams.model_validate({**kinds, **_with_seed_parts(head)})
         names = tuple(sorted(views))
-        params = TrainHeadParams.model_validate(
-            {
-                "model_type": model_type,
-                "fusion_strategy": fusion_strategy,
-                "sensor_enabled": sensor_enabled,
-                "robot_state_enabled": robot_state_enabled,
-                "horizon": horizon,
-                "sensor_window": sensor_window,
-                "state_window": state_window,
-                **_with_seed_parts(head),
-            }
-        )
         slots, width = feature_shape(vlm_params, names)
         groups = _ACTION_GROUPS if action_dim == len(_ACTION_GROUPS) else ("other",) * action_dim
         sizes = (slots, feature_dim or width, sensor_channels, state_dim, action_dim)
         shape = PolicyShape(*sizes, action_groups=groups)
-        policy = Policy(params, shape, normalization or Unchanged(shape))
+        policy = Policy(params, shape, normalization or no_normalization(shape))
         self._assemble(policy, vlm_params, tuned, names)
 
     @classmethod
@@ -159,19 +137,16 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
 
     def forward(
         self,
-        images: Sequence[Frames | None] | None = None,
+        images: Sequence[FramesByView | None] | None = None,
         text: Sequence[str] | None = None,
         features: Any = None,
         sensor: Any = None,
         state: Any = None,
         actions: Any = None,
         *,
-        slot_valid: Any = None,
-        feature_age: Any = None,
-        sensor_valid: Any = None,
-        state_valid: Any = None,
         action_valid: Any = None,
         generator: torch.Generator | None = None,
+        **validity: Any,
     ) -> Tensor:
         """The loss where `actions` are given, else an action chunk (batch, horizon, action).
 
@@ -184,17 +159,23 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
         `train()` mode, which stays as it is. Raises `ObservationError` for a shape that does not
         fit and where there is nothing to look at.
         """
-        known = {"slot_valid": slot_valid, "feature_age": feature_age}
-        known |= {"sensor_valid": sensor_valid, "state_valid": state_valid}
-        observation = self.observe(images, text, features, sensor, state, **known)
+        observation = self.observe(images, text, features, sensor, state, **validity)
         if actions is None:
             return self.act(observation, generator)
-        action, valid = target_of(self.policy, observation, actions, action_valid)
-        return self.loss(observation, action, valid, generator)[0]
+        device, batch = observation.features.device, len(observation.features)
+        steps = {"batch": batch, "horizon": self.policy.params.horizon}
+        action = torch.as_tensor(actions, dtype=torch.float32, device=device)
+        channels = self.policy.shape.action_dim
+        check_axes("actions", action, {**steps, "channel": channels}, "the streams")
+        if action_valid is None:
+            action_valid = torch.ones(action.shape[:2], dtype=torch.bool)
+        valid = torch.as_tensor(action_valid, device=device)
+        check_axes("action_valid", valid, steps, "the streams")
+        return self.loss(observation, action, valid.bool(), generator)[0]
 
     def observe(
         self,
-        images: Sequence[Frames | None] | None = None,
+        images: Sequence[FramesByView | None] | None = None,
         text: Sequence[str] | None = None,
         features: Any = None,
         sensor: Any = None,
@@ -204,7 +185,7 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
         feature_age: Any = None,
         sensor_valid: Any = None,
         state_valid: Any = None,
-    ) -> Seen:
+    ) -> LiveObservation:
         """The observation of what `forward` takes; equal frames and text share a row."""
         rows: list[PreparedRow] = []
         row_of = [] if images is None else [-1] * len(images)
@@ -212,20 +193,31 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
             if text is None or isinstance(text, str) or len(text) != len(images):
                 wanted = f"expected {len(images)} instructions, one for each of images"
                 raise ObservationError(f"text: {wanted}, found {text!r}")
-            from pipeline.vlm.distinct import distinct_rows
-
-            spec = self.load_vlm().spec
-            rows, row_of = distinct_rows(self._preparer, spec, images, text)
+            rows, row_of = self._preparer.prepare_distinct(images, text)
         streams = {"features": features, "slot_valid": slot_valid, "feature_age": feature_age}
         streams |= {"sensor": sensor, "sensor_valid": sensor_valid}
         streams |= {"state": state, "state_valid": state_valid}
-        return observation_of(self.policy, streams, rows, row_of)
+        return self.policy.observe(streams, rows, row_of)
 
     @cached_property
     def _preparer(self) -> Preparer:
         from pipeline.vlm.preparation import Preparer
 
         return Preparer(self.vlm_params, self.load_vlm().spec)
+
+
+def no_normalization(shape: PolicyShape) -> Normalization:
+    """Statistics of this shape under which every stream stays as it is."""
+
+    def unit(*channels: int) -> ChannelStatistics:
+        return ChannelStatistics(np.zeros(channels), np.ones(channels), 0)
+
+    return Normalization(
+        action=unit(shape.action_dim),
+        features=unit(shape.slots, shape.feature_dim),
+        sensor=unit(shape.sensor_channels),
+        state=unit(shape.state_dim),
+    )
 
 
 def _with_seed_parts(head: Mapping[str, Any]) -> dict[str, Any]:

@@ -11,7 +11,6 @@ from pathlib import Path
 
 from pipeline.base.config import Source
 from pipeline.base.errors import RecordingError
-from pipeline.data.content import content_digest
 from pipeline.data.discovery import READERS, episode_folders, listing
 from pipeline.data.reader import FileRecording, absolute, natural_key
 from pipeline.data.recording import (
@@ -21,6 +20,7 @@ from pipeline.data.recording import (
     RecordedAction,
     Recording,
     Stream,
+    content_digest,
 )
 
 __all__ = [

@@ -18,7 +18,7 @@ Found = tuple[Sequence[FileRecording], Sequence[str]]
 
 
 @dataclass(frozen=True)
-class Reader:
+class FormatReader:
     """A format: what marks its folders, and how one is opened."""
 
     marker: str
@@ -33,10 +33,10 @@ def _one(
 
 
 READERS = {
-    "new": Reader(windowed.MARKER, windowed.is_episode, _one(windowed.WindowedRecording)),
-    "old": Reader(pickled.MARKER, pickled.is_episode, _one(pickled.PickledRecording)),
-    "raw": Reader(raw.MARKER, raw.is_episode, _one(raw.RawRecording)),
-    "lerobot": Reader(lerobot.MARKER, lerobot.is_root, lerobot.open_data_set),
+    "new": FormatReader(windowed.MARKER, windowed.is_episode, _one(windowed.WindowedRecording)),
+    "old": FormatReader(pickled.MARKER, pickled.is_episode, _one(pickled.PickledRecording)),
+    "raw": FormatReader(raw.MARKER, raw.is_episode, _one(raw.RawRecording)),
+    "lerobot": FormatReader(lerobot.MARKER, lerobot.is_root, lerobot.open_data_set),
 }
 """In the order of detection."""
 
@@ -62,13 +62,13 @@ _DEEPEST = 4
 """Levels below a LeRobot root at which its files lie: videos/chunk-000/view/episode.mp4."""
 
 
-def episode_folders(source: Source, root: Path) -> list[tuple[Path, Reader]]:
+def episode_folders(source: Source, root: Path) -> list[tuple[Path, FormatReader]]:
     """The source's episode folders and LeRobot roots, each once, in natural order.
 
     Raises `RecordingError` where a path has none, and where a name is not UTF-8: a store could not
     keep it.
     """
-    found: dict[Path, tuple[Path, Reader]] = {}
+    found: dict[Path, tuple[Path, FormatReader]] = {}
     for pattern in source.paths:
         full = absolute(root / pattern)
         matches = _matches(full)
@@ -107,7 +107,7 @@ def _matches(full: Path) -> list[Path]:
 
 def _episodes(
     folder: Path, source: Source, seen: frozenset[Path] = frozenset()
-) -> Iterator[tuple[Path, Reader]]:
+) -> Iterator[tuple[Path, FormatReader]]:
     """Episode folders at or below a folder; nothing is looked for inside an episode."""
     names = listing(folder)
     format = _detect(folder, names, source)

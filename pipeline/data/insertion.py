@@ -53,7 +53,7 @@ class InsertionRecording(FileRecording):
             if self._wants(view)
             for path in paths
         ]
-        return sorted({*self._data_files(), *frames})
+        return sorted({*filter(None, self._data_files()), *frames})
 
     def all_views(self) -> Sequence[str]:
         return list(self._view_files())
@@ -70,8 +70,8 @@ class InsertionRecording(FileRecording):
         """JPEGs by view, views without any left out."""
 
     @abstractmethod
-    def _data_files(self) -> Sequence[Path]:
-        """The files that are not frames."""
+    def _data_files(self) -> Sequence[Path | None]:
+        """The files that are not frames; None for one that the episode does without."""
 
 
 def promised(metadata: Mapping[str, Any], *keys: str) -> str:

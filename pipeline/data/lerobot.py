@@ -19,7 +19,7 @@ from pipeline.base.errors import RecordingError
 from pipeline.data.arrays import member, read_npz
 from pipeline.data.insertion import SENSOR
 from pipeline.data.lerobot_clock import NUMBERS, check_numbers, read_clock, stored_clock
-from pipeline.data.lerobot_layout import Entry, Layout, read_layout
+from pipeline.data.lerobot_layout import LeRobotEntry, LeRobotLayout, read_layout
 from pipeline.data.lerobot_rows import ParquetCamera, find_rows, matrix
 from pipeline.data.reader import FileRecording
 from pipeline.data.recording import (
@@ -81,7 +81,11 @@ class LeRobotRecording(FileRecording):
     format = "lerobot"
 
     def __init__(
-        self, layout: Layout, entry: Entry, source: Source, views: Sequence[str] | None
+        self,
+        layout: LeRobotLayout,
+        entry: LeRobotEntry,
+        source: Source,
+        views: Sequence[str] | None,
     ) -> None:
         super().__init__(layout.root, source, views)
         self.id = entry.id

@@ -11,8 +11,8 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from pipeline.base.errors import RecordingError
-from pipeline.data.lerobot_layout import Entry
-from pipeline.data.lerobot_rows import EpisodeRows, matrix
+from pipeline.data.lerobot_layout import LeRobotEntry
+from pipeline.data.lerobot_rows import ParquetRows, matrix
 from pipeline.data.recording import check_clock, check_rising_clock
 
 CLOCK = "timestamp"
@@ -47,7 +47,7 @@ def stored_clock(table: pa.Table, where: str) -> NDArray[np.float64]:
     return matrix(table[CLOCK], 1, f"{where}, {CLOCK!r}")[:, 0]
 
 
-def check_numbers(table: pa.Table, rows: EpisodeRows, entry: Entry) -> None:
+def check_numbers(table: pa.Table, rows: ParquetRows, entry: LeRobotEntry) -> None:
     """Raise `RecordingError` where rows are another episode's, or frame numbers do not rise.
 
     Frame numbers may begin above 0 and leave some out: rows can have been taken away. A column that

@@ -27,7 +27,7 @@ _V3_TEXT = ("task", "__index_level_0__")
 
 
 @dataclass(frozen=True)
-class Entry:
+class LeRobotEntry:
     """One episode as `meta/` lists it."""
 
     index: int
@@ -46,7 +46,7 @@ class Entry:
 
 
 @dataclass(frozen=True)
-class Layout:
+class LeRobotLayout:
     """What all episodes of a data set share."""
 
     root: Path
@@ -66,7 +66,7 @@ class Layout:
         return {_view_name(key): key for key in _cameras(self.features, depth=True)}
 
 
-def read_layout(root: Path) -> tuple[Layout, tuple[Entry, ...]]:
+def read_layout(root: Path) -> tuple[LeRobotLayout, tuple[LeRobotEntry, ...]]:
     """The data set's layout, and its episodes by index.
 
     Raises `RecordingError` naming the file of `meta/` that is wrong, and the place in it: also
@@ -93,10 +93,10 @@ def read_layout(root: Path) -> tuple[Layout, tuple[Entry, ...]]:
         if isinstance(error, RecordingError):
             raise
         raise RecordingError(f"{root / 'meta'}: cannot be understood: {error!r}") from None
-    return Layout(root, version, fps, features, tasks), entries
+    return LeRobotLayout(root, version, fps, features, tasks), entries
 
 
-def _apart(entries: Sequence[Entry], root: Path) -> tuple[Entry, ...]:
+def _apart(entries: Sequence[LeRobotEntry], root: Path) -> tuple[LeRobotEntry, ...]:
     """Entries in the order of their index with their rivals for frames, none of them twice."""
     for one, other in pairwise(entries):
         if one.index == other.index:
@@ -118,9 +118,9 @@ def _apart(entries: Sequence[Entry], root: Path) -> tuple[Entry, ...]:
     )
 
 
-def _rivals(entries: Sequence[Entry]) -> dict[tuple[int, str], str]:
+def _rivals(entries: Sequence[LeRobotEntry]) -> dict[tuple[int, str], str]:
     """Of each span that overlaps another episode's, by index and feature key: that episode."""
-    by_file: dict[Path, list[tuple[int, int, str, Entry]]] = defaultdict(list)
+    by_file: dict[Path, list[tuple[int, int, str, LeRobotEntry]]] = defaultdict(list)
     for entry in entries:
         for key, span in entry.videos.items():
             if span.first is not None:
@@ -172,7 +172,7 @@ def _video_keys(info: Mapping[str, Any]) -> list[str]:
     return [key for key, f in info["features"].items() if f.get("dtype") == "video"]
 
 
-def _entries_v2(root: Path, info: Mapping[str, Any]) -> Iterator[Entry]:
+def _entries_v2(root: Path, info: Mapping[str, Any]) -> Iterator[LeRobotEntry]:
     path = root / "meta" / "episodes.jsonl"
     chunk = number(info, "chunks_size", str(root / "meta" / "info.json"), positive=True)
     if chunk is None or chunk % 1:
@@ -182,7 +182,7 @@ def _entries_v2(root: Path, info: Mapping[str, Any]) -> Iterator[Entry]:
     for row in _jsonl(path, ("episode_index", "length")):
         index = int(row["episode_index"])
         place = {"episode_index": index, "episode_chunk": index // int(chunk)}
-        yield Entry(
+        yield LeRobotEntry(
             index=index,
             length=int(row["length"]),
             tasks=_texts(row, path),
@@ -195,7 +195,7 @@ def _entries_v2(root: Path, info: Mapping[str, Any]) -> Iterator[Entry]:
         )
 
 
-def _entries_v3(root: Path, info: Mapping[str, Any], fps: float) -> Iterator[Entry]:
+def _entries_v3(root: Path, info: Mapping[str, Any], fps: float) -> Iterator[LeRobotEntry]:
     folder = root / "meta" / "episodes"
     files = sorted(folder.glob("chunk-*/file-*.parquet"), key=natural_key)
     if not files:
@@ -205,7 +205,7 @@ def _entries_v3(root: Path, info: Mapping[str, Any], fps: float) -> Iterator[Ent
     for key in keys:
         needed += [f"videos/{key}/{field}" for field in _SPAN_FIELDS]
     for row in _rows(files, needed):
-        yield Entry(
+        yield LeRobotEntry(
             index=row["episode_index"],
             length=row["length"],
             tasks=_texts(row, folder),

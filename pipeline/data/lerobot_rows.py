@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.base.errors import RecordingError
 from pipeline.data.jpeg import check_image, read_image
-from pipeline.data.lerobot_layout import Entry, Layout
+from pipeline.data.lerobot_layout import LeRobotEntry, LeRobotLayout
 from pipeline.data.reader import natural_key
 from pipeline.data.recording import CameraStream
 
@@ -22,7 +22,7 @@ _IMAGE_ROWS = 8
 
 
 @dataclass(frozen=True)
-class EpisodeRows:
+class ParquetRows:
     """A half-open range of rows of a parquet file."""
 
     path: Path
@@ -65,7 +65,7 @@ class ParquetCamera(CameraStream):
     """A view whose frames are encoded images in the rows."""
 
     def __init__(
-        self, view: str, time: NDArray[np.float64], rows: EpisodeRows, column: str
+        self, view: str, time: NDArray[np.float64], rows: ParquetRows, column: str
     ) -> None:
         self.view = view
         self.time = time
@@ -89,7 +89,7 @@ class ParquetCamera(CameraStream):
         return f"{self._rows.path}, column {self._column!r}, row {self._rows.start + index}"
 
 
-def find_rows(layout: Layout, entry: Entry) -> EpisodeRows:
+def find_rows(layout: LeRobotLayout, entry: LeRobotEntry) -> ParquetRows:
     """The episode's rows, found by their `episode_index` in a shared file.
 
     The metadata's file_index can be stale (lerobot up to 0.4.4), so where the file named has none
@@ -98,7 +98,7 @@ def find_rows(layout: Layout, entry: Entry) -> EpisodeRows:
     """
     if not entry.shared:
         with opened(entry.data) as file:
-            rows = EpisodeRows(entry.data, 0, file.metadata.num_rows)
+            rows = ParquetRows(entry.data, 0, file.metadata.num_rows)
         _check_length(rows.stop, entry, entry.data)
         if not rows.stop:
             raise RecordingError(f"{entry.data}: has no row of episode {entry.index}")
@@ -112,7 +112,7 @@ def find_rows(layout: Layout, entry: Entry) -> EpisodeRows:
             _check_length(found.size, entry, path)
             if found[-1] - found[0] + 1 != found.size:
                 raise RecordingError(f"{path}: rows of episode {entry.index} are not together")
-            return EpisodeRows(path, int(found[0]), int(found[-1]) + 1)
+            return ParquetRows(path, int(found[0]), int(found[-1]) + 1)
     raise RecordingError(
         f"{entry.data}: has no row of episode {entry.index}, nor has any other file under "
         f"{layout.root / 'data'}"
@@ -153,7 +153,7 @@ def opened(path: Path) -> Generator[pq.ParquetFile, None, None]:
         ) from None
 
 
-def _check_length(rows: int, entry: Entry, path: Path) -> None:
+def _check_length(rows: int, entry: LeRobotEntry, path: Path) -> None:
     if rows != entry.length:
         raise RecordingError(
             f"{path}: {rows} rows of episode {entry.index}, but meta/ says {entry.length}; "

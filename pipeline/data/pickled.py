@@ -185,13 +185,9 @@ class PickledRecording(InsertionRecording):
             if self._wants(view)
         }
 
-    def _data_files(self) -> Sequence[Path]:
-        sensor, state = self.path / _SENSOR_FILE, robot_state_file(self.path)
-        return [
-            self._pickle,
-            *([sensor] if sensor.is_file() else []),
-            *([state] if state else []),
-        ]
+    def _data_files(self) -> Sequence[Path | None]:
+        sensor = self.path / _SENSOR_FILE
+        return [self._pickle, sensor if sensor.is_file() else None, robot_state_file(self.path)]
 
 
 def _pure(recorded: str) -> PurePath:

@@ -80,5 +80,5 @@ class RawRecording(InsertionRecording):
     def _view_files(self) -> Mapping[str, list[Path]]:
         return list_views(self.path, prefix="View")
 
-    def _data_files(self) -> Sequence[Path]:
-        return [self._state_file, *([self._sensor_file] if self._sensor_file else [])]
+    def _data_files(self) -> Sequence[Path | None]:
+        return [self._state_file, self._sensor_file]

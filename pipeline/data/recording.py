@@ -8,8 +8,10 @@ Times are float64 seconds on the recording's own clock, never decreasing. Anythi
 `RecordingError` with the file and the place in it.
 """
 
+import json
+import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -17,7 +19,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.base.digests import joint_digest
 from pipeline.base.errors import RecordingError
+from pipeline.base.finite import first_non_finite, non_finite
 
 ActionKind = Literal["absolute", "velocity", "delta"]
 
@@ -179,12 +183,12 @@ def checked_stream(
     if not len(values):
         raise RecordingError(f"{where}: the stream is empty")
     check_clock(time, where)
-    bad = ~np.isfinite(values)
-    if bad.any():
-        row, column = np.argwhere(bad)[0]
+    if (at := first_non_finite(values)) is not None:
+        row, column = at
         raise RecordingError(
-            f"{where}: {values[row, column]} in row {row}, {time[row] - time[0]:.3f} s after the "
-            f"first, channel {channels.names[column]!r} ({int(bad.sum())} such values in all). "
+            f"{where}: {values[at]} in row {row}, {time[row] - time[0]:.3f} s after the "
+            f"first, channel {channels.names[column]!r} ({int(non_finite(values).sum())} such "
+            "values in all). "
             "Mend the recording or leave it out: nothing is filled in"
         )
     return Stream(channels, time, values)
@@ -192,9 +196,8 @@ def checked_stream(
 
 def check_clock(time: NDArray[np.float64], where: str) -> None:
     """Raise `RecordingError` where a clock is not finite or goes backwards."""
-    if not np.isfinite(time).all():
-        row = int(np.flatnonzero(~np.isfinite(time))[0])
-        raise RecordingError(f"{where}: timestamp {time[row]} in row {row}")
+    if (at := first_non_finite(time)) is not None:
+        raise RecordingError(f"{where}: timestamp {time[at]} in row {at[0]}")
     backwards = np.flatnonzero(np.diff(time) < 0)
     if backwards.size:
         row = int(backwards[0]) + 1
@@ -214,3 +217,14 @@ def check_rising_clock(time: NDArray[np.float64], where: str) -> None:
             f"{where}: the clock stands still at row {row}: "
             f"{time[row]:.6f} s after {time[row - 1]:.6f} s; it must rise from row to row"
         )
+
+
+def content_digest(recording: Recording, digest_of: Callable[[Path], str]) -> str:
+    """Digest of a recording's files, wherever they lie; equal content means equal streams.
+
+    `digest_of` gives that of one file. Raises `RecordingError`, and what `digest_of` raises where a
+    file cannot be read.
+    """
+    # Frame times stand in file names, so a name is content too; where the folder lies is not.
+    named = ((os.path.relpath(file, recording.path), digest_of(file)) for file in recording.files())
+    return joint_digest(recording.identity(), json.dumps(sorted(named)))

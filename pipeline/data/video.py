@@ -9,8 +9,9 @@ from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
+from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import av
 import numpy as np
@@ -37,23 +38,13 @@ class VideoSpan:
     """Another episode to which the metadata gives some of these frames too."""
 
 
-@dataclass(frozen=True)
-class _FrameTable:
-    """Per frame of the clip, in order of presentation."""
+class _FrameTable(NamedTuple):
+    """What the container says of the frames of a clip, in order of presentation: (frame,) each."""
 
     pts: NDArray[np.int64]
     key_pts: NDArray[np.int64]
     """Of the key frame from which decoding has to start."""
     key_dts: NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class _Packet:
-    """What the container says of a frame."""
-
-    pts: int
-    key_pts: int
-    key_dts: int
 
 
 class VideoClip(CameraStream):
@@ -127,9 +118,7 @@ class VideoClip(CameraStream):
                     "pair by number, so the counts must agree. Copy the video again, or leave "
                     "the episode out"
                 )
-        packets.sort(key=lambda packet: packet.pts)
-        columns = np.array([(p.pts, p.key_pts, p.key_dts) for p in packets], np.int64)
-        return _FrameTable(*columns.reshape(-1, 3).T)
+        return _FrameTable(*np.array(sorted(packets, key=itemgetter(0)), np.int64).reshape(-1, 3).T)
 
     @contextmanager
     def _open(self) -> Generator[tuple[InputContainer, VideoStream], None, None]:
@@ -150,8 +139,8 @@ class VideoClip(CameraStream):
 
 def _packets(
     container: InputContainer, stream: VideoStream, span: VideoSpan, fps: float, rows: int
-) -> Iterator[_Packet]:
-    """The packets of the clip's frames, in decoding order, without decoding any."""
+) -> Iterator[tuple[int, int, int]]:
+    """`pts`, `key_pts`, `key_dts` of the clip's frames, in decoding order; none is decoded."""
     if stream.time_base is None:
         raise RecordingError(f"{span.path}: the video has no time base")
     start, step = stream.start_time or 0, 1 / (fps * float(stream.time_base))
@@ -171,7 +160,7 @@ def _packets(
             keys = [*keys[-1:], (packet.pts, dts)]
         if keys and round((packet.pts - start) / step) in wanted:
             # A frame shown before the newest key frame depends on the key frame before that.
-            yield _Packet(packet.pts, *(keys[-1] if packet.pts >= keys[-1][0] else keys[0]))
+            yield (packet.pts, *(keys[-1] if packet.pts >= keys[-1][0] else keys[0]))
 
 
 def _seek_before(container: InputContainer, stream: VideoStream, pts: int) -> None:

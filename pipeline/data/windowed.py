@@ -114,10 +114,7 @@ class WindowedRecording(InsertionRecording):
     def _view_files(self) -> Mapping[str, list[Path]]:
         return list_views(self.path / "images")
 
-    def _data_files(self) -> Sequence[Path]:
-        sensor, state = self.path / _SENSOR_FILE, robot_state_file(self.path)
-        return [
-            self._metadata_file,
-            *([sensor] if sensor.is_file() else []),
-            *([state] if state else []),
-        ]
+    def _data_files(self) -> Sequence[Path | None]:
+        sensor = self.path / _SENSOR_FILE
+        state = robot_state_file(self.path)
+        return [self._metadata_file, sensor if sensor.is_file() else None, state]

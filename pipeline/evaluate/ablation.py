@@ -1,41 +1,44 @@
-"""Is a stream used? A policy judged again and again, with one of its streams spoilt each time.
+"""Is a stream used? A policy evaluated again and again, with one of its streams ablated each time.
 
 An error that stays says that the policy does not use the stream, or that others tell it the same.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.evaluate.corruption import (
-    FIELDS,
-    Alter,
-    donors_of,
-    exchanged,
-    feed_maker,
-    missing,
-    zeroed,
-)
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.policy import Policy
-from pipeline.store import FeatureStore, episode_name
-from pipeline.train.batches import Lags, Ticks, Windows
+from pipeline.store import Batch, FeatureStore, episode_name
+from pipeline.train.batches import NO_LAGS, BatchIndices, Lags, Prefetch, Ticks, Windows
 from pipeline.train.held_out import judge
 from pipeline.train.predictions import FeedMaker
 from pipeline.train.scores import Comparison
 
 DELAYS_MS = (50, 100, 200)
 MOST_TICKS = 1000
-"""Held-out ticks judged: every way to spoil a stream costs a pass over them."""
+"""Held-out ticks evaluated: every way to ablate a stream costs a pass over them."""
 MOST_SAMPLES = 4
-"""Chunks a tick of a stochastic policy whose mean is judged, for the same reason."""
+"""Chunks a tick of a stochastic policy whose mean is evaluated, for the same reason."""
+FIELDS = {
+    "sensor": ("sensor", "sensor_valid"),
+    "state": ("state", "state_valid"),
+    "features": ("features", "slot_valid", "feature_age"),
+}
+"""What belongs to each stream: its values, which of them are real, and of features their age."""
+
+Alter = Callable[[BatchIndices, Batch], Batch]
+"""A batch as the policy is to see it; the one it is given stays as it is."""
 
 
 @dataclass(frozen=True)
 class Ablated:
-    """A policy judged with one stream spoilt."""
+    """A policy evaluated with one stream ablated."""
 
     stream: str
     how: str
@@ -44,28 +47,28 @@ class Ablated:
 
 
 @dataclass(frozen=True)
-class ModalityStudy:
-    """A policy judged on the same ticks with all streams intact and with each one spoilt."""
+class AblationStudy:
+    """A policy evaluated on the same ticks with all streams intact and with each one ablated."""
 
     intact: Comparison
-    spoilt: tuple[Ablated, ...]
+    ablated: tuple[Ablated, ...]
     notes: tuple[str, ...]
-    """What could not be judged as asked, and why."""
+    """What could not be evaluated as asked, and why."""
     samples: int
-    """Chunks a tick whose mean was judged; 1 where the policy does not sample."""
+    """Chunks a tick whose mean was evaluated; 1 where the policy does not sample."""
 
     @property
     def streams(self) -> tuple[str, ...]:
         """The streams that the policy sees."""
-        return tuple(dict.fromkeys(one.stream for one in self.spoilt))
+        return tuple(dict.fromkeys(ablated.stream for ablated in self.ablated))
 
-    def times_intact(self, one: Ablated) -> float | None:
-        """The error with a stream spoilt, as a multiple of the intact one; None where that is 0."""
+    def times_intact(self, ablated: Ablated) -> float | None:
+        """The error with a stream ablated, in multiples of the intact one; None where that is 0."""
         intact = self.intact.overall("policy")
-        return one.comparison.overall("policy") / intact if intact > 0 else None
+        return ablated.comparison.overall("policy") / intact if intact > 0 else None
 
 
-def judge_modalities(
+def evaluate_ablation(
     checkpoint: PolicyCheckpoint,
     policy: Policy,
     store: FeatureStore,
@@ -73,12 +76,12 @@ def judge_modalities(
     batch_size: int,
     samples: int = 1,
     progress: bool = False,
-) -> ModalityStudy | None:
+) -> AblationStudy | None:
     """The study of this policy, which is `checkpoint.policy()`, on these held-out ticks.
 
     At most `MOST_TICKS` evenly spaced ones are taken, of those so far into their episode that the
     longest delay stays inside it; None where there is no such tick. Of a stochastic policy, the
-    mean of `samples` chunks, but of `MOST_SAMPLES` at most. Every judgement draws from the same
+    mean of `samples` chunks, but of `MOST_SAMPLES` at most. Every evaluation draws from the same
     seed, so that the same noise stands on both sides of a difference. Raises as `judge` does.
     """
     samples = min(samples, MOST_SAMPLES) if policy.stochastic else 1
@@ -91,89 +94,155 @@ def judge_modalities(
             f"intact is not the error above: {len(ticks) - len(settled)} of {len(ticks)} held-out "
             "ticks are left out, so near their episode's start that a delay would reach beyond it"
         )
-    ticks = _spaced(settled)
-    spoiler = _Spoiler(checkpoint, store, ticks, next(policy.parameters()).device)
+    count = min(len(settled), MOST_TICKS)
+    ticks = settled[np.linspace(0, len(settled) - 1, count).round().astype(np.int64)]
+    windows, device = Windows.of(checkpoint.params), next(policy.parameters()).device
     ways: list[tuple[str, str, FeedMaker | None]] = [("", "intact", None)]
     for stream in (stream for stream in FIELDS if stream in policy.encoders):
-        found, said = spoiler.ways(stream)
-        ways += [(stream, how, feed) for how, feed in found.items()]
-        notes += said
-    comparisons = [
+        alterations, reasons = _alterations(checkpoint, store, ticks, stream)
+        notes += reasons
+        for how, alter in alterations.items():
+            ways.append((stream, how, feed_maker(store, windows, device, alter=alter)))
+        for how, lags in delays(store, stream).items():
+            ways.append((stream, how, feed_maker(store, windows, device, lags)))
+    bar = tqdm(ways, "ablating streams", unit="way", disable=None if progress else True)
+    intact, *comparisons = (
         judge(
             policy,
-            store,
-            ticks,
-            spoiler.windows,
-            batch_size,
-            checkpoint.normalization,
+            *(store, ticks, windows, batch_size, checkpoint.normalization),
             samples=samples,
             feed=feed,
         )[0]
-        for *_, feed in tqdm(
-            ways, desc="spoiling streams", unit="way", disable=None if progress else True
-        )
-    ]
-    spoilt = (
-        Ablated(stream, how, comparison)
-        for (stream, how, _), comparison in zip(ways[1:], comparisons[1:], strict=True)
+        for *_, feed in bar
     )
-    return ModalityStudy(comparisons[0], tuple(spoilt), tuple(notes), samples)
+    ablated = (
+        Ablated(stream, how, comparison)
+        for (stream, how, _), comparison in zip(ways[1:], comparisons, strict=True)
+    )
+    return AblationStudy(intact, tuple(ablated), tuple(notes), samples)
 
 
-@dataclass(frozen=True)
-class _Spoiler:
-    """The ways to spoil the streams of a store for a policy at some ticks."""
+def feed_maker(
+    store: FeatureStore,
+    windows: Windows,
+    device: torch.device,
+    lags: Lags = NO_LAGS,
+    alter: Alter | None = None,
+) -> FeedMaker:
+    """Feeds of this store in which streams come late or are altered, once, before anyone looks."""
 
-    checkpoint: PolicyCheckpoint
-    store: FeatureStore
-    ticks: Ticks
-    device: torch.device
-
-    @property
-    def windows(self) -> Windows:
-        return Windows.of(self.checkpoint.params)
-
-    def ways(self, stream: str) -> tuple[dict[str, FeedMaker], list[str]]:
-        """Feeds by what they do to the stream, and why one is not there or not as asked."""
-        found, notes = {}, []
-        statistics = getattr(self.checkpoint.normalization, stream)
-        assert statistics is not None, "a policy has statistics of each stream that it sees"
-        found["zeroed"] = self._altered(zeroed(stream, statistics.mean))
-        if self._knows_missing(stream):
-            found["missing"] = self._altered(missing(stream))
-        else:
-            notes.append(
-                f"{stream} missing: not judged, for in training it never was (train_head."
-                f"drop_{stream} 0), so that the embedding for it has learned nothing"
+    @contextmanager
+    def make(plan: Sequence[BatchIndices]) -> Generator[Iterator[tuple[BatchIndices, Batch]]]:
+        with Prefetch(store, plan, windows, device, lags=lags) as batches:
+            yield (
+                (indices, batch if alter is None else alter(indices, batch))
+                for indices, batch in batches
             )
-        donors = donors_of(self.store, self.ticks, stream)
-        if donors is None:
-            notes.append(f"{stream} shuffled: not judged, it takes two held-out episodes with it")
-        else:
-            found["shuffled"] = self._altered(
-                exchanged(stream, self.store, self.windows, self.ticks, donors)
-            )
-        for how, lags in delays(self.store, stream).items():
-            found[how] = feed_maker(self.store, self.windows, self.device, lags)
-        if stream == "features":
-            notes += _rounded_delays(self.store)
-        return found, notes
 
-    def _altered(self, alter: Alter) -> FeedMaker:
-        return feed_maker(self.store, self.windows, self.device, alter=alter)
+    return make
 
-    def _knows_missing(self, stream: str) -> bool:
-        """Whether training showed the policy what it is like without this stream."""
-        if getattr(self.checkpoint.params, f"drop_{stream}") > 0:
-            return True
-        if stream == "features":
-            return False
-        count = np.diff(self.store.array(f"episode/{stream}_start"))
-        held_out = self.checkpoint.held_out_ticks
-        return any(
-            not count[episode.index] and episode_name(episode) not in held_out
-            for episode in self.store.episodes
+
+def _alterations(
+    checkpoint: PolicyCheckpoint, store: FeatureStore, ticks: Ticks, stream: str
+) -> tuple[dict[str, Alter], list[str]]:
+    """Ways to alter a stream at these ticks, and why one is not there or a delay not as asked."""
+    statistics = getattr(checkpoint.normalization, stream)
+    assert statistics is not None, "a policy has statistics of each stream that it sees"
+    ways, notes = {"zeroed": zeroed(stream, statistics.mean)}, []
+    if _knows_missing(checkpoint, store, stream):
+        ways["missing"] = missing(stream)
+    else:
+        notes.append(
+            f"{stream} missing: not judged, for in training it never was (train_head."
+            f"drop_{stream} 0), so that the embedding for it has learned nothing"
         )
+    donors = donors_of(store, ticks, stream)
+    if donors is None:
+        notes.append(f"{stream} shuffled: not judged, it takes two held-out episodes with it")
+    else:
+        windows = Windows.of(checkpoint.params)
+        ways["shuffled"] = exchanged(stream, store, windows, ticks, donors)
+    if stream == "features":
+        late = list(delays(store, stream))
+        other = [f"{ms}" for ms in DELAYS_MS if f"delayed {ms} ms" not in late]
+        if other:
+            evaluated = ", ".join(how.removeprefix("delayed ") for how in late)
+            notes.append(
+                f"features delayed: they change every {_row_ms(store):.0f} ms only "
+                f"(vlm_reuse_count {store.vlm_reuse_count}) and go back whole VL rows, at least "
+                f"one: judged {evaluated}; {', '.join(other)} ms end within a row"
+            )
+    return ways, notes
+
+
+def _knows_missing(checkpoint: PolicyCheckpoint, store: FeatureStore, stream: str) -> bool:
+    """Whether training showed the policy what it is like without this stream."""
+    if getattr(checkpoint.params, f"drop_{stream}") > 0:
+        return True
+    if stream == "features":
+        return False
+    readings = np.diff(store.array(f"episode/{stream}_start"))
+    return any(
+        not readings[episode.index] and episode_name(episode) not in checkpoint.held_out_ticks
+        for episode in store.episodes
+    )
+
+
+def zeroed(stream: str, mean: NDArray[np.floating]) -> Alter:
+    """Every value of the stream at its training mean, which the policy sees as zeros.
+
+    A raw 0 would be a reading far from all others (a pose at the robot's foot, light of no
+    intensity): the error would tell how the policy extrapolates, not what it does without knowing.
+    """
+
+    def alter(indices: BatchIndices, batch: Batch) -> Batch:
+        values = getattr(batch, stream)
+        level = torch.tensor(mean, dtype=torch.float32, device=values.device)
+        return replace(batch, **{stream: level.expand(values.shape)})
+
+    return alter
+
+
+def missing(stream: str) -> Alter:
+    """Nothing of the stream is real: the policy's encoder gives its embedding for that."""
+    valid = FIELDS[stream][1]
+    return lambda indices, batch: replace(batch, **{valid: torch.zeros_like(getattr(batch, valid))})
+
+
+def exchanged(
+    stream: str, store: FeatureStore, windows: Windows, ticks: Ticks, donors: Ticks
+) -> Alter:
+    """Tick `ticks[i]` sees the stream as it is at tick `donors[i]`; `ticks` ascend."""
+
+    def alter(indices: BatchIndices, batch: Batch) -> Batch:
+        here = donors[np.searchsorted(ticks, indices.ticks)]
+        other = store.gather(here, *astuple(windows)).to(batch.action.device)
+        return replace(batch, **{name: getattr(other, name) for name in FIELDS[stream]})
+
+    return alter
+
+
+def donors_of(store: FeatureStore, ticks: Ticks, stream: str, seed: int = 0) -> Ticks | None:
+    """For each of these ascending ticks, one of another episode among them, drawn evenly.
+
+    A tick whose episode lacks the stream gives it to nobody and keeps what it has. None where
+    fewer than two episodes have the stream.
+    """
+    episode = store.episode_of(ticks)
+    having = np.full(len(ticks), True)
+    if stream != "features":
+        having = np.diff(store.array(f"episode/{stream}_start"))[episode] > 0
+    episode = episode[having]
+    first = np.searchsorted(episode, episode, side="left")
+    size = np.searchsorted(episode, episode, side="right") - first
+    if len(episode) == 0 or (size == len(episode)).any():
+        return None
+    # A place among the ticks of other episodes: what lies behind one's own moves up by its size.
+    drawn = np.random.default_rng(seed).integers(0, len(episode) - size)
+    drawn = np.where(drawn < first, drawn, drawn + size)
+    donors = ticks.copy()
+    donors[having] = ticks[having][drawn]
+    return donors
 
 
 def delays(store: FeatureStore, stream: str) -> dict[str, Lags]:
@@ -183,39 +252,18 @@ def delays(store: FeatureStore, stream: str) -> dict[str, Lags]:
     """
     if stream != "features":
         return {
-            f"delayed {ms} ms": Lags(sensor_s=ms / 1000)
-            if stream == "sensor"
-            else Lags(state_s=ms / 1000)
-            for ms in DELAYS_MS
+            f"delayed {ms} ms": replace(NO_LAGS, **{f"{stream}_s": ms / 1000}) for ms in DELAYS_MS
         }
     row_ms = _row_ms(store)
     rows = sorted({max(1, round(ms / row_ms)) for ms in DELAYS_MS})
     return {f"delayed {count * row_ms:.0f} ms": Lags(features=count) for count in rows}
 
 
-def _rounded_delays(store: FeatureStore) -> list[str]:
-    """Why features are not delayed by what was asked; nothing where they are."""
-    had = delays(store, "features")
-    other = [f"{ms}" for ms in DELAYS_MS if f"delayed {ms} ms" not in had]
-    if not other:
-        return []
-    judged = ", ".join(how.removeprefix("delayed ") for how in had)
-    return [
-        f"features delayed: they change every {_row_ms(store):.0f} ms only (vlm_reuse_count "
-        f"{store.vlm_reuse_count}) and go back whole VL rows, at least one: judged {judged}; "
-        f"{', '.join(other)} ms end within a row"
-    ]
-
-
 def _row_ms(store: FeatureStore) -> float:
-    """Time between VL rows."""
-    return 1000 * store.vlm_reuse_count * _tick_s(store)
-
-
-def _tick_s(store: FeatureStore) -> float:
-    """Time between ticks of an episode; where the recorded rows are the ticks, its median."""
+    """Time between VL rows; where the recorded rows are the ticks, by their median step."""
     step_s = store.tick_step() if store.action_hz is None else 1 / store.action_hz
-    return step_s if step_s > 0 else np.inf  # no episode has two ticks: none can be delayed
+    # Where no episode has two ticks, none can be delayed.
+    return 1000 * store.vlm_reuse_count * (step_s if step_s > 0 else np.inf)
 
 
 def _settled(store: FeatureStore, ticks: Ticks) -> Ticks:
@@ -226,9 +274,3 @@ def _settled(store: FeatureStore, ticks: Ticks) -> Ticks:
     rows = row[ticks] - store.array("episode/vl_start")[episode]
     most = max(lags.features for lags in delays(store, "features").values())
     return ticks[(since_s > max(DELAYS_MS) / 1000) & (rows >= most)]
-
-
-def _spaced(ticks: Ticks) -> Ticks:
-    """At most `MOST_TICKS` of them, evenly."""
-    count = min(len(ticks), MOST_TICKS)
-    return ticks[np.linspace(0, len(ticks) - 1, count).round().astype(np.int64)]

@@ -13,7 +13,7 @@ from pipeline.policy.checkpoint import PolicyCheckpoint
 
 
 @dataclass(frozen=True)
-class Curve:
+class TrainingCurve:
     """One metric over the steps of a training, both (point,)."""
 
     step: NDArray[np.int64]
@@ -21,32 +21,34 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class Curves:
+class TrainingCurves:
     """All that a training logged, or why there is nothing of it."""
 
-    curves: Mapping[str, Curve]
+    curves: Mapping[str, TrainingCurve]
     """By name: `train/loss`, `val/error`, `lr`, …"""
     absence: str = ""
     """One sentence where there are none, naming the path."""
 
 
-def read_curves(checkpoint: PolicyCheckpoint) -> Curves:
+def read_curves(checkpoint: PolicyCheckpoint) -> TrainingCurves:
     """The curves of the training that a checkpoint is of, where its logs still have them."""
     folder = checkpoint.params.logs / "plots" / "metrics"
     files = sorted(folder.rglob("*.tsv"))
     try:
-        found = {file.relative_to(folder).with_suffix("").as_posix(): _read(file) for file in files}
+        read = {file.relative_to(folder).with_suffix("").as_posix(): _read(file) for file in files}
     except (ValueError, KeyError) as error:
-        return Curves({}, f"No training curves: those in {folder} cannot be read ({error}).")
-    curves = {name: curve for name, curve in found.items() if len(curve.step)}
+        return TrainingCurves(
+            {}, f"No training curves: those in {folder} cannot be read ({error})."
+        )
+    curves = {name: curve for name, curve in read.items() if len(curve.step)}
     if not curves:
-        return Curves({}, f"No training curves: there are none in {folder} any more.")
+        return TrainingCurves({}, f"No training curves: there are none in {folder} any more.")
     if _of_another(curves, checkpoint):
-        return Curves({}, f"No training curves: those in {folder} are of another training.")
-    return Curves(curves)
+        return TrainingCurves({}, f"No training curves: those in {folder} are of another training.")
+    return TrainingCurves(curves)
 
 
-def _of_another(curves: Mapping[str, Curve], checkpoint: PolicyCheckpoint) -> bool:
+def _of_another(curves: Mapping[str, TrainingCurve], checkpoint: PolicyCheckpoint) -> bool:
     """Whether a later training wrote to the same logs: no step so late, or another error there."""
     if max(int(curve.step[-1]) for curve in curves.values()) < checkpoint.step:
         return True
@@ -57,11 +59,11 @@ def _of_another(curves: Mapping[str, Curve], checkpoint: PolicyCheckpoint) -> bo
     return not (len(there) and math.isclose(there[-1], error, rel_tol=1e-4))
 
 
-def _read(file: Path) -> Curve:
+def _read(file: Path) -> TrainingCurve:
     """The columns `step` and the file's own name; `ValueError` or `KeyError` on anything else."""
     rows = list(csv.DictReader(file.read_text(encoding="utf-8").splitlines(), delimiter="\t"))
     try:
-        return Curve(
+        return TrainingCurve(
             np.array([int(row["step"]) for row in rows], np.int64),
             np.array([float(row[file.stem]) for row in rows], np.float64),
         )

@@ -21,7 +21,7 @@ Frame = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
-class Footage:
+class EpisodeFrames:
     """Frames of one episode, or why there are none."""
 
     frames: Mapping[str, Sequence[Frame]]
@@ -43,13 +43,13 @@ def shown_ticks(store: FeatureStore, ticks: Ticks, count: int) -> Ticks:
     return among[np.linspace(0, len(among) - 1, count).round().astype(np.int64)]
 
 
-def footage(
+def read_episode_frames(
     store: FeatureStore,
     episode: Episode,
     vl_rows: Sequence[int],
     root: Path,
     digest_of: Callable[[Path], str] = file_digest,
-) -> Footage:
+) -> EpisodeFrames:
     """The frames of these store-global VL rows of one episode, ascending.
 
     A relative path of the store lies under `root`. No frame is handed out of a recording whose
@@ -58,22 +58,22 @@ def footage(
     """
     path = root / episode.path
     if not path.is_dir():
-        return Footage({}, f"No frames: there is no recording at {path} any more.")
+        return EpisodeFrames({}, f"No frames: there is no recording at {path} any more.")
     try:
-        recording = _same(store, episode, path, digest_of)
+        recording = _open_recording(store, episode, path, digest_of)
         if recording is None:
-            return Footage(
+            return EpisodeFrames(
                 {}, f"No frames: the recording at {path} changed since the store was made from it."
             )
         times = _frame_times(store, vl_rows)
         cameras = recording.cameras()
-        return Footage({view: _read(cameras, view, at) for view, at in times.items()})
+        return EpisodeFrames({view: _read(cameras, view, at) for view, at in times.items()})
     except (RecordingError, OSError) as error:
-        said = " ".join(str(error).split())
-        return Footage({}, f"No frames: the recording at {path} cannot be read ({said}).")
+        reason = " ".join(str(error).split())
+        return EpisodeFrames({}, f"No frames: the recording at {path} cannot be read ({reason}).")
 
 
-def _same(
+def _open_recording(
     store: FeatureStore, episode: Episode, path: Path, digest_of: Callable[[Path], str]
 ) -> Recording | None:
     """The episode's recording, with the views it was extracted with: all, or those of the store."""

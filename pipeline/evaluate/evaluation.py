@@ -1,4 +1,4 @@
-"""A policy judged, and what of, so that two judgements can be told to be of the same things."""
+"""A policy evaluated, and on what, so that two evaluations can be told to be of the same things."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -8,8 +8,8 @@ from typing import Any
 import torch
 
 from pipeline.base.config import EvaluateParams
-from pipeline.evaluate.ablation import ModalityStudy, judge_modalities
-from pipeline.evaluate.curves import Curves, read_curves
+from pipeline.evaluate.ablation import AblationStudy, evaluate_ablation
+from pipeline.evaluate.curves import TrainingCurves, read_curves
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.policy import Trainable
 from pipeline.store import FeatureStore
@@ -25,7 +25,7 @@ JUDGED = "judged.json"
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A policy that was judged, and all that is known of it."""
+    """A policy that was evaluated, and all that is known of it."""
 
     name: str
     """Of the checkpoint, as the user called it."""
@@ -33,15 +33,15 @@ class Evaluation:
     store: FeatureStore
     comparison: Comparison
     predictions: Predictions
-    study: ModalityStudy | None
+    study: AblationStudy | None
     judged: Mapping[str, Any]
     """`judged_document`."""
-    curves: Curves
+    curves: TrainingCurves
     recordings: Path
     """Below which a relative path of the store lies."""
 
 
-def judgement(
+def evaluate_checkpoint(
     folder: Path,
     checkpoint: PolicyCheckpoint,
     store: FeatureStore,
@@ -50,10 +50,10 @@ def judgement(
     recordings: Path,
     say: Callable[[str], None],
 ) -> Evaluation:
-    """The policy of the checkpoint in `folder`, judged on its held-out ticks of a store it fits.
+    """The policy of the checkpoint in `folder`, on its held-out ticks of a store it fits.
 
-    What is judged on what is said first. Raises `CheckpointMismatch` as `held_out_ticks` does, and
-    `NumericsError` as `predict`.
+    `say` is told first what is evaluated on what. Raises `CheckpointMismatch` as `held_out_ticks`
+    does, and `NumericsError` as `predict`.
     """
     checkpoint, renamed = named_as_in(store, checkpoint)
     if renamed:
@@ -78,7 +78,7 @@ def judgement(
     )
     study = None
     if wanted.modalities:
-        study = judge_modalities(
+        study = evaluate_ablation(
             checkpoint, policy, store, ticks, wanted.batch_size, wanted.samples, progress=True
         )
     return Evaluation(
@@ -101,7 +101,7 @@ def judged_document(
     samples: int,
     batch_size: int,
 ) -> dict[str, Any]:
-    """What was judged (`policy`), how it was sampled (`drawn`) and on what (`on`), as JSON.
+    """What was evaluated (`policy`), how it was sampled (`drawn`) and on what (`on`), as JSON.
 
     `on` is equal for all evaluations whose errors may stand in one table, whatever features the
     policies saw: which are better is a question to ask. `drawn` is equal for those

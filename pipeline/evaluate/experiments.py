@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import Any, get_args
 
 from pipeline.base.config import FusionStrategy, ModelType
+from pipeline.base.differences import describe, differences
 from pipeline.base.errors import ConfigError
+from pipeline.base.table import Table
 from pipeline.evaluate.evaluation import JUDGED
-from pipeline.evaluate.tables import ERRORS, OVERALL
-from pipeline.policy.checkpoint import describe, differences
+from pipeline.evaluate.names import with_unit
+from pipeline.evaluate.tables import ERRORS, HEADINGS, OVERALL
 from pipeline.train.log import speed_file
 from pipeline.train.predictions import BASELINES, METHODS
 from pipeline.train.scores import Group
@@ -21,23 +23,17 @@ from pipeline.train.scores import Group
 _OVERALL = (OVERALL, "training std")
 _SAME = 1e-4
 """Relative difference of two baselines that rounding on another machine explains."""
-
-
-@dataclass(frozen=True)
-class _Shared:
-    """What evaluations in one table share, and what to do where they do not."""
-
-    expected: str
-    remedy: str
-
-
-_SAME_TICKS = _Shared(
-    "evaluations on the same held-out ticks", "Evaluate all of them on the same recordings"
-)
-_SAMPLED_ALIKE = _Shared(
-    "evaluations of stochastic policies from as many samples and ticks a batch",
-    "Evaluate all of them with one evaluate.samples and evaluate.batch_size",
-)
+_SHARED = {
+    "on": (
+        "evaluations on the same held-out ticks",
+        "Evaluate all of them on the same recordings",
+    ),
+    "drawn": (
+        "evaluations of stochastic policies from as many samples and ticks a batch",
+        "Evaluate all of them with one evaluate.samples and evaluate.batch_size",
+    ),
+}
+"""By key of `JUDGED`: what evaluations in one table share, and what to do where they do not."""
 
 
 @dataclass(frozen=True)
@@ -54,11 +50,6 @@ class Experiment:
     """Name and unit of `OVERALL` and each action group -> error of the policy and each baseline."""
     training_s: float | None
     """Time that its training took; None where its speed file is not there."""
-
-    @staticmethod
-    def key(group: tuple[str, str]) -> str:
-        """A group of `errors` as one word of a file."""
-        return OVERALL if group == _OVERALL else Group(*group, ()).key
 
     @property
     def overall(self) -> Mapping[str, float]:
@@ -81,30 +72,102 @@ def read_experiments(reports: Path) -> tuple[Experiment, ...]:
     """The evaluations in the folders of `reports`, ordered by expert, fusion and name.
 
     What else lies there, such as the logs of a training, is passed over. Raises `ConfigError`
-    where there is none, where one lacks a file or cannot be read, where they were not judged on the
-    same ticks, and where stochastic policies were not sampled alike.
+    where there is none, where one lacks a file or cannot be read, where they were not evaluated on
+    the same ticks, and where stochastic policies were not sampled alike.
     """
-    folders = [path for path in sorted(reports.glob("*")) if _is_evaluation(path)]
+    folders = [
+        folder
+        for folder in sorted(reports.glob("*"))
+        if any((folder / name).exists() for name in (JUDGED, ERRORS))
+    ]
     if not folders:
         raise ConfigError(
             f"compare.reports: expected one folder for each experiment in {reports}, each with a "
             f"{JUDGED}, found none. Run stages.evaluate for each with its own evaluate.output "
             "there, or dvc repro experiments/dvc.yaml."
         )
-    judged = [_read(folder, JUDGED, "policy", "drawn", "on") for folder in folders]
-    named = [(folder.name, what) for folder, what in zip(folders, judged, strict=True)]
-    _check_same(reports, "on", named, _SAME_TICKS)
-    sampled = [(name, what) for name, what in named if what["drawn"] is not None]
-    _check_same(reports, "drawn", sampled, _SAMPLED_ALIKE)
-    found = [
-        _experiment(folder, what["policy"]) for folder, what in zip(folders, judged, strict=True)
+    documents = {folder: _read_document(folder) for folder in folders}
+    for key in _SHARED:
+        alike = {f.name: what[key] for f, what in documents.items() if what[key] is not None}
+        for (name, what), (other, other_what) in pairwise(alike.items()):
+            if differing := differences(what, other_what):
+                expected, remedy = _SHARED[key]
+                lines = [f"  {line} ({other})" for line in describe(differing, f" ({name}), ")]
+                raise ConfigError(
+                    "\n".join(
+                        (
+                            f"compare.reports: expected {expected} in {reports}, but they differ:",
+                            *lines,
+                            f"{remedy}, or move those that do not belong away.",
+                        )
+                    )
+                )
+    experiments = [_experiment(folder, what["policy"]) for folder, what in documents.items()]
+    for experiment, other in pairwise(experiments):
+        _check_baselines(reports, experiment, other)
+    return tuple(sorted(experiments, key=_order))
+
+
+def experiment_table(experiments: Sequence[Experiment], trained: bool = False) -> Table:
+    """An experiment a row, a baseline a row; mean absolute errors.
+
+    `samples` are the chunks a tick whose mean was evaluated; `trained` adds the time that each
+    training took.
+    """
+    groups = list(experiments[0].errors)
+    own = ["policy / best", "expert", "fusion", "samples", "parameters", "trained [s]"]
+    rows: list[list[Any]] = []
+    for experiment in experiments:
+        errors = (experiment.errors[group]["policy"] for group in groups)
+        kind = (experiment.model_type, experiment.fusion_strategy, experiment.samples)
+        seconds = None if experiment.training_s is None else round(experiment.training_s)
+        rows.append([experiment.name, *errors, experiment.relative, *kind, experiment.parameters])
+        rows[-1].append(seconds)
+    for method in BASELINES:
+        errors = (experiments[0].errors[group][method] for group in groups)
+        rows.append([f"baseline: {HEADINGS[method]}", *errors, None, "", "", None, None, None])
+    heads = ["experiment", *(with_unit(*group) for group in groups), *own]
+    stop = len(heads) if trained else -1
+    return Table(heads[:stop], [row[:stop] for row in rows])
+
+
+def experiment_csv(experiments: Sequence[Experiment]) -> Table:
+    """For a file, without the time of training: what the clock says is never tracked."""
+    errors = {
+        f"{_key(group)}_{method}": (group, method)
+        for group in experiments[0].errors
+        for method in METHODS
+    }
+    own = ("model_type", "fusion_strategy", "step", "parameters", "samples")
+    rows = [
+        [
+            experiment.name,
+            *(getattr(experiment, key) for key in own),
+            *(experiment.errors[group][method] for group, method in errors.values()),
+        ]
+        for experiment in experiments
     ]
-    for one, other in pairwise(found):
-        _check_baselines(reports, one, other)
-    return tuple(sorted(found, key=_order))
+    return Table(["experiment", *own, *errors], rows)
 
 
-def training_seconds(logs: Path) -> float | None:
+def _key(group: tuple[str, str]) -> str:
+    """A group of `errors` as one word of a file."""
+    return OVERALL if group == _OVERALL else Group(*group, ()).key
+
+
+def _experiment(folder: Path, policy: Mapping[str, Any]) -> Experiment:
+    try:
+        return Experiment(
+            name=folder.name,
+            errors=_read_errors(folder),
+            training_s=_training_seconds(Path(policy["logs"])),
+            **{key: value for key, value in policy.items() if key != "logs"},
+        )
+    except (KeyError, TypeError) as error:
+        raise _no_evaluation(folder, f"it lacks {error}") from None
+
+
+def _training_seconds(logs: Path) -> float | None:
     """What the speed file beside these logs says that the training took; None without it."""
     path = speed_file(logs)
     if not path.exists():
@@ -113,94 +176,65 @@ def training_seconds(logs: Path) -> float | None:
     return float(rows[-1]["trained_s"]) if rows and rows[-1].get("trained_s") else None
 
 
-def _is_evaluation(folder: Path) -> bool:
-    """Whether stages.evaluate wrote to it, even if one of its files is gone."""
-    return any((folder / name).exists() for name in (JUDGED, ERRORS))
-
-
-def _experiment(folder: Path, policy: Mapping[str, Any]) -> Experiment:
-    try:
-        return Experiment(
-            name=folder.name,
-            errors=_errors(folder),
-            training_s=training_seconds(Path(policy["logs"])),
-            **{key: value for key, value in policy.items() if key != "logs"},
-        )
-    except (KeyError, TypeError) as error:
-        raise ConfigError(_no_evaluation(folder, f"it lacks {error}")) from None
-
-
-def _errors(folder: Path) -> dict[tuple[str, str], dict[str, float]]:
+def _read_errors(folder: Path) -> dict[tuple[str, str], dict[str, float]]:
     """Of `OVERALL`, which comes first, and each action group, by method."""
-    rows = csv.DictReader(_text(folder, ERRORS).splitlines())
+    rows = csv.DictReader(_read_text(folder, ERRORS).splitlines())
     try:
         errors = {
             (row["group"], row["unit"]): {method: float(row[method]) for method in METHODS}
             for row in rows
         }
     except ValueError as error:
-        raise ConfigError(_no_evaluation(folder, f"{ERRORS} cannot be read: {error}")) from None
+        raise _no_evaluation(folder, f"{ERRORS} cannot be read: {error}") from None
     return {_OVERALL: errors.pop(_OVERALL), **errors}
 
 
-def _check_same(
-    reports: Path, key: str, judged: Sequence[tuple[str, Mapping[str, Any]]], same: _Shared
-) -> None:
-    for (one, what), (other, what_other) in pairwise(judged):
-        differing = differences(what[key], what_other[key])
-        if differing:
-            raise ConfigError(
-                f"compare.reports: expected {same.expected} in {reports}, but they differ:\n"
-                f"{describe(differing, one, other)}\n"
-                f"{same.remedy}, or move those that do not belong away."
-            )
-
-
-def _check_baselines(reports: Path, one: Experiment, other: Experiment) -> None:
-    for group, errors in one.errors.items():
+def _check_baselines(reports: Path, experiment: Experiment, other: Experiment) -> None:
+    for group, errors in experiment.errors.items():
         for method in BASELINES:
-            found = other.errors.get(group, {}).get(method, math.nan)
-            if not math.isclose(errors[method], found, rel_tol=_SAME, abs_tol=1e-9):
+            error = other.errors.get(group, {}).get(method, math.nan)
+            if not math.isclose(errors[method], error, rel_tol=_SAME, abs_tol=1e-9):
                 raise ConfigError(
                     f"compare.reports: expected the same baselines in all evaluations in "
-                    f"{reports}, found {method} ({one.key(group)}) {errors[method]} in {one.name} "
-                    f"and {found} in {other.name}: they were trained on other recordings. Train "
-                    "and evaluate all of them on one store, or move those that do not belong away."
+                    f"{reports}, found {method} ({_key(group)}) {errors[method]} in "
+                    f"{experiment.name} and {error} in {other.name}: they were trained on other "
+                    "recordings. Train and evaluate all of them on one store, or move those that "
+                    "do not belong away."
                 )
 
 
-def _read(folder: Path, name: str, *keys: str) -> dict[str, Any]:
-    text = _text(folder, name)
+def _read_document(folder: Path) -> dict[str, Any]:
+    text = _read_text(folder, JUDGED)
     try:
         document = json.loads(text)
     except ValueError as error:
-        raise ConfigError(_no_evaluation(folder, f"{name} is no JSON: {error}")) from None
-    lacking = [key for key in keys if key not in document]
-    if lacking:
-        raise ConfigError(_no_evaluation(folder, f"it lacks {lacking[0]!r} in {name}"))
+        raise _no_evaluation(folder, f"{JUDGED} is no JSON: {error}") from None
+    for key in ("policy", *_SHARED):
+        if key not in document:
+            raise _no_evaluation(folder, f"it lacks {key!r} in {JUDGED}")
     return document
 
 
-def _text(folder: Path, name: str) -> str:
+def _read_text(folder: Path, name: str) -> str:
     try:
         return (folder / name).read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise ConfigError(_no_evaluation(folder, f"it has no {name}")) from None
+        raise _no_evaluation(folder, f"it has no {name}") from None
 
 
-def _no_evaluation(folder: Path, why: str) -> str:
-    return (
+def _no_evaluation(folder: Path, why: str) -> ConfigError:
+    return ConfigError(
         f"compare.reports: expected the output of stages.evaluate in {folder}, but {why}. Evaluate "
         "that experiment again with this version, or move the folder away."
     )
 
 
 def _order(experiment: Experiment) -> tuple[int, int, str]:
-    places = [
-        names.index(name) if name in names else len(names)
-        for names, name in (
-            (get_args(ModelType), experiment.model_type),
-            (get_args(FusionStrategy), experiment.fusion_strategy),
-        )
-    ]
-    return places[0], places[1], experiment.name
+    """The order of params.yaml's choices, what is none of them last."""
+    experts, fusions = get_args(ModelType), get_args(FusionStrategy)
+    expert, fusion = experiment.model_type, experiment.fusion_strategy
+    return (
+        experts.index(expert) if expert in experts else len(experts),
+        fusions.index(fusion) if fusion in fusions else len(fusions),
+        experiment.name,
+    )

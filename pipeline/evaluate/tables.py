@@ -1,23 +1,22 @@
 """Scores -> what is printed, what DVC shows, what others plot."""
 
-from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 from pipeline.base.channels import named
 from pipeline.base.durable import write_document
-from pipeline.evaluate.ablation import ModalityStudy
-from pipeline.evaluate.ablation_tables import best_baseline, modality_rows, stream_rows
-from pipeline.evaluate.cells import aligned, cell, numbers, ratio, write_rows
-from pipeline.evaluate.names import with_unit
+from pipeline.base.table import Table
+from pipeline.evaluate.ablation import AblationStudy
+from pipeline.evaluate.names import rounded, with_unit
 from pipeline.store import FeatureStore
-from pipeline.train.predictions import METHODS, Predictions
+from pipeline.train.predictions import BASELINES, METHODS, Predictions
 from pipeline.train.scores import Comparison
 
 FOOTNOTE = (
     "repeat last: at an episode's first tick, which has none before it, it does nothing; where "
     "actions are absolute, it takes the mean training action"
 )
+ABLATION_FOOTNOTE = "zeroed: every value at its training mean, which the policy sees as zeros"
 METRICS = "metrics.json"
 ERRORS = "errors.csv"
 """The file with the errors of all methods, a line an action group and one `OVERALL`."""
@@ -39,35 +38,35 @@ def metrics(comparison: Comparison) -> dict[str, Any]:
     """
     document: dict[str, Any] = {
         "held_out": {"episodes": len(comparison.episodes), "ticks": comparison.ticks},
-        "overall": numbers(
+        "overall": rounded(
             {"policy": comparison.overall("policy"), "relative": comparison.relative()}
         ),
     }
     for group in comparison.groups:
-        document[group.key] = numbers(
-            {
-                "policy": comparison.group_mae("policy", group),
-                "relative": comparison.relative(group),
-            }
-        )
+        policy, relative = comparison.group_mae("policy", group), comparison.relative(group)
+        document[group.key] = rounded({"policy": policy, "relative": relative})
     return document
 
 
-def error_rows(comparison: Comparison) -> list[tuple[str, list[float], float | None]]:
-    """Mean absolute errors: what of, those of `METHODS`, and policy / best baseline.
+def best_baseline(comparison: Comparison) -> str:
+    """The baseline with the lowest overall error."""
+    return min(BASELINES, key=comparison.overall)
 
-    One for each action group, and the overall one last.
-    """
+
+def error_table(comparison: Comparison) -> Table:
+    """Mean absolute errors of policy and baselines, a row an action group, the overall one last."""
     rows = [
-        (
+        [
             with_unit(group.name, group.unit),
-            [comparison.group_mae(method, group) for method in METHODS],
+            *(comparison.group_mae(method, group) for method in METHODS),
             comparison.relative(group),
-        )
+        ]
         for group in comparison.groups
     ]
-    overall = [comparison.overall(method) for method in METHODS]
-    return [*rows, ("overall [training std]", overall, comparison.relative())]
+    overall = (comparison.overall(method) for method in METHODS)
+    rows.append(["overall [training std]", *overall, comparison.relative()])
+    heads = (HEADINGS[method] for method in METHODS)
+    return Table(["mean absolute error", *heads, "policy / best"], rows)
 
 
 def still_dimensions(comparison: Comparison) -> str:
@@ -79,7 +78,7 @@ def still_dimensions(comparison: Comparison) -> str:
     largest = max(still, key=lambda index: comparison.scale[index] / still[index])
     moving = comparison.without_still()
     relative, best = moving.relative(), HEADINGS[best_baseline(moving)]
-    beside = "" if relative is None else f", {ratio(relative)} times the best baseline's ({best})"
+    beside = "" if relative is None else f", {relative:.2f} times the best baseline's ({best})"
     return (
         f"hardly moving: {names} (training std at most {comparison.scale[largest]:.2g}, where "
         f"{still[largest]:.2g} is usual for such dimensions), {len(still)} of the "
@@ -88,17 +87,45 @@ def still_dimensions(comparison: Comparison) -> str:
     )
 
 
-def table(comparison: Comparison) -> str:
-    """Mean absolute errors of policy and baselines, a line a group and a footnote.
+def error_text(comparison: Comparison) -> str:
+    """`error_table` and its footnote as lines; below them the dimensions that hardly move."""
+    lines = [*error_table(comparison).text(), FOOTNOTE, still_dimensions(comparison)]
+    return "\n".join(lines).rstrip("\n")
 
-    Below them, where there are any, the dimensions that hardly move.
+
+def ablation_table(study: AblationStudy) -> Table:
+    """Each way to ablate a stream, between intact and best baseline.
+
+    Two words, the errors of each group and the overall one, and the latter's multiple of intact.
     """
-    lines = [["mean absolute error", *(HEADINGS[method] for method in METHODS), "policy / best"]]
-    lines += [
-        [name, *(f"{error:.4g}" for error in errors), ratio(relative)]
-        for name, errors, relative in error_rows(comparison)
-    ]
-    return "\n".join([*aligned(lines), FOOTNOTE, still_dimensions(comparison)]).rstrip("\n")
+    groups = study.intact.varying_groups()
+
+    def row(stream: str, how: str, comparison: Comparison, method: str = "policy") -> list[Any]:
+        overall, intact = comparison.overall(method), study.intact.overall("policy")
+        errors = (comparison.group_mae(method, group) for group in groups)
+        return [stream, how, *errors, overall, overall / intact if intact > 0 else None]
+
+    best = best_baseline(study.intact)
+    rows = [row("all", "intact", study.intact)]
+    rows += [row(ablated.stream, ablated.how, ablated.comparison) for ablated in study.ablated]
+    rows.append(row("none", best.replace("_", " "), study.intact, best))
+    names = (with_unit(group.name, group.unit) for group in groups)
+    heads = ["stream", "policy sees it", *names, "overall [training std]", "times intact"]
+    return Table(heads, rows, caption=ABLATION_FOOTNOTE, strong=frozenset({0}))
+
+
+def ablation_text(study: AblationStudy) -> str:
+    """`ablation_table` as lines; below them what `zeroed` means, and what was not evaluated."""
+    lines = [f"{evaluated_on(study)}:", *ablation_table(study).text()]
+    return "\n".join([*lines, ABLATION_FOOTNOTE, *study.notes])
+
+
+def evaluated_on(study: AblationStudy) -> str:
+    """What a table of this study says above it."""
+    return (
+        f"mean absolute error on {study.intact.ticks} held-out ticks, {study.samples} chunk(s) a "
+        "tick, one stream ablated each"
+    )
 
 
 def write_tables(
@@ -106,95 +133,126 @@ def write_tables(
     comparison: Comparison,
     predictions: Predictions,
     store: FeatureStore,
-    study: ModalityStudy | None = None,
+    study: AblationStudy | None = None,
 ) -> list[Path]:
     """Write metrics.json and one CSV each of all errors, by dimension, horizon, episode and tick.
 
-    And two by spoilt stream, which have headings alone without a `study`: `dvc plots` would miss
+    And two by ablated stream, which have headings alone without a `study`: `dvc plots` would miss
     the file, and one of an evaluation before would stay. steps.csv and streams.csv have one line a
     point, as `dvc plots` takes them; the rest is for others.
     """
     files = {
-        ERRORS: _error_rows(comparison),
-        "dimensions.csv": _dimension_rows(comparison),
-        "horizon.csv": _horizon_rows(comparison),
-        "steps.csv": _step_rows(comparison),
-        "episodes.csv": _episode_rows(comparison, store),
-        "predictions.csv": _prediction_rows(comparison, predictions, store),
-        "modalities.csv": modality_rows(study),
-        "streams.csv": stream_rows(study),
+        ERRORS: _errors(comparison),
+        "dimensions.csv": _dimensions(comparison),
+        "horizon.csv": _horizon(comparison),
+        "steps.csv": _steps(comparison),
+        "episodes.csv": _episodes(comparison, store),
+        "predictions.csv": _predictions(comparison, predictions, store),
+        "modalities.csv": _ablation_errors(study),
+        "streams.csv": _streams(study),
     }
     write_document(folder / METRICS, metrics(comparison))
-    return [
-        folder / METRICS,
-        *(write_rows(folder / name, rows) for name, rows in files.items()),
-    ]
+    return [folder / METRICS, *(files[name].write_csv(folder / name) for name in files)]
 
 
-def _error_rows(comparison: Comparison) -> Iterable[Sequence[object]]:
-    yield ["group", "unit", *METHODS, "policy_rmse"]
-    for group in comparison.groups:
-        errors = (comparison.group_mae(method, group) for method in METHODS)
-        rmse = comparison.group_rmse("policy", group)
-        yield [group.name, group.unit, *map(cell, errors), cell(rmse)]
-    yield [OVERALL, "training std", *(cell(comparison.overall(method)) for method in METHODS), ""]
-
-
-def _dimension_rows(comparison: Comparison) -> Iterable[Sequence[object]]:
-    yield ["dimension", "unit", *(f"{m}_mae" for m in METHODS), *(f"{m}_rmse" for m in METHODS)]
-    for index, (name, unit) in enumerate(zip(comparison.names, comparison.units, strict=True)):
-        yield [
-            name,
-            unit,
-            *(cell(comparison.scores[method].mae[index]) for method in METHODS),
-            *(cell(comparison.scores[method].rmse[index]) for method in METHODS),
+def _errors(comparison: Comparison) -> Table:
+    rows: list[list[Any]] = [
+        [
+            *(group.name, group.unit),
+            *(comparison.group_mae(method, group) for method in METHODS),
+            comparison.group_rmse("policy", group),
         ]
+        for group in comparison.groups
+    ]
+    overall = (comparison.overall(method) for method in METHODS)
+    rows.append([OVERALL, "training std", *overall, None])
+    return Table(["group", "unit", *METHODS, "policy_rmse"], rows)
 
 
-def _horizon_rows(comparison: Comparison) -> Iterable[Sequence[object]]:
-    yield ["steps_ahead", "dimension", "unit", *METHODS, *(f"{m}_rmse" for m in METHODS)]
-    for step in range(len(comparison.scores["policy"].mae_horizon)):
-        for index, (name, unit) in enumerate(zip(comparison.names, comparison.units, strict=True)):
-            scores = [comparison.scores[method] for method in METHODS]
-            yield [
-                step,
-                name,
-                unit,
-                *(cell(score.mae_horizon[step, index]) for score in scores),
-                *(cell(score.rmse_horizon[step, index]) for score in scores),
-            ]
+def _dimensions(comparison: Comparison) -> Table:
+    scores = [comparison.scores[method] for method in METHODS]
+    rows = [
+        [
+            *(name, unit),
+            *(score.mae[index] for score in scores),
+            *(score.rmse[index] for score in scores),
+        ]
+        for index, (name, unit) in enumerate(zip(comparison.names, comparison.units, strict=True))
+    ]
+    errors = (f"{method}_{error}" for error in ("mae", "rmse") for method in METHODS)
+    return Table(["dimension", "unit", *errors], rows)
 
 
-def _step_rows(comparison: Comparison) -> Iterable[Sequence[object]]:
+def _horizon(comparison: Comparison) -> Table:
+    scores = [comparison.scores[method] for method in METHODS]
+    rows = [
+        [
+            *(step, name, unit),
+            *(score.mae_horizon[step, index] for score in scores),
+            *(score.rmse_horizon[step, index] for score in scores),
+        ]
+        for step in range(len(scores[0].mae_horizon))
+        for index, (name, unit) in enumerate(zip(comparison.names, comparison.units, strict=True))
+    ]
+    rmse = (f"{method}_rmse" for method in METHODS)
+    return Table(["steps_ahead", "dimension", "unit", *METHODS, *rmse], rows)
+
+
+def _steps(comparison: Comparison) -> Table:
     """The overall error [training std] by steps ahead."""
-    yield ["steps_ahead", *METHODS]
     scores = [comparison.scores[method].mae_horizon for method in METHODS]
     errors = [comparison.in_training_std(score).mean(axis=-1).tolist() for score in scores]
-    for step, values in enumerate(zip(*errors, strict=True)):
-        yield [step, *map(cell, values)]
+    rows = [[step, *values] for step, values in enumerate(zip(*errors, strict=True))]
+    return Table(["steps_ahead", *METHODS], rows)
 
 
-def _episode_rows(comparison: Comparison, store: FeatureStore) -> Iterable[Sequence[object]]:
-    yield ["source", "episode", "group", "unit", *METHODS]
-    for place, index in enumerate(comparison.episodes):
-        episode = store.episodes[index]
-        for group in comparison.groups:
-            errors = [float(group.mean(comparison.scores[m].mae_episode[place])) for m in METHODS]
-            yield [episode.source, episode.id, group.name, group.unit, *map(cell, errors)]
+def _episodes(comparison: Comparison, store: FeatureStore) -> Table:
+    rows = [
+        [
+            *(store.episodes[index].source, store.episodes[index].id, group.name, group.unit),
+            *(group.mean(comparison.scores[method].mae_episode[place]) for method in METHODS),
+        ]
+        for place, index in enumerate(comparison.episodes)
+        for group in comparison.groups
+    ]
+    return Table(["source", "episode", "group", "unit", *METHODS], rows)
 
 
-def _prediction_rows(
-    comparison: Comparison, predictions: Predictions, store: FeatureStore
-) -> Iterable[Sequence[object]]:
-    columns = [f"{name}_{what}" for name in comparison.names for what in ("recorded", "predicted")]
-    yield ["source", "episode", "time_s", *columns]
+def _predictions(comparison: Comparison, predictions: Predictions, store: FeatureStore) -> Table:
+    rows: list[list[Any]] = []
     time_s = store.array("tick/time")[predictions.ticks]
     for place, index in enumerate(predictions.episodes):
         episode = store.episodes[index]
         pairs = zip(predictions.recorded[place, 0], predictions.predicted[place, 0], strict=True)
-        yield [
-            episode.source,
-            episode.id,
-            f"{time_s[place]:.3f}",
-            *(cell(value) for pair in pairs for value in pair),
-        ]
+        values = (value for pair in pairs for value in pair)
+        rows.append([episode.source, episode.id, f"{time_s[place]:.3f}", *values])
+    columns = (f"{name}_{what}" for name in comparison.names for what in ("recorded", "predicted"))
+    return Table(["source", "episode", "time_s", *columns], rows)
+
+
+def _ablation_errors(study: AblationStudy | None) -> Table:
+    """Error by stream, way to ablate it, and action group."""
+    rows: list[list[Any]] = []
+    if study is not None:
+        best = best_baseline(study.intact)
+        for ablated in study.ablated:
+            named = (ablated.stream, ablated.how)
+            compared = [(ablated.comparison, "policy"), (study.intact, "policy")]
+            compared.append((study.intact, best))
+            for group in study.intact.groups:
+                errors = (comparison.group_mae(method, group) for comparison, method in compared)
+                rows.append([*named, group.name, group.unit, *errors])
+            overall = (comparison.overall(method) for comparison, method in compared)
+            rows.append([*named, OVERALL, "training std", *overall])
+    errors = ("error", "intact_error", "best_baseline_error")
+    return Table(["stream", "how", "group", "unit", *errors], rows)
+
+
+def _streams(study: AblationStudy | None) -> Table:
+    """The overall error by way to ablate a stream, and what of the intact."""
+    rows: list[list[Any]] = []
+    if study is not None:
+        for ablated in study.ablated:
+            errors = (study.times_intact(ablated), ablated.comparison.overall("policy"))
+            rows.append([f"{ablated.stream} {ablated.how}", *errors])
+    return Table(["spoilt", "times_intact", "overall_error"], rows)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pipeline.base.errors import NumericsError
 from pipeline.extract.batch_size import BatchSize
 from pipeline.extract.rows import ReadyRow
-from pipeline.vlm.preparation import Layout
+from pipeline.vlm.preparation import TokenLayout
 from pipeline.vlm.qwen import FrozenVLM, Pending
 
 Encoded = tuple[list[ReadyRow], NDArray[Any]]
@@ -79,7 +79,7 @@ class Encoder:
 
         So that waiting rows stay few, the largest group goes when many shapes wait.
         """
-        waiting: dict[Layout, list[ReadyRow]] = defaultdict(list)
+        waiting: dict[TokenLayout, list[ReadyRow]] = defaultdict(list)
         for row in rows:
             layout = row.variants[0].layout
             waiting[layout].append(row)

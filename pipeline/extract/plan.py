@@ -5,12 +5,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from pipeline.base.config import DataParams, Params
+from pipeline.base.differences import describe, differences
 from pipeline.base.format import duration, size
 from pipeline.extract.check import CheckedEpisode
 from pipeline.extract.survey import Survey
 from pipeline.store import FEATURES, RowSource
 from pipeline.store.schema import ArraySpec
-from pipeline.vlm.feature_spec import differences
 
 _MOST_DIFFERENCES = 6
 """Lines on how a feature spec changed."""
@@ -98,7 +98,7 @@ def reasons(
 
 def spec_differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     """What differs between two feature specs, without all that follows from it."""
-    lines = differences(before, now)
+    lines = describe(differences(before, now))
     follow = [line for line in lines if line.startswith(("slots", "example_prompt"))]
     first = [line for line in lines if line not in follow] or follow
     left = len(lines) - len(first[:_MOST_DIFFERENCES])

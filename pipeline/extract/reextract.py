@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from pipeline.base.config import Params
+from pipeline.base.differences import describe, differences
 from pipeline.base.digests import ContentDigests
 from pipeline.base.errors import StoreMismatch
 from pipeline.data import Recording
@@ -22,7 +23,6 @@ from pipeline.extract.survey import Survey, survey
 from pipeline.store import FEATURES, FeatureStore
 from pipeline.store.integrity.findings import capped
 from pipeline.store.reader import Episode
-from pipeline.vlm.feature_spec import differences
 from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.qwen import FrozenVLM
 
@@ -150,7 +150,7 @@ def reextract(path: Path, params: Params, say: Callable[[str], None]) -> Reextra
 def _refuse_other_spec(store: FeatureStore, surveyed: Survey) -> None:
     if store.spec["digest"] == surveyed.spec.digest:
         return
-    lines = [f"  {line}" for line in differences(store.spec, surveyed.spec.attrs())]
+    lines = [f"  {line}" for line in describe(differences(store.spec, surveyed.spec.attrs()))]
     raise StoreMismatch(
         "\n".join(
             [
@@ -232,5 +232,5 @@ def _environment_differences(
         start, stop = noted["rows"]
         if ((rows >= start) & (rows < stop)).any():
             then = {name: value for name, value in noted.items() if name != "rows"}
-            lines += differences(then, today)
+            lines += describe(differences(then, today))
     return sorted(set(lines))

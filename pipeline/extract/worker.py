@@ -17,6 +17,7 @@ import torch
 from distributed import Worker, WorkerPlugin, get_worker
 from numpy.typing import NDArray
 
+from pipeline.base.differences import describe, differences
 from pipeline.base.digests import file_digest
 from pipeline.base.errors import ConfigError, NumericsError, StoreIncomplete
 from pipeline.data import CameraStream
@@ -26,7 +27,7 @@ from pipeline.extract.job import Came, Job, Outcome, Piece, WrittenRows
 from pipeline.extract.rows import KnownRow, ReadyRow, RowPreparation
 from pipeline.store import RowSource, StoreBuild, part_path, read_plan
 from pipeline.store.schema import read_specs
-from pipeline.vlm.feature_spec import differences, feature_spec
+from pipeline.vlm.feature_spec import feature_spec
 from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.qwen import FrozenVLM
 
@@ -207,7 +208,7 @@ def check_place(job: Job) -> None:
         vlm, dtype = job.params.vlm, job.params.extract.dtype
         found = feature_spec(vlm, dtype, job.spec.views, file_digest)
         if found.digest != job.spec.digest:
-            lines = "; ".join(differences(found.attrs(), job.spec.attrs()))
+            lines = "; ".join(describe(differences(found.attrs(), job.spec.attrs())))
             raise ConfigError(
                 f"the worker on {host} would compute other features than the coordinator asks "
                 f"for: {lines}. Give it the same checkpoint and the same version of this package."

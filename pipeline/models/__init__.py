@@ -7,13 +7,13 @@ bring a vision-language model, and training from a store needs none.
 from importlib import import_module
 from typing import Any
 
+from pipeline.base.observation import Observation
 from pipeline.policy.cost import describe_cost, flop_table
 from pipeline.policy.denoiser import Denoiser
 from pipeline.policy.diffusion import DiffusionActionExpert
 from pipeline.policy.expert import ActionExpert, GroupedLoss
 from pipeline.policy.feature_encoder import FeatureEncoder
 from pipeline.policy.flow_matching import FlowMatchingActionExpert
-from pipeline.policy.force_encoder import ForceAwareSensorEncoder
 from pipeline.policy.fusion import (
     ConcatFusion,
     CrossAttentionFusion,
@@ -23,11 +23,10 @@ from pipeline.policy.fusion import (
     build_fusion,
 )
 from pipeline.policy.noise_schedule import NoiseSchedule
-from pipeline.policy.normalizer import Normalizer
-from pipeline.policy.observation import Observation, PolicyShape, action_groups
-from pipeline.policy.policy import Policy, Trainable
+from pipeline.policy.observation import PolicyShape, action_groups
+from pipeline.policy.policy import Normalizer, Policy, Trainable
 from pipeline.policy.regression import RegressionActionExpert
-from pipeline.policy.sensor_encoder import SensorEncoder
+from pipeline.policy.sensor_encoder import ForceAwareSensorEncoder, SensorEncoder
 from pipeline.policy.state_encoder import RobotStateEncoder
 
 _LIVE = {

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from pipeline.base.errors import ConfigError
+from pipeline.policy.tensors import Context, TokenMask
 
 Projected = tuple[
     Float[Tensor, "batch head source head_dim"], Float[Tensor, "batch head source head_dim"]
@@ -35,13 +36,13 @@ class Attention(nn.Module):
     def forward(
         self,
         queries: Float[Tensor, "batch query dim"],
-        source: Float[Tensor, "batch token dim"],
-        valid: Bool[Tensor, "batch token"] | None = None,
+        source: Context,
+        valid: TokenMask | None = None,
     ) -> Float[Tensor, "batch query dim"]:
         """What each query takes from the valid tokens, of which each row must have one."""
         return self.attend(queries, self.project(source), valid)
 
-    def project(self, source: Float[Tensor, "batch token dim"]) -> Projected:
+    def project(self, source: Context) -> Projected:
         """Keys and values, for a source that is attended to more than once."""
         key, value = self.key_value(source).chunk(2, dim=-1)
         return self._split(key), self._split(value)
@@ -50,7 +51,7 @@ class Attention(nn.Module):
         self,
         queries: Float[Tensor, "batch query dim"],
         projected: Projected,
-        valid: Bool[Tensor, "batch token"] | None = None,
+        valid: TokenMask | None = None,
     ) -> Float[Tensor, "batch query dim"]:
         """The same from keys and values of `project`."""
         mask = None if valid is None else valid[:, None, None, :]
@@ -83,11 +84,11 @@ class TransformerLayer(nn.Module):
 
     def forward(
         self,
-        tokens: Float[Tensor, "batch token dim"],
-        valid: Bool[Tensor, "batch token"] | None = None,
+        tokens: Context,
+        valid: TokenMask | None = None,
         context: Float[Tensor, "batch source dim"] | Projected | None = None,
         modulation: Float[Tensor, "batch 6 dim"] | None = None,
-    ) -> Float[Tensor, "batch token dim"]:
+    ) -> Context:
         """The tokens after one layer; tokens that are not valid are never attended to.
 
         `context` may come as this layer's `project` of it, where many forward passes share it.
@@ -131,9 +132,7 @@ def learned(*shape: int) -> nn.Parameter:
     return nn.Parameter(torch.randn(*shape) * 0.02)
 
 
-def masked_mean(
-    tokens: Float[Tensor, "batch token dim"], valid: Bool[Tensor, "batch token"]
-) -> Float[Tensor, "batch dim"]:
+def masked_mean(tokens: Context, valid: TokenMask) -> Float[Tensor, "batch dim"]:
     """The float32 mean of each row's valid tokens, 0 where it has none."""
     weight = valid.unsqueeze(-1)
     total = tokens.float().masked_fill(~weight, 0.0).sum(dim=1)

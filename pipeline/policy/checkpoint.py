@@ -8,13 +8,15 @@ A kill at any instant leaves the previous checkpoint or the new one.
 
 import json
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.base.config import TrainHeadParams
+from pipeline.base.differences import Differences, differences
 from pipeline.base.durable import (
     DIGEST,
     check_digest,
@@ -92,9 +94,7 @@ class PolicyCheckpoint:
 
 
 def save_policy(
-    folder: Path,
-    checkpoint: PolicyCheckpoint,
-    beside: Callable[[Path], None] = lambda folder: None,
+    folder: Path, checkpoint: PolicyCheckpoint, beside: Callable[[Path], None] = lambda folder: None
 ) -> None:
     """Put a checkpoint at `folder`, in place of an older one there, atomically.
 
@@ -134,8 +134,7 @@ def load_policy(folder: Path) -> PolicyCheckpoint:
     """
     from pipeline.policy.observation import PolicyShape
 
-    document = _described(folder)
-    try:
+    with _description(folder) as document:
         return PolicyCheckpoint(
             params=_params(document),
             shape=PolicyShape.from_document(document["shape"]),
@@ -150,10 +149,6 @@ def load_policy(folder: Path) -> PolicyCheckpoint:
             metrics=document["metrics"],
             weights=read_tensors(folder / WEIGHTS, document["weights_sha256"]),
         )
-    except PipelineError:
-        raise
-    except (KeyError, TypeError, AttributeError, ValueError) as error:
-        raise _strange(folder, error) from None
 
 
 def check_policy(folder: Path) -> TrainHeadParams:
@@ -161,27 +156,33 @@ def check_policy(folder: Path) -> TrainHeadParams:
 
     Raises `CheckpointIncomplete` and `CheckpointMismatch` as `load_policy`.
     """
-    document = _described(folder)
-    try:
+    with _description(folder) as document:
         check_digest(folder / WEIGHTS, document["weights_sha256"])
         Normalization.from_document(document["normalization"])
         return _params(document)
+
+
+@contextmanager
+def _description(folder: Path) -> Generator[dict[str, Any]]:
+    """The document of a checkpoint; what it lacks where it is read is `CheckpointIncomplete`."""
+    path = folder / DOCUMENT
+    document, has_digest = read_with_digest(path)
+    if not has_digest:
+        _note_without_digest(path)
+    if document.get("format") != FORMAT:
+        raise CheckpointMismatch(
+            f"{path}: expected format {FORMAT}, found {document.get('format')!r}. "
+            "Train it again with this version."
+        )
+    try:
+        yield document
     except PipelineError:
         raise
     except (KeyError, TypeError, AttributeError, ValueError) as error:
-        raise _strange(folder, error) from None
-
-
-def _described(folder: Path) -> dict[str, Any]:
-    document, has_digest = read_with_digest(folder / DOCUMENT)
-    if not has_digest:
-        _note_without_digest(folder / DOCUMENT)
-    if document.get("format") != FORMAT:
-        raise CheckpointMismatch(
-            f"{folder / DOCUMENT}: expected format {FORMAT}, found {document.get('format')!r}. "
-            "Train it again with this version."
-        )
-    return document
+        raise CheckpointIncomplete(
+            f"{path}: not what a checkpoint's description must be ({type(error).__name__}: "
+            f"{error}). Train it again."
+        ) from None
 
 
 def _params(document: Mapping[str, Any]) -> TrainHeadParams:
@@ -190,13 +191,6 @@ def _params(document: Mapping[str, Any]) -> TrainHeadParams:
     if said.get("feed") == "compressed":
         del said["feed"]
     return TrainHeadParams.model_validate_json(json.dumps(said))
-
-
-def _strange(folder: Path, error: Exception) -> CheckpointIncomplete:
-    return CheckpointIncomplete(
-        f"{folder / DOCUMENT}: not what a checkpoint's description must be "
-        f"({type(error).__name__}: {error}). Train it again."
-    )
 
 
 @cache
@@ -209,56 +203,7 @@ def _note_without_digest(path: Path) -> None:
     )
 
 
-def differences(expected: Any, found: Any, place: str = "") -> dict[str, tuple[Any, Any]]:
-    """Where two JSON documents differ: dotted place -> (expected, found); None where absent."""
-    if isinstance(expected, Mapping) and isinstance(found, Mapping):
-        return {
-            where: pair
-            for key in [*expected, *(key for key in found if key not in expected)]
-            for where, pair in differences(
-                expected.get(key), found.get(key), f"{place}.{key}" if place else str(key)
-            ).items()
-        }
-    if isinstance(expected, tuple):
-        expected = list(expected)
-    if isinstance(found, tuple):
-        found = list(found)
-    return {} if expected == found else {place: (expected, found)}
-
-
-def describe(differing: Mapping[str, tuple[Any, Any]], expected: str, found: str) -> str:
-    """One indented line for each of `differences`, long values cut."""
-    return "\n".join(
-        f"  {place}: {_short(a)} ({expected}), {_short(b)} ({found})"
-        for place, (a, b) in differing.items()
-    )
-
-
-def source_differences(
-    expected: Mapping[str, Any], found: Mapping[str, Any]
-) -> dict[str, tuple[Any, Any]]:
-    """`differences` of what a checkpoint's store was and another store is.
-
-    Two feature specs of one digest are the same; of two digests, the entries that differ are
-    named, and the digest only where they all agree.
-    """
-    differing = {}
-    for key in SOURCE_KEYS:
-        a, b = expected[key], found[key]
-        if key == "feature_spec":
-            if a.get("digest") == b.get("digest"):
-                continue
-            entries = differences(_without_digest(a), _without_digest(b), key)
-            differing |= entries or differences(a, b, key)
-        else:
-            differing |= differences(a, b, key)
-    return differing
-
-
-def _without_digest(spec: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in spec.items() if key != "digest"}
-
-
-def _short(value: Any) -> str:
-    text = json.dumps(value, ensure_ascii=False)
-    return text if len(text) <= 80 else f"{text[:50]} … {text[-25:]}"
+def source_differences(expected: Mapping[str, Any], actual: Mapping[str, Any]) -> Differences:
+    """Where what a checkpoint's store was and what another store is differ."""
+    first, second = ({key: source[key] for key in SOURCE_KEYS} for source in (expected, actual))
+    return differences(first, second)

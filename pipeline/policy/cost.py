@@ -5,11 +5,10 @@ from copy import deepcopy
 from functools import partial
 
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
-from pipeline.policy.live_observation import Seen, observation_of
 from pipeline.policy.observation import stream_validity
 from pipeline.policy.policy import Policy
 
@@ -23,7 +22,13 @@ def flop_table(policy: Policy) -> list[tuple[str, int]]:
     """
     # A frozen copy: the counter hooks every module, and views of what learns upset its hooks.
     frozen = deepcopy(policy).requires_grad_(False).eval()
-    blank = _blank(frozen)
+    params, shape = frozen.params, frozen.shape
+    sizes = {
+        "features": (shape.slots, shape.feature_dim),
+        "sensor": (params.sensor_window, shape.sensor_channels),
+        "state": (params.state_window, shape.state_dim),
+    }
+    blank = frozen.observe({name: torch.zeros(1, *size) for name, size in sizes.items()})
     encoded: dict[str, Tensor] = {}
     table: list[tuple[str, int]] = []
 
@@ -38,7 +43,7 @@ def flop_table(policy: Policy) -> list[tuple[str, int]]:
         valid = stream_validity(blank, name)
         encoded[name] = count(name, partial(frozen.encode, name, blank, valid))
     context = count("fusion", partial(frozen.fusion, encoded))
-    generator = torch.Generator(context.device).manual_seed(0)
+    generator = Generator(context.device).manual_seed(0)
     count("expert", partial(frozen.expert.act, context, generator))
     return table
 
@@ -46,26 +51,9 @@ def flop_table(policy: Policy) -> list[tuple[str, int]]:
 def describe_cost(policy: Policy) -> list[str]:
     """Two lines for the user: parameters, and FLOPs of one `act` at one tick, by part."""
     parameters, flops = policy.parameter_table(), flop_table(policy)
+    counts = ", ".join(f"{name} {count:,}" for name, count in parameters)
+    costs = ", ".join(f"{name} {count / 1e6:,.1f}" for name, count in flops)
     return [
-        f"parameters: {sum(count for _, count in parameters):,} ("
-        + ", ".join(f"{name} {count:,}" for name, count in parameters)
-        + ")",
-        f"one act: {_mega(sum(count for _, count in flops))} MFLOP a tick ("
-        + ", ".join(f"{name} {_mega(count)}" for name, count in flops)
-        + ")",
+        f"parameters: {sum(count for _, count in parameters):,} ({counts})",
+        f"one act: {sum(count for _, count in flops) / 1e6:,.1f} MFLOP a tick ({costs})",
     ]
-
-
-def _mega(count: int) -> str:
-    return f"{count / 1e6:,.1f}"
-
-
-def _blank(policy: Policy) -> Seen:
-    """One observation of zeros that are all real."""
-    params, shape = policy.params, policy.shape
-    sizes = {
-        "features": (shape.slots, shape.feature_dim),
-        "sensor": (params.sensor_window, shape.sensor_channels),
-        "state": (params.state_window, shape.state_dim),
-    }
-    return observation_of(policy, {name: torch.zeros(1, *size) for name, size in sizes.items()})

@@ -5,10 +5,11 @@ from collections.abc import Sequence
 from typing import cast
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from pipeline.policy.attention import Projected, TransformerLayer, learned
+from pipeline.policy.tensors import Chunk, Context, StepMask
 
 FREQUENCIES = 64
 """Pairs of sine and cosine that a time is written in."""
@@ -49,11 +50,11 @@ class Denoiser(nn.Module):
 
     def forward(
         self,
-        noisy: Float[Tensor, "batch horizon action"],
+        noisy: Chunk,
         time: Float[Tensor, " batch"],
-        context: Float[Tensor, "batch token dim"] | Sequence[Projected],
-        valid: Bool[Tensor, "batch horizon"] | None = None,
-    ) -> Float[Tensor, "batch horizon action"]:
+        context: Context | Sequence[Projected],
+        valid: StepMask | None = None,
+    ) -> Chunk:
         """The float32 prediction for every step of the chunk; times are in [0, 1].
 
         `context` may be prepared, see `prepare`.
@@ -71,7 +72,7 @@ class Denoiser(nn.Module):
         shift, scale = last.unsqueeze(2).unbind(1)
         return self.head(self.norm(tokens) * (1 + scale) + shift).float()
 
-    def prepare(self, context: Float[Tensor, "batch token dim"]) -> Sequence[Projected]:
+    def prepare(self, context: Context) -> Sequence[Projected]:
         """The context as every layer attends to it, for a sampler that asks many times."""
         return [cast(TransformerLayer, layer).project(context) for layer in self.layers]
 

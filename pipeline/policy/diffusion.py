@@ -5,13 +5,13 @@ from itertools import pairwise
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float
-from torch import Tensor
+from torch import Generator
 
 from pipeline.policy.attention import Projected
 from pipeline.policy.denoiser import Denoiser
 from pipeline.policy.expert import ActionExpert, standard_normal, uniform
 from pipeline.policy.noise_schedule import NoiseSchedule, Prediction, ScheduleKind
+from pipeline.policy.tensors import Chunk, Context, Losses, StepMask
 
 
 class DiffusionActionExpert(ActionExpert):
@@ -55,12 +55,8 @@ class DiffusionActionExpert(ActionExpert):
         )  # fmt: skip
 
     def loss(
-        self,
-        context: Float[Tensor, "batch token dim"],
-        actions: Float[Tensor, "batch horizon action"],
-        valid: Bool[Tensor, "batch horizon"],
-        generator: torch.Generator | None = None,
-    ) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
+        self, context: Context, actions: Chunk, valid: StepMask, generator: Generator | None = None
+    ) -> Losses:
         """The grouped squared error of the prediction at a uniform step of the schedule."""
         sample = actions.float().masked_fill(~valid.unsqueeze(-1), 0.0)
         epsilon = standard_normal(sample.shape, sample.device, generator)
@@ -72,9 +68,7 @@ class DiffusionActionExpert(ActionExpert):
         return self.grouped(predicted, target, valid)
 
     @torch.no_grad()
-    def act(
-        self, context: Float[Tensor, "batch token dim"], generator: torch.Generator | None = None
-    ) -> Float[Tensor, "batch horizon action"]:
+    def act(self, context: Context, generator: Generator | None = None) -> Chunk:
         """A chunk drawn by the sampler, float32; from noise, the context and the generator."""
         shape = (len(context), self.horizon, self.action_dim)
         chunk = standard_normal(shape, context.device, generator)
@@ -90,12 +84,7 @@ class DiffusionActionExpert(ActionExpert):
                 chunk = chunk + variance.sqrt() * noise
         return chunk
 
-    def clean(
-        self,
-        noisy: Float[Tensor, "batch horizon action"],
-        step: int,
-        context: Float[Tensor, "batch token dim"] | Sequence[Projected],
-    ) -> Float[Tensor, "batch horizon action"]:
+    def clean(self, noisy: Chunk, step: int, context: Context | Sequence[Projected]) -> Chunk:
         """The clean chunk that the network sees in a noisy one at this step, clipped."""
         time = noisy.new_full((len(noisy),), step / self.schedule.timesteps)
         predicted = self.denoiser(noisy, time, context)

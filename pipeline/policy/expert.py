@@ -5,11 +5,12 @@ from collections.abc import Mapping, Sequence
 from typing import ClassVar, Literal
 
 import torch
-from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from jaxtyping import Float
+from torch import Generator, Tensor, nn
 from torch.nn import functional as F
 
 from pipeline.base.errors import ConfigError
+from pipeline.policy.tensors import Chunk, Context, Losses, StepMask
 
 ErrorKind = Literal["smooth_l1", "mse"]
 
@@ -41,18 +42,12 @@ class ActionExpert(nn.Module, ABC):
 
     @abstractmethod
     def loss(
-        self,
-        context: Float[Tensor, "batch token dim"],
-        actions: Float[Tensor, "batch horizon action"],
-        valid: Bool[Tensor, "batch horizon"],
-        generator: torch.Generator | None = None,
-    ) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
+        self, context: Context, actions: Chunk, valid: StepMask, generator: Generator | None = None
+    ) -> Losses:
         """The scalar to minimise and its detached parts by name; masked steps count nothing."""
 
     @abstractmethod
-    def act(
-        self, context: Float[Tensor, "batch token dim"], generator: torch.Generator | None = None
-    ) -> Float[Tensor, "batch horizon action"]:
+    def act(self, context: Context, generator: Generator | None = None) -> Chunk:
         """A chunk; the same for the same context and generator state."""
 
 
@@ -70,10 +65,7 @@ class GroupedLoss(nn.Module):
     weights: Tensor
 
     def __init__(
-        self,
-        groups: Sequence[str],
-        weights: Mapping[str, float],
-        kind: ErrorKind = "smooth_l1",
+        self, groups: Sequence[str], weights: Mapping[str, float], kind: ErrorKind = "smooth_l1"
     ) -> None:
         super().__init__()
         self.error = F.smooth_l1_loss if kind == "smooth_l1" else F.mse_loss
@@ -89,12 +81,7 @@ class GroupedLoss(nn.Module):
         normalised = torch.tensor(chosen) / sum(chosen)
         self.register_buffer("weights", normalised, persistent=False)
 
-    def forward(
-        self,
-        prediction: Float[Tensor, "batch horizon action"],
-        target: Float[Tensor, "batch horizon action"],
-        valid: Bool[Tensor, "batch horizon"],
-    ) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
+    def forward(self, prediction: Chunk, target: Chunk, valid: StepMask) -> Losses:
         """The weighted mean over the groups, and each group's own mean, detached."""
         mask = valid.unsqueeze(-1)
         target = target.masked_fill(~mask, 0.0)
@@ -107,7 +94,7 @@ class GroupedLoss(nn.Module):
 
 
 def standard_normal(
-    shape: Sequence[int], device: torch.device, generator: torch.Generator | None
+    shape: Sequence[int], device: torch.device, generator: Generator | None
 ) -> Float[Tensor, "..."]:
     """Float32 noise on `device`, drawn where the generator is."""
     drawn_on = device if generator is None else generator.device
@@ -115,7 +102,7 @@ def standard_normal(
 
 
 def uniform(
-    count: int, device: torch.device, generator: torch.Generator | None
+    count: int, device: torch.device, generator: Generator | None
 ) -> Float[Tensor, " {count}"]:
     """Float32 numbers in [0, 1) on `device`, drawn where the generator is."""
     drawn_on = device if generator is None else generator.device

@@ -4,11 +4,12 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from jaxtyping import Float
+from torch import Generator, Tensor, nn
 
 from pipeline.policy.denoiser import Denoiser
 from pipeline.policy.expert import ActionExpert, standard_normal, uniform
+from pipeline.policy.tensors import Chunk, Context, Losses, StepMask
 
 Solver = Literal["euler", "midpoint", "rk4"]
 Velocity = Callable[[Tensor, float], Tensor]
@@ -99,12 +100,8 @@ class FlowMatchingActionExpert(ActionExpert):
         )  # fmt: skip
 
     def loss(
-        self,
-        context: Float[Tensor, "batch token dim"],
-        actions: Float[Tensor, "batch horizon action"],
-        valid: Bool[Tensor, "batch horizon"],
-        generator: torch.Generator | None = None,
-    ) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
+        self, context: Context, actions: Chunk, valid: StepMask, generator: Generator | None = None
+    ) -> Losses:
         """The grouped squared error of the velocity at a drawn time."""
         chunk = actions.float().masked_fill(~valid.unsqueeze(-1), 0.0)
         noise = standard_normal(chunk.shape, chunk.device, generator)
@@ -114,9 +111,7 @@ class FlowMatchingActionExpert(ActionExpert):
         return self.grouped(self.denoiser(noisy, time, context, valid), chunk - noise, valid)
 
     @torch.no_grad()
-    def act(
-        self, context: Float[Tensor, "batch token dim"], generator: torch.Generator | None = None
-    ) -> Float[Tensor, "batch horizon action"]:
+    def act(self, context: Context, generator: Generator | None = None) -> Chunk:
         """Where the flow takes a drawn noise, float32."""
         shape = (len(context), self.horizon, self.action_dim)
         noise = standard_normal(shape, context.device, generator)

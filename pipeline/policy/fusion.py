@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from pipeline.policy.attention import TransformerLayer, learned
+from pipeline.policy.tensors import Context
 
 Tokens = Mapping[str, Float[Tensor, "batch _ _"]]
 Shapes = Mapping[str, tuple[int, int]]
@@ -26,7 +27,7 @@ class Fusion(nn.Module, ABC):
     """
 
     @abstractmethod
-    def forward(self, encoded: Tokens) -> Float[Tensor, "batch token dim"]:
+    def forward(self, encoded: Tokens) -> Context:
         """The context."""
 
 
@@ -108,7 +109,7 @@ class ConcatFusion(Fusion):
         )
         self.read_out = read_out(dim, tokens)
 
-    def forward(self, encoded: Tokens) -> Float[Tensor, "batch token dim"]:
+    def forward(self, encoded: Tokens) -> Context:
         """The context of `tokens` tokens."""
         return self.read_out(self.mix(torch.cat([*self.vectors(encoded).values()], dim=-1)))
 
@@ -140,7 +141,7 @@ class GatedFusion(Fusion):
         opened = self.gate(torch.cat([*vectors.values()], dim=-1)).float().sigmoid()
         return dict(zip(vectors, opened.chunk(len(vectors), dim=-1), strict=True))
 
-    def forward(self, encoded: Tokens) -> Float[Tensor, "batch token dim"]:
+    def forward(self, encoded: Tokens) -> Context:
         """The context of `tokens` tokens."""
         vectors = self.vectors(encoded)
         gates = self._gates(vectors)
@@ -167,7 +168,7 @@ class CrossAttentionFusion(Fusion):
         )
         self.norm = nn.LayerNorm(dim)
 
-    def forward(self, encoded: Tokens) -> Float[Tensor, "batch token dim"]:
+    def forward(self, encoded: Tokens) -> Context:
         """The context of `queries` tokens and those of sensor and state."""
         tokens = self.tokens(encoded)
         slots = tokens.pop("features", None)
@@ -186,7 +187,7 @@ class NoFusion(Fusion):
         self.tokens = StreamTokens(shapes, dim)
         self.norm = nn.LayerNorm(dim)
 
-    def forward(self, encoded: Tokens) -> Float[Tensor, "batch token dim"]:
+    def forward(self, encoded: Tokens) -> Context:
         """The context of as many tokens as the encoders give together."""
         return self.norm(torch.cat([*self.tokens(encoded).values()], dim=1))
 

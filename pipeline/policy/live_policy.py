@@ -5,18 +5,19 @@ from contextlib import contextmanager
 from typing import Any, Generic, TypeVar
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 
-from pipeline.policy.live_observation import LiveObservation, with_features
-from pipeline.policy.observation import Observation
-from pipeline.policy.policy import Policy
+from pipeline.base.observation import Observation
+from pipeline.policy.observation import LiveObservation, with_features
+from pipeline.policy.policy import Policy, Trainable
+from pipeline.policy.tensors import Chunk, Losses, StepMask
 
 Model = TypeVar("Model", bound=nn.Module)
 
 
-class LivePolicy(nn.Module, Generic[Model]):
-    """A `Trainable` of a policy and, in front of it, a model `rows -> (features, valid)`.
+class LivePolicy(Trainable, Generic[Model]):
+    """A policy and, in front of it, a model `rows -> (features, valid)`.
 
     A `LiveObservation` is looked at through the model, any other goes to the policy as it is.
     """
@@ -73,10 +74,10 @@ class LivePolicy(nn.Module, Generic[Model]):
     def loss(
         self,
         observation: Observation,
-        action: Float[Tensor, "batch horizon action"],
-        action_valid: Bool[Tensor, "batch horizon"],
+        action: Chunk,
+        action_valid: StepMask,
         generator: torch.Generator | None = None,
-    ) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
+    ) -> Losses:
         """As `Policy.loss`; gradients reach the model where a sample is live and it learns."""
         return self.policy.loss(self._seen(observation), action, action_valid, generator)
 
@@ -91,12 +92,6 @@ class LivePolicy(nn.Module, Generic[Model]):
         with self._evaluating():
             return self.policy.sample(self._seen(observation), samples, generator)
 
-    def act(
-        self, observation: Observation, generator: torch.Generator | None = None
-    ) -> Float[Tensor, "batch horizon action"]:
-        """One sample: an action chunk in physical units, float32."""
-        return self.sample(observation, 1, generator)[0]
-
     @property
     def stochastic(self) -> bool:
         """Whether two samples differ."""
@@ -106,11 +101,9 @@ class LivePolicy(nn.Module, Generic[Model]):
         """The number of parameters of each part of the policy, and of the model where loaded."""
         table = self.policy.parameter_table()
         if self.vlm is not None:
-            sizes = [(p.numel(), p.requires_grad) for p in self.vlm.parameters()]
-            table += [
-                ("vlm, learning", sum(size for size, learns in sizes if learns)),
-                ("vlm, frozen", sum(size for size, learns in sizes if not learns)),
-            ]
+            for kind, learns in (("learning", True), ("frozen", False)):
+                sizes = (p.numel() for p in self.vlm.parameters() if p.requires_grad == learns)
+                table.append((f"vlm, {kind}", sum(sizes)))
         return table
 
     @contextmanager
@@ -126,6 +119,6 @@ class LivePolicy(nn.Module, Generic[Model]):
 
     def _seen(self, observation: Observation) -> Observation:
         """The observation with the features of its live samples computed."""
-        if not isinstance(observation, LiveObservation) or not observation.rows:
-            return observation
-        return with_features(observation, *self.load_vlm()(observation.rows))
+        if isinstance(observation, LiveObservation) and observation.rows:
+            return with_features(observation, *self.load_vlm()(observation.rows))
+        return observation

@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from pipeline.base.errors import ConfigError
+from pipeline.policy.tensors import Chunk
 
 ScheduleKind = Literal["cosine", "linear"]
 Prediction = Literal["epsilon", "sample", "v"]
@@ -33,8 +34,8 @@ class NoiseSchedule(nn.Module):
         super().__init__()
         self.timesteps = timesteps
         betas = _cosine_betas(timesteps) if kind == "cosine" else _linear_betas(timesteps)
-        one = torch.ones(1, dtype=torch.float64, device="cpu")
-        alpha_bar = torch.cat([one, (1 - betas).cumprod(0)])
+        clean = torch.ones(1, dtype=torch.float64, device="cpu")
+        alpha_bar = torch.cat([clean, (1 - betas).cumprod(0)])
         # Rounded at the end: of 1 - alpha_bar, float32 has few digits left at small steps.
         self.register_buffer("alpha_bar", alpha_bar.float())
         self.register_buffer("signal", alpha_bar.sqrt().float())
@@ -59,22 +60,13 @@ class NoiseSchedule(nn.Module):
         shares = [index / max(1, count - 1) for index in range(count)]
         return [round(first + (last - first) * share) for share in shares] + [0]
 
-    def add_noise(
-        self,
-        sample: Float[Tensor, "batch horizon action"],
-        epsilon: Float[Tensor, "batch horizon action"],
-        step: Int[Tensor, " batch"],
-    ) -> Float[Tensor, "batch horizon action"]:
+    def add_noise(self, sample: Chunk, epsilon: Chunk, step: Int[Tensor, " batch"]) -> Chunk:
         """The noisy chunk at each row's step (Ho et al. 2020, eq. 4)."""
         return self._at(self.signal, step) * sample + self._at(self.noise, step) * epsilon
 
     def target(
-        self,
-        kind: Prediction,
-        sample: Float[Tensor, "batch horizon action"],
-        epsilon: Float[Tensor, "batch horizon action"],
-        step: Int[Tensor, " batch"],
-    ) -> Float[Tensor, "batch horizon action"]:
+        self, kind: Prediction, sample: Chunk, epsilon: Chunk, step: Int[Tensor, " batch"]
+    ) -> Chunk:
         """What a network of this prediction must say (v: Salimans & Ho 2022, section 4)."""
         if kind == "epsilon":
             return epsilon
@@ -83,12 +75,8 @@ class NoiseSchedule(nn.Module):
         return self._at(self.signal, step) * epsilon - self._at(self.noise, step) * sample
 
     def sample_of(
-        self,
-        kind: Prediction,
-        predicted: Float[Tensor, "batch horizon action"],
-        noisy: Float[Tensor, "batch horizon action"],
-        step: Int[Tensor, " batch"] | int,
-    ) -> Float[Tensor, "batch horizon action"]:
+        self, kind: Prediction, predicted: Chunk, noisy: Chunk, step: Int[Tensor, " batch"] | int
+    ) -> Chunk:
         """The clean chunk that a prediction stands for; steps are above 0."""
         signal, noise = self._at(self.signal, step), self._at(self.noise, step)
         if kind == "epsilon":
@@ -97,21 +85,11 @@ class NoiseSchedule(nn.Module):
             return predicted
         return signal * noisy - noise * predicted
 
-    def epsilon_of(
-        self,
-        sample: Float[Tensor, "batch horizon action"],
-        noisy: Float[Tensor, "batch horizon action"],
-        step: Int[Tensor, " batch"] | int,
-    ) -> Float[Tensor, "batch horizon action"]:
+    def epsilon_of(self, sample: Chunk, noisy: Chunk, step: Int[Tensor, " batch"] | int) -> Chunk:
         """The noise between a clean chunk and a noisy one; steps are above 0."""
         return (noisy - self._at(self.signal, step) * sample) / self._at(self.noise, step)
 
-    def posterior(
-        self,
-        sample: Float[Tensor, "batch horizon action"],
-        noisy: Float[Tensor, "batch horizon action"],
-        step: int,
-    ) -> tuple[Float[Tensor, "batch horizon action"], Float[Tensor, ""]]:
+    def posterior(self, sample: Chunk, noisy: Chunk, step: int) -> tuple[Chunk, Float[Tensor, ""]]:
         """Mean and variance of step - 1 given this step and the clean chunk (Ho 2020, eq. 7).
 
         The caller clips `sample` before: the mean follows from what it is given and nothing else.
@@ -123,13 +101,8 @@ class NoiseSchedule(nn.Module):
         return mean + (1 - beta).sqrt() * cleaned * noisy, cleaned * beta
 
     def ddim(
-        self,
-        sample: Float[Tensor, "batch horizon action"],
-        noisy: Float[Tensor, "batch horizon action"],
-        step: int,
-        to: int,
-        eta: float,
-    ) -> tuple[Float[Tensor, "batch horizon action"], Float[Tensor, ""]]:
+        self, sample: Chunk, noisy: Chunk, step: int, to: int, eta: float
+    ) -> tuple[Chunk, Float[Tensor, ""]]:
         """Mean and variance of step `to` < `step` (Song et al. 2021, eq. 12 and 16).
 
         The noise of eq. 12 is the one that belongs to `sample`, also where the caller clipped it,

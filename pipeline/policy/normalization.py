@@ -1,10 +1,12 @@
 """Per-channel mean and standard deviation: fitted in one streaming pass, kept exactly in JSON.
 
-Numpy only; `pipeline.policy.normalizer` applies them to tensors.
+Numpy only; `pipeline.policy.policy.Normalizer` applies them to tensors.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from typing import Any
 
@@ -12,12 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.errors import CheckpointMismatch, NumericsError
+from pipeline.base.finite import first_non_finite
 
 Block = NDArray[Any] | tuple[NDArray[Any], NDArray[np.bool_]]
 """Rows of values, or such rows and which of their values are valid."""
 
 Reading = Block | Callable[[], Block]
-"""A block, or what reads one: on the thread that needs it, and again where an error is named."""
+"""A block, or what reads one: on one of several threads, and again where an error is named."""
 
 _PIECE_VALUES = 4_194_304
 """Values converted to float64 at a time: 32 MB, whatever the size of the blocks."""
@@ -79,13 +82,7 @@ class Normalization:
 
     def document(self) -> dict[str, Any]:
         """All statistics as JSON values."""
-        streams = {
-            "action": self.action,
-            "features": self.features,
-            "sensor": self.sensor,
-            "state": self.state,
-        }
-        return {name: None if one is None else one.document() for name, one in streams.items()}
+        return {name: fitted and fitted.document() for name, fitted in vars(self).items()}
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any]) -> "Normalization":
@@ -94,7 +91,7 @@ class Normalization:
             raise CheckpointMismatch("normalisation: expected statistics of `action`, found none")
         streams = {
             name: ChannelStatistics.from_document(document[name])
-            for name in ("action", "features", "sensor", "state")
+            for name in cls.__dataclass_fields__
             if document.get(name) is not None
         }
         return cls(**streams)
@@ -108,7 +105,7 @@ def fit_channels(
     A block may be a pair (values, valid): `valid` is bool over the leading axes of `values`, such
     as (row, slot) for features (row, slot, dim), and what is not valid is neither checked nor
     counted. Moments are merged in float64 after Chan, Golub and LeVeque (1983), eq. 2.1, in the
-    order of the blocks: the same bits, whatever the `threads` of dask's scheduler that read them.
+    order of the blocks: the same bits, however many `threads` read them.
     Raises `NumericsError`, naming `what`, channel and row, on NaN, inf, or where there is no row.
     """
     moments: _Moments | None = None
@@ -135,38 +132,20 @@ class _Moments:
     squares: NDArray[np.float64]
 
 
-_Measured = list[tuple[_Moments, int]]
-"""Of each piece of a block, and how many rows it has."""
-
-
 def _measured_in_order(
     blocks: Iterable[Reading], what: str, threads: int
-) -> Iterator[tuple[Reading, _Measured]]:
-    """A few blocks at a time, so that memory does not grow with their number."""
-    if threads == 1:
-        yield from ((block, _measured(block, what)) for block in blocks)
-        return
-    import dask  # here, as most commands never need it
+) -> Iterator[tuple[Reading, list[tuple[_Moments, int]]]]:
+    """Each block, and of each piece of it the moments and how many rows it has.
 
+    A few blocks at a time, so that memory does not grow with their number.
+    """
     waiting = iter(blocks)
-    while some := list(islice(waiting, 2 * threads)):
-        jobs = [dask.delayed(_Job(block, what), pure=False)() for block in some]
-        found = dask.compute(*jobs, scheduler="threads", num_workers=threads)
-        yield from zip(some, found, strict=True)
+    with ThreadPoolExecutor(threads) as pool:
+        while some := list(islice(waiting, 2 * threads)):
+            yield from zip(some, pool.map(partial(_measured, what=what), some), strict=True)
 
 
-@dataclass(frozen=True, eq=False)
-class _Job:
-    """A block to measure; in one piece, as dask looks for tasks inside the arguments of others."""
-
-    block: Reading
-    what: str
-
-    def __call__(self) -> _Measured:
-        return _measured(self.block, self.what)
-
-
-def _measured(block: Reading, what: str) -> _Measured:
+def _measured(block: Reading, what: str) -> list[tuple[_Moments, int]]:
     return [(_moments(*piece, what), len(piece[0])) for piece in _pieces(block)]
 
 
@@ -217,18 +196,16 @@ def _refuse(
     names: Sequence[str] | None,
     first_row: int,
 ) -> None:
-    bad = ~np.isfinite(values)
-    if valid is not None:
-        bad &= valid.reshape(valid.shape + (1,) * (values.ndim - valid.ndim))
-    if not bad.any():
+    at = first_non_finite(values, valid)
+    if at is None:
         raise NumericsError(
             f"{what}: values near row {first_row} are so large that their variance overflows"
         )
-    row, *channel = (int(i) for i in np.argwhere(bad)[0])
+    row, *channel = at
     place = ", ".join(str(i) for i in channel)
     if names is not None and len(channel) == 1:
         place = repr(names[channel[0]])
     raise NumericsError(
-        f"{what}: expected finite numbers, found {values[(row, *channel)]} in row "
+        f"{what}: expected finite numbers, found {values[at]} in row "
         f"{first_row + row}, channel {place}. Mend the recording and run stages.extract again."
     )

@@ -1,15 +1,16 @@
-"""What a policy sees, and the widths of it that a store decides."""
+"""What a policy is built for, and observations made by hand that are checked against it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pipeline.base.errors import CheckpointMismatch
-from pipeline.policy.expert import uniform
+from pipeline.base.config import TrainHeadParams
+from pipeline.base.errors import CheckpointMismatch, ObservationError
+from pipeline.base.observation import Observation
 
 STREAMS = ("features", "sensor", "state")
 """What a policy may have encoders of, in the order in which it builds them."""
@@ -19,22 +20,18 @@ _GROUP_BY_UNIT = {"m": "translation", "cm": "translation", "mm": "translation"} 
     "rad": "rotation",
 }
 
+Axes = Mapping[str, int | None]
+"""Names and sizes of a tensor's axes; None is any size above 0."""
 
-@runtime_checkable
-class Observation(Protocol):
-    """What the policy sees, in physical units; `store.Batch` has these fields.
 
-    Streams come in their stored dtype and right-aligned; `*_valid` counts real readings; an absent
-    stream has width 0. `feature_age` is s since the newest frame.
-    """
+@dataclass
+class LiveObservation(Observation):
+    """An observation whose features, of some samples or all, a model has yet to compute."""
 
-    features: Float[Tensor, "batch slot dim"]
-    slot_valid: Bool[Tensor, "batch slot"]
-    feature_age: Float[Tensor, " batch"]
-    sensor: Float[Tensor, "batch sensor_window channel"]
-    sensor_valid: Int[Tensor, " batch"]
-    state: Float[Tensor, "batch state_window state_dim"]
-    state_valid: Int[Tensor, " batch"]
+    rows: Sequence[Any]
+    """What the model takes (`pipeline.vlm.preparation.PreparedRow`), each distinct one once."""
+    row_of: Int[Tensor, " batch"]
+    """Index into `rows` of each sample; -1 keeps the sample's cached features."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +62,19 @@ class PolicyShape:
         except (KeyError, TypeError) as error:
             raise CheckpointMismatch(f"policy shape: {error!r} in {fields}") from None
 
+    def stream_axes(self, params: TrainHeadParams) -> dict[str, Axes]:
+        """The axes behind the batch of each field of an `Observation` of this shape."""
+        return {
+            "features": {"slot": self.slots, "dim": self.feature_dim},
+            "slot_valid": {"slot": self.slots},
+            "feature_age": {},
+            # Of any length: it is resampled. The state's tokens have places, as many as configured.
+            "sensor": {"window": None, "channel": self.sensor_channels},
+            "sensor_valid": {},
+            "state": {"window": params.state_window, "channel": self.state_dim},
+            "state_valid": {},
+        }
+
 
 def action_groups(names: Sequence[str], units: Sequence[str]) -> tuple[str, ...]:
     """The loss group of each action channel, by its name (gripper) and then by its unit.
@@ -77,6 +87,11 @@ def action_groups(names: Sequence[str], units: Sequence[str]) -> tuple[str, ...]
     )
 
 
+def stream_of(field: str) -> str:
+    """The stream that a field of an observation is about."""
+    return "features" if field in ("slot_valid", "feature_age") else field.removesuffix("_valid")
+
+
 def stream_validity(observation: Observation, stream: str) -> Tensor:
     """What of a stream is real: (batch, slot) bool of the features, else (batch,) counts."""
     if stream == "features":
@@ -84,29 +99,79 @@ def stream_validity(observation: Observation, stream: str) -> Tensor:
     return getattr(observation, f"{stream}_valid")
 
 
-def drop_streams(
-    validity: Mapping[str, Tensor],
-    rates: Mapping[str, float],
-    generator: torch.Generator | None = None,
-) -> dict[str, Tensor]:
-    """The validity of each stream, 0 for a random share `rates[stream]` of the samples.
+def build_observation(
+    shape: PolicyShape,
+    params: TrainHeadParams,
+    given: Mapping[str, Tensor],
+    device: torch.device,
+    rows: Sequence[Any] = (),
+    row_of: Sequence[int] = (),
+) -> LiveObservation:
+    """The observation of the fields that are given; what is not given is missing.
 
-    Modality dropout (Neverova et al. 2016, "ModDrop"): so that a policy learns to lean on what
-    it has. Streams are dropped independently, but a sample never loses all that it has: one of
-    its streams, each as likely, is then kept. With rates p and q of two streams, the first is
-    thus missing from p - pq/2 of the samples that have both.
+    Without its `*_valid` a stream is all real, without `feature_age` features are new. Raises
+    `ObservationError` for a `*_valid` without its stream, and for a shape that is not the policy's
+    or not the batch's.
     """
-    device = next(iter(validity.values())).device
-    present = torch.stack([v.reshape(len(v), -1).gt(0).any(dim=1) for v in validity.values()], 1)
-    limits = torch.tensor([rates[name] for name in validity], device=device)
-    draw = uniform(present.numel(), device, generator).view(present.shape)
-    dropped = draw < limits
-    # Below its limit a draw is uniform, so relative to it all streams are alike.
-    relative = (draw / limits.clamp(min=torch.finfo(limits.dtype).tiny)).masked_fill(~present, -1.0)
-    last = torch.zeros_like(present).scatter(1, relative.argmax(dim=1, keepdim=True), True)
-    blind = ~(present & ~dropped).any(dim=1, keepdim=True)
-    dropped = dropped & ~(blind & last)
-    return {
-        name: valid.masked_fill(gone.view(-1, *[1] * (valid.ndim - 1)), 0)
-        for (name, valid), gone in zip(validity.items(), dropped.unbind(dim=1), strict=True)
+    for name in given:
+        if name.endswith("_valid") and stream_of(name) not in given:
+            raise ObservationError(
+                f"{name}: expected {stream_of(name)} beside it, of which it says what is real"
+            )
+    first = next((name for name in STREAMS if name in given), "images")
+    index = torch.tensor(row_of, dtype=torch.int64, device=device)
+    # The number of elements and not len, which a scalar lacks; its shape is refused all the same.
+    count = given[first].shape[:1].numel() if first in given else len(index)
+    axes = shape.stream_axes(params)
+    for name, value in given.items():
+        check_axes(name, value, {"batch": count, **axes[name]}, first)
+    if len(index):
+        check_axes("images", index, {"batch": count}, first)
+    else:
+        index = torch.full((count,), -1, device=device)
+    missing = {
+        "features": torch.zeros(count, shape.slots, shape.feature_dim, device=device),
+        "slot_valid": torch.full((count, shape.slots), "features" in given, device=device),
+        "feature_age": torch.zeros(count, device=device),
+        "sensor": torch.zeros(count, params.sensor_window, shape.sensor_channels, device=device),
+        "state": torch.zeros(count, params.state_window, shape.state_dim, device=device),
     }
+    for stream in ("sensor", "state"):
+        real = given[stream].shape[1] if stream in given else 0
+        missing[f"{stream}_valid"] = torch.full((count,), real, device=device)
+    fields = missing | {**given}
+    fields["slot_valid"] = fields["slot_valid"].bool()
+    return LiveObservation(**fields, rows=rows, row_of=index)
+
+
+def with_features(
+    observation: LiveObservation,
+    features: Float[Tensor, "row slot dim"],
+    slot_valid: Bool[Tensor, "row slot"],
+) -> Observation:
+    """The observation with the features of its rows where a sample has one."""
+    given = {name: getattr(observation, name) for name in Observation.__dataclass_fields__}
+    row_of = observation.row_of.to(features.device)
+    live, index = row_of >= 0, row_of.clamp(min=0)
+    cached = given["features"].to(features.dtype)
+    given["features"] = torch.where(live[:, None, None], features[index], cached)
+    given["slot_valid"] = torch.where(live[:, None], slot_valid[index], given["slot_valid"])
+    return Observation(**given)
+
+
+def check_axes(name: str, value: Tensor, axes: Axes, batch_of: str) -> None:
+    """Raise `ObservationError` where an argument has not these axes.
+
+    `batch_of` is the argument that says how large the batch is.
+    """
+    actual = tuple(value.shape)
+    fits = len(actual) == len(axes) and all(
+        have == size or (size is None and have > 0)
+        for have, size in zip(actual, axes.values(), strict=True)
+    )
+    if not fits:
+        sizes = (f"{axis} {'any' if size is None else size}" for axis, size in axes.items())
+        raise ObservationError(
+            f"{name}: expected shape ({', '.join(sizes)}), found {actual}. The batch is that of "
+            f"{batch_of}; all else is what the policy was built for: give that or build another."
+        )

@@ -1,54 +1,107 @@
 """The policy: encoders, fusion and action expert, from physical units to physical units."""
 
-from collections.abc import Mapping
-from typing import Any, Protocol, runtime_checkable
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from jaxtyping import Float
+from torch import Generator, Tensor, nn
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.base.errors import CheckpointMismatch
-from pipeline.policy.building import build_encoders, build_expert
+from pipeline.base.errors import CheckpointMismatch, ConfigError, ObservationError
+from pipeline.base.observation import Observation
+from pipeline.policy.diffusion import DiffusionActionExpert
+from pipeline.policy.expert import ActionExpert, uniform
+from pipeline.policy.feature_encoder import FeatureEncoder
+from pipeline.policy.flow_matching import FlowMatchingActionExpert
 from pipeline.policy.fusion import build_fusion
-from pipeline.policy.normalizer import Normalizer, Statistics, StreamStatistics
-from pipeline.policy.observation import Observation, PolicyShape, drop_streams, stream_validity
+from pipeline.policy.normalization import ChannelStatistics, Normalization
+from pipeline.policy.observation import (
+    STREAMS,
+    LiveObservation,
+    PolicyShape,
+    build_observation,
+    stream_of,
+    stream_validity,
+)
+from pipeline.policy.regression import RegressionActionExpert
+from pipeline.policy.sensor_encoder import ForceAwareSensorEncoder, SensorEncoder
+from pipeline.policy.state_encoder import RobotStateEncoder
+from pipeline.policy.tensors import Chunk, Context, Losses, StepMask
+
+EXPERTS: dict[str, type[ActionExpert]] = {
+    "regression": RegressionActionExpert,
+    "diffusion": DiffusionActionExpert,
+    "flow_matching": FlowMatchingActionExpert,
+}
+"""The class of each `train_head.model_type`."""
+
+SENSOR_ENCODERS: dict[str, type[SensorEncoder] | type[ForceAwareSensorEncoder]] = {
+    "joint": SensorEncoder,
+    "force_aware": ForceAwareSensorEncoder,
+}
+"""The class of each `train_head.sensor_encoder.kind`."""
 
 
-@runtime_checkable
-class Trainable(Protocol):
-    """What every module that is trained or judged can do; each is an `nn.Module`."""
+class Trainable(nn.Module, ABC):
+    """What every module that is trained or judged can do."""
 
+    @abstractmethod
     def loss(
         self,
         observation: Observation,
-        action: Float[Tensor, "batch horizon action"],
-        action_valid: Bool[Tensor, "batch horizon"],
-        generator: torch.Generator | None = None,
-    ) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
+        action: Chunk,
+        action_valid: StepMask,
+        generator: Generator | None = None,
+    ) -> Losses:
         """The scalar to minimise and its detached parts by name; `action` is physical."""
-        ...
 
+    @abstractmethod
     def sample(
-        self,
-        observation: Observation,
-        samples: int = 1,
-        generator: torch.Generator | None = None,
+        self, observation: Observation, samples: int = 1, generator: Generator | None = None
     ) -> Float[Tensor, "sample batch horizon action"]:
         """Action chunks in physical units, float32."""
-        ...
+
+    def act(self, observation: Observation, generator: Generator | None = None) -> Chunk:
+        """One sample: an action chunk in physical units, float32."""
+        return self.sample(observation, 1, generator)[0]
 
     @property
+    @abstractmethod
     def stochastic(self) -> bool:
-        """Whether two samples differ."""
-        ...
+        """Whether two samples differ; else any number of them costs one."""
 
+    @abstractmethod
     def parameter_table(self) -> list[tuple[str, int]]:
         """The number of parameters of each part."""
-        ...
 
 
-class Policy(nn.Module):
+class Normalizer(nn.Module):
+    """Physical units to zero mean and unit variance per channel, and back, in float32.
+
+    The statistics are buffers that move with the module but stay out of its state dict: they
+    travel in the checkpoint's JSON.
+    """
+
+    mean: Tensor
+    scale: Tensor
+
+    def __init__(self, statistics: ChannelStatistics) -> None:
+        super().__init__()
+        for name, value in (("mean", statistics.mean), ("scale", statistics.scale)):
+            self.register_buffer(name, torch.tensor(value, dtype=torch.float32), persistent=False)
+
+    def normalize(self, values: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """The normalised values; trailing axes are the statistics' channels, any float dtype."""
+        return (values.to(self.mean.dtype) - self.mean).div_(self.scale)
+
+    def invert(self, values: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """Physical units from normalised values, any float dtype."""
+        return values.to(self.mean.dtype) * self.scale + self.mean
+
+
+class Policy(Trainable):
     """Encoders of the streams that are both present and enabled, fusion, expert.
 
     Raises `ConfigError` where no stream is left, `CheckpointMismatch` where the statistics do not
@@ -59,7 +112,7 @@ class Policy(nn.Module):
     """What the features are that it was trained on, where a checkpoint says so."""
 
     def __init__(
-        self, params: TrainHeadParams, shape: PolicyShape, normalization: StreamStatistics
+        self, params: TrainHeadParams, shape: PolicyShape, normalization: Normalization
     ) -> None:
         super().__init__()
         self.params, self.shape = params, shape
@@ -75,20 +128,27 @@ class Policy(nn.Module):
 
     @property
     def stochastic(self) -> bool:
-        """Whether two samples differ; else any number of them costs one."""
+        """Whether the expert draws what it answers."""
         return self.expert.stochastic
 
-    def context(self, observation: Observation) -> Float[Tensor, "batch token dim"]:
-        """What the expert attends to."""
-        return self._context(observation, self._validity(observation))
+    def context(
+        self, observation: Observation, validity: Mapping[str, Tensor] | None = None
+    ) -> Context:
+        """What the expert attends to; by default of all that is valid."""
+        return self.fusion(
+            {
+                name: self.encode(name, observation, valid)
+                for name, valid in (validity or self._validity(observation)).items()
+            }
+        )
 
     def loss(
         self,
         observation: Observation,
-        action: Float[Tensor, "batch horizon action"],
-        action_valid: Bool[Tensor, "batch horizon"],
-        generator: torch.Generator | None = None,
-    ) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
+        action: Chunk,
+        action_valid: StepMask,
+        generator: Generator | None = None,
+    ) -> Losses:
         """The scalar to minimise and its detached parts by action group; `action` is physical.
 
         While training, streams of some samples go missing at the rates of `train_head.drop_*`;
@@ -98,15 +158,12 @@ class Policy(nn.Module):
         if self.training and any(self.drop_rates.values()):
             validity = drop_streams(validity, self.drop_rates, generator)
         target = self.action_normalizer.normalize(action)
-        context = self._context(observation, validity)
+        context = self.context(observation, validity)
         return self.expert.loss(context, target, action_valid, generator)
 
     @torch.no_grad()
     def sample(
-        self,
-        observation: Observation,
-        samples: int = 1,
-        generator: torch.Generator | None = None,
+        self, observation: Observation, samples: int = 1, generator: Generator | None = None
     ) -> Float[Tensor, "sample batch horizon action"]:
         """Action chunks in physical units, float32; call `eval()` first to silence dropout.
 
@@ -118,22 +175,31 @@ class Policy(nn.Module):
         physical = self.action_normalizer.invert(chunks).unflatten(0, (repeats, len(context)))
         return physical.expand(samples, -1, -1, -1)
 
-    def act(
-        self, observation: Observation, generator: torch.Generator | None = None
-    ) -> Float[Tensor, "batch horizon action"]:
-        """One sample: an action chunk in physical units, float32."""
-        return self.sample(observation, 1, generator)[0]
+    def observe(
+        self, streams: Mapping[str, Any], rows: Sequence[Any] = (), row_of: Sequence[int] = ()
+    ) -> LiveObservation:
+        """The observation of what was given, on the policy's device; what was not is missing.
+
+        `streams` has the fields of `Observation` as tensors or arrays, None where not given. A
+        stream without an encoder is left out. Raises `ObservationError` where nothing is left to
+        look at, and as `build_observation`.
+        """
+        device = next(self.parameters()).device
+        given = {
+            name: torch.as_tensor(value, device=device)
+            for name, value in streams.items()
+            if value is not None and stream_of(name) in self.encoders
+        }
+        if not rows and given.keys().isdisjoint(STREAMS):
+            raise ObservationError(
+                f"expected images or at least one of {', '.join(self.encoders)}, found none of them"
+            )
+        return build_observation(self.shape, self.params, given, device, rows, row_of)
 
     def parameter_table(self) -> list[tuple[str, int]]:
-        """The number of parameters of each part."""
-        return [
-            (name, sum(p.numel() for p in part.parameters())) for name, part in self.parts.items()
-        ]
-
-    @property
-    def parts(self) -> dict[str, nn.Module]:
-        """Encoders by stream, `fusion`, `expert`: in the order in which they work."""
-        return {**dict(self.encoders.items()), "fusion": self.fusion, "expert": self.expert}
+        """The number of parameters of encoders by stream, `fusion`, `expert`: as they work."""
+        parts = {**dict(self.encoders.items()), "fusion": self.fusion, "expert": self.expert}
+        return [(name, sum(p.numel() for p in part.parameters())) for name, part in parts.items()]
 
     def encode(
         self, stream: str, observation: Observation, valid: Tensor
@@ -146,27 +212,93 @@ class Policy(nn.Module):
             return encoder(values, valid, observation.feature_age)
         return encoder(values, valid).unsqueeze(1)
 
-    def _context(self, observation: Observation, validity: Mapping[str, Tensor]) -> Tensor:
-        return self.fusion(
-            {name: self.encode(name, observation, valid) for name, valid in validity.items()}
-        )
-
     def _validity(self, observation: Observation) -> dict[str, Tensor]:
         return {name: stream_validity(observation, name) for name in self.encoders}
 
 
-def _fitting(normalization: StreamStatistics, name: str, shape: PolicyShape) -> Statistics:
+def build_encoders(
+    params: TrainHeadParams, shape: PolicyShape
+) -> tuple[nn.ModuleDict, dict[str, tuple[int, int]]]:
+    """Encoders of the streams both present and enabled, and how many tokens of what width each.
+
+    Raises `ConfigError` where no stream is left.
+    """
+    encoders, tokens = nn.ModuleDict(), dict[str, tuple[int, int]]()
+    if params.features_enabled and shape.slots and shape.feature_dim:
+        features = FeatureEncoder(shape.slots, shape.feature_dim)
+        encoders["features"], tokens["features"] = features, (shape.slots, features.width)
+    if params.sensor_enabled and shape.sensor_channels:
+        sensor = params.sensor_encoder
+        encoders["sensor"] = SENSOR_ENCODERS[sensor.kind](
+            shape.sensor_channels, params.sensor_window, **sensor.model_dump(exclude={"kind"})
+        )
+        tokens["sensor"] = (1, sensor.output_dim)
+    if params.robot_state_enabled and shape.state_dim:
+        state = params.state_encoder
+        encoders["state"] = RobotStateEncoder(
+            shape.state_dim, params.state_window, **state.model_dump()
+        )
+        tokens["state"] = (1, state.output_dim)
+    if not tokens:
+        raise ConfigError(
+            "the policy has nothing to look at: the store has "
+            f"{shape.slots} feature slots, {shape.sensor_channels} sensor channels and "
+            f"{shape.state_dim} state channels. Enable one of these in train_head "
+            "(features_enabled, sensor_enabled, robot_state_enabled)."
+        )
+    return encoders, tokens
+
+
+def build_expert(params: TrainHeadParams, shape: PolicyShape) -> ActionExpert:
+    """The action expert of `train_head.model_type`, with the params of the section of that name."""
+    return EXPERTS[params.model_type](
+        horizon=params.horizon,
+        action_dim=shape.action_dim,
+        groups=shape.action_groups,
+        group_weights={str(name): weight for name, weight in params.group_weights.items()},
+        **params.expert.model_dump(),
+        **getattr(params, params.model_type).model_dump(),
+    )
+
+
+def drop_streams(
+    validity: Mapping[str, Tensor], rates: Mapping[str, float], generator: Generator | None = None
+) -> dict[str, Tensor]:
+    """The validity of each stream, 0 for a random share `rates[stream]` of the samples.
+
+    Modality dropout (Neverova et al. 2016, "ModDrop"): so that a policy learns to lean on what
+    it has. Streams are dropped independently, but a sample never loses all that it has: one of
+    its streams, each as likely, is then kept. With rates p and q of two streams, the first is
+    thus missing from p - pq/2 of the samples that have both.
+    """
+    device = next(iter(validity.values())).device
+    present = torch.stack([v.reshape(len(v), -1).gt(0).any(dim=1) for v in validity.values()], 1)
+    limits = torch.tensor([rates[name] for name in validity], device=device)
+    draw = uniform(present.numel(), device, generator).view(present.shape)
+    dropped = draw < limits
+    # Below its limit a draw is uniform, so relative to it all streams are alike.
+    relative = (draw / limits.clamp(min=torch.finfo(limits.dtype).tiny)).masked_fill(~present, -1.0)
+    last = torch.zeros_like(present).scatter(1, relative.argmax(dim=1, keepdim=True), True)
+    blind = ~(present & ~dropped).any(dim=1, keepdim=True)
+    dropped = dropped & ~(blind & last)
+    return {
+        name: valid.masked_fill(gone.view(-1, *[1] * (valid.ndim - 1)), 0)
+        for (name, valid), gone in zip(validity.items(), dropped.unbind(dim=1), strict=True)
+    }
+
+
+def _fitting(normalization: Normalization, name: str, shape: PolicyShape) -> ChannelStatistics:
     expected = {
         "features": (shape.slots, shape.feature_dim),
         "sensor": (shape.sensor_channels,),
         "state": (shape.state_dim,),
         "action": (shape.action_dim,),
     }[name]
-    statistics: Statistics | None = getattr(normalization, name)
-    found = None if statistics is None else statistics.mean.shape
-    if statistics is None or found != expected:
+    statistics: ChannelStatistics | None = getattr(normalization, name)
+    actual = None if statistics is None else statistics.mean.shape
+    if statistics is None or actual != expected:
         raise CheckpointMismatch(
-            f"normalisation of {name}: expected statistics of shape {expected}, found {found}. "
+            f"normalisation of {name}: expected statistics of shape {expected}, found {actual}. "
             "Train again: python -m stages.train_head"
         )
     return statistics

@@ -3,11 +3,11 @@
 from collections.abc import Mapping, Sequence
 
 import torch
-from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from torch import Generator, Tensor, nn
 
 from pipeline.policy.attention import TransformerLayer, learned
 from pipeline.policy.expert import ActionExpert
+from pipeline.policy.tensors import Chunk, Context, Losses, StepMask
 
 
 class RegressionActionExpert(ActionExpert):
@@ -46,9 +46,7 @@ class RegressionActionExpert(ActionExpert):
         nn.init.normal_(self.head.weight, std=0.02)
         nn.init.zeros_(self.head.bias)
 
-    def predict(
-        self, context: Float[Tensor, "batch token dim"]
-    ) -> Float[Tensor, "batch horizon action"]:
+    def predict(self, context: Context) -> Chunk:
         """The chunk in normalised units, float32."""
         chunk = context.new_zeros(len(context), self.horizon, self.action_dim, dtype=torch.float32)
         for _ in range(self.refinements):
@@ -64,17 +62,11 @@ class RegressionActionExpert(ActionExpert):
         return self.head(self.norm(tokens))
 
     def loss(
-        self,
-        context: Float[Tensor, "batch token dim"],
-        actions: Float[Tensor, "batch horizon action"],
-        valid: Bool[Tensor, "batch horizon"],
-        generator: torch.Generator | None = None,
-    ) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
+        self, context: Context, actions: Chunk, valid: StepMask, generator: Generator | None = None
+    ) -> Losses:
         """The grouped smooth-L1 of `predict(context)`; `generator` is not needed."""
         return self.grouped(self.predict(context), actions, valid)
 
-    def act(
-        self, context: Float[Tensor, "batch token dim"], generator: torch.Generator | None = None
-    ) -> Float[Tensor, "batch horizon action"]:
+    def act(self, context: Context, generator: Generator | None = None) -> Chunk:
         """`predict(context)`; `generator` is not needed."""
         return self.predict(context)

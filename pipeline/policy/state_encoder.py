@@ -37,9 +37,7 @@ class RobotStateEncoder(nn.Module):
         self.missing = learned(output_dim)
 
     def forward(
-        self,
-        values: Float[Tensor, "batch window dim"],
-        valid: Int[Tensor, " batch"] | None = None,
+        self, values: Float[Tensor, "batch window dim"], valid: Int[Tensor, " batch"] | None = None
     ) -> Float[Tensor, "batch output"]:
         """Encode; `valid` None means that every reading is real."""
         batch, window, _ = values.shape

@@ -6,7 +6,6 @@
 other params are replaced, and nothing that the demo did not write is ever touched.
 """
 
-import errno
 import json
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
@@ -16,8 +15,8 @@ from typing import Any, Final
 import numpy as np
 from tqdm import tqdm
 
-from pipeline.base.durable import write_document
-from pipeline.base.errors import ConfigError, DiskFull
+from pipeline.base.durable import disk_full_named, write_document
+from pipeline.base.errors import ConfigError
 from pipeline.base.ownership import OutputKind, remove_folder, there
 from pipeline.simulation.insertion_formats import (
     ABUTTING,
@@ -53,7 +52,7 @@ def write_demo_recordings(root: Path, episodes: int, seed: int) -> None:
     """
     wanted = {"version": DEMO_VERSION, "episodes": episodes, "seed": seed}
     finished = _finished_sets(root, wanted)
-    try:
+    with disk_full_named(root):
         root.mkdir(parents=True, exist_ok=True)
         _mark(root, wanted, finished)
         with tqdm(total=4 * episodes, unit="episode", desc="simulating", disable=None) as progress:
@@ -67,13 +66,6 @@ def write_demo_recordings(root: Path, episodes: int, seed: int) -> None:
                 part.rename(root / name)
                 finished.append(name)
                 _mark(root, wanted, finished)
-    except OSError as error:
-        if error.errno != errno.ENOSPC:
-            raise
-        raise DiskFull(
-            f"{root}: the disk is full after {len(finished)} of {len(_SETS)} sets; "
-            "make room (the demo takes about 60 MB) and run stages.demo again"
-        ) from error
 
 
 def _simulated(number: int, episodes: int, seed: int, progress: "tqdm[Any]") -> Episodes:
@@ -85,26 +77,24 @@ def _simulated(number: int, episodes: int, seed: int, progress: "tqdm[Any]") -> 
         progress.update()
 
 
-def _write_raw_set(folder: Path, episodes: Episodes) -> None:
-    for episode in episodes:
-        write_raw(folder / TASK, episode)
-
-
 def _write_new_set(folder: Path, episodes: Episodes) -> None:
     for index, episode in enumerate(episodes):
         windows = OVERLAPPING if index % _OVERLAPPING_EVERY == 1 else ABUTTING
         write_new(folder / TASK, episode, windows, index % _ROBOT_CLOCK_EVERY == 2)
 
 
-def _write_old_set(folder: Path, episodes: Episodes) -> None:
-    for episode in episodes:
-        write_old(folder / TASK, episode)
+def _each(write: Callable[[Path, SimulatedEpisode], None]) -> Write:
+    def write_set(folder: Path, episodes: Episodes) -> None:
+        for episode in episodes:
+            write(folder / TASK, episode)
+
+    return write_set
 
 
 _SETS: Final[dict[str, Write]] = {
-    "raw": _write_raw_set,
+    "raw": _each(write_raw),
     "new": _write_new_set,
-    "old": _write_old_set,
+    "old": _each(write_old),
     "lerobot": write_lerobot,
 }
 

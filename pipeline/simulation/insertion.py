@@ -35,8 +35,8 @@ from pipeline.simulation.arm import (
     wrapped_deg,
 )
 from pipeline.simulation.expert import REACTION_TICKS, Percept, expert_motion
-from pipeline.simulation.layout import Layout, draw_layout
-from pipeline.simulation.needle_sensor import READING_HZ, Contact, sensor_readings
+from pipeline.simulation.layout import InsertionLayout, draw_layout
+from pipeline.simulation.needle_sensor import READING_HZ, NeedleContact, sensor_readings
 
 TICK_HZ: Final = 10
 TICK_S: Final = 1 / TICK_HZ
@@ -66,7 +66,7 @@ class Scene:
 
 
 @dataclass(frozen=True)
-class Observation:
+class InsertionObservation:
     """What a policy may see at the end of a tick.
 
     `state` (10, 12) and `sensor` (65, 1026) are the readings of the tick that ends at `time_s`;
@@ -99,17 +99,17 @@ class NeedleInsertion:
     the rotation channels of an action are meant.
     """
 
-    layout: Layout
+    layout: InsertionLayout
     knots: list[Knot]
 
     def __init__(self, action_rotation: ActionRotation = "rotvec") -> None:
         self.action_rotation: ActionRotation = action_rotation
 
-    def reset(self, seed: int) -> Observation:
+    def reset(self, seed: int) -> InsertionObservation:
         """The first observation of the episode that this seed draws."""
         return self.start(draw_layout(seed))
 
-    def start(self, layout: Layout) -> Observation:
+    def start(self, layout: InsertionLayout) -> InsertionObservation:
         """The first observation of this very episode: the arm has stood still for one tick."""
         self.layout = layout
         self._upright = orientation(layout.upright_deg)
@@ -128,7 +128,7 @@ class NeedleInsertion:
         """Whether the tip has rested at the target layer, or time is up."""
         return self._held >= _HOLD_TICKS or len(self.knots) > MAX_TICKS
 
-    def step(self, action: NDArray[np.float64]) -> Observation:
+    def step(self, action: NDArray[np.float64]) -> InsertionObservation:
         """Carry out one tick: dx dy dz (mm, base frame), rotation (deg), gripper (ignored)."""
         now = self.knots[-1]
         pose = moved(now.pose, np.asarray(action, np.float64), self.action_rotation)
@@ -139,13 +139,13 @@ class NeedleInsertion:
         self._held = self._held + 1 if resting else 0
         return self.observe()
 
-    def observe(self) -> Observation:
+    def observe(self) -> InsertionObservation:
         """What the last tick showed; asking again changes nothing."""
         tick = len(self.knots) - 1
         before, now = self.knots[-2].pose, self.knots[-1].pose
         part = np.arange(1, STATE_HZ // TICK_HZ + 1)[:, None] * (TICK_HZ / STATE_HZ)
         rng = np.random.default_rng([self.layout.seed, 101, tick])
-        return Observation(
+        return InsertionObservation(
             time_s=self.time_s,
             scene=self.scene(self.time_s),
             state=robot_state(before + part * (now - before)),
@@ -211,7 +211,7 @@ class NeedleInsertion:
         surface = now.surface_mm + share * (layout.surfaces_mm[self._place] - now.surface_mm)
         return target, float(surface)
 
-    def _meet(self, before: Knot, now: Knot) -> Contact:
+    def _meet(self, before: Knot, now: Knot) -> NeedleContact:
         """Needle and tissue over one tick; also settles whether the tip is now inside."""
         part = np.arange(1, READINGS_PER_TICK + 1) / READINGS_PER_TICK
         tip = before.pose[2] + part * (now.pose[2] - before.pose[2])
@@ -222,7 +222,7 @@ class NeedleInsertion:
         inside = self.inside | np.logical_or.accumulate(spring >= tissue.puncture_n)
         inside &= depth > 0
         self.inside = bool(inside[-1])
-        return Contact(
+        return NeedleContact(
             distance_mm=np.maximum(-depth, 0),
             # A surface that gives way carries the layer along, until it is punctured.
             layer_mm=tissue.layer_depth_mm - np.where(inside, depth, np.minimum(depth, 0)),

@@ -40,7 +40,7 @@ class Tissue:
 
 
 @dataclass(frozen=True)
-class Layout:
+class InsertionLayout:
     """What an episode is made of and no observation states outright.
 
     `bench_mm` (2,), `start_pose` (6,) and `surfaces_mm` (place,) are in the base frame,
@@ -61,7 +61,7 @@ class Layout:
     oct_gain: float
 
 
-def draw_layout(seed: int, crosses_180: bool = False) -> Layout:
+def draw_layout(seed: int, crosses_180: bool = False) -> InsertionLayout:
     """The episode of a seed; with `crosses_180` its angle r passes ±180° on the way upright."""
     bench, lateral, depth, hand, look = (np.random.default_rng([seed, i]) for i in range(5))
     bench_mm = NOMINAL_POSE[:2] + bench.uniform(-15, 15, 2)
@@ -70,7 +70,7 @@ def draw_layout(seed: int, crosses_180: bool = False) -> Layout:
     start_xy = bench_mm + hand.uniform(-WORKSPACE_MM, WORKSPACE_MM)
     start_z = surface + depth.uniform(3.8, 5.0)
     upright, leaning = _orientations(hand.uniform(-8, 8, 2), crosses_180)
-    return Layout(
+    return InsertionLayout(
         seed=seed,
         bench_mm=bench_mm,
         start_pose=np.concatenate([start_xy, [start_z], leaning]),

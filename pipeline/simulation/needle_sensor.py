@@ -25,7 +25,7 @@ _FORCE_NOISE_N, _FORCE_DRIFT_N, _FORCE_DRIFT_HZ = 0.01, 0.02, 0.07
 
 
 @dataclass(frozen=True)
-class Contact:
+class NeedleContact:
     """How needle and tissue stand to each other, a row a reading.
 
     `distance_mm` from the tip to the surface, 0 in contact; `layer_mm` from the tip to the target
@@ -43,7 +43,7 @@ def distance_bin(distance_mm: NDArray[np.float64]) -> NDArray[np.int64]:
     return np.clip(np.rint(distance_mm / BIN_MM), -A_SCAN_BINS, _ORIGIN).astype(np.int64)
 
 
-def a_scans(contact: Contact, gain: float, rng: np.random.Generator) -> NDArray[np.float32]:
+def a_scans(contact: NeedleContact, gain: float, rng: np.random.Generator) -> NDArray[np.float32]:
     """A-scans (row, 1025) in counts, a whole number in 0..255, with digitiser noise."""
     bins = np.arange(A_SCAN_BINS)
     surface = np.where(contact.inside, 0, distance_bin(contact.distance_mm))
@@ -57,19 +57,14 @@ def a_scans(contact: Contact, gain: float, rng: np.random.Generator) -> NDArray[
 
 
 def sensor_readings(
-    contact: Contact, start_s: float, gain: float, rng: np.random.Generator
+    contact: NeedleContact, start_s: float, gain: float, rng: np.random.Generator
 ) -> NDArray[np.float32]:
     """Readings (row, 1026) that follow each other at 650 Hz: force in N, then the A-scan.
 
     The number of rows is a multiple of `READINGS_PER_SCAN`. The force drifts slowly.
     """
     fresh = slice(None, None, READINGS_PER_SCAN)
-    seen = Contact(
-        contact.distance_mm[fresh],
-        contact.layer_mm[fresh],
-        contact.inside[fresh],
-        contact.force_n[fresh],
-    )
+    seen = NeedleContact(*(values[fresh] for values in vars(contact).values()))
     scans = np.repeat(a_scans(seen, gain, rng), READINGS_PER_SCAN, axis=0)
     time = start_s + np.arange(len(scans)) / READING_HZ
     drift = _FORCE_DRIFT_N * np.sin(2 * np.pi * _FORCE_DRIFT_HZ * time)

@@ -5,27 +5,20 @@ from dataclasses import dataclass, fields, replace
 from typing import Self
 
 import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float
 from torch import Tensor
+
+from pipeline.base.observation import Observation
 
 
 @dataclass
-class Batch:
+class Batch(Observation):
     """Everything a policy sees and should do at `batch` ticks.
 
-    Windows are causal and right-aligned: they end at their tick, and where the episode had not
-    begun they are zero on the left; `*_valid` counts the real readings. A stream that the store
-    lacks has width 0. Features and sensor have the dtype they are stored in.
+    A stream that the store lacks has width 0. Features and sensor have the dtype they are stored
+    in.
     """
 
-    features: Float[Tensor, "batch slot dim"]
-    slot_valid: Bool[Tensor, "batch slot"]
-    feature_age: Float[Tensor, " batch"]
-    """Seconds since the newest frame that the features have seen."""
-    sensor: Float[Tensor, "batch sensor_window channel"]
-    sensor_valid: Int64[Tensor, " batch"]
-    state: Float[Tensor, "batch state_window state_dim"]
-    state_valid: Int64[Tensor, " batch"]
     action: Float[Tensor, "batch horizon action_dim"]
     action_valid: Bool[Tensor, "batch horizon"]
 

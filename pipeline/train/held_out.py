@@ -5,8 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from pipeline.base.differences import describe
 from pipeline.base.errors import CheckpointMismatch
-from pipeline.policy.checkpoint import PolicyCheckpoint, describe, source_differences
+from pipeline.policy.checkpoint import PolicyCheckpoint, source_differences
 from pipeline.policy.normalization import Normalization
 from pipeline.policy.observation import action_groups
 from pipeline.policy.policy import Trainable
@@ -123,9 +124,9 @@ def check_store(checkpoint: PolicyCheckpoint, store: FeatureStore) -> None:
     """Raise `CheckpointMismatch`, naming what differs, when the policy does not fit this store."""
     differing = source_differences(checkpoint.source, source_of(store))
     if differing:
+        lines = "\n".join(f"  {line}" for line in describe(differing))
         raise CheckpointMismatch(
-            f"the checkpoint does not fit {store.path}:\n"
-            f"{describe(differing, 'the checkpoint', 'the store')}\n"
+            f"the checkpoint does not fit {store.path} (the checkpoint -> the store):\n{lines}\n"
             "Name the store it was trained from in evaluate.store, extract with the params it was "
             "trained with, or train again: python -m stages.train_head"
         )

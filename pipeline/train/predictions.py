@@ -1,6 +1,7 @@
 """What a policy does at recorded ticks, and what simple rules would have done there."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,15 +11,17 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from pipeline.base.errors import NumericsError
-from pipeline.policy.observation import Observation
+from pipeline.base.observation import Observation
 from pipeline.policy.policy import Trainable
-from pipeline.store import FeatureStore, place
-from pipeline.train.batches import BatchIndices, Feed, Prefetch, Ticks, Windows, draws
+from pipeline.store import Batch, FeatureStore, place
+from pipeline.train.batches import BatchIndices, Prefetch, Ticks, Windows, draws
 
 Actions = NDArray[np.float32]
 METHODS = ("policy", "zero_action", "mean_action", "repeat_last")
 BASELINES = METHODS[1:]
-FeedMaker = Callable[[Sequence[BatchIndices]], Feed]
+FeedMaker = Callable[
+    [Sequence[BatchIndices]], AbstractContextManager[Iterable[tuple[BatchIndices, Batch]]]
+]
 """Makes the feed of a plan: what a policy is to see at these ticks."""
 _SEED = 0
 _CHUNKS_AT_ONCE = 1024

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pipeline.base.config import TrainHeadParams
+from pipeline.base.differences import Differences, describe, differences
 from pipeline.base.durable import (
     damaged,
     put_in_place,
@@ -35,8 +36,6 @@ from pipeline.policy.checkpoint import (
     DOCUMENT,
     SOURCE_KEYS,
     check_policy,
-    describe,
-    differences,
     source_differences,
 )
 from pipeline.store import FeatureStore, build_lock
@@ -141,7 +140,7 @@ def open_run(
         if differing:
             notes.append(
                 f"{part} is an unfinished run of something else; it is put aside as "
-                f"{_aside(part)}:\n{describe(differing, 'that run', 'now')}"
+                f"{_aside(part)} (that run -> now):\n{_indented(differing)}"
             )
         elif (part / LAST).exists():
             notes.append(f"resuming the run in {part}")
@@ -203,7 +202,7 @@ def _finished_notes(params: TrainHeadParams) -> tuple[str, ...]:
     return said, f"its curves are left where they were written, in {logs}, not in {params.logs}"
 
 
-def _compare(part: Path, identity: Mapping[str, Any], section: str) -> dict[str, tuple[Any, Any]]:
+def _compare(part: Path, identity: Mapping[str, Any], section: str) -> Differences:
     """What else the unfinished run in `part` was to be; refused where its store was another."""
     prior = read_document(part / RUN)
     source = prior.get("source")
@@ -212,12 +211,16 @@ def _compare(part: Path, identity: Mapping[str, Any], section: str) -> dict[str,
     differing = source_differences(source, identity["source"])
     if differing:
         raise CheckpointMismatch(
-            f"{part}: this unfinished run cannot go on, its store was another one:\n"
-            f"{describe(differing, 'the run', 'the store now')}\n"
+            f"{part}: this unfinished run cannot go on, its store was another one "
+            f"(the run -> the store now):\n{_indented(differing)}\n"
             f"Remove {part} to begin anew, choose another {section}.output, or name the store "
             "it began with in train_head.store."
         )
     return differences(prior["decides"], identity["decides"])
+
+
+def _indented(differing: Differences) -> str:
+    return "\n".join(f"  {line}" for line in describe(differing))
 
 
 def _has_checkpoint(part: Path) -> bool:

@@ -41,8 +41,8 @@ class Augmentation:
     @classmethod
     def drawn(cls, params: AugmentationParams, key: bytes, view: str, variant: int) -> Self:
         """The change of a view in a variant of the row of this key, uniform within `params`."""
-        said = f"{params.seed} {variant} {view}".encode()
-        digest = hashlib.blake2b(said, key=key, digest_size=64).digest()
+        drawn_for = f"{params.seed} {variant} {view}".encode()
+        digest = hashlib.blake2b(drawn_for, key=key, digest_size=64).digest()
         # 53 bits a draw: every float64 step of [0, 1), without rounding up to 1.
         chances = (int(word) >> 11 for word in np.frombuffer(digest, "<u8"))
         draws = (chance * 2.0**-53 for chance in chances)

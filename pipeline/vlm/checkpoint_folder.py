@@ -48,13 +48,13 @@ def cached_checkpoint(checkpoint: str, revision: str | None) -> Path | None:
     from huggingface_hub.errors import HFValidationError, LocalEntryNotFoundError
 
     try:
-        found = snapshot_download(
+        copy = snapshot_download(
             checkpoint, revision=revision, local_files_only=True, allow_patterns=_WANTED
         )
     except (LocalEntryNotFoundError, HFValidationError):
         return None
     # A download that was cut short leaves a folder with holes: it is finished, not trusted.
-    return Path(found) if _is_complete(Path(found)) else None
+    return Path(copy) if _is_complete(Path(copy)) else None
 
 
 def _is_complete(folder: Path) -> bool:
@@ -77,17 +77,13 @@ def _downloaded(checkpoint: str, revision: str | None, setting: str) -> Path:
     except LocalEntryNotFoundError as error:
         cause, why = error, "it is neither whole in the local cache nor reachable"
     except (HFValidationError, OSError) as error:
-        cause, why = error, f"it cannot be downloaded: {_first_line(error)}"
+        cause, why = error, f"it cannot be downloaded: {str(error).strip().splitlines()[0]}"
     raise VLMError(
         f"{setting} {checkpoint}: there is no folder of that name here; and as a hub id, {why}. "
         "If it is the demo's folder, run `python -m stages.demo`; if it is a hub id, run "
         f"`hf download {checkpoint}` where there is network and set {setting} to the folder. "
         "`python -m stages.doctor` looks at the rest."
     ) from cause
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).strip().partition("\n")[0]
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -160,7 +156,9 @@ def tensor_headers(path: Path) -> dict[str, tuple[str, list[int]]]:
     try:
         with safe_open(path, "numpy") as file:
             tensors = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118
-            return {name: (one.get_dtype(), one.get_shape()) for name, one in tensors.items()}
+            return {
+                name: (tensor.get_dtype(), tensor.get_shape()) for name, tensor in tensors.items()
+            }
     except SafetensorError as error:
         raise VLMError(f"{path}: cut off or damaged: {error}. Copy or download it again.") from None
 
@@ -224,9 +222,8 @@ def _present_weights(folder: Path) -> list[Path]:
             f"{folder}: no *.safetensors file. Expected a checkpoint in the hub's format; pickled "
             "weights (*.bin, *.pt) are not opened."
         )
-    config = folder / "config.json"
-    read_json(config)
-    return sorted([config, *shards])
+    read_json(folder / "config.json")
+    return sorted([folder / "config.json", *shards])
 
 
 def tokenizer_files(folder: Path) -> list[Path]:

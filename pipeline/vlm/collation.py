@@ -11,9 +11,9 @@ from jaxtyping import Bool, Float, Int64, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.vlm.pixels import PixelSettings
 from pipeline.vlm.pooling import batch_weights
-from pipeline.vlm.preparation import Layout, PreparedRow
+from pipeline.vlm.preparation import PreparedRow, TokenLayout
+from pipeline.vlm.processor import PixelSettings
 from pipeline.vlm.slots import Slot
 from pipeline.vlm.vision import TowerPlan, VisionTower, sent
 
@@ -43,7 +43,7 @@ class Arrangement:
 
 
 @dataclass(frozen=True)
-class Batch:
+class TokenBatch:
     """Rows side by side, padded on the right, on the model's device."""
 
     arrangement: Arrangement
@@ -74,10 +74,10 @@ class Collator:
         self._places = places
         self._tower = tower
         self._static = static
-        self._positions: dict[Layout, Int64[Tensor, "3 token"]] = {}
-        self._arrangements: dict[tuple[Layout, ...], Arrangement] = {}
+        self._positions: dict[TokenLayout, Int64[Tensor, "3 token"]] = {}
+        self._arrangements: dict[tuple[TokenLayout, ...], Arrangement] = {}
 
-    def collate(self, rows: Sequence[PreparedRow]) -> Batch:
+    def collate(self, rows: Sequence[PreparedRow]) -> TokenBatch:
         """The batch of these rows."""
         arrangement = self._arrangement(tuple(row.layout for row in rows))
         token_ids = self._pinned((len(rows), arrangement.length), torch.int64)
@@ -92,7 +92,7 @@ class Collator:
         plan = self._tower.plan(len(distinct), self._device) if distinct else None
         shown = torch.from_numpy(self._shown(which, plan))
         device = self._device
-        return Batch(
+        return TokenBatch(
             arrangement, sent(token_ids, device), sent(pixels, device), plan, sent(shown, device)
         )
 
@@ -106,14 +106,14 @@ class Collator:
         rows, columns = self._settings.merged_grid
         return plan.place.reshape(-1, rows * columns)[which].reshape(-1)
 
-    def _arrangement(self, layouts: tuple[Layout, ...]) -> Arrangement:
+    def _arrangement(self, layouts: tuple[TokenLayout, ...]) -> Arrangement:
         if layouts not in self._arrangements:
             if len(self._arrangements) == _KEPT:
                 del self._arrangements[next(iter(self._arrangements))]
             self._arrangements[layouts] = self._arranged(layouts)
         return self._arrangements[layouts]
 
-    def _arranged(self, layouts: tuple[Layout, ...]) -> Arrangement:
+    def _arranged(self, layouts: tuple[TokenLayout, ...]) -> Arrangement:
         length = max(layout.length for layout in layouts)
         if self._static:
             length = -(-length // _STEP) * _STEP
@@ -136,19 +136,19 @@ class Collator:
             (weights != 0).any(dim=-1),
         )
 
-    def _rope_positions(self, layout: Layout) -> Int64[Tensor, "3 token"]:
+    def _rope_positions(self, layout: TokenLayout) -> Int64[Tensor, "3 token"]:
         """Time, height and width position of each token; computed once a layout, on the CPU."""
         if layout not in self._positions:
             kinds = torch.zeros(1, layout.length, dtype=torch.int64)
             kinds[0, torch.from_numpy(layout.image_tokens())] = 1
             grid = (1, *self._settings.grid)
             images = len(layout.image_starts)
-            found, _ = self._model.get_rope_index(
+            positions, _ = self._model.get_rope_index(
                 torch.zeros_like(kinds),
                 mm_token_type_ids=kinds,
                 image_grid_thw=torch.tensor([grid] * images) if images else None,
             )
-            self._positions[layout] = found[:, 0]
+            self._positions[layout] = positions[:, 0]
         return self._positions[layout]
 
     def _pinned(self, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
@@ -167,10 +167,10 @@ def unique(images: Sequence[NDArray[np.uint8]]) -> tuple[list[NDArray[np.uint8]]
     for image in images:
         flat = image.reshape(-1)
         sampled = alike[flat[:: max(1, flat.size // _SAMPLE)].tobytes()]
-        found = next((one for one in sampled if np.array_equal(distinct[one], image)), None)
-        if found is None:
-            found = len(distinct)
+        known = next((k for k in sampled if np.array_equal(distinct[k], image)), None)
+        if known is None:
+            known = len(distinct)
             distinct.append(image)
-            sampled.append(found)
-        which.append(found)
+            sampled.append(known)
+        which.append(known)
     return distinct, which

@@ -1,18 +1,18 @@
 """Prepared rows -> pooled features, differentiable: what the frozen and the live model share."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float, Int64, UInt8
 from torch import Tensor
 from transformers.masking_utils import create_causal_mask, create_sliding_window_causal_mask
 
-from pipeline.vlm.collation import Batch, Collator
-from pipeline.vlm.patches import patchify
-from pipeline.vlm.pixels import PixelSettings
+from pipeline.vlm.collation import Collator, TokenBatch
 from pipeline.vlm.pooling import pool
 from pipeline.vlm.preparation import PreparedRow
+from pipeline.vlm.processor import PixelSettings
 from pipeline.vlm.slots import Slot
 from pipeline.vlm.vision import TowerPlan, VisionTower
 
@@ -69,15 +69,15 @@ class Extractor:
         batch = self.collate(rows)
         return self.features(batch), self.valid(batch)
 
-    def collate(self, rows: Sequence[PreparedRow]) -> Batch:
+    def collate(self, rows: Sequence[PreparedRow]) -> TokenBatch:
         """The rows as `features` takes them, sent to the model's device without waiting."""
         return self._collator.collate(rows)
 
-    def valid(self, batch: Batch) -> Bool[Tensor, "batch slot"]:
+    def valid(self, batch: TokenBatch) -> Bool[Tensor, "batch slot"]:
         """Which slots have a token at all; on the CPU."""
         return batch.arrangement.valid.repeat(1, len(self._reads))
 
-    def features(self, batch: Batch) -> Float[Tensor, "batch slot dim"]:
+    def features(self, batch: TokenBatch) -> Float[Tensor, "batch slot dim"]:
         """The slots of each row, in float32 on the model's device.
 
         What a compiled extractor gives is overwritten by its next batch.
@@ -141,3 +141,40 @@ class Extractor:
                     with torch.autocast(tokens.device.type, enabled=False):
                         read[key] = pool(tokens, weights, real)
         return torch.cat([read[key] for key in self._reads], dim=1)
+
+
+def patchify(
+    images: UInt8[Tensor, "image height width 3"], settings: PixelSettings
+) -> Float[Tensor, "patch value"]:
+    """Normalised patches of all images (stretched, uint8), in float32 on the images' device.
+
+    The layout is that of transformers' Qwen2-VL image processor.
+
+    Patches stand in the tower's order: block by block of merge size x merge size, row-major; the
+    values of a patch are (channel, time, y, x), with the still image repeated over time.
+    """
+    rows, columns = settings.grid
+    merge, patch = settings.merge_size, settings.patch_size
+    blocks = images.reshape(
+        -1, rows // merge, merge, patch, columns // merge, merge, patch, images.shape[-1]
+    )
+    # image, block row, block column, row in block, column in block, channel, y, x
+    patches = blocks.permute(0, 1, 4, 2, 5, 7, 3, 6).to(torch.float32)
+    scale, offset = _normalisation(settings, images.device)
+    patches = torch.addcmul(offset, patches, scale)
+    frames = patches.unsqueeze(6).expand(*[-1] * 6, settings.temporal_patch_size, -1, -1)
+    return frames.reshape(len(images) * rows * columns, -1)
+
+
+@lru_cache(maxsize=8)
+def _normalisation(settings: PixelSettings, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Scale and offset of each channel (channel, 1, 1), so that one pass rescales and normalises.
+
+    Sent once: sending waits.
+    """
+    mean, std = (
+        torch.tensor(values, dtype=torch.float64).reshape(-1, 1, 1)
+        for values in (settings.image_mean, settings.image_std)
+    )
+    scale, offset = settings.rescale_factor / std, -mean / std
+    return scale.float().to(device), offset.float().to(device)

@@ -16,9 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.config import VLMParams
+from pipeline.base.differences import describe, differences
 from pipeline.base.errors import VLMError
 from pipeline.vlm.checkpoint_folder import (
     adapter_files,
+    could_be_hub_id,
     read_config,
     resolve_checkpoint,
     tokenizer_files,
@@ -26,24 +28,17 @@ from pipeline.vlm.checkpoint_folder import (
 )
 from pipeline.vlm.slots import Slot, slot_documents, slots_of
 
-__all__ = [
-    "AUGMENTATION_VERSION",
-    "EXTRACTOR_VERSION",
-    "FeatureSpec",
-    "Slot",
-    "differences",
-    "document_digest",
-    "feature_spec",
-    "live_differences",
-    "resolve_checkpoint",
-    "row_key",
-]
-
 EXTRACTOR_VERSION = 1
 """Raised whenever this code changes what a feature is: the golden-feature test sees to it."""
 
 AUGMENTATION_VERSION = 1
 """Raised whenever this code changes what an augmented variant of a frame is."""
+
+_WIDTH_OF_3B = 2048
+"""Of the hidden states of Qwen2.5-VL-3B."""
+
+_MANY_LAYERS = 10_000
+"""How many layers a model has decides which of them are read, not how many slots."""
 
 _PLACEHOLDER_INSTRUCTION = "…"
 _READS_CHECKPOINTS = ("transformers", "tokenizers", "huggingface-hub", "jinja2")
@@ -122,10 +117,26 @@ def feature_spec(
     return FeatureSpec(document, digest, slots, ordered, dim, image_size, vlm.variants)
 
 
+def feature_shape(vlm: VLMParams, views: Sequence[str]) -> tuple[int, int]:
+    """Slots, and width: what a checkpoint folder says of itself, Qwen2.5-VL-3B's for a hub id.
+
+    Raises `VLMError` for what is neither, and for a name in a folder that is here and lacks it.
+    """
+    slots = len(slots_of(vlm, _MANY_LAYERS, views))
+    folder = Path(vlm.checkpoint).expanduser()
+    if folder.is_dir():
+        return slots, _model_shape(folder)[1]
+    if folder.parent.is_dir() or not could_be_hub_id(vlm.checkpoint):
+        raise VLMError(
+            f"{vlm.checkpoint}: no such folder. Expected a checkpoint's folder or a hub id, as "
+            "Qwen/Qwen2.5-VL-3B-Instruct. The demo's is written by `python -m stages.demo`."
+        )
+    return slots, _WIDTH_OF_3B
+
+
 def _read(folder: Path, vlm: VLMParams, views: int) -> dict[str, Any]:
     """The entries of the document that transformers has to read."""
-    from pipeline.vlm.pixels import PixelSettings
-    from pipeline.vlm.prompt import PromptRenderer
+    from pipeline.vlm.processor import PixelSettings, PromptRenderer
 
     pixels = PixelSettings.read(folder, (vlm.image_resize_height, vlm.image_resize_width))
     renderer = PromptRenderer(folder, vlm.prompt)
@@ -142,9 +153,7 @@ def _read_digest(
     """The digest of all that `_read` depends on: files, libraries, this code and its arguments."""
     beside = folder.glob("additional_chat_templates/*")
     files = [p for p in (*folder.glob("*"), *beside) if p.suffix in _READ_FROM_CHECKPOINTS]
-    code = [
-        Path(__file__).with_name(name) for name in ("feature_spec.py", "pixels.py", "prompt.py")
-    ]
+    code = [Path(__file__).with_name(name) for name in ("feature_spec.py", "processor.py")]
     return _digest(
         {
             "files": {str(path.relative_to(folder)): digest_file(path) for path in sorted(files)},
@@ -178,59 +187,19 @@ def row_key(spec: FeatureSpec, prompt: str, frames: Mapping[str, NDArray[np.uint
     return digest.digest()
 
 
-def differences(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[str]:
-    """Readable lines such as `prompt: 'x' -> 'y'`, one for each entry that differs."""
-    lines: list[str] = []
-    for key in sorted(set(a) | set(b)):
-        if key != "digest":
-            lines += _differing(key, a.get(key), b.get(key))
-    return lines
-
-
 def live_differences(trained: Mapping[str, Any], live: Mapping[str, Any]) -> list[str]:
-    """`differences` between the spec that a policy was trained on and that of a live model.
+    """A line for each entry that differs between the spec of a policy and that of a live model.
 
     How features are stored makes none, nor do augmented variants: a live model gives plain ones.
     """
-    return differences(_as_live(trained), _as_live(live))
+    return describe(differences(_as_live(trained), _as_live(live)))
 
 
 def _as_live(spec: Mapping[str, Any]) -> dict[str, Any]:
     plain = [slot for slot in spec.get("slots", []) if slot.get("variant", 0) == 0]
     slots = [{name: said for name, said in slot.items() if name != "variant"} for slot in plain]
-    stored = {"storage_dtype", "variants", "augmentation"}
-    return {name: value for name, value in spec.items() if name not in stored} | {"slots": slots}
-
-
-def _differing(place: str, a: Any, b: Any) -> list[str]:
-    if a == b:
-        return []
-    if isinstance(a, Mapping) and isinstance(b, Mapping):
-        return [
-            line
-            for key in sorted(set(a) | set(b))
-            for line in _differing(f"{place}.{key}", a.get(key), b.get(key))
-        ]
-    if isinstance(a, list) and isinstance(b, list) and any(isinstance(x, dict) for x in a + b):
-        if len(a) != len(b):
-            return [f"{place}: {len(a)} entries -> {len(b)} entries"]
-        return [
-            line
-            for index, pair in enumerate(zip(a, b, strict=True))
-            for line in _differing(f"{place}[{index}]", *pair)
-        ]
-    return [f"{place}: {_shown(a, b)} -> {_shown(b, a)}"]
-
-
-def _shown(value: Any, other: Any) -> str:
-    """The value, and of a long text only the part around where it departs from the other."""
-    if not isinstance(value, str) or len(value) <= 80:
-        return repr(value)
-    other = other if isinstance(other, str) else ""
-    pairs = zip(value, other, strict=False)
-    first = next((i for i, (x, y) in enumerate(pairs) if x != y), min(len(value), len(other)))
-    start = max(0, first - 20)
-    return f"{'…' * (start > 0)}{value[start : start + 60]!r}{'…' * (start + 60 < len(value))}"
+    other = {"digest", "storage_dtype", "variants", "augmentation"}
+    return {name: value for name, value in spec.items() if name not in other} | {"slots": slots}
 
 
 def _model_shape(folder: Path) -> tuple[int, int]:

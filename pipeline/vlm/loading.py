@@ -18,7 +18,7 @@ from transformers.utils import logging as transformers_logging
 from pipeline.base.config import VLMParams
 from pipeline.base.errors import VLMError
 from pipeline.vlm.checkpoint_folder import adapter_files, resolve_checkpoint, weight_files
-from pipeline.vlm.pixels import PixelSettings
+from pipeline.vlm.processor import PixelSettings
 from pipeline.vlm.vision import tower_attention
 
 _UNUSED = {"lm_head.weight"}
@@ -154,19 +154,19 @@ def adapted(whole: Any, vlm: VLMParams, dropout: float | None = None) -> Any:
             if dropout is not None:
                 config.lora_dropout = dropout
             learns = dropout is not None
-            found: Any = PeftModel.from_pretrained(
+            adapting: Any = PeftModel.from_pretrained(
                 whole, str(folder), config=config, is_trainable=learns
             )
-            report = found.load_adapter(str(folder), adapter_name="default", is_trainable=learns)
+            report = adapting.load_adapter(str(folder), adapter_name="default", is_trainable=learns)
     except (OSError, ValueError, RuntimeError, KeyError, TypeError, SafetensorError) as error:
         raise VLMError(
             f"{folder}: this adapter does not fit the checkpoint {vlm.checkpoint}: {error}. Set "
             "vlm.adapter to one that was trained on this checkpoint, or to null."
         ) from error
     _refuse_strange(folder, set(report.missing_keys), set(report.unexpected_keys), "adapter")
-    if not hasattr(found, "merge_and_unload"):
+    if not hasattr(adapting, "merge_and_unload"):
         raise VLMError(f"{folder}: a {config.peft_type} adapter cannot be merged; use LoRA")
-    return found
+    return adapting
 
 
 def _refuse_strange(folder: Path, missing: set[str], unexpected: set[str], what: str) -> None:

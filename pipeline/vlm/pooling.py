@@ -14,12 +14,12 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.vlm.preparation import Layout
+from pipeline.vlm.preparation import TokenLayout
 from pipeline.vlm.slots import GRID_CELLS, Slot
 
 
 @lru_cache(maxsize=64)
-def token_weights(slots: tuple[Slot, ...], layout: Layout) -> NDArray[np.float32]:
+def token_weights(slots: tuple[Slot, ...], layout: TokenLayout) -> NDArray[np.float32]:
     """Weight (slot, token) of each token in each slot; a row sums to 1, or to 0 without tokens."""
     weights = np.zeros((len(slots), layout.length), np.float32)
     for row, slot in zip(weights, slots, strict=True):
@@ -30,7 +30,7 @@ def token_weights(slots: tuple[Slot, ...], layout: Layout) -> NDArray[np.float32
     return weights
 
 
-def _tokens_of(slot: Slot, layout: Layout) -> NDArray[np.int64]:
+def _tokens_of(slot: Slot, layout: TokenLayout) -> NDArray[np.int64]:
     every = np.arange(layout.length)
     match slot.pooling:
         case "mean":
@@ -47,7 +47,7 @@ def _tokens_of(slot: Slot, layout: Layout) -> NDArray[np.int64]:
             raise ValueError(f"unknown pooling {unknown!r}")
 
 
-def _view_tokens(slot: Slot, layout: Layout) -> NDArray[np.int64]:
+def _view_tokens(slot: Slot, layout: TokenLayout) -> NDArray[np.int64]:
     start = dict(layout.image_starts).get(slot.view or "")
     if start is None:
         return np.empty(0, np.int64)
@@ -64,7 +64,7 @@ def _extent(cell: int, size: int) -> slice:
 
 
 def batch_weights(
-    slots: tuple[Slot, ...], layouts: Sequence[Layout], length: int
+    slots: tuple[Slot, ...], layouts: Sequence[TokenLayout], length: int
 ) -> Float[Tensor, "batch slot token"]:
     """`token_weights` of each row, padded on the right to `length` tokens."""
     weights = torch.zeros(len(layouts), len(slots), length)

@@ -6,18 +6,21 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from pipeline.base.config import VLMParams
 from pipeline.base.errors import VLMError
 from pipeline.vlm.augmentation import Augmentation
 from pipeline.vlm.checkpoint_folder import resolve_checkpoint
-from pipeline.vlm.feature_spec import FeatureSpec
-from pipeline.vlm.pixels import PixelSettings, stretch
-from pipeline.vlm.prompt import PromptRenderer, TokenKind
+from pipeline.vlm.feature_spec import FeatureSpec, row_key
+from pipeline.vlm.processor import PixelSettings, PromptRenderer, TokenKind, stretch
+
+FramesByView = Mapping[str, NDArray[np.uint8] | Image.Image]
+"""RGB frames (height, width, 3) of one moment by view."""
 
 
 @dataclass(frozen=True)
-class Layout:
+class TokenLayout:
     """Where what stands in a row's tokens; rows of equal layout need no padding between them."""
 
     length: int
@@ -44,7 +47,7 @@ class PreparedRow:
     """(token,), the placeholders expanded to one a merged patch."""
     pixels: NDArray[np.uint8]
     """(image, height, width, 3) RGB at the spec's image size, views in order."""
-    layout: Layout
+    layout: TokenLayout
 
 
 class Preparer:
@@ -53,8 +56,7 @@ class Preparer:
     def __init__(self, vlm: VLMParams, spec: FeatureSpec) -> None:
         """Read the checkpoint's tokenizer and processor settings."""
         folder = resolve_checkpoint(vlm.checkpoint, vlm.revision)
-        self._views = spec.views
-        self._variants = spec.variants
+        self._spec = spec
         self._augmentation = vlm.augmentation
         self._renderer = PromptRenderer(folder, vlm.prompt)
         resize = (vlm.image_resize_height, vlm.image_resize_width)
@@ -86,10 +88,33 @@ class Preparer:
         pixels = np.empty((len(views), *size, 3), np.uint8)
         for place, view in zip(pixels, views, strict=True):
             place[:] = stretch(_checked(frames[view], view), size)
-        layout = Layout(
+        layout = TokenLayout(
             len(token_ids), tuple(zip(views, starts, strict=True)), self._settings.merged_grid
         )
         return PreparedRow(prompt, token_ids, pixels, layout)
+
+    def prepare_distinct(
+        self, images: Sequence[FramesByView | None], instructions: Sequence[str]
+    ) -> tuple[list[PreparedRow], list[int]]:
+        """The rows of samples that differ, each once, and which of them each sample is.
+
+        -1 is a sample whose frames are None. Raises `VLMError` for a view that is not the spec's
+        and for what is not an RGB frame.
+        """
+        rows: dict[bytes, PreparedRow] = {}
+        place: dict[bytes, int] = {}
+        row_of: list[int] = []
+        for given, instruction in zip(images, instructions, strict=True):
+            if given is None:
+                row_of.append(-1)
+                continue
+            frames = {view: _as_array(frame) for view, frame in given.items()}
+            key = row_key(self._spec, self.render(instruction, tuple(frames)), frames)
+            if key not in rows:
+                place[key] = len(rows)
+                rows[key] = self.prepare(instruction, frames)
+            row_of.append(place[key])
+        return list(rows.values()), row_of
 
     def prepare_variants(
         self, instruction: str, frames: Mapping[str, NDArray[np.uint8]], key: bytes
@@ -99,7 +124,7 @@ class Preparer:
         `key` is the row's (`row_key`): what is drawn depends on nothing else. All have one layout.
         """
         plain = self.prepare(instruction, frames)
-        others = range(1, self._variants)
+        others = range(1, self._spec.variants)
         return (plain, *(self._augmented(plain, frames, key, variant) for variant in others))
 
     def _augmented(
@@ -122,13 +147,13 @@ class Preparer:
         return replace(plain, pixels=pixels)
 
     def _ordered(self, views: Sequence[str] | Mapping[str, object]) -> tuple[str, ...]:
-        unknown = sorted(set(views) - set(self._views))
+        unknown = sorted(set(views) - set(self._spec.views))
         if unknown:
             raise VLMError(
                 f"view {', '.join(unknown)} is not in the feature spec, which has "
-                f"{', '.join(self._views)}"
+                f"{', '.join(self._spec.views)}"
             )
-        return tuple(view for view in self._views if view in views)
+        return tuple(view for view in self._spec.views if view in views)
 
     def _expanded_tokens(self, prompt: str) -> tuple[NDArray[np.int64], tuple[int, ...]]:
         """Token ids with each image's placeholder repeated, and where each image begins."""
@@ -140,6 +165,10 @@ class Preparer:
         token_ids = np.repeat(ids, counts)
         token_ids.flags.writeable = False
         return token_ids, tuple(starts.tolist())
+
+
+def _as_array(frame: NDArray[np.uint8] | Image.Image) -> NDArray[np.uint8]:
+    return np.asarray(frame.convert("RGB")) if isinstance(frame, Image.Image) else frame
 
 
 def _checked(frame: NDArray[np.uint8], view: str) -> NDArray[np.uint8]:

@@ -16,8 +16,8 @@ from pipeline.base.errors import NumericsError, VLMError
 from pipeline.vlm.extractor import Extractor, layers_needed
 from pipeline.vlm.feature_spec import FeatureSpec
 from pipeline.vlm.loading import environment, load_model, pixel_settings
-from pipeline.vlm.pixels import PixelSettings
-from pipeline.vlm.preparation import Layout, PreparedRow
+from pipeline.vlm.preparation import PreparedRow, TokenLayout
+from pipeline.vlm.processor import PixelSettings
 
 
 class FrozenVLM:
@@ -40,7 +40,7 @@ class FrozenVLM:
         self._spec = spec
         self._storage_dtype = getattr(torch, spec.document["storage_dtype"])
         self._compiled = compiled
-        self._fitted: dict[Layout, set[int]] = defaultdict(set)
+        self._fitted: dict[TokenLayout, set[int]] = defaultdict(set)
         self.environment = environment(model, device) | ({"compiled": "true"} if compiled else {})
 
     @classmethod
@@ -85,17 +85,20 @@ class FrozenVLM:
         with torch.cuda.device(self.device if self.device.type == "cuda" else -1):
             try:
                 batch = self._extractor.collate(padded)
-                clock = _Clock(self.device)
-                # Cut and converted before they leave the device: a padded row is nobody's.
-                features = self._extractor.features(batch)[: len(rows)].to(self._storage_dtype)
+                valid = self._extractor.valid(batch)[: len(rows)]
+
+                def compute() -> Float[Tensor, "batch slot dim"]:
+                    # Cut and converted before they leave the device: a padded row is nobody's.
+                    return self._extractor.features(batch)[: len(rows)].to(self._storage_dtype)
+
+                pending = Pending(compute, valid, self.device, self._check_finite)
             except RuntimeError as error:
                 self._fitted[layout].discard(len(padded))
                 if self._compiled:
                     raise _of_compiler(error) from None
                 raise
-            self._fitted[layout].add(len(padded))
-            valid = self._extractor.valid(batch)[: len(rows)]
-            return Pending(features, valid, clock, self._check_finite)
+        self._fitted[layout].add(len(padded))
+        return pending
 
     def _padded(self, rows: Sequence[PreparedRow]) -> Sequence[PreparedRow]:
         """What a compiled model is given: as many rows as it has been given before, or more.
@@ -123,85 +126,58 @@ class FrozenVLM:
 
 
 class Pending:
-    """Features that are being computed, or on their way to the CPU."""
+    """Features that are being computed, or on their way to the CPU.
+
+    What the model takes is told by the device's own clock where it has one: the host does not wait.
+    """
 
     def __init__(
         self,
-        features: Float[Tensor, "batch slot dim"],
+        compute: Callable[[], Float[Tensor, "batch slot dim"]],
         valid: Bool[Tensor, "batch slot"],
-        clock: "_Clock",
+        device: torch.device,
         check: Callable[[Float[Tensor, "batch slot dim"]], None],
     ) -> None:
-        """Begin to copy `features` to the CPU; `clock` began when the model did."""
-        self._valid = valid
-        self._clock = clock
-        self._check = check
-        clock.stop()
+        """Begin to `compute` features on `device` and to copy them to the CPU."""
+        self._valid, self._check = valid, check
+        began, begun = time.perf_counter(), _event(device)
+        features = compute()
+        self._computed, self._took = (begun, _event(device)), time.perf_counter() - began
         self._features = features
-        if features.device.type == "cuda":
+        if device.type == "cuda":
             self._features = torch.empty(features.shape, dtype=features.dtype, pin_memory=True)
             self._features.copy_(features, non_blocking=True)
-        clock.copied()
+        self._copied = _event(device)
 
     def result(self) -> tuple[Float[Tensor, "batch slot dim"], Bool[Tensor, "batch slot"]]:
         """What `FrozenVLM.encode` gives, when it is there; raises as it does."""
-        self._clock.wait()
+        if self._copied:
+            self._copied.synchronize()
         self._check(self._features)
         return self._features, self._valid
 
     @property
     def done(self) -> bool:
         """Whether the `result` is there, without waiting for it."""
-        return self._clock.done
+        return self._copied is None or self._copied.query()
 
     @property
     def model_s(self) -> float:
         """Seconds that the model worked; waits for the `result`."""
-        return self._clock.model_s
-
-
-class _Clock:
-    """What the model takes, by the device's own clock where it has one: the host does not wait."""
-
-    def __init__(self, device: torch.device) -> None:
-        self._stream = torch.cuda.current_stream(device) if device.type == "cuda" else None
-        self._events = [self._event()]
-        self._begun, self._took = time.perf_counter(), 0.0
-
-    def stop(self) -> None:
-        """The model is done."""
-        self._events.append(self._event())
-        self._took = time.perf_counter() - self._begun
-
-    def copied(self) -> None:
-        """The result is on the CPU."""
-        self._events.append(self._event())
-
-    @property
-    def done(self) -> bool:
-        last = self._events[-1]
-        return last is None or last.query()
-
-    def wait(self) -> None:
-        """Wait until it is."""
-        if last := self._events[-1]:
-            last.synchronize()
-
-    @property
-    def model_s(self) -> float:
-        begun, done, _ = self._events
-        if begun is None or done is None:
+        begun, done = self._computed
+        if begun is None or done is None or self._copied is None:
             return self._took
-        self.wait()
+        self._copied.synchronize()
         return begun.elapsed_time(done) / 1000
 
-    def _event(self) -> torch.cuda.Event | None:
-        """This moment in the device's work; nothing on the CPU, whose work is done by then."""
-        if self._stream is None:
-            return None
-        event = torch.cuda.Event(enable_timing=True)
-        event.record(self._stream)
-        return event
+
+def _event(device: torch.device) -> torch.cuda.Event | None:
+    """This moment in the device's work; nothing on the CPU, whose work is done by then."""
+    if device.type != "cuda":
+        return None
+    event = torch.cuda.Event(enable_timing=True)
+    event.record(torch.cuda.current_stream(device))
+    return event
 
 
 def _of_compiler(error: RuntimeError) -> RuntimeError | VLMError:

@@ -21,21 +21,8 @@ from pipeline.vlm.slots import Slot
 TOWERS = {"language": "model.language_model.", "vision": "model.visual."}
 """Where each tower stands in a `Qwen2_5_VLForConditionalGeneration`."""
 
-_COMPANIONS = (
-    "config.json",
-    "generation_config.json",
-    "preprocessor_config.json",
-    "processor_config.json",
-    "video_preprocessor_config.json",
-    "chat_template.json",
-    "chat_template.jinja",
-    "tokenizer.json",
-    "tokenizer_config.json",
-    "vocab.json",
-    "merges.txt",
-    "added_tokens.json",
-    "special_tokens_map.json",
-)
+
+_COMPANIONS = ("*config.json", "chat_template.*", "*token*.json", "vocab.json", "merges.txt")
 """What a checkpoint folder holds beside its weights."""
 
 
@@ -114,9 +101,8 @@ def save_checkpoint(folder: Path, vlm: VLMParams, tuned: Mapping[str, Tensor]) -
     base = resolve_checkpoint(vlm.checkpoint, vlm.revision)
     with disk_full_named(folder), quiet_transformers():
         whole.save_pretrained(folder)
-        for name in _COMPANIONS:
-            if (base / name).exists():
-                shutil.copyfile(base / name, folder / name)
+        for path in (path for pattern in _COMPANIONS for path in base.glob(pattern)):
+            shutil.copyfile(path, folder / path.name)
         _finish(folder)
 
 
@@ -155,11 +141,11 @@ def _prefixes(tuning: TuningParams) -> tuple[str, ...]:
 
 def _check_goes_on(model: Any, vlm: VLMParams, tuning: TuningParams) -> None:
     config = model.peft_config["default"]
-    found = f"lora_r {config.r}, lora_alpha {config.lora_alpha}"
+    actual = f"lora_r {config.r}, lora_alpha {config.lora_alpha}"
     asked = f"lora_r {tuning.lora_r}, lora_alpha {tuning.lora_alpha}"
-    if found != asked:
+    if actual != asked:
         raise VLMError(
-            f"{vlm.adapter}: tuning goes on from this adapter of {found}, but {asked} is asked "
+            f"{vlm.adapter}: tuning goes on from this adapter of {actual}, but {asked} is asked "
             "for. Set finetune.tuning to the adapter's values, or vlm.adapter to null."
         )
     names = [name for name, _ in model.named_parameters() if "lora_" in name]
@@ -175,10 +161,10 @@ def _check_goes_on(model: Any, vlm: VLMParams, tuning: TuningParams) -> None:
 def _beyond(model: Any, layers: int) -> dict[str, Tensor]:
     """The adapter's weights on decoder layers that do not run, by their names in its file."""
     place = re.compile(r"\.language_model\.layers\.(\d+)\..*\.lora_")
-    found = ((name, place.search(name), tensor) for name, tensor in model.state_dict().items())
+    weights = ((name, place.search(name), tensor) for name, tensor in model.state_dict().items())
     return {
         name.replace(".default.", "."): tensor
-        for name, match, tensor in found
+        for name, match, tensor in weights
         if match and int(match[1]) >= layers
     }
 

@@ -28,7 +28,7 @@ _KEPT = 64
 
 
 @dataclass(frozen=True)
-class Windows:
+class PatchWindows:
     """How patches stand: by window length, then image, then window."""
 
     images: int
@@ -112,7 +112,7 @@ class VisionTower:
         tokens = sum(map(len, self._windows))
         every = [(image, window) for image in range(images) for window in self._windows]
         if not self._flash:
-            every.sort(key=lambda one: len(one[1]))  # stable: then by image and by window
+            every.sort(key=lambda placed: len(placed[1]))  # stable: then by image and by window
         order = np.concatenate([image * tokens + window for image, window in every])
         place = np.empty_like(order)
         place[order] = np.arange(len(order))
@@ -129,19 +129,19 @@ class VisionTower:
         if self._flash:
             windows, wholes = (
                 {
-                    "cu_seqlens": torch.tensor([0, *accumulate(each)], dtype=torch.int32).to(
+                    "cu_seqlens": torch.tensor([0, *accumulate(sizes)], dtype=torch.int32).to(
                         device
                     ),
-                    "max_seqlen": max(each),
+                    "max_seqlen": max(sizes),
                 }
-                for each in (lengths, [patches] * images)
+                for sizes in (lengths, [patches] * images)
             )
             return windows, wholes
         counts = tuple((count // images, length) for length, count in Counter(lengths).items())
         told = {"cu_seqlens": None, "max_seqlen": patches}
         return (
-            told | {"windows": Windows(images, counts)},
-            told | {"windows": Windows(images, counts, whole=True)},
+            told | {"windows": PatchWindows(images, counts)},
+            told | {"windows": PatchWindows(images, counts, whole=True)},
         )
 
 
@@ -164,38 +164,40 @@ def _grouped_attention(
     value: Float[Tensor, "1 head patch dim"],
     attention_mask: None,
     *,
-    each: Callable[..., tuple[Tensor, Any]],
-    windows: Windows,
+    attend: Callable[..., tuple[Tensor, Any]],
+    windows: PatchWindows,
     scaling: float,
     dropout: float,
     **_: object,
 ) -> tuple[Float[Tensor, "1 patch head dim"], None]:
-    """Attention of each window, or of each image, by one call of `each` for every length."""
+    """Attention of each window, or of each image, by one call of `attend` for every length."""
     # Patches first: windows of equal length are then one view, without a copy.
     flat = [tensor[0].transpose(0, 1) for tensor in (query, key, value)]
     group = _of_images if windows.whole else _of_windows
-    found = [
-        each(module, *batched, attention_mask, scaling=scaling, dropout=dropout, is_causal=False)[0]
+    attended = [
+        attend(module, *batched, attention_mask, scaling=scaling, dropout=dropout, is_causal=False)[
+            0
+        ]
         for batched in zip(*(group(tensor, windows) for tensor in flat), strict=True)
     ]
     if windows.whole:
-        (images,) = found
-        found = images.split([count * length for count, length in windows.lengths], dim=1)
-    return torch.cat([tensor.flatten(0, 1) for tensor in found])[None], None
+        (images,) = attended
+        attended = images.split([count * length for count, length in windows.lengths], dim=1)
+    return torch.cat([tensor.flatten(0, 1) for tensor in attended])[None], None
 
 
-def _slabs(tensor: Float[Tensor, "patch head dim"], windows: Windows) -> Sequence[Tensor]:
+def _slabs(tensor: Float[Tensor, "patch head dim"], windows: PatchWindows) -> Sequence[Tensor]:
     """The patches of each window length."""
     return tensor.split([windows.images * count * length for count, length in windows.lengths])
 
 
-def _of_windows(tensor: Float[Tensor, "patch head dim"], windows: Windows) -> list[Tensor]:
+def _of_windows(tensor: Float[Tensor, "patch head dim"], windows: PatchWindows) -> list[Tensor]:
     """(window, head, patch, dim) of each window length."""
     slabs = zip(_slabs(tensor, windows), windows.lengths, strict=True)
     return [slab.unflatten(0, (-1, length)).transpose(1, 2) for slab, (_, length) in slabs]
 
 
-def _of_images(tensor: Float[Tensor, "patch head dim"], windows: Windows) -> list[Tensor]:
+def _of_images(tensor: Float[Tensor, "patch head dim"], windows: PatchWindows) -> list[Tensor]:
     """(image, head, patch, dim)"""
     parts = [slab.unflatten(0, (windows.images, -1)) for slab in _slabs(tensor, windows)]
     return [torch.cat(parts, dim=1).transpose(1, 2)]
@@ -205,8 +207,8 @@ _GROUPED = {"sdpa": "grouped_flash_sdpa", "eager": "grouped_flash_eager"}
 """A name has to hold "flash" for transformers to leave windows together."""
 
 AttentionInterface.register(
-    _GROUPED["sdpa"], partial(_grouped_attention, each=sdpa_attention_forward)
+    _GROUPED["sdpa"], partial(_grouped_attention, attend=sdpa_attention_forward)
 )
 AttentionInterface.register(
-    _GROUPED["eager"], partial(_grouped_attention, each=eager_attention_forward)
+    _GROUPED["eager"], partial(_grouped_attention, attend=eager_attention_forward)
 )

@@ -13,7 +13,8 @@ from torch.utils.data import ConcatDataset, DataLoader
 
 from pipeline.base.config import Source, TrainHeadParams
 from pipeline.base.errors import ConfigError, RecordingError, StoreIncomplete, StoreMismatch
-from pipeline.compat.unchanged import Unchanged
+from pipeline.base.observation import Observation
+from pipeline.compat.unified import no_normalization
 from pipeline.data import Channels, RecordedAction, open_recordings
 from pipeline.data.timeline import build_timeline
 from pipeline.data.windowed import WindowedRecording
@@ -25,7 +26,7 @@ from pipeline.datasets import (
     unified_collate_fn,
 )
 from pipeline.models import QwenVLAUnified
-from pipeline.policy.observation import Observation, PolicyShape
+from pipeline.policy.observation import PolicyShape
 from pipeline.policy.policy import Policy
 from pipeline.store import Batch, FeatureStore
 from pipeline.train.split import split_by_episode
@@ -418,7 +419,7 @@ class TestModels:
             shape = PolicyShape(*cached.store.feature_shape, 1026, 12, 7, ("other",) * 7)
             if data is live:
                 shape = replace(shape, slots=0, feature_dim=0)
-            loss, _ = Policy(SMALL, shape, Unchanged(shape)).loss(
+            loss, _ = Policy(SMALL, shape, no_normalization(shape)).loss(
                 batch, batch.action, batch.action_valid
             )
             assert torch.isfinite(loss)

@@ -6,11 +6,11 @@ from types import SimpleNamespace
 import pytest
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.evaluate.curves import Curves
+from pipeline.evaluate.curves import TrainingCurves
 from pipeline.evaluate.curves import read_curves as curves_of
 
 
-def read_curves(logs: Path, step: int = 20, **metrics: float) -> Curves:
+def read_curves(logs: Path, step: int = 20, **metrics: float) -> TrainingCurves:
     """Of a checkpoint of that step, with this error where one is given."""
     named = {name.replace("_", "/"): value for name, value in metrics.items()}
     checkpoint = SimpleNamespace(params=TrainHeadParams(logs=logs), step=step, metrics=named)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.evaluate.corruption import feed_maker
+from pipeline.evaluate.ablation import feed_maker
 from pipeline.store import FeatureStore
 from pipeline.train import predictions
 from pipeline.train.batches import NO_LAGS, Lags, Windows

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pipeline.base.errors import DiskFull
-from pipeline.evaluate.tables import FOOTNOTE, metrics, table, write_tables
+from pipeline.evaluate.tables import FOOTNOTE, error_text, metrics, write_tables
 from pipeline.store import FeatureStore
 from pipeline.train.predictions import BASELINES, Predictions
 from pipeline.train.scores import Comparison
@@ -53,7 +53,7 @@ def test_the_metrics_are_few_and_numbers_only(comparison: Comparison) -> None:
 
 
 def test_the_table_lines_up(comparison: Comparison) -> None:
-    lines = table(comparison).splitlines()
+    lines = error_text(comparison).splitlines()
     assert [line.split("  ")[0] for line in lines] == [
         "mean absolute error",
         "translation [mm]",
@@ -63,7 +63,7 @@ def test_the_table_lines_up(comparison: Comparison) -> None:
         FOOTNOTE,
     ]
     assert len({len(line) for line in lines[:-1]}) == 1
-    assert lines[3].endswith("-")
+    assert lines[3].endswith("–")
 
 
 def test_dimensions_that_hardly_move_are_said_below_the_table(comparison: Comparison) -> None:
@@ -74,7 +74,7 @@ def test_dimensions_that_hardly_move_are_said_below_the_table(comparison: Compar
     moving = replace(still, scale=np.array([0.05, 0.06, 0.07, 0.0, 0.0]))
     error = f"{moving.overall('policy'):.3f}, {moving.relative():.2f} times the best baseline's"
     best = min(BASELINES, key=moving.overall).replace("_action", "").replace("_", " ")
-    *_, footnote, line = table(still).splitlines()
+    *_, footnote, line = error_text(still).splitlines()
     assert footnote == FOOTNOTE
     assert line == (
         "hardly moving: joint_3 (training std at most 1e-09, where 0.07 is usual for such "

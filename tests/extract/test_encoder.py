@@ -11,7 +11,7 @@ import torch
 from pipeline.base.errors import NumericsError, VLMError
 from pipeline.extract.encoder import Encoder
 from pipeline.extract.rows import ReadyRow
-from pipeline.vlm.preparation import Layout, PreparedRow
+from pipeline.vlm.preparation import PreparedRow, TokenLayout
 
 K = 3
 
@@ -68,7 +68,7 @@ class FakeVLM:
 
 
 def ready(row: int, values: list[int], length: int = 1) -> ReadyRow:
-    layout = Layout(length, (), (1, 1))
+    layout = TokenLayout(length, (), (1, 1))
     plain = PreparedRow("p", np.zeros(length, np.int64), np.zeros((1, 1, 1, 3), np.uint8), layout)
     variants = tuple(
         dataclasses.replace(plain, pixels=np.full((1, 1, 1, 3), value, np.uint8))

@@ -268,7 +268,7 @@ class TestWhatItTakesOver:
         report, said = run(changed(vlm={"prompt": "{images} do: {instruction}"}))
         assert report.taken == 0
         assert sum(counted) == report.rows
-        assert any("prompt: '{instruction}" in line for line in said)
+        assert any('prompt: "{instruction}' in line for line in said)
 
     @pytest.mark.usefixtures("extracted")
     def test_the_speed_knobs_change_nothing(self, params, changed, no_model_later):

@@ -131,11 +131,11 @@ class TestOtherThanTheStore:
             return vlm
 
         monkeypatch.setattr(FrozenVLM, "load", classmethod(elsewhere))
-        assert any("-> '99'" in line for line in again(document, rows=1).environment)
+        assert any('-> "99"' in line for line in again(document, rows=1).environment)
 
     def test_params_of_other_features_are_refused(self, document):
         document["vlm"] = document["vlm"] | {"prompt": "{images}"}
-        with pytest.raises(StoreMismatch, match=r"other features.*\n  example_prompt"):
+        with pytest.raises(StoreMismatch, match=r"other features.*\n  prompt"):
             again(document)
 
     def test_episodes_whose_recordings_changed_are_named_and_left_out(self, document):

@@ -10,22 +10,16 @@ import torch
 from torch import Tensor
 
 from pipeline.base.config import TrainHeadParams
+from pipeline.base.observation import Observation
 from pipeline.policy.normalization import ChannelStatistics, Normalization
 from pipeline.policy.observation import PolicyShape
 from pipeline.policy.policy import Policy
 
 
 @dataclass
-class Seen:
-    """An observation with the fields of the store's batch, and what was done."""
+class Seen(Observation):
+    """An observation, and what was done."""
 
-    features: Tensor
-    slot_valid: Tensor
-    feature_age: Tensor
-    sensor: Tensor
-    sensor_valid: Tensor
-    state: Tensor
-    state_valid: Tensor
     action: Tensor
     action_valid: Tensor
 

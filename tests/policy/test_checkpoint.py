@@ -13,8 +13,6 @@ from pipeline.base.durable import read_document, write_document, write_with_dige
 from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch
 from pipeline.policy.checkpoint import (
     PolicyCheckpoint,
-    describe,
-    differences,
     find_policy,
     load_policy,
     save_policy,
@@ -195,16 +193,6 @@ def test_missing_weights_are_named(checkpoint: PolicyCheckpoint, tmp_path: Path)
     (tmp_path / "best/policy.safetensors").unlink()
     with pytest.raises(CheckpointIncomplete, match=r"policy\.safetensors.*no such file"):
         load_policy(tmp_path / "best")
-
-
-def test_differences_are_named_by_place() -> None:
-    left = {"a": {"b": 1, "c": [1, 2]}, "d": None}
-    right = {"a": {"b": 2, "c": (1, 2)}, "e": "x" * 200}
-    found = differences(left, right)
-    assert found == {"a.b": (1, 2), "e": (None, "x" * 200)}
-    said = describe(found, "before", "now")
-    assert "  a.b: 1 (before), 2 (now)" in said
-    assert max(map(len, said.splitlines())) < 140
 
 
 def test_specs_of_one_digest_are_the_same_whatever_else_they_say() -> None:

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from pipeline.policy.normalization import ChannelStatistics, fit_channels
-from pipeline.policy.normalizer import Normalizer
+from pipeline.policy.policy import Normalizer
 
 WIDTH = 4
 number = st.floats(-1e6, 1e6, width=32)

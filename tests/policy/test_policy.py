@@ -10,8 +10,8 @@ from pipeline.base.config import SensorEncoderParams, TrainHeadParams
 from pipeline.base.errors import CheckpointMismatch, ConfigError
 from pipeline.policy.cost import describe_cost, flop_table
 from pipeline.policy.normalization import Normalization
-from pipeline.policy.observation import PolicyShape, action_groups, drop_streams
-from pipeline.policy.policy import Policy, Trainable
+from pipeline.policy.observation import PolicyShape, action_groups
+from pipeline.policy.policy import Policy, Trainable, drop_streams
 from pipeline.policy.sensor_encoder import SensorEncoder
 
 BuildPolicy = Callable[..., Policy]

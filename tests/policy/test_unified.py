@@ -21,19 +21,17 @@ from torch import Tensor
 from pipeline.base.config import TrainHeadParams, TuningParams, VLMParams
 from pipeline.base.digests import file_digest
 from pipeline.base.errors import CheckpointMismatch, ObservationError, VLMError
-from pipeline.compat.unchanged import Unchanged
 from pipeline.compat.unified import (
     Not_freeze_QwenVLAWithSensor,
     QwenVLAUnified,
     QwenVLAWithSensor,
     QwenVLAWithSensorDiffusion,
+    no_normalization,
 )
 from pipeline.policy.checkpoint import PolicyCheckpoint
-from pipeline.policy.live_observation import LiveObservation
 from pipeline.policy.normalization import Normalization
-from pipeline.policy.observation import PolicyShape
+from pipeline.policy.observation import LiveObservation, PolicyShape
 from pipeline.policy.policy import Policy, Trainable
-from pipeline.vlm.distinct import distinct_rows
 from pipeline.vlm.feature_spec import feature_spec
 from pipeline.vlm.live import LiveVLM, live_spec
 from pipeline.vlm.preparation import Preparer
@@ -394,7 +392,7 @@ def test_of_two_parts(
     vlm = whole.load_vlm()
     model = QwenVLAUnified.of(whole.policy, vlm).eval()
     assert (model.policy, model.vlm) == (whole.policy, vlm)
-    rows, row_of = distinct_rows(Preparer(vlm.vlm, vlm.spec), vlm.spec, images, TEXT)
+    rows, row_of = Preparer(vlm.vlm, vlm.spec).prepare_distinct(images, TEXT)
     assert (len(rows), row_of) == (3, [0, 1, 0, 2])
     torch.manual_seed(0)
     expected = whole(images, TEXT)
@@ -432,11 +430,11 @@ def trained(demo_checkpoint: Path, small_params: Callable[..., TrainHeadParams])
         vlm = SEEN.model_copy(update={"checkpoint": str(demo_checkpoint), **changed})
         spec = feature_spec(vlm, storage_dtype, VIEWS, file_digest)
         shape = PolicyShape(len(spec.slots), spec.dim, 9, 12, 7, ("other",) * 7)
-        fresh = Policy(small_params(), shape, Unchanged(shape))
+        fresh = Policy(small_params(), shape, no_normalization(shape))
         source = {"feature_spec": json.loads(json.dumps(spec.attrs()))}
         weights = fresh.state_dict()
         return PolicyCheckpoint(
-            fresh.params, shape, Unchanged(shape), source, {}, {}, 1, weights
+            fresh.params, shape, no_normalization(shape), source, {}, {}, 1, weights
         ).policy()
 
     return policy
@@ -451,13 +449,13 @@ def _live(vlm: VLMParams, views: Sequence[str] = VIEWS) -> LiveVLM:
 @pytest.mark.parametrize(
     ("live", "views", "said"),
     [
-        ({}, ("View1", "View3"), r"views: \['View1', 'View2'\] -> \['View1', 'View3'\]"),
+        ({}, ("View1", "View3"), r'views: \["View1", "View2"\] -> \["View1", "View3"\]'),
         ({}, ("View1",), "slots: 3 entries -> 2 entries"),
         ({"image_resize_width": 56}, VIEWS, r"processor.image_size: \[56, 84\] -> \[56, 56\]"),
-        ({"prompt": "{images} {instruction}"}, VIEWS, "prompt: .* -> '{images} {instruction}'"),
+        ({"prompt": "{images} {instruction}"}, VIEWS, 'prompt: .* -> "{images} {instruction}"'),
         ({"layers": (0,)}, VIEWS, r"slots\[0\].layer: 3 -> 0"),
-        ({"pooling": ("last", "view_mean")}, VIEWS, "slots.*: 'mean' -> 'last'"),
-        ({"dtype": "bfloat16"}, VIEWS, "compute_dtype: 'float32' -> 'bfloat16'"),
+        ({"pooling": ("last", "view_mean")}, VIEWS, 'slots.*: "mean" -> "last"'),
+        ({"dtype": "bfloat16"}, VIEWS, 'compute_dtype: "float32" -> "bfloat16"'),
     ],
 )
 def test_a_live_model_of_other_features_than_the_policy_s_is_refused(
@@ -483,7 +481,7 @@ def test_a_live_model_of_other_weights_is_refused(
     content = bytearray(weights.read_bytes())
     content[-1] ^= 1
     weights.write_bytes(content)
-    with pytest.raises(CheckpointMismatch, match=r"weights: '.*' -> '.*'") as refused:
+    with pytest.raises(CheckpointMismatch, match=r'weights: ".*" -> ".*"') as refused:
         QwenVLAUnified.of(policy, _live(vlm))
     assert len(str(refused.value).splitlines()) == 3, "nothing else differs"
 

@@ -8,8 +8,12 @@ from torch import Tensor, nn
 
 from pipeline.base.errors import ConfigError
 from pipeline.policy.attention import right_aligned
-from pipeline.policy.force_encoder import ForceAwareSensorEncoder
-from pipeline.policy.sensor_encoder import HalvingBlock, SensorEncoder, resampled
+from pipeline.policy.sensor_encoder import (
+    ForceAwareSensorEncoder,
+    HalvingBlock,
+    SensorEncoder,
+    resampled,
+)
 from pipeline.policy.state_encoder import RobotStateEncoder
 
 CHANNELS, WINDOW, OUTPUT = 9, 13, 24

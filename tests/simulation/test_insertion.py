@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from pipeline.simulation.arm import euler_actions, orientation
 from pipeline.simulation.expert import ALIGNED_MM, REACTION_TICKS
-from pipeline.simulation.insertion import MAX_TICKS, NeedleInsertion, Observation
-from pipeline.simulation.layout import WORKSPACE_MM, Layout, draw_layout
+from pipeline.simulation.insertion import MAX_TICKS, InsertionObservation, NeedleInsertion
+from pipeline.simulation.layout import WORKSPACE_MM, InsertionLayout, draw_layout
 from pipeline.simulation.needle_sensor import BIN_MM
 from pipeline.simulation.rendering import VIEWS, render
 
@@ -22,24 +22,24 @@ def down(step_mm: float) -> NDArray[np.float64]:
     return np.array([0, 0, -step_mm, 0, 0, 0, 1.0])
 
 
-def calm(seed: int = 0) -> Layout:
+def calm(seed: int = 0) -> InsertionLayout:
     """An episode in which nobody pushes the phantom."""
     return replace(draw_layout(seed), push_times_s=np.zeros(0))
 
 
-def follow(insertion: NeedleInsertion) -> Iterator[Observation]:
+def follow(insertion: NeedleInsertion) -> Iterator[InsertionObservation]:
     """The demonstrator's episode from here on."""
     while not insertion.finished:
         yield insertion.step(insertion.expert_action())
 
 
-def peak_bin(observation: Observation) -> int:
+def peak_bin(observation: InsertionObservation) -> int:
     """The brightest bin of the newest A-scan."""
     return int(observation.sensor[-1, 1:].argmax())
 
 
 def test_same_seed_and_actions_give_the_same_bits() -> None:
-    runs: list[list[Observation]] = []
+    runs: list[list[InsertionObservation]] = []
     for _ in range(2):
         insertion = NeedleInsertion()
         runs.append([insertion.reset(3), *follow(insertion)])
@@ -133,7 +133,9 @@ def test_a_needle_pulled_out_must_puncture_again() -> None:
     assert not insertion.inside and insertion.contact.force_n[-1] > 0
 
 
-def twins(first: Layout, second: Layout) -> Iterator[tuple[NeedleInsertion, NeedleInsertion]]:
+def twins(
+    first: InsertionLayout, second: InsertionLayout
+) -> Iterator[tuple[NeedleInsertion, NeedleInsertion]]:
     """Both episodes under the demonstrator's actions in the first, tick by tick."""
     one, other = NeedleInsertion(), NeedleInsertion()
     one.start(first)

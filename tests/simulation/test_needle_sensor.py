@@ -8,15 +8,15 @@ from pipeline.simulation.needle_sensor import (
     A_SCAN_BINS,
     BIN_MM,
     READINGS_PER_SCAN,
-    Contact,
+    NeedleContact,
     a_scans,
     sensor_readings,
 )
 
 
-def outside(distance_mm: float, layer_depth_mm: float, rows: int) -> Contact:
+def outside(distance_mm: float, layer_depth_mm: float, rows: int) -> NeedleContact:
     """A needle that hangs still above the tissue."""
-    return Contact(
+    return NeedleContact(
         distance_mm=np.full(rows, distance_mm),
         layer_mm=np.full(rows, distance_mm + layer_depth_mm),
         inside=np.zeros(rows, np.bool_),

@@ -72,9 +72,9 @@ def test_a_table_a_file_and_a_picture(
     assert run("", compare.main, ["--params", str(experiments)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines[1:5]] == NAMES
-    assert lines[0].split()[-3:] == ["samples", "parameters", "trained"]
+    assert lines[0].split()[-4:] == ["samples", "parameters", "trained", "[s]"]
     assert "overall [training std]  translation [mm]  rotation [deg]  gripper" in lines[0]
-    assert [line.split()[-4] for line in lines[1:5]] == ["1", "1", "2", "2"]
+    assert [line.split()[-3] for line in lines[1:5]] == ["1", "1", "2", "2"]
     assert [line.split("  ")[0] for line in lines[5:8]] == [
         "baseline: zero",
         "baseline: mean",

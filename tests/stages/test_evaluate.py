@@ -90,10 +90,10 @@ def test_a_store_that_grew_is_judged_on_the_same_episodes(
 @pytest.mark.parametrize(
     ("store", "said"),
     [
-        ({"spec_digest": "other"}, 'feature_spec.digest: "tiny-spec" (the checkpoint), "other"'),
+        ({"spec_digest": "other"}, 'feature_spec.digest: "tiny-spec" -> "other"'),
         ({"sensor_channels": 7}, "streams.sensor.names"),
         ({"state_dim": 0}, "streams.state.names"),
-        ({"reuse": 2}, "vlm_reuse_count: 3 (the checkpoint), 2 (the store)"),
+        ({"reuse": 2}, "vlm_reuse_count: 3 -> 2"),
         ({"episodes": 1}, "lacks 1 of the 1 episodes"),
         ({"seed": 1}, "other recordings under the names of 1 of the 1 held-out episodes"),
     ],

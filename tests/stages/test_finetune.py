@@ -200,9 +200,9 @@ def test_mistakes_end_in_one_message(
         ("train_head.features_enabled=false", "would not see the model"),
         ("finetune.lr=-1", "finetune.lr"),
         ("train_head.store=nowhere.zarr", "no finished store"),
-        ("vlm.prompt=look", "prompt: '{instruction}"),
+        ("vlm.prompt=look", 'prompt: "{instruction}'),
         ("data.sources=[{name: other, path: .}]", "no source 'made'"),
-        ("vlm.dtype=float16", "compute_dtype: 'float32' -> 'float16'"),
+        ("vlm.dtype=float16", 'compute_dtype: "float32" -> "float16"'),
     ):
         assert run("", finetune.main, ["--params", str(params), "--set", override]) == 2
         err = capsys.readouterr().err

@@ -97,8 +97,8 @@ def test_other_params_move_an_unfinished_run_aside(
     assert run.status == "new"
     assert not aside.exists()
     run.begin()
-    assert "train_head.lr: 0.003 (that run), 0.5 (now)" in run.notes[0]
-    assert "train_head.expert.heads: 2 (that run), 4 (now)" in run.notes[0]
+    assert "train_head.lr: 0.003 -> 0.5" in run.notes[0]
+    assert "train_head.expert.heads: 2 -> 4" in run.notes[0]
     assert (aside / "last" / "policy.json").exists()
     assert os.listdir(unfinished) == ["run.json"]
     # One that has only begun does not replace what was put aside before.
@@ -142,9 +142,9 @@ def test_other_features_or_streams_are_refused(
     with pytest.raises(CheckpointMismatch) as caught:
         open_run(params(), other)
     said = str(caught.value)
-    assert 'feature_spec.digest: "tiny-spec" (the run), "another" (the store now)' in said
+    assert 'feature_spec.digest: "tiny-spec" -> "another"' in said
     assert "streams.state.names" in said
-    assert "vlm_reuse_count: 3 (the run), 5 (the store now)" in said
+    assert "vlm_reuse_count: 3 -> 5" in said
     assert f"Remove {unfinished}" in said
     assert (unfinished / "last").exists()
 
@@ -159,7 +159,7 @@ def test_other_recordings_of_the_same_kind_begin_anew(
     more = FeatureStore.open(tiny_store(tmp_path, name="more", episodes=7))
     run = open_run(params(), more)
     assert run.status == "new"
-    assert "recordings.episodes: 6 (that run), 7 (now)" in run.notes[0]
+    assert "recordings.episodes: 6 -> 7" in run.notes[0]
 
 
 @pytest.mark.parametrize("half", ["new", "old"])
@@ -311,4 +311,4 @@ def test_code_of_other_numbers_goes_on_with_no_run(
     monkeypatch.setattr("pipeline.train.identity.TRAINER_VERSION", 99)
     run = open_run(params(), store)
     assert run.status == "new"
-    assert f"trainer_version: {TRAINER_VERSION} (that run), 99 (now)" in run.notes[0]
+    assert f"trainer_version: {TRAINER_VERSION} -> 99" in run.notes[0]

@@ -20,8 +20,7 @@ from transformers import Qwen2_5_VLForConditionalGeneration
 from pipeline.base.config import VLMParams
 from pipeline.base.errors import ConfigError, VLMError
 from pipeline.vlm.loading import load_model
-from pipeline.vlm.pixels import PixelSettings
-from pipeline.vlm.prompt import PromptRenderer
+from pipeline.vlm.processor import PixelSettings, PromptRenderer
 
 # peft 0.21 reads an attribute that transformers 5.23 calls deprecated.
 pytestmark = pytest.mark.filterwarnings("ignore:`is_gradient_checkpointing`:FutureWarning")

@@ -4,16 +4,16 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.vlm.feature_spec import Slot
 from pipeline.vlm.pooling import batch_weights, pool, token_weights
-from pipeline.vlm.preparation import Layout
+from pipeline.vlm.preparation import TokenLayout
+from pipeline.vlm.slots import Slot
 
 CELLS = tuple(Slot(0, True, "grid", "View1", (r, c)) for r in range(4) for c in range(4))
 
 
 @given(rows=st.integers(1, 14), columns=st.integers(1, 24), start=st.integers(0, 5))
 def test_grid_is_adaptive_average_pooling(rows: int, columns: int, start: int) -> None:
-    layout = Layout(start + rows * columns + 3, (("View1", start),), (rows, columns))
+    layout = TokenLayout(start + rows * columns + 3, (("View1", start),), (rows, columns))
     tokens = torch.randn(layout.length, 5, generator=torch.Generator().manual_seed(0))
     cells = torch.tensor(token_weights(CELLS, layout)) @ tokens
     plane = tokens[start : start + rows * columns].T.reshape(5, rows, columns)
@@ -28,7 +28,7 @@ def test_grid_is_adaptive_average_pooling(rows: int, columns: int, start: int) -
 def test_weights_sum_to_one_or_to_nothing(grid: tuple[int, int], present: set[str]) -> None:
     size = grid[0] * grid[1]
     starts = tuple((view, 2 + i * (size + 2)) for i, view in enumerate(sorted(present)))
-    layout = Layout(4 + len(starts) * (size + 2), starts, grid)
+    layout = TokenLayout(4 + len(starts) * (size + 2), starts, grid)
     slots = (
         Slot(0, True, "mean"),
         Slot(0, True, "image_mean"),
@@ -43,7 +43,7 @@ def test_weights_sum_to_one_or_to_nothing(grid: tuple[int, int], present: set[st
 
 
 def test_padding_never_enters_even_when_it_is_infinite() -> None:
-    layouts = [Layout(3, (), (1, 1)), Layout(5, (), (1, 1))]
+    layouts = [TokenLayout(3, (), (1, 1)), TokenLayout(5, (), (1, 1))]
     slots = (Slot(0, True, "mean"), Slot(0, True, "last"))
     hidden = torch.randn(2, 5, 4, dtype=torch.float32).to(torch.bfloat16)
     hidden[0, 3:] = torch.inf

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from transformers import AutoTokenizer
 
 from pipeline.base.errors import VLMError
-from pipeline.vlm.prompt import PromptRenderer
+from pipeline.vlm.processor import PromptRenderer
 
 SYSTEM = "<|im_start|>system\nYou are a helpful assistant.<|im_end|>\n"
 IMAGE = "<|vision_start|><|image_pad|><|vision_end|>"

@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 from transformers import Qwen2_5_VLForConditionalGeneration
 
-from pipeline.vlm.extractor import Extractor
-from pipeline.vlm.patches import patchify
-from pipeline.vlm.pixels import PixelSettings
+from pipeline.vlm.extractor import Extractor, patchify
+from pipeline.vlm.processor import PixelSettings
 from pipeline.vlm.vision import VisionTower
 
 CPU = torch.device("cpu")

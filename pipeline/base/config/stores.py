@@ -70,14 +70,14 @@ class ProbeParams(Section):
     )
     """Ridge penalties a row, of standardised inputs; each fold takes the best one on the episodes
     that it trains on."""
-    max_ticks: int | None = Field(default=None, ge=1)
-    """Ticks used at most, evenly spread; null uses all."""
+    max_ticks: int | None = Field(default=20_000, ge=1)
+    """Ticks used at most, evenly spread over all episodes; null uses all. Memory grows with it."""
     sensor_window: int = Field(default=65, ge=1)
     """Readings before the tick, of which the mean, the last and the spread are read."""
     state_window: int = Field(default=100, ge=1)
     """Readings before the tick, likewise."""
     threads: int = Field(default=2, ge=1)
-    """That work at a time."""
+    """That work at a time, each on a slot of its own."""
     output: Path = Path("reports/probe")
     """Folder of the table and the picture."""
 

@@ -4,8 +4,7 @@ from collections.abc import Sequence
 from functools import partial
 
 from pipeline.base.table import Table
-from pipeline.evaluate.experiment_tables import experiment_errors
-from pipeline.evaluate.experiments import Experiment
+from pipeline.evaluate.experiments import Experiment, experiment_table
 from pipeline.evaluate.tables import FOOTNOTE
 from pipeline.look.evaluation import pictures as plots
 from pipeline.look.page.blocks import Picture, Report, Section
@@ -15,7 +14,8 @@ from pipeline.look.page.writing import sentence
 def comparison_report(experiments: Sequence[Experiment]) -> Report:
     """The page of these experiments, of which the first are no better than the last."""
     best = min(experiments, key=lambda experiment: experiment.error)
-    columns, rows = experiment_errors(experiments)
+    table = experiment_table(experiments)
+    columns, rows = table.columns, table.rows
     edge = columns.index("expert")
     errors = Table(
         columns[:edge],

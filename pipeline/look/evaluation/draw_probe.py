@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
-from pipeline.evaluate.probe import Finding, SlotName, Study, ranked
+from pipeline.evaluate.probe import ProbeResult, ProbeStudy, SlotName, ranked
 from pipeline.look.page.style import RECORDED, canvas, legend_below, write
 
 _BARS = 20
@@ -22,27 +22,28 @@ _LEAST = -0.2
 _ALONE, _BESIDE = "#56B4E9", "#0072B2"
 
 
-def write_probe_plots(folder: Path, study: Study) -> list[Path]:
+def write_probe_plots(folder: Path, study: ProbeStudy) -> list[Path]:
     """Write probe.png, the map over layers and poolings, and probe_bars.png, the ranking."""
     pictures = {"probe.png": lambda: heat_map(study), "probe_bars.png": lambda: bars(study)}
     return write(folder, pictures)
 
 
-def heat_map(study: Study) -> Figure:
+def heat_map(study: ProbeStudy) -> Figure:
     """R^2 of every slot: layers against what is pooled over, and the best maps of a view's cells.
 
     Beside state + sensor, where the store has them. All take their colours from one scale, which
     spans what is shown; what is more than 1 below its best has the darkest.
     """
-    plain = [one for one in study.slots if one.name.cell is None]
-    poolings = list({one.name.pooling: None for one in study.groups})
-    named = sorted([*study.groups, *plain], key=lambda one: poolings.index(one.name.pooling))
-    kinds = {_column(one.name): None for one in named}
-    rows = {_row(one.name): None for one in study.slots}
+    plain = [result for result in study.slots if result.name.cell is None]
+    poolings = list({result.name.pooling: None for result in study.groups})
+    named = sorted([*study.groups, *plain], key=lambda result: poolings.index(result.name.pooling))
+    kinds = {_column(result.name): None for result in named}
+    rows = {_row(result.name): None for result in study.slots}
     maps = _maps(study)
     shown = sorted(maps, key=lambda place: _best(maps[place]), reverse=True)[:_MAPS]
     lines = -(-len(shown) // _MAPS_A_ROW)
-    values = [_value(one) for one in (*named, *(one for place in shown for one in maps[place]))]
+    seen = [*named, *(result for place in shown for result in maps[place])]
+    values = [result.best.mean for result in seen]
     limits = _limits(values if study.streams is None else [*values, study.streams.mean])
     columns = max(1, min(_MAPS_A_ROW, len(shown)))
     height = 1.8 + 0.5 * len(rows) + 2.2 * lines
@@ -58,29 +59,29 @@ def heat_map(study: Study) -> Figure:
         axis = figure.add_subplot(panels[1 + line, column])
         axes.append(axis)
         _cells(axis, maps[place], ", ".join(place), limits)
-    _scale(figure, axes, image, study, min(values, default=0) < limits[0])
-    said = "Where a linear reader finds the action"
+    _scale(figure, axes, image, study, min(values) < limits[0])
+    words = "Where a linear reader finds the action"
     if len(shown) < len(maps):
-        said += f" (the {len(shown)} best of {len(maps)} maps of a view; all are in slots.csv)"
-    figure.suptitle(_title(study, said))
+        words += f" (the {len(shown)} best of {len(maps)} maps of a view; all are in slots.csv)"
+    figure.suptitle(_title(study, words))
     return figure
 
 
-def bars(study: Study) -> Figure:
+def bars(study: ProbeStudy) -> Figure:
     """The choices of layer, norm and pooling, ranked, alone and beside state + sensor.
 
     A bar that would end left of the axis ends at an arrow and its number.
     """
-    shown = [one for one in ranked(study.groups) if one.best is not None][:_BARS][::-1]
+    shown = ranked(study.groups)[:_BARS][::-1]
     figure = canvas(8.5, 2.4 + 0.55 * len(shown))
     axis = figure.subplots()
     at = np.arange(len(shown))
-    kinds = [("alone", _ALONE, [one.alone for one in shown])]
+    kinds = [("alone", _ALONE, [result.alone for result in shown])]
     if study.streams is not None:
-        kinds.append(("beside state + sensor", _BESIDE, [one.beside for one in shown]))
+        kinds.append(("beside state + sensor", _BESIDE, [result.best for result in shown]))
     for offset, (label, colour, scores) in enumerate(kinds):
-        heights = [np.nan if one is None else one.mean for one in scores]
-        errors = [np.nan if one is None else one.error for one in scores]
+        heights = [score.mean for score in scores]
+        errors = [score.error for score in scores]
         where = at + (0.2 - 0.4 * offset if len(kinds) > 1 else 0)
         style = {"ecolor": RECORDED, "capsize": 3, "lw": 1}
         height = 0.38 if len(kinds) > 1 else 0.6
@@ -92,7 +93,7 @@ def bars(study: Study) -> Figure:
     axis.axvline(0, color=RECORDED, lw=1)
     low, high = axis.get_xlim()
     axis.set_xlim(max(low, _LEAST), min(max(high, 0.1), 1.0))
-    axis.set_yticks(at, [_bar_name(one) for one in shown])
+    axis.set_yticks(at, [_bar_name(result) for result in shown])
     axis.grid(axis="y", visible=False)
     axis.set_xlabel("held-out R², mean over channels and steps (lines: standard error over folds)")
     legend_below(figure, axis, 3)
@@ -100,7 +101,7 @@ def bars(study: Study) -> Figure:
     return figure
 
 
-def _state_sensor(axis: Axes, study: Study) -> None:
+def _state_sensor(axis: Axes, study: ProbeStudy) -> None:
     """Where state + sensor are by themselves, if only in the legend."""
     if study.streams is None:
         return
@@ -113,18 +114,22 @@ def _state_sensor(axis: Axes, study: Study) -> None:
 
 def _off_axis(axis: Axes, place: float, value: float) -> None:
     """On the bar, at the left end of the axis."""
-    said = f"◀ {value:.2f}"
-    axis.text(_LEAST + 0.005, place, said, ha="left", va="center", color="white", size=8)
+    words = f"◀ {value:.2f}"
+    axis.text(_LEAST + 0.005, place, words, ha="left", va="center", color="white", size=8)
 
 
 def _overview(
-    axis: Axes, study: Study, rows: Sequence[str], kinds: Sequence[str], limits: tuple[float, float]
+    axis: Axes,
+    study: ProbeStudy,
+    rows: Sequence[str],
+    kinds: Sequence[str],
+    limits: tuple[float, float],
 ) -> AxesImage:
     """Groups and whole views; a group of one slot is that slot."""
     grid = np.full((len(rows), len(kinds)), np.nan)
-    plain = [one for one in study.slots if one.name.cell is None]
-    for one in [*plain, *study.groups]:
-        grid[rows.index(_row(one.name)), kinds.index(_column(one.name))] = _value(one)
+    plain = [result for result in study.slots if result.name.cell is None]
+    for result in [*plain, *study.groups]:
+        grid[rows.index(_row(result.name)), kinds.index(_column(result.name))] = result.best.mean
     image = _map(axis, grid, limits)
     axis.set_xticks(range(len(kinds)), kinds)
     axis.set_yticks(range(len(rows)), rows)
@@ -132,13 +137,13 @@ def _overview(
     return image
 
 
-def _cells(axis: Axes, found: list[Finding], title: str, limits: tuple[float, float]) -> None:
+def _cells(axis: Axes, results: list[ProbeResult], title: str, limits: tuple[float, float]) -> None:
     """Where in the image of a view: its cells, top left first."""
-    places = [cell for one in found if (cell := one.name.cell) is not None]
+    places = [cell for result in results if (cell := result.name.cell) is not None]
     shape = (1 + max(row for row, _ in places), 1 + max(column for _, column in places))
     grid = np.full(shape, np.nan)
-    for place, one in zip(places, found, strict=True):
-        grid[place] = _value(one)
+    for place, result in zip(places, results, strict=True):
+        grid[place] = result.best.mean
     image = _map(axis, grid, limits)
     axis.set_xticks([])
     axis.set_yticks([])
@@ -147,15 +152,15 @@ def _cells(axis: Axes, found: list[Finding], title: str, limits: tuple[float, fl
 
 
 def _scale(
-    figure: Figure, axes: Sequence[Axes], image: AxesImage, study: Study, below: bool
+    figure: Figure, axes: Sequence[Axes], image: AxesImage, study: ProbeStudy, below: bool
 ) -> None:
     """The colours' numbers, and among them state + sensor by themselves."""
     known = study.streams
-    said = "alone" if known is None else "beside state + sensor"
+    words = "alone" if known is None else "beside state + sensor"
     if known is not None:
-        said += f"\n(line: state + sensor alone, {known.mean:.2f})"
+        words += f"\n(line: state + sensor alone, {known.mean:.2f})"
     bar = figure.colorbar(
-        image, ax=axes, label=f"held-out R², {said}", extend="min" if below else "neither"
+        image, ax=axes, label=f"held-out R², {words}", extend="min" if below else "neither"
     )
     if known is not None:
         bar.ax.axhline(max(known.mean, image.get_clim()[0]), color="#D55E00", lw=2.5)
@@ -175,29 +180,24 @@ def _number(axis: Axes, grid: np.ndarray, image: AxesImage) -> None:
             axis.text(column, row, f"{value:.2f}", ha="center", va="center", color=colour, size=8)
 
 
-def _maps(study: Study) -> dict[tuple[str, str], list[Finding]]:
+def _maps(study: ProbeStudy) -> dict[tuple[str, str], list[ProbeResult]]:
     """The slots that are cells, by layer and view."""
-    found: dict[tuple[str, str], list[Finding]] = {}
-    for one in study.slots:
-        if one.name.cell is not None:
-            found.setdefault((_row(one.name), str(one.name.view)), []).append(one)
-    return found
+    maps: dict[tuple[str, str], list[ProbeResult]] = {}
+    for result in study.slots:
+        if result.name.cell is not None:
+            maps.setdefault((_row(result.name), str(result.name.view)), []).append(result)
+    return maps
 
 
-def _best(cells: Sequence[Finding]) -> float:
-    return max((value for one in cells if np.isfinite(value := _value(one))), default=-np.inf)
+def _best(cells: Sequence[ProbeResult]) -> float:
+    return max(result.best.mean for result in cells)
 
 
 def _limits(values: Sequence[float]) -> tuple[float, float]:
-    """From what is found; a very bad slot does not wash out the others."""
-    finite = [value for value in values if np.isfinite(value)] or [0.0]
-    high = max(finite)
-    low = max(min(finite), high - 1.0)
+    """From what is there; a very bad slot does not wash out the others."""
+    high = max(values)
+    low = max(min(values), high - 1.0)
     return (low, high) if high > low else (low - 0.5, high + 0.5)
-
-
-def _value(one: Finding) -> float:
-    return float("nan") if one.best is None else one.best.mean
 
 
 def _row(name: SlotName) -> str:
@@ -208,13 +208,13 @@ def _column(name: SlotName) -> str:
     return name.pooling if name.view is None else f"{name.pooling}\n{name.view}"
 
 
-def _bar_name(one: Finding) -> str:
-    slots = f" ({len(one.slots)} slots)" if len(one.slots) > 1 else ""
-    return f"{_row(one.name)}\n{one.name.pooling}{slots}"
+def _bar_name(result: ProbeResult) -> str:
+    slots = f" ({len(result.slots)} slots)" if len(result.slots) > 1 else ""
+    return f"{_row(result.name)}\n{result.name.pooling}{slots}"
 
 
-def _title(study: Study, said: str) -> str:
+def _title(study: ProbeStudy, words: str) -> str:
     return (
-        f"{said}\nchunks of {study.horizon} ticks at {len(study.folds.ticks)} ticks of "
+        f"{words}\nchunks of {study.horizon} ticks at {len(study.folds.ticks)} ticks of "
         f"{study.folds.recordings} recordings, {study.folds.count} folds"
     )

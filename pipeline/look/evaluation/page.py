@@ -6,13 +6,20 @@ from typing import Any
 
 from pipeline.base.digests import file_digest
 from pipeline.base.table import Table
-from pipeline.evaluate.ablation import ModalityStudy
-from pipeline.evaluate.ablation_tables import FOOTNOTE as MODALITY_FOOTNOTE
-from pipeline.evaluate.ablation_tables import best_baseline, judged_on, modality_errors
-from pipeline.evaluate.episode_frames import footage, shown_ticks
+from pipeline.evaluate.ablation import AblationStudy
+from pipeline.evaluate.episode_frames import read_episode_frames, shown_ticks
 from pipeline.evaluate.evaluation import Evaluation
 from pipeline.evaluate.names import with_unit
-from pipeline.evaluate.tables import FOOTNOTE, HEADINGS, error_rows, still_dimensions
+from pipeline.evaluate.tables import (
+    ABLATION_FOOTNOTE,
+    FOOTNOTE,
+    HEADINGS,
+    ablation_table,
+    best_baseline,
+    error_table,
+    evaluated_on,
+    still_dimensions,
+)
 from pipeline.look.evaluation import pictures as plots
 from pipeline.look.page.blocks import Block, Document, Picture, Report, Section, Text
 from pipeline.look.page.writing import sentence
@@ -91,7 +98,7 @@ def _tiles(comparison: Comparison) -> list[tuple[str, str]]:
 
 
 def _baselines(comparison: Comparison) -> list[Block]:
-    rows = [(name, *errors, relative) for name, errors, relative in error_rows(comparison)]
+    errors = error_table(comparison)
     return [
         Text(
             "Mean absolute errors over all steps of the chunk, of the policy and of three rules "
@@ -99,10 +106,10 @@ def _baselines(comparison: Comparison) -> list[Block]:
             "deviation; below 1, `policy / best` beats the best rule."
         ),
         Table(
-            ["mean absolute error", *(HEADINGS[method] for method in METHODS), "policy / best"],
-            rows,
+            errors.columns,
+            errors.rows,
             caption=sentence(FOOTNOTE),
-            strong=frozenset({len(rows) - 1}),
+            strong=frozenset({len(errors.rows) - 1}),
         ),
         Picture(
             "dimensions",
@@ -213,7 +220,7 @@ def _extremes(evaluation: Evaluation) -> Iterator[Section]:
         episode = store.episodes[index]
         ticks = shown_ticks(store, _whole(predictions, index), _INSTANTS)
         rows = store.array("tick/vl_row")[ticks]
-        seen = footage(store, episode, rows.tolist(), evaluation.recordings, digest_of)
+        seen = read_episode_frames(store, episode, rows.tolist(), evaluation.recordings, digest_of)
         above = "Above, the frames that the features at the dotted ticks were computed from. "
         caption = (
             f"Instruction: {episode.instruction}. {above if seen.frames else ''}Recorded action, "
@@ -237,7 +244,7 @@ def _whole(predictions: Predictions, index: int) -> Ticks:
     return predictions.ticks[whole if whole.any() else here]
 
 
-def _modalities(study: ModalityStudy | None) -> list[Block]:
+def _modalities(study: AblationStudy | None) -> list[Block]:
     if study is None:
         return [
             Text(
@@ -245,17 +252,17 @@ def _modalities(study: ModalityStudy | None) -> list[Block]:
                 "its episode."
             )
         ]
-    columns, rows = modality_errors(study)
+    table = ablation_table(study)
     return [
         Text(
-            f"{sentence(judged_on(study))} {sentence(MODALITY_FOOTNOTE)} An error that stays "
+            f"{sentence(evaluated_on(study))} {sentence(ABLATION_FOOTNOTE)} An error that stays "
             "says that the policy does not use the stream, or that others tell it the same."
         ),
-        Table(columns, rows, strong=frozenset({0})),
+        Table(table.columns, table.rows, strong=frozenset({0})),
         *(Text(sentence(note)) for note in study.notes),
         Picture(
             "modalities",
-            "The error with one stream spoilt as a multiple of the error with all intact.",
+            "The error with one stream ablated as a multiple of the error with all intact.",
             partial(plots.modalities, study),
         ),
     ]

@@ -12,12 +12,11 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from pipeline.evaluate.ablation import Ablated, ModalityStudy
-from pipeline.evaluate.ablation_tables import FOOTNOTE as MODALITY_FOOTNOTE
-from pipeline.evaluate.ablation_tables import best_baseline
-from pipeline.evaluate.curves import Curve, Curves
+from pipeline.evaluate.ablation import Ablated, AblationStudy
+from pipeline.evaluate.curves import TrainingCurve, TrainingCurves
 from pipeline.evaluate.experiments import Experiment
 from pipeline.evaluate.names import with_unit
+from pipeline.evaluate.tables import ABLATION_FOOTNOTE, best_baseline
 from pipeline.look.page.style import (
     GRID,
     INK,
@@ -50,7 +49,7 @@ _CURVES = {
     "val/error": ("held-out error [training std]", PALETTE[5], False),
     "lr": ("learning rate", PALETTE[2], False),
 }
-"""Curve -> what its axis says, colour, and whether to draw decades of it logarithmic."""
+"""TrainingCurve -> what its axis says, colour, and whether to draw decades of it logarithmic."""
 _ABLATIONS = {
     "zeroed": "#0072B2",
     "missing": "#56B4E9",
@@ -287,7 +286,7 @@ def _plot_chunks(
         label = ""
 
 
-def curves(logged: Curves, step: int) -> Figure:
+def curves(logged: TrainingCurves, step: int) -> Figure:
     """Loss, held-out error and learning rate over the steps; a line marks the step judged here."""
     shown = [name for name in _CURVES if name in logged.curves] or sorted(logged.curves)[:3]
     figure = canvas(max(4.2 * len(shown), 8.4), 3.4)
@@ -299,7 +298,7 @@ def curves(logged: Curves, step: int) -> Figure:
     return figure
 
 
-def _plot_curve(axis: Axes, name: str, curve: Curve) -> None:
+def _plot_curve(axis: Axes, name: str, curve: TrainingCurve) -> None:
     title, colour, by_decades = _CURVES.get(name, (name, PALETTE[4], False))
     marker = "o" if len(curve.step) <= 30 else ""
     axis.plot(curve.step, curve.value, color=colour, marker=marker, markersize=4)
@@ -313,13 +312,13 @@ def _plot_curve(axis: Axes, name: str, curve: Curve) -> None:
     axis.set_xlabel("step")
 
 
-def modalities(study: ModalityStudy) -> Figure:
-    """The error with each stream spoilt as a multiple of the intact one, a panel a stream.
+def modalities(study: AblationStudy) -> Figure:
+    """The error with each stream ablated as a multiple of the intact one, a panel a stream.
 
     The error itself, in units of the training standard deviation, where the intact one is 0.
     """
     panels = [
-        [ablated for ablated in study.spoilt if ablated.stream == name] for name in study.streams
+        [ablated for ablated in study.ablated if ablated.stream == name] for name in study.streams
     ]
     widths = [len(panel) for panel in panels]
     figure = canvas(max(0.95 * sum(widths) + 1.5, 7.5), 4.6)
@@ -331,16 +330,16 @@ def modalities(study: ModalityStudy) -> Figure:
     axes[0].set_ylabel("held-out error / error with all streams intact")
     axes[0].set_ylim(0, 1.12 * axes[0].get_ylim()[1])
     legend_below(figure, axes[0], 2)
-    figure.legends[0].set_title(MODALITY_FOOTNOTE)
+    figure.legends[0].set_title(ABLATION_FOOTNOTE)
     figure.suptitle(
-        f"What the policy loses with one stream spoilt, on {study.intact.ticks} held-out ticks, "
+        f"What the policy loses with one stream ablated, on {study.intact.ticks} held-out ticks, "
         f"{study.samples} chunk(s) a tick\n"
         "(well above 1: the stream is used; delays fade where a stream changes slowly)"
     )
     return figure
 
 
-def _plot_ablations(axis: Axes, panel: Sequence[Ablated], study: ModalityStudy) -> None:
+def _plot_ablations(axis: Axes, panel: Sequence[Ablated], study: AblationStudy) -> None:
     unit = study.intact.overall("policy") or 1.0
     heights = [ablated.comparison.overall("policy") / unit for ablated in panel]
     colours = [_ABLATIONS[ablated.how.split()[0]] for ablated in panel]

@@ -2,7 +2,7 @@
 
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Self
@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Int64
 from torch import Tensor
 
+from pipeline.policy.observation import LiveObservation
 from pipeline.store import Batch, FeatureStore
 from pipeline.train.batches import BatchIndices, Prefetch, Windows
 from pipeline.train.finetuning.rows import LiveRows
@@ -19,13 +20,8 @@ from pipeline.vlm.preparation import PreparedRow
 
 
 @dataclass
-class LiveBatch(Batch):
-    """A batch and the rows that its features are to be computed from; a `LiveObservation`."""
-
-    rows: Sequence[PreparedRow]
-    """The distinct VL rows of the batch, each once."""
-    row_of: Int64[Tensor, " batch"]
-    """Index into `rows` of each tick."""
+class LiveBatch(Batch, LiveObservation):
+    """A batch and the rows that its features are to be computed from, each distinct one once."""
 
 
 @dataclass(frozen=True)

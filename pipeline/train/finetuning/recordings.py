@@ -6,11 +6,12 @@ from contextlib import closing
 from tqdm import tqdm
 
 from pipeline.base.config import Params
+from pipeline.base.differences import describe, differences
 from pipeline.base.digests import ContentDigests
 from pipeline.base.errors import RecordingError, StoreMismatch
 from pipeline.data import Opened, Recording, content_digest, open_recordings
 from pipeline.store import Episode, FeatureStore
-from pipeline.vlm.feature_spec import FeatureSpec, differences, feature_spec
+from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 
 _SHOWN = 5
 _EXTRACT = "python -m stages.extract"
@@ -62,7 +63,8 @@ def check_spec(store: FeatureStore, params: Params, digests: ContentDigests) -> 
     stored = store.spec
     spec = feature_spec(params.vlm, stored["storage_dtype"], stored["views"], digests.of)
     if spec.digest != stored["digest"]:
-        lines = "\n".join(f"  {line}" for line in differences(stored, spec.attrs()))
+        differing = describe(differences(stored, spec.attrs()))
+        lines = "\n".join(f"  {line}" for line in differing)
         raise StoreMismatch(
             f"{store.path}: tuning begins with the model whose features the store holds, but its "
             f"feature spec is not that of vlm (store -> vlm):\n{lines}\n"

@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 import zarr
+from sklearn.linear_model import Ridge
 
-from pipeline.evaluate.probe.projection import LIMIT, STILL
+from pipeline.evaluate.probe.inputs import LIMIT, STILL
 from pipeline.store import FeatureStore
-
-Rewrite = Callable[[FeatureStore, np.random.Generator], None]
 
 
 @pytest.fixture(scope="session")
@@ -38,48 +37,38 @@ def renamed() -> Callable[..., FeatureStore]:
     return rename
 
 
-def fitted(
-    x: np.ndarray, y: np.ndarray, penalty: float | np.ndarray
-) -> Callable[[np.ndarray], np.ndarray]:
-    """Ridge regression written down as in the textbook, on the rows themselves.
-
-    An input that hardly varies here is not used: `x` spreads by about 1 over all folds.
-    """
-    mean, spread = x.mean(0), x.std(0)
-    spread[spread <= STILL] = np.inf
-    standard = (x - mean) / spread
-    ridge = np.diag(np.broadcast_to(penalty, x.shape[1])) * len(x)
-    weights = np.linalg.solve(standard.T @ standard + ridge, standard.T @ (y - y.mean(0)))
-    return lambda other: (other - mean) / spread @ weights + y.mean(0)
-
-
 @pytest.fixture
 def limited() -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """`limited(x, fold)`: inputs as a reader gives them, each column by the formula itself."""
+    """`limited(x, fold)`: inputs as they are read, each column by the formula itself."""
 
     def limit(x: np.ndarray, fold: np.ndarray) -> np.ndarray:
-        found = np.zeros(x.shape)
+        inputs = np.zeros(x.shape)
         for column in range(x.shape[1]):
             values = x[:, column]
             trained = [values[fold != held] for held in np.unique(fold)]
-            if min(one.std() for one in trained) <= STILL * values.std():
+            if min(rows.std() for rows in trained) <= STILL * values.std():
                 continue
-            lower = max(one.mean() - LIMIT * one.std() for one in trained)
-            upper = min(one.mean() + LIMIT * one.std() for one in trained)
+            lower = max(rows.mean() - LIMIT * rows.std() for rows in trained)
+            upper = min(rows.mean() + LIMIT * rows.std() for rows in trained)
             if upper > lower:
                 kept = np.clip(values, lower, upper)
-                found[:, column] = (kept - kept.mean()) / kept.std()
-        return found
+                inputs[:, column] = (kept - kept.mean()) / kept.std()
+        return inputs
 
     return limit
 
 
 @pytest.fixture
 def nested() -> Callable[..., tuple[np.ndarray, np.ndarray]]:
-    """`nested(x, y, fold, penalties)`: (fold, target) R^2 and the chosen penalties, row by row.
+    """`nested(x, y, fold, penalties)`: (fold, target) R^2 and the chosen penalties.
 
-    `known` is the number of last columns that have the penalties `of_known` (fold,) instead.
+    By scikit-learn's Ridge on the rows themselves. `known` is the number of last columns that have
+    the penalties `of_known` (fold,) instead: Ridge has one for all, so the columns are scaled.
     """
+
+    def predicted(x: np.ndarray, y: np.ndarray, other: np.ndarray, ridge: np.ndarray) -> np.ndarray:
+        scale = 1 / np.sqrt(ridge)
+        return Ridge(alpha=len(x)).fit(x * scale, y).predict(other * scale)
 
     def score(
         x: np.ndarray,
@@ -96,16 +85,16 @@ def nested() -> Callable[..., tuple[np.ndarray, np.ndarray]]:
             ridges = [np.full(x.shape[1], penalty) for penalty in penalties]
             for ridge in ridges:
                 ridge[x.shape[1] - known :] = of_known[held] if known else 0
+            varies = y[train].std(0) > STILL * y.std(0)
             for out in np.unique(fold[train]):
                 inside, test = train & (fold != out), fold == out
                 for index, ridge in enumerate(ridges):
-                    error = (y[test] - fitted(x[inside], y[inside], ridge)(x[test])) ** 2
-                    varies = y[train].std(0) > STILL * y.std(0)
+                    error = (y[test] - predicted(x[inside], y[inside], x[test], ridge)) ** 2
                     lost[index] += (error[:, varies] / y[train][:, varies].var(0)).sum()
             best = int(lost.argmin())
-            predicted = fitted(x[train], y[train], ridges[best])(x[~train])
+            error = (y[~train] - predicted(x[train], y[train], x[~train], ridges[best])) ** 2
             with np.errstate(divide="ignore", invalid="ignore"):
-                r2.append(1 - ((y[~train] - predicted) ** 2).mean(0) / y.var(0))
+                r2.append(1 - error.mean(0) / y.var(0))
             chosen.append(penalties[best])
         return np.array(r2), np.array(chosen)
 

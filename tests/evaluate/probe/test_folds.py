@@ -15,8 +15,7 @@ def test_each_recording_is_in_one_fold_with_its_other_formats(store: FeatureStor
     store.array("vl/key")[40] = store.array("vl/key")[10]  # episode 4 is episode 1
     folds = fold_by_recording(store, 5, 8)
     episode = folds.ticks // 30
-    fold = np.array(folds.fold_of_part)[folds.part]
-    of = {int(one): set(fold[episode == one].tolist()) for one in np.unique(episode)}
+    of = {int(one): set(folds.fold[episode == one].tolist()) for one in np.unique(episode)}
     assert all(len(several) == 1 for several in of.values())
     assert of[1] == of[4]
     assert folds.count == len(set.union(*of.values())) == 5
@@ -50,10 +49,10 @@ def test_two_recordings_are_two_folds_of_two_halves(
 ) -> None:
     store = FeatureStore.open(tiny_store(tmp_path, episodes=2))
     folds = fold_by_recording(store, 5, 8)
-    assert folds.fold_of_part == (0, 0, 1, 1)
+    assert (folds.fold == folds.part // 2).all()
     assert "2 recordings make 2 folds, not 5" in folds.notes
     assert set(folds.part.tolist()) == {0, 1, 2, 3}
-    assert (folds.part // 2 == folds.ticks // 30).all()
+    assert len(set(zip(folds.fold.tolist(), (folds.ticks // 30).tolist(), strict=True))) == 2
     rows = store.array("tick/vl_row")[folds.ticks]
     assert all(len(set(folds.part[rows == row].tolist())) == 1 for row in np.unique(rows))
 
@@ -80,4 +79,9 @@ def test_a_limit_takes_ticks_evenly(store: FeatureStore) -> None:
     folds = fold_by_recording(store, 5, 8, max_ticks=20)
     assert len(folds.ticks) == 20
     assert set(folds.ticks // 30) == set(range(6))
-    assert folds.notes[1:] == ("20 of the ticks are read, evenly spread",)
+    assert folds.notes[1:] == ("20 of the ticks are read, evenly spread (probe.max_ticks)",)
+
+
+def test_too_few_ticks_for_every_fold_are_refused(store: FeatureStore) -> None:
+    with pytest.raises(StoreMismatch, match=r"one of 5 folds.*larger probe.max_ticks"):
+        fold_by_recording(store, 5, 8, max_ticks=4)

@@ -10,9 +10,9 @@ import pytest
 
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.table import Table
-from pipeline.evaluate.ablation import judge_modalities
-from pipeline.evaluate.curves import Curve, Curves
-from pipeline.evaluate.episode_frames import Footage
+from pipeline.evaluate.ablation import evaluate_ablation
+from pipeline.evaluate.curves import TrainingCurve, TrainingCurves
+from pipeline.evaluate.episode_frames import EpisodeFrames
 from pipeline.evaluate.evaluation import Evaluation, judged_document
 from pipeline.evaluate.experiments import Experiment
 from pipeline.look.evaluation import page as evaluation_page
@@ -40,7 +40,7 @@ PARAMS = TrainHeadParams.model_validate(
         "state_window": 5,
     }
 )
-CURVES = Curves({"train/loss": Curve(np.array([10, 20]), np.array([1.0, 0.1]))})
+CURVES = TrainingCurves({"train/loss": TrainingCurve(np.array([10, 20]), np.array([1.0, 0.1]))})
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +82,7 @@ def judgement(
         store=store,
         comparison=comparison,
         predictions=predictions,
-        study=judge_modalities(checkpoint, policy, store, ticks, 64),
+        study=evaluate_ablation(checkpoint, policy, store, ticks, 64),
         judged=judged_document(checkpoint, policy, store, 1, 64),
         curves=CURVES,
         recordings=Path("data/nowhere"),
@@ -112,7 +112,7 @@ def test_tables_say_what_the_comparison_says(judgement: Evaluation) -> None:
     worst_first = [row[2] for row in episodes.rows]
     assert worst_first == sorted(comparison.overall_by_episode("policy"), reverse=True)
     assert [row[1] for row in episodes.rows] == [30, 30, 30]
-    assert streams.rows[0][:2] == ("all", "intact") and len(streams.rows) > 5
+    assert streams.rows[0][:2] == ["all", "intact"] and len(streams.rows) > 5
     assert dict(report.tiles)["held-out episodes"] == "3"
 
 
@@ -168,16 +168,16 @@ def test_a_page_with_frames_and_without_is_sound(
 ) -> None:
     """Frames of the best episode; the worst one's recording is where no recording is."""
     (_, best), (_, worst) = judgement.comparison.extremes()
-    look = evaluation_page.footage
+    look = evaluation_page.read_episode_frames
 
-    def half(store: FeatureStore, episode: Any, rows: list[int], *rest: Any) -> Footage:
+    def half(store: FeatureStore, episode: Any, rows: list[int], *rest: Any) -> EpisodeFrames:
         if episode.index != best:
             return look(store, episode, rows, *rest)
         assert all(row in episode.vl_rows for row in rows) and len(rows) == 5
         shades = np.linspace(0, 255, len(rows)).astype(np.uint8)
-        return Footage({"View1": [np.full((12, 16, 3), shade, np.uint8) for shade in shades]})
+        return EpisodeFrames({"View1": [np.full((12, 16, 3), shade, np.uint8) for shade in shades]})
 
-    monkeypatch.setattr(evaluation_page, "footage", half)
+    monkeypatch.setattr(evaluation_page, "read_episode_frames", half)
     files = write_report(tmp_path, evaluation_report(judgement))
     assert {file.stem for file in files} == {
         *("report", "dimensions", "scatter", "horizon", "dimension_horizon", "episodes"),
@@ -192,7 +192,7 @@ def test_a_page_with_frames_and_without_is_sound(
 
 
 def test_what_is_missing_is_said(judgement: Evaluation) -> None:
-    bare = replace(judgement, study=None, curves=Curves({}, "No training curves: gone."))
+    bare = replace(judgement, study=None, curves=TrainingCurves({}, "No training curves: gone."))
     report = evaluation_report(bare)
     assert {one.name for one in report.blocks(Picture)}.isdisjoint({"modalities", "curves"})
     (training,) = section(report, "Training").blocks

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from pipeline.evaluate.ablation import Ablated, ModalityStudy
-from pipeline.evaluate.curves import Curve, Curves
+from pipeline.evaluate.ablation import Ablated, AblationStudy
+from pipeline.evaluate.curves import TrainingCurve, TrainingCurves
 from pipeline.evaluate.experiments import Experiment
-from pipeline.evaluate.probe import Finding, Folds, Score, SlotName, Study
+from pipeline.evaluate.probe import ProbeFolds, ProbeResult, ProbeScore, ProbeStudy, SlotName
 from pipeline.look.evaluation import draw_probe as probe
 from pipeline.look.evaluation import pictures as plots
 from pipeline.look.page.style import write
@@ -198,14 +198,14 @@ def test_errors_by_dimension_and_step_are_in_training_deviations() -> None:
 def test_curves_mark_the_step_that_was_judged() -> None:
     steps = np.array([10, 20, 30])
     logged = {
-        name: Curve(steps, np.array(values))
+        name: TrainingCurve(steps, np.array(values))
         for name, values in {
             "train/loss": [1.0, 0.1, 0.01],
             "lr": [0.0, 1e-3, 5e-4],
             "train/other": [1.0, 1.0, 1.0],
         }.items()
     }
-    figure = plots.curves(Curves(logged), 20)
+    figure = plots.curves(TrainingCurves(logged), 20)
     assert [axis.get_title() for axis in figure.axes] == ["training loss", "learning rate"]
     assert [axis.get_yscale() for axis in figure.axes] == ["log", "linear"]
     for axis in figure.axes:
@@ -214,13 +214,13 @@ def test_curves_mark_the_step_that_was_judged() -> None:
     assert len({axis.get_xlim() for axis in figure.axes}) == 1
     assert "step 20" in figure.get_suptitle()
     short = {
-        "train/loss": Curve(steps, np.array([0.31, 0.29, 0.3])),
-        "lr": Curve(steps[:1], steps[:1]),
+        "train/loss": TrainingCurve(steps, np.array([0.31, 0.29, 0.3])),
+        "lr": TrainingCurve(steps[:1], steps[:1]),
     }
-    loss, rate = plots.curves(Curves(short), 20).axes
+    loss, rate = plots.curves(TrainingCurves(short), 20).axes
     assert (loss.get_yscale(), loss.get_ylim()[0]) == ("linear", 0)
     assert rate.get_xlim() == loss.get_xlim()
-    (axis,) = plots.curves(Curves({"train/other": logged["train/other"]}), 5).axes
+    (axis,) = plots.curves(TrainingCurves({"train/other": logged["train/other"]}), 5).axes
     assert axis.get_title() == "train/other"
 
 
@@ -295,7 +295,7 @@ def heights(figure: Figure) -> list[list[float]]:
     return [[patch.get_height() for patch in axis.patches] for axis in figure.axes]
 
 
-def studied(*errors: float) -> ModalityStudy:
+def studied(*errors: float) -> AblationStudy:
     """A study whose policy, in the first dimension of two, is wrong by these, intact first."""
 
     def judged(error: float) -> Comparison:
@@ -316,7 +316,7 @@ def studied(*errors: float) -> ModalityStudy:
         Ablated(stream, how, judged(error))
         for (stream, how), error in zip(ways, errors[1:], strict=True)
     )
-    return ModalityStudy(judged(errors[0]), spoilt, (), 4)
+    return AblationStudy(judged(errors[0]), spoilt, (), 4)
 
 
 def test_what_each_stream_is_worth_stands_beside_intact_and_best_baseline(tmp_path: Path) -> None:
@@ -374,22 +374,21 @@ def test_numbers_of_experiments_lie_on_nothing() -> None:
         assert text.get_window_extent().x1 < figure.bbox.x1
 
 
-def score(mean: float, spread: float = 0.02) -> Score:
+def score(mean: float, spread: float = 0.02) -> ProbeScore:
     """Over three folds and two targets, of which one does not vary."""
     by_fold = mean + spread * np.array([-1.0, 0.0, 1.0])
     r2 = np.stack([by_fold, np.full(3, np.nan)], axis=1)
-    return Score(r2, np.full(3, 10.0), (1.0,) * 3)
+    return ProbeScore(r2, np.full(3, 10.0), (1.0,) * 3)
 
 
-def found(name: SlotName, mean: float | None, slots: int = 1, streams: bool = True) -> Finding:
-    """Alone half as good as beside; None could not be scored."""
-    beside = score(mean) if mean is not None and streams else None
-    alone = None if mean is None else score(mean / 2)
-    without = score(0.2) if streams else None
-    return Finding(name, tuple(range(slots)), 8 * slots, 8 * slots, 1.0, alone, beside, without)
+def found(name: SlotName, mean: float, slots: int = 1, streams: bool = True) -> ProbeResult:
+    """Alone half as good as beside."""
+    beside = score(mean) if streams else None
+    size = 8 * slots
+    return ProbeResult(name, tuple(range(slots)), size, size, 1.0, score(mean / 2), beside)
 
 
-def probed(streams: bool = True, layers: int = 2, scored: bool = True) -> Study:
+def probed(streams: bool = True, layers: int = 2) -> ProbeStudy:
     """Each layer has a mean, a mean a view and a grid of 2 x 2 cells a view."""
     slots, groups = [], []
     for layer in range(layers):
@@ -399,16 +398,17 @@ def probed(streams: bool = True, layers: int = 2, scored: bool = True) -> Study:
             places += [("grid", view, cell) for view in "AB" for cell in cells]
             for pooling, view, cell in places:
                 place = (cell or (0, 0))[0] * 0.1 + (cell or (0, 0))[1] * 0.01
-                mean = 0.3 + 0.1 * layer + place if scored else None
+                mean = 0.3 + 0.1 * layer + place
                 name = SlotName(layer, norm, pooling, view, cell)
                 slots.append(found(name, mean, streams=streams))
             groups += [
-                found(SlotName(layer, norm, pooling), 0.5 if scored else None, count, streams)
+                found(SlotName(layer, norm, pooling), 0.5, count, streams)
                 for pooling, count in (("mean", 1), ("view_mean", 2), ("grid", 8))
             ]
-    folds = Folds(np.arange(30), np.arange(30) // 10, (0, 1, 2), 3, ())
+    fold = np.arange(30) // 10
+    folds = ProbeFolds(np.arange(30), fold, fold, 3, ())
     known = score(0.2) if streams else None
-    return Study(2, ("dx",), folds, score(-0.01), known, 5, tuple(slots), tuple(groups))
+    return ProbeStudy(2, ("dx",), folds, score(-0.01), known, 5, tuple(slots), tuple(groups))
 
 
 def test_slots_are_a_map_over_layers_and_cells_a_map_a_view(tmp_path: Path) -> None:
@@ -469,6 +469,5 @@ def test_what_is_far_below_the_mean_action_is_a_number_at_the_edge() -> None:
     assert bar.lines[-1].get_ydata()[0] == pytest.approx(-0.49)
 
 
-@pytest.mark.parametrize("study", [probed(streams=False, layers=1), probed(scored=False)])
-def test_what_is_missing_is_left_white(study: Study, tmp_path: Path) -> None:
-    assert len(probe.write_probe_plots(tmp_path, study)) == 2
+def test_without_streams_all_stands_alone(tmp_path: Path) -> None:
+    assert len(probe.write_probe_plots(tmp_path, probed(streams=False, layers=1))) == 2

@@ -11,7 +11,7 @@ import torch
 
 from pipeline.base.config import Params, TuningParams
 from pipeline.base.errors import RecordingError
-from pipeline.policy.live_observation import LiveObservation
+from pipeline.policy.observation import LiveObservation
 from pipeline.store import Batch, FeatureStore
 from pipeline.train.batches import BatchIndices, Windows
 from pipeline.train.finetuning.feed import LiveFeed

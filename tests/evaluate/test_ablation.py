@@ -9,10 +9,16 @@ import pytest
 import torch
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.evaluate.ablation import ModalityStudy, delays, judge_modalities
-from pipeline.evaluate.ablation_tables import modality_rows, modality_table, stream_rows
-from pipeline.evaluate.cells import write_rows
-from pipeline.evaluate.corruption import donors_of, exchanged, missing, zeroed
+from pipeline.evaluate.ablation import (
+    AblationStudy,
+    delays,
+    donors_of,
+    evaluate_ablation,
+    exchanged,
+    missing,
+    zeroed,
+)
+from pipeline.evaluate.tables import ablation_text, write_tables
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.normalization import ChannelStatistics, Normalization
 from pipeline.policy.policy import Policy
@@ -20,6 +26,7 @@ from pipeline.store import FeatureStore
 from pipeline.train.batches import BatchIndices, Lags, Windows
 from pipeline.train.held_out import held_out_contents, held_out_ranges
 from pipeline.train.identity import policy_shape, source_of
+from pipeline.train.predictions import Predictions
 from pipeline.train.split import split_by_episode
 
 PARAMS = {
@@ -83,36 +90,36 @@ def held_out(store: FeatureStore) -> np.ndarray:
 @pytest.fixture(scope="module")
 def study(
     tiny_store: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory
-) -> ModalityStudy:
+) -> AblationStudy:
     store = FeatureStore.open(tiny_store(tmp_path_factory.mktemp("study"), episodes=20))
     checkpoint, policy = trained(store, 250)
-    found = judge_modalities(checkpoint, policy, store, held_out(store), 64)
+    found = evaluate_ablation(checkpoint, policy, store, held_out(store), 64)
     assert found is not None
     return found
 
 
-def times(study: ModalityStudy, stream: str, how: str) -> float:
-    (one,) = (one for one in study.spoilt if (one.stream, one.how) == (stream, how))
+def times(study: AblationStudy, stream: str, how: str) -> float:
+    (one,) = (one for one in study.ablated if (one.stream, one.how) == (stream, how))
     ratio = study.times_intact(one)
     assert ratio is not None
     return ratio
 
 
-def test_a_stream_that_decides_the_action_is_missed(study: ModalityStudy) -> None:
+def test_a_stream_that_decides_the_action_is_missed(study: AblationStudy) -> None:
     assert study.intact.relative() < 0.5  # type: ignore[operator]
     for how in ("zeroed", "shuffled", "delayed 50 ms", "delayed 100 ms", "delayed 200 ms"):
         assert times(study, "sensor", how) > 2, how
 
 
-def test_a_stream_that_decides_nothing_is_not(study: ModalityStudy) -> None:
-    for one in study.spoilt:
+def test_a_stream_that_decides_nothing_is_not(study: AblationStudy) -> None:
+    for one in study.ablated:
         if one.stream != "sensor":
             assert times(study, one.stream, one.how) < 1.5, one.how
 
 
-def test_the_ways_to_spoil_are_those_that_mean_something(study: ModalityStudy) -> None:
+def test_the_ways_to_spoil_are_those_that_mean_something(study: AblationStudy) -> None:
     assert study.streams == ("sensor", "state", "features")
-    hows = {name: [s.how for s in study.spoilt if s.stream == name] for name in study.streams}
+    hows = {name: [s.how for s in study.ablated if s.stream == name] for name in study.streams}
     late = ["delayed 50 ms", "delayed 100 ms", "delayed 200 ms"]
     assert hows["sensor"] == hows["state"] == ["zeroed", "shuffled", *late]
     # A VL row serves 3 ticks of 100 ms: nothing shorter can be had.
@@ -120,27 +127,31 @@ def test_the_ways_to_spoil_are_those_that_mean_something(study: ModalityStudy) -
     assert study.notes[-1].startswith("features delayed: they change every 300 ms only")
     assert study.notes[-1].endswith("judged 300 ms; 50, 100, 200 ms end within a row")
     assert sum("missing: not judged" in note for note in study.notes) == 3
-    assert all(one.comparison.ticks == study.intact.ticks for one in study.spoilt)
+    assert all(one.comparison.ticks == study.intact.ticks for one in study.ablated)
 
 
-def test_the_figures_are_the_same_in_table_and_files(study: ModalityStudy, tmp_path: Path) -> None:
+def test_the_figures_are_the_same_in_table_and_files(
+    study: AblationStudy, tiny_store: Callable[..., Path], tmp_path: Path
+) -> None:
+    store = FeatureStore.open(tiny_store(tmp_path, episodes=20))
     multiple = times(study, "sensor", "zeroed")
-    path = write_rows(tmp_path / "modalities.csv", modality_rows(study))
-    rows = list(csv.DictReader(path.read_text().splitlines()))
+    ticks = np.arange(4)
+    predictions = Predictions(ticks, ticks * 0, *[np.zeros((4, 1, 5), np.float32)] * 2, ticks > 0)
+    write_tables(tmp_path, study.intact, predictions, store, study)
+    rows = list(csv.DictReader((tmp_path / "modalities.csv").read_text().splitlines()))
     (row,) = (
         row
         for row in rows
         if (row["stream"], row["how"], row["group"]) == ("sensor", "zeroed", "overall")
     )
     assert float(row["error"]) / float(row["intact_error"]) == pytest.approx(multiple, rel=1e-4)
-    path = write_rows(tmp_path / "streams.csv", stream_rows(study))
     (row,) = (
         row
-        for row in csv.DictReader(path.read_text().splitlines())
+        for row in csv.DictReader((tmp_path / "streams.csv").read_text().splitlines())
         if row["spoilt"] == "sensor zeroed"
     )
     assert float(row["times_intact"]) == pytest.approx(multiple, rel=1e-5)
-    lines = modality_table(study).splitlines()
+    lines = ablation_text(study).splitlines()
     assert any(line.startswith("sensor    zeroed") for line in lines)
     assert lines[2].split()[:2] == ["all", "intact"]
     assert any(line.startswith("none") for line in lines)
@@ -154,7 +165,7 @@ def test_missing_is_judged_where_training_dropped_the_stream(
 ) -> None:
     store = FeatureStore.open(tiny_store(tmp_path))
     checkpoint, policy = trained(store, 1, drop_sensor=0.2, robot_state_enabled=False)
-    found = judge_modalities(checkpoint, policy, store, held_out(store), 64)
+    found = evaluate_ablation(checkpoint, policy, store, held_out(store), 64)
     assert found is not None
     assert found.streams == ("sensor", "features")
     assert times(found, "sensor", "missing") > 0
@@ -169,13 +180,13 @@ def test_one_held_out_episode_has_nobody_to_be_shuffled_with(
 ) -> None:
     store = FeatureStore.open(tiny_store(tmp_path))
     checkpoint, policy = trained(store, 1)
-    found = judge_modalities(checkpoint, policy, store, np.arange(30, 60), 64)
+    found = evaluate_ablation(checkpoint, policy, store, np.arange(30, 60), 64)
     assert found is not None
-    assert not [one for one in found.spoilt if one.how == "shuffled"]
+    assert not [one for one in found.ablated if one.how == "shuffled"]
     assert sum("shuffled: not judged" in note for note in found.notes) == 3
     # The first ticks of an episode, at which a delay would find nothing, are not judged.
     assert found.intact.ticks == 27
-    assert judge_modalities(checkpoint, policy, store, np.arange(30, 33), 64) is None
+    assert evaluate_ablation(checkpoint, policy, store, np.arange(30, 33), 64) is None
 
 
 def test_donors_are_of_other_episodes(store: FeatureStore) -> None:
@@ -236,7 +247,7 @@ def test_features_go_back_whole_rows_and_say_the_true_time(
     }
     assert delays(store, "state")["delayed 50 ms"] == Lags(state_s=0.05)
     checkpoint, policy = trained(store, 1)
-    found = judge_modalities(checkpoint, policy, store, np.arange(30, 60), 64)
+    found = evaluate_ablation(checkpoint, policy, store, np.arange(30, 60), 64)
     assert found is not None
     assert found.notes[-1].endswith("judged 100 ms, 200 ms; 50 ms end within a row")
 
@@ -262,10 +273,10 @@ def test_a_study_of_a_sampling_policy_is_of_few_samples(
     store = FeatureStore.open(tiny_store(tmp_path))
     checkpoint, policy = trained(store, 1, model_type="flow_matching")
     ticks = held_out(store)
-    found = judge_modalities(checkpoint, policy, store, ticks, 64, samples=asked)
+    found = evaluate_ablation(checkpoint, policy, store, ticks, 64, samples=asked)
     assert found is not None
     assert found.samples == judged
-    assert f"{judged} chunk(s) a tick" in modality_table(found)
-    few = judge_modalities(checkpoint, policy, store, ticks, 64, samples=judged)
+    assert f"{judged} chunk(s) a tick" in ablation_text(found)
+    few = evaluate_ablation(checkpoint, policy, store, ticks, 64, samples=judged)
     assert few is not None
     assert few.intact.overall("policy") == found.intact.overall("policy")

@@ -12,7 +12,7 @@ from pipeline.base.config import Source
 from pipeline.base.digests import file_digest
 from pipeline.data import Recording, content_digest, open_recordings
 from pipeline.data.timeline import Timeline, build_timeline
-from pipeline.evaluate.episode_frames import Footage, footage, shown_ticks
+from pipeline.evaluate.episode_frames import EpisodeFrames, read_episode_frames, shown_ticks
 from pipeline.simulation.demo_recordings import write_demo_recordings
 from pipeline.store import FeatureStore
 
@@ -37,8 +37,8 @@ class Stored:
             content=content_digest(recording, file_digest),
         )
 
-    def footage(self, rows: Sequence[int], root: Path) -> Footage:
-        return footage(self.store, self.episode, rows, root)  # type: ignore[arg-type]
+    def frames(self, rows: Sequence[int], root: Path) -> EpisodeFrames:
+        return read_episode_frames(self.store, self.episode, rows, root)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="session")
@@ -70,7 +70,7 @@ def expected(one: Stored, view: str, rows: Sequence[int]) -> list[np.ndarray]:
 def test_frames_are_those_that_the_rows_were_made_of(recorded_demo: Path, format: str) -> None:
     one = stored(recorded_demo, format)
     rows = [0, 4, 5, len(one.timeline.vl_time) - 1]
-    found = one.footage(rows, recorded_demo)
+    found = one.frames(rows, recorded_demo)
     assert found.absence == ""
     assert list(found.frames) == ["View1", "View2", "View5"]
     for view, frames in found.frames.items():
@@ -83,7 +83,7 @@ def test_frames_are_those_that_the_rows_were_made_of(recorded_demo: Path, format
 @pytest.mark.parametrize("format", FORMATS)
 def test_only_the_views_of_the_store_are_shown(recorded_demo: Path, format: str) -> None:
     one = stored(recorded_demo, format, ("View2",))
-    found = one.footage([2], recorded_demo)
+    found = one.frames([2], recorded_demo)
     assert (list(found.frames), found.absence) == (["View2"], "")
     np.testing.assert_array_equal(found.frames["View2"][0], expected(one, "View2", [2])[0])
 
@@ -100,7 +100,7 @@ def test_a_changed_recording_shows_nothing(root: Path, format: str) -> None:
     one = stored(root, format)
     file = a_file(one)
     file.write_bytes(file.read_bytes() + b"\n")
-    found = one.footage([0], root)
+    found = one.frames([0], root)
     assert found.frames == {}
     assert found.absence == (
         f"No frames: the recording at {root / one.episode.path} changed since the store was made "
@@ -112,21 +112,21 @@ def test_another_frame_under_the_same_name_is_not_shown(root: Path) -> None:
     one = stored(root, "raw")
     first, second, *_ = [file for file in one.recording.files() if file.suffix == ".jpg"]
     shutil.copyfile(second, first)
-    assert one.footage([0], root).frames == {}
+    assert one.frames([0], root).frames == {}
 
 
 @pytest.mark.parametrize("format", FORMATS)
 def test_a_recording_that_is_gone_is_said(root: Path, format: str) -> None:
     one = stored(root, format)
     shutil.rmtree(one.recording.path)
-    found = one.footage([0], root)
+    found = one.frames([0], root)
     assert found.frames == {}
     assert f"no recording at {root / one.episode.path} any more" in found.absence
 
 
 def test_another_root_is_said_by_its_path(recorded_demo: Path, tmp_path: Path) -> None:
     one = stored(recorded_demo, "new")
-    assert str(tmp_path / one.episode.path) in one.footage([0], tmp_path).absence
+    assert str(tmp_path / one.episode.path) in one.frames([0], tmp_path).absence
 
 
 @pytest.mark.parametrize(
@@ -142,7 +142,7 @@ def test_what_cannot_be_read_is_said_in_one_sentence(
 ) -> None:
     one = stored(root, format)
     spoil(one.recording.path)
-    found = one.footage([0], root)
+    found = one.frames([0], root)
     assert found.frames == {}
     assert found.absence.startswith(
         f"No frames: the recording at {one.recording.path} cannot be read ("
@@ -153,7 +153,7 @@ def test_what_cannot_be_read_is_said_in_one_sentence(
 def test_a_time_between_two_frames_belongs_to_neither(recorded_demo: Path) -> None:
     one = stored(recorded_demo, "raw")
     one.store.array("vl/frame_time")[2, 1] += 1e-3
-    found = one.footage([2], recorded_demo)
+    found = one.frames([2], recorded_demo)
     assert found.frames == {}
     assert "View2 has no frames at the times that the store has" in found.absence
 
@@ -161,7 +161,7 @@ def test_a_time_between_two_frames_belongs_to_neither(recorded_demo: Path) -> No
 def test_a_view_that_the_episode_lacks_is_left_out(recorded_demo: Path) -> None:
     one = stored(recorded_demo, "raw")
     one.store.array("vl/frame_time")[:, 0] = np.nan
-    assert list(one.footage([0, 1], recorded_demo).frames) == ["View2", "View5"]
+    assert list(one.frames([0, 1], recorded_demo).frames) == ["View2", "View5"]
 
 
 def test_ticks_are_shown_where_their_frames_are_newest(store: FeatureStore) -> None:

@@ -1,0 +1,25 @@
+"""What a policy sees: what stores gather and policies look at."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+
+@dataclass
+class Observation:
+    """What a policy sees at `batch` ticks, in physical units.
+
+    Streams come in their stored dtype, right-aligned: windows end at their tick and are zero on the
+    left where the episode had not begun; `*_valid` counts the real readings. A stream that is
+    absent has width 0.
+    """
+
+    features: Float[Tensor, "batch slot dim"]
+    slot_valid: Bool[Tensor, "batch slot"]
+    feature_age: Float[Tensor, " batch"]
+    """Seconds since the newest frame that the features have seen."""
+    sensor: Float[Tensor, "batch sensor_window channel"]
+    sensor_valid: Int[Tensor, " batch"]
+    state: Float[Tensor, "batch state_window state_dim"]
+    state_valid: Int[Tensor, " batch"]

@@ -1,0 +1,191 @@
+"""What a regression reads at a tick: features of a row, and state and sensor before the tick."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Float64, Int64
+from sklearn.preprocessing import StandardScaler
+from sklearn.utils.extmath import randomized_svd
+from tqdm import tqdm
+
+from pipeline.base.bfloat16 import widen
+from pipeline.base.errors import NumericsError
+from pipeline.base.finite import first_non_finite
+from pipeline.store import FeatureStore, place
+
+Inputs = Float64[np.ndarray, "row _"]
+"""What a regression reads or predicts at each VL row or tick."""
+Folds = Int64[np.ndarray, " row"]
+"""The fold that holds each row or tick out."""
+WIDTH = 1024
+"""Inputs at most that a slot makes, or several together."""
+STREAM_WIDTH = 64
+"""Inputs at most of each summary of channels that share a unit."""
+LIMIT = 5.0
+"""Standard deviations from the mean, of any rows that a fold is trained on, that are kept."""
+STILL = 0.1
+"""What spreads less than this share of its spread over all folds, in rows that are trained on, is
+taken as constant."""
+_ROUNDING = 1e-6
+
+
+@dataclass(frozen=True)
+class SlotName:
+    """What a slot or a group of slots is: of a group, `view` and `cell` are None."""
+
+    layer: int
+    norm: bool
+    pooling: str
+    view: str | None = None
+    cell: tuple[int, int] | None = None
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any]) -> "SlotName":
+        """As the store's attributes name it."""
+        cell = document.get("cell")
+        names: Any = {key: document.get(key) for key in ("layer", "norm", "pooling", "view")}
+        return cls(**names, cell=None if cell is None else (cell[0], cell[1]))
+
+    @property
+    def group(self) -> "SlotName":
+        """The choice of layer, norm and pooling that gave it."""
+        return SlotName(self.layer, self.norm, self.pooling)
+
+    @property
+    def label(self) -> str:
+        """In a few words."""
+        words = f"layer {self.layer}{'' if self.norm else ', no norm'}, {self.pooling}"
+        words += "" if self.view is None else f", {self.view}"
+        return words + ("" if self.cell is None else f" cell {self.cell[0]},{self.cell[1]}")
+
+
+def read_slots(
+    store: FeatureStore,
+    rows: Int64[np.ndarray, " row"],
+    fold: Folds,
+    slots: Sequence[int],
+) -> tuple[Inputs, Bool[np.ndarray, " row"]]:
+    """These slots of the VL `rows` as inputs side by side, and where at least one is valid.
+
+    `fold` is the fold that holds each row out. The slots share `WIDTH` inputs, each on its main
+    directions where its channels are more; one that is not valid stands at its mean, which is 0.
+    Raises `NumericsError` on NaN or inf, naming the place.
+    """
+    inputs: list[Inputs] = [np.empty((len(rows), 0))]
+    valid = store.array("vl/slot_valid")[rows][:, list(slots)].astype(bool)
+    for slot, there in zip(slots, valid.T, strict=True):
+        if not there.any():
+            continue
+        values = store.array("vl/features")[rows[there], slot]
+        if (bad := first_non_finite(values)) is not None:
+            row, channel = bad
+            raise NumericsError(
+                f"{store.path}: expected finite numbers, found {widen(values)[bad]} at "
+                f"{place(store, 'vl', int(rows[there][row]))}, slot {slot}, channel {channel}. "
+                "Run stages.verify to see what else is damaged."
+            )
+        reduced = reduce(widen(values), fold[there], WIDTH // len(slots))
+        inputs.append(np.zeros((len(rows), reduced.shape[1])))
+        inputs[-1][there] = reduced
+    return np.concatenate(inputs, axis=1), valid.max(axis=1)
+
+
+def summarize(
+    store: FeatureStore,
+    ticks: Int64[np.ndarray, " row"],
+    fold: Folds,
+    sensor_window: int,
+    state_window: int,
+) -> Inputs:
+    """The last, the mean and the spread of every channel over the window before each tick.
+
+    No column where the store has neither stream. Channels of one unit that are more than
+    `STREAM_WIDTH`, as those of an A-scan, are projected on that many main directions of each
+    summary, so a force beside them is not lost. Nothing is later than its tick; a tick without a
+    reading has the mean of those with one, and a column that says so. `fold` is the fold that holds
+    each tick out. Raises `NumericsError` on NaN or inf, naming the place.
+    """
+    inputs: list[Inputs] = [np.empty((len(ticks), 0))]
+    for stream, window in (("sensor", sensor_window), ("state", state_window)):
+        units: list[str] = store.streams[stream]["units"]
+        if not units:
+            continue
+        summaries, known = _summaries(store, stream, ticks, window)
+        if not known.any():
+            continue
+        channels_of = {unit: [i for i, u in enumerate(units) if u == unit] for unit in units}
+        for summary in summaries:
+            for channels in channels_of.values():
+                reduced = reduce(summary[known][:, channels], fold[known], STREAM_WIDTH)
+                inputs.append(np.zeros((len(ticks), reduced.shape[1])))
+                inputs[-1][known] = reduced
+        inputs.append(known[:, None].astype(np.float64))
+    return np.concatenate(inputs, axis=1)
+
+
+def _summaries(
+    store: FeatureStore, stream: str, ticks: Int64[np.ndarray, " tick"], window: int
+) -> tuple[Float[np.ndarray, "3 tick channel"], Bool[np.ndarray, " tick"]]:
+    """The last reading, the mean and the spread, and whether there was a reading."""
+    values = store.array(f"{stream}/values")
+    stops = store.array(f"tick/{stream}_end")[ticks]
+    first = store.array(f"episode/{stream}_start")[store.episode_of(ticks)]
+    starts = np.maximum(first, stops - window)
+    summaries = np.zeros((3, len(ticks), values.shape[1]), np.float32)
+    pairs = enumerate(zip(starts.tolist(), stops.tolist(), strict=True))
+    for tick, (start, stop) in tqdm(pairs, stream, len(ticks), leave=False, disable=None):
+        if start == stop:
+            continue
+        readings = values[start:stop]
+        if (bad := first_non_finite(readings)) is not None:
+            name = store.streams[stream]["names"][bad[1]]
+            raise NumericsError(
+                f"{store.path}: expected finite numbers, found {readings[bad]} at "
+                f"{place(store, stream, start + bad[0])}, channel {name!r}. Mend or leave out the "
+                "recording and run stages.extract again."
+            )
+        summaries[:, tick] = (
+            readings[-1],
+            readings.mean(axis=0, dtype=np.float64),
+            readings.std(axis=0, dtype=np.float64),
+        )
+    return summaries, stops > starts
+
+
+def reduce(values: Float[np.ndarray, "row channel"], fold: Folds, width: int) -> Inputs:
+    """Standardised channels, or at most `width` main directions of them, within `limit`."""
+    columns = StandardScaler().fit_transform(values.astype(np.float64))
+    width = min(width, len(columns))
+    if width < columns.shape[1]:
+        options: Any = {"n_iter": 2, "random_state": 0}
+        _, _, directions = randomized_svd(columns, width, **options)
+        columns = columns @ directions.T
+    return limit(columns, fold)
+
+
+def limit(columns: Inputs, fold: Folds) -> Inputs:
+    """Columns of mean 0 and spread 1 over all folds, kept near to what every fold is trained on.
+
+    A joint that rests in all recordings but one has a spread of about 0 in what is trained on when
+    that one is held out; in such units it would then be thousands, and so would the prediction. So
+    a column z, of mean m_f and spread s_f over the rows of all folds but f, becomes
+
+        min(max(z, max_f(m_f - LIMIT s_f)), min_f(m_f + LIMIT s_f))
+
+    and 0 where some s_f < `STILL` s, or the limits cross: nothing can be learnt of it from other
+    recordings. This reads the inputs of all folds, which say nothing of any action.
+    """
+    held = np.unique(fold)
+    # A slot in one fold only: no fold is trained on it without another.
+    trained = (columns[fold != one] if len(held) > 1 else columns for one in held)
+    moments = [(rows.mean(axis=0), rows.std(axis=0)) for rows in trained]
+    mean, spread = np.array(moments).transpose(1, 0, 2)
+    lower = (mean - LIMIT * spread).max(axis=0)
+    upper = (mean + LIMIT * spread).min(axis=0)
+    kept = np.clip(columns, lower, np.maximum(lower, upper))
+    within = kept.std(axis=0)
+    varies = (spread > STILL * columns.std(axis=0)).all(axis=0)
+    varies &= (upper > lower) & (within > _ROUNDING)
+    return np.where(varies, (kept - kept.mean(axis=0)) / np.where(varies, within, 1), 0.0)
