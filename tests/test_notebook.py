@@ -18,7 +18,7 @@ NOTEBOOK = ROOT / "notebooks" / "check.ipynb"
 FIRST = """import sys, warnings
 warnings.simplefilter("error")
 print(sys.executable)"""
-PICTURES_A_RECORDING = 7
+PICTURES_A_RECORDING = 5
 
 
 def read() -> NotebookNode:

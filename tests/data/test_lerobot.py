@@ -17,8 +17,8 @@ from pipeline.data import content_digest, open_recording, open_recordings
 from pipeline.data.lerobot import action_kind
 from pipeline.data.lerobot_clock import read_clock
 from pipeline.data.timeline import build_timeline
-from pipeline.look.recording.episodes import view_episode
-from pipeline.look.recording.flaws import find_flaws
+from pipeline.look.recording.episode import view_episode
+from pipeline.look.recording.issues import find_issues
 
 VERSIONS = ["v2.0", "v2.1", "v3.0"]
 LENGTHS = (7, 5, 9)
@@ -547,7 +547,7 @@ def test_a_stale_file_index_is_seen_through(tmp_path, write):
     params = DataParams(sources=(Source(name="s", path=str(root)),), action_hz=None)
     (flaw,) = [
         flaw
-        for flaw in find_flaws(view_episode(recordings[2], params, "rotvec"))
+        for flaw in find_issues(view_episode(recordings[2], params, "rotvec"))
         if flaw.kind == "wrong metadata"
     ]
     assert flaw.episode == "episode_000002" and flaw.severity == "warning"
@@ -556,7 +556,7 @@ def test_a_stale_file_index_is_seen_through(tmp_path, write):
     (root / "data/chunk-000/file-001.parquet").unlink()
     with pytest.raises(RecordingError, match=r"file-000.*no row of episode 2"):
         opened(root).recordings[2].state()
-    lost = find_flaws(view_episode(opened(root).recordings[2], params, "rotvec"))
+    lost = find_issues(view_episode(opened(root).recordings[2], params, "rotvec"))
     assert [flaw.kind for flaw in lost] == ["unreadable"]
 
 

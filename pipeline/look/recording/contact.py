@@ -11,30 +11,38 @@ drifts by more than the threshold makes a contact seem to begin early, or to las
 has glided out of tissue; a touch below the threshold is none.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from pipeline.data import Stream
 from pipeline.look.recording.clocks import usual_step
-from pipeline.look.recording.facts import Contact, EpisodeView
-from pipeline.look.recording.runs import runs
+from pipeline.look.recording.episode import EpisodeView, runs
 
 _REST_S = 0.5
 _SMOOTHED_S = 0.02
 _ENTER, _LEAVE = 6.0, 3.0
 _LEAST_N = 0.05
+# Contacts nearer than this are one; shorter ones are none.
 _APART_S, _SHORTEST_S = 0.1, 0.05
-"""Contacts nearer than this are one; shorter ones are none."""
+# Of normal noise, standard deviation over median absolute deviation.
 _MAD_TO_STD = 1.4826
-"""Of normal noise, standard deviation over median absolute deviation."""
 
+# The rule in a sentence, for a caption.
 RULE = (
     f"In contact: from where the force leaves its median of the first {_REST_S:g} s by "
     f"{_ENTER:g} times its noise (in newtons by {_LEAST_N:g} at least) until it is back within "
     f"{100 * _LEAVE / _ENTER:.0f} % of that."
 )
-"""The rule in a sentence, for a caption."""
+
+
+class Contact(NamedTuple):
+    """A span in which the needle touches something, by the force alone."""
+
+    start_s: float
+    stop_s: float
 
 
 def contacts(view: EpisodeView) -> tuple[Contact, ...]:

@@ -1,48 +1,285 @@
-"""Pictures at chosen ticks."""
+"""What the cameras saw: frames at chosen ticks, and what looks wrong in the pictures.
 
-from collections.abc import Sequence
+What is looked at, so that a long episode costs no more than a short one:
+- JPEG files: all of them for duplicates (two files are the same picture where their bytes are);
+  every frame that a VL row sees is checked at an eighth of its size, as extraction does, looked at
+  for one colour and asked for its size; `RUNS` pairs of neighbours, evenly spread, are decoded
+  whole.
+- Videos and pictures in rows: all frames of an episode of up to `MOST_FRAMES`, else `RUNS` runs of
+  neighbours, evenly spread. The packets of a whole video are read in any case.
+
+Equal pictures prove a frozen camera only where its pictures have noise: where most pixels differ
+between neighbours, also between those just before and after equal ones. The pictures of a
+simulation, and of a video whose encoder skips what stands still, are equal whenever nothing moves;
+there a camera counts as frozen when every other one of the episode sees something move meanwhile,
+and a single such camera only when it never changes at all.
+"""
+
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from pipeline.base.config import Params
+from pipeline.base.issue import Issue
+from pipeline.data import CameraStream
 from pipeline.data.timeline import last_at
-from pipeline.look.recording.episodes import BROKEN
-from pipeline.look.recording.facts import EpisodeView, Flaw
+from pipeline.look.page.blocks import Block, Text
+from pipeline.look.page.style import canvas
+from pipeline.look.recording.episode import BROKEN, Draw, EpisodeView, runs
+
+MOST_FRAMES, RUNS = 120, 12
+# Standard deviation of the colour that varies most, of 255, up to which a frame shows nothing.
+ONE_COLOUR = 2.0
+# Equal pairs in a row that are a freeze of a camera with noise, and the share of all pairs from
+# which single ones are told.
+DUPLICATES, DUPLICATE_SHARE = 3, 0.1
+# Equal pairs in a row, and how many differing ones every other view has meanwhile, that are a
+# freeze where pictures have no noise.
+STILL_PAIRS, MOVING_PAIRS = 5, 20
+# Share of the pixels that differ between neighbours where pictures have noise, at least in nine of
+# ten pairs.
+NOISY = 0.3
+_COLUMN_IN = 2.3
+
+
+def camera_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
+    """The picture of the views at `inspect.ticks` ticks, and why a view is not shown.
+
+    Empty without ticks or views.
+    """
+    if not (ticks := spread_ticks(view, params.inspect.ticks)):
+        return []
+    shown, broken = read_frames(view, ticks)
+    blocks: list[Block] = [Text(f"{one.stream} is not shown: {one.message}") for one in broken]
+    if shown:
+        caption = (
+            f"What each view shows at {len(ticks)} ticks, evenly from the first to the last: the "
+            "last frame at or before the tick."
+        )
+        blocks.append(draw("views", caption, lambda view: draw_views(view, ticks)))
+    return blocks
 
 
 def spread_ticks(view: EpisodeView, count: int) -> list[int]:
     """At most `count` different ticks, evenly from the first to the last; none without ticks."""
-    if view.timeline is None:
-        return []
-    return np.unique(
-        np.linspace(0, len(view.timeline.time) - 1, count).round().astype(int)
-    ).tolist()
-
-
-def frames_at(view: EpisodeView, ticks: Sequence[int]) -> dict[str, list[NDArray[np.uint8]]]:
-    """By view, the last frame (height, width, 3) RGB at or before each of these ticks.
-
-    Ticks never decrease. A view of which a frame cannot be read is left out (`read_frames` says
-    why), and so is every view of an episode without ticks.
-    """
-    return read_frames(view, ticks)[0]
+    last = -1 if view.timeline is None else len(view.timeline.time) - 1
+    return np.unique(np.linspace(0, last, count).round().astype(int)).tolist() if last >= 0 else []
 
 
 def read_frames(
     view: EpisodeView, ticks: Sequence[int]
-) -> tuple[dict[str, list[NDArray[np.uint8]]], tuple[Flaw, ...]]:
-    """`frames_at`, and a flaw `unreadable` for each view that is left out of it.
+) -> tuple[dict[str, list[NDArray[np.uint8]]], tuple[Issue, ...]]:
+    """By view, the last frame (height, width, 3) RGB at or before each of these rising ticks.
 
-    Also one that `find_flaws` did not find: a file may vanish after it was looked at.
+    And an issue `unreadable` for each view that is left out because a frame of it cannot be read,
+    also one that `find_frame_issues` did not find: a file may vanish after it was looked at.
     """
-    if view.timeline is None:
-        return {}, ()
-    times, slack_s = view.timeline.time[np.asarray(ticks, np.int64)], view.timeline.slack_s
-    found: dict[str, list[NDArray[np.uint8]]] = {}
-    broken: list[Flaw] = []
+    frames: dict[str, list[NDArray[np.uint8]]] = {}
+    broken: list[Issue] = []
     for name, camera in view.cameras.items():
         try:
-            found[name] = list(camera.read(last_at(camera.time, times, slack_s).tolist()))
+            frames[name] = list(camera.read(_shown_at(view, name, ticks).tolist()))
         except BROKEN as error:
-            broken.append(view.flaw("unreadable", f"view {name}", str(error), severity="error"))
-    return found, tuple(broken)
+            broken.append(view.issue("unreadable", f"view {name}", str(error), severity="error"))
+    return frames, tuple(broken)
+
+
+def draw_views(view: EpisodeView, ticks: Sequence[int]) -> Figure:
+    """The last frame of each view (row) at each tick (column), and how old it was then."""
+    assert view.timeline is not None
+    frames, _ = read_frames(view, ticks)
+    time = view.timeline.time[list(ticks)]
+    heights = [_COLUMN_IN * row[0].shape[0] / row[0].shape[1] + 0.25 for row in frames.values()]
+    figure = canvas(_COLUMN_IN * max(len(ticks), 2) + 0.4, sum(heights) + 0.6)
+    axes = figure.subplots(
+        len(frames), len(ticks), squeeze=False, gridspec_kw={"height_ratios": heights}
+    )
+    for line, (name, row) in zip(axes, frames.items(), strict=True):
+        ages = time - view.cameras[name].time[_shown_at(view, name, ticks)]
+        for axis, frame, age in zip(line, row, ages, strict=True):
+            axis.set(xticks=[], yticks=[])
+            axis.grid(visible=False)
+            axis.imshow(frame)
+            axis.set_xlabel(f"{1000 * age:.0f} ms old", fontsize=8, labelpad=2)
+            axis.spines[:].set_visible(False)
+        line[0].set_ylabel(name)
+    for axis, tick, at in zip(axes[0], ticks, time - view.zero, strict=True):
+        axis.set_title(f"tick {tick}, {at:.2f} s", fontsize=10)
+    return figure
+
+
+@dataclass(frozen=True)
+class _Looked:
+    """What was seen of a camera.
+
+    `index` (frame,) are the frames that were compared, `equal` (frame - 1,) says whether one is
+    that before; `blank` says by frame whether it shows nothing, of those that were looked at for
+    that; `sizes` (height, width) by frame, of those that were decoded or that a VL row sees.
+    """
+
+    index: NDArray[np.int64]
+    equal: NDArray[np.bool_]
+    blank: dict[int, bool]
+    noisy: bool
+    sizes: dict[int, tuple[int, ...]]
+
+
+def find_frame_issues(view: EpisodeView) -> Iterator[Issue]:
+    """Issues of kind unreadable, frame size, dead camera and duplicate frames."""
+    looked: dict[str, _Looked] = {}
+    for name, camera in view.cameras.items():
+        try:
+            looked[name] = _look(view, name, camera)
+        except BROKEN as error:
+            yield view.issue("unreadable", f"view {name}", str(error), severity="error")
+    for name, seen in looked.items():
+        yield from _resized(view, name, seen)
+        yield from _dead(view, name, seen.blank)
+        if not all(seen.blank.values()):
+            yield from _duplicates(view, name, looked)
+
+
+def _shown_at(view: EpisodeView, name: str, ticks: Sequence[int]) -> NDArray[np.int64]:
+    line = view.timeline
+    assert line is not None
+    return last_at(view.cameras[name].time, line.time[list(ticks)], line.slack_s)
+
+
+def _look(view: EpisodeView, name: str, camera: CameraStream) -> _Looked:
+    frames, repeats = len(camera.time), camera.repeats()
+    index = _neighbours(frames, MOST_FRAMES if repeats is None else 2 * RUNS)
+    compared = index if repeats is None else np.arange(frames)
+    equal = np.zeros(max(0, len(index) - 1), np.bool_) if repeats is None else repeats
+    sizes: dict[int, tuple[int, ...]] = {}
+    blank: dict[int, bool] = {}
+    if repeats is not None and view.timeline is not None:
+        served = np.unique(view.timeline.frames[name]).tolist()
+        if (thumbnails := camera.check(served)) is not None:
+            blank = dict(zip(served, map(_is_blank, thumbnails), strict=True))
+        if (known := camera.sizes(served)) is not None:
+            sizes |= zip(served, map(tuple, known.tolist()), strict=True)
+    wanted = not blank
+    differing: list[float] = []
+    before: NDArray[np.uint8] | None = None
+    for place, frame in enumerate(camera.read(index.tolist())):
+        number = int(index[place])
+        sizes[number] = frame.shape[:2]
+        if wanted:
+            blank[number] = _is_blank(frame)
+        if before is not None and before.shape == frame.shape:
+            differs = _share_differing(before, frame)
+            if compared is index:
+                equal[place - 1] = differs == 0
+            if differs and number == index[place - 1] + 1:
+                differing.append(differs)
+        before = frame
+    noisy = bool(differing) and float(np.percentile(differing, 10)) > NOISY
+    if noisy and compared is not index:
+        noisy = min(_beside(camera, equal), default=1.0) > NOISY
+    return _Looked(compared, equal, blank, noisy, dict(sorted(sizes.items())))
+
+
+def _is_blank(frame: NDArray[np.uint8]) -> bool:
+    return bool(frame.std(axis=(0, 1)).max() <= ONE_COLOUR)
+
+
+def _share_differing(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> float:
+    """Share of pixels that differ; all of them where sizes do."""
+    return float((before != after).any(axis=2).mean()) if before.shape == after.shape else 1.0
+
+
+def _beside(camera: CameraStream, equal: NDArray[np.bool_]) -> Iterator[float]:
+    """Share of pixels that differ just before and just after the longest runs of equal pairs."""
+    for first, last in sorted(runs(equal), key=lambda run: run[0] - run[1])[:RUNS]:
+        for place in (first - 1, last):
+            if 0 <= place < len(equal):
+                yield _share_differing(*camera.read([place, place + 1]))
+
+
+def _neighbours(frames: int, most: int) -> NDArray[np.int64]:
+    """All frames where they are few, else `RUNS` runs of neighbours, evenly spread."""
+    if frames <= most:
+        return np.arange(frames)
+    length = most // RUNS
+    starts = np.linspace(0, frames - length, RUNS).astype(np.int64)
+    return np.unique(starts[:, None] + np.arange(length))
+
+
+def _resized(view: EpisodeView, name: str, seen: _Looked) -> Iterator[Issue]:
+    """Where a view's frames change in size, in one line."""
+    time, sizes = view.cameras[name].time, seen.sizes
+    changes = [pair for pair in itertools.pairwise(sizes) if sizes[pair[0]] != sizes[pair[1]]]
+    if changes:
+        old, new = (f"{sizes[at][1]} x {sizes[at][0]} (frame {at})" for at in changes[0])
+        span = float(time[changes[0][1]]), float(time[changes[-1][1]])
+        more = f"; {len(changes)} changes in all" if len(changes) > 1 else ""
+        message = f"frames change from {old} to {new} at {span[0] - view.zero:.2f} s{more}"
+        yield view.issue("frame size", f"view {name}", f"{message}; expected one size", *span)
+
+
+def _dead(view: EpisodeView, name: str, blank: Mapping[int, bool]) -> Iterator[Issue]:
+    kind, stream, time = "dead camera", f"view {name}", view.cameras[name].time
+    frames = list(blank)
+    if frames and all(blank.values()):
+        message = f"all {len(frames)} frames looked at are of one colour; expected a picture"
+        yield view.issue(kind, stream, message)
+        return
+    for first, stop in runs(np.array(list(blank.values()), np.bool_)):
+        start, last = frames[first], frames[stop - 1]
+        span = float(time[start]), float(time[last])
+        message = (
+            f"{stop - first} of the {len(frames)} frames looked at are of one colour: frames "
+            f"{start} to {last}, {span[0] - view.zero:.2f} to {span[1] - view.zero:.2f} s; "
+            "expected a picture"
+        )
+        yield view.issue(kind, stream, message, *span)
+
+
+def _duplicates(view: EpisodeView, name: str, looked: Mapping[str, _Looked]) -> Iterator[Issue]:
+    seen, kind, stream = looked[name], "duplicate frames", f"view {name}"
+    time, pairs = view.cameras[name].time, len(seen.equal)
+    among = "" if len(seen.index) == len(time) else " looked at"
+    if pairs >= STILL_PAIRS and seen.equal.all():
+        message = f"all {len(seen.index)} frames{among} are one picture; expected a running camera"
+        yield view.issue(kind, stream, message)
+        return
+    single = seen.equal.copy()
+    for first, last in runs(seen.equal):
+        start, stop = (int(seen.index[place]) for place in (first, last))
+        span = float(time[start]), float(time[stop])
+        long = last - first >= (DUPLICATES if seen.noisy else STILL_PAIRS)
+        if long and (seen.noisy or _others_move(view, name, looked, *span)):
+            single[first:last] = False
+            why = "elsewhere no frame is that before" if seen.noisy else "other views move"
+            message = (
+                f"frames {start} to {stop}{among} are one picture, {span[1] - span[0]:.2f} s from "
+                f"{span[0] - view.zero:.2f} s; {why}"
+            )
+            yield view.issue(kind, stream, message, *span)
+    again = time[seen.index[1:][single]]
+    if seen.noisy and len(again) >= DUPLICATES and len(again) > DUPLICATE_SHARE * pairs:
+        instants = ", ".join(f"{at - view.zero:.2f}" for at in again[:DUPLICATES])
+        message = (
+            f"{len(again)} of {pairs} frames compared are the picture before, first at "
+            f"{instants} s, last at {again[-1] - view.zero:.2f} s; the camera is slower than its "
+            "frames are stamped, or frames were stored twice"
+        )
+        yield view.issue(kind, stream, message, float(again[0]), float(again[-1]))
+
+
+def _others_move(
+    view: EpisodeView, name: str, looked: Mapping[str, _Looked], start_s: float, stop_s: float
+) -> bool:
+    """Whether every other camera's pictures change between two instants, and there is another."""
+
+    def differing(other: str) -> int:
+        compared = view.cameras[other].time[looked[other].index]
+        inside = (compared[:-1] >= start_s) & (compared[1:] <= stop_s)
+        return int(np.count_nonzero(inside & ~looked[other].equal))
+
+    counts = [differing(other) for other in looked if other != name]
+    return bool(counts) and min(counts) >= MOVING_PAIRS

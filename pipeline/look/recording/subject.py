@@ -20,18 +20,17 @@ STORE = (".zarr", ".zarr.part")
 
 @dataclass(frozen=True)
 class Subject:
-    """What is looked at."""
+    """What is looked at: recordings, or a store.
+
+    `name` is as the user said it, `folder` where its page goes, `store` None for recordings, whose
+    relative paths begin at `root`.
+    """
 
     name: str
-    """As the user said it."""
     folder: Path
-    """Where its page goes."""
     store: Path | None
-    """None for recordings."""
     sources: tuple[Source, ...]
-    """Of recordings."""
     root: Path
-    """Where relative paths of the sources begin."""
 
     def recordings(self, views: Sequence[str] | None) -> Opened:
         """Its recordings; raises `RecordingError` where there is none that can be looked at."""
@@ -57,23 +56,21 @@ def subject_of(params: Params) -> Subject:
     _check_output(wanted.output)
     if not places:
         refuse_foreign(wanted.output, REPORT)
-        said = ", ".join(source.name for source in params.data.sources)
-        return Subject(said, wanted.output, None, params.data.sources, params.data.root)
+        names = ", ".join(source.name for source in params.data.sources)
+        return Subject(names, wanted.output, None, params.data.sources, params.data.root)
     for place in places:
         _check(place, params.data.root)
-    name = " ".join(places)
-    found = [Path(match) for place in places for match in _matches(place)]
-    stores = [path for path in found if _is_store(path)]
-    if stores and len(found) > 1:
+    matches = [Path(match) for place in places for match in sorted(_matches(place))]
+    stores = [path for path in matches if _is_store(path)]
+    if stores and len(matches) > 1:
         raise ConfigError(
-            f"inspect.path: expected recordings or one store, found {len(found)} paths, the store "
-            f"{stores[0]} among them. Look at it alone: python -m stages.inspect {stores[0]}"
+            f"inspect.path: expected recordings or one store, found {len(matches)} paths, the "
+            f"store {stores[0]} among them. Look at it alone: python -m stages.inspect {stores[0]}"
         )
-    store = stores[0] if stores else None
     folder = _folder(wanted, places)
     refuse_foreign(folder, REPORT)
     source = Source(name=_last(places), path=tuple(places), format=wanted.format)
-    return Subject(name, folder, store, (source,), Path())
+    return Subject(" ".join(places), folder, stores[0] if stores else None, (source,), Path())
 
 
 def _check(place: str, root: Path) -> None:
@@ -83,18 +80,17 @@ def _check(place: str, root: Path) -> None:
         return
     if not path.exists():
         raise ConfigError(f"inspect.path: {path} is not there. {_there_is(place, root)}")
-    if path.suffix.lower() in ARCHIVES:
-        raise ConfigError(
-            f"inspect.path: expected a folder, found the packed file {path}. Unpack it, then look "
-            "at the folder that comes out."
-        )
-    raise ConfigError(
-        f"inspect.path: expected a folder of recordings or a store, found the file {path}. "
-        + (
+    packed = path.suffix.lower() in ARCHIVES
+    remedy = (
+        "Unpack it, then look at the folder that comes out."
+        if packed
+        else (
             meant(path.absolute())
             or "Name the folder of the whole recording: of LeRobot's, the one that holds meta/"
         )
     )
+    kind = "packed file" if packed else "file"
+    raise ConfigError(f"inspect.path: expected a folder, found the {kind} {path}. {remedy}")
 
 
 def _check_output(folder: Path) -> None:
@@ -132,7 +128,7 @@ def _there_is(place: str, root: Path) -> str:
 
 
 def _matches(place: str) -> list[str]:
-    return sorted(glob.glob(place, recursive=True)) or [place]  # noqa: PTH207
+    return glob.glob(place, recursive=True) or [place]  # noqa: PTH207
 
 
 def _is_store(path: Path) -> bool:

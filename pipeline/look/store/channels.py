@@ -15,10 +15,12 @@ from pipeline.base.issue import Issue
 from pipeline.data import Channels
 from pipeline.look.page.blocks import Block, Picture, Text
 from pipeline.look.page.style import GRID, PALETTE, canvas
-from pipeline.look.recording.channel_flaws import still_channels
-from pipeline.look.recording.facts import ChannelStatistics
-from pipeline.look.recording.page_statistics import statistics_table
-from pipeline.look.recording.statistics import statistics_of
+from pipeline.look.recording.channels import (
+    ChannelStatistics,
+    statistics_of,
+    statistics_table,
+    still_channels,
+)
 from pipeline.store import FeatureStore
 
 SAMPLE_BYTES = 64 * 2**20

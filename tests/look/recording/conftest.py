@@ -1,24 +1,35 @@
 """Healthy simulated recordings of every format, and copies of them that a test may damage."""
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import matplotlib as mpl
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from pipeline.base.config import DataParams, Source
-from pipeline.data import open_recordings
+from pipeline.base.issue import Issue
+from pipeline.data import Channels, Stream, open_recordings
 from pipeline.data.timeline import choose_action_rotation
-from pipeline.look.recording.episodes import view_episode
-from pipeline.look.recording.facts import EpisodeView, Flaw
-from pipeline.look.recording.flaws import find_flaws
+from pipeline.look.page.style import RC
+from pipeline.look.recording.episode import EpisodeView, view_episode
+from pipeline.look.recording.issues import find_issues
 from pipeline.simulation.insertion_formats import ABUTTING, write_new, write_old, write_raw
 from pipeline.simulation.lerobot_format import write_lerobot
 from pipeline.simulation.recorder import simulate_episode
 
 EPOCH_S = 1.767e9 + 0.25
+
+
+@pytest.fixture(autouse=True)
+def common_style() -> Iterator[None]:
+    """As the page draws them."""
+    with mpl.rc_context(RC):
+        yield
 
 
 @pytest.fixture(scope="session")
@@ -57,12 +68,12 @@ def look() -> Callable[..., EpisodeView]:
 
 
 @pytest.fixture(scope="session")
-def flaws_of(look: Callable[..., EpisodeView]) -> Callable[..., tuple[Flaw, ...]]:
-    """`flaws_of(folder)`: what looks wrong in the one recording there."""
+def issues_of(look: Callable[..., EpisodeView]) -> Callable[..., tuple[Issue, ...]]:
+    """`issues_of(folder)`: what looks wrong in the one recording there."""
 
-    def find(folder: Path, **data: Any) -> tuple[Flaw, ...]:
-        found = find_flaws(look(folder, **data))
-        assert not any("\n" in flaw.message for flaw in found)
+    def find(folder: Path, **data: Any) -> tuple[Issue, ...]:
+        found = find_issues(look(folder, **data))
+        assert not any("\n" in issue.message for issue in found)
         return found
 
     return find
@@ -90,3 +101,32 @@ def change_csv() -> Callable[[Path, Callable[[np.ndarray], np.ndarray]], None]:
         np.savetxt(path, table, delimiter=",", header=header, comments="", fmt="%.6f")
 
     return change
+
+
+@pytest.fixture(scope="session")
+def view(healthy: Path, look: Callable[..., EpisodeView]) -> EpisodeView:
+    """A raw episode of three views, whose robot's clock has a gap, not to be changed."""
+    return look(healthy / "raw")
+
+
+@pytest.fixture
+def felt(view: EpisodeView) -> Callable[..., EpisodeView]:
+    """`felt(names, units, time, values)`: that episode with this sensor, beginning at time 0."""
+
+    def build(names: Any, units: Any, time: np.ndarray, values: np.ndarray) -> EpisodeView:
+        stream = Stream(Channels(tuple(names), tuple(units)), time, values.astype(np.float32))
+        return replace(view, sensor=stream, zero=0.0)
+
+    return build
+
+
+@pytest.fixture
+def words_of() -> Callable[[Figure], str]:
+    """All that is written in a figure."""
+
+    def words(figure: Figure) -> str:
+        figure.draw_without_rendering()
+        texts = figure.findobj(lambda one: hasattr(one, "get_text"))
+        return "\n".join(text.get_text() for text in texts)  # type: ignore[attr-defined]
+
+    return words

@@ -6,15 +6,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.look.recording.clocks import clocks, gaps, usual_step
-from pipeline.look.recording.facts import EpisodeView
+from pipeline.look.recording.clocks import Clock, Gap, read_clocks, usual_step
+from pipeline.look.recording.episode import EpisodeView
+
+
+def gaps(time: np.ndarray) -> tuple[Gap, ...]:
+    return Clock("sensor", "stream", time).gaps
 
 
 @pytest.mark.parametrize("format", ["raw", "new", "old", "lerobot"])
 def test_every_clock_of_a_recording(healthy: Path, look: Callable[..., EpisodeView], format: str):
     view = look(healthy / format)
     assert view.timeline is not None
-    found = {clock.name: clock for clock in clocks(view)}
+    found = {clock.name: clock for clock in read_clocks(view)}
     streams = {"sensor", "state"} | ({"action"} if view.action else set())
     # Poses are columns of the state here: no clock of their own.
     assert set(found) == {"View1", "View2", "View5", "ticks", "VL rows"} | streams

@@ -1,4 +1,4 @@
-"""Each flaw is found where it is put, and none where there is none."""
+"""Each issue is found where it is put, and none where there is none."""
 
 import json
 import pickle
@@ -12,13 +12,13 @@ from PIL import Image
 
 from pipeline.base.channels import named
 from pipeline.base.config import DataParams, Source
+from pipeline.base.issue import Issue
 from pipeline.data import open_recordings
-from pipeline.look.recording.channel_flaws import channel_flaws
-from pipeline.look.recording.clock_flaws import clock_flaws
-from pipeline.look.recording.episodes import view_episode
-from pipeline.look.recording.facts import EpisodeView, Flaw
+from pipeline.look.recording.channels import find_channel_issues
+from pipeline.look.recording.clocks import find_clock_issues
+from pipeline.look.recording.episode import EpisodeView, view_episode
 
-Find = Callable[..., tuple[Flaw, ...]]
+Find = Callable[..., tuple[Issue, ...]]
 Copied = Callable[[str], Path]
 CR5 = "lerobot/cr5_banana_v21"
 
@@ -41,10 +41,10 @@ def test_a_real_camera_that_loses_frames(shared_data: Path) -> None:
     data = DataParams(sources=(Source(name="s", path=str(path)),))
     recordings = open_recordings(data.sources).recordings
     found = {
-        one.id: flaw.message
+        one.id: issue.message
         for one in recordings
-        for flaw in clock_flaws(view_episode(one, data, "rotvec"), one.nominal())
-        if flaw.kind == "dropped frames"
+        for issue in find_clock_issues(view_episode(one, data, "rotvec"), one.nominal())
+        if issue.kind == "dropped frames"
     }
     assert found == {
         "episode_000000": "13 of 175 steps take at least 1.5 times the usual 99 ms (up to 233 ms), "
@@ -54,11 +54,11 @@ def test_a_real_camera_that_loses_frames(shared_data: Path) -> None:
 
 
 @pytest.mark.parametrize("format", ["raw", "new", "old", "lerobot"])
-def test_nothing_is_found_in_a_healthy_recording(healthy: Path, flaws_of: Find, format: str):
-    assert flaws_of(healthy / format) == ()
+def test_nothing_is_found_in_a_healthy_recording(healthy: Path, issues_of: Find, format: str):
+    assert issues_of(healthy / format) == ()
 
 
-def test_little_is_found_in_real_recordings(shared_data: Path, flaws_of: Find) -> None:
+def test_little_is_found_in_real_recordings(shared_data: Path, issues_of: Find) -> None:
     # Composites: half of these views' frames were shown twice, and the tip never moved in z.
     twice = [("duplicate frames", "view View3"), ("duplicate frames", "view View5")]
     expected = {
@@ -67,182 +67,182 @@ def test_little_is_found_in_real_recordings(shared_data: Path, flaws_of: Find) -
         # Its pickle counts 300 robot states, which nobody copied.
         "old": [("missing", "state"), ("flat channel", "action")],
     }
-    for format, flaws in expected.items():
-        found = flaws_of(shared_data / "insertion" / format)
-        assert [(flaw.kind, flaw.stream) for flaw in found] == flaws
+    for format, issues in expected.items():
+        found = issues_of(shared_data / "insertion" / format)
+        assert [(issue.kind, issue.stream) for issue in found] == issues
 
 
 class TestCameras:
-    def test_dead(self, copied: Copied, flaws_of: Find) -> None:
+    def test_dead(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("raw")
         for path in frames(folder, "View1"):
             Image.new("RGB", (224, 126)).save(path)
-        (flaw,) = flaws_of(folder)
-        assert (flaw.kind, flaw.stream, flaw.start_s) == ("dead camera", "view View1", None)
-        assert "of one colour (mean 0 of 255)" in flaw.message
+        (issue,) = issues_of(folder)
+        assert (issue.kind, issue.stream, issue.start_s) == ("dead camera", "view View1", None)
+        assert "are of one colour" in issue.message
 
-    def test_dead_for_a_while(self, copied: Copied, flaws_of: Find) -> None:
+    def test_dead_for_a_while(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("raw")
         dead = frames(folder, "View2")[20:50]
         for path in dead:
             Image.new("RGB", (224, 126), (90, 90, 90)).save(path)
-        (flaw,) = flaws_of(folder)
-        assert flaw.start_s is not None and flaw.stop_s is not None
-        assert time_of(dead[0]) <= flaw.start_s < flaw.stop_s <= time_of(dead[-1])
-        assert flaw.stop_s - flaw.start_s > 1
+        (issue,) = issues_of(folder)
+        assert issue.start_s is not None and issue.stop_s is not None
+        assert time_of(dead[0]) <= issue.start_s < issue.stop_s <= time_of(dead[-1])
+        assert issue.stop_s - issue.start_s > 1
 
     @pytest.mark.parametrize("colour", [(0, 0, 0), (0, 135, 0)])
     def test_dead_for_some_frames(
-        self, copied: Copied, flaws_of: Find, colour: tuple[int, int, int]
+        self, copied: Copied, issues_of: Find, colour: tuple[int, int, int]
     ) -> None:
         folder = copied("raw")
         dead = frames(folder, "View1")[7:11]
         for path in dead:
             Image.new("RGB", (224, 126), colour).save(path)
-        (flaw,) = flaws_of(folder, vlm_reuse_count=1)
-        assert (flaw.kind, flaw.stream) == ("dead camera", "view View1")
-        assert (flaw.start_s, flaw.stop_s) == (time_of(dead[0]), time_of(dead[-1]))
+        (issue,) = issues_of(folder, vlm_reuse_count=1)
+        assert (issue.kind, issue.stream) == ("dead camera", "view View1")
+        assert (issue.start_s, issue.stop_s) == (time_of(dead[0]), time_of(dead[-1]))
         # A VL row serves three ticks, and of the frames between two rows nothing is said.
-        assert [one.kind for one in flaws_of(folder)] == ["dead camera"]
+        assert [one.kind for one in issues_of(folder)] == ["dead camera"]
 
-    def test_dead_twice(self, copied: Copied, flaws_of: Find) -> None:
+    def test_dead_twice(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("raw")
         paths = frames(folder, "View2")
         for path in (*paths[5:10], *paths[40:50]):
             Image.new("RGB", (224, 126)).save(path)
-        found = flaws_of(folder, vlm_reuse_count=1)
-        assert [(flaw.kind, flaw.start_s, flaw.stop_s) for flaw in found] == [
+        found = issues_of(folder, vlm_reuse_count=1)
+        assert [(issue.kind, issue.start_s, issue.stop_s) for issue in found] == [
             ("dead camera", time_of(paths[5]), time_of(paths[9])),
             ("dead camera", time_of(paths[40]), time_of(paths[49])),
         ]
 
-    def test_frozen_while_the_others_move(self, copied: Copied, flaws_of: Find) -> None:
+    def test_frozen_while_the_others_move(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("raw")
         frozen = frames(folder, "View1")[3:45]
         for path in frozen[1:]:
             path.write_bytes(frozen[0].read_bytes())
-        (flaw,) = flaws_of(folder)
-        assert (flaw.kind, flaw.stream) == ("duplicate frames", "view View1")
-        assert flaw.start_s == pytest.approx(time_of(frozen[0]))
-        assert flaw.stop_s is not None and flaw.stop_s >= time_of(frozen[-1])
-        assert "other views move" in flaw.message
+        (issue,) = issues_of(folder)
+        assert (issue.kind, issue.stream) == ("duplicate frames", "view View1")
+        assert issue.start_s == pytest.approx(time_of(frozen[0]))
+        assert issue.stop_s is not None and issue.stop_s >= time_of(frozen[-1])
+        assert "other views move" in issue.message
 
-    def test_frozen_with_noise_in_its_pictures(self, copied: Copied, flaws_of: Find) -> None:
+    def test_frozen_with_noise_in_its_pictures(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("raw")
         noisy(folder, "View1")
-        assert flaws_of(folder, views=["View1"]) == ()
+        assert issues_of(folder, views=["View1"]) == ()
         frozen = frames(folder, "View1")[30:34]
         for path in frozen[1:]:
             path.write_bytes(frozen[0].read_bytes())
-        (flaw,) = flaws_of(folder, views=["View1"])
-        assert (flaw.kind, flaw.start_s, flaw.stop_s) == (
+        (issue,) = issues_of(folder, views=["View1"])
+        assert (issue.kind, issue.start_s, issue.stop_s) == (
             "duplicate frames",
             time_of(frozen[0]),
             time_of(frozen[-1]),
         )
-        assert "frames 30 to 33 are one picture" in flaw.message
+        assert "frames 30 to 33 are one picture" in issue.message
 
     def test_every_second_frame_twice(
-        self, copied: Copied, look: Callable[..., EpisodeView], flaws_of: Find
+        self, copied: Copied, look: Callable[..., EpisodeView], issues_of: Find
     ) -> None:
         folder = copied("raw")
         noisy(folder, "View1")
         paths = frames(folder, "View1")
         for first, second in zip(paths[::2], paths[1::2], strict=False):
             second.write_bytes(first.read_bytes())
-        (flaw,) = flaws_of(folder, views=["View1"])
-        assert flaw.kind == "duplicate frames"
-        assert f"{len(paths) // 2} of {len(paths) - 1} frames" in flaw.message
+        (issue,) = issues_of(folder, views=["View1"])
+        assert issue.kind == "duplicate frames"
+        assert f"{len(paths) // 2} of {len(paths) - 1} frames" in issue.message
         twice = [time_of(path) for path in paths[1::2]]
-        assert (flaw.start_s, flaw.stop_s) == (twice[0], twice[-1])
+        assert (issue.start_s, issue.stop_s) == (twice[0], twice[-1])
         zero = look(folder, views=["View1"]).zero
         said = ", ".join(f"{time - zero:.2f}" for time in twice[:3])
-        assert f"first at {said} s, last at {twice[-1] - zero:.2f} s" in flaw.message
+        assert f"first at {said} s, last at {twice[-1] - zero:.2f} s" in issue.message
 
-    def test_frames_that_change_in_size(self, copied: Copied, flaws_of: Find) -> None:
+    def test_frames_that_change_in_size(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("raw")
         noisy(folder, "View1")
         paths = frames(folder, "View1")
         for path in paths[40:]:
             Image.open(path).resize((160, 90)).save(path)
         paths[39].write_bytes(paths[38].read_bytes())  # an equal pair just before the change
-        (flaw,) = flaws_of(folder, views=["View1"], vlm_reuse_count=1)
-        assert (flaw.kind, flaw.stream, flaw.severity) == ("frame size", "view View1", "warning")
-        assert flaw.start_s == flaw.stop_s == time_of(paths[40])
-        assert "from 224 x 126 (frame 39) to 160 x 90 (frame 40)" in flaw.message
+        (issue,) = issues_of(folder, views=["View1"], vlm_reuse_count=1)
+        assert (issue.kind, issue.stream, issue.severity) == ("frame size", "view View1", "warning")
+        assert issue.start_s == issue.stop_s == time_of(paths[40])
+        assert "from 224 x 126 (frame 39) to 160 x 90 (frame 40)" in issue.message
 
-    def test_one_picture_throughout(self, copied: Copied, flaws_of: Find) -> None:
+    def test_one_picture_throughout(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("raw")
         paths = frames(folder, "View5")
         for path in paths[1:]:
             path.write_bytes(paths[0].read_bytes())
-        (flaw,) = flaws_of(folder, views=["View5"])
-        assert f"all {len(paths)} frames are one picture" in flaw.message
+        (issue,) = issues_of(folder, views=["View5"])
+        assert f"all {len(paths)} frames are one picture" in issue.message
 
-    def test_a_frame_that_cannot_be_decoded(self, copied: Copied, flaws_of: Find) -> None:
+    def test_a_frame_that_cannot_be_decoded(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("raw")
         broken = frames(folder, "View5")[33]
         broken.write_bytes(broken.read_bytes()[:100])
-        (flaw,) = flaws_of(folder, vlm_reuse_count=1)
-        assert (flaw.kind, flaw.severity) == ("unreadable", "error")
-        assert broken.name in flaw.message
+        (issue,) = issues_of(folder, vlm_reuse_count=1)
+        assert (issue.kind, issue.severity) == ("unreadable", "error")
+        assert broken.name in issue.message
 
-    def test_a_broken_video(self, copied: Copied, flaws_of: Find) -> None:
+    def test_a_broken_video(self, copied: Copied, issues_of: Find) -> None:
         root = copied("lerobot")
         video = sorted(root.rglob("*.mp4"))[0]
         video.write_bytes(video.read_bytes()[:2000])
-        (flaw,) = flaws_of(root)
-        assert (flaw.kind, flaw.severity, flaw.stream) == ("unreadable", "error", "view View1")
+        (issue,) = issues_of(root)
+        assert (issue.kind, issue.severity, issue.stream) == ("unreadable", "error", "view View1")
 
-    def test_frames_left_out(self, copied: Copied, flaws_of: Find) -> None:
+    def test_frames_left_out(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("raw")
         paths = frames(folder, "View2")
         for path in paths[1::3]:
             path.unlink()
-        (flaw,) = flaws_of(folder)
-        assert (flaw.kind, flaw.stream) == ("frame count", "view View2")
-        assert flaw.message.startswith(f"{len(paths) - len(paths[1::3])} frames, ")
+        (issue,) = issues_of(folder)
+        assert (issue.kind, issue.stream) == ("frame count", "view View2")
+        assert issue.message.startswith(f"{len(paths) - len(paths[1::3])} frames, ")
 
-    def test_fewer_frames_than_the_metadata_says(self, copied: Copied, flaws_of: Find) -> None:
+    def test_fewer_frames_than_the_metadata_says(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("new")
         metadata(folder, camera_frames_count=200)
-        (flaw,) = flaws_of(folder)
-        assert (flaw.kind, flaw.stream) == ("frame count", "cameras")
-        assert "metadata.json says 200" in flaw.message
+        (issue,) = issues_of(folder)
+        assert (issue.kind, issue.stream) == ("frame count", "cameras")
+        assert "metadata.json says 200" in issue.message
 
-    def test_a_slower_camera_has_fewer_frames(self, copied: Copied, flaws_of: Find) -> None:
+    def test_a_slower_camera_has_fewer_frames(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("raw")
         for path in frames(folder, "View2")[1::2]:
             path.unlink()
-        assert flaws_of(folder) == ()
+        assert issues_of(folder) == ()
 
-    def test_a_view_that_the_metadata_lists(self, copied: Copied, flaws_of: Find) -> None:
+    def test_a_view_that_the_metadata_lists(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("new")
         metadata(folder, camera_views=["View1", "View2", "View5", "View9"])
-        (flaw,) = flaws_of(folder)
-        assert (flaw.kind, flaw.stream) == ("missing", "view View9")
+        (issue,) = issues_of(folder)
+        assert (issue.kind, issue.stream) == ("missing", "view View9")
         # A view that the params leave out is not missing.
         metadata(folder, camera_views=["View1", "View2", "View5"])
-        assert flaws_of(folder, views=["View1"]) == ()
+        assert issues_of(folder, views=["View1"]) == ()
 
-    def test_no_camera_at_all(self, copied: Copied, flaws_of: Find) -> None:
+    def test_no_camera_at_all(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("raw")
-        assert any(flaw.kind == "missing" for flaw in flaws_of(folder, views=[]))
+        assert any(issue.kind == "missing" for issue in issues_of(folder, views=[]))
         for view in ("View1", "View2", "View5"):
             shutil.rmtree(folder / view)
-        (flaw,) = flaws_of(folder)
-        assert (flaw.kind, flaw.stream) == ("missing", "cameras")
-        assert flaw.message == "no camera has a frame: the VLM would see no picture"
+        (issue,) = issues_of(folder)
+        assert (issue.kind, issue.stream) == ("missing", "cameras")
+        assert issue.message == "no camera has a frame: the VLM would see no picture"
 
     @pytest.mark.parametrize(("format", "place"), [("raw", ""), ("new", "images")])
     def test_a_folder_without_a_frame(
-        self, copied: Copied, flaws_of: Find, format: str, place: str
+        self, copied: Copied, issues_of: Find, format: str, place: str
     ) -> None:
         folder = copied(format)
         (folder / place / "View3" / "left").mkdir(parents=True)
-        (flaw,) = flaws_of(folder)
-        assert (flaw.kind, flaw.stream) == ("missing", "view View3")
-        assert flaws_of(folder, views=["View1"]) == ()
+        (issue,) = issues_of(folder)
+        assert (issue.kind, issue.stream) == ("missing", "view View3")
+        assert issues_of(folder, views=["View1"]) == ()
 
     @pytest.mark.parametrize(
         ("format", "file", "stream", "said"),
@@ -253,110 +253,112 @@ class TestCameras:
         ],
     )
     def test_a_stream_that_the_metadata_promise(
-        self, copied: Copied, flaws_of: Find, format: str, file: str, stream: str, said: str
+        self, copied: Copied, issues_of: Find, format: str, file: str, stream: str, said: str
     ) -> None:
         folder = copied(format)
         (folder / file).unlink()
-        (flaw,) = [flaw for flaw in flaws_of(folder) if flaw.kind == "missing"]
-        assert flaw.stream == stream and said in flaw.message
+        (issue,) = [issue for issue in issues_of(folder) if issue.kind == "missing"]
+        assert issue.stream == stream and said in issue.message
 
     def test_a_rate_promises_a_stream_and_a_count_of_nothing_does_not(
-        self, copied: Copied, flaws_of: Find
+        self, copied: Copied, issues_of: Find
     ) -> None:
         folder = copied("new")
         (folder / "sensor_data.npz").unlink()
         metadata(folder, sensor_windows_count=None)
-        (flaw,) = flaws_of(folder)
-        assert flaw.stream == "sensor" and "sensor_hz 650" in flaw.message
+        (issue,) = issues_of(folder)
+        assert issue.stream == "sensor" and "sensor_hz 650" in issue.message
         metadata(folder, sensor_windows_count=0)
-        assert flaws_of(folder) == ()
+        assert issues_of(folder) == ()
 
     def test_a_promised_stream_that_is_broken_is_told_once(
-        self, copied: Copied, flaws_of: Find
+        self, copied: Copied, issues_of: Find
     ) -> None:
         folder = copied("new")
         (folder / "sensor_data.npz").write_bytes(b"")
-        assert [flaw.kind for flaw in flaws_of(folder)] == ["unreadable"]
+        assert [issue.kind for issue in issues_of(folder)] == ["unreadable"]
 
-    def test_a_depth_map_is_no_view(self, copied: Copied, flaws_of: Find) -> None:
+    def test_a_depth_map_is_no_view(self, copied: Copied, issues_of: Find) -> None:
         root = copied("lerobot")
         info = json.loads((root / "meta/info.json").read_text())
         info["features"]["observation.images.View2"]["info"]["video.is_depth_map"] = True
         (root / "meta/info.json").write_text(json.dumps(info))
-        (flaw,) = flaws_of(root)
-        assert (flaw.kind, flaw.severity, flaw.stream) == ("depth view", "warning", "view View2")
-        assert flaws_of(root, views=["View1"]) == ()
+        (issue,) = issues_of(root)
+        assert (issue.kind, issue.severity, issue.stream) == ("depth view", "warning", "view View2")
+        assert issues_of(root, views=["View1"]) == ()
 
-    def test_frames_counted_in_words(self, copied: Copied, flaws_of: Find) -> None:
+    def test_frames_counted_in_words(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("new")
         metadata(folder, camera_frames_count="many")
-        (flaw,) = flaws_of(folder)
-        assert (flaw.kind, flaw.stream) == ("unreadable", "metadata")
-        assert "camera_frames_count" in flaw.message
+        (issue,) = issues_of(folder)
+        assert (issue.kind, issue.stream) == ("unreadable", "metadata")
+        assert "camera_frames_count" in issue.message
 
-    def test_frames_lost_one_by_one(self, copied: Copied, flaws_of: Find) -> None:
+    def test_frames_lost_one_by_one(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("raw")
         paths = frames(folder, "View2")
         lost = paths[5:-5:9]
         for path in lost:
             path.unlink()
-        (flaw,) = [flaw for flaw in flaws_of(folder) if flaw.kind == "dropped frames"]
-        assert (flaw.stream, flaw.severity) == ("view View2", "warning")
-        assert f"time for {len(lost)} more frames" in flaw.message
-        assert " Hz on average" in flaw.message
+        (issue,) = [issue for issue in issues_of(folder) if issue.kind == "dropped frames"]
+        assert (issue.stream, issue.severity) == ("view View2", "warning")
+        assert f"time for {len(lost)} more frames" in issue.message
+        assert " Hz on average" in issue.message
 
-    def test_jitter_loses_no_frame(self, copied: Copied, flaws_of: Find) -> None:
+    def test_jitter_loses_no_frame(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("raw")
         rng = np.random.default_rng(0)
         for place, path in enumerate(frames(folder, "View2")):
             time = time_of(path) + (0.07 * rng.random() if place % 3 == 1 else 0)
             path.rename(path.with_name(f"{path.stem.rsplit('_', 1)[0]}_{time:.3f}.jpg"))
-        assert flaws_of(folder) == ()
+        assert issues_of(folder) == ()
 
-    def test_slower_than_the_rows_that_need_it(self, copied: Copied, flaws_of: Find) -> None:
+    def test_slower_than_the_rows_that_need_it(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("raw")
         for view in ("View1", "View2", "View5"):
             for index, path in enumerate(frames(folder, view)):
                 if index % 20:
                     path.unlink()
-        old = [flaw for flaw in flaws_of(folder) if flaw.kind != "lost ticks"]
-        assert {flaw.kind for flaw in old} == {"old frames"}
-        assert {flaw.stream for flaw in old} == {"view View1", "view View2", "view View5"}
+        old = [issue for issue in issues_of(folder) if issue.kind != "lost ticks"]
+        assert {issue.kind for issue in old} == {"old frames"}
+        assert {issue.stream for issue in old} == {"view View1", "view View2", "view View5"}
         assert "expected at most 0.60 s" in old[0].message
 
 
 class TestClocks:
-    def test_a_gap(self, copied: Copied, flaws_of: Find, change_csv) -> None:
+    def test_a_gap(self, copied: Copied, issues_of: Find, change_csv) -> None:
         folder = copied("raw")
         path = only(folder, "robot_state_*.csv")
         time = np.loadtxt(path, delimiter=",", skiprows=1)[:, 1]
         change_csv(path, lambda table: np.delete(table, np.s_[200:300], axis=0))
-        flaw = next(flaw for flaw in flaws_of(folder) if flaw.kind == "gap")
-        assert flaw.stream == "state, poses"
-        assert flaw.start_s == pytest.approx(time[199]) and flaw.stop_s == pytest.approx(time[300])
-        assert f"no entry for {time[300] - time[199]:.2f} s" in flaw.message
+        issue = next(issue for issue in issues_of(folder) if issue.kind == "gap")
+        assert issue.stream == "state, poses"
+        assert issue.start_s == pytest.approx(time[199]) and issue.stop_s == pytest.approx(
+            time[300]
+        )
+        assert f"no entry for {time[300] - time[199]:.2f} s" in issue.message
 
-    def test_a_gap_of_a_camera(self, copied: Copied, flaws_of: Find) -> None:
+    def test_a_gap_of_a_camera(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("raw")
         gone = frames(folder, "View2")[30:40]
         for path in gone:
             path.unlink()
-        kinds = {flaw.kind: flaw for flaw in flaws_of(folder)}
+        kinds = {issue.kind: issue for issue in issues_of(folder)}
         assert "gap" in kinds and kinds["gap"].stream == "view View2"
         assert kinds["gap"].start_s == pytest.approx(time_of(gone[0]), abs=0.2)
         assert "ticks see a frame up to 1." in kinds["gap"].message
 
     def test_each_of_many_gaps_has_its_time(
-        self, copied: Copied, flaws_of: Find, change_csv
+        self, copied: Copied, issues_of: Find, change_csv
     ) -> None:
         folder = copied("raw")
         holes = np.concatenate([np.arange(50 * i, 50 * i + 15) for i in range(1, 12)])
         change_csv(only(folder, "robot_state_*.csv"), lambda table: np.delete(table, holes, axis=0))
-        found = [flaw for flaw in flaws_of(folder) if flaw.kind == "gap"]
+        found = [issue for issue in issues_of(folder) if issue.kind == "gap"]
         assert len(found) == 11
-        assert len({flaw.start_s for flaw in found}) == 11
+        assert len({issue.start_s for issue in found}) == 11
 
-    def test_a_jump(self, copied: Copied, flaws_of: Find, change_csv) -> None:
+    def test_a_jump(self, copied: Copied, issues_of: Find, change_csv) -> None:
         folder = copied("raw")
 
         def jump(table: np.ndarray) -> np.ndarray:
@@ -364,12 +366,12 @@ class TestClocks:
             return table
 
         change_csv(only(folder, "robot_state_*.csv"), jump)
-        flaw = next(flaw for flaw in flaws_of(folder) if flaw.kind == "clock jump")
-        assert flaw.start_s is not None and flaw.stop_s is not None
-        assert flaw.stop_s - flaw.start_s == pytest.approx(3600, abs=0.1)
-        assert "jumps by 3600.0" in flaw.message
+        issue = next(issue for issue in issues_of(folder) if issue.kind == "clock jump")
+        assert issue.start_s is not None and issue.stop_s is not None
+        assert issue.stop_s - issue.start_s == pytest.approx(3600, abs=0.1)
+        assert "jumps by 3600.0" in issue.message
 
-    def test_times_that_repeat(self, copied: Copied, flaws_of: Find, change_csv) -> None:
+    def test_times_that_repeat(self, copied: Copied, issues_of: Find, change_csv) -> None:
         folder = copied("raw")
 
         def coarse(table: np.ndarray) -> np.ndarray:
@@ -377,25 +379,25 @@ class TestClocks:
             return table
 
         change_csv(only(folder, "robot_state_*.csv"), coarse)
-        (flaw,) = flaws_of(folder)
-        assert (flaw.kind, flaw.stream) == ("repeated times", "state, poses")
+        (issue,) = issues_of(folder)
+        assert (issue.kind, issue.stream) == ("repeated times", "state, poses")
 
-    def test_another_rate_than_the_metadata_says(self, copied: Copied, flaws_of: Find) -> None:
+    def test_another_rate_than_the_metadata_says(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("new")
         metadata(folder, sensor_hz=800)
-        (flaw,) = flaws_of(folder)
-        assert (flaw.kind, flaw.stream) == ("rate", "sensor")
-        assert "found 65" in flaw.message
-        assert "entries a second, expected 800 by metadata.json" in flaw.message
+        (issue,) = issues_of(folder)
+        assert (issue.kind, issue.stream) == ("rate", "sensor")
+        assert "found 65" in issue.message
+        assert "entries a second, expected 800 by metadata.json" in issue.message
 
-    def test_another_rate_than_fps(self, copied: Copied, flaws_of: Find) -> None:
+    def test_another_rate_than_fps(self, copied: Copied, issues_of: Find) -> None:
         root = copied("lerobot")
         info = json.loads((root / "meta/info.json").read_text())
         (root / "meta/info.json").write_text(json.dumps(info | {"fps": 15}))
-        flaw = next(flaw for flaw in flaws_of(root, action_hz=None) if flaw.kind == "rate")
-        assert "expected 15 by meta/info.json" in flaw.message
+        issue = next(issue for issue in issues_of(root, action_hz=None) if issue.kind == "rate")
+        assert "expected 15 by meta/info.json" in issue.message
 
-    def test_ticks_lost_at_both_ends(self, copied: Copied, flaws_of: Find, change_npz) -> None:
+    def test_ticks_lost_at_both_ends(self, copied: Copied, issues_of: Find, change_npz) -> None:
         folder = copied("raw")
         sensor = only(folder, "sensor_data_*.npz")
         with np.load(sensor) as archive:
@@ -403,7 +405,7 @@ class TestClocks:
         np.savez(sensor, **members)
         for path in frames(folder, "View5")[-15:]:
             path.unlink()
-        found = {flaw.stream: flaw for flaw in flaws_of(folder) if flaw.kind == "lost ticks"}
+        found = {issue.stream: issue for issue in issues_of(folder) if issue.kind == "lost ticks"}
         assert set(found) == {"sensor", "view View5"}
         late, early = found["sensor"], found["view View5"]
         assert late.start_s is not None and late.stop_s == members["timestamps"][0]
@@ -414,7 +416,7 @@ class TestClocks:
 
 
 class TestChannels:
-    def test_flat_channels_are_one_line(self, copied: Copied, flaws_of: Find, change_npz) -> None:
+    def test_flat_channels_are_one_line(self, copied: Copied, issues_of: Find, change_npz) -> None:
         folder = copied("raw")
 
         def dead(alines: np.ndarray) -> np.ndarray:
@@ -423,11 +425,13 @@ class TestChannels:
             return alines
 
         change_npz(only(folder, "sensor_data_*.npz"), alines=dead)
-        (flaw,) = flaws_of(folder)
-        assert (flaw.kind, flaw.stream) == ("flat channel", "sensor")
-        assert "65 of 1026 channels never change: aline_0100–aline_0163, aline_0500" in flaw.message
+        (issue,) = issues_of(folder)
+        assert (issue.kind, issue.stream) == ("flat channel", "sensor")
+        assert (
+            "65 of 1026 channels never change: aline_0100–aline_0163, aline_0500" in issue.message
+        )
 
-    def test_a_joint_that_never_moves(self, copied: Copied, flaws_of: Find, change_csv) -> None:
+    def test_a_joint_that_never_moves(self, copied: Copied, issues_of: Find, change_csv) -> None:
         folder = copied("raw")
 
         def hold(table: np.ndarray) -> np.ndarray:
@@ -435,12 +439,12 @@ class TestChannels:
             return table
 
         change_csv(only(folder, "robot_state_*.csv"), hold)
-        (flaw,) = flaws_of(folder)
-        assert flaw.message == "joint_3 is 12.5 throughout; the others vary"
-        assert flaw.start_s is not None and flaw.stop_s is not None
-        assert flaw.stop_s - flaw.start_s > 6
+        (issue,) = issues_of(folder)
+        assert issue.message == "joint_3 is 12.5 throughout; the others vary"
+        assert issue.start_s is not None and issue.stop_s is not None
+        assert issue.stop_s - issue.start_s > 6
 
-    def test_a_joint_that_hardly_moves(self, copied: Copied, flaws_of: Find, change_csv) -> None:
+    def test_a_joint_that_hardly_moves(self, copied: Copied, issues_of: Find, change_csv) -> None:
         folder = copied("raw")
         rng = np.random.default_rng(0)
 
@@ -454,15 +458,15 @@ class TestChannels:
         path = only(folder, "robot_state_*.csv")
         usual = np.median(np.loadtxt(path, delimiter=",", skiprows=1)[:, 4:10].std(axis=0))
         change_csv(path, hold(0.1 * usual))
-        assert flaws_of(folder) == ()
+        assert issues_of(folder) == ()
         change_csv(path, hold(0.002 * usual))
-        (flaw,) = flaws_of(folder)
-        assert (flaw.kind, flaw.stream, flaw.severity) == ("still channel", "state", "warning")
-        assert flaw.message.startswith("joint_3 hardly moves: a standard deviation of ")
-        assert flaw.start_s is not None and flaw.stop_s is not None
-        assert flaw.stop_s - flaw.start_s > 6
+        (issue,) = issues_of(folder)
+        assert (issue.kind, issue.stream, issue.severity) == ("still channel", "state", "warning")
+        assert issue.message.startswith("joint_3 hardly moves: a standard deviation of ")
+        assert issue.start_s is not None and issue.stop_s is not None
+        assert issue.stop_s - issue.start_s > 6
 
-    def test_a_frozen_scan(self, copied: Copied, flaws_of: Find, change_npz) -> None:
+    def test_a_frozen_scan(self, copied: Copied, issues_of: Find, change_npz) -> None:
         folder = copied("raw")
 
         def stall(alines: np.ndarray) -> np.ndarray:
@@ -473,13 +477,13 @@ class TestChannels:
         change_npz(path, alines=stall)
         with np.load(path) as archive:
             time = archive["timestamps"]
-        (flaw,) = flaws_of(folder)
-        assert flaw.kind == "frozen" and "all channels but the force" in flaw.message
-        assert flaw.start_s == pytest.approx(time[1000], abs=0.02)
-        assert flaw.stop_s == pytest.approx(time[1649], abs=0.02)
+        (issue,) = issues_of(folder)
+        assert issue.kind == "frozen" and "all channels but the force" in issue.message
+        assert issue.start_s == pytest.approx(time[1000], abs=0.02)
+        assert issue.stop_s == pytest.approx(time[1649], abs=0.02)
 
     def test_one_depth_that_holds_is_no_frozen_scan(
-        self, copied: Copied, flaws_of: Find, change_npz
+        self, copied: Copied, issues_of: Find, change_npz
     ) -> None:
         folder = copied("raw")
 
@@ -488,9 +492,9 @@ class TestChannels:
             return alines
 
         change_npz(only(folder, "sensor_data_*.npz"), alines=hold)
-        assert flaws_of(folder) == ()
+        assert issues_of(folder) == ()
 
-    def test_an_action_outlier(self, copied: Copied, flaws_of: Find) -> None:
+    def test_an_action_outlier(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("old")
         path = folder / "data.pkl"
         document = pickle.loads(path.read_bytes())
@@ -498,12 +502,12 @@ class TestChannels:
         path.write_bytes(pickle.dumps(document))
         # The recorded actions are looked at where no poses give others.
         (folder / "robot_states.npz").unlink()
-        (flaw,) = [flaw for flaw in flaws_of(folder) if flaw.kind != "missing"]
-        assert (flaw.kind, flaw.stream) == ("action outlier", "action")
-        assert "db leaps to 360 deg" in flaw.message
+        (issue,) = [issue for issue in issues_of(folder) if issue.kind != "missing"]
+        assert (issue.kind, issue.stream) == ("action outlier", "action")
+        assert "db leaps to 360 deg" in issue.message
 
     @pytest.mark.parametrize("row", [0, 300, -1])
-    def test_a_state_outlier(self, copied: Copied, flaws_of: Find, change_csv, row: int) -> None:
+    def test_a_state_outlier(self, copied: Copied, issues_of: Find, change_csv, row: int) -> None:
         folder = copied("raw")
 
         def leap(table: np.ndarray) -> np.ndarray:
@@ -513,17 +517,17 @@ class TestChannels:
         path = only(folder, "robot_state_*.csv")
         change_csv(path, leap)
         time = np.loadtxt(path, delimiter=",", skiprows=1)[:, 1]
-        (flaw,) = flaws_of(folder)
-        assert (flaw.kind, flaw.stream) == ("state outlier", "state")
-        assert flaw.start_s == pytest.approx(time[row])
-        assert "joint_3 leaps to 360 deg at " in flaw.message and "1 such rows" in flaw.message
+        (issue,) = issues_of(folder)
+        assert (issue.kind, issue.stream) == ("state outlier", "state")
+        assert issue.start_s == pytest.approx(time[row])
+        assert "joint_3 leaps to 360 deg at " in issue.message and "1 such rows" in issue.message
 
     def test_a_real_robot_that_leaps_and_stands_still(self, shared_data: Path) -> None:
         data = DataParams(sources=(Source(name="s", path=str(shared_data / CR5)),))
         found = {
-            (one.id, flaw.kind, flaw.stream): flaw.message
+            (one.id, issue.kind, issue.stream): issue.message
             for one in open_recordings(data.sources).recordings
-            for flaw in channel_flaws(view_episode(one, data, "rotvec"))
+            for issue in find_channel_issues(view_episode(one, data, "rotvec"))
         }
         ids = [f"episode_{place:06d}" for place in range(5)]
         assert [key[0] for key in found if key[1:] == ("state outlier", "state")] == ids[:1]
@@ -537,15 +541,15 @@ class TestChannels:
         assert named(names, list(range(0, 40, 2))) == "c0, c2, c4, c6 and 16 more"
 
 
-def test_a_recording_may_be_very_short(copied: Copied, look: Callable[..., EpisodeView], flaws_of):
+def test_a_recording_may_be_very_short(copied: Copied, look: Callable[..., EpisodeView], issues_of):
     folder = copied("raw")
     for view in ("View1", "View2", "View5"):
         for path in frames(folder, view)[1:]:
             path.unlink()
     view = look(folder)
     assert view.timeline is None or len(view.timeline.time) <= 1
-    found = flaws_of(folder)
-    assert all(flaw.kind in ("no ticks", "lost ticks") for flaw in found) and found
+    found = issues_of(folder)
+    assert all(issue.kind in ("no ticks", "lost ticks") for issue in found) and found
 
 
 def noisy(folder: Path, view: str) -> None:

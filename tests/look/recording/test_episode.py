@@ -1,4 +1,4 @@
-"""What cannot be read is a flaw; everything else is there all the same."""
+"""What cannot be read is an issue; everything else is there all the same."""
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from pipeline.base.errors import RecordingError
-from pipeline.look.recording.clocks import clocks
-from pipeline.look.recording.facts import EpisodeView
-from pipeline.look.recording.flaws import find_flaws
-from pipeline.look.recording.frames import frames_at, read_frames, spread_ticks
-from pipeline.look.recording.statistics import channel_statistics
+from pipeline.look.recording.channels import channel_statistics
+from pipeline.look.recording.clocks import read_clocks
+from pipeline.look.recording.episode import EpisodeView
+from pipeline.look.recording.frames import read_frames, spread_ticks
+from pipeline.look.recording.issues import find_issues
 
 Look = Callable[..., EpisodeView]
 
@@ -24,7 +24,7 @@ def only(folder: Path, pattern: str) -> Path:
 @pytest.mark.parametrize("format", ["raw", "new", "old", "lerobot"])
 def test_a_healthy_recording_is_read_whole(healthy: Path, look: Look, format: str) -> None:
     view = look(healthy / format)
-    assert not view.flaws
+    assert not view.issues
     assert set(view.cameras) == {"View1", "View2", "View5"}
     assert view.timeline is not None and view.sensor is not None and view.state is not None
     assert (view.action is None) == (format in ("raw", "new"))
@@ -42,13 +42,13 @@ def test_a_nan_leaves_the_other_streams(copied, look: Look, change_npz) -> None:
 
     change_npz(only(folder, "sensor_data_*.npz"), forces=spoil)
     view = look(folder)
-    (flaw,) = view.flaws
-    assert (flaw.kind, flaw.severity, flaw.stream) == ("unreadable", "error", "sensor")
-    assert "nan in row 7, 0.01" in flaw.message and "channel 'force'" in flaw.message
-    assert "s after the first" in flaw.message and "leave it out" in flaw.message
+    (issue,) = view.issues
+    assert (issue.kind, issue.severity, issue.stream) == ("unreadable", "error", "sensor")
+    assert "nan in row 7, 0.01" in issue.message and "channel 'force'" in issue.message
+    assert "s after the first" in issue.message and "leave it out" in issue.message
     assert view.sensor is None and view.state is not None and len(view.cameras) == 3
     assert view.timeline is not None and not view.timeline.sensor_end.any()
-    assert find_flaws(view)[0] == flaw
+    assert find_issues(view)[0] == issue
     assert {one.stream for one in channel_statistics(view)} == {"state", "action"}
 
 
@@ -61,14 +61,14 @@ def test_a_backwards_clock_leaves_the_other_streams(copied, look: Look, change_c
 
     change_csv(only(folder, "robot_state_*.csv"), turn_back)
     view = look(folder)
-    (flaw,) = view.flaws
-    assert flaw.stream == "state" and "the clock goes backwards at row 100" in flaw.message
-    # Without poses there are no actions, and so no ticks: told once, by the state's flaw.
+    (issue,) = view.issues
+    assert issue.stream == "state" and "the clock goes backwards at row 100" in issue.message
+    # Without poses there are no actions, and so no ticks: told once, by the state's issue.
     assert view.state is None and view.poses is None and view.timeline is None
     assert view.sensor is not None and len(view.cameras) == 3
-    assert find_flaws(view) == (flaw,)
-    assert {one.name for one in clocks(view)} == {"View1", "View2", "View5", "sensor"}
-    assert spread_ticks(view, 5) == [] and frames_at(view, []) == {}
+    assert find_issues(view) == (issue,)
+    assert {one.name for one in read_clocks(view)} == {"View1", "View2", "View5", "sensor"}
+    assert spread_ticks(view, 5) == []
 
 
 def test_a_truncated_file_is_told_once(copied, look: Look) -> None:
@@ -76,13 +76,13 @@ def test_a_truncated_file_is_told_once(copied, look: Look) -> None:
     pickled = folder / "data.pkl"
     pickled.write_bytes(pickled.read_bytes()[:500])
     view = look(folder)
-    (flaw,) = view.flaws
-    assert flaw.severity == "error" and str(pickled) in flaw.message
-    assert {"cameras", "sensor", "action", "instruction"} <= set(flaw.stream.split(", "))
+    (issue,) = view.issues
+    assert issue.severity == "error" and str(pickled) in issue.message
+    assert {"cameras", "sensor", "action", "instruction"} <= set(issue.stream.split(", "))
     assert not view.clocks and view.zero == 0 and view.duration_s == 0
     assert view.instruction is None
-    assert find_flaws(view) == (flaw,)
-    assert clocks(view) == () and channel_statistics(view) == ()
+    assert find_issues(view) == (issue,)
+    assert read_clocks(view) == () and not list(channel_statistics(view))
     with pytest.raises(RecordingError):
         _ = view.recording.instruction
 
@@ -91,9 +91,9 @@ def test_streams_that_never_meet_leave_no_ticks(copied, look: Look, change_npz) 
     folder = copied("raw")
     change_npz(only(folder, "sensor_data_*.npz"), timestamps=lambda time: time + 1000)
     view = look(folder)
-    (flaw,) = view.flaws
-    assert (flaw.kind, flaw.severity, flaw.stream) == ("no ticks", "error", "ticks")
-    assert "no instant is covered by every stream" in flaw.message
+    (issue,) = view.issues
+    assert (issue.kind, issue.severity, issue.stream) == ("no ticks", "error", "ticks")
+    assert "no instant is covered by every stream" in issue.message
     assert view.timeline is None and view.sensor is not None and view.state is not None
 
 
@@ -102,7 +102,7 @@ def test_frames_are_the_last_at_or_before_a_tick(healthy: Path, look: Look) -> N
     assert view.timeline is not None
     ticks = spread_ticks(view, 4)
     assert ticks[0] == 0 and ticks[-1] == len(view.timeline.time) - 1 and len(ticks) == 4
-    found = frames_at(view, ticks)
+    found, _ = read_frames(view, ticks)
     for name, camera in view.cameras.items():
         for tick, frame in zip(ticks, found[name], strict=True):
             index = int(np.flatnonzero(camera.time <= view.timeline.time[tick])[-1])
@@ -116,10 +116,10 @@ def test_a_view_that_cannot_be_decoded_is_left_out(copied, look: Look) -> None:
     for path in (folder / "View2").iterdir():
         path.write_bytes(b"no picture")
     view = look(folder)
-    assert set(frames_at(view, spread_ticks(view, 3))) == {"View1", "View5"}
-    (flaw,) = find_flaws(view)
-    assert (flaw.kind, flaw.severity, flaw.stream) == ("unreadable", "error", "view View2")
-    assert "cannot be decoded" in flaw.message
+    assert set(read_frames(view, spread_ticks(view, 3))[0]) == {"View1", "View5"}
+    (issue,) = find_issues(view)
+    assert (issue.kind, issue.severity, issue.stream) == ("unreadable", "error", "view View2")
+    assert "cannot be decoded" in issue.message
 
 
 def test_a_disk_that_fails_while_frames_are_read(
@@ -132,7 +132,7 @@ def test_a_disk_that_fails_while_frames_are_read(
         raise OSError("the disk is gone")
 
     monkeypatch.setattr(failing, "read", read)
-    shown, (flaw,) = read_frames(view, spread_ticks(view, 3))
-    assert set(shown) == {"View1", "View5"} == set(frames_at(view, [0]))
-    assert (flaw.kind, flaw.severity, flaw.stream) == ("unreadable", "error", "view View2")
-    assert flaw.message == "the disk is gone"
+    shown, (issue,) = read_frames(view, spread_ticks(view, 3))
+    assert set(shown) == {"View1", "View5"}
+    assert (issue.kind, issue.severity, issue.stream) == ("unreadable", "error", "view View2")
+    assert issue.message == "the disk is gone"

@@ -6,23 +6,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.look.recording.facts import Flaw
+from pipeline.base.issue import Issue
 
 Change = Callable[[np.ndarray], np.ndarray]
-Found = Callable[..., tuple[Flaw, ...]]
+Found = Callable[..., tuple[Issue, ...]]
 
 
 @pytest.fixture
 def with_sensor(
-    copied: Callable[[str], Path], flaws_of: Found, change_npz: Callable[..., None]
+    copied: Callable[[str], Path], issues_of: Found, change_npz: Callable[..., None]
 ) -> Found:
     """`with_sensor(forces=…, alines=…)`: what is found after members were changed."""
 
-    def find(**changes: Change) -> tuple[Flaw, ...]:
+    def find(**changes: Change) -> tuple[Issue, ...]:
         folder: Path = copied("raw")
         (path,) = folder.glob("sensor_data_*.npz")
         change_npz(path, **changes)
-        return flaws_of(folder)
+        return issues_of(folder)
 
     return find
 
@@ -34,23 +34,23 @@ def loaded(force: np.ndarray) -> np.ndarray:
 
 
 def test_a_force(with_sensor: Found) -> None:
-    (flaw,) = with_sensor(forces=lambda f: np.minimum(f, 0.4))
-    assert (flaw.kind, flaw.stream) == ("saturated", "sensor")
-    assert "force (1 of 1026 channels)" in flaw.message and "0.4" in flaw.message
-    assert flaw.start_s is not None and flaw.stop_s is not None and flaw.start_s < flaw.stop_s
+    (issue,) = with_sensor(forces=lambda f: np.minimum(f, 0.4))
+    assert (issue.kind, issue.stream) == ("saturated", "sensor")
+    assert "force (1 of 1026 channels)" in issue.message and "0.4" in issue.message
+    assert issue.start_s is not None and issue.stop_s is not None and issue.start_s < issue.stop_s
 
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_force_clipped_in_most_readings(with_sensor: Found, sign: int) -> None:
-    (flaw,) = with_sensor(forces=lambda f: sign * np.minimum(loaded(f), 0.3))
+    (issue,) = with_sensor(forces=lambda f: sign * np.minimum(loaded(f), 0.3))
     end = "upper" if sign > 0 else "lower"
-    assert f"the {end} end of their range, {sign * 0.3:g}, in 75.0 % of" in flaw.message
+    assert f"the {end} end of their range, {sign * 0.3:g}, in 75.0 % of" in issue.message
 
 
 def test_a_scan(with_sensor: Found) -> None:
-    (flaw,) = with_sensor(alines=lambda a: np.minimum(a, 130))
-    assert flaw.kind == "saturated" and "aline_" in flaw.message
-    assert "upper end of their range, 130" in flaw.message
+    (issue,) = with_sensor(alines=lambda a: np.minimum(a, 130))
+    assert issue.kind == "saturated" and "aline_" in issue.message
+    assert "upper end of their range, 130" in issue.message
 
 
 def test_the_brightest_depths_of_a_scan_are_clipped_too(with_sensor: Found) -> None:
@@ -62,8 +62,8 @@ def test_the_brightest_depths_of_a_scan_are_clipped_too(with_sensor: Found) -> N
         assert (clipped[:, 30:230] == rail).mean() > 0.5
         return clipped
 
-    (flaw,) = with_sensor(alines=amplify)
-    assert "aline_0000–aline_1024 (1025 of 1026 channels)" in flaw.message
+    (issue,) = with_sensor(alines=amplify)
+    assert "aline_0000–aline_1024 (1025 of 1026 channels)" in issue.message
 
 
 @pytest.mark.parametrize(
@@ -76,4 +76,4 @@ def test_the_brightest_depths_of_a_scan_are_clipped_too(with_sensor: Found) -> N
     ],
 )
 def test_a_force_that_rests_at_its_end_is_not_clipped(with_sensor: Found, rest: Change) -> None:
-    assert [flaw for flaw in with_sensor(forces=rest) if flaw.kind == "saturated"] == []
+    assert [issue for issue in with_sensor(forces=rest) if issue.kind == "saturated"] == []

@@ -8,14 +8,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from pipeline.base.issue import Issue
 from pipeline.data.recording import Nominal
-from pipeline.look.recording.clock_flaws import clock_flaws
-from pipeline.look.recording.facts import EpisodeView, Flaw
+from pipeline.look.recording.clocks import find_clock_issues
+from pipeline.look.recording.episode import EpisodeView
 
 FAST = np.arange(39000) / 650
 SLOW = np.arange(6000) / 100
 CAMERA = np.arange(600) / 10
-Find = Callable[[Mapping[str, np.ndarray]], tuple[Flaw, ...]]
+Find = Callable[[Mapping[str, np.ndarray]], tuple[Issue, ...]]
 
 
 def set_by(time: np.ndarray, seconds: float, at: float = 30) -> np.ndarray:
@@ -28,10 +29,10 @@ def without(time: np.ndarray, start: float, stop: float) -> np.ndarray:
 
 @pytest.fixture
 def find(healthy: Path, look: Callable[..., EpisodeView]) -> Find:
-    """`find({"sensor": time, "view View1": time})`: the clock flaws of streams with these times."""
+    """`find({"sensor": time, "view View1": time})`: clock issues of streams with these times."""
     view = look(healthy / "raw")
 
-    def flaws(clocks: Mapping[str, np.ndarray]) -> tuple[Flaw, ...]:
+    def issues(clocks: Mapping[str, np.ndarray]) -> tuple[Issue, ...]:
         streams = {
             name: replace(stream, time=clocks[name])
             for name, stream in view.streams.items()
@@ -44,48 +45,48 @@ def find(healthy: Path, look: Callable[..., EpisodeView]) -> Find:
         }
         absent = {"sensor": None, "state": None, "poses": None, "action": None}
         one = replace(view, timeline=None, cameras=cameras, zero=0.0, **absent | streams)
-        return tuple(clock_flaws(one, Nominal()))
+        return tuple(find_clock_issues(one, Nominal()))
 
-    return flaws
+    return issues
 
 
 @pytest.mark.parametrize("seconds", [1.5, 5.0, 3600.0])
 def test_a_clock_that_was_set_is_a_jump_of_that_clock_alone(find: Find, seconds: float) -> None:
-    (flaw,) = find({"sensor": set_by(FAST, seconds), "state": SLOW})
-    assert (flaw.kind, flaw.stream) == ("clock jump", "sensor")
-    assert flaw.start_s == pytest.approx(30, abs=0.01)
-    assert f"the clock jumps by {seconds:.2f} s at 30.00 s" in flaw.message
+    (issue,) = find({"sensor": set_by(FAST, seconds), "state": SLOW})
+    assert (issue.kind, issue.stream) == ("clock jump", "sensor")
+    assert issue.start_s == pytest.approx(30, abs=0.01)
+    assert f"the clock jumps by {seconds:.2f} s at 30.00 s" in issue.message
 
 
 def test_a_clock_that_was_set_twice_jumps_twice(find: Find) -> None:
     found = find({"sensor": set_by(set_by(FAST, 10), 3, at=50), "state": SLOW})
-    assert [(flaw.kind, flaw.stream) for flaw in found] == [("clock jump", "sensor")] * 2
+    assert [(issue.kind, issue.stream) for issue in found] == [("clock jump", "sensor")] * 2
     assert "3.01 s from the nearest other clock, 0.01 s without" in found[1].message
 
 
 def test_where_all_clocks_pause_none_loses_ticks_by_it(find: Find) -> None:
     asleep = {"sensor": set_by(FAST[:9685], 15, at=10), "state": set_by(SLOW[:1510], 15, at=10)}
-    assert {flaw.kind for flaw in find(asleep)} == {"clock jump", "gap"}
+    assert {issue.kind for issue in find(asleep)} == {"clock jump", "gap"}
 
 
 def test_clocks_that_were_set_together_are_no_witness_of_each_other(find: Find) -> None:
     late = {f"view View{place}": set_by(CAMERA + 0.03 * place, 5) for place in (1, 2, 5)}
     found = find({"sensor": FAST, "state": SLOW, **late})
-    assert [flaw.kind for flaw in found] == ["clock jump"] * 3
+    assert [issue.kind for issue in found] == ["clock jump"] * 3
     found = find({"sensor": set_by(FAST, 3600), "state": set_by(SLOW, 3600)})
-    assert [flaw.kind for flaw in found] == ["clock jump"] * 2
+    assert [issue.kind for issue in found] == ["clock jump"] * 2
 
 
 @pytest.mark.parametrize("stop", [35, 55])
 def test_a_stream_that_lacks_entries_has_a_gap_however_long(find: Find, stop: float) -> None:
-    (flaw,) = find({"sensor": without(FAST, 10, stop), "state": SLOW})
-    assert (flaw.kind, flaw.stream) == ("gap", "sensor")
+    (issue,) = find({"sensor": without(FAST, 10, stop), "state": SLOW})
+    assert (issue.kind, issue.stream) == ("gap", "sensor")
 
 
 def test_a_gap_of_a_stream_that_was_stopped_late_is_no_jump(find: Find) -> None:
     late = without(np.arange(606) / 10, 20, 21)
-    (flaw,) = find({"view View1": late, "sensor": FAST, "state": SLOW})
-    assert (flaw.kind, flaw.stream) == ("gap", "view View1")
+    (issue,) = find({"view View1": late, "sensor": FAST, "state": SLOW})
+    assert (issue.kind, issue.stream) == ("gap", "view View1")
 
 
 def test_a_stream_that_ends_early(find: Find) -> None:
@@ -93,7 +94,7 @@ def test_a_stream_that_ends_early(find: Find) -> None:
     assert (early.kind, early.stream) == ("lost ticks", "state")
     assert "ends 20.01 s before the other stream does" in early.message
     found = find({"sensor": set_by(FAST, 5), "state": SLOW[:4000], "view View1": CAMERA})
-    assert [(flaw.kind, flaw.stream) for flaw in found] == [
+    assert [(issue.kind, issue.stream) for issue in found] == [
         ("clock jump", "sensor"),
         ("lost ticks", "state"),
     ]
@@ -108,9 +109,9 @@ def test_what_a_late_or_early_stream_costs_is_judged_by_the_episode(
     short = {name: time[time < 3.2] for name, time in (("sensor", FAST), ("state", SLOW))}
     time = short["sensor"]
     kept = time >= start if start > 0 else time < 3.2 + start
-    (flaw,) = find(short | {"sensor": time[kept]})
-    assert (flaw.kind, flaw.stream) == ("lost ticks", "sensor")
-    assert "about 3 ticks, 9 %" in flaw.message
+    (issue,) = find(short | {"sensor": time[kept]})
+    assert (issue.kind, issue.stream) == ("lost ticks", "sensor")
+    assert "about 3 ticks, 9 %" in issue.message
     long = {"sensor": FAST[200:], "state": SLOW}
     assert find(long) == ()
 
@@ -122,9 +123,9 @@ def test_a_slow_camera_of_a_short_episode_loses_nothing(find: Find) -> None:
 
 def test_frames_that_are_lost_have_a_place(find: Find) -> None:
     burst = np.arange(200, 240, 2)
-    (flaw,) = find({"view View1": np.delete(CAMERA, [5, *burst, *range(300, 600, 30)])})
-    assert flaw.kind == "dropped frames"
-    assert flaw.start_s is not None and flaw.stop_s is not None
-    assert 19.9 <= flaw.start_s < flaw.stop_s <= 23.95
-    assert f"half of them from {flaw.start_s:.2f} to {flaw.stop_s:.2f} s" in flaw.message
-    assert flaw.stop_s - flaw.start_s == pytest.approx(16 * 0.2)  # of 31
+    (issue,) = find({"view View1": np.delete(CAMERA, [5, *burst, *range(300, 600, 30)])})
+    assert issue.kind == "dropped frames"
+    assert issue.start_s is not None and issue.stop_s is not None
+    assert 19.9 <= issue.start_s < issue.stop_s <= 23.95
+    assert f"half of them from {issue.start_s:.2f} to {issue.stop_s:.2f} s" in issue.message
+    assert issue.stop_s - issue.start_s == pytest.approx(16 * 0.2)  # of 31

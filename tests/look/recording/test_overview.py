@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from pipeline.base.config import Params, Source
+from pipeline.base.issue import Issue
 from pipeline.data import open_recordings
 from pipeline.look.recording.overview import RecordingsOverview, survey_recordings
 
@@ -39,13 +40,13 @@ def many(healthy: Path, tmp_path: Path) -> Path:
 def test_formats_of_one_source_need_not_have_the_same_streams(healthy: Path) -> None:
     paths = tuple(str(healthy / name) for name in ("raw", "new", "old", "lerobot"))
     # Only the LeRobot episode has no poses beside its actions.
-    assert survey(Source(name="s", path=paths)).flaws == ()
+    assert survey(Source(name="s", path=paths)).issues == ()
 
 
 def test_healthy_recordings_of_every_format(healthy: Path) -> None:
     names = ("raw", "new", "old")
     found = survey(*(Source(name=name, path=str(healthy / name)) for name in names))
-    assert found.flaws == ()
+    assert found.issues == ()
     assert found.views == ("View1", "View2", "View5") and found.rotation == "rotvec"
     assert [one.source for one in found.summaries] == list(names)
     for one in found.summaries:
@@ -53,8 +54,8 @@ def test_healthy_recordings_of_every_format(healthy: Path) -> None:
         assert one.ticks > 30 and one.vl_rows == -(-one.ticks // 3)
         assert one.duration_s == pytest.approx(one.ticks / 10, abs=0.5)
         assert set(one.frames) == {"View1", "View2", "View5"} and min(one.frames.values()) > 30
-        assert one.readings and one.states and one.instruction
-        assert found.flaws_of(one) == ()
+        assert one.counts["sensor"] and one.counts["state"] and one.instruction
+        assert one.issues == []
 
 
 def test_one_broken_episode_hides_no_other(many: Path) -> None:
@@ -64,11 +65,11 @@ def test_one_broken_episode_hides_no_other(many: Path) -> None:
     assert [one.episode for one in found.summaries] == ["a", "b", "c"]
     assert [one.errors for one in found.summaries] == [0, 1, 0]
     broken = found.summaries[1]
-    assert (broken.ticks, broken.frames, broken.readings, broken.instruction) == (0, {}, 0, None)
-    # The file is the flaw; that its streams are absent follows and is not told again.
-    (flaw,) = found.flaws
-    assert found.flaws_of(broken) == (flaw,) and flaw.severity == "error"
-    assert found.chosen(1) == (1,) and found.chosen(2) == (0, 1) and found.chosen(9) == (0, 1, 2)
+    assert (broken.ticks, broken.counts, broken.instruction) == (0, {}, None)
+    # The file is the issue; that its streams are absent follows and is not told again.
+    (issue,) = found.issues
+    assert broken.issues == [issue] and issue.severity == "error"
+    assert found.choose(1) == (1,) and found.choose(2) == (0, 1) and found.choose(9) == (0, 1, 2)
 
 
 def test_what_most_episodes_of_a_source_have(many: Path) -> None:
@@ -76,9 +77,9 @@ def test_what_most_episodes_of_a_source_have(many: Path) -> None:
 
     def missing() -> tuple[str, str]:
         found = survey(Source(name="s", path=str(many)))
-        (flaw,) = [flaw for flaw in found.flaws if flaw.kind == "missing"]
+        (issue,) = [issue for issue in found.issues if issue.kind == "missing"]
         assert found.summaries[2].warnings == 1
-        return flaw.episode, flaw.stream
+        return issue.episode, issue.stream
 
     assert missing() == ("c", "state")  # its own metadata count them
     pickled = many / "c" / "data.pkl"
@@ -91,8 +92,8 @@ def test_what_most_episodes_of_a_source_have(many: Path) -> None:
 def test_the_same_recording_twice(many: Path) -> None:
     shutil.copytree(many / "a", many / "d")
     found = survey(Source(name="s", path=str(many)), Source(name="t", path=str(many / "b")))
-    first, second = found.flaws
-    assert {flaw.kind for flaw in found.flaws} == {"duplicate recording"}
+    first, second = found.issues
+    assert {issue.kind for issue in found.issues} == {"duplicate recording"}
     assert (first.source, first.episode, second.source, second.episode) == ("s", "d", "t", "b")
     assert first.message.startswith(f"the same recording as a ({many / 'a'}): ")
     assert second.message.startswith(f"the same recording as s/b ({many / 'b'}): ")
@@ -102,27 +103,27 @@ def test_the_same_recording_twice(many: Path) -> None:
 def test_the_same_recording_in_two_formats(shared_data: Path) -> None:
     paths = (str(shared_data / "insertion/new"), str(shared_data / "insertion/raw"))
     found = survey(Source(name="s", path=paths), views=())
-    (flaw,) = [flaw for flaw in found.flaws if flaw.kind == "duplicate recording"]
-    assert flaw.episode == "data_collection_20251108_055533"
-    assert "the same recording as episode_20251108_055533" in flaw.message
-    assert "all values of state are equal, and nothing else was compared" in flaw.message
+    (issue,) = [issue for issue in found.issues if issue.kind == "duplicate recording"]
+    assert issue.episode == "data_collection_20251108_055533"
+    assert "the same recording as episode_20251108_055533" in issue.message
+    assert "all values of state are equal, and nothing else was compared" in issue.message
 
 
 def test_a_recording_without_its_actions_is_still_the_same(many: Path) -> None:
     found = survey(Source(name="s", path=str(many)))
-    assert found.flaws == ()  # equal states with other actions
+    assert found.issues == ()  # equal states with other actions
     shutil.copytree(many / "a", many / "d")
     (many / "d" / "robot_states.npz").unlink()
-    twice = [f for f in survey(Source(name="s", path=str(many))).flaws if "same" in f.message]
-    assert [flaw.episode for flaw in twice] == ["d"]
+    twice = [f for f in survey(Source(name="s", path=str(many))).issues if "same" in f.message]
+    assert [issue.episode for issue in twice] == ["d"]
     assert "all values of action are equal" in twice[0].message
 
 
 def test_real_recordings_in_two_versions(shared_data: Path) -> None:
     # Their motion tells; decoding the videos would tell nothing more.
     found = survey(Source(name="s", path=str(shared_data / "lerobot")), views=())
-    twice = [flaw for flaw in found.flaws if flaw.kind == "duplicate recording"]
-    assert [flaw.episode for flaw in twice] == [
+    twice = [issue for issue in found.issues if issue.kind == "duplicate recording"]
+    assert [issue.episode for issue in twice] == [
         f"cr5_banana_v30_split/episode_{index:06d}" for index in range(5)
     ]
     assert "the same recording as cr5_banana_v21/episode_000000" in twice[0].message
@@ -135,8 +136,8 @@ def test_episodes_that_cannot_be_opened(healthy: Path, tmp_path: Path) -> None:
     (tmp_path / "new" / "bad" / "metadata.json").write_text("{")
     found = survey(Source(name="s", path=str(tmp_path / "new")))
     assert [one.episode for one in found.summaries] == ["good"]
-    (flaw,) = found.flaws
-    assert (flaw.kind, flaw.severity, flaw.episode) == ("unreadable", "error", "bad")
+    (issue,) = found.issues
+    assert (issue.kind, issue.severity, issue.episode) == ("unreadable", "error", "bad")
     assert found.summaries[0].errors == 0
 
 
@@ -150,9 +151,9 @@ def test_episodes_that_meta_lists_and_are_not_there(healthy: Path, tmp_path: Pat
         + line.replace('"episode_index": 0', '"episode_index": 2')
     )
     found = survey(Source(name="s", path=str(root)))
-    (flaw,) = found.flaws
-    assert (flaw.kind, flaw.severity, flaw.source) == ("missing", "warning", "s")
-    assert "episode_000001" in flaw.message and "(2 such episodes in all)" in flaw.message
+    (issue,) = found.issues
+    assert (issue.kind, issue.severity, issue.source) == ("missing", "warning", "s")
+    assert "episode_000001" in issue.message and "(2 such episodes in all)" in issue.message
 
 
 def test_ticks_at_another_rate_than_the_recorded_rows(healthy: Path) -> None:
@@ -160,11 +161,13 @@ def test_ticks_at_another_rate_than_the_recorded_rows(healthy: Path) -> None:
         Source(name="held", path=str(healthy / "lerobot"), action_kind="absolute"),
         Source(name="poses", path=str(healthy / "raw")),
     ]
-    assert survey(*sources[:1]).flaws == survey(*sources[:1], action_hz=None).flaws == ()
+    assert survey(*sources[:1]).issues == survey(*sources[:1], action_hz=None).issues == ()
     for action_hz, fate in ((5, "left out between ticks"), (20, "held")):
-        (flaw,) = [f for f in survey(*sources, action_hz=action_hz).flaws if f.kind == "tick rate"]
-        assert (flaw.severity, flaw.source, flaw.episode) == ("warning", "held", "")
-        assert f"ticks at {action_hz} Hz, recorded at 10 Hz: actions are {fate}" in flaw.message
+        (issue,) = [
+            f for f in survey(*sources, action_hz=action_hz).issues if f.kind == "tick rate"
+        ]
+        assert (issue.severity, issue.source, issue.episode) == ("warning", "held", "")
+        assert f"ticks at {action_hz} Hz, recorded at 10 Hz: actions are {fate}" in issue.message
 
 
 def test_recordings_of_two_robots(healthy: Path, tmp_path: Path) -> None:
@@ -177,19 +180,36 @@ def test_recordings_of_two_robots(healthy: Path, tmp_path: Path) -> None:
         Source(name="two", path=str(other), action_kind="velocity"),
     )
     found = survey(*sources)
-    (flaw,) = [flaw for flaw in found.flaws if flaw.kind == "embodiment"]
-    assert flaw.severity == "error" and "'one'" in flaw.message and "'two'" in flaw.message
+    (issue,) = [issue for issue in found.issues if issue.kind == "embodiment"]
+    assert issue.severity == "error" and "'one'" in issue.message and "'two'" in issue.message
 
 
 def test_the_choice_spreads_over_sound_episodes(healthy: Path) -> None:
     (one,) = survey(Source(name="s", path=str(healthy / "old"))).summaries
-    summaries = [replace(one, episode=str(place)) for place in range(11)]
-    found = RecordingsOverview(tuple(summaries), (), "rotvec", ())
-    assert found.chosen(3) == (0, 5, 10) and found.chosen(1) == (0,)
-    summaries[7] = replace(one, warnings=2)
-    summaries[8] = replace(one, errors=1)
-    summaries[3] = replace(one, warnings=3)
-    found = RecordingsOverview(tuple(summaries), (), "rotvec", ())
-    assert found.chosen(1) == (8,) and found.chosen(2) == (3, 8)
-    assert found.chosen(5) == (0, 3, 7, 8, 10)
-    assert np.array_equal(found.chosen(99), np.arange(11))
+    summaries = [replace(one, episode=str(place), issues=[]) for place in range(11)]
+    found = RecordingsOverview(tuple(summaries), (), "rotvec")
+    assert found.choose(3) == (0, 5, 10) and found.choose(1) == (0,)
+    warning, error = (Issue(severity=how, kind="gap", message="") for how in ("warning", "error"))
+    summaries[7].issues = [warning] * 2
+    summaries[8].issues = [error]
+    summaries[3].issues = [warning] * 3
+    found = RecordingsOverview(tuple(summaries), (), "rotvec")
+    assert found.choose(1) == (8,) and found.choose(2) == (3, 8)
+    assert found.choose(5) == (0, 3, 7, 8, 10)
+    assert np.array_equal(found.choose(99), np.arange(11))
+
+
+def test_issues_count_time_as_the_page_does(healthy: Path) -> None:
+    (one,) = survey(Source(name="s", path=str(healthy / "old"))).summaries
+    gap = Issue(
+        severity="warning",
+        kind="gap",
+        message="",
+        source="s",
+        episode=one.episode,
+        start_s=one.zero + 0.5,
+    )
+    whole = replace(gap, start_s=None)
+    found = RecordingsOverview((one,), (), "rotvec").since_start([gap, whole])
+    assert [issue.start_s for issue in found] == [pytest.approx(0.5), None]
+    assert [issue.stop_s for issue in found] == [None, None]

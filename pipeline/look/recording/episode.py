@@ -1,0 +1,168 @@
+"""A recording -> all of it that can be read, and an issue for each part that cannot.
+
+All times are float64 seconds on the recording's own clock; `EpisodeView.zero` is what pictures and
+tables subtract.
+"""
+
+from collections.abc import Callable, Mapping
+from copy import copy
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TypeVar
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from pipeline.base.config import DataParams
+from pipeline.base.errors import RecordingError
+from pipeline.base.issue import Issue, Severity
+from pipeline.data import CameraStream, RecordedAction, Recording, Stream
+from pipeline.data.timeline import ActionRotation, Timeline, build_timeline
+from pipeline.look.page.blocks import Picture
+
+# What a damaged recording raises: a reader's word, or a disk's.
+BROKEN = (RecordingError, OSError)
+_Part = TypeVar("_Part")
+
+
+@dataclass(frozen=True)
+class EpisodeView:
+    """One recording with everything of it that could be read.
+
+    What could not is None, or absent from `cameras`, and an issue of kind `unreadable` says why.
+    `action` is as recorded, `timeline.action` what the ticks have; `zero` is the first instant of
+    all clocks, `action_rotation` how `timeline` derived actions from poses.
+    """
+
+    recording: Recording
+    timeline: Timeline | None
+    cameras: Mapping[str, CameraStream]
+    sensor: Stream | None
+    state: Stream | None
+    poses: Stream | None
+    action: RecordedAction | None
+    issues: tuple[Issue, ...]
+    zero: float
+    instruction: str | None = None
+    action_rotation: ActionRotation = "rotvec"
+
+    @property
+    def streams(self) -> dict[str, Stream]:
+        """The streams that could be read, by name: sensor, state, poses, action."""
+        streams = {name: getattr(self, name) for name in ("sensor", "state", "poses", "action")}
+        return {name: stream for name, stream in streams.items() if stream is not None}
+
+    @property
+    def clocks(self) -> dict[str, NDArray[np.float64]]:
+        """The times of all that was recorded: `view View1`, …, `sensor`, `state`, …"""
+        cameras = {f"view {view}": camera.time for view, camera in self.cameras.items()}
+        return cameras | {name: stream.time for name, stream in self.streams.items()}
+
+    @property
+    def poses_are_state(self) -> bool:
+        """Whether the poses are columns of the state, so that showing them adds nothing."""
+        if self.poses is None or self.state is None:
+            return False
+        return set(self.poses.channels.names) <= set(self.state.channels.names)
+
+    @property
+    def duration_s(self) -> float:
+        """From the first to the last instant of all clocks; 0 where nothing could be read."""
+        return (
+            max((float(time[-1]) for time in self.clocks.values()), default=self.zero) - self.zero
+        )
+
+    def issue(
+        self, kind: str, stream: str, message: str, *span: float, severity: Severity = "warning"
+    ) -> Issue:
+        """An issue of this episode; `span` is its start and stop, nothing for all of the stream."""
+        start_s, stop_s = span or (None, None)
+        return Issue(
+            severity=severity,
+            kind=kind,
+            message=message,
+            source=self.recording.source,
+            episode=self.recording.id,
+            stream=stream,
+            start_s=start_s,
+            stop_s=stop_s,
+        )
+
+
+# Makes a picture of an episode from a name, a caption and what draws it.
+Draw = Callable[[str, str, Callable[[EpisodeView], Figure]], Picture]
+
+
+def view_episode(recording: Recording, data: DataParams, rotation: ActionRotation) -> EpisodeView:
+    """Whatever of this recording can be read, and its ticks under `data`; no frame is decoded.
+
+    A part that cannot be read is None (no cameras: empty) and becomes an issue `unreadable`,
+    streams that leave no tick an issue `no ticks`; both are errors. Raises nothing for a broken
+    recording, and `ConfigError` where poses need `data.action_hz`.
+    """
+    broken: dict[str, str] = {}
+
+    def attempt(stream: str, read: Callable[[], _Part]) -> _Part | None:
+        try:
+            return read()
+        except BROKEN as error:
+            broken[stream] = str(error)
+            return None
+
+    view = EpisodeView(
+        recording=recording,
+        timeline=None,
+        cameras=attempt("cameras", recording.cameras) or {},
+        sensor=attempt("sensor", recording.sensor),
+        state=attempt("state", recording.state),
+        poses=None,
+        action=attempt("action", recording.action),
+        issues=(),
+        zero=0.0,
+        instruction=attempt("instruction", lambda: recording.instruction),
+        action_rotation=rotation,
+    )
+    # Poses are most often columns of the state, whose issue has said what is wrong.
+    if "state" not in broken:
+        view = replace(view, poses=attempt("poses", recording.poses))
+    issues = _unreadable(view, broken)
+    if view.action is not None or view.poses is not None or not {"action", "state"} & {*broken}:
+        try:
+            view = replace(view, timeline=_timeline(view, data))
+        except RecordingError as error:
+            issues.append(view.issue("no ticks", "ticks", str(error), severity="error"))
+    zero = min((float(time[0]) for time in view.clocks.values()), default=0.0)
+    return replace(view, issues=tuple(issues), zero=zero)
+
+
+def runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """First place of each run of set flags, and one past its last.
+
+    Where a flag stands between an entry and the next, these are a run's first and last entry.
+    """
+    edges = np.flatnonzero(np.diff(flags, prepend=False, append=False)).reshape(-1, 2)
+    return [(int(start), int(stop)) for start, stop in edges]
+
+
+def _unreadable(view: EpisodeView, broken: Mapping[str, str]) -> list[Issue]:
+    """One broken file breaks every stream that is in it: its message stands once."""
+    return [
+        view.issue(
+            "unreadable",
+            ", ".join(stream for stream, reason in broken.items() if reason == message),
+            message,
+            severity="error",
+        )
+        for message in dict.fromkeys(broken.values())
+    ]
+
+
+def _timeline(view: EpisodeView, data: DataParams) -> Timeline:
+    # What was read stands in the place of what would read it again.
+    read = copy(view.recording)
+    read.cameras, read.poses, read.action = (
+        partial(getattr, view, name) for name in ("cameras", "poses", "action")
+    )
+    reuse, rotation = data.vlm_reuse_count, view.action_rotation
+    return build_timeline(read, data.action_hz, reuse, rotation, view.state, view.sensor)

@@ -1,0 +1,383 @@
+"""What the model and the policy get of a recording: samples, the batch, the prompt, its tokens."""
+
+import os
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from pipeline.base.config import Params, VLMParams
+from pipeline.base.digests import ContentDigests
+from pipeline.base.errors import PipelineError, RecordingError
+from pipeline.base.table import Table
+from pipeline.data import Channels
+from pipeline.extract.places import ledger_path
+from pipeline.look.page.blocks import Block, Document, Text, TokenRun, Tokens
+from pipeline.look.page.style import INK, canvas
+from pipeline.look.recording.episode import BROKEN, Draw, EpisodeView
+from pipeline.look.recording.frames import read_frames
+from pipeline.look.recording.streams import Group, group_channels, legend_beside, plot_curves
+from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
+from pipeline.vlm.preparation import Preparer
+from pipeline.vlm.prompt import TokenKind
+
+# Of the picture, as long as its columns are no narrower than the least; and what is beside them. At
+# a page's width its smallest text, 8 points, then is no smaller than 8 pixels.
+_WIDTH_IN, _BESIDE_IN = 10.0, 1.6
+_LEAST_COLUMN_IN, _COLUMN_IN, _PANEL_IN = 1.65, 2.5, 1.15
+_SMALL = 8
+# Characters of a title over the whole width.
+_TITLE = 120
+# In `inspect.output`, where extraction has none yet.
+LEDGER = ".files.sqlite"
+# A change of width over height that is said.
+_STRETCHED = 0.05
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What a policy sees at a tick, and the actions from there on, without padding.
+
+    `frames` (height, width, 3) are by view those of the VL row that the tick reuses. `windows` are
+    by stream, (entry, channel): of `sensor` and `state` the last readings up to the tick, of
+    `action` the chunk that begins at it.
+    """
+
+    tick: int
+    frames: Mapping[str, NDArray[np.uint8]]
+    windows: Mapping[str, NDArray[np.float32]]
+
+
+def sample_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
+    """`inspect.samples` samples of an episode side by side and as a batch, or why there is none."""
+    try:
+        samples = cut_samples(view, params)
+    except BROKEN as error:
+        return [Text(f"No sample can be made: {error}")]
+    lengths = window_lengths(params)
+    return [
+        draw(
+            "samples",
+            f"{len(samples)} training samples side by side: the frames, the sensor and state "
+            f"windows that end at the tick, and the chunk of {lengths['action']} actions that "
+            "begins at it. The first is the episode's first tick, the last its last.",
+            lambda view: draw_samples(view, samples, lengths),
+        ),
+        batch_table(samples, lengths),
+    ]
+
+
+def window_lengths(params: Params) -> dict[str, int]:
+    """Entries of each stream's window, and of the action chunk, in training."""
+    head = params.train_head
+    return {"sensor": head.sensor_window, "state": head.state_window, "action": head.horizon}
+
+
+def cut_samples(view: EpisodeView, params: Params) -> list[Sample]:
+    """At most `inspect.samples` different samples of an episode, as training cuts them.
+
+    In order of time: the first is the episode's first tick, whose windows begin with padding, the
+    last its last, whose chunk is masked past the end; those between are drawn by `inspect.seed`.
+    Raises `RecordingError` where the episode has an error, as it has without ticks, or where a
+    frame cannot be read.
+    """
+    line, lengths = view.timeline, window_lengths(params)
+    errors = [issue.message for issue in view.issues if issue.severity == "error"]
+    if line is None or errors:
+        raise RecordingError(errors[0])
+    last = len(line.time) - 1
+    inner = np.random.default_rng(params.inspect.seed).permutation(np.arange(1, last))
+    ticks = np.unique([0, last, *inner][: params.inspect.samples]).tolist()
+    frames = {
+        name: list(camera.read(line.frames[name][line.vl_row[ticks]].tolist()))
+        for name, camera in view.cameras.items()
+    }
+    streams = {"sensor": (view.sensor, line.sensor_end), "state": (view.state, line.state_end)}
+    return [
+        Sample(
+            tick,
+            {name: row[place] for name, row in frames.items()},
+            {
+                name: stream.values[max(0, ends[tick] - lengths[name]) : ends[tick]].copy()
+                for name, (stream, ends) in streams.items()
+                if stream is not None
+            }
+            | {"action": line.action[tick : tick + lengths["action"]]},
+        )
+        for place, tick in enumerate(ticks)
+    ]
+
+
+def draw_samples(
+    view: EpisodeView, samples: Sequence[Sample], lengths: Mapping[str, int]
+) -> Figure:
+    """The samples side by side, a column each: frames, windows, action chunk.
+
+    Windows end at their tick; hatched is what the episode had not recorded yet, and the steps of a
+    chunk that lie past its end and are masked. States are drawn as what they changed since the
+    first of the window.
+    """
+    line = view.timeline
+    assert line is not None
+    channels: dict[str, Channels] = {name: one.channels for name, one in view.streams.items()}
+    channels["action"] = line.action_channels
+    rows = [
+        (name, group) for name in samples[0].windows for group in group_channels(channels[name])
+    ]
+    views = list(samples[0].frames)
+    column = (_WIDTH_IN - _BESIDE_IN) / len(samples)
+    column = min(max(column, _LEAST_COLUMN_IN), _COLUMN_IN)
+    shapes = [samples[0].frames[name].shape for name in views]
+    heights = [*(column * shape[0] / shape[1] for shape in shapes), *[_PANEL_IN] * len(rows)]
+    figure = canvas(column * len(samples) + _BESIDE_IN, sum(heights) + 1.8)
+    grid = {"height_ratios": heights}
+    axes = figure.subplots(
+        len(heights), len(samples), squeeze=False, sharey="row", gridspec_kw=grid
+    )
+    for axis, sample in zip(axes[0], samples, strict=True):
+        axis.set_title(_sample_title(view, sample.tick), fontsize=_SMALL)
+    for line_axes, name in zip(axes, views, strict=False):
+        for axis, sample in zip(line_axes, samples, strict=True):
+            axis.imshow(sample.frames[name])
+            axis.set(xticks=[], yticks=[])
+            axis.grid(visible=False)
+        line_axes[0].set_ylabel(name, fontsize=_SMALL)
+    for line_axes, (name, group) in zip(axes[len(views) :], rows, strict=True):
+        values = [sample.windows[name][:, group.indices] for sample in samples]
+        _draw_row(line_axes, name, group, values, lengths[name])
+    episode = view.recording.id.split("/")[-1]
+    figure.suptitle(f"{episode}\n“{view.instruction}”"[:_TITLE], fontsize=9)
+    return figure
+
+
+def batch_table(samples: Sequence[Sample], lengths: Mapping[str, int]) -> Table:
+    """What of each window and chunk is real, a line a sample."""
+    streams = list(samples[0].windows)
+    rows = [
+        [sample.tick, *(f"{len(sample.windows[name])} of {lengths[name]}" for name in streams)]
+        for sample in samples
+    ]
+    caption = (
+        "The same samples as one batch: how many readings and steps are real. Windows are padded "
+        "with zeros on the left before the episode's start; chunks are masked past its end and "
+        "count for no loss there."
+    )
+    heads = [f"{name} {'steps' if name == 'action' else 'readings'}" for name in streams]
+    return Table(["tick", *heads], rows, caption)
+
+
+def _draw_row(
+    axes: Sequence[Axes], name: str, group: Group, windows: Sequence[NDArray[Any]], length: int
+) -> None:
+    """The panels of one group of channels, a sample each, of one range of values and colours."""
+    ahead = name == "action"
+    start, stop = (0.0, float(length)) if ahead else (0.5 - length, 0.5)
+    limits = np.percentile(np.concatenate(windows), (1, 99.5)) if group.profile else (0, 1)
+    for axis, real in zip(axes, windows, strict=True):
+        edge = float(len(real)) if ahead else 0.5 - len(real)
+        if len(real) < length:
+            absent = (edge, stop) if ahead else (start, edge)
+            axis.axvspan(*absent, facecolor="none", edgecolor=INK, hatch="//", lw=0, alpha=0.35)
+        if group.profile:
+            extent = (edge, stop, len(group.indices) - 0.5, -0.5)
+            axis.imshow(real.T, aspect="auto", extent=extent, vmin=limits[0], vmax=limits[1])
+        elif ahead:
+            # The last is held to the end, under the hatch where it is masked.
+            at = np.array([*range(len(real)), length], np.float64)
+            plot_curves(axis, at, np.concatenate([real, real[-1:]]), group.names, held=True)
+        else:
+            # States lie far apart and move little within a window.
+            shown = real - real[0] if name == "state" else real
+            plot_curves(axis, np.arange(1.0 - len(real), 1.0), shown, group.names)
+        axis.set_xlim(start, stop)
+        axis.xaxis.set_major_locator(MaxNLocator(3, integer=True))
+        axis.tick_params(labelsize=_SMALL)
+    label = f"{name}\n{group.label}" + (", depth" if group.profile else "")
+    label += "\nchange since the\nwindow began" if name == "state" else ""
+    axes[0].set_ylabel(label, fontsize=_SMALL)
+    along = "steps ahead" if ahead else "readings before the tick"
+    axes[(len(axes) - 1) // 2].set_xlabel(along, fontsize=_SMALL)
+    if len(group.names) > 1 and not group.profile:
+        # The last sample's window is the fullest: a single reading has a marker, not a line.
+        legend_beside(axes[-1], fontsize=_SMALL)
+
+
+def _sample_title(view: EpisodeView, tick: int) -> str:
+    """What tells a sample from the others, above its column."""
+    line = view.timeline
+    assert line is not None
+    row = line.vl_row[tick]
+    old = tick - int(np.argmax(line.vl_row == row))
+    newest = max((time[row] for time in line.frame_time.values()), default=None)
+    age = "" if newest is None else f"\nnewest frame {1000 * (line.time[tick] - newest):.0f} ms old"
+    return (
+        f"tick {tick} of {len(line.time)}\nat {line.time[tick] - view.zero:.2f} s\n"
+        f"reuses VL row {row},\n{old} {'tick' if old == 1 else 'ticks'} old{age}"
+    )
+
+
+class PromptToken(NamedTuple):
+    """One token of the prompt as the model gets it; `view` is an image token's camera."""
+
+    text: str
+    kind: TokenKind
+    view: str | None = None
+
+
+@dataclass(frozen=True)
+class PromptView:
+    """The prompt of one VL row: as text before image tokens are repeated, and as tokens.
+
+    `pixels` (height, width) are those that each image has for the model, `recorded` by view those
+    that its frames have.
+    """
+
+    text: str
+    tokens: tuple[PromptToken, ...]
+    pixels: tuple[int, int]
+    recorded: Mapping[str, tuple[int, ...]]
+
+    @property
+    def image_tokens(self) -> dict[str, int]:
+        """How many there are by view, in the order of the prompt."""
+        return dict(Counter(token.view for token in self.tokens if token.view is not None))
+
+    @property
+    def special(self) -> dict[str, int]:
+        """How often each special token stands there, the image's included, by its name."""
+        return dict(Counter(token.text for token in self.tokens if token.kind != "text"))
+
+
+def prompt_blocks(view: EpisodeView, params: Params, views: Sequence[str]) -> list[Block]:
+    """The prompt of the episode's first VL row, and the spec of the features of these views."""
+    try:
+        spec = remembered_spec(params, views)
+    except PipelineError as error:
+        return [
+            Text(
+                "Neither the prompt nor the feature spec can be shown: "
+                f"{str(error).rstrip('.')}. Name a checkpoint that is here with "
+                "`--set vlm.checkpoint=FOLDER`; the demo's is written by `python -m stages.demo`."
+            )
+        ]
+    try:
+        blocks = _token_blocks(view_prompt(view, params.vlm, spec))
+    except PipelineError as error:
+        blocks = [Text(f"The prompt cannot be shown: {error}")]
+    return [*blocks, Document("Feature spec: what decides what a feature is", spec.attrs())]
+
+
+def view_prompt(view: EpisodeView, vlm: VLMParams, spec: FeatureSpec) -> PromptView:
+    """The prompt of the episode's first VL row.
+
+    Loads the checkpoint's tokenizer and settings, no weight. Raises `VLMError` where the checkpoint
+    is not there or the instruction holds a control token, and `RecordingError` where the episode
+    has no tick, no instruction or a frame that cannot be decoded.
+    """
+    if view.instruction is None or view.timeline is None:
+        raise RecordingError(f"{view.recording.path}: has no instruction to read, or no tick")
+    shown, broken = read_frames(view, [0])
+    if broken:
+        raise RecordingError(broken[0].message)
+    frames = {name: row[0] for name, row in shown.items()}
+    preparer = Preparer(vlm, spec)
+    prepared = preparer.prepare(view.instruction, frames)
+    layout = prepared.layout
+    size = layout.grid[0] * layout.grid[1]
+    views = {
+        place: name for name, start in layout.image_starts for place in range(start, start + size)
+    }
+    tokens = tuple(
+        PromptToken(*preparer.describe(token), views.get(place))
+        for place, token in enumerate(prepared.token_ids.tolist())
+    )
+    recorded = {name: frame.shape[:2] for name, frame in frames.items()}
+    return PromptView(prepared.prompt, tokens, spec.image_size, recorded)
+
+
+def remembered_spec(params: Params, views: Sequence[str]) -> FeatureSpec:
+    """The spec of features that `params` give for these views.
+
+    A checkpoint is read whole for its digest, which takes seconds a gigabyte, and after that only
+    where a file of it has changed: digests are remembered in the ledger of `digest_ledger`. Raises
+    `VLMError` where the checkpoint is not there or incomplete.
+    """
+    with (
+        closing(ContentDigests(digest_ledger(params))) as digests,
+        tqdm(desc="digest of the checkpoint", unit="file", disable=None, leave=False) as bar,
+    ):
+
+        def digest(path: Path) -> str:
+            bar.update()
+            return digests.of(path)
+
+        return feature_spec(params.vlm, params.extract.dtype, views, digest)
+
+
+def digest_ledger(params: Params) -> Path:
+    """The ledger beside `extract.store` where extraction keeps one, else one in `inspect.output`.
+
+    Looking makes no file beside stores: whoever only looks may have none, or may not write there.
+    """
+    shared = ledger_path(params.extract.store)
+    if shared.is_file() and os.access(shared, os.W_OK) and os.access(shared.parent, os.W_OK):
+        return shared
+    return params.inspect.output / LEDGER
+
+
+def describe_stretch(recorded: tuple[int, ...], pixels: tuple[int, int]) -> str | None:
+    """How a frame (height, width) is drawn out for the model; None for less than a twentieth."""
+    wider = pixels[1] / pixels[0] / (recorded[1] / recorded[0])
+    more = max(wider, 1 / wider) - 1
+    return f"{more:.0%} in {'width' if wider > 1 else 'height'}" if more > _STRETCHED else None
+
+
+def fold_tokens(tokens: Sequence[PromptToken]) -> list[TokenRun]:
+    """Text as one run, special tokens one by one, those of an image folded to a count."""
+    folded: list[TokenRun] = []
+    for (kind, view), like in groupby(tokens, lambda token: (token.kind, token.view)):
+        texts = [token.text for token in like]
+        if kind == "image":
+            folded.append(TokenRun(texts[0], kind, f"× {len(texts):,}, {view}"))
+        else:
+            texts = texts if kind == "special" else ["".join(texts)]
+            folded += [TokenRun(text, kind) for text in texts]
+    return folded
+
+
+def _token_blocks(prompt: PromptView) -> list[Block]:
+    images, pixels = sum(prompt.image_tokens.values()), _size(prompt.pixels)
+    sizes = [
+        (name, _size(size), pixels, describe_stretch(size, prompt.pixels), count)
+        for name, count in prompt.image_tokens.items()
+        for size in [prompt.recorded[name]]
+    ]
+    return [
+        Text(
+            f"{len(prompt.tokens):,} tokens: {images:,} of images, {len(prompt.tokens) - images:,} "
+            f"others. Each image is {pixels} pixels for the model. Attention is "
+            "causal: a token sees only what stands before it."
+        ),
+        Tokens(fold_tokens(prompt.tokens)),
+        Table(
+            ["view", "recorded [pixels]", "for the model [pixels]", "drawn out", "image tokens"],
+            sizes,
+            "Image tokens by view; sizes are height × width, the model's those of "
+            "`vlm.image_resize_height` and `vlm.image_resize_width`",
+        ),
+        Table(["token", "times"], list(prompt.special.items()), "Special tokens by name"),
+    ]
+
+
+def _size(size: tuple[int, ...]) -> str:
+    return f"{size[0]} × {size[1]}"

@@ -1,0 +1,235 @@
+"""What was felt and how the robot moved: the pictures of sensor, state, poses and actions."""
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from pipeline.base.channels import PROFILE_CHANNELS, unnumbered
+from pipeline.base.config import Params
+from pipeline.data import Channels, Stream
+from pipeline.data.timeline import last_at
+from pipeline.look.page.blocks import Block
+from pipeline.look.page.style import PALETTE, canvas
+from pipeline.look.recording.clocks import Clock
+from pipeline.look.recording.contact import RULE, Contact, contacts
+from pipeline.look.recording.episode import Draw, EpisodeView
+
+CONTACT_COLOUR = "#E69F00"
+_LINES = ("-", "--", ":")
+_WIDTH_IN, _PANEL_IN, _SMALL_IN, _IMAGE_IN = 10.0, 1.75, 1.0, 2.6
+# Of the span of a group: where its channels move less than this, their changes are drawn.
+_STANDS_STILL = 0.2
+# Readings from which a curve is a bitmap in the page, and columns of an image.
+_BITMAP, _COLUMNS = 5000, 1200
+# Seconds that an image covers at least.
+_LEAST_S = 1e-3
+
+
+class Group(NamedTuple):
+    """Channels that one panel shows: those of one unit, or one quantity over place.
+
+    `profile` is what the names of the depths of an A-scan and the like have in common, else ''.
+    """
+
+    profile: str
+    unit: str
+    indices: list[int]
+    names: list[str]
+
+    @property
+    def label(self) -> str:
+        """Name, where there is one for all, and unit as an axis says them."""
+        name = self.profile or (self.names[0] if len(self.names) == 1 else "")
+        return f"{name} [{self.unit}]".strip() if self.unit else name
+
+
+def group_channels(channels: Channels) -> list[Group]:
+    """The channels by unit, in the order in which they come; then profiles; grippers are apart."""
+    kinds = list(zip(map(unnumbered, channels.names), channels.units, strict=True))
+    counts = Counter(kinds)
+    groups: dict[tuple[str, str, bool], Group] = {}
+    for index, (name, (stem, unit)) in enumerate(zip(channels.names, kinds, strict=True)):
+        profile = stem.replace("_#", "") if counts[stem, unit] >= PROFILE_CHANNELS else ""
+        key = profile, unit, "gripper" in name.lower()
+        group = groups.setdefault(key, Group(profile, unit, [], []))
+        group.indices.append(index)
+        group.names.append(name)
+    return sorted(groups.values(), key=lambda group: bool(group.profile))
+
+
+def sensor_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
+    """The picture of the sensor, contact marked; empty without one."""
+    if view.sensor is None:
+        return []
+    spans = ", ".join(
+        f"{start - view.zero:.2f}–{stop - view.zero:.2f} s" for start, stop in contacts(view)
+    )
+    touching = f"Contact, by the force alone: {spans}." if spans else "No contact in the force."
+    caption = (
+        f"The sensor's {len(view.sensor.channels.names):,} channels over time, contact shaded. "
+        f"{touching} {RULE}"
+    )
+    return [draw("sensor", caption, draw_sensor)]
+
+
+def motion_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
+    """The picture of state, poses and actions; empty without any."""
+    if not {"state", "poses", "action"} & view.streams.keys():
+        return []
+    caption = "State of the robot as recorded, by unit, and the actions at the ticks."
+    return [draw("motion", caption, draw_motion)]
+
+
+def draw_sensor(view: EpisodeView) -> Figure:
+    """Curves of the sensor by unit above, a profile such as the A-scan as an image below.
+
+    The spans in contact are shaded in all panels, over one axis of time.
+    """
+    assert view.sensor is not None
+    groups = group_channels(view.sensor.channels)
+    figure, axes = _panels(groups)
+    for axis, group in zip(axes, groups, strict=True):
+        (_draw_profile if group.profile else _draw_curves)(axis, view.sensor, group, view.zero)
+        _mark_contacts(axis, contacts(view), view.zero, bool(group.profile))
+        if not group.profile:
+            legend_beside(axis)
+    return figure
+
+
+def draw_motion(view: EpisodeView) -> Figure:
+    """State and poses in panels by unit, and below them the actions, held from tick to tick.
+
+    Where channels of a panel lie so far apart that none would be seen to move, it shows what they
+    changed since the first reading, and the legend where each began.
+    """
+    line = view.timeline
+    streams: dict[str, Stream | None] = {
+        "state": view.state,
+        "poses": None if view.poses_are_state else view.poses,
+        "actions as recorded": view.action if line is None else None,
+        "actions at the ticks": line and Stream(line.action_channels, line.time, line.action),
+    }
+    panels = [
+        (title, stream, group)
+        for title, stream in streams.items()
+        if stream is not None
+        for group in group_channels(stream.channels)
+    ]
+    figure, axes = _panels([group for _, _, group in panels])
+    titled = ""
+    for axis, (title, stream, group) in zip(axes, panels, strict=True):
+        held = title.startswith("actions")
+        _draw_curves(axis, stream, group, view.zero, held=held, changes=not held)
+        axis.set_title(title if title != titled else "", loc="left")
+        legend_beside(axis)
+        titled = title
+    return figure
+
+
+def plot_curves(
+    axis: Axes,
+    time: NDArray[np.float64],
+    values: NDArray[np.floating],
+    labels: Sequence[str],
+    held: bool = False,
+) -> None:
+    """Values (point, channel) as a curve a channel, no two of the first 18 alike.
+
+    `held` holds each value until the next. Long curves are a bitmap in the page.
+    """
+    for index, label in enumerate(labels):
+        axis.plot(
+            time,
+            values[:, index],
+            color=PALETTE[index % len(PALETTE)],
+            ls=_LINES[index // len(PALETTE) % len(_LINES)],
+            lw=1.3,
+            # A label that begins with an underscore would drop out of the legend.
+            label=f" {label}" if label.startswith("_") else label,
+            drawstyle="steps-post" if held else "default",
+            # A single reading makes no line.
+            marker="." if len(time) == 1 else None,
+            rasterized=len(time) > _BITMAP,
+        )
+
+
+def legend_beside(axis: Axes, of: Axes | None = None, fontsize: float = 8) -> None:
+    """The legend of a panel, or of another one, right of it; in columns where it is long."""
+    handles, labels = (of or axis).get_legend_handles_labels()
+    axis.legend(
+        handles, labels, loc="center left", bbox_to_anchor=(1.005, 0.5), fontsize=fontsize,
+        ncols=1 + len(labels) // 8, handlelength=1.6,
+    )  # fmt: skip
+
+
+def _panels(groups: Sequence[Group]) -> tuple[Figure, list[Axes]]:
+    heights = [
+        _IMAGE_IN if group.profile else _SMALL_IN if len(group.names) == 1 else _PANEL_IN
+        for group in groups
+    ]
+    figure = canvas(_WIDTH_IN, sum(heights) + 0.5)
+    axes = figure.subplots(
+        len(groups), 1, squeeze=False, sharex=True, gridspec_kw={"height_ratios": heights}
+    )[:, 0]
+    axes[-1].set_xlabel("time since the recording began [s]")
+    figure.align_ylabels(axes)
+    return figure, list(axes)
+
+
+def _draw_curves(
+    axis: Axes, stream: Stream, group: Group, zero: float, held: bool = False, changes: bool = False
+) -> None:
+    """Curves that break where the clock has a gap; of what moves little, its changes."""
+    values = stream.values[:, group.indices].astype(np.float64)
+    labels, unit = group.names, group.label
+    if changes and np.ptp(values, axis=0).max() < _STANDS_STILL * np.ptp(values):
+        labels = [f"{name} from {at:.4g}" for name, at in zip(labels, values[0], strict=True)]
+        values, unit = values - values[0], f"change {unit}".strip()
+    breaks = np.flatnonzero(np.diff(stream.time) >= Clock("", "stream", stream.time).shortest_gap_s)
+    time = np.insert(stream.time, breaks + 1, stream.time[breaks + 1])
+    plot_curves(axis, time - zero, np.insert(values, breaks + 1, np.nan, axis=0), labels, held)
+    axis.set_ylabel(unit)
+
+
+def _draw_profile(axis: Axes, stream: Stream, group: Group, zero: float) -> None:
+    """A channel of the profile a line, the first on top, in colours that a few extremes keep.
+
+    A column shows the last reading before it, and nothing where the clock has a gap.
+    """
+    clock = Clock("", "stream", stream.time)
+    stop = max(stream.time[-1] + np.nan_to_num(clock.step_s), stream.time[0] + _LEAST_S)
+    columns = np.linspace(stream.time[0], stop, _COLUMNS, endpoint=False)
+    shown = last_at(stream.time, columns)
+    image = stream.values[shown][:, group.indices].T
+    image[:, columns - stream.time[shown] >= clock.shortest_gap_s] = np.nan
+    low, high = np.nanpercentile(image, (1, 99.5))
+    drawn = axis.imshow(
+        image,
+        vmin=low,
+        vmax=high if high > low else low + 1,
+        aspect="auto",
+        extent=(stream.time[0] - zero, stop - zero, len(image) - 0.5, -0.5),
+    )
+    axis.grid(visible=False)
+    axis.set_ylabel(f"depth: channel of {group.profile}")
+    # Beside the panel: taken from it, its time axis would no longer stand below the curves'.
+    bar = axis.inset_axes((1.01, 0.0, 0.015, 1.0))
+    unit = f"[{group.unit}]" if group.unit else "(no unit)"
+    axis.figure.colorbar(drawn, cax=bar, label=f"{group.profile} {unit}", extend="both")
+
+
+def _mark_contacts(axis: Axes, spans: Sequence[Contact], zero: float, over_image: bool) -> None:
+    """Shaded over curves; over an image two edges, which hide nothing of it."""
+    for number, (start, stop) in enumerate(spans):
+        if over_image:
+            for edge in (start - zero, stop - zero):
+                axis.axvline(edge, color=CONTACT_COLOUR, lw=1.4, ls="--")
+        else:
+            label = "in contact" if number == 0 else None
+            edges = start - zero, stop - zero
+            axis.axvspan(*edges, color=CONTACT_COLOUR, alpha=0.22, lw=0, label=label)

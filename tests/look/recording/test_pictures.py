@@ -1,0 +1,291 @@
+"""What pictures of a recording show lies where and when it was recorded."""
+
+import io
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from PIL import Image
+
+from pipeline.base.channels import unnumbered
+from pipeline.base.config import Params
+from pipeline.base.table import Table
+from pipeline.data import Channels, Stream
+from pipeline.look.page.blocks import Picture, Text
+from pipeline.look.recording.channels import statistics_blocks
+from pipeline.look.recording.clocks import Clock, clock_blocks, clock_table, draw_lanes
+from pipeline.look.recording.contact import contacts
+from pipeline.look.recording.episode import EpisodeView
+from pipeline.look.recording.frames import camera_blocks, draw_views
+from pipeline.look.recording.streams import (
+    draw_motion,
+    draw_sensor,
+    group_channels,
+    motion_blocks,
+    sensor_blocks,
+)
+
+PARAMS = Params.model_validate(
+    {"data": {"sources": [{"name": "s", "path": "."}]}, "vlm": {"checkpoint": "none"}}
+)
+Felt = Callable[..., EpisodeView]
+Words = Callable[[Figure], str]
+
+
+def test_views_are_rows_and_ticks_columns_with_the_age_of_each_frame(view: EpisodeView) -> None:
+    assert view.timeline is not None
+    figure = draw_views(view, [3, 5])
+    assert [axis.get_ylabel() for axis in figure.axes[::2]] == ["View1", "View2", "View5"]
+    assert [len(axis.images) for axis in figure.axes] == [1] * 6
+    at = view.timeline.time[3]
+    clock = view.cameras["View1"].time
+    age = at - clock[clock <= at][-1]
+    assert figure.axes[0].get_xlabel() == f"{1000 * age:.0f} ms old"
+
+
+def test_a_view_that_is_not_shown_is_said(copied, look, draw) -> None:
+    folder = copied("raw")
+    for path in (folder / "View2").iterdir():
+        path.write_bytes(b"no picture")
+    text, _ = camera_blocks(look(folder), draw, PARAMS)
+    assert isinstance(text, Text) and text.words.startswith("view View2 is not shown: ")
+
+
+def test_contact_is_marked_over_the_force_and_over_the_scan(view: EpisodeView) -> None:
+    figure = draw_sensor(view)
+    force, scan = figure.axes[:2]
+    assert force.get_ylabel() == "force [N]"
+    start, stop = contacts(view)[0]
+    span = force.patches[0]
+    assert isinstance(span, Rectangle)
+    edges = (start - view.zero, stop - view.zero)
+    assert (span.get_x(), span.get_x() + span.get_width()) == pytest.approx(edges)
+    assert [line.get_xdata()[0] for line in scan.lines[:2]] == pytest.approx(edges)
+    assert force.get_xlim() == scan.get_xlim()
+    (bar,) = scan.child_axes
+    assert bar.get_ylabel() == "aline (no unit)"
+    left, right, bottom, top = scan.images[0].get_extent()
+    assert view.sensor is not None
+    assert left == pytest.approx(view.sensor.time[0] - view.zero)
+    assert right == pytest.approx(view.sensor.time[-1] - view.zero, abs=0.01)
+    assert (bottom, top) == (1024.5, -0.5)
+
+
+def test_another_sensor_is_curves_by_unit(felt: Felt) -> None:
+    time = np.arange(100) / 100
+    names = ("fx", "fy", "fz", "tx", "ty", "tz")
+    wrench = felt(
+        names, ("N",) * 3 + ("Nm",) * 3, time, np.random.default_rng(0).normal(size=(100, 6))
+    )
+    figure = draw_sensor(wrench)
+    assert [axis.get_ylabel() for axis in figure.axes] == ["[N]", "[Nm]"]
+    assert [len(axis.lines) for axis in figure.axes] == [3, 3]
+    one = draw_sensor(felt(("pressure",), ("",), time[:1], np.ones((1, 1))))
+    assert one.axes[0].get_ylabel() == "pressure"
+
+
+def test_names_are_written_as_they_are(view: EpisodeView) -> None:
+    names = ("cost_$5_$6", "$\\foo$", "<b>x</b>", "_hidden", "100%")
+    time = np.arange(9) / 9
+    stream = Stream(Channels(names, ("$\\bar$",) * 5), time, np.eye(9, 5, dtype=np.float32))
+    named = replace(
+        view, sensor=stream, state=stream, poses=None, action=None, timeline=None, cameras={}
+    )
+    legends = [axis.get_legend() for axis in draw_motion(named).axes]
+    said = {text.get_text().strip() for one in legends if one for text in one.get_texts()}
+    assert said == set(names)
+    for figure in (draw_motion(named), draw_sensor(named)):
+        svg, _ = saved(figure)
+        assert b"foo$" in svg or b"bar$" in svg
+
+
+def test_one_reading_of_a_profile_is_drawn_at_a_time_of_day(felt: Felt) -> None:
+    names = ("force", *(f"aline_{at}" for at in range(40)))
+    one = replace(felt(names, ("N", *[""] * 40), np.array([1.767e9]), np.ones((1, 41))), zero=0.0)
+    figure = draw_sensor(one)
+    figure.draw_without_rendering()
+    left, right, _, _ = figure.axes[1].images[0].get_extent()
+    assert right - left == pytest.approx(1e-3, rel=0.01)
+
+
+def test_a_scan_is_blank_where_its_clock_has_a_gap_and_nowhere_else(felt: Felt) -> None:
+    names = ("force", *(f"aline_{at}" for at in range(40)))
+    time = np.arange(1000) / 100
+    time[600:] += 5
+
+    def image(time: np.ndarray) -> np.ndarray:
+        values = np.tile(np.arange(len(time))[:, None], 41)
+        view = replace(felt(names, ("N", *[""] * 40), time, values), timeline=None)
+        return np.asarray(draw_sensor(view).axes[1].images[0].get_array(), float)
+
+    gap = np.isnan(image(time)[0])
+    assert gap.mean() == pytest.approx(5 / 15, abs=0.01) and (np.diff(gap) != 0).sum() == 2
+    bursts = np.repeat(np.arange(10), 130) + 1.767e9
+    assert np.isfinite(image(bursts)).all()
+
+
+def test_frames_of_any_size_stand_side_by_side(copied, look) -> None:
+    folder = copied("raw")
+    sizes = {"View1": (224, 126), "View2": (64, 48), "View5": (48, 64)}
+    for name, size in sizes.items():
+        for path in (folder / name).rglob("*.jpg"):
+            Image.open(path).resize(size).save(path)
+    figure = draw_views(look(folder), [0, 3])
+    figure.draw_without_rendering()
+    for axis, (wide, high) in zip(figure.axes[::2], sizes.values(), strict=True):
+        assert axis.images[0].get_size() == (high, wide)
+        box = axis.get_window_extent()
+        assert box.height / box.width == pytest.approx(high / wide, rel=0.02)
+
+
+@pytest.fixture
+def draw(view: EpisodeView) -> Callable[..., Picture]:
+    """Makes pictures of that episode."""
+    return lambda name, caption, draw: Picture(name, caption, lambda: draw(view))
+
+
+def test_motion_says_from_where_each_joint_moved_and_holds_actions(view: EpisodeView) -> None:
+    figure = draw_motion(view)
+    labels = [axis.get_ylabel() for axis in figure.axes]
+    assert labels == [
+        "change [deg]", "change [mm]", "[mm]", "[deg]", "gripper",
+    ]  # fmt: skip
+    titles = [axis.get_title(loc="left") for axis in figure.axes]
+    assert titles == ["state", "", "actions at the ticks", "", ""]
+    assert view.state is not None
+    first = view.state.values[0, 0]
+    assert figure.axes[0].lines[0].get_label() == f"joint_1 from {first:.4g}"
+    assert figure.axes[0].lines[0].get_ydata()[0] == 0
+    assert figure.axes[2].lines[0].get_drawstyle() == "steps-post"
+    assert np.isnan(figure.axes[0].lines[0].get_ydata()).sum() == 1  # the gap of its clock
+
+
+def test_long_curves_are_bitmaps_that_keep_every_extreme(felt: Felt) -> None:
+    time = np.arange(100_000) / 1000
+    values = np.zeros((len(time), 1))
+    values[12_345], values[80_000] = 7, -3
+    (line,) = draw_sensor(felt(("force",), ("N",), time, values)).axes[0].lines
+    assert line.get_rasterized()
+    assert (max(line.get_ydata()), min(line.get_ydata())) == (7, -3)
+
+
+def test_lanes_show_every_clock_once_with_its_gap(view: EpisodeView) -> None:
+    whole, near = draw_lanes(view).axes
+    names = [label.get_text() for label in whole.get_yticklabels()]
+    assert names == ["sensor", "state", "View1", "View2", "View5", "VL rows", "ticks"]
+    assert view.state is not None
+    (gap,) = Clock("state", "stream", view.state.time).gaps
+    for axis in (whole, near):
+        (gaps,) = [one for one in axis.collections if one.get_hatch() and one.get_paths()]
+        (box,) = (path.get_extents() for path in gaps.get_paths())
+        assert (box.x0, box.x1) == pytest.approx((gap.start_s - view.zero, gap.stop_s - view.zero))
+    assert near.get_xlim()[0] < gap.start_s - view.zero < near.get_xlim()[1]
+
+
+def test_many_gaps_are_one_artist_and_the_longest_have_words(felt: Felt) -> None:
+    time = np.cumsum(np.where(np.arange(4000) % 40, 0.1, 0.5 + np.arange(4000) / 4000))
+    view = felt(("force",), ("N",), time, np.zeros((4000, 1)))
+    alone = replace(view, timeline=None, state=None, poses=None, cameras={})
+    whole, _ = draw_lanes(alone).axes
+    (drawn,) = [one for one in whole.collections if one.get_hatch()]
+    assert len(drawn.get_paths()) == 99 and not whole.patches[1:]
+    said = [text.get_text() for text in whole.texts if text.get_text().endswith(" s")]
+    assert len(said) == 8 and min(said) >= "1.4 s"
+
+
+def test_lines_lead_from_the_frame_to_its_row_and_brackets_to_its_ticks(view: EpisodeView) -> None:
+    assert view.timeline is not None
+    line, (_, near) = view.timeline, draw_lanes(view).axes
+    said = [text.get_text() for text in near.texts if "row" in text.get_text()]
+    row = int(said[0].split()[1].rstrip(","))
+    took = [
+        one for one in near.collections
+        if isinstance(one, LineCollection) and str(one.get_label()).startswith("took")
+    ]  # fmt: skip
+    assert [one.get_label() for one in took] == ["took View1", "took View2", "took View5"]
+    ends = [tuple(segment[0]) for segment in took[0].get_segments()]
+    assert any(x == pytest.approx(line.frame_time["View1"][row] - view.zero) for x, _ in ends)
+    served = line.time[line.vl_row == row] - view.zero
+    brackets = [one.get_xdata() for one in near.lines if len(one.get_xdata()) == 4]
+    assert any(
+        (one[0], one[-1]) == (pytest.approx(served[0]), pytest.approx(served[-1]))
+        for one in brackets
+    )
+
+
+def test_a_long_clock_has_as_many_strokes_as_there_is_room_for(felt: Felt) -> None:
+    time = np.arange(3600 * 650) / 650
+    long = felt(("force",), ("N",), time, np.zeros((len(time), 1)))
+    alone = replace(long, timeline=None, state=None, poses=None, cameras={})
+    whole, _ = draw_lanes(alone).axes
+    (strokes,) = [one for one in whole.collections if isinstance(one, LineCollection)]
+    assert 1000 < len(strokes.get_segments()) <= 1501
+
+
+def test_lanes_without_ticks_are_drawn(view: EpisodeView) -> None:
+    whole, _ = draw_lanes(replace(view, timeline=None)).axes
+    assert len(whole.get_yticks()) == 5
+
+
+def test_without_streams_there_is_nothing_to_show(view: EpisodeView, draw) -> None:
+    empty = replace(
+        view, timeline=None, cameras={}, sensor=None, state=None, poses=None, action=None
+    )
+    for blocks in (camera_blocks, sensor_blocks, motion_blocks, clock_blocks, statistics_blocks):
+        assert blocks(empty, draw, PARAMS) == []
+
+
+@pytest.mark.parametrize(
+    ("jitter_s", "unit"), [(0.027, "ms"), (9.2e-4, "µs"), (1.5, "s"), (0.0, "µs")]
+)
+def test_jitter_is_told_in_a_unit_of_its_size(
+    view: EpisodeView, jitter_s: float, unit: str
+) -> None:
+    steps = 10.0 + jitter_s * np.tile([1, -1], 50)
+    table = clock_table(view, [Clock("state", "stream", np.cumsum(steps))])
+    assert isinstance(table, Table)
+    place = table.columns.index(f"jitter [{unit}]")
+    size = {"s": 1, "ms": 1e-3, "µs": 1e-6}[unit]
+    assert table.rows[0][place] == pytest.approx(jitter_s / size, rel=0.02, abs=1e-3)
+
+
+def test_channels_of_one_unit_share_a_panel_and_profiles_and_grippers_are_apart() -> None:
+    names = (*(f"aline_{at:04d}" for at in range(40)), "force", "gripper", "joint_0", "pose_x")
+    groups = group_channels(Channels(names, (*[""] * 40, "N", "", "deg", "deg")))
+    assert [(one.label, len(one.indices), one.profile) for one in groups] == [
+        ("force [N]", 1, ""),
+        ("gripper", 1, ""),
+        ("[deg]", 2, ""),
+        ("aline", 40, "aline"),
+    ]
+
+
+def test_channels_that_a_number_tells_apart_share_a_name() -> None:
+    assert unnumbered("aline_0012") == unnumbered("aline_7") == "aline_#"
+    assert unnumbered("joint_1_vel") != unnumbered("joint_1_pos")
+    assert unnumbered("force") == "force"
+
+
+def test_the_same_recording_is_the_same_bytes(view: EpisodeView) -> None:
+    draws: tuple[Callable[[], Figure], ...] = (
+        lambda: draw_views(view, [3, 5]),
+        lambda: draw_sensor(view),
+        lambda: draw_motion(view),
+        lambda: draw_lanes(view),
+    )
+    for draw in draws:
+        assert saved(draw()) == saved(draw())
+
+
+def saved(figure: Figure) -> tuple[bytes, bytes]:
+    """As SVG, and as a PNG of few pixels."""
+    svg, png = io.BytesIO(), io.BytesIO()
+    figure.savefig(svg, format="svg", metadata={"Date": None})
+    # Where everything lies is settled: it need not be found again for the other format.
+    figure.set_layout_engine("none")
+    figure.savefig(png, format="png", dpi=30, metadata={"Software": None})
+    return svg.getvalue(), png.getvalue()

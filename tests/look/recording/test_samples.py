@@ -1,0 +1,160 @@
+"""Samples are those of training, and their pictures mark what is not real."""
+
+import io
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+
+from pipeline.base.config import Params
+from pipeline.base.errors import RecordingError
+from pipeline.datasets import UnifiedVLADataset
+from pipeline.look.recording.episode import EpisodeView
+from pipeline.look.recording.model_input import (
+    Sample,
+    batch_table,
+    cut_samples,
+    draw_samples,
+    window_lengths,
+)
+
+Look = Callable[..., EpisodeView]
+WINDOWS = {"horizon": 6, "sensor_window": 40, "state_window": 30}
+
+
+def params_of(samples: int, seed: int = 0, **head: int) -> Params:
+    return Params.model_validate(
+        {
+            "data": {"sources": [{"name": "s", "path": "."}]},
+            "vlm": {"checkpoint": "none"},
+            "train_head": WINDOWS | head,
+            "inspect": {"samples": samples, "seed": seed},
+        }
+    )
+
+
+@pytest.mark.parametrize("format", ["raw", "new", "old", "lerobot"])
+def test_samples_are_those_of_training(healthy: Path, look: Look, format: str) -> None:
+    view = look(healthy / format)
+    assert view.timeline is not None
+    samples = cut_samples(view, params_of(5))
+    ticks = [sample.tick for sample in samples]
+    assert ticks[0] == 0 and ticks[-1] == len(view.timeline.time) - 1
+    assert len(set(ticks)) == 5 and ticks == sorted(ticks)
+    assert len(samples[0].windows["state"]) < 30 and len(samples[-1].windows["action"]) == 1
+    dataset = UnifiedVLADataset(
+        healthy / format,
+        horizon=6,
+        sensor_window_size=40,
+        state_window_size=30,
+        action_rotation=view.action_rotation,
+    )
+    batch = dataset.__getitems__(ticks)
+    assert batch.images is not None
+    for place, sample in enumerate(samples):
+        for name in ("sensor", "state"):
+            valid = int(getattr(batch, f"{name}_valid")[place])
+            window = getattr(batch, name)[place].numpy()
+            assert len(sample.windows[name]) == valid
+            assert np.array_equal(sample.windows[name], window[len(window) - valid :])
+        chunk = batch.action[place].numpy()[batch.action_valid[place].numpy().astype(bool)]
+        assert np.array_equal(sample.windows["action"], chunk)
+        assert sample.frames.keys() == batch.images[place].keys()
+        for name, frame in sample.frames.items():
+            assert np.array_equal(frame, batch.images[place][name])
+
+
+def test_samples_follow_the_seed_and_are_never_more_than_ticks(healthy: Path, look: Look) -> None:
+    view = look(healthy / "old")
+    assert view.timeline is not None
+
+    def ticks(samples: int, seed: int) -> list[int]:
+        return [sample.tick for sample in cut_samples(view, params_of(samples, seed))]
+
+    assert ticks(4, 1) == ticks(4, 1) != ticks(4, 2)
+    assert ticks(1, 0) == [0]
+    assert len(ticks(10_000, 0)) == len(view.timeline.time)
+
+
+def test_of_an_episode_that_training_refuses_there_is_no_sample(
+    copied: Callable[[str], Path], look: Look
+) -> None:
+    folder = copied("raw")
+    next(folder.glob("sensor_data_*.npz")).write_bytes(b"no archive")
+    with pytest.raises(RecordingError, match="sensor_data"):
+        cut_samples(look(folder), params_of(5))
+
+
+@pytest.fixture(scope="module")
+def params() -> Params:
+    return params_of(3, sensor_window=65, state_window=20, horizon=4)
+
+
+@pytest.fixture(scope="module")
+def samples(view: EpisodeView, params: Params) -> list[Sample]:
+    """The first tick, one within, and the last."""
+    return cut_samples(view, params)
+
+
+@pytest.fixture
+def side_by_side(view: EpisodeView, samples: list[Sample], params: Params) -> Figure:
+    return draw_samples(view, samples, window_lengths(params))
+
+
+def test_samples_have_a_column_each_and_say_what_they_reuse(
+    view: EpisodeView, samples: list[Sample], side_by_side: Figure
+) -> None:
+    # Three views, force, A-scan, state in deg and mm, action in mm, deg and gripper.
+    assert len(side_by_side.axes) == 3 * 10
+    line, tick = view.timeline, samples[1].tick
+    assert line is not None
+    title = side_by_side.axes[1].get_title()
+    assert f"tick {tick} of {len(line.time)}\nat {line.time[tick] - view.zero:.2f} s" in title
+    assert f"reuses VL row {tick // 3},\n{tick % 3} tick" in title
+    newest = max(time[tick // 3] for time in line.frame_time.values())
+    assert f"{1000 * (line.time[tick] - newest):.0f} ms old" in title
+    assert side_by_side.get_suptitle().splitlines()[1] == f"“{view.instruction}”"
+
+
+def test_five_samples_are_read_at_the_width_of_a_page(view: EpisodeView) -> None:
+    params = params_of(5)
+    figure = draw_samples(view, cut_samples(view, params), window_lengths(params))
+    figure.draw_without_rendering()
+    smallest = min(text.get_fontsize() for text in figure.findobj(Text) if text.get_text())
+    assert smallest / 72 * 720 / figure.get_figwidth() >= 8
+    titles = [axis.title.get_window_extent() for axis in figure.axes[:5]]
+    assert all(left.x1 < right.x0 for left, right in pairwise(titles))
+
+
+def test_padding_and_masked_steps_are_hatched(samples: list[Sample], side_by_side: Figure) -> None:
+    force, gripper = side_by_side.axes[9:12], side_by_side.axes[27:30]
+    (padding,) = [one for one in force[0].patches if one.get_hatch()]
+    assert padding.get_width() == pytest.approx(65 - len(samples[0].windows["sensor"]))
+    assert not [one for one in force[1].patches if one.get_hatch()]
+    (masked,) = [one for one in gripper[2].patches if one.get_hatch()]
+    assert (masked.get_x(), masked.get_width()) == (1, 3)
+    assert not [one for one in gripper[1].patches if one.get_hatch()]
+
+
+def test_a_batch_tells_real_from_padded_and_masked(samples: list[Sample], params: Params) -> None:
+    table = batch_table(samples, window_lengths(params))
+    assert table.columns == ["tick", "sensor readings", "state readings", "action steps"]
+    real = [[len(sample.windows[name]) for name in samples[0].windows] for sample in samples]
+    assert real[0][0] < 65 and real[2][2] == 1
+    assert [list(row) for row in table.rows] == [
+        [sample.tick, f"{sensor} of 65", f"{state} of 20", f"{action} of 4"]
+        for sample, (sensor, state, action) in zip(samples, real, strict=True)
+    ]
+
+
+def test_the_same_samples_are_the_same_bytes(view: EpisodeView, params: Params) -> None:
+    one = cut_samples(view, params_of(1))
+    written = [io.BytesIO(), io.BytesIO()]
+    for stream in written:
+        figure = draw_samples(view, one, window_lengths(params))
+        figure.savefig(stream, format="svg", metadata={"Date": None})
+    assert written[0].getvalue() == written[1].getvalue()
