@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from pipeline.base.config import Params
-from pipeline.base.digests import ContentDigests
+from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.base.errors import StoreMismatch
 from pipeline.data import Recording
+from pipeline.data.row_range import RowFrames
 from pipeline.extract.encoder import Encoder
-from pipeline.extract.places import ledger_path
-from pipeline.extract.rows import ReadyRow, RowPreparation, in_background, spans_of
+from pipeline.extract.rows import RANGE_ROWS, ReadyRow, RowPreparation, in_background
 from pipeline.extract.survey import Survey, survey
 from pipeline.store import FEATURES, FeatureStore
 from pipeline.store.integrity.findings import capped
@@ -186,10 +186,10 @@ def _computed(
     # Episodes that are gone have none of the chosen rows; any recording may stand in their place.
     by_episode = [one if one is not None else present[0] for one in recordings]
     starts = store.array("episode/vl_start")
-    spans = spans_of(by_episode, starts, frame_time, spec.views, rows, spec.variants)
-    preparation = RowPreparation(Preparer(params.vlm, spec), spec, donors=())
-    prepared = in_background(spans, preparation.prepare, params.extract.decode_threads)
-    ready = (row for row in prepared if isinstance(row, ReadyRow))
+    ranges = RowFrames(by_episode, starts, frame_time, spec.views).ranges(rows, RANGE_ROWS)
+    preparation = RowPreparation(Preparer(params.vlm, spec), spec, known=())
+    prepared = in_background(ranges, preparation.prepare, params.extract.decode_threads)
+    ready = (row for rows in prepared for row in rows if isinstance(row, ReadyRow))
     encoder = Encoder(vlm, params.extract.batch_size, spec.variants)
     for batch, features in encoder.encoded(ready):
         yield from zip(batch, features, strict=True)

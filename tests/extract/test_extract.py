@@ -268,7 +268,7 @@ class TestWhatItTakesOver:
         report, said = run(changed(vlm={"prompt": "{images} do: {instruction}"}))
         assert report.taken == 0
         assert sum(counted) == report.rows
-        assert any("prompt: '{instruction}" in line for line in said)
+        assert any('prompt: "{instruction}' in line for line in said)
 
     @pytest.mark.usefixtures("extracted")
     def test_the_speed_knobs_change_nothing(self, params, changed, no_model_later):
@@ -315,16 +315,16 @@ class TestAbandonedBuilds:
     def interrupted(self, params, monkeypatch, rows: int) -> None:
         """Stop as Ctrl-C does once this many rows are committed."""
         done = []
-        real = StoreBuild.commit
+        real = StoreBuild.mark
 
-        def commit(self, numbers, *rest):
+        def mark(self, numbers, *rest):
             real(self, numbers, *rest)
             done.extend(numbers)
             if len(done) >= rows:
                 raise KeyboardInterrupt
 
         with monkeypatch.context() as patch:
-            patch.setattr(StoreBuild, "commit", commit)
+            patch.setattr(StoreBuild, "mark", mark)
             with pytest.raises(KeyboardInterrupt):
                 run(params)
 

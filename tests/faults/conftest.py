@@ -25,7 +25,7 @@ from stages.command import run
 
 ROOT = Path(__file__).resolve().parents[2]
 
-_place = ROOT / "tests" / "extraction" / "conftest.py"
+_place = ROOT / "tests" / "extract" / "conftest.py"
 _spec = importlib.util.spec_from_file_location("extraction_conftest", _place)
 assert _spec is not None
 assert _spec.loader is not None

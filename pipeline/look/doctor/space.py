@@ -12,12 +12,11 @@ from pipeline.base.durable import free_bytes
 from pipeline.base.errors import RecordingError, StoreMismatch, VLMError
 from pipeline.base.format import size
 from pipeline.data import Recording, open_recordings
-from pipeline.data.embodiment import Embodiment
-from pipeline.data.timeline import ActionRotation, build_timeline, choose_action_rotation
-from pipeline.extract.check import CheckedEpisode
+from pipeline.data.episode import read_episode
+from pipeline.data.timeline import ActionRotation, choose_action_rotation
 from pipeline.extract.layout import build_arrays
 from pipeline.extract.plan import store_bytes
-from pipeline.extract.survey import Survey, SurveyedEpisode
+from pipeline.extract.survey import CheckedEpisode, Survey, SurveyedEpisode
 from pipeline.look.doctor.checkpoint import local_folder
 from pipeline.look.doctor.data import unusable
 from pipeline.look.doctor.findings import Finding, missing, note, ok
@@ -149,12 +148,12 @@ def estimate_store(params: Params) -> tuple[Estimate | None, list[str]]:
     views = sorted({view for one in checked for view in one.surveyed.recording.view_names()})
     # A digest decides nothing of a size, and reading every weight for it takes long.
     spec = feature_spec(params.vlm, params.extract.dtype, views, lambda path: "")
-    survey = Survey(tuple(one.surveyed for one in checked), (), (), spec, rotation, "")
+    survey = Survey(params, tuple(one.surveyed for one in checked), (), (), spec, rotation, "")
     episodes = len(opened.recordings) - len(bad)
     times = episodes / len(checked)
     specs = {
         name: replace(one, shape=(math.ceil(one.shape[0] * times), *one.shape[1:]))
-        for name, one in build_arrays(checked, survey, params).items()
+        for name, one in build_arrays(checked, survey).items()
     }
     maps = sum(one.chunk_count for one in specs.values())
     return Estimate(store_bytes(specs), maps, episodes, len(checked)), bad
@@ -174,9 +173,5 @@ def _spread(recordings: Sequence[Recording]) -> list[Recording]:
 
 def _read(recording: Recording, params: Params, rotation: ActionRotation) -> CheckedEpisode:
     _ = recording.instruction  # some formats read it when asked; remembered
-    state, sensor = recording.state(), recording.sensor()
-    hz, reuse = params.data.action_hz, params.data.vlm_reuse_count
-    line = build_timeline(recording, hz, reuse, rotation, state, sensor)
-    embodiment = Embodiment.of(line.action_channels, line.action_kind, sensor, state)
-    readings, states = (len(one.time) if one else 0 for one in (sensor, state))
-    return CheckedEpisode(SurveyedEpisode(recording, "", ""), line, embodiment, readings, states)
+    read = read_episode(recording, params.data.action_hz, params.data.vlm_reuse_count, rotation)
+    return CheckedEpisode.of(SurveyedEpisode(recording, "", ""), read)

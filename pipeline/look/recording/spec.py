@@ -8,8 +8,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from pipeline.base.config import Params
-from pipeline.base.digests import ContentDigests
-from pipeline.extract.places import ledger_path
+from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 
 LEDGER = ".files.sqlite"
