@@ -75,11 +75,11 @@ def stopwatch_table(work: Work) -> dict[str, float]:
     watch = Stopwatch()
     read = RowRange.read
 
-    def timed_read(span: RowRange) -> Iterator[Any]:
-        rows = read(span)
+    def timed_read(rows: RowRange) -> Iterator[Any]:
+        frames = read(rows)
         while True:
             with watch.step("decode"):
-                row = next(rows, None)
+                row = next(frames, None)
             if row is None:
                 return
             yield row

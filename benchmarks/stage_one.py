@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from itertools import chain, repeat
 from unittest.mock import patch
 
@@ -9,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.workload import Workload
+from pipeline.data.row_range import RowRange
 from pipeline.extract.encoder import Encoder
-from pipeline.extract.fill import fill
-from pipeline.extract.rows import ReadyRow, RowPreparation, in_background
+from pipeline.extract.engine import RowEngine, fill
+from pipeline.extract.rows import ReadyRow, Row, RowPreparation, in_background
 from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.qwen import FrozenVLM
 
@@ -35,9 +37,7 @@ class StageOne:
     def run_every_frame(self) -> None:
         """Fill the store, computing anew what is shown again: no row or frame is spared."""
         with ExitStack() as stack:
-            stack.enter_context(
-                patch.object(RowPreparation, "prepare_once", RowPreparation.prepare)
-            )
+            stack.enter_context(patch.object(RowEngine, "prepare", prepare_all))
             stack.enter_context(patch("pipeline.vlm.collation.unique", _all))
             self.run()
 
@@ -46,9 +46,10 @@ class StageOne:
         work = self._workload
         extract = work.params.extract.model_copy(update={"batch_size": self.batch_size})
         params = work.params.model_copy(update={"extract": extract})
+        surveyed = replace(work.survey, params=params)
         # Stage one takes the model that is there instead of loading it again.
         with patch.object(FrozenVLM, "load", return_value=self._vlm):
-            done = fill(self._build, work.survey, [], params, work.digests, work.missing)
+            done = fill(self._build, surveyed, [], work.digests, work.missing)
         assert done.computed + done.repeated == len(work.missing), done
         assert done.model_share is not None and done.waited_share is not None
         self.shares.append((done.model_share, done.waited_share))
@@ -56,6 +57,14 @@ class StageOne:
     def features(self) -> NDArray[np.float32]:
         """Features (row, dim) of the last run."""
         return self._build.files("vl/features").read(0, len(self._workload.missing))[:, 0]
+
+
+_prepare = RowEngine.prepare
+
+
+def prepare_all(engine: RowEngine, rows: RowRange, firsts: object) -> list[Row]:
+    """Every row made ready, as if they all differed."""
+    return _prepare(engine, rows, None)
 
 
 def _all(images: Sequence[NDArray[np.uint8]]) -> tuple[Sequence[NDArray[np.uint8]], list[int]]:
@@ -70,12 +79,13 @@ def _settled(workload: Workload, vlm: FrozenVLM) -> int:
     threads = params.extract.decode_threads
     rows = [
         row
-        for row in in_background(workload.spans(), preparation.prepare, threads)
+        for prepared in in_background(workload.ranges(), preparation.prepare, threads)
+        for row in prepared
         if isinstance(row, ReadyRow)
     ]
     encoder = Encoder(vlm, "auto")
     for _ in encoder.encoded(chain.from_iterable(repeat(rows))):
-        if encoder.settled:
+        if encoder.size.settled:
             # In a larger batch, rows would stand twice and be seen once.
-            return min(encoder.batch_size, len(rows))
+            return min(encoder.size.current, len(rows))
     raise AssertionError("rows without end came to an end")

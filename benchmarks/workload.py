@@ -14,16 +14,14 @@ from tqdm import tqdm
 
 from pipeline.base.config import Params
 from pipeline.base.digests import ContentDigests
-from pipeline.data import Recording
-from pipeline.data.row_range import RowRange
-from pipeline.extract.check import CheckedEpisode, check_episodes
+from pipeline.data.row_range import RowFrames, RowRange
 from pipeline.extract.layout import build_arrays, lay_out
-from pipeline.extract.rows import spans_of
-from pipeline.extract.survey import Survey, survey
+from pipeline.extract.rows import RANGE_ROWS
+from pipeline.extract.survey import CheckedEpisode, Survey, check_episodes, survey
 from pipeline.simulation.demo_recordings import TASK
 from pipeline.simulation.insertion_formats import write_raw
 from pipeline.simulation.recorder import simulate_episode
-from pipeline.store import RowSource, StoreBuild
+from pipeline.store import StoreBuild
 from pipeline.vlm.preparation import Preparer
 
 ROWS_AN_EPISODE = 18
@@ -45,42 +43,36 @@ class Workload:
     digests: ContentDigests
     missing: NDArray[np.int64]
     """The VL rows to compute."""
-    recordings: Sequence[Recording]
-    """In the store's order."""
-    vl_start: NDArray[np.int64]
-    frame_time: NDArray[np.float64]
+    frames: RowFrames
 
     @classmethod
     def of(cls, params: Params, rows: int, digests: ContentDigests) -> "Workload":
         """The first `rows` VL rows of the recordings of `params`."""
         surveyed = survey(params, digests)
-        checked, bad = check_episodes(surveyed, params)
+        checked, bad = check_episodes(surveyed)
         assert not bad, bad
-        with closing(_laid_out(params, surveyed, checked)) as build:
-            layout = RowSource(build.part)
-            vl_start = layout.episode_edges("vl")
-            by_digest = {one.digest: one.recording for one in surveyed.episodes}
-            recordings = [by_digest[digest] for digest in layout.episode_digests]
-            layout.close()
-            frame_time = build.files("vl/frame_time").read(0, int(vl_start[-1]))
+        with closing(_laid_out(surveyed, checked)) as build:
+            vl_start, frame_time = (
+                build.files(name).read(0, build.specs[name].shape[0])
+                for name in ("episode/vl_start", "vl/frame_time")
+            )
         assert rows <= len(frame_time), f"expected {rows} VL rows, found {len(frame_time)}"
-        missing = np.arange(rows)
-        return cls(params, surveyed, checked, digests, missing, recordings, vl_start, frame_time)
+        frames = RowFrames(surveyed.recordings, vl_start, frame_time, surveyed.spec.views)
+        return cls(params, surveyed, checked, digests, np.arange(rows), frames)
 
     def fresh_build(self) -> StoreBuild:
         """A build with everything but feature rows, in place of the one before."""
-        return _laid_out(self.params, self.survey, self.checked)
+        return _laid_out(self.survey, self.checked)
 
-    def spans(self) -> Iterator[RowRange]:
-        """The rows in spans, as stage one cuts them."""
-        views = self.survey.spec.views
-        return spans_of(self.recordings, self.vl_start, self.frame_time, views, self.missing, 1)
+    def ranges(self) -> Iterator[RowRange]:
+        """The rows in ranges, as stage one cuts them."""
+        return self.frames.ranges(self.missing, RANGE_ROWS)
 
     def read(self) -> Iterator[tuple[str, Frames]]:
         """Instruction and decoded frames of each row, in line."""
-        for span in self.spans():
-            for _, frames in span.read():
-                yield span.recording.instruction, frames
+        for rows in self.ranges():
+            for _, frames in rows.read():
+                yield rows.recording.instruction, frames
 
     def text_tokens(self) -> int:
         """Tokens of the first row that are not an image's."""
@@ -94,10 +86,10 @@ class Workload:
         return len(set(hashes)) / len(hashes)
 
 
-def _laid_out(params: Params, surveyed: Survey, checked: Sequence[CheckedEpisode]) -> StoreBuild:
-    build = StoreBuild(params.extract.store, build_arrays(checked, surveyed, params), surveyed.plan)
+def _laid_out(surveyed: Survey, checked: Sequence[CheckedEpisode]) -> StoreBuild:
+    build = StoreBuild(surveyed.target, build_arrays(checked, surveyed), surveyed.plan)
     shutil.rmtree(build.part, ignore_errors=True)
-    lay_out(build, checked, surveyed, params, [])
+    lay_out(build, checked, surveyed, [])
     return build
 
 

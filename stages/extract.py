@@ -29,7 +29,7 @@ if __name__ == "__main__":  # here, for --help waits for no import below
     raise SystemExit(run(__doc__ or "", "stages.extract", sections=("data", "vlm", "extract")))
 
 from pipeline.base.config import Params
-from pipeline.extract import extract
+from pipeline.extract.run import extract
 
 
 def main(params: Params) -> None:

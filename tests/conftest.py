@@ -168,7 +168,7 @@ def fork_server() -> ForkServerContext:
     """Processes of a server that has imported what takes each seconds otherwise."""
     server = get_context("forkserver")
     stages = [f"stages.{name}" for name in ("evaluate", "extract", "store", "train_head")]
-    heavy = ["pipeline.extract.local", "pipeline.extract.cluster", MODEL]
+    heavy = ["pipeline.extract.engine", "pipeline.extract.cluster", MODEL]
     server.set_forkserver_preload([*stages, *heavy])
     forkserver.ensure_running()  # with these, whoever forks next
     return server

@@ -21,6 +21,8 @@ from pipeline.base.errors import (
 )
 from pipeline.base.ownership import described
 
+LEDGER_SUFFIX = ".files.sqlite"
+
 _BLOCK = 4 * 2**20
 _HEADER, _HEADER_BYTES = b"SQLite format 3\0", 100
 _APPLICATION = 0x564C4146
@@ -172,6 +174,11 @@ class ContentDigests:
             f"{self._ledger}: cannot be written: {error}. Set extract.store to a folder that "
             "can be written to."
         )
+
+
+def ledger_path(store: Path) -> Path:
+    """Where the digests of a store's recordings and checkpoint are remembered: beside it."""
+    return store.with_name(f"{store.name}{LEDGER_SUFFIX}")
 
 
 def is_ledger(path: Path) -> bool:

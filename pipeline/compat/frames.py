@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.compat.batch import Images
-from pipeline.compat.streams import ReadEpisode
-from pipeline.data import CameraStream
+from pipeline.data.episode import ReadEpisode
+from pipeline.data.row_range import RowFrames
 from pipeline.store import KEY_BYTES
 
 
@@ -16,31 +16,24 @@ class Frames:
     """Frames by VL row over these episodes, whose rows begin at `vl_start` (episode + 1,)."""
 
     def __init__(self, episodes: Sequence[ReadEpisode], vl_start: NDArray[np.int64]) -> None:
+        views = sorted({view for episode in episodes for view in episode.timeline.frames})
+        times = [episode.timeline.frame_times(views) for episode in episodes]
+        recordings = [episode.recording for episode in episodes]
         self._vl_start = vl_start
-        self._shown = [dict(one.timeline.frames) for one in episodes]
-        # Opened once: listing an episode's frames costs time.
-        self._cameras: list[dict[str, CameraStream]] = [
-            dict(one.recording.cameras()) for one in episodes
-        ]
+        self._frames = RowFrames(
+            recordings, vl_start, np.concatenate(times), views, len(recordings)
+        )
 
     def read(self, rows: NDArray[np.int64]) -> dict[int, Images]:
         """The frames of each of these rows, every row decoded once.
 
         Raises `RecordingError` naming the file that cannot be decoded.
         """
-        found: dict[int, Images] = {}
-        distinct = np.unique(rows)
-        episodes = np.searchsorted(self._vl_start, distinct, side="right") - 1
-        for episode in np.unique(episodes).tolist():
-            of_episode = distinct[episodes == episode]
-            inside = of_episode - self._vl_start[episode]
-            readers = {
-                view: camera.read(self._shown[episode][view][inside].tolist())
-                for view, camera in self._cameras[episode].items()
-            }
-            for row in of_episode.tolist():
-                found[row] = {view: next(reader) for view, reader in readers.items()}
-        return found
+        return {
+            row: frames
+            for part in self._frames.ranges(np.unique(rows))
+            for row, frames in part.read()
+        }
 
     def first_keys(self) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
         """Each episode's first row, and a digest (episode, 16) of the frames it sees.

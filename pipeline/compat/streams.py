@@ -4,7 +4,6 @@ So the store's own `gather` cuts the windows of both.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,43 +12,11 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from pipeline.data import Recording, Stream
-from pipeline.data.embodiment import Embodiment, common_embodiment
-from pipeline.data.timeline import ActionRotation, Timeline, build_timeline
+from pipeline.data.embodiment import common_embodiment
+from pipeline.data.episode import ReadEpisode, read_episode
+from pipeline.data.timeline import ActionRotation
 from pipeline.store import KEY_BYTES, SCHEMA, FeatureStore
 from pipeline.store.episodes import EpisodeRows, episode_arrays
-
-
-@dataclass(frozen=True)
-class ReadEpisode:
-    """A recording, its ticks and its whole streams."""
-
-    recording: Recording
-    timeline: Timeline
-    sensor: Stream | None
-    state: Stream | None
-
-    @property
-    def embodiment(self) -> Embodiment:
-        """What its channels are."""
-        line = self.timeline
-        return Embodiment.of(line.action_channels, line.action_kind, self.sensor, self.state)
-
-    @property
-    def rows(self) -> EpisodeRows:
-        """What a store without features has of it."""
-        one = self.recording
-        said = {
-            "id": one.id,
-            "path": str(one.path),
-            "format": one.format,
-            "instruction": one.instruction,
-            "content": "",
-            "digest": "",
-        }
-        readings, states = (
-            0 if each is None else len(each.time) for each in (self.sensor, self.state)
-        )
-        return EpisodeRows(self.timeline, readings, states, one.source, said)
 
 
 def read_episodes(
@@ -62,12 +29,10 @@ def read_episodes(
 
     Raises `RecordingError` for what cannot be read or has no tick.
     """
-    episodes: list[ReadEpisode] = []
-    for recording in tqdm(recordings, "reading", unit="episode", disable=None, leave=False):
-        sensor, state = recording.sensor(), recording.state()
-        line = build_timeline(recording, action_hz, vlm_reuse_count, action_rotation, state, sensor)
-        episodes.append(ReadEpisode(recording, line, sensor, state))
-    return episodes
+    return [
+        read_episode(recording, action_hz, vlm_reuse_count, action_rotation)
+        for recording in tqdm(recordings, "reading", unit="episode", disable=None, leave=False)
+    ]
 
 
 def in_memory(
@@ -95,7 +60,7 @@ def in_memory(
         "vlm_reuse_count": vlm_reuse_count,
         "environment": [],
     }
-    arrays = episode_arrays([one.rows for one in episodes], sources, views)
+    arrays = episode_arrays([_rows(episode) for episode in episodes], sources, views)
     rows = len(arrays["vl/time"])
     arrays |= {
         "vl/features": np.zeros((rows, 0, 0), np.float32),
@@ -105,6 +70,21 @@ def in_memory(
     arrays |= _joined("sensor", [one.sensor for one in episodes], len(embodiment.sensor.names))
     arrays |= _joined("state", [one.state for one in episodes], len(embodiment.state.names))
     return FeatureStore(Path(episodes[0].recording.path), attrs, arrays)
+
+
+def _rows(episode: ReadEpisode) -> EpisodeRows:
+    """What a store without features has of it."""
+    recording = episode.recording
+    text = {
+        "id": recording.id,
+        "path": str(recording.path),
+        "format": recording.format,
+        "instruction": recording.instruction,
+        "content": "",
+        "digest": "",
+    }
+    readings, states = episode.readings, episode.states
+    return EpisodeRows(episode.timeline, readings, states, recording.source, text)
 
 
 def _joined(name: str, streams: Sequence[Stream | None], width: int) -> dict[str, NDArray[Any]]:

@@ -1,14 +1,19 @@
-"""VL rows of one episode and the frames that they show."""
+"""VL rows and the frames that they show, decoded when they are asked for."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.base.errors import RecordingError
 from pipeline.data.recording import CameraStream, Recording
 from pipeline.data.timeline import last_at
+
+Frames = dict[str, NDArray[np.uint8]]
+"""By view: (height, width, 3) RGB."""
 
 
 @dataclass(frozen=True)
@@ -31,18 +36,72 @@ class RowRange:
         frame_time: NDArray[np.float64],
         views: Sequence[str],
     ) -> Self:
-        """Which frames rows show follows from the capture times (row, view) that a store has."""
-        frames = {
-            view: last_at(cameras[view].time, frame_time[:, column])
-            for column, view in enumerate(views)
-            if np.isfinite(frame_time[0, column])
-        }
+        """Which frames rows show follows from the capture times (row, view) that a store has.
+
+        Raises `RecordingError` where the recording has no frames of these times.
+        """
+        frames: dict[str, NDArray[np.int64]] = {}
+        for column, view in enumerate(views):
+            times = frame_time[:, column]
+            if not np.isfinite(times).all():  # the episode lacks the view
+                continue
+            clock = cameras[view].time if view in cameras else np.zeros(0)
+            frames[view] = last_at(clock, times)
+            # A store has the cameras' own times, so that any other is not of this frame.
+            if (frames[view] < 0).any() or not np.array_equal(clock[frames[view]], times):
+                raise RecordingError(
+                    f"{recording.path}: {view} has no frames at the times that the store has"
+                )
         return cls(recording, cameras, rows, frames)
 
-    def read(self) -> Iterator[tuple[int, dict[str, NDArray[np.uint8]]]]:
+    def read(self) -> Iterator[tuple[int, Frames]]:
         """Each row and its frames by view, decoded one row at a time."""
         readers = {
             view: self.cameras[view].read(frames.tolist()) for view, frames in self.frames.items()
         }
         for row in self.rows.tolist():
             yield row, {view: next(reader) for view, reader in readers.items()}
+
+
+class RowFrames:
+    """Which recording each VL row is of, and when its frames were captured."""
+
+    def __init__(
+        self,
+        recordings: Sequence[Recording],
+        vl_start: NDArray[np.int64],
+        frame_time: NDArray[np.float64],
+        views: Sequence[str],
+        open_episodes: int = 8,
+    ) -> None:
+        """Of all episodes of a store: where the rows of each begin (episode + 1,), (row, view) s.
+
+        The cameras of so many episodes are kept open.
+        """
+        self.vl_start = vl_start
+        self.frame_time = frame_time
+        self._recordings = recordings
+        self._views = views
+        self._cameras = lru_cache(open_episodes)(lambda episode: recordings[episode].cameras())
+
+    def ranges(self, rows: NDArray[np.int64], most: int | None = None) -> Iterator[RowRange]:
+        """These rows, ascending, in ranges of one episode and at most so many rows each.
+
+        Raises as `RowRange.of` and the recordings' `cameras` do.
+        """
+        for episode, inside in by_episode(rows, self.vl_start):
+            for start in range(0, len(inside), most or len(inside)):
+                part = inside[start : start + (most or len(inside))]
+                times = self.frame_time[part]
+                cameras = self._cameras(episode)
+                yield RowRange.of(self._recordings[episode], cameras, part, times, self._views)
+
+
+def by_episode(
+    rows: NDArray[np.int64], vl_start: NDArray[np.int64]
+) -> Iterator[tuple[int, NDArray[np.int64]]]:
+    """The episodes that rows, ascending, are of, and the rows of each."""
+    episode = np.searchsorted(vl_start, rows, side="right") - 1
+    for part in np.split(rows, np.flatnonzero(np.diff(episode)) + 1):
+        if len(part):
+            yield int(np.searchsorted(vl_start, part[0], side="right")) - 1, part

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from pipeline.base.digests import file_digest
 from pipeline.base.errors import RecordingError
-from pipeline.data import CameraStream, Recording, content_digest, open_recording
+from pipeline.data import Recording, content_digest, open_recording
+from pipeline.data.row_range import RowRange
 from pipeline.store import Episode, FeatureStore
 from pipeline.train.batches import Ticks
 
@@ -65,9 +66,11 @@ def read_episode_frames(
             return EpisodeFrames(
                 {}, f"No frames: the recording at {path} changed since the store was made from it."
             )
-        times = _frame_times(store, vl_rows)
-        cameras = recording.cameras()
-        return EpisodeFrames({view: _read(cameras, view, at) for view, at in times.items()})
+        rows = np.asarray(vl_rows, np.int64)
+        times = store.array("vl/frame_time")[rows]
+        shown = RowRange.of(recording, recording.cameras(), rows, times, store.spec["views"])
+        frames = [frames for _, frames in shown.read()]
+        return EpisodeFrames({view: [by_view[view] for by_view in frames] for view in shown.frames})
     except (RecordingError, OSError) as error:
         reason = " ".join(str(error).split())
         return EpisodeFrames({}, f"No frames: the recording at {path} cannot be read ({reason}).")
@@ -82,27 +85,3 @@ def _open_recording(
         if content_digest(recording, digest_of) == episode.content:
             return recording
     return None
-
-
-def _frame_times(store: FeatureStore, vl_rows: Sequence[int]) -> dict[str, NDArray[np.float64]]:
-    """Capture times of the rows' frames, by view that the episode has."""
-    times = store.array("vl/frame_time")[np.asarray(vl_rows, np.int64)]
-    names = store.spec["views"]
-    return {
-        view: times[:, column]
-        for column, view in enumerate(names)
-        if np.isfinite(times[:, column]).all()
-    }
-
-
-def _read(
-    cameras: Mapping[str, CameraStream], view: str, times: NDArray[np.float64]
-) -> list[Frame]:
-    if view not in cameras:
-        raise RecordingError(f"it has no {view}")
-    clock = cameras[view].time
-    index = np.searchsorted(clock, times, side="right") - 1
-    # The store has the cameras' own times, so that any other is not of this frame.
-    if (index < 0).any() or not np.array_equal(clock[index], times):
-        raise RecordingError(f"{view} has no frames at the times that the store has")
-    return list(cameras[view].read(index.tolist()))

@@ -1,106 +1,234 @@
-"""Hand the missing rows out to dask workers and mark what they wrote.
+"""The engine on dask workers: ranges of rows are handed out, what was written is marked here.
 
-The client is the coordinator: workers write feature rows, it alone marks them.
+Dask tries again what failed, and what a worker had when it died. What it gives up is computed at
+the end, one episode at a time while nothing else is, so that no recording is blamed for another.
 """
 
 import math
+import os
+import signal
 import socket
+import sys
 import time
-from collections import Counter
 from collections.abc import Generator, Iterable, Iterator
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import closing, contextmanager
-from pathlib import Path
+from functools import partial
+from itertools import islice
+from multiprocessing import active_children, resource_tracker
+from typing import Any
 
-from distributed import Client
+import dask
+import numpy as np
+from distributed import Client, Future, KilledWorker, LocalCluster, as_completed
+from distributed.scheduler import NoWorkerError
+from numpy.typing import NDArray
+from tqdm import tqdm
 
-from pipeline.base.errors import ConfigError, PipelineError
-from pipeline.extract.connection import connected
-from pipeline.extract.handout import Task, TaskScheduler
-from pipeline.extract.job import Job, Piece, WrittenRows
-from pipeline.extract.ranges import by_episode, ranges_of, rows_between_pages
-from pipeline.extract.work import Computed, Work
-from pipeline.extract.worker import ExtractionPlugin
+from pipeline.base.config import ExtractParams
+from pipeline.base.errors import ConfigError, NumericsError, PipelineError, RecordingError
+from pipeline.base.scheduler import client_of, private_cluster, quiet
+from pipeline.data.row_range import by_episode
+from pipeline.extract.engine import ExtractionJob, RowMarks, WrittenRows
+from pipeline.extract.worker import ExtractionPlugin, compute_rows
 from pipeline.store import FEATURES
+
+PAGE_BYTES = 4096
 
 _AUTO_RANGE_ROWS = 32
 """Rows a task where each worker finds its own batch size."""
 
-_LOCAL_PATIENCE_S = 120.0
-"""For processes of this machine to come back after a death."""
+_TASKS_AHEAD = 1000
+"""Tasks that the scheduler holds: enough for hundreds of workers, never millions."""
+
+_HOPELESS_DEATHS = 4
+"""So many workers dead, each with a task that dask gave up, before a row is written are no
+recording's fault."""
+
+_LOCAL_PATIENCE = {
+    "distributed.deploy.lost-worker-timeout": "1h",
+    "distributed.scheduler.no-workers-timeout": "120s",
+}
+"""For processes of this machine to come back after a death, however long their imports take."""
+
+_SETTING = "extract.workers"
+_LOOK_EVERY_S = 0.05
+
+Range = NDArray[np.int64]
+"""Rows that one task computes, ascending."""
+Result = Any
+"""Of a task: what it returned, or in its place an exception."""
 
 
-def compute_on_cluster(work: Work) -> Computed:
-    """Have `extract.workers` compute every missing row, and mark each as it is written.
+def compute_on_cluster(
+    job: ExtractionJob, vl_start: NDArray[np.int64], missing: NDArray[np.int64], marks: RowMarks
+) -> float | None:
+    """Have `extract.workers` compute every missing row; rows a second, None where too few to tell.
 
     Raises at once what stops every row: `ConfigError` for a wrong address or a worker elsewhere,
-    `VLMError`, `DiskFull`, `PipelineError` where the scheduler is lost. Raises `RecordingError`
-    after all other rows where some failed more often than `extract.retries`.
+    `VLMError`, `DiskFull`, `PipelineError` where the scheduler or all workers are lost. Raises
+    `RecordingError` after all other rows where some could not be computed.
     """
-    extract = work.params.extract
-    job = _job(work)
-    patience_s = _LOCAL_PATIENCE_S if job.local else math.inf
-    with connected(extract) as client, _plugged(client, job):
-        handout = TaskScheduler(
-            client, job.name, _tasks(work, job.local), extract.retries, patience_s
-        )
-        with closing(handout.results()) as written:
-            return _marked(work, written)
-
-
-def _job(work: Work) -> Job:
-    """With every path that the coordinator may have given relative to its own folder."""
-    extract = work.params.extract
-    target = work.build.target.absolute()
-    return Job(
-        target,
-        work.build.plan,
-        work.spec,
-        work.params.model_copy(update={"extract": extract.model_copy(update={"store": target})}),
-        tuple(donor.path.absolute() for donor in work.donors),
-        Path.cwd(),
-        isinstance(extract.workers, int),
-    )
-
-
-def _tasks(work: Work, local: bool) -> Iterator[Task]:
-    """A range of about one batch each; where hosts may differ, none shares a page with another."""
-    array, size = work.build.specs[FEATURES], work.params.extract.batch_size
-    batch = _AUTO_RANGE_ROWS if size == "auto" else size
-    ranges = ranges_of(
-        work.missing,
-        work.vl_start,
-        array.chunk_rows,
-        max(1, batch // work.spec.variants),
-        1 if local else rows_between_pages(array.row_bytes),
-    )
-    for one in ranges:
-        pieces = by_episode(one, work.vl_start)
-        yield Task(
-            [
-                Piece(episode, work.recordings[episode], rows, work.frame_time[rows])
-                for episode, rows in pieces
-            ]
-        )
-
-
-def _marked(work: Work, written: Iterable[WrittenRows]) -> Computed:
-    """The rate is that after the first block: until then workers start and load the model."""
-    rows: Counter[str] = Counter()
+    extract, array = job.surveyed.params.extract, marks.build.specs[FEATURES]
+    rows = _AUTO_RANGE_ROWS if extract.batch_size == "auto" else extract.batch_size
+    most = max(1, rows // job.surveyed.spec.variants)
+    # Where hosts may differ, no two ranges share a page of the file.
+    together = 1 if job.local else rows_between_pages(array.row_bytes)
+    ranges = ranges_of(missing, vl_start, array.chunk_rows, most, together)
     begun, before = 0.0, 0
-    for block in written:
-        number = work.build.environment_index(block.environment)
-        work.build.mark(block.rows, block.keys, block.checksums, number)
-        work.done(len(block.rows))
-        rows[block.came] += len(block.rows)
-        if not before:
-            begun, before = time.monotonic(), rows["computed"]
-    later = rows["computed"] - before
-    rate = later / (time.monotonic() - begun) if later else None
-    return Computed(rows["computed"], rows["known"], rows["repeated"], rate)
+    with connected(extract) as client, _plugged(client, job):
+        tasks = ClusterTasks(client, job, vl_start)
+        with closing(tasks.results(ranges)) as results:
+            for written in results:
+                marks.mark(written)
+                if not before:  # until then workers start and load the model
+                    begun, before = time.monotonic(), marks.counts["computed"]
+    later = marks.counts["computed"] - before
+    return later / (time.monotonic() - begun) if later else None
+
+
+class ClusterTasks:
+    """Ranges on their way to workers and back."""
+
+    def __init__(self, client: Client, job: ExtractionJob, vl_start: NDArray[np.int64]) -> None:
+        self._client = client
+        self._job = job
+        self._vl_start = vl_start
+        self._given_up: list[Range] = []
+        self._dead: set[str] = set()
+        self._any_written = False
+
+    def results(self, ranges: Iterable[Range]) -> Generator[list[WrittenRows]]:
+        """What workers wrote; raises at the end what could not be computed."""
+        for done in self._completed(ranges, self._job.surveyed.params.extract.retries):
+            written = [block for _, result in done if isinstance(result, list) for block in result]
+            self._any_written |= bool(written)
+            yield written
+            for rows, result in done:
+                if not isinstance(result, list):
+                    self._note_failure(rows, result)
+        failed: dict[int, str] = {}
+        for rows in self._given_up:
+            for episode, inside in by_episode(rows, self._vl_start):
+                if episode not in failed:
+                    (((_, result),),) = self._completed([inside], retries=0)
+                    if isinstance(result, list):
+                        yield result
+                    else:
+                        failed[episode] = self._reason(episode, inside, result)
+        if failed:
+            reasons = "\n".join(f"  {failed[episode]}" for episode in sorted(failed))
+            raise RecordingError(
+                f"{len(failed)} episodes could not be computed:\n{reasons}\nAll others are kept. "
+                "Mend or remove these recordings and run the same command again; it computes what "
+                "is missing."
+            )
+
+    def _completed(
+        self, ranges: Iterable[Range], retries: int
+    ) -> Iterator[list[tuple[Range, Result]]]:
+        """Ranges and what came of them, as they are done."""
+        left, under_way = iter(ranges), dict[Future[Any], Range]()
+        submit = partial(self._client.submit, compute_rows, self._job.name, pure=False)
+
+        def submitted(count: int) -> Iterable[Future[Any]]:
+            futures = {submit(rows, retries=retries): rows for rows in islice(left, count)}
+            under_way.update(futures)
+            return futures
+
+        completed = as_completed(
+            submitted(_TASKS_AHEAD), loop=self._client.loop, with_results=True, raise_errors=False
+        )
+        for batch in completed.batches():
+            done: list[tuple[Range, Result]] = []
+            for future, result in batch:
+                error = result[1] if isinstance(result, tuple) else result
+                done.append((under_way.pop(future), error))
+                future.release()  # else dask computes it again where the worker that has it dies
+            completed.update(submitted(len(batch)))
+            yield done
+
+    def _note_failure(self, rows: Range, error: Exception) -> None:
+        """Set a range aside that its recordings may be to blame for; raise what is not."""
+        if isinstance(error, CancelledError):
+            raise PipelineError(
+                f"the connection to the dask scheduler was lost ({error}). The rows that were "
+                "written are kept: start the scheduler and its workers again, and run the same "
+                "command; it computes what is missing."
+            )
+        if isinstance(error, NoWorkerError):
+            raise PipelineError(
+                "no worker has been there for two minutes: they were killed, or ran out of memory "
+                "as they began. The rows that were written are kept. Run the same command again, "
+                "with fewer extract.workers where memory is short."
+            )
+        if not isinstance(error, KilledWorker | RecordingError | NumericsError):
+            raise error
+        self._given_up.append(rows)
+        if isinstance(error, KilledWorker):
+            self._note_death(str(error.last_worker.address))
+
+    def _note_death(self, address: str) -> None:
+        if address not in self._dead:
+            self._dead.add(address)
+            said = f"the worker {address} died; what it had is computed again at the end"
+            tqdm.write(said, file=sys.stderr)
+        if not self._any_written and len(self._dead) >= _HOPELESS_DEATHS:
+            raise PipelineError(
+                f"workers died again and again before a single row was written; last {address}. Do "
+                "they have enough memory for the model? Look at their logs, or run with "
+                "extract.workers=0."
+            )
+
+    def _reason(self, episode: int, rows: Range, error: Exception) -> str:
+        """Why the rows of an episode could not be computed, alone."""
+        if isinstance(error, KilledWorker):
+            error = RecordingError(
+                f"every worker died that computed them alone ({1 + error.allowed_failures} deaths)"
+            )
+        elif not isinstance(error, RecordingError | NumericsError):
+            self._note_failure(rows, error)
+        path = self._job.surveyed.recordings[episode].path
+        told = str(path) in str(error)
+        return str(error) if told else f"{path}, VL rows {rows[0]} to {rows[-1]}: {error}"
+
+
+def rows_between_pages(row_bytes: int) -> int:
+    """Every how many rows one begins where a page of its file begins.
+
+    Divides every chunk: chunks are multiples of 4,096 rows.
+    """
+    return PAGE_BYTES // math.gcd(row_bytes, PAGE_BYTES)
+
+
+def ranges_of(
+    missing: Range, vl_start: NDArray[np.int64], chunk_rows: int, most: int, together: int = 1
+) -> Iterator[Range]:
+    """Rows (ascending, of `missing`) that one task computes, range after range.
+
+    A range lies within one chunk and one episode (`vl_start`, (episode + 1,)) and has at most
+    `most` rows. Blocks of `together` rows are never cut: where hosts must not share a page, a
+    range may so hold more rows, or the end of one episode and the beginning of the next.
+    """
+    episode = np.searchsorted(vl_start, missing, side="right")
+    block, chunk = missing // together, missing // chunk_rows
+    begin = last = 0
+    for start in [*(np.flatnonzero(np.diff(block)) + 1).tolist(), len(missing)]:
+        apart = last > begin and (
+            episode[last] != episode[last - 1]
+            or chunk[last] != chunk[last - 1]
+            or start - begin > most
+        )
+        if apart:
+            yield missing[begin:last]
+            begin = last
+        last = start
+    if begin < len(missing):
+        yield missing[begin:]
 
 
 @contextmanager
-def _plugged(client: Client, job: Job) -> Generator[None]:
+def _plugged(client: Client, job: ExtractionJob) -> Generator[None]:
     """Give every worker, now and later, what it needs; take it back at the end."""
     try:
         client.register_plugin(ExtractionPlugin(job))
@@ -119,3 +247,81 @@ def _plugged(client: Client, job: Job) -> Generator[None]:
     finally:
         if client.status == "running":
             client.unregister_worker_plugin(job.name)
+
+
+def check_scheduler(extract: ExtractParams) -> None:
+    """Raise `ConfigError` where `extract.workers` is an address at which no scheduler answers."""
+    if isinstance(extract.workers, str):
+        with quiet(), client_of(extract.workers, _SETTING):
+            pass
+
+
+@contextmanager
+def connected(extract: ExtractParams) -> Generator[Client]:
+    """A client of `extract.workers`; local processes end with it.
+
+    Raises `ConfigError` where no scheduler answers at the address, `PipelineError` where local
+    processes cannot be started.
+    """
+    with quiet():
+        if isinstance(extract.workers, int):
+            with (
+                dask.config.set(_LOCAL_PATIENCE),
+                _local_cluster(extract.workers, extract) as cluster,
+                Client(cluster, set_as_default=False) as client,
+            ):
+                yield client
+        else:
+            with client_of(extract.workers, _SETTING) as client:
+                if not client.nthreads():
+                    said = "the scheduler has no worker yet; waiting for one"
+                    print(f"{extract.workers}: {said}", file=sys.stderr)
+                yield client
+
+
+@contextmanager
+def _local_cluster(workers: int, extract: ExtractParams) -> Generator[LocalCluster]:
+    """Worker processes of this host, all of them up; raises `PipelineError` where they cannot be.
+
+    Dask cannot be interrupted while they start without noise and orphans, so a thread starts them
+    and an interrupted coordinator kills what was begun: then that thread ends by itself.
+    """
+    others = active_children()
+    with ThreadPoolExecutor(1) as pool:
+        # Ctrl-C reaches the whole process group, but only the coordinator may act on it: threads
+        # and processes, also workers begun again later, inherit the mask of the one that made them.
+        resource_tracker.ensure_running()  # now, for it unblocks SIGINT in whoever starts it
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        starting = pool.submit(_started, workers, extract)
+        try:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            try:
+                cluster = starting.result()
+            except (RuntimeError, OSError) as error:
+                raise PipelineError(
+                    f"extract.workers: {workers} worker processes could not be started "
+                    f"({error.__cause__ or error}). One was killed, or ran out of memory as it "
+                    "began: run the same command again, with fewer extract.workers where memory "
+                    "is short, or with extract.workers=0."
+                ) from None
+            yield cluster
+        finally:
+            while not starting.done():
+                for child in active_children():
+                    if child not in others:
+                        child.kill()
+                time.sleep(_LOOK_EVERY_S)
+            if starting.exception() is None:
+                starting.result().close()
+
+
+def _started(workers: int, extract: ExtractParams) -> LocalCluster:
+    """One thread of each process has the model, the others prepare.
+
+    A process that died is begun again however long its imports take (dask gives it up after 15 s).
+    """
+    cores = len(os.sched_getaffinity(0))
+    threads = os.environ.get("OMP_NUM_THREADS") or str(max(1, cores // workers))
+    names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+    env: dict[str, str] = dict.fromkeys(names, threads)
+    return private_cluster(workers, 1 + extract.decode_threads, extract.retries, env)

@@ -1,18 +1,95 @@
-"""Group prepared rows by shape and run the model over their variants."""
+"""Prepared rows -> features, in batches of equal shape that are as large as is fastest."""
 
+import sys
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any, Literal, NoReturn
+from typing import Any, Literal
 
 import torch
 from numpy.typing import NDArray
 
-from pipeline.base.errors import NumericsError
-from pipeline.extract.batch_size import BatchSize
+from pipeline.base.bfloat16 import array_of
+from pipeline.base.errors import NumericsError, VLMError
 from pipeline.extract.rows import ReadyRow
 from pipeline.vlm.preparation import TokenLayout
 from pipeline.vlm.qwen import FrozenVLM, Pending
+
+_FIRST = 8
+"""Fewer are slower on any device; where they do not fit, memory running out says so."""
+
+_MOST = {"cpu": 64, "cuda": 512}
+"""Past these, more rows gain nothing and only hold memory."""
+
+_MEASURED = 3
+"""Batches of a size that are timed; the one before them warms up.
+
+The fastest counts: whatever else the machine does makes a batch slower, never faster.
+"""
+
+_GAIN = 1.03
+"""How much faster more rows must be to be worth their memory."""
+
+_MISSES = 2
+"""Sizes in a row that are no faster before the search ends: one may be a hiccup."""
+
+
+class BatchSize:
+    """The current batch size, of prepared rows.
+
+    A number stays until memory runs out. "auto" doubles as long as that makes the model faster by
+    a few percent; then the smallest of the fastest sizes stays.
+    """
+
+    def __init__(self, size: int | Literal["auto"], device: str = "cpu") -> None:
+        """`device` is the type of the one that the model is on."""
+        self.current = _FIRST if size == "auto" else size
+        self.settled = size != "auto"
+        self._most = _MOST[device]
+        self._best = (0.0, self.current)
+        self._misses = 0
+        self._warm = False
+        self._timed: list[tuple[int, float]] = []
+
+    def note(self, size: int, tokens: int, seconds: float) -> None:
+        """What a full batch of this size took.
+
+        Tokens, not rows, are counted: rows of another shape have more of them.
+        """
+        if self.settled or size != self.current:  # one more was under way when it changed
+            return
+        if not self._warm:
+            self._warm = True
+            return
+        self._timed.append((tokens, seconds))
+        if len(self._timed) == _MEASURED:
+            self._decide(max(tokens / max(seconds, 1e-9) for tokens, seconds in self._timed))
+
+    def halve(self, failed: int, error: RuntimeError) -> None:
+        """Go on with half of what did not fit; `VLMError` where that was a single row."""
+        if failed == 1:
+            raise VLMError(
+                f"out of memory with a single row ({error}). Use a GPU with more memory, a smaller "
+                "vlm.image_resize_height and _width, or fewer data.views."
+            ) from error
+        self._settle(min(failed // 2, self._best[1]))
+        torch.cuda.empty_cache()
+        print(f"out of memory: going on with batches of {self.current}", file=sys.stderr)
+
+    def _decide(self, speed: float) -> None:
+        if speed >= self._best[0] * _GAIN:
+            self._best, self._misses = (speed, self.current), 0
+        else:
+            self._misses += 1
+        if self._misses == _MISSES or self.current * 2 > self._most:
+            self._settle(self._best[1])
+        else:
+            self.current *= 2
+            self._warm, self._timed = False, []
+
+    def _settle(self, size: int) -> None:
+        self.current, self.settled = size, True
+
 
 Encoded = tuple[list[ReadyRow], NDArray[Any]]
 """Rows, and their features (row, variant x slot, dim) as they are stored."""
@@ -41,18 +118,8 @@ class Encoder:
         self.model_s = 0.0
         """Seconds that the model worked on what was handed out so far."""
         self._vlm = vlm
-        self._size = BatchSize(batch_size, vlm.device.type)
+        self.size = BatchSize(batch_size, vlm.device.type)
         self._variants = variants
-
-    @property
-    def batch_size(self) -> int:
-        """How many prepared rows the model takes at a time, as of now."""
-        return self._size.current
-
-    @property
-    def settled(self) -> bool:
-        """Whether only memory running out would change the batch size."""
-        return self._size.settled
 
     def encoded(self, rows: Iterable[ReadyRow]) -> Iterator[Encoded]:
         """Every row once, batch by batch as the model is done with them, in no given order.
@@ -92,21 +159,21 @@ class Encoder:
     @property
     def _rows(self) -> int:
         """Whole rows a batch: at least one, whose variants may then take several passes."""
-        return max(1, self.batch_size // self._variants)
+        return max(1, self.size.current // self._variants)
 
     def _submitted(self, rows: list[ReadyRow]) -> Iterator[_Submitted]:
         """The rows in as many batches as the batch size makes of them."""
         while rows:
             batch = rows[: self._rows]
             every = [prepared for row in batch for prepared in row.variants]
-            size = self.batch_size
+            size = self.size.current
             try:
                 parts = (every[start : start + size] for start in range(0, len(every), size))
                 passes = [self._vlm.submit(part) for part in parts]
             except RuntimeError as error:
                 if not _out_of_memory(error):
                     raise
-                self._size.halve(min(size, len(every)), error)
+                self.size.halve(min(size, len(every)), error)
                 continue
             yield _Submitted(batch, passes, size if len(batch) == self._rows else None)
             rows = rows[len(batch) :]
@@ -114,42 +181,32 @@ class Encoder:
     def _finished(self, submitted: _Submitted) -> Iterator[Encoded]:
         rows = submitted.rows
         try:
-            features = torch.cat([one.result()[0] for one in submitted.passes])
-        except NumericsError as error:
-            if len(rows) == 1:
-                self._refuse(rows[0], error)
-            for one in rows:  # alone, the row that is not finite names itself
-                for alone in self._submitted([one]):
-                    yield from self._finished(alone)
+            features = [one.result()[0] for one in submitted.passes]
+        except NumericsError:
+            for row in rows:  # alone, the one that is not finite names itself
+                yield [row], _stored([row], [self._alone(row, v) for v in range(self._variants)])
             return
         seconds = sum(one.model_s for one in submitted.passes)
         self.model_s += seconds
         if submitted.full is not None:
             tokens = len(rows) * self._variants * rows[0].variants[0].layout.length
-            self._size.note(submitted.full, tokens, seconds)
-        yield rows, stored_bits(features.reshape(len(rows), -1, features.shape[-1]))
+            self.size.note(submitted.full, tokens, seconds)
+        yield rows, _stored(rows, features)
 
-    def _refuse(self, row: ReadyRow, error: NumericsError) -> NoReturn:
-        where = row.where
-        if self._variants > 1:
-            where += f", variant {self._not_finite(row)}"
-        raise NumericsError(f"{where}: {error}") from None
+    def _alone(self, row: ReadyRow, variant: int) -> torch.Tensor:
+        try:
+            return self._vlm.encode([row.variants[variant]])[0]
+        except NumericsError as error:
+            which = f", variant {variant}" if self._variants > 1 else ""
+            raise NumericsError(f"{row.where}{which}: {error}") from None
 
-    def _not_finite(self, row: ReadyRow) -> str:
-        for variant, prepared in enumerate(row.variants):
-            try:
-                self._vlm.encode([prepared])
-            except NumericsError:
-                return str(variant)
-        return "unknown (each is finite alone)"
+
+def _stored(rows: list[ReadyRow], features: list[torch.Tensor]) -> NDArray[Any]:
+    """Features (row x variant, slot, dim) as the rows are stored."""
+    joined = torch.cat(features)
+    return array_of(joined.reshape(len(rows), -1, joined.shape[-1]))
 
 
 def _out_of_memory(error: RuntimeError) -> bool:
     """CUDA has an exception of its own; the CPU allocator says it in words."""
     return isinstance(error, torch.OutOfMemoryError) or "can't allocate memory" in str(error)
-
-
-def stored_bits(features: torch.Tensor) -> NDArray[Any]:
-    """Features as the store's array holds them: bfloat16 as its bits."""
-    bits = features.view(torch.uint16) if features.dtype == torch.bfloat16 else features
-    return bits.contiguous().numpy()

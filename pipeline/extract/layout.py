@@ -1,21 +1,21 @@
 """Write everything of a store that needs no model: streams, ticks, episodes."""
 
 from collections.abc import Iterator, Sequence
+from itertools import takewhile
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.base.config import Params
 from pipeline.base.durable import free_bytes
 from pipeline.base.errors import DiskFull, NumericsError
+from pipeline.base.finite import first_non_finite
 from pipeline.base.format import size
 from pipeline.data import Stream
 from pipeline.data.timeline import Timeline
-from pipeline.extract.check import CheckedEpisode, embodiment_of
 from pipeline.extract.plan import store_bytes
-from pipeline.extract.survey import Survey, shown_path
+from pipeline.extract.survey import CheckedEpisode, Survey, embodiment_of, shown_path
 from pipeline.store import SCHEMA, RowSource, Sizes, StoreBuild, arrays
 from pipeline.store.episodes import EpisodeRows, episode_arrays, episode_edges
 from pipeline.store.schema import ArraySpec
@@ -23,12 +23,12 @@ from pipeline.vlm.feature_spec import FeatureSpec
 
 
 def check_space(
-    build: StoreBuild, checked: Sequence[CheckedEpisode], donors: Sequence[RowSource]
+    build: StoreBuild, checked: Sequence[CheckedEpisode], known: Sequence[RowSource]
 ) -> None:
     """Raise `DiskFull` where the store will not fit, chunks that can be linked left out."""
     linked = sum(
-        build.linkable(name, donor.specs[name], rows) * build.specs[name].chunk_bytes
-        for donor, name, rows in _linkable(build, checked, donors)
+        build.linkable(name, source.specs[name], rows) * build.specs[name].chunk_bytes
+        for source, name, rows in _linkable(build, checked, known)
     )
     needed = store_bytes(build.specs) - linked
     free = free_bytes(build.part)
@@ -42,39 +42,33 @@ def check_space(
 
 
 def lay_out(
-    build: StoreBuild,
-    checked: Sequence[CheckedEpisode],
-    survey: Survey,
-    params: Params,
-    donors: Sequence[RowSource],
+    build: StoreBuild, checked: Sequence[CheckedEpisode], survey: Survey, known: Sequence[RowSource]
 ) -> None:
     """Write all but the feature rows; chunks of unchanged streams are linked from a finished store.
 
     Raises `DiskFull` where the disk fills up.
     """
     build.create()
-    for donor, name, rows in _linkable(build, checked, donors):
-        build.link_unchanged(name, donor.path, donor.specs[name], rows)
+    for source, name, rows in _linkable(build, checked, known):
+        build.link_unchanged(name, source.path, source.specs[name], rows)
     build.allocate()
-    sources = [source.name for source in params.data.sources]
-    for name, values in episode_arrays(
-        _episodes(checked, params), sources, survey.spec.views
-    ).items():
+    attributes = _attributes(checked, survey)
+    episodes, views = _episode_rows(checked, survey), survey.spec.views
+    for name, values in episode_arrays(episodes, attributes["sources"], views).items():
         build.write(name, 0, values)
-    valid = [_slot_valid(one.timeline, survey.spec) for one in checked]
+    valid = [_slot_valid(episode.timeline, survey.spec) for episode in checked]
     build.write("vl/slot_valid", 0, np.concatenate(valid))
     starts = {"sensor": 0, "state": 0}
     for episode in tqdm(checked, "streams", unit="episode", disable=None, leave=False):
         _write_streams(build, episode, starts)
-    build.finish_layout(_attributes(checked, survey, params), {"slots": survey.spec.stored_slots()})
+    build.finish_layout(attributes, {"slots": attributes["slots"]})
 
 
-def build_arrays(
-    checked: Sequence[CheckedEpisode], survey: Survey, params: Params
-) -> dict[str, ArraySpec]:
+def build_arrays(checked: Sequence[CheckedEpisode], survey: Survey) -> dict[str, ArraySpec]:
     """The arrays that these episodes need."""
-    embodiment = embodiment_of(checked)
-    ends = {kind: int(edge[-1]) for kind, edge in episode_edges(_episodes(checked, params)).items()}
+    embodiment, extract = embodiment_of(checked), survey.params.extract
+    edges = episode_edges(_episode_rows(checked, survey))
+    ends = {kind: int(edge[-1]) for kind, edge in edges.items()}
     sizes = Sizes(
         episodes=len(checked),
         ticks=ends["tick"],
@@ -89,49 +83,44 @@ def build_arrays(
         sensor_channels=len(embodiment.sensor.names),
         state_dim=len(embodiment.state.names),
     )
-    return arrays(sizes, params.extract.dtype, params.extract.sensor_dtype)
+    return arrays(sizes, extract.dtype, extract.sensor_dtype)
 
 
-def _episodes(checked: Sequence[CheckedEpisode], params: Params) -> list[EpisodeRows]:
-    return [
-        EpisodeRows(
-            one.timeline,
-            one.readings,
-            one.states,
-            one.surveyed.recording.source,
-            {
-                "id": one.surveyed.recording.id,
-                "path": shown_path(one.surveyed.recording.path, params.data.root),
-                "format": one.surveyed.recording.format,
-                "instruction": one.surveyed.recording.instruction,
-                "content": one.surveyed.content,
-                "digest": one.surveyed.digest,
-            },
-        )
-        for one in checked
-    ]
+def _episode_rows(checked: Sequence[CheckedEpisode], survey: Survey) -> list[EpisodeRows]:
+    rows: list[EpisodeRows] = []
+    for episode in checked:
+        surveyed, recording = episode.surveyed, episode.surveyed.recording
+        text = {
+            "id": recording.id,
+            "path": shown_path(recording.path, survey.params.data.root),
+            "format": recording.format,
+            "instruction": recording.instruction,
+            "content": surveyed.content,
+            "digest": surveyed.digest,
+        }
+        readings, states = episode.readings, episode.states
+        rows.append(EpisodeRows(episode.timeline, readings, states, recording.source, text))
+    return rows
 
 
 def _linkable(
-    build: StoreBuild, checked: Sequence[CheckedEpisode], donors: Sequence[RowSource]
+    build: StoreBuild, checked: Sequence[CheckedEpisode], known: Sequence[RowSource]
 ) -> Iterator[tuple[RowSource, str, int]]:
     """Stream arrays of a finished store, and how many of their first rows are the same here.
 
     Those of the leading episodes of unchanged content; only whole chunks of them can be linked.
     """
-    for donor in donors:
-        if donor.path != build.target:
+    for source in known:
+        if source.path != build.target:
             continue
-        same = 0
-        for known, one in zip(donor.episode_contents, checked, strict=False):
-            if known != one.surveyed.content:
-                break
-            same += 1
-        readings = sum(one.readings for one in checked[:same])
-        states = sum(one.states for one in checked[:same])
+        contents = [episode.surveyed.content for episode in checked]
+        pairs = zip(source.episode_contents, contents, strict=False)
+        same = len(list(takewhile(lambda pair: pair[0] == pair[1], pairs)))
+        readings = sum(episode.readings for episode in checked[:same])
+        states = sum(episode.states for episode in checked[:same])
         for stream, rows in (("sensor", readings), ("state", states)):
             for part in ("values", "time"):
-                yield donor, f"{stream}/{part}", rows
+                yield source, f"{stream}/{part}", rows
 
 
 def _slot_valid(line: Timeline, spec: FeatureSpec) -> NDArray[np.uint8]:
@@ -159,8 +148,8 @@ def _write_streams(build: StoreBuild, episode: CheckedEpisode, starts: dict[str,
 def _stored(stream: Stream, spec: ArraySpec) -> NDArray[Any]:
     with np.errstate(over="ignore"):
         values = stream.values.astype(spec.dtype)
-    if not np.isfinite(values).all():
-        row, column = np.argwhere(~np.isfinite(values))[0]
+    if (bad := first_non_finite(values)) is not None:
+        row, column = bad
         raise NumericsError(
             f"{stream.channels.names[column]} = {stream.values[row, column]:g} at "
             f"{stream.time[row]:.3f} s does not fit {spec.dtype}; set extract.sensor_dtype=float32"
@@ -168,16 +157,15 @@ def _stored(stream: Stream, spec: ArraySpec) -> NDArray[Any]:
     return values
 
 
-def _attributes(
-    checked: Sequence[CheckedEpisode], survey: Survey, params: Params
-) -> dict[str, Any]:
+def _attributes(checked: Sequence[CheckedEpisode], survey: Survey) -> dict[str, Any]:
+    data = survey.params.data
     return {
         "schema": SCHEMA,
         "feature_spec": survey.spec.attrs(),
         "slots": survey.spec.stored_slots(),
-        "sources": [source.name for source in params.data.sources],
+        "sources": [source.name for source in data.sources],
         "streams": embodiment_of(checked).document() | {"views": list(survey.spec.views)},
-        "action_hz": params.data.action_hz,
-        "vlm_reuse_count": params.data.vlm_reuse_count,
+        "action_hz": data.action_hz,
+        "vlm_reuse_count": data.vlm_reuse_count,
         "environment": [],
     }

@@ -1,15 +1,15 @@
 """What lies at the place of a store and beside it, and what of that an extraction may use."""
 
 from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
+from pipeline.base.differences import describe, differences
 from pipeline.base.durable import KEPT, previous_path
 from pipeline.base.errors import StoreIncomplete, StoreMismatch
 from pipeline.base.ownership import refuse_foreign, remove_folder
 from pipeline.data.embodiment import Embodiment
-from pipeline.extract.plan import spec_differences
 from pipeline.extract.survey import Survey
 from pipeline.store import RowSource, StoreBuild, part_path, read_plan
 from pipeline.store.paths import MERGED, STORE, is_store
@@ -17,83 +17,168 @@ from pipeline.store.schema import read_specs
 
 Say = Callable[[str], None]
 _SHOWN = 6
-"""Channels that a message lists."""
+"""Channels, or entries of a feature spec, that a message lists."""
 
 
-def plans(target: Path) -> tuple[str | None, str | None]:
-    """Of the unfinished build, and of the store."""
-    return read_plan(part_path(target)), read_plan(target)
+class StorePlaces:
+    """A store, its unfinished build and what earlier runs left of it; plans as they were found.
 
-
-def layout_damage(target: Path) -> str | None:
-    """What is wrong with all but the feature rows of the build of a store."""
-    part = part_path(target)
-    with closing(StoreBuild(target, read_specs(part), read_plan(part) or "")) as build:
-        return build.layout_damage()
-
-
-def known_places(target: Path) -> list[Path]:
-    """Builds that were set aside, the store, and the one before it, unless a repair has begun.
-
-    A repair leaves out what is damaged: that must not come back from the store that it mends.
+    `begun` and `finished` are the plans of the build and of the store, None where there is none.
+    `aside` are builds of other plans that were interrupted, kept for their rows, and `kept` is the
+    store that a run kept, if there is one: a copy that a user made is not one.
     """
-    aside = set_aside(target)
-    repairs = {read_plan(place) for place in [*aside, part_path(target)]} - {None}
-    return aside if read_plan(target) in repairs else [*aside, target, *_kept(target)]
+
+    def __init__(self, target: Path) -> None:
+        self.target, self.part, self.previous = (target, part_path(target), previous_path(target))
+        self.begun, self.finished = read_plan(self.part), read_plan(target)
+        builds = sorted(target.parent.glob(f"{target.name}.known-*"))
+        numbered = [path for path in builds if path.name.rpartition("-")[2].isdigit()]
+        self.aside = [path for path in numbered if is_store(path)]
+        is_kept = KEPT.owns(self.previous) and read_plan(self.previous) is not None
+        self.kept = [self.previous] if is_kept else []
+
+    @property
+    def known(self) -> list[Path]:
+        """Builds that were set aside, the store, and the one before it, unless a repair has begun.
+
+        A repair leaves out what is damaged: that must not come back from the store that it mends.
+        """
+        store = [] if self.finished is None else [self.target]
+        return self.aside if self.repaired else [*self.aside, *store, *self.kept]
+
+    @property
+    def repaired(self) -> bool:
+        """Whether a build of the store's own plan has begun."""
+        repairs = {self.begun, *(read_plan(place) for place in self.aside)}
+        return self.finished is not None and self.finished in repairs
+
+    def stands(self, surveyed: Survey) -> bool:
+        """Whether a store or a build of this very plan is there; a build, as it was laid out."""
+        if self.begun == surveyed.plan:
+            return self.layout_damage() is None
+        return self.finished == surveyed.plan
+
+    def begun_build(self) -> StoreBuild:
+        """The unfinished build."""
+        return StoreBuild(self.target, read_specs(self.part), self.begun or "")
+
+    def layout_damage(self) -> str | None:
+        """What is wrong with all but the feature rows of the unfinished build."""
+        with closing(self.begun_build()) as build:
+            return build.layout_damage()
+
+    def make_room(self, surveyed: Survey, say: Say) -> None:
+        """Set an unfinished build aside; of another feature spec, it is of no use."""
+        if self.begun is None:
+            return
+        with closing(RowSource(self.part)) as abandoned:
+            before, spec_digest = abandoned.attrs["feature_spec"], abandoned.spec_digest
+        if spec_digest != surveyed.spec.digest:
+            for line in spec_differences(before, surveyed.spec.attrs()):
+                say(f"the unfinished build {self.part} is given up: {line}")
+            return
+        number = len(self.aside)
+        while (aside := self.target.with_name(f"{self.target.name}.known-{number}")).exists():
+            number += 1
+        self.part.rename(aside)
+
+    def keeping_note(self, surveyed: Survey) -> list[str]:
+        """What a run says of episodes that it does not name: the store with them is kept once more.
+
+        Raises `ConfigError` where something else lies where it would be kept.
+        """
+        contents, lines = surveyed.contents, list[str]()
+        if lost := self._lost(surveyed):
+            refuse_foreign(self.previous, KEPT)
+            lines = [
+                f"{self.target} holds {lost}: it is kept as {self.previous} until the next "
+                "successful run, which takes their rows from it where they are there again"
+            ]
+            contents |= set(_contents(self.target) or ())
+        for place in self.kept:
+            known = _contents(place)
+            gone = "all its" if known is None else sum(content not in contents for content in known)
+            then = "replaced by it" if lost else "removed"
+            lines.append(
+                f"{place} is {then} when this run succeeds; {gone} episode(s) are only in there"
+            )
+        return lines
+
+    def put_in_place(self, build: StoreBuild, surveyed: Survey, say: Say) -> None:
+        """Seal a build, keep the store before it where episodes would be lost, and tidy up."""
+        build.keeps_replaced = self._lost(surveyed) is not None
+        with closing(build):
+            build.seal()
+        for folder in self.aside:
+            remove_folder(folder, STORE)
+        if build.keeps_replaced:
+            say(f"{self.previous}: the store of before, kept until the next successful run")
+        else:
+            for place in self.kept:
+                remove_folder(place, KEPT)
+
+    def _lost(self, surveyed: Survey) -> str | None:
+        """Which episodes of the store are not in the one that takes its place; None: all are."""
+        if self.finished in (None, surveyed.plan):
+            return None
+        if (known := _contents(self.target)) is None:
+            return "episodes that can no longer be told"
+        contents = surveyed.contents
+        lost = sum(content not in contents for content in known)
+        what = f"{lost} episode(s) that are not in this run (or whose files are read otherwise now)"
+        return what if lost else None
+
+    def refuse_to_lose(self, surveyed: Survey, embodiment: Embodiment) -> None:
+        """Raise `StoreMismatch` where rows would be lost that these params cannot give again.
+
+        Those of a merged store, or one under repair, with recordings that params do not name: who
+        follows the advice of a check may run under other params than that store's own. And those of
+        a store or build without an episode in common, of another embodiment or other sources only.
+        """
+        plans = {self.target: self.finished, self.part: self.begun}
+        for place in (place for place, plan in plans.items() if plan is not None):
+            with closing(RowSource(place)) as source:
+                _refuse_another(source, surveyed, embodiment)
+        under_repair = self.finished is not None and self.finished == self.begun
+        if not under_repair and not (self.finished or "").startswith(MERGED):
+            return
+        with closing(RowSource(self.part if under_repair else self.target)) as source:
+            lost = set(source.episode_contents) - surveyed.contents
+        if lost:
+            what = "is under repair" if under_repair else "was merged of others"
+            raise StoreMismatch(
+                f"{self.target}: {what} and holds {len(lost)} episode(s) that the params do not "
+                "name; extraction would replace it. Give the --params it was made with (or run its "
+                "merge again), name another extract.store, or move it away."
+            )
 
 
 @contextmanager
-def donors_at(places: Sequence[Path], surveyed: Survey) -> Generator[list[RowSource]]:
-    """Stores and laid-out builds of the same feature spec among these places."""
-    donors = [RowSource(place) for place in places if read_plan(place) is not None]
-    try:
-        yield [donor for donor in donors if donor.spec_digest == surveyed.spec.digest]
-    finally:
-        for donor in donors:
-            donor.close()
+def row_sources(places: Sequence[Path], surveyed: Survey) -> Generator[list[RowSource]]:
+    """The stores and laid-out builds of the same feature spec among these."""
+    with ExitStack() as stack:
+        sources = [RowSource(place) for place in places]
+        for source in sources:
+            stack.enter_context(closing(source))
+        yield [source for source in sources if source.spec_digest == surveyed.spec.digest]
 
 
-def refuse_to_lose(target: Path, surveyed: Survey, embodiment: Embodiment) -> None:
-    """Raise `StoreMismatch` where rows would be lost that these params cannot give again.
-
-    Those of a merged store, or one under repair, with recordings that params do not name: who
-    follows the advice of a check may run under other params than that store's own. And those of a
-    store or build without an episode in common, of another embodiment or of other sources only.
-    """
-    begun, finished = plans(target)
-    for place in (target, part_path(target)):
-        if read_plan(place) is not None:
-            with closing(RowSource(place)) as donor:
-                _refuse_another(donor, surveyed, embodiment)
-    if finished is None or not (begun == finished or finished.startswith(MERGED)):
+def _refuse_another(source: RowSource, surveyed: Survey, embodiment: Embodiment) -> None:
+    known = set(source.episode_contents)
+    if not known or known & surveyed.contents or not source.rows:
         return
-    with closing(RowSource(part_path(target) if begun == finished else target)) as donor:
-        lost = set(donor.episode_contents) - {one.content for one in surveyed.episodes}
-    if lost:
-        what = "is under repair" if begun == finished else "was merged of others"
-        raise StoreMismatch(
-            f"{target}: {what} and holds {len(lost)} episode(s) that the params do not name; "
-            "extraction would replace it. Give the --params it was made with (or run its merge "
-            "again), name another extract.store, or move it away."
-        )
-
-
-def _refuse_another(donor: RowSource, surveyed: Survey, embodiment: Embodiment) -> None:
-    known, now = set(donor.episode_contents), {one.content for one in surveyed.episodes}
-    if not known or known & now or not donor.rows:
-        return
-    sources = donor.attrs["sources"], sorted({one.recording.source for one in surveyed.episodes})
-    before, now = donor.attrs["streams"], embodiment.document()
+    there, here = (source.attrs["sources"], sorted({one.source for one in surveyed.recordings}))
+    before, now = source.attrs["streams"], embodiment.document()
     differing = [
         f"{stream}: {_channels(before[stream])} there, {_channels(now[stream])} here"
         for stream in ("action", "sensor", "state")
         if before[stream]["names"] and now[stream]["names"]
         if any(before[stream][key] != now[stream][key] for key in ("names", "units"))
     ]
-    if differing or not set(sources[0]) & set(sources[1]):
-        why = [f"sources: {', '.join(sources[0])} there, {', '.join(sources[1])} here", *differing]
+    if differing or not set(there) & set(here):
+        why = [f"sources: {', '.join(there)} there, {', '.join(here)} here", *differing]
         raise StoreMismatch(
-            f"{donor.path}: holds the feature rows of {len(known)} episode(s), none "
+            f"{source.path}: holds the feature rows of {len(known)} episode(s), none "
             "of which is in data.sources, and extraction would throw them away:\n"
             + "\n".join(f"  {line}" for line in why)
             + "\nName another store for these recordings, with --set extract.store=…, give the "
@@ -108,99 +193,21 @@ def _channels(stream: Mapping[str, Any]) -> str:
     return f"{len(named)} channels [{listed}]"
 
 
-def keeping_note(target: Path, surveyed: Survey) -> list[str]:
-    """What a run says of episodes that it does not name: the store with them is kept once more.
-
-    Raises `ConfigError` where something else lies where it would be kept.
-    """
-    kept, lines = previous_path(target), list[str]()
-    contents = {one.content for one in surveyed.episodes}
-    if lost := _lost(target, surveyed):
-        refuse_foreign(kept, KEPT)
-        lines = [
-            f"{target} holds {lost}: it is kept as {kept} until the next successful run, which "
-            "takes their rows from it where they are there again"
-        ]
-        contents |= set(_contents(target) or ())
-    for place in _kept(target):
-        known = _contents(place)
-        gone = "all its" if known is None else sum(content not in contents for content in known)
-        then = "replaced by it" if lost else "removed"
-        lines.append(
-            f"{place} is {then} when this run succeeds; {gone} episode(s) are only in there"
-        )
-    return lines
-
-
-def put_in_place(build: StoreBuild, surveyed: Survey, say: Say) -> None:
-    """Seal a build, keep the store before it where episodes would be lost, and tidy up."""
-    target = build.target
-    build.keeps_replaced = _lost(target, surveyed) is not None
-    with closing(build):
-        build.seal()
-    for folder in set_aside(target):
-        remove_folder(folder, STORE)
-    if build.keeps_replaced:
-        say(f"{previous_path(target)}: the store of before, kept until the next successful run")
-    else:
-        for place in _kept(target):
-            remove_folder(place, KEPT)
-
-
-def _lost(target: Path, surveyed: Survey) -> str | None:
-    """Which episodes of the store are not in the one that takes its place; None where all are."""
-    if read_plan(target) in (None, surveyed.plan):
-        return None
-    if (known := _contents(target)) is None:
-        return "episodes that can no longer be told"
-    contents = {one.content for one in surveyed.episodes}
-    lost = sum(content not in contents for content in known)
-    named = f"{lost} episode(s) that are not in this run (or whose files are read otherwise now)"
-    return named if lost else None
-
-
 def _contents(store: Path) -> list[str] | None:
     """The content digest of each episode; None where they can no longer be read."""
-    with closing(RowSource(store)) as donor:
+    with closing(RowSource(store)) as source:
         try:
-            return donor.episode_contents
+            return source.episode_contents
         except StoreIncomplete:
             return None
 
 
-def _kept(target: Path) -> list[Path]:
-    """The store that a run kept, if there is one; a copy that a user made is not one."""
-    kept = previous_path(target)
-    return [kept] if KEPT.owns(kept) and read_plan(kept) is not None else []
-
-
-def make_room(target: Path, surveyed: Survey, say: Say) -> None:
-    """Set an unfinished build of another plan aside; of another feature spec, it is of no use."""
-    part = part_path(target)
-    if read_plan(part) is None:
-        return
-    abandoned = RowSource(part)
-    abandoned.close()
-    if abandoned.spec_digest == surveyed.spec.digest:
-        taken = len(set_aside(target))
-        while (aside := _beside(target, f".known-{taken}")).exists():
-            taken += 1
-        part.rename(aside)
-        return
-    for line in spec_differences(abandoned.attrs["feature_spec"], surveyed.spec.attrs()):
-        say(f"the unfinished build {part} is given up: {line}")
-
-
-def set_aside(target: Path) -> list[Path]:
-    """Builds of other plans that were interrupted, kept for their rows."""
-    builds = sorted(target.parent.glob(f"{target.name}.known-*"))
-    return [path for path in builds if path.name.rpartition("-")[2].isdigit() and is_store(path)]
-
-
-def ledger_path(target: Path) -> Path:
-    """Where the digests of files are remembered."""
-    return _beside(target, ".files.sqlite")
-
-
-def _beside(target: Path, suffix: str) -> Path:
-    return target.with_name(target.name + suffix)
+def spec_differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """What differs between two feature specs, without all that follows from it."""
+    differing = differences(before, now)
+    follows = ("slots", "example_prompt")
+    first = {place: two for place, two in differing.items() if not place.startswith(follows)}
+    lines = describe(first or differing)[:_SHOWN]
+    left = len(differing) - len(lines)
+    more = [f"{left} more entries, most of which follow from that"] if left else []
+    return [*lines, *more]

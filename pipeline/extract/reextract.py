@@ -14,12 +14,12 @@ from tqdm import tqdm
 from pipeline.base.bfloat16 import widen
 from pipeline.base.config import Params
 from pipeline.base.differences import describe, differences
-from pipeline.base.digests import ContentDigests
+from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.base.errors import NumericsError, StoreMismatch
 from pipeline.data import Recording
 from pipeline.data.row_range import RowRange
 from pipeline.extract.survey import survey
-from pipeline.store import FEATURES, Episode, FeatureStore, ledger_path
+from pipeline.store import FEATURES, Episode, FeatureStore
 from pipeline.store.environments import environment_runs
 from pipeline.store.integrity.verification import capped
 from pipeline.vlm.feature_spec import FeatureSpec, row_key

@@ -5,18 +5,16 @@ from contextlib import closing
 from pathlib import Path
 
 from pipeline.base.config import Params
-from pipeline.base.digests import ContentDigests
+from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.base.durable import disk_full_named
 from pipeline.base.errors import StoreMismatch
 from pipeline.base.ownership import remove_folder
 from pipeline.extract.layout import build_arrays, check_space, lay_out
-from pipeline.extract.run import sound_episodes
-from pipeline.extract.survey import survey
+from pipeline.extract.survey import sound_episodes, survey
 from pipeline.store import (
     FEATURES,
     StoreBuild,
     build_lock,
-    ledger_path,
     part_path,
     read_plan,
     recover,
@@ -96,7 +94,7 @@ def _refuse_other_build(store: Path, plan: str) -> None:
 def _lay_out_anew(store: Path, plan: str, params: Params) -> StoreBuild:
     """Everything but the feature rows, from the recordings."""
     with closing(ContentDigests(ledger_path(store))) as digests:
-        surveyed, checked = sound_episodes(survey(params, digests), params, digests)
+        surveyed, checked = sound_episodes(survey(params, digests), digests)
     if surveyed.plan != plan:
         raise StoreMismatch(
             f"{store}: metadata, streams, ticks or episodes are damaged, and the params describe "
@@ -104,9 +102,9 @@ def _lay_out_anew(store: Path, plan: str, params: Params) -> StoreBuild:
             "cannot be written again. Restore the recordings and params, or run "
             f"{_completed_by(store, plan)}, which takes over every row whose frames it knows."
         )
-    build = StoreBuild(repair_build(store), build_arrays(checked, surveyed, params), plan)
+    build = StoreBuild(repair_build(store), build_arrays(checked, surveyed), plan)
     check_space(build, checked, ())
-    lay_out(build, checked, surveyed, params, ())
+    lay_out(build, checked, surveyed, ())
     return build
 
 

@@ -1,4 +1,4 @@
-"""Decode and prepare missing rows in the background, while the model works."""
+"""Row ranges -> rows ready for the model, decoded and prepared in the background."""
 
 import threading
 from collections import deque
@@ -8,11 +8,9 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import Any, TypeVar
 
-import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data import Recording
-from pipeline.data.row_range import RowRange
+from pipeline.data.row_range import Frames, RowRange
 from pipeline.store import RowSource
 from pipeline.vlm.feature_spec import FeatureSpec, row_key
 from pipeline.vlm.preparation import PreparedRow, Preparer
@@ -20,7 +18,7 @@ from pipeline.vlm.preparation import PreparedRow, Preparer
 Work = TypeVar("Work")
 Made = TypeVar("Made")
 
-SPAN_ROWS = 16
+RANGE_ROWS = 16
 """Rows that one thread decodes in one go: long enough for video, short enough for memory.
 
 Variants count as rows of their own here: they wait in memory alike.
@@ -29,7 +27,7 @@ Variants count as rows of their own here: they wait in memory alike.
 
 @dataclass(frozen=True)
 class KnownRow:
-    """A row that a donor has."""
+    """A row that an older store or build has."""
 
     row: int
     key: bytes
@@ -51,7 +49,7 @@ class ReadyRow:
 
 @dataclass(frozen=True)
 class RepeatedRow:
-    """A row that shows and says what another row of this run does."""
+    """A row that shows and says what another row does."""
 
     row: int
     key: bytes
@@ -59,81 +57,47 @@ class RepeatedRow:
     """The row of the same key that the model is given."""
 
 
-def spans_of(
-    recordings: Sequence[Recording],
-    vl_start: NDArray[np.int64],
-    frame_time: NDArray[np.float64],
-    views: Sequence[str],
-    missing: NDArray[np.int64],
-    variants: int,
-) -> Iterator[RowRange]:
-    """Cut the missing rows into spans of `SPAN_ROWS` prepared rows, `variants` of each.
-
-    By the frame times that the layout wrote, so that a resumed build needs no stream.
-    """
-    together = max(1, SPAN_ROWS // variants)
-    for episode, recording in enumerate(recordings):
-        first, last = np.searchsorted(missing, vl_start[episode : episode + 2])
-        if first == last:
-            continue
-        cameras = recording.cameras()
-        for start in range(first, last, together):
-            rows = missing[start : min(start + together, last)]
-            yield RowRange.of(recording, cameras, rows, frame_time[rows], views)
+Row = KnownRow | ReadyRow | RepeatedRow
 
 
 class RowPreparation:
-    """Turns spans into rows; used from several threads."""
+    """Turns row ranges into rows; used from several threads."""
 
-    def __init__(self, preparer: Preparer, spec: FeatureSpec, donors: Sequence[RowSource]) -> None:
+    def __init__(self, preparer: Preparer, spec: FeatureSpec, known: Sequence[RowSource]) -> None:
+        """A row of a key that one of `known` has is taken from there."""
         self._preparer = preparer
         self._spec = spec
-        self._donors = donors
-        self._firsts: dict[bytes, int] = {}
+        self._known = known
         self._lock = threading.Lock()
 
-    def prepare(self, span: RowRange) -> list[KnownRow | ReadyRow]:
-        """The rows of a span, each decoded frame held only while its row is made."""
-        return [
-            self._known(row, key) or self._ready(span, row, key, frames)
-            for row, key, frames in self._keyed(span)
-        ]
+    def prepare(self, rows: RowRange, firsts: dict[bytes, int] | None = None) -> list[Row]:
+        """The rows of a range, each decoded frame held only while its row is made.
 
-    def prepare_once(self, span: RowRange) -> list[KnownRow | ReadyRow | RepeatedRow]:
-        """As `prepare`, but of all rows of equal key only one is made ready."""
-        return [
-            self._known(row, key) or self._repeated(row, key) or self._ready(span, row, key, frames)
-            for row, key, frames in self._keyed(span)
-        ]
+        Of all rows of equal key only the one that `firsts` notes is made ready; where that is None,
+        all are. Raises what the recording raises.
+        """
+        prompt = self._preparer.render(rows.recording.instruction, list(rows.frames))
+        return [self._row(rows, row, frames, prompt, firsts) for row, frames in rows.read()]
 
-    def _keyed(self, span: RowRange) -> Iterator[tuple[int, bytes, dict[str, NDArray[np.uint8]]]]:
-        prompt = self._preparer.render(span.recording.instruction, list(span.frames))
-        for row, frames in span.read():
-            yield row, row_key(self._spec, prompt, frames), frames
-
-    def _known(self, row: int, key: bytes) -> KnownRow | None:
+    def _row(
+        self, rows: RowRange, row: int, frames: Frames, prompt: str, firsts: dict[bytes, int] | None
+    ) -> Row:
+        key = row_key(self._spec, prompt, frames)
         with self._lock:
-            for donor in self._donors:
-                features = donor.take(key)
-                if features is not None:
-                    return KnownRow(row, key, features, donor.environment_of(key))
-        return None
-
-    def _repeated(self, row: int, key: bytes) -> RepeatedRow | None:
-        with self._lock:
-            first = self._firsts.setdefault(key, row)
-        return RepeatedRow(row, key, first) if first != row else None
-
-    def _ready(
-        self, span: RowRange, row: int, key: bytes, frames: dict[str, NDArray[np.uint8]]
-    ) -> ReadyRow:
-        variants = self._preparer.prepare_variants(span.recording.instruction, frames, key)
-        return ReadyRow(row, key, variants, f"{span.recording.path}, VL row {row}")
+            for source in self._known:
+                if (features := source.take(key)) is not None:
+                    return KnownRow(row, key, features, source.environment_of(key))
+            first = row if firsts is None else firsts.setdefault(key, row)
+        if first != row:
+            return RepeatedRow(row, key, first)
+        recording = rows.recording
+        variants = self._preparer.prepare_variants(recording.instruction, frames, key)
+        return ReadyRow(row, key, variants, f"{recording.path}, VL row {row}")
 
 
 def in_background(
     work: Iterable[Work],
-    make: Callable[[Work], list[Made]],
+    make: Callable[[Work], Made],
     threads: int,
     ahead: Callable[[], int] = lambda: 0,
 ) -> Generator[Made]:
@@ -142,14 +106,14 @@ def in_background(
     At least `threads + 1`, so that no thread waits for the reader.
     """
     with ThreadPoolExecutor(threads, thread_name_prefix="decode") as pool:
-        pieces = iter(work)
-        made: deque[Future[list[Made]]] = deque()
+        pieces: Iterator[Work] = iter(work)
+        made: deque[Future[Made]] = deque()
         try:
             while True:
                 lacking = max(threads + 1, ahead()) - len(made)  # below 0 once `ahead` has shrunk
                 made.extend(pool.submit(make, piece) for piece in islice(pieces, max(0, lacking)))
                 if not made:
                     return
-                yield from made.popleft().result()
+                yield made.popleft().result()
         finally:
             pool.shutdown(cancel_futures=True)

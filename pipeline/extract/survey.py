@@ -1,7 +1,9 @@
-"""Which episodes there are and what they are, without reading a sensor or decoding a frame.
+"""Which episodes there are and what they are, and whether each can be used.
 
-The survey's plan digest names everything that decides what a store holds. Where a finished store
-carries the same, there is nothing to do.
+A survey reads no sensor and decodes no frame. Its plan digest names everything that decides what a
+store holds: where a finished store carries the same, there is nothing to do. `check_episodes` then
+reads every episode whole, before the first byte is written, so that all that is wrong is said at
+once and before anything expensive runs.
 """
 
 import os
@@ -9,14 +11,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from tqdm import tqdm
 
 from pipeline.base.config import DataParams, Params
 from pipeline.base.digests import ContentDigests, joint_digest
-from pipeline.base.errors import RecordingError
+from pipeline.base.errors import RecordingError, VLMError
 from pipeline.data import BadEpisode, Recording, content_digest, open_recordings
-from pipeline.data.timeline import ActionRotation, choose_action_rotation
+from pipeline.data.embodiment import Embodiment, common_embodiment
+from pipeline.data.episode import ReadEpisode, read_episode
+from pipeline.data.timeline import ActionRotation, Timeline, choose_action_rotation
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
+from pipeline.vlm.preparation import Preparer
 
 
 @dataclass(frozen=True)
@@ -34,6 +40,7 @@ class SurveyedEpisode:
 class Survey:
     """What is to be in the store."""
 
+    params: Params
     episodes: tuple[SurveyedEpisode, ...]
     missing: tuple[str, ...]
     """Listed by a data set's metadata, absent from its files."""
@@ -43,6 +50,37 @@ class Survey:
     plan: str
     """Digest of all that decides what the store holds."""
 
+    @property
+    def target(self) -> Path:
+        """The store."""
+        return self.params.extract.store
+
+    @property
+    def recordings(self) -> list[Recording]:
+        """Of the episodes, in order."""
+        return [episode.recording for episode in self.episodes]
+
+    @property
+    def contents(self) -> set[str]:
+        """The content digests of the episodes."""
+        return {episode.content for episode in self.episodes}
+
+
+@dataclass(frozen=True)
+class CheckedEpisode:
+    """An episode that was read whole and found sound; its streams are let go again."""
+
+    surveyed: SurveyedEpisode
+    timeline: Timeline
+    embodiment: Embodiment
+    readings: int
+    states: int
+
+    @classmethod
+    def of(cls, surveyed: SurveyedEpisode, read: ReadEpisode) -> "CheckedEpisode":
+        """What is kept of an episode that was read."""
+        return cls(surveyed, read.timeline, read.embodiment, read.readings, read.states)
+
 
 def survey(params: Params, digests: ContentDigests) -> Survey:
     """Open every source, take the content digest of its files and name the feature spec.
@@ -50,7 +88,7 @@ def survey(params: Params, digests: ContentDigests) -> Survey:
     With `data.on_bad_episode: skip`, episodes that an earlier check found bad are left out. Raises
     `RecordingError` when no episode is usable, and whatever a source as a whole is refused for.
     """
-    data = params.data
+    data, extract = params.data, params.extract
     opened = open_recordings(data.sources, data.root, data.views)
     rotation = choose_action_rotation(data.action_rotation, opened.recordings)
     episodes: list[SurveyedEpisode] = []
@@ -68,28 +106,73 @@ def survey(params: Params, digests: ContentDigests) -> Survey:
             continue
         episodes.append(SurveyedEpisode(recording, content, digest))
     if not episodes:
-        refuse_bad(bad, of=len(bad))
-    spec = feature_spec(params.vlm, params.extract.dtype, sorted(views), digests.of, digests.text)
+        _refuse_bad(bad, of=len(bad))
+    spec = feature_spec(params.vlm, extract.dtype, sorted(views), digests.of, digests.text)
     plan = joint_digest(
         spec.digest,
-        params.extract.sensor_dtype,
+        extract.sensor_dtype,
         repr([(source.name, source.action_kind) for source in data.sources]),
         *(episode.digest for episode in episodes),
     )
-    return Survey(tuple(episodes), opened.missing, tuple(bad), spec, rotation, plan)
+    return Survey(params, tuple(episodes), opened.missing, tuple(bad), spec, rotation, plan)
 
 
-def refuse_bad(bad: Sequence[BadEpisode], of: int) -> None:
-    """Raise one `RecordingError` that lists every bad episode."""
-    lines = [f"{len(bad)} of {of} episodes cannot be used:"]
-    lines += [f"  {one.source}: {_reason(one)}" for one in bad]
-    lines.append("Mend or remove them, or leave them out with --set data.on_bad_episode=skip.")
-    raise RecordingError("\n".join(lines))
+def sound_episodes(
+    surveyed: Survey, digests: ContentDigests
+) -> tuple[Survey, list[CheckedEpisode]]:
+    """Every sound episode; the survey again without those that have to be skipped.
+
+    A bad episode must decide neither the views nor how actions are derived. Raises as
+    `check_episodes` does.
+    """
+    checked, bad = check_episodes(surveyed)
+    if not bad:
+        return surveyed, checked
+    for episode, reason in bad:
+        digests.note_bad(episode.digest, reason)
+    again = survey(surveyed.params, digests)
+    if again.action_rotation == surveyed.action_rotation:
+        kept = {episode.digest for episode in again.episodes}
+        return again, [episode for episode in checked if episode.surveyed.digest in kept]
+    return sound_episodes(again, digests)
 
 
-def _reason(bad: BadEpisode) -> str:
-    where = str(bad.where)
-    return bad.reason if where in bad.reason else f"{where}: {bad.reason}"
+def check_episodes(
+    surveyed: Survey,
+) -> tuple[list[CheckedEpisode], list[tuple[SurveyedEpisode, str]]]:
+    """Read and check every episode; returns the sound ones, and the others with the reason.
+
+    Raises one `RecordingError` that lists all that cannot be used, unless
+    `data.on_bad_episode: skip` allows to leave them out, and `StoreMismatch` when two sources are
+    not of one embodiment.
+    """
+    preparer = Preparer(surveyed.params.vlm, surveyed.spec)
+    sound: list[CheckedEpisode] = []
+    failed: list[tuple[SurveyedEpisode, str]] = []
+    for episode in tqdm(surveyed.episodes, "check", unit="episode", disable=None, leave=False):
+        try:
+            sound.append(_checked(episode, surveyed, preparer))
+        except RecordingError as error:
+            failed.append((episode, str(error)))
+    recordings = [(episode.recording, reason) for episode, reason in failed]
+    bad = [
+        *surveyed.bad,
+        *(BadEpisode(recording.source, recording.path, reason) for recording, reason in recordings),
+    ]
+    if bad and (surveyed.params.data.on_bad_episode == "stop" or not sound):
+        _refuse_bad(bad, of=len(sound) + len(bad))
+    embodiment_of(sound)
+    return sound, failed
+
+
+def embodiment_of(checked: Sequence[CheckedEpisode]) -> Embodiment:
+    """What all these episodes have in common; `StoreMismatch` where two sources differ."""
+    return common_embodiment(
+        [(episode.surveyed.recording, episode.embodiment) for episode in checked],
+        "store",
+        "Extract them into two stores: one params file each, with its own data.sources and "
+        "extract.store.",
+    )
 
 
 def shown_path(path: Path, root: Path) -> str:
@@ -98,6 +181,30 @@ def shown_path(path: Path, root: Path) -> str:
         return Path(os.path.abspath(path)).relative_to(os.path.abspath(root)).as_posix()
     except ValueError:
         return os.path.abspath(path)
+
+
+def _checked(episode: SurveyedEpisode, surveyed: Survey, preparer: Preparer) -> CheckedEpisode:
+    recording, data = episode.recording, surveyed.params.data
+    read = read_episode(recording, data.action_hz, data.vlm_reuse_count, surveyed.action_rotation)
+    cameras = recording.cameras()
+    try:
+        preparer.render(recording.instruction, list(cameras))
+    except VLMError as error:
+        raise RecordingError(f"{recording.path}: {error}") from None
+    for view, camera in cameras.items():
+        camera.check(np.unique(read.timeline.frames[view]).tolist())
+    return CheckedEpisode.of(episode, read)
+
+
+def _refuse_bad(bad: Sequence[BadEpisode], of: int) -> None:
+    """Raise one `RecordingError` that lists every bad episode."""
+    lines = [f"{len(bad)} of {of} episodes cannot be used:"]
+    for episode in bad:
+        told = str(episode.where) in episode.reason
+        reason = episode.reason if told else f"{episode.where}: {episode.reason}"
+        lines.append(f"  {episode.source}: {reason}")
+    lines.append("Mend or remove them, or leave them out with --set data.on_bad_episode=skip.")
+    raise RecordingError("\n".join(lines))
 
 
 def _digest(recording: Recording, content: str, data: DataParams, rotation: ActionRotation) -> str:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.store.chunks import check_trailers
 from pipeline.store.episodes import Episode
 from pipeline.store.lock import build_lock
-from pipeline.store.paths import ledger_path, part_path, read_plan, recover
+from pipeline.store.paths import part_path, read_plan, recover
 from pipeline.store.reader import FeatureStore, episode_name, place
 from pipeline.store.row_source import RowSource
 from pipeline.store.schema import FEATURES, KEY_BYTES, SCHEMA, Sizes, arrays
@@ -35,7 +35,6 @@ __all__ = [
     "build_lock",
     "check_trailers",
     "episode_name",
-    "ledger_path",
     "part_path",
     "place",
     "read_plan",

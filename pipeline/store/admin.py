@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 import zarr
 
-from pipeline.base.digests import is_ledger
+from pipeline.base.digests import LEDGER_SUFFIX, is_ledger
 from pipeline.base.durable import HELD, KEPT
 from pipeline.base.errors import ConfigError, PipelineError, StoreIncomplete, StoreLocked
 from pipeline.base.format import size
@@ -27,7 +27,7 @@ from pipeline.base.table import Table
 from pipeline.store.archive import ARCHIVE, is_archive, read_manifest
 from pipeline.store.chunks import read_rows
 from pipeline.store.lock import build_lock, lock_holder
-from pipeline.store.paths import LEDGER, MERGED, STORE, read_plan
+from pipeline.store.paths import MERGED, STORE, read_plan
 from pipeline.store.reader import FeatureStore
 from pipeline.store.repair_hints import gc_command
 from pipeline.store.schema import CHECKSUMS, FEATURES, ArraySpec, read_specs
@@ -47,7 +47,7 @@ _KINDS = {
     ".previous": "previous",
     ".lock": "lock",
     ".wait": "lock",  # of a version that restored archives while it trained
-    LEDGER: "ledger",
+    LEDGER_SUFFIX: "ledger",
 }
 """What a name is that ends so behind a store's; a store may turn out to be an `archive`."""
 _NAME = re.compile(r"(?P<base>.+?\.zarr)(?P<suffix>\.[a-z.]+?)?(?:-(?:\d+|wal|shm))?")
@@ -277,7 +277,8 @@ def _contents(path: Path, kind: str) -> StoreContents:
 
 def _disk(path: Path) -> tuple[dict[str, int], dict[tuple[int, int], int]]:
     """Bytes on the disk by group and by file."""
-    sizes, files = dict[str, int].fromkeys(GROUPS, 0), dict[tuple[int, int], int]()
+    sizes: dict[str, int] = dict.fromkeys(GROUPS, 0)
+    files: dict[tuple[int, int], int] = {}
     for file in path.rglob("*") if path.is_dir() else [path]:
         try:
             status = file.stat()  # of the file itself where a cache hands out symbolic links
@@ -428,7 +429,7 @@ def _work(entry: StoreEntry) -> str | None:
 
 
 def _is_foreign(entry: StoreEntry) -> bool:
-    if entry.path.name.endswith(LEDGER):
+    if entry.path.name.endswith(LEDGER_SUFFIX):
         return not is_ledger(entry.path)
     return entry.path.is_dir() and _owner(entry.path) is None
 

@@ -12,8 +12,6 @@ from pipeline.store.schema import SCHEMA
 
 MERGED = "merge-"
 """How the plan of a store begins that was not extracted but merged."""
-LEDGER = ".files.sqlite"
-"""What is added to a store's name for the file that remembers the digests of recordings."""
 
 Inode = tuple[int, int]
 
@@ -21,11 +19,6 @@ Inode = tuple[int, int]
 def part_path(target: Path) -> Path:
     """Where a store is built."""
     return target.with_name(target.name + ".part")
-
-
-def ledger_path(target: Path) -> Path:
-    """Where the content digests of a store's recordings are remembered."""
-    return target.with_name(target.name + LEDGER)
 
 
 def is_store(path: Path) -> bool:

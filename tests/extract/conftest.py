@@ -174,7 +174,7 @@ def laid_over(document: dict[str, Any], **sections: dict[str, Any]) -> Params:
 
 FORKING = """
 import json, os, signal, sys
-import distributed, stages.extract, pipeline.extract.cluster, pipeline.extract.local
+import distributed, stages.extract, pipeline.extract.cluster, pipeline.extract.engine
 import transformers.models.qwen2_5_vl.modeling_qwen2_5_vl
 
 running = set()

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from pipeline.base.errors import VLMError
-from pipeline.extract.batch_size import BatchSize
+from pipeline.extract.encoder import BatchSize
 
 
 def settled(seconds_of, device="cpu", batches=200) -> BatchSize:

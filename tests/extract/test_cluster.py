@@ -27,7 +27,7 @@ from distributed import LocalCluster, Security, rpc
 
 from pipeline.base import errors
 from pipeline.base.config import Params
-from pipeline.base.digests import ContentDigests, file_digest
+from pipeline.base.digests import ContentDigests, file_digest, ledger_path
 from pipeline.base.errors import (
     ConfigError,
     PipelineError,
@@ -36,11 +36,10 @@ from pipeline.base.errors import (
     VLMError,
 )
 from pipeline.extract import extract
-from pipeline.extract.connection import check_scheduler, connected
-from pipeline.extract.fill import rate_name
-from pipeline.extract.job import Job
-from pipeline.extract.places import ledger_path
-from pipeline.extract.survey import survey
+from pipeline.extract.cluster import check_scheduler, connected
+from pipeline.extract.engine import ExtractionJob
+from pipeline.extract.plan import rate_name
+from pipeline.extract.survey import Survey, survey
 from pipeline.extract.worker import check_place, device_of
 from pipeline.store import FeatureStore, RowSource, StoreBuild, part_path, read_plan
 from pipeline.store.schema import ARRAY_NAMES, read_specs
@@ -56,10 +55,11 @@ from contextlib import suppress
 from pathlib import Path
 from pipeline.base.errors import NumericsError
 from pipeline.extract.encoder import Encoder
-from pipeline.extract.worker import ExtractionPlugin, RangeComputer
+from pipeline.extract.engine import RowEngine
+from pipeline.extract.worker import ExtractionPlugin
 
 control = Path({control!r})
-prepare, encode, begin = RangeComputer.prepared, Encoder.encoded, ExtractionPlugin.setup
+prepare, encode, begin = RowEngine.prepare, Encoder.encoded, ExtractionPlugin.setup
 one_at_a_time = threading.Lock()
 
 def setup(self, worker, begin=begin):
@@ -68,15 +68,15 @@ def setup(self, worker, begin=begin):
         os.kill(os.getpid(), signal.SIGKILL)
     begin(self, worker)
 
-def prepared(self, piece, prepare=prepare):
-    name = Path(piece.recording.path).name
+def prepared(self, rows, firsts, prepare=prepare):
+    name = Path(rows.recording.path).name
     with (control / "tried").open("a") as log:
         log.write(f"{{name}}\\n")
     if (control / f"raises-{{name}}").exists():
         raise ValueError(f"a frame of {{name}} cannot be read")
     if (control / f"kills-{{name}}").exists():
         os.kill(os.getpid(), signal.SIGKILL)
-    return prepare(self, piece)
+    return prepare(self, rows, firsts)
 
 def encoded(self, rows, encode=encode):
     for batch, features in encode(self, rows):
@@ -114,8 +114,8 @@ def wait_until(true):
     while not true() and time.monotonic() < deadline:
         time.sleep(0.02)
 
-if prepare.__module__ == RangeComputer.__module__:  # a worker may run this twice
-    RangeComputer.prepared, Encoder.encoded, ExtractionPlugin.setup = prepared, encoded, setup
+if prepare.__module__ == RowEngine.__module__:  # a worker may run this twice
+    RowEngine.prepare, Encoder.encoded, ExtractionPlugin.setup = prepared, encoded, setup
 """
 """Run by each worker as it starts: it notes what it does, and does what the tests ask for."""
 
@@ -310,8 +310,7 @@ class TestDeaths:
         preload = str(workers.preload)
         monkeypatch.setattr(StoreBuild, "mark", joined_after_first)
         # Few ahead: of the twelve tasks some are left when the third is there.
-        monkeypatch.setattr("pipeline.extract.handout._TASKS_A_THREAD", 1)
-        monkeypatch.setattr("pipeline.extract.handout._COUNT_THREADS_EVERY_S", 0.0)
+        monkeypatch.setattr("pipeline.extract.cluster._TASKS_AHEAD", 4)
         params = changed(extract={"workers": workers.address, "batch_size": 1})
         try:
             run(params)
@@ -389,12 +388,21 @@ class TestRefusals:
 
     def test_a_worker_elsewhere(self, params, changed, tmp_path, monkeypatch):
         spec = feature_spec(params.vlm, params.extract.dtype, ["View1", "View2"], file_digest)
-        job = Job(params.extract.store, "plan", spec, params, (), Path.cwd(), local=False)
+        elsewhere = params.extract.model_copy(update={"workers": "tcp://elsewhere:8786"})
+        surveyed = Survey(
+            params.model_copy(update={"extract": elsewhere}), (), (), (), spec, "rotvec", "plan"
+        )
+        job = ExtractionJob(surveyed, (), Path.cwd())
         with pytest.raises(StoreIncomplete, match=r"does not see the build .*made\.zarr\.part"):
             check_place(job)
         monkeypatch.setattr("pipeline.extract.worker.read_plan", lambda part: "plan")
         check_place(job)
-        other = replace(job, params=changed(vlm={"layers": [0]}))
+        other = replace(
+            job,
+            surveyed=replace(
+                surveyed, params=changed(vlm={"layers": [0]}, extract=elsewhere.model_dump())
+            ),
+        )
         with pytest.raises(ConfigError, match="would compute other features"):
             check_place(other)
         monkeypatch.chdir(tmp_path)
@@ -411,9 +419,13 @@ class TestRefusals:
             ("auto", False, 3, "auto"),
         ],
     )
-    def test_local_workers_take_turns_over_the_gpus(self, monkeypatch, wanted, local, name, device):
+    def test_local_workers_take_turns_over_the_gpus(
+        self, changed, monkeypatch, wanted, local, name, device
+    ):
         monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
-        assert device_of(wanted, local, name) == device
+        params = changed(extract={"device": wanted, "workers": 4 if local else "tcp://a:1"})
+        surveyed = Survey(params, (), (), (), None, "rotvec", "")  # type: ignore[arg-type]
+        assert device_of(ExtractionJob(surveyed, (), Path()), name) == device
 
     def test_errors_survive_the_way_from_a_worker(self):
         children = [
@@ -498,7 +510,7 @@ class TestLocalProcesses:
         assert report.computed == len(missing)
         assert_same(store, here)
         surveyed = survey(with_workers, ContentDigests(ledger_path(store)))
-        rate = ContentDigests(ledger_path(store)).rate(rate_name(surveyed, with_workers))
+        rate = ContentDigests(ledger_path(store)).rate(rate_name(surveyed))
         assert rate is not None
         assert 0 < rate < math.inf
 

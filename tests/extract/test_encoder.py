@@ -162,7 +162,7 @@ def test_a_feature_that_is_not_finite_names_row_and_variant_and_spares_the_other
     encoder = encoder_of(FakeVLM(), 9)
     rows = [ready(0, [1, 2, 3]), ready(1, [4, 5, 255]), ready(2, [6, 7, 8])]
     handed_out = []
-    with pytest.raises(NumericsError, match="recording, VL row 1, variant 2: row 2 of the"):
+    with pytest.raises(NumericsError, match="recording, VL row 1, variant 2: row 0 of the"):
         handed_out += [one.row for batch, _ in encoder.encoded(rows) for one in batch]
     encoded = encoder_of(FakeVLM(), 9).encoded(rows)
     assert [one.row for one in next(encoded)[0]] == [0]
@@ -176,8 +176,8 @@ def test_auto_settles_where_more_rows_gain_nothing(variants):
     rows = (ready(row, [row % 200] * variants) for row in range(600))
     found = sorted(one.row for batch, _ in encoder.encoded(rows) for one in batch)
     assert found == list(range(600))
-    assert encoder.settled
-    assert encoder.batch_size == 32 * variants if variants == 1 else encoder.batch_size == 64
+    assert encoder.size.settled
+    assert encoder.size.current == 32 * variants if variants == 1 else encoder.size.current == 64
     assert vlm.batches[0] == 8 // variants * variants
     assert max(vlm.batches) == 64 // variants * variants
 
@@ -186,5 +186,5 @@ def test_auto_takes_what_memory_allows():
     vlm = FakeVLM(room=20, overhead_s=100.0)
     encoder = encoder_of(vlm, "auto", 1)
     assert sum(len(batch) for batch, _ in encoder.encoded(ready(i, [1]) for i in range(300))) == 300
-    assert encoder.settled
-    assert encoder.batch_size == 16
+    assert encoder.size.settled
+    assert encoder.size.current == 16

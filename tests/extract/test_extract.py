@@ -315,16 +315,16 @@ class TestAbandonedBuilds:
     def interrupted(self, params, monkeypatch, rows: int) -> None:
         """Stop as Ctrl-C does once this many rows are committed."""
         done = []
-        real = StoreBuild.commit
+        real = StoreBuild.mark
 
-        def commit(self, numbers, *rest):
+        def mark(self, numbers, *rest):
             real(self, numbers, *rest)
             done.extend(numbers)
             if len(done) >= rows:
                 raise KeyboardInterrupt
 
         with monkeypatch.context() as patch:
-            patch.setattr(StoreBuild, "commit", commit)
+            patch.setattr(StoreBuild, "mark", mark)
             with pytest.raises(KeyboardInterrupt):
                 run(params)
 

@@ -10,6 +10,7 @@ import pytest
 from pipeline.base.digests import ContentDigests
 from pipeline.base.errors import DiskFull
 from pipeline.extract import extract
+from pipeline.extract.engine import RowEngine
 from pipeline.extract.rows import in_background
 from pipeline.store import FeatureStore, StoreBuild
 from pipeline.vlm.qwen import FrozenVLM
@@ -46,9 +47,9 @@ class TestEqualRows:
         assert sum(asked) == report.computed == len(set(keys))
         assert report.repeated == len(keys) - len(set(keys))
         other = changed(extract={"store": str(params.extract.store.with_name("each.zarr"))})
+        prepare = RowEngine.prepare
         monkeypatch.setattr(
-            "pipeline.extract.rows.RowPreparation.prepare_once",
-            lambda self, span: self.prepare(span),
+            RowEngine, "prepare", lambda self, rows, firsts: prepare(self, rows, None)
         )
         assert run(other).computed == len(keys)
         each = FeatureStore.open(other.extract.store)
@@ -58,14 +59,14 @@ class TestEqualRows:
 
     def test_go_on_after_a_kill(self, params, recordings, stand_still, monkeypatch):
         stand_still(recordings / "Touch_dot" / "episode_2")
-        real = StoreBuild.commit
+        real = StoreBuild.mark
 
-        def commit(self, rows, *rest):
+        def mark(self, rows, *rest):
             real(self, rows, *rest)
             raise KeyboardInterrupt
 
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-            patch.setattr(StoreBuild, "commit", commit)
+            patch.setattr(StoreBuild, "mark", mark)
             run(params)
         report = run(params)
         assert report.taken == 0
@@ -74,27 +75,28 @@ class TestEqualRows:
 
 class TestCommits:
     def test_run_beside_the_model_in_order_on_one_thread(self, params, monkeypatch):
-        real, threads, rows = StoreBuild.commit, set(), []
+        real, threads, rows = StoreBuild.mark, set(), []
 
-        def commit(self, numbers, *rest):
+        def mark(self, numbers, *rest):
             threads.add(threading.current_thread().name)
             rows.extend(numbers)
             real(self, numbers, *rest)
 
-        monkeypatch.setattr(StoreBuild, "commit", commit)
+        monkeypatch.setattr(StoreBuild, "mark", mark)
         report = run(params)
-        assert threads == {"commit"}
+        assert len(threads) == 1
+        assert threads.pop().startswith("commit")
         assert sorted(rows) == list(range(report.rows))
 
     def test_a_failure_stops_the_model_at_once(self, params, asked, monkeypatch):
-        def commit(self, *args):
+        def mark(self, *args):
             raise DiskFull("no room at all")
 
-        monkeypatch.setattr(StoreBuild, "commit", commit)
+        monkeypatch.setattr(StoreBuild, "mark", mark)
         with pytest.raises(DiskFull, match="no room at all"):
             run(params)
         assert len(asked) <= 4
-        assert not [one for one in threading.enumerate() if one.name == "commit"]
+        assert not [one for one in threading.enumerate() if one.name.startswith("commit")]
 
     def test_what_is_computed_is_kept_when_the_model_fails(self, params, monkeypatch):
         real, calls = FrozenVLM.submit, []
@@ -120,8 +122,8 @@ def test_the_report_says_how_the_time_was_spent(params):
 
 
 def test_a_batch_size_that_was_found_is_not_searched_again(changed, asked, monkeypatch):
-    monkeypatch.setattr("pipeline.extract.batch_size._FIRST", 1)
-    monkeypatch.setattr("pipeline.extract.batch_size._MOST", {"cpu": 2})
+    monkeypatch.setattr("pipeline.extract.encoder._FIRST", 1)
+    monkeypatch.setattr("pipeline.extract.encoder._MOST", {"cpu": 2})
     params = changed(extract={"batch_size": "auto"})
     run(params)
     assert asked[0] == 1
@@ -139,16 +141,16 @@ def test_a_batch_size_that_was_found_is_not_searched_again(changed, asked, monke
 def test_pieces_are_made_in_order_as_far_ahead_as_is_asked():
     begun, ahead = [], [0]
 
-    def make(piece: int) -> list[int]:
+    def make(piece: int) -> int:
         begun.append(piece)
-        return [piece, -piece]
+        return -piece
 
     made = in_background(range(1, 21), make, 2, lambda: ahead[0])
-    assert next(made) == 1
+    assert next(made) == -1
     assert len(begun) <= 3
     ahead[0] = 9
-    assert [next(made), next(made)] == [-1, 2]
+    assert next(made) == -2
     ahead[0] = 0  # as when the batch size settles on a smaller one
-    assert len(list(made)) == 2 * 20 - 3
+    assert list(made) == [-piece for piece in range(3, 21)]
     assert sorted(begun) == list(range(1, 21))
     assert not [one for one in threading.enumerate() if one.name.startswith("decode")]

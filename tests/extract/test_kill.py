@@ -40,11 +40,11 @@ def submit(self, rows, submit=FrozenVLM.submit):
         noted.write(f"{len(rows)}\\n")
     return submit(self, rows)
 FrozenVLM.submit = submit
-def slow_commit(self, *args, commit=StoreBuild.commit):
-    commit(self, *args)
+def slow_mark(self, *args, mark=StoreBuild.mark):
+    mark(self, *args)
     marked.touch()
     time.sleep(0.03)
-StoreBuild.commit = slow_commit
+StoreBuild.mark = slow_mark
 from stages.extract import main
 from stages.command import run
 raise SystemExit(run("", main, sys.argv[4:]))

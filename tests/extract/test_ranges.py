@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.extract.ranges import PAGE_BYTES, by_episode, ranges_of, rows_between_pages
+from pipeline.data.row_range import by_episode
+from pipeline.extract.cluster import PAGE_BYTES, ranges_of, rows_between_pages
 
 
 @st.composite

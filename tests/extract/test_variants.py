@@ -116,7 +116,7 @@ class TestWhatItTakesOver:
         store = changed().extract.store
         shutil.copytree(extracted[1].path, store)
         _, said = run(changed(vlm={"variants": 2}, extract={"plan": True}))
-        assert any("feature spec, variants: None -> 2" in line for line in said)
+        assert any("feature spec, variants: null -> 2" in line for line in said)
         assert any("rows: 24, 0 known, 24 to compute in 2 variants" in line for line in said)
 
     def test_an_added_episode_computes_only_its_rows(
@@ -136,17 +136,17 @@ class TestWhatItTakesOver:
 
     def test_an_interrupted_build_goes_on(self, extracted, varied, monkeypatch):
         params = varied(extract={"batch_size": 2 * K})
-        real = StoreBuild.commit
+        real = StoreBuild.mark
         commits = []
 
-        def commit(self, numbers, *rest):
+        def mark(self, numbers, *rest):
             real(self, numbers, *rest)
             commits.append(len(numbers))
             if len(commits) == 3:
                 raise KeyboardInterrupt
 
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-            patch.setattr(StoreBuild, "commit", commit)
+            patch.setattr(StoreBuild, "mark", mark)
             run(params)
         assert commits == [2, 2, 2], "the batch size counts variants"
         report, said = run(params)

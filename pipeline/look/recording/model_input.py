@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from pipeline.base.config import Params, VLMParams
-from pipeline.base.digests import ContentDigests
+from pipeline.base.digests import LEDGER_SUFFIX as LEDGER
+from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.base.errors import PipelineError, RecordingError
 from pipeline.base.table import Table
 from pipeline.data import Channels
-from pipeline.extract.places import ledger_path
 from pipeline.look.page.blocks import Block, Document, Text, TokenRun, Tokens
 from pipeline.look.page.style import INK, canvas
 from pipeline.look.recording.episode import BROKEN, Draw, EpisodeView
@@ -29,7 +29,7 @@ from pipeline.look.recording.frames import read_frames
 from pipeline.look.recording.streams import Group, group_channels, legend_beside, plot_curves
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 from pipeline.vlm.preparation import Preparer
-from pipeline.vlm.prompt import TokenKind
+from pipeline.vlm.processor import TokenKind
 
 # Of the picture, as long as its columns are no narrower than the least; and what is beside them. At
 # a page's width its smallest text, 8 points, then is no smaller than 8 pixels.
@@ -38,8 +38,6 @@ _LEAST_COLUMN_IN, _COLUMN_IN, _PANEL_IN = 1.65, 2.5, 1.15
 _SMALL = 8
 # Characters of a title over the whole width.
 _TITLE = 120
-# In `inspect.output`, where extraction has none yet.
-LEDGER = ".files.sqlite"
 # A change of width over height that is said.
 _STRETCHED = 0.05
 

@@ -7,7 +7,7 @@ from tqdm import tqdm
 
 from pipeline.base.config import Params
 from pipeline.base.differences import describe, differences
-from pipeline.base.digests import ContentDigests
+from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.base.errors import RecordingError, StoreMismatch
 from pipeline.data import Opened, Recording, content_digest, open_recordings
 from pipeline.store import Episode, FeatureStore, episode_name
@@ -75,7 +75,7 @@ def check_spec(store: FeatureStore, params: Params, digests: ContentDigests) -> 
 
 def known_digests(store: FeatureStore) -> "closing[ContentDigests]":
     """The ledger that extraction keeps beside a store, to be closed."""
-    return closing(ContentDigests(store.path.with_name(f"{store.path.name}.files.sqlite")))
+    return closing(ContentDigests(ledger_path(store.path)))
 
 
 def _why_missing(episode: Episode, sources: set[str], opened: Opened) -> str:

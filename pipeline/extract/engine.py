@@ -1,0 +1,369 @@
+"""The one engine: rows are prepared, encoded and written in any process, and marked in one.
+
+A `RowEngine` has the model of a process: that of the coordinator, or each dask worker's. What was
+written counts once the coordinator has marked it. `fill` is the coordinator's side.
+"""
+
+import json
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from itertools import chain, groupby, islice
+from operator import attrgetter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from pipeline.base.digests import ContentDigests
+from pipeline.data.row_range import RowFrames, RowRange
+from pipeline.extract.plan import rate_name
+from pipeline.extract.rows import (
+    RANGE_ROWS,
+    KnownRow,
+    ReadyRow,
+    RepeatedRow,
+    Row,
+    RowPreparation,
+    in_background,
+)
+from pipeline.extract.survey import Survey
+from pipeline.store import FEATURES, RowSource, StoreBuild
+from pipeline.vlm.preparation import Preparer
+
+if TYPE_CHECKING:
+    from pipeline.extract.encoder import Encoder
+
+_WAITING = 2
+"""Blocks that are written or wait for it; the model waits when there are more: a kill loses few."""
+
+_TOGETHER = 64
+"""Known or repeated rows that are written in one go: each time waits for the disk."""
+
+
+@dataclass(frozen=True)
+class ExtractionReport:
+    """What was done; the shares are of the time since the model was loaded, where one was here."""
+
+    store: Path
+    rows: int
+    taken: int
+    """Rows taken over from an earlier store or build."""
+    computed: int
+    repeated: int
+    """Rows equal to another that was computed."""
+    seconds: float
+    model_share: float | None
+    """How much the model worked."""
+    waited_share: float | None
+    """How much it waited for frames to be decoded and prepared."""
+
+
+@dataclass(frozen=True)
+class ExtractionJob:
+    """What every process of an extraction must know.
+
+    `known` are stores and builds of the same feature spec, `folder` is where the coordinator runs:
+    relative paths begin there.
+    """
+
+    surveyed: Survey
+    known: tuple[Path, ...]
+    folder: Path
+
+    @property
+    def name(self) -> str:
+        """Of its plugin: an extraction that was killed is replaced by the next on its store."""
+        return f"extraction of {self.surveyed.target.absolute()}"
+
+    @property
+    def local(self) -> bool:
+        """Whether all its processes are on the coordinator's host."""
+        return isinstance(self.surveyed.params.extract.workers, int)
+
+    def frames(self, build: StoreBuild) -> RowFrames:
+        """The frames of the laid-out build's rows, by the times in it: no stream is read again."""
+        vl_start, frame_time = (
+            build.files(name).read(0, build.specs[name].shape[0])
+            for name in ("episode/vl_start", "vl/frame_time")
+        )
+        return RowFrames(self.surveyed.recordings, vl_start, frame_time, self.surveyed.spec.views)
+
+
+@dataclass(frozen=True)
+class WrittenRows:
+    """Feature rows that lie in the build and only need marking."""
+
+    origin: Literal["computed", "known", "repeated"]
+    rows: NDArray[np.int64]
+    keys: Sequence[bytes]
+    checksums: NDArray[np.uint32]
+    environment: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class FeatureBlock:
+    """Rows of one environment with their features (row, variant x slot, dim), as they are stored.
+
+    Repeated rows have None in place of features: theirs are those of their firsts.
+    """
+
+    origin: Literal["computed", "known", "repeated"]
+    rows: Sequence[Row]
+    features: NDArray[Any] | None
+    environment: Mapping[str, Any]
+
+    def write(self, build: StoreBuild) -> WrittenRows:
+        """Write the features and wait for the disk."""
+        features = self.features
+        if features is None:
+            firsts = [row.first for row in self.rows if isinstance(row, RepeatedRow)]
+            files = build.files(FEATURES)
+            features = np.concatenate([files.read(first, 1) for first in firsts])
+        rows, keys = np.array([row.row for row in self.rows]), [row.key for row in self.rows]
+        checksums = build.write_features(rows, features)
+        return WrittenRows(self.origin, rows, keys, checksums, self.environment)
+
+
+class RowMarks:
+    """Marks written rows in the build, counts them by origin and moves the progress bar."""
+
+    def __init__(self, build: StoreBuild, bar: "tqdm[Any]") -> None:
+        self.build = build
+        self.counts: Counter[str] = Counter()
+        self._bar = bar
+
+    def mark(self, written: Iterable[WrittenRows]) -> None:
+        """Rows of one environment in one go: each time waits for the disk."""
+        for environment, alike in groupby(written, attrgetter("environment")):
+            blocks = list(alike)
+            rows = np.concatenate([block.rows for block in blocks])
+            keys = [key for block in blocks for key in block.keys]
+            checksums = np.concatenate([block.checksums for block in blocks])
+            self.build.mark(rows, keys, checksums, self.build.environment_index(environment))
+            self._bar.update(len(rows))
+            for block in blocks:
+                self.counts[block.origin] += len(block.rows)
+
+
+class RowEngine:
+    """The preparation and the model of one process, which is loaded when a row first needs it."""
+
+    def __init__(
+        self,
+        job: ExtractionJob,
+        frames: RowFrames,
+        known: Sequence[RowSource],
+        device: str,
+        digests: ContentDigests | None = None,
+    ) -> None:
+        """`digests` remember the best batch size from one extraction to the next."""
+        self.params = job.surveyed.params
+        self.frames = frames
+        self.encoder: Encoder | None = None
+        self.loaded_at = self.waited_s = 0.0
+        """`time.monotonic()` when the model was there, and how long it has waited for rows."""
+        self._spec = job.surveyed.spec
+        self._device = device
+        self._digests = digests
+        preparer = Preparer(self.params.vlm, self._spec)
+        self._preparation = RowPreparation(preparer, self._spec, known)
+        self._environment: Mapping[str, Any] = {}
+
+    def prepare(self, rows: RowRange, firsts: dict[bytes, int] | None) -> list[Row]:
+        """`RowPreparation.prepare`; may be called from several threads."""
+        return self._preparation.prepare(rows, firsts)
+
+    def encode(self, prepared: Iterator[list[Row]], put: Callable[[FeatureBlock], object]) -> None:
+        """Hand over the features of all these rows, a repeated row's after those of its first."""
+        repeated: list[RepeatedRow] = []
+        done: set[int] = set()
+
+        def put_repeated() -> None:
+            ready = [row for row in repeated if row.first in done]
+            repeated[:] = [row for row in repeated if row.first not in done]
+            if ready:
+                put(FeatureBlock("repeated", ready, None, self._environment))
+
+        rows = self._rows_for_model(prepared, repeated, put)
+        if (first := next(rows, None)) is not None:
+            for batch, features in self._loaded().encoded(chain([first], rows)):
+                put(FeatureBlock("computed", batch, features, self._environment))
+                done |= {row.row for row in batch}
+                if len(repeated) >= _TOGETHER:
+                    put_repeated()
+            self._remember()
+        put_repeated()
+        assert not repeated, "a repeated row whose first was never computed"
+
+    def _rows_for_model(
+        self,
+        prepared: Iterator[list[Row]],
+        repeated: list[RepeatedRow],
+        put: Callable[[FeatureBlock], object],
+    ) -> Iterator[ReadyRow]:
+        """Those that are ready; repeated ones are set aside, known ones handed over."""
+        while True:
+            begun = time.monotonic()
+            rows = next(prepared, None)
+            if self.encoder is not None:
+                self.waited_s += time.monotonic() - begun
+            if rows is None:
+                return
+            for block in _known_blocks([row for row in rows if isinstance(row, KnownRow)]):
+                put(block)
+            repeated += [row for row in rows if isinstance(row, RepeatedRow)]
+            yield from (row for row in rows if isinstance(row, ReadyRow))
+
+    def _loaded(self) -> "Encoder":
+        if self.encoder is None:
+            # Seconds to import: a run that finds every row in an older store does without.
+            from pipeline.extract.encoder import Encoder
+            from pipeline.vlm.qwen import FrozenVLM
+
+            extract, size = self.params.extract, self.params.extract.batch_size
+            vlm = FrozenVLM.load(self.params.vlm, self._spec, self._device, extract.compile)
+            self._environment = vlm.environment
+            if size == "auto" and self._digests is not None:
+                size = self._digests.batch_size(self._size_name()) or "auto"
+            self.encoder = Encoder(vlm, size, self._spec.variants)
+            self.loaded_at = time.monotonic()
+        return self.encoder
+
+    def _remember(self) -> None:
+        searched = self.params.extract.batch_size == "auto"
+        if searched and self._digests and self.encoder and self.encoder.size.settled:
+            self._digests.note_batch_size(self._size_name(), self.encoder.size.current)
+
+    def _size_name(self) -> str:
+        """Under which the best batch size of this model on this device is remembered."""
+        return f"{self._spec.digest} {json.dumps(self._environment, sort_keys=True)}"
+
+
+def fill(
+    build: StoreBuild,
+    surveyed: Survey,
+    known: Sequence[RowSource],
+    digests: ContentDigests,
+    missing: NDArray[np.int64],
+) -> ExtractionReport:
+    """Fill in the missing rows of a laid-out build: of `known` where they are, else by the model.
+
+    `extract.workers` says whether this process has the model, or dask workers do. Raises as they
+    do; what was marked until then is kept.
+    """
+    begun, total = time.monotonic(), build.specs["vl/time"].shape[0]
+    job = ExtractionJob(surveyed, tuple(source.path.absolute() for source in known), Path.cwd())
+    frames, extract = job.frames(build), surveyed.params.extract
+    done = total - len(missing)
+    with tqdm(
+        None, "extract", total, initial=done, unit="row", disable=None, smoothing=0.05
+    ) as bar:
+        marks = RowMarks(build, bar)
+        missing = _take_over(surveyed, known, frames, missing, marks)
+        rate, shares = None, (None, None)
+        if len(missing) and extract.workers != 0:
+            from pipeline.extract.cluster import compute_on_cluster  # dask: a second to import
+
+            rate = compute_on_cluster(job, frames.vl_start, missing, marks)
+        elif len(missing):
+            engine = RowEngine(job, frames, known, extract.device, digests)
+            compute_here(engine, missing, marks)
+            if engine.encoder is not None:
+                since = time.monotonic() - engine.loaded_at
+                rate = marks.counts["computed"] / since
+                shares = engine.encoder.model_s / since, engine.waited_s / since
+    if rate is not None:
+        digests.note_rate(rate_name(surveyed), rate)
+    taken, computed, repeated = (marks.counts[of] for of in ("known", "computed", "repeated"))
+    seconds = time.monotonic() - begun
+    return ExtractionReport(build.target, total, taken, computed, repeated, seconds, *shares)
+
+
+def _take_over(
+    surveyed: Survey,
+    known: Sequence[RowSource],
+    frames: RowFrames,
+    missing: NDArray[np.int64],
+    marks: RowMarks,
+) -> NDArray[np.int64]:
+    """Mark the missing rows that are known by content, instruction and frame times.
+
+    No frame is decoded. Returns the rows that are left.
+    """
+    taken: list[int] = []
+    found = _found(surveyed, known, frames, set(missing.tolist()))
+    while rows := list(islice(found, _TOGETHER)):
+        marks.mark(block.write(marks.build) for block in _known_blocks(rows))
+        taken += [row.row for row in rows]
+    return np.setdiff1d(missing, taken)
+
+
+def _found(
+    surveyed: Survey, known: Sequence[RowSource], frames: RowFrames, missing: set[int]
+) -> Iterator[KnownRow]:
+    for index, episode in enumerate(surveyed.episodes):
+        of = episode.content, episode.recording.instruction
+        keys = [(source, source.keys_of(*of)) for source in known]
+        for row in range(*frames.vl_start[index : index + 2]):
+            for source, by_frames in keys if row in missing else ():
+                key = by_frames.get(frames.frame_time[row].tobytes())
+                if key is not None and (features := source.take(key)) is not None:
+                    yield KnownRow(row, key, features, source.environment_of(key))
+                    break
+
+
+def _known_blocks(rows: Sequence[KnownRow]) -> Iterator[FeatureBlock]:
+    for environment, alike in groupby(rows, attrgetter("environment")):
+        block = list(alike)
+        features = np.stack([row.features for row in block])
+        yield FeatureBlock("known", block, features, environment)
+
+
+def compute_here(engine: RowEngine, missing: NDArray[np.int64], marks: RowMarks) -> None:
+    """Compute and mark rows in this process: threads prepare, this one encodes, one commits."""
+    most = max(1, RANGE_ROWS // engine.params.vlm.variants)
+
+    def ranges_ahead() -> int:
+        """While the model has one batch, the next should be complete."""
+        return 2 * engine.encoder.size.current // RANGE_ROWS + 1 if engine.encoder else 0
+
+    rows = in_background(
+        engine.frames.ranges(missing, most),
+        partial(engine.prepare, firsts={}),
+        engine.params.extract.decode_threads,
+        ranges_ahead,
+    )
+    with _committing(marks) as put, closing(rows):
+        engine.encode(rows, put)
+
+
+@contextmanager
+def _committing(marks: RowMarks) -> Generator[Callable[[FeatureBlock], None]]:
+    """Give what writes and marks blocks in order, on a thread, while the model goes on.
+
+    What fails there is raised by a later call. Leaving the context waits for what was handed in,
+    whatever else went wrong: it is computed.
+    """
+    pending: deque[Future[None]] = deque()
+
+    def commit(block: FeatureBlock, before: Future[None] | None) -> None:
+        if before is not None:
+            before.result()  # after a failure nothing: a repeated row is copied from one before
+        marks.mark([block.write(marks.build)])
+
+    def put(block: FeatureBlock) -> None:
+        while len(pending) >= _WAITING:
+            pending.popleft().result()
+        pending.append(pool.submit(commit, block, pending[-1] if pending else None))
+
+    with ThreadPoolExecutor(1, thread_name_prefix="commit") as pool:
+        yield put
+        for commits in pending:
+            commits.result()
