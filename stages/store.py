@@ -95,11 +95,11 @@ def _merge(params: StoresParams) -> None:
             "stores.output: expected the store to merge into, found none. Name it: "
             "python -m stages.store merge A.zarr B.zarr --into C.zarr"
         )
-    report = merge([_input(path, params.folder) for path in params.inputs], params.output)
-    if report is not None:
+    merged = merge([_input(path, params.folder) for path in params.inputs], params.output)
+    if merged is not None:
         print(
-            f"{report.store}: {report.episodes} episodes, {report.rows} rows, none computed; "
-            f"{report.twice} episode(s) were held twice and are kept once"
+            f"{params.output}: {len(merged.episodes)} episodes, {merged.count('vl')} rows, none "
+            f"computed; {merged.twice} episode(s) were held twice and are kept once"
         )
 
 
