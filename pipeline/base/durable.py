@@ -150,7 +150,6 @@ def recover(target: Path, kind: OutputKind) -> None:
         elif there(old) and suffix == "keeping":
             _keep(old, target)
         remove_folder(held, HELD)
-    _recover_unheld(target, kind)
 
 
 def _keep(old: Path, target: Path) -> None:
@@ -165,13 +164,6 @@ def _keep(old: Path, target: Path) -> None:
     mark(old, KEPT)
     remove_folder(previous, KEPT)
     old.rename(previous)
-
-
-def _recover_unheld(target: Path, kind: OutputKind) -> None:
-    """Bring back what an earlier version, when it was killed, left as `<target>.old`."""
-    old = _beside(target, "old")
-    if old.exists() and not there(target) and kind.owns(old):
-        old.rename(target)
 
 
 def sync(path: Path) -> None:

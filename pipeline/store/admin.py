@@ -9,6 +9,7 @@ that the next run resumes or takes over: it goes only where it is named.
 import re
 import stat
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -35,24 +36,29 @@ from pipeline.store.schema import CHECKSUMS, FEATURES, ArraySpec, read_specs
 Fate = Literal["unneeded", "work", "kept", "in place"]
 """`work` goes where it is named; what is `kept` looks like a leftover and is none."""
 
-GROUPS = ("features", "sensor", "state", "rest")
 _KINDS = {
     None: "store",
     ".part": "build",
     ".repair.part": "repair",
     ".known": "set aside",
-    ".old": "replaced",
     ".replaced": "replaced",
     ".keeping": "replaced",
     ".previous": "previous",
     ".lock": "lock",
-    ".wait": "lock",  # of a version that restored archives while it trained
     LEDGER_SUFFIX: "ledger",
 }
-"""What a name is that ends so behind a store's; a store may turn out to be an `archive`."""
+"""What a name is that ends so after a store's; a store may turn out to be an `archive`."""
 _NAME = re.compile(r"(?P<base>.+?\.zarr)(?P<suffix>\.[a-z.]+?)?(?:-(?:\d+|wal|shm))?")
 _BUILDS = ("build", "set aside", "replaced", "previous")
-_UNREADABLE = (PipelineError, OSError, ValueError, KeyError, TypeError, AttributeError, IndexError)
+_UNNEEDED = {
+    "build": "a build that was stopped before any row was done; there is nothing to resume",
+    "repair": "a repair that was stopped before it was a build; the next begins anew",
+    "set aside": "an interrupted build of which no row was done",
+    "replaced": "another store has taken its place",
+    "ledger": "content digests for a store that is not there",
+    "lock": "held by no process",
+}
+"""Why something of a kind may go, where it is no work and nothing holds it."""
 
 
 @dataclass(frozen=True)
@@ -84,8 +90,6 @@ class StoreEntry:
     kind: str
     base: Path
     """The store that it is, or belongs to."""
-    sizes: Mapping[str, int]
-    """Bytes on the disk by group of arrays; files that are hard links counted like others."""
     files: Mapping[tuple[int, int], int] = field(repr=False)
     """Bytes on the disk of each file, by device and inode."""
     contents: StoreContents | None
@@ -95,7 +99,7 @@ class StoreEntry:
     @property
     def bytes(self) -> int:
         """On the disk."""
-        return sum(self.sizes.values())
+        return sum(self.files.values())
 
 
 @dataclass(frozen=True)
@@ -130,9 +134,10 @@ class Inventory:
 
 @dataclass(frozen=True)
 class Leftover:
-    """Something that may be removed."""
+    """Something in a folder of stores, and whether it may be removed."""
 
     entry: StoreEntry
+    fate: Fate
     why: str
     bytes: int
     """On the disk; what hard links elsewhere hold on to is not counted."""
@@ -156,17 +161,15 @@ def describe_inventory(inventory: Inventory, dependents: Mapping[Path, Sequence[
 
     `dependents`: store -> what trained policies depend on it, a line each.
     """
-    beside = ("lock", "ledger")  # shown with the store that they lie beside
-    bases = {entry.base for entry in inventory.entries if entry.kind not in beside}
-    shown = [e for e in inventory.entries if e.kind not in beside or e.base not in bases]
+    shown = [entry for entry in inventory.entries if entry.kind != "lock"]
     if not shown:
         return [f"{inventory.folder}: no store in it"]
-    heads = ("", "what", "on disk", *GROUPS, "episodes", "ticks", "VL rows", "spec")
+    heads = ("", "what", "on disk", "episodes", "ticks", "VL rows", "spec")
     header, *rows = Table(heads, [_row(inventory, entry) for entry in shown]).text()
     lines = [header]
     for entry, row in zip(shown, rows, strict=True):
-        lines += [row, *(f"    {line}" for line in _details(inventory, entry))]
-        lines += [f"    {line}" for line in dependents.get(entry.path, ())]
+        details = [*_details(inventory, entry), *dependents.get(entry.path, ())]
+        lines += [row, *(f"    {line}" for line in details)]
     specs = {entry.contents.digest: entry.contents for entry in shown if entry.contents}
     apart, once = sum(entry.bytes for entry in inventory.entries), inventory.bytes
     linked = f", {size(apart - once)} of hard links counted once" if apart > once else ""
@@ -180,9 +183,7 @@ def describe_inventory(inventory: Inventory, dependents: Mapping[Path, Sequence[
 
 def find_leftovers(inventory: Inventory) -> list[Leftover]:
     """What nothing needs, with the reason, by path."""
-    fates = [(entry, *_fate(inventory, entry)) for entry in inventory.entries]
-    unneeded = ((entry, why) for entry, fate, why in fates if fate == "unneeded")
-    return [Leftover(entry, why, _freed(inventory, entry)) for entry, why in unneeded]
+    return [leftover for leftover in _judge(inventory) if leftover.fate == "unneeded"]
 
 
 def find_named(inventory: Inventory, paths: Sequence[Path]) -> list[Leftover]:
@@ -190,30 +191,26 @@ def find_named(inventory: Inventory, paths: Sequence[Path]) -> list[Leftover]:
 
     Raises `ConfigError` for a path that is none, with the reason.
     """
-    known = {entry.path.absolute(): entry for entry in inventory.entries}
-    named: list[Leftover] = []
-    for path in paths:
-        entry = known.get(path.absolute())
-        fate, why = _fate(inventory, entry) if entry else ("kept", "no leftover of a build")
-        if entry is None or fate in ("kept", "in place"):
+    known = {leftover.entry.path.absolute(): leftover for leftover in _judge(inventory)}
+    named = [known.get(path.absolute()) for path in paths]
+    for path, leftover in zip(paths, named, strict=True):
+        if leftover is None or leftover.fate in ("kept", "in place"):
+            why = leftover.why if leftover else "no leftover of a build"
             raise ConfigError(
                 f"stores.inputs: {path}: {why}. Nothing was removed; "
                 "python -m stages.store gc lists what may be."
             )
-        named.append(Leftover(entry, why, _freed(inventory, entry)))
-    return named
+    return [leftover for leftover in named if leftover]
 
 
 def describe_kept(inventory: Inventory) -> list[str]:
     """What looks like a leftover and is none, with the reason, a line each."""
-    lines: list[str] = []
-    for entry in inventory.entries:
-        fate, why = _fate(inventory, entry)
-        if fate == "work":
-            lines.append(f"{entry.path}: {why}, and {gc_command(entry.path)} removes it")
-        elif fate == "kept" and entry.kind != "lock":
-            lines.append(f"{entry.path}: {why}")
-    return lines
+    return [
+        f"{leftover.entry.path}: {leftover.why}"
+        + f", and {gc_command(leftover.entry.path)} removes it" * (leftover.fate == "work")
+        for leftover in _judge(inventory)
+        if leftover.fate == "work" or (leftover.fate == "kept" and leftover.entry.kind != "lock")
+    ]
 
 
 def remove_leftover(leftover: Leftover) -> None:
@@ -226,7 +223,7 @@ def remove_leftover(leftover: Leftover) -> None:
     there = lock.exists()
     try:
         with build_lock(base):
-            # Looked at again under the lock: a killed replacement leaves the only copy as `.old`.
+            # Looked at again under the lock: a killed replacement leaves the only copy there.
             only_copy = _KINDS.get(path.suffix) == "replaced" and not base.exists()
             if path.is_symlink() or only_copy:
                 return
@@ -259,9 +256,9 @@ def _entry(path: Path, kind: str, base: Path) -> StoreEntry:
             FeatureStore.open(path)
         if kind in ("store", "archive") or (kind in _BUILDS and read_plan(path) is not None):
             contents = _contents(path, kind)
-    except _UNREADABLE as error:
+    except Exception as error:  # whatever is wrong with it, the others are listed
         damage = str(error) if isinstance(error, PipelineError) else f"{path}: {error!r}"
-    return StoreEntry(path, kind, base, *_disk(path), contents, damage)
+    return StoreEntry(path, kind, base, _files(path), contents, damage)
 
 
 def _contents(path: Path, kind: str) -> StoreContents:
@@ -275,26 +272,20 @@ def _contents(path: Path, kind: str) -> StoreContents:
     return StoreContents(read_plan(path), attrs, specs, int(done))
 
 
-def _disk(path: Path) -> tuple[dict[str, int], dict[tuple[int, int], int]]:
-    """Bytes on the disk by group and by file."""
-    sizes: dict[str, int] = dict.fromkeys(GROUPS, 0)
+def _files(path: Path) -> dict[tuple[int, int], int]:
+    """Bytes on the disk of each file, by device and inode."""
     files: dict[tuple[int, int], int] = {}
     for file in path.rglob("*") if path.is_dir() else [path]:
-        try:
+        with suppress(FileNotFoundError):  # removed meanwhile, or a link into an emptied cache
             status = file.stat()  # of the file itself where a cache hands out symbolic links
-        except FileNotFoundError:
-            continue  # removed meanwhile, or a link into a cache that was emptied
-        if not stat.S_ISDIR(status.st_mode):
-            inside = file.relative_to(path).as_posix().removeprefix("vl/").split("/")[0]
-            sizes[inside if inside in GROUPS else "rest"] += status.st_blocks * 512
-            files[status.st_dev, status.st_ino] = status.st_blocks * 512
-    return sizes, files
+            if not stat.S_ISDIR(status.st_mode):
+                files[status.st_dev, status.st_ino] = status.st_blocks * 512
+    return files
 
 
 def _row(inventory: Inventory, entry: StoreEntry) -> tuple[object, ...]:
     name = entry.path.relative_to(inventory.folder).as_posix()
-    sizes = (entry.bytes, *(entry.sizes[group] for group in GROUPS))
-    row = (name, "damaged" if entry.damage else entry.kind, *map(size, sizes))
+    row = (name, "damaged" if entry.damage else entry.kind, size(entry.bytes))
     held = entry.contents
     if held is None:
         return (*row, None, None, None, None)
@@ -310,27 +301,15 @@ def _details(inventory: Inventory, entry: StoreEntry) -> Iterator[str]:
         yield _embodiment(entry.contents)
     if entry.path.is_symlink():
         yield f"a link to {entry.path.resolve()}"
-    if entry.kind in (*_BUILDS, "repair"):
-        begun = entry.contents is not None or entry.damage is not None
-        yield f"belongs to {entry.base.name}{'' if begun else '; of no use unfinished'}"
     holder = inventory.holders.get(entry.base)
     if holder and entry.kind != "archive":
         yield f"being built by {holder}" if entry.kind == "build" else f"locked by {holder}"
     for path, count in inventory.shared(entry).items():
         yield f"shares {size(count)} with {path.name} by hard links"
-    if entry.kind == "store":
-        yield from _company(inventory, entry)
-
-
-def _company(inventory: Inventory, store: StoreEntry) -> Iterator[str]:
-    """The archives of a store, its lock and its ledger."""
-    plan = store.contents.plan if store.contents else None
-    for other in inventory.entries:
-        of_it = other.contents is not None and other.contents.plan == plan is not None
-        if other.kind == "archive" and of_it:
+    plan = entry.contents and entry.contents.plan
+    for other in inventory.entries if entry.kind == "store" and plan else ():
+        if other.kind == "archive" and other.contents and other.contents.plan == plan:
             yield f"archived as {other.path.name}"
-        elif other.kind in ("lock", "ledger") and other.base == store.base:
-            yield f"beside it: {other.path.name} ({size(other.bytes)})"
 
 
 def _embodiment(held: StoreContents) -> str:
@@ -352,24 +331,29 @@ def _spec(held: StoreContents) -> str:
     _, slots, dim = features.shape
     pooled = [slot for slot in spec.get("slots", ()) if isinstance(slot, Mapping)]
     kinds = dict.fromkeys(f"{slot.get('pooling')} of layer {slot.get('layer')}" for slot in pooled)
-    entries = {
-        "": " + ".join(kinds),
-        "weights ": str(spec.get("weights") or "")[:8],
-        "adapter ": str(spec.get("adapter") or "")[:8],
-        "pixels ": " x ".join(map(str, spec.get("processor", {}).get("image_size", ()))),
-        "computed in ": spec.get("compute_dtype"),
-        "variants ": spec.get("variants"),
-        "prompt ": "prompt" in spec and repr(shorten(spec["prompt"], 40, placeholder="…")),
-    }
-    stored = features.attributes.get("dtype", features.dtype.name)
+    pixels = " x ".join(map(str, spec.get("processor", {}).get("image_size", ())))
+    entries = {**spec, "pixels": pixels, "pooling": " + ".join(kinds)}
+    names = ("pooling", "weights", "adapter", "pixels", "compute_dtype", "variants", "prompt")
+    words = [
+        f"{name.replace('_', ' ')} {shorten(str(entries[name]), 60, placeholder='…')}"
+        for name in names
+        if entries.get(name)
+    ]
     sensor = held.specs["sensor/values"].dtype.name
-    words = [f"{name}{value}" for name, value in entries.items() if value]
-    return ", ".join([f"{slots} slots x {dim} in {stored}", f"sensor in {sensor}", *words])
+    stored = f"{slots} slots x {dim} in {features.stored_dtype}"
+    return ", ".join([stored, f"sensor in {sensor}", *words])
 
 
 def _clause(damage: str) -> str:
     """What is wrong, without what to run about it."""
     return damage.split(". ", 1)[0].splitlines()[0]
+
+
+def _judge(inventory: Inventory) -> Iterator[Leftover]:
+    """What may become of each entry, by path."""
+    for entry in inventory.entries:
+        freed = entry.bytes - sum(inventory.shared(entry).values())
+        yield Leftover(entry, *_fate(inventory, entry), freed)
 
 
 def _fate(inventory: Inventory, entry: StoreEntry) -> tuple[Fate, str]:
@@ -385,28 +369,15 @@ def _fate(inventory: Inventory, entry: StoreEntry) -> tuple[Fate, str]:
     if work := _work(entry):
         return "work", work
     beside = [other for other in inventory.entries if other.base == entry.base]
-    match entry.kind:
-        case "build":
-            why = "a build that was stopped before any row was done; there is nothing to resume"
-        case "repair":
-            why = "a repair that was stopped before it was a build; the next begins anew"
-        case "set aside":
-            why = "an interrupted build of which no row was done"
-        case "replaced":
-            sound = [other.kind for other in beside if other.damage is None]
-            if "store" not in sound and "archive" not in sound:
-                return "kept", (
-                    f"the only copy of {entry.base.name}, set aside by a replacement that was "
-                    "killed; the next stages.extract puts it back"
-                )
-            why = f"{entry.base.name} has taken its place"
-        case "ledger":
-            if any(other.kind not in ("lock", "ledger") for other in beside):
-                return "in place", "content digests for a store that is there"
-            why = "content digests for a store that is not there"
-        case _:
-            why = "held by no process"
-    return "unneeded", why
+    sound = {other.kind for other in beside if other.damage is None}
+    if entry.kind == "replaced" and not sound & {"store", "archive"}:
+        return "kept", (
+            f"the only copy of {entry.base.name}, set aside by a replacement that was killed; the "
+            "next stages.extract puts it back"
+        )
+    if entry.kind == "ledger" and any(other.kind not in ("lock", "ledger") for other in beside):
+        return "in place", "content digests for a store that is there"
+    return "unneeded", _UNNEEDED[entry.kind]
 
 
 def _work(entry: StoreEntry) -> str | None:
@@ -420,12 +391,9 @@ def _work(entry: StoreEntry) -> str | None:
     held = entry.contents
     if held is None or not held.done:
         return None
-    resumes = "stages.extract resumes"
-    if entry.kind == "set aside":
-        resumes = "stages.extract takes rows from"
-    elif held.plan and held.plan.startswith(MERGED):
-        resumes = "the same stages.store merge resumes"
-    return f"unfinished build, {held.done} of {held.rows} rows done; {resumes} it"
+    merged = held.plan is not None and held.plan.startswith(MERGED)
+    command = "the same stages.store merge" if merged else "stages.extract"
+    return f"unfinished build, {held.done} of {held.rows} rows done; {command} takes them over"
 
 
 def _is_foreign(entry: StoreEntry) -> bool:
@@ -446,8 +414,3 @@ def _owner(path: Path) -> OutputKind | None:
         return marked or next((kind for kind in kinds if kind.owns(path)), None)
     except StoreIncomplete:  # a group's metadata, but damaged
         return OutputKind(STORE.name, lambda _: True)
-
-
-def _freed(inventory: Inventory, entry: StoreEntry) -> int:
-    """Bytes that its removal gives back."""
-    return entry.bytes - sum(inventory.shared(entry).values())

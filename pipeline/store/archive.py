@@ -13,10 +13,9 @@ store to the byte. The manifest is written last: a folder that has one is a comp
 import hashlib
 import json
 import math
-import os
-import warnings
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -28,21 +27,19 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 from tqdm import tqdm
 from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec
-from zarr.errors import ZarrUserWarning
 
 from pipeline.base.digests import file_digest
 from pipeline.base.durable import disk_full_named, put_in_place, sync
 from pipeline.base.errors import StoreIncomplete, StoreMismatch
 from pipeline.base.ownership import OutputKind, begin_folder, remove_folder
-from pipeline.store.chunks import ChunkFiles, check_row_checksums, check_trailers, read_rows
+from pipeline.store.chunks import check_row_checksums, check_trailers, read_rows
 from pipeline.store.lock import build_lock
 from pipeline.store.metadata import ATTRIBUTE as METADATA_DIGEST
-from pipeline.store.metadata import check_metadata
 from pipeline.store.paths import STORE, inode_of, part_path, read_plan, recover, refuse_replaced
 from pipeline.store.reader import FeatureStore
 from pipeline.store.repair_hints import extract_command, gc_command
 from pipeline.store.schema import CHECKSUMS, FEATURES, ArraySpec, chunk_paths, read_spec, read_specs
-from pipeline.store.writer import StoreBuild
+from pipeline.store.writer import StoreBuild, sync_folders
 
 _SCHEMA = 1
 _ZARR_JSON = "zarr.json"
@@ -60,8 +57,6 @@ class ArchivedArray(BaseModel, frozen=True):
     """What the manifest says of one array."""
 
     codec: str
-    ratios: dict[str, float | None] = {}
-    """What each codec made of samples, where an earlier version chose among several."""
     raw_bytes: int
     """Of its rows."""
     shard_bytes: tuple[int, ...]
@@ -115,10 +110,9 @@ def read_manifest(path: Path) -> Manifest:
     """
     document = _manifest_document(path)
     if document is None:
-        found = "something else" if path.exists() else "nothing"
         raise StoreMismatch(
-            f"{path}: expected an archive, found {found}. Name one with archive.output, or make "
-            "it with stages.archive."
+            f"{path}: expected an archive, found {'something else' if path.exists() else 'nothing'}"
+            ". Name one with archive.output, or make it with stages.archive."
         )
     if document.get("schema") != _SCHEMA:
         raise StoreMismatch(
@@ -133,15 +127,14 @@ def read_manifest(path: Path) -> Manifest:
 def archive(store: Path, output: Path, level: int, threads: int) -> Manifest | None:
     """Write the archive of a finished store to `output` and prove that it gives the store back.
 
-    `level` is zstd's, 1 to 22. Every shard is read back and compared with the trailers of the
-    store's chunk files. What is written lies in `<output>.part` until it is complete; stopped or
-    killed, it is begun anew. Returns None where an archive of this very store is there already.
+    `level` is zstd's, 1 to 22. The store is checked before, and every shard read back after it was
+    written. What is written lies in `<output>.part` until it is complete; stopped or killed, it is
+    begun anew. Returns None where an archive of this very store is there already.
 
     Raises `StoreIncomplete` naming the file where the store is not finished or is damaged,
     `StoreMismatch` where something else lies at `output`, `StoreLocked` and `DiskFull`.
     """
     FeatureStore.open(store)  # says what is wrong with something that is no finished store
-    check_metadata(store)
     with build_lock(output):
         if output.exists():
             if is_archive(output) and _holds(read_manifest(output), store):
@@ -150,6 +143,7 @@ def archive(store: Path, output: Path, level: int, threads: int) -> Manifest | N
                 f"{output}: there already, and not an archive of {store} as it is now. Move it "
                 "away, or name another place with archive.output."
             )
+        check_trailers(store)
         with _begun(output, ARCHIVE, threads) as part:
             manifest = _write(store, part, level)
         put_in_place(part, output, ARCHIVE)
@@ -211,19 +205,15 @@ def _write(store: Path, part: Path, level: int) -> Manifest:
     manifest = Manifest(metadata=metadata, arrays=arrays)
     group = zarr.open_group(part, mode="r+")
     group.attrs.put({**group.attrs.asdict(), _MANIFEST: manifest.document()})
-    for folder, _, files in os.walk(part):
-        if _ZARR_JSON in files:  # shards were synced as they were written
-            sync(Path(folder, _ZARR_JSON))
-        sync(Path(folder))
+    sync_folders(part)
     return manifest
 
 
 def _write_array(
     store: Path, part: Path, spec: ArraySpec, level: int, progress: "tqdm[Any]"
 ) -> ArchivedArray:
-    """Copy an array shard by shard; each has to give the store's trailers before the next."""
+    """Copy an array shard by shard; each is read back before the next."""
     array = _create_array(part, spec, level)
-    trailers = _trailers(store, spec)
     sizes: list[int] = []
     for shard, rows in _shards(part, spec, array):
         values = read_rows(store, spec, rows.start, rows.stop)
@@ -231,22 +221,20 @@ def _write_array(
             wanted = read_rows(store, read_spec(store, CHECKSUMS), rows.start, rows.stop)
             check_row_checksums(store, spec, rows.start, values, wanted)
         array[rows.start : rows.stop] = values
+        written = google_crc32c.value(values.reshape(-1).view(np.uint8))
         del values  # a shard may be large: what is read back takes its place
         if shard.exists():
             sync(shard)
-        try:
-            _checked_rows(spec, array, shard, rows, trailers)
-        except StoreIncomplete:
-            with closing(ChunkFiles(store, spec, writable=False)) as files:
-                files.check()  # says so where it is the store that is damaged
-            raise
+        back = _read_shard(array, shard, rows)
+        if google_crc32c.value(back.reshape(-1).view(np.uint8)) != written:
+            raise _damaged(shard, f"the disk did not keep the rows of {spec.name}")
         sizes.append(shard.stat().st_size if shard.exists() else 0)
         progress.update(len(rows) * spec.row_bytes)
     return ArchivedArray(
         codec=f"zstd+{codec_for(spec.dtype, 0, level).shuffle.value}",
         raw_bytes=spec.data_bytes,
         shard_bytes=tuple(sizes),
-        crc32c=trailers,
+        crc32c=_trailers(store, spec),
         metadata=file_digest(part / spec.name / _ZARR_JSON),
     )
 
@@ -254,46 +242,45 @@ def _write_array(
 def _rebuild(manifest: Manifest, archive: Path, target: Path, part: Path) -> None:
     for name, text in manifest.metadata.items():
         if name != _ZARR_JSON:
-            _write_text(part / name, text)
+            (part / name).parent.mkdir(parents=True, exist_ok=True)
+            (part / name).write_text(text, encoding="utf-8")
     with closing(StoreBuild(target, read_specs(part), manifest.plan or "")) as build:
         build.allocate()
         with _progress("restore", manifest.raw_bytes) as progress:
             for name, record in manifest.arrays.items():
                 spec, array = build.specs[name], _open_array(archive, name, record)
-                for shard, rows in _shards(archive, spec, array):
-                    values = _checked_rows(spec, array, shard, rows, record.crc32c)
-                    build.write(name, rows.start, values)
+                shards = _shards(archive, spec, array)
+                for shard, rows in shards:
+                    build.write(name, rows.start, _read_shard(array, shard, rows))
                     progress.update(len(rows) * spec.row_bytes)
                 build.files(name).write_trailers()
+                _check_rebuilt(part, spec, record, shards)
         build.finish()
         # With the root's attributes, which hold the plan, it is what an extraction would go on
         # with, or an earlier one have left, and so nothing that another restoration may remove.
-        _write_text(part / _ZARR_JSON, manifest.metadata[_ZARR_JSON])
+        (part / _ZARR_JSON).write_text(manifest.metadata[_ZARR_JSON], encoding="utf-8")
         sync(part / _ZARR_JSON)
         sync(part)
         build.put_in_place()
 
 
-def _checked_rows(
-    spec: ArraySpec, array: "zarr.Array[Any]", shard: Path, rows: range, crc32c: Sequence[int]
-) -> NDArray[Any]:
-    """The rows of one shard.
-
-    Raises `StoreIncomplete` where they do not give the checksums of the store's chunk files.
-    """
+def _read_shard(array: "zarr.Array[Any]", shard: Path, rows: range) -> NDArray[Any]:
+    """The rows of a shard; raises `StoreIncomplete` where it is damaged."""
     try:
-        values = np.ascontiguousarray(array[rows.start : rows.stop])
+        return np.ascontiguousarray(array[rows.start : rows.stop])
     except (ValueError, RuntimeError) as error:
-        raise _damaged(shard, f"{spec.name} cannot be read: {error}") from None
-    raw = values.reshape(-1).view(np.uint8)
-    expected = crc32c[rows.start // spec.chunk_rows :]
-    for start, crc in zip(range(0, len(raw), spec.chunk_bytes), expected, strict=False):
-        data = raw[start : start + spec.chunk_bytes]
-        padding = bytes(spec.chunk_bytes - len(data))
-        if google_crc32c.extend(google_crc32c.value(data), padding) != crc:
-            said = f"rows {rows.start} to {rows.stop - 1} of {spec.name} are other ones"
-            raise _damaged(shard, said)
-    return values
+        raise _damaged(shard, f"{array.path} cannot be read: {error}") from None
+
+
+def _check_rebuilt(
+    part: Path, spec: ArraySpec, record: ArchivedArray, shards: Sequence[tuple[Path, range]]
+) -> None:
+    """Raise `StoreIncomplete` naming the shard that gave other rows than were archived."""
+    for chunk, crc in enumerate(_trailers(part, spec)):
+        if crc != record.crc32c[chunk]:
+            rows = spec.chunk_rows_of(chunk)
+            shard = next(path for path, inside in shards if rows.start in inside)
+            raise _damaged(shard, f"rows {rows[0]} to {rows[-1]} of {spec.name} are other ones")
 
 
 def _create_array(root: Path, spec: ArraySpec, level: int) -> "zarr.Array[Any]":
@@ -345,13 +332,11 @@ def _chunks_a_shard(spec: ArraySpec) -> int:
     return math.ceil(spec.chunk_count / max(1, math.ceil(spec.chunk_count / most))) or 1
 
 
-def _shards(root: Path, spec: ArraySpec, array: "zarr.Array[Any]") -> Generator[tuple[Path, range]]:
+def _shards(root: Path, spec: ArraySpec, array: "zarr.Array[Any]") -> list[tuple[Path, range]]:
     """The file of each shard of an array with data, and the rows in it."""
     assert array.shards is not None, "an archive is sharded"
-    rows = spec.shape[0] if spec.data_bytes else 0
-    for index, start in enumerate(range(0, rows, array.shards[0])):
-        key = array.metadata.encode_chunk_key((index, *(0,) * (array.ndim - 1)))
-        yield root / spec.name / key, range(start, min(start + array.shards[0], rows))
+    cut = replace(spec, stored_chunk_rows=array.shards[0])
+    return [(path, cut.chunk_rows_of(shard)) for shard, path in enumerate(chunk_paths(root, cut))]
 
 
 def _open_array(archive: Path, name: str, record: ArchivedArray) -> "zarr.Array[Any]":
@@ -361,9 +346,7 @@ def _open_array(archive: Path, name: str, record: ArchivedArray) -> "zarr.Array[
         raise _damaged(metadata, f"the file is missing, and with it {name}")
     if file_digest(metadata) != record.metadata:
         raise _damaged(metadata, f"the metadata of {name} are not those that were written")
-    with warnings.catch_warnings():  # earlier versions took numcodecs' Delta for some integers
-        warnings.filterwarnings("ignore", "Numcodecs codecs are not in the Zarr", ZarrUserWarning)
-        return zarr.open_array(archive, path=name, mode="r")
+    return zarr.open_array(archive, path=name, mode="r")
 
 
 def _holds(manifest: Manifest, store: Path) -> bool:
@@ -371,10 +354,10 @@ def _holds(manifest: Manifest, store: Path) -> bool:
     if _read_metadata(store) != manifest.metadata:
         return False
     try:
-        found = {name: _trailers(store, spec) for name, spec in read_specs(store).items()}
+        trailers = {name: _trailers(store, spec) for name, spec in read_specs(store).items()}
     except (OSError, IndexError):
         return False
-    return found == {name: array.crc32c for name, array in manifest.arrays.items()}
+    return trailers == {name: array.crc32c for name, array in manifest.arrays.items()}
 
 
 def _trailers(store: Path, spec: ArraySpec) -> tuple[int, ...]:
@@ -402,11 +385,6 @@ def _read_metadata(store: Path) -> dict[str, str]:
 
 def _progress(label: str, total: int) -> "tqdm[Any]":
     return tqdm(total=total, unit="B", unit_scale=True, desc=label, disable=None)
-
-
-def _write_text(path: Path, text: str) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(text.encode())
 
 
 def _manifest_document(path: Path) -> dict[str, Any] | None:

@@ -250,7 +250,7 @@ def _runs(rows: Sequence[int] | NDArray[np.int64]) -> list[NDArray[np.intp]]:
 
 
 def sync_folders(root: Path) -> None:
-    """Wait for every folder and zarr's metadata; chunk files are synced as they are sealed."""
+    """Wait for every folder and zarr's metadata; data files are synced as they are written."""
     for folder, _, files in os.walk(root):
         sync(Path(folder))
         if "zarr.json" in files:

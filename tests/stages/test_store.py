@@ -76,7 +76,7 @@ def test_list_names_what_was_trained_on_a_store(
     assert f"{tmp_path}/models/lone: can be evaluated on it" in of_first
     assert "models" not in of_second
     assert "spec tiny-spe: 3 slots x 8 in float32" in said.out
-    assert "prompt '{instruction}'" in said.out
+    assert "prompt {instruction}" in said.out
     assert "broken/run.json" in said.err
 
 

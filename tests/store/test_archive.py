@@ -16,13 +16,10 @@ import google_crc32c
 import numpy as np
 import pytest
 import zarr
-from zarr.codecs.numcodecs import Delta
-from zarr.errors import ZarrUserWarning
 
-from pipeline.base.digests import file_digest
 from pipeline.base.errors import ConfigError, DiskFull, StoreIncomplete, StoreLocked, StoreMismatch
 from pipeline.store import FeatureStore, Sizes, StoreBuild, arrays, build_lock, part_path
-from pipeline.store.archive import archive, codec_for, is_archive, read_manifest, restore
+from pipeline.store.archive import archive, codec_for, is_archive, restore
 from pipeline.store.schema import INCREMENTAL, read_specs
 
 DEMO = Path(__file__).resolve().parents[2] / "cache_store/demo.zarr"
@@ -408,35 +405,6 @@ class TestRestore:
             restore(output, store, threads=2)
         assert other.part.exists()
 
-    def test_an_archive_of_an_earlier_version(self, archived, tmp_path):
-        """Which chose other codecs, numcodecs' Delta among them, and noted what it chose from."""
-        store, output = archived
-        name, values = "tick/vl_row", zarr.open_array(output, path="tick/vl_row", mode="r")
-        rows = values[...]
-        with pytest.warns(ZarrUserWarning, match="Numcodecs"):
-            other = zarr.create_array(
-                output,
-                name=name,
-                shape=rows.shape,
-                shards=values.shards,
-                chunks=values.chunks,
-                dtype=rows.dtype,
-                filters=[Delta(dtype="<i8")],
-                overwrite=True,
-            )
-        other[...] = rows
-        manifest = read_manifest(output)
-        noted = {
-            "codec": "delta+zstd",
-            "ratios": {"delta+zstd": 2.5, "rounding": None},
-            "metadata": file_digest(output / name / "zarr.json"),
-        }
-        changed = {**manifest.arrays, name: manifest.arrays[name].model_copy(update=noted)}
-        document = manifest.model_copy(update={"arrays": changed}).document()
-        zarr.open_group(output, mode="r+").attrs["archive"] = document
-        restore(output, tmp_path / "back.zarr", threads=2)
-        assert content(tmp_path / "back.zarr") == content(store)
-
     def test_not_beside_a_running_extraction(self, archived, tmp_path):
         target = tmp_path / "back.zarr"
         with build_lock(target), pytest.raises(StoreLocked):
@@ -476,10 +444,10 @@ from pathlib import Path
 import pipeline.store.archive as module
 from pipeline.store import schema
 schema.CHUNK_BYTES, module.SHARD_BYTES = 2**17, 2**18
-def slow(*arguments, real=module._checked_rows):
+def slow(*arguments, real=module._read_shard):
     time.sleep(0.02)
     return real(*arguments)
-module._checked_rows = slow
+module._read_shard = slow
 what, source, target = sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3])
 if what == "archive":
     module.archive(source, target, 1, 2)

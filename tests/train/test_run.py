@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from pipeline.base.durable import read_document
+from pipeline.base.durable import HELD, read_document
 from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch, ConfigError
-from pipeline.base.ownership import MARKER
+from pipeline.base.ownership import MARKER, begin_folder
 from pipeline.store import FeatureStore
 from pipeline.train.loop import Trainer
 from pipeline.train.run import RUN_FOLDER, TRAINER_VERSION, open_run
@@ -169,7 +169,8 @@ def test_a_checkpoint_swap_that_was_killed_is_recovered(
     if half == "new":  # killed while writing: the old one still stands
         (unfinished / "last.new").mkdir()
     else:  # killed between the two renames
-        last.rename(unfinished / "last.old")
+        begin_folder(unfinished / "last.replaced", HELD)
+        last.rename(unfinished / "last.replaced" / "last")
     assert trainer(store, params()).step == 4
 
 
