@@ -19,14 +19,6 @@ def widen(values: NDArray[Any]) -> NDArray[Any]:
     return (values.astype(np.uint32) << 16).view(np.float32)
 
 
-def tensor_of(values: NDArray[Any]) -> "Tensor":
-    """A tensor over the same memory; uint16 bits become bfloat16."""
-    import torch
-
-    tensor = torch.from_numpy(values)
-    return tensor.view(torch.bfloat16) if values.dtype == np.uint16 else tensor
-
-
 def array_of(tensor: "Tensor") -> NDArray[Any]:
     """The tensor, on the CPU, as a store holds it: bfloat16 becomes its bits as uint16."""
     import torch

@@ -195,14 +195,7 @@ def is_ledger(path: Path) -> bool:
         return True
     if not header.startswith(_HEADER):
         return not header
-    if application := int.from_bytes(header[68:72], "big"):
-        return application == _APPLICATION
-    try:  # of an earlier version, which left no application's id
-        with closing(_immutable(path)) as file:
-            made = {row[0] for row in file.execute("SELECT sql FROM sqlite_master")}
-    except sqlite3.DatabaseError:
-        return True
-    return not made or f"CREATE TABLE {_TABLES[0]}" in made
+    return int.from_bytes(header[68:72], "big") == _APPLICATION
 
 
 def _refuse_foreign(ledger: Path) -> None:

@@ -64,17 +64,6 @@ def test_what_is_no_ledger_is_left_as_it_is(tmp_path, kind, opened):
     assert list(tmp_path.iterdir()) == [ledger]
 
 
-def test_a_ledger_of_an_earlier_version_is_gone_on_with(tmp_path):
-    ledger = tmp_path / "ledger.sqlite"
-    with closing(ContentDigests(ledger)) as digests:
-        digests.note_rate("model", 12.5)
-    with closing(sqlite3.connect(ledger)) as database:
-        database.execute("PRAGMA application_id = 0")
-    for _ in range(2):
-        with closing(ContentDigests(ledger)) as digests:
-            assert digests.rate("model") == 12.5
-
-
 def test_names_a_file_that_cannot_be_read(tmp_path):
     with (
         closing(ContentDigests(tmp_path / "ledger.sqlite")) as digests,

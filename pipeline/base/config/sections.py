@@ -1,12 +1,27 @@
-"""All sections together."""
+"""All sections together, and their keys described for people."""
+
+import inspect
+import json
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 from pydantic import model_validator
+from pydantic.fields import FieldInfo
 
-from pipeline.base.config.finetune import FinetuneParams
-from pipeline.base.config.inspect import InspectParams
 from pipeline.base.config.section import Section
-from pipeline.base.config.stage_one import DataParams, DemoParams, ExtractParams, VLMParams
-from pipeline.base.config.stage_two import CompareParams, EvaluateParams, TrainHeadParams
+from pipeline.base.config.stage_one import (
+    DataParams,
+    DemoParams,
+    ExtractParams,
+    InspectParams,
+    VLMParams,
+)
+from pipeline.base.config.stage_two import (
+    CompareParams,
+    EvaluateParams,
+    FinetuneParams,
+    TrainHeadParams,
+)
 from pipeline.base.config.stores import ArchiveParams, ProbeParams, StoresParams, VerifyParams
 
 
@@ -37,3 +52,31 @@ class Params(Section):
                 f"but data.sources has {', '.join(names)}"
             )
         return self
+
+
+def described_keys(sections: Sequence[str]) -> list[str]:
+    """Every key of these sections: a line with its default, and what it means below."""
+    lines: list[str] = []
+    for name in sections:
+        section = Params.model_fields[name].annotation
+        assert isinstance(section, type) and issubclass(section, Section), name
+        lines += [f"{name}: {inspect.getdoc(section)}", *_lines(section, name), ""]
+    return lines[:-1]
+
+
+def _lines(section: type[Section], place: str) -> Iterator[str]:
+    for name, field in section.model_fields.items():
+        inner = field.annotation
+        if isinstance(inner, type) and issubclass(inner, Section):
+            yield from _lines(inner, f"{place}.{name}")
+            continue
+        yield f"  {place}.{name} = {_default(field)}"
+        for line in (field.description or "").splitlines():
+            yield f"      {line.strip()}"
+
+
+def _default(field: FieldInfo) -> str:
+    if field.is_required():
+        return "(has to be given)"
+    value: Any = field.get_default(call_default_factory=True, validated_data={})
+    return json.dumps(value, default=str)
