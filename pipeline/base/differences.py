@@ -24,7 +24,7 @@ def differences(expected: Any, actual: Any, place: str = "") -> Differences:
             for key in keys
         }
         digest = inside.pop("digest", {})
-        return {where: pair for found in inside.values() for where, pair in found.items()} or digest
+        return {place: pair for part in inside.values() for place, pair in part.items()} or digest
     expected = list(expected) if isinstance(expected, tuple) else expected
     actual = list(actual) if isinstance(actual, tuple) else actual
     if expected == actual:
@@ -52,7 +52,7 @@ def _short(value: Any, other: Any, most: int = 80) -> str:
     # Entries of lists of one length are compared: these lists differ in theirs.
     if isinstance(value, list) and any(isinstance(entry, Mapping) for entry in value):
         return f"{len(value)} entries"
-    text, beside = (json.dumps(one, ensure_ascii=False) for one in (value, other))
+    text, beside = (json.dumps(side, ensure_ascii=False) for side in (value, other))
     if len(text) <= most:
         return text
     same = next((at for at, (a, b) in enumerate(zip(text, beside, strict=False)) if a != b), 0)

@@ -23,8 +23,6 @@ from pipeline.base.ownership import described
 
 LEDGER_SUFFIX = ".files.sqlite"
 
-_BLOCK = 4 * 2**20
-_HEADER, _HEADER_BYTES = b"SQLite format 3\0", 100
 _APPLICATION = 0x564C4146
 """SQLite's `application_id` of a ledger, in its header at bytes 68 to 71, big-endian."""
 
@@ -190,12 +188,11 @@ def is_ledger(path: Path) -> bool:
         return not path.exists()
     try:
         with path.open("rb") as file:
-            header = file.read(_HEADER_BYTES)
+            header = file.read(100)
     except OSError:
         return True
-    if not header.startswith(_HEADER):
-        return not header
-    return int.from_bytes(header[68:72], "big") == _APPLICATION
+    sqlite = header.startswith(b"SQLite format 3\0")
+    return not header or (sqlite and int.from_bytes(header[68:72], "big") == _APPLICATION)
 
 
 def _refuse_foreign(ledger: Path) -> None:
@@ -214,11 +211,8 @@ def _immutable(path: Path) -> sqlite3.Connection:
 
 def file_digest(path: Path) -> str:
     """The digest of a file's content, read anew: 32 hex digits of BLAKE2b."""
-    hasher = hashlib.blake2b(digest_size=16)
     with path.open("rb") as file:
-        while block := file.read(_BLOCK):
-            hasher.update(block)
-    return hasher.hexdigest()
+        return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
 
 
 def joint_digest(*parts: str) -> str:

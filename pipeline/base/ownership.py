@@ -14,8 +14,6 @@ from pathlib import Path
 from pipeline.base.errors import ConfigError
 
 MARKER = ".vla-feature-cache"
-_NAMED = 3
-"""Names that a message lists of a folder."""
 
 _SPEED = "step\tsteps_per_s\tdata_wait_share\t"
 """How the speed begins that a training writes beside its logs (`pipeline.train.log`)."""
@@ -160,11 +158,7 @@ def _marked(folder: Path) -> str | None:
 
 def described(path: Path) -> str:
     """What lies there, for an error."""
-    if not path.exists():
-        return "a link to nothing"
     if not path.is_dir():
-        return "a file"
-    if any((path / name).is_file() for name in ("zarr.json", ".zgroup", ".zarray")):
-        return "a zarr group or array that it did not write"
+        return "a file" if path.exists() else "a link to nothing"
     names = sorted(entry.name for entry in path.iterdir())
-    return f"a folder with {', '.join(names[:_NAMED])}{' …' if len(names) > _NAMED else ''}"
+    return f"a folder with {', '.join(names[:3])}{' …' if len(names) > 3 else ''}"

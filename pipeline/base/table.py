@@ -114,14 +114,11 @@ def number(value: float) -> str:
 
 
 def _column(head: str, values: Sequence[Any]) -> Column:
-    numeric = any(_is_number(value) for value in values) and all(
-        value is None or _is_number(value) for value in values
-    )
-    if numeric and all(_is_whole(value) for value in values):
-        cells = tuple(NOTHING if _is_missing(value) else f"{int(value):,}" for value in values)
-    else:
-        cells = tuple(_word(value) for value in values)
-    return Column(head, numeric, cells)
+    given = [value for value in values if value is not None]
+    numeric = bool(given) and all(_is_number(value) for value in given)
+    whole = numeric and all(math.isnan(value) or float(value).is_integer() for value in given)
+    cells = [int(v) if whole and v is not None and not math.isnan(v) else v for v in values]
+    return Column(head, numeric, tuple(map(_word, cells)))
 
 
 def _word(value: Any) -> str:
@@ -146,11 +143,3 @@ def _is_bool(value: Any) -> bool:
 
 def _is_number(value: Any) -> bool:
     return not _is_bool(value) and isinstance(value, numbers.Real)
-
-
-def _is_missing(value: Any) -> bool:
-    return value is None or math.isnan(value)
-
-
-def _is_whole(value: Any) -> bool:
-    return _is_missing(value) or (math.isfinite(value) and float(value).is_integer())

@@ -69,14 +69,11 @@ def _all_problems(error: ValidationError, where: str) -> str:
         match problem["type"]:
             case "extra_forbidden":
                 said = _unknown_key(problem["loc"])
-            case "missing":
-                said = problem["msg"]
             case "tuple_type":
                 said = f"expected a list, such as [{problem['input']}]"
             case _:
                 said = problem["msg"].removeprefix("Value error, ")
-                # A rule over a whole section names what it found; the section would bury it.
-                if not (problem["type"] == "value_error" and isinstance(problem["input"], dict)):
+                if not isinstance(problem["input"], dict):  # a whole section would bury it
                     said += f" (found {problem['input']!r:.200})"
         lines.append(f"  {place}: {said}")
     return "\n".join(lines)
