@@ -313,16 +313,14 @@ def _details(inventory: Inventory, entry: StoreEntry) -> Iterator[str]:
 
 
 def _embodiment(held: StoreContents) -> str:
-    attrs = held.attrs
-    action = f"{attrs['streams']['action'].get('kind', '')} action".strip()
-    arrays = {action: "tick/action", "sensor": "sensor/values", "state": "state/values"}
-    widths = {stream: held.specs[name].shape[1] for stream, name in arrays.items()}
-    words = [f"{stream} {width}" if width else f"no {stream}" for stream, width in widths.items()]
+    attrs, names = held.attrs, ("tick/action", "sensor/values", "state/values")
+    action, sensor, state = (held.specs[name].shape[1] for name in names)
     rate = "recorded rows" if attrs["action_hz"] is None else f"{attrs['action_hz']:g} Hz"
     return (
-        f"{', '.join(words)}; {rate}, an answer every {attrs['vlm_reuse_count']} ticks; "
+        f"{attrs['streams']['action'].get('kind', '')} action {action}, sensor {sensor}, state "
+        f"{state}; {rate}, an answer every {attrs['vlm_reuse_count']} ticks; "
         f"sources {', '.join(attrs['sources'])}"
-    )
+    ).strip()
 
 
 def _spec(held: StoreContents) -> str:

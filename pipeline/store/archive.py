@@ -38,7 +38,7 @@ from pipeline.store.metadata import ATTRIBUTE as METADATA_DIGEST
 from pipeline.store.paths import STORE, inode_of, part_path, read_plan, recover, refuse_replaced
 from pipeline.store.reader import FeatureStore
 from pipeline.store.repair_hints import extract_command, gc_command
-from pipeline.store.schema import CHECKSUMS, FEATURES, ArraySpec, chunk_paths, read_spec, read_specs
+from pipeline.store.schema import CHECKSUMS, FEATURES, GROUPS, ArraySpec, chunk_paths, read_specs
 from pipeline.store.writer import StoreBuild, sync_folders
 
 _SCHEMA = 1
@@ -88,11 +88,6 @@ class Manifest(BaseModel, frozen=True):
     def stored_bytes(self) -> int:
         """Of all shards."""
         return sum(sum(array.shard_bytes) for array in self.arrays.values())
-
-    def document(self) -> dict[str, Any]:
-        """The manifest as JSON, with a digest of itself."""
-        body = {"schema": _SCHEMA, **self.model_dump(mode="json")}
-        return {**body, "digest": _digest_of(body)}
 
 
 def is_archive(path: Path) -> bool:
@@ -192,10 +187,9 @@ def _begun(target: Path, kind: OutputKind, threads: int) -> Generator[Path]:
 def _write(store: Path, part: Path, level: int) -> Manifest:
     """Everything of an archive, its manifest last, all of it on the disk."""
     inode, specs, metadata = inode_of(store), read_specs(store), _read_metadata(store)
-    for name in ("", *sorted({name.split("/")[0] for name in specs})):
-        attributes = zarr.open_group(store, path=name, mode="r").attrs.asdict()
-        if not name:
-            attributes = {k: v for k, v in attributes.items() if k not in _OF_A_STORE}
+    of_groups = {n: zarr.open_group(store, path=n, mode="r").attrs.asdict() for n in ("", *GROUPS)}
+    of_groups[""] = {k: v for k, v in of_groups[""].items() if k not in _OF_A_STORE}
+    for name, attributes in of_groups.items():
         zarr.create_group(part, path=name, attributes=attributes)
     with _progress("archive", sum(spec.data_bytes for spec in specs.values())) as progress:
         arrays = {
@@ -203,8 +197,9 @@ def _write(store: Path, part: Path, level: int) -> Manifest:
         }
     refuse_replaced(store, inode)
     manifest = Manifest(metadata=metadata, arrays=arrays)
-    group = zarr.open_group(part, mode="r+")
-    group.attrs.put({**group.attrs.asdict(), _MANIFEST: manifest.document()})
+    document = {"schema": _SCHEMA, **manifest.model_dump(mode="json")}
+    document["digest"] = _digest_of(document)
+    zarr.open_group(part, mode="r+").attrs.put({**of_groups[""], _MANIFEST: document})
     sync_folders(part)
     return manifest
 
@@ -218,7 +213,7 @@ def _write_array(
     for shard, rows in _shards(part, spec, array):
         values = read_rows(store, spec, rows.start, rows.stop)
         if spec.name == FEATURES:
-            wanted = read_rows(store, read_spec(store, CHECKSUMS), rows.start, rows.stop)
+            wanted = FeatureStore.open(store).array(CHECKSUMS)[rows.start : rows.stop]
             check_row_checksums(store, spec, rows.start, values, wanted)
         array[rows.start : rows.stop] = values
         written = google_crc32c.value(values.reshape(-1).view(np.uint8))
