@@ -4,6 +4,7 @@ import random
 import signal
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -88,15 +89,20 @@ def test_a_training_killed_again_and_again(
 
 
 def test_a_merge_killed_again_and_again(
-    tiny_store: Callable[..., Path], head_params, kill_after, here, tmp_path: Path
+    tiny_store: Callable[..., Path], head_params, kill_after, fork, here, tmp_path: Path
 ) -> None:
     chance = random.Random(0)
     inputs = [str(tiny_store(tmp_path, name=name, seed=seed)) for seed, name in enumerate("ab")]
     params = head_params(Path("unused.zarr"))
     words = ["merge", *inputs, "--into"]
+    _, heard = fork(merge, params, [*words, str(tmp_path / "counted.zarr")])
+    writes = 0
+    with suppress(EOFError):
+        while heard.recv():
+            writes += 1
     for _ in range(3):
         wanted = [*words, str(tmp_path / "killed.zarr")]
-        kill_after(chance.randint(1, 40), 0.0, merge, params, wanted)
+        kill_after(chance.randint(1, writes // 4), 0.0, merge, params, wanted)
         assert not (tmp_path / "killed.zarr").exists()
     for name in ("killed", "whole"):
         code, _, complained = here("stages.store", params, *words, str(tmp_path / f"{name}.zarr"))
