@@ -34,7 +34,7 @@ from pipeline.base.digests import file_digest
 from pipeline.base.durable import disk_full_named, put_in_place, sync
 from pipeline.base.errors import StoreIncomplete, StoreMismatch
 from pipeline.base.ownership import OutputKind, begin_folder, remove_folder
-from pipeline.store.chunks import ChunkFiles, check_row_checksums, check_trailers, read_rows
+from pipeline.store.chunks import check_chunks, check_row_checksums, check_trailers, read_rows
 from pipeline.store.lock import build_lock
 from pipeline.store.metadata import ATTRIBUTE as METADATA_DIGEST
 from pipeline.store.metadata import check_metadata
@@ -237,8 +237,7 @@ def _write_array(
         try:
             _checked_rows(spec, array, shard, rows, trailers)
         except StoreIncomplete:
-            with closing(ChunkFiles(store, spec, writable=False)) as files:
-                files.check()  # says so where it is the store that is damaged
+            check_chunks(store, spec)  # says so where it is the store that is damaged
             raise
         sizes.append(shard.stat().st_size if shard.exists() else 0)
         progress.update(len(rows) * spec.row_bytes)

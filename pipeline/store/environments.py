@@ -62,7 +62,7 @@ class EnvironmentLog:
             self._temporary.write_text(json.dumps(known))
             sync(self._temporary)
             self._temporary.replace(self._listed)
-        return known.index(dict(environment))
+        return known.index(environment)
 
     def note(self, start: int, count: int, number: int) -> None:
         """Say with which environment a run of rows was computed."""
@@ -74,8 +74,8 @@ class EnvironmentLog:
 
     def ranges(self) -> list[dict[str, Any]]:
         """`[{"rows": [start, stop], **environment}, ...]`, in order."""
-        known, numbers = self._known(), self._numbers()
-        ranges, start = [], 0
+        known, ranges, start = self._known(), [], 0
+        numbers = np.fromfile(self._of_row, "<u2") if self._of_row.exists() else np.zeros(0, "<u2")
         for run in np.split(numbers, np.flatnonzero(np.diff(numbers)) + 1):
             if len(run):
                 ranges.append({"rows": [start, start + len(run)], **known[run[0]]})
@@ -84,12 +84,8 @@ class EnvironmentLog:
 
     def remove(self) -> None:
         """Forget it; a kill between the two leaves nothing that would be folded again."""
-        self._listed.unlink(missing_ok=True)
-        self._of_row.unlink(missing_ok=True)
-        self._temporary.unlink(missing_ok=True)
+        for path in (self._listed, self._of_row, self._temporary):
+            path.unlink(missing_ok=True)
 
     def _known(self) -> list[dict[str, Any]]:
         return json.loads(self._listed.read_text()) if self._listed.exists() else []
-
-    def _numbers(self) -> NDArray[np.uint16]:
-        return np.fromfile(self._of_row, "<u2") if self._of_row.exists() else np.zeros(0, "<u2")

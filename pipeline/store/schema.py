@@ -129,9 +129,13 @@ class ArraySpec:
 
 
 def chunk_paths(root: Path, spec: ArraySpec) -> list[Path]:
-    """The chunk files of an array on disk, in order, under the default chunk keys of zarr v3."""
-    zeros = ["0"] * (len(spec.shape) - 1)
-    return [Path(root, spec.name, "c", str(chunk), *zeros) for chunk in range(spec.chunk_count)]
+    """The chunk files of an array on disk, in order."""
+    return [chunk_path(root, spec, chunk) for chunk in range(spec.chunk_count)]
+
+
+def chunk_path(root: Path, spec: ArraySpec, chunk: int) -> Path:
+    """A chunk file of an array on disk, under the default chunk keys of zarr v3."""
+    return Path(root, spec.name, "c", str(chunk), *["0"] * (len(spec.shape) - 1))
 
 
 @dataclass(frozen=True)
@@ -194,18 +198,24 @@ def arrays(sizes: Sizes, features_dtype: str, sensor_dtype: str) -> dict[str, Ar
         "key_byte": KEY_BYTES,
         "byte": sizes.text_bytes,
     }
-    bfloat16 = features_dtype == "bfloat16"
-    chosen = {FEATURES: "u2" if bfloat16 else features_dtype, "sensor/values": sensor_dtype}
+    chosen = {FEATURES: features_dtype, "sensor/values": sensor_dtype}
     return {
-        name: ArraySpec(
-            name,
-            tuple(lengths[axis] for axis in axes),
-            np.dtype(chosen.get(name, code)).newbyteorder("<"),
-            tuple(axis.removeprefix("key_") for axis in axes),
-            {"dtype": "bfloat16"} if bfloat16 and name == FEATURES else {},
-        )
-        for name, (code, *axes) in _ARRAYS.items()
+        name: array_spec(name, tuple(lengths[axis] for axis in axes), chosen.get(name))
+        for name, (_, *axes) in _ARRAYS.items()
     }
+
+
+def array_spec(name: str, shape: tuple[int, ...], dtype: str | None = None) -> ArraySpec:
+    """An array as the contract says; `dtype` is one of `DTYPES` where params choose it."""
+    code, *axes = _ARRAYS[name]
+    bits = name == FEATURES and dtype == "bfloat16"
+    return ArraySpec(
+        name,
+        shape,
+        np.dtype("u2" if bits else code or dtype).newbyteorder("<"),
+        tuple(axis.removeprefix("key_") for axis in axes),
+        {"dtype": dtype} if bits else {},
+    )
 
 
 def read_specs(root: Path) -> dict[str, ArraySpec]:
