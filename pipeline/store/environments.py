@@ -62,7 +62,7 @@ class EnvironmentLog:
             self._temporary.write_text(json.dumps(known))
             sync(self._temporary)
             self._temporary.replace(self._listed)
-        return known.index(environment)
+        return known.index(dict(environment))
 
     def note(self, start: int, count: int, number: int) -> None:
         """Say with which environment a run of rows was computed."""

@@ -39,11 +39,6 @@ class RowSource:
         """The digest of each episode, in order: equal digest, equal rows."""
         return [text["digest"] for text in self._texts]
 
-    @property
-    def episode_said(self) -> list[tuple[str, str]]:
-        """Content digest and instruction of each episode, in order."""
-        return [(text["content"], text["instruction"]) for text in self._texts]
-
     @cached_property
     def episode_contents(self) -> list[str]:
         """The content digest of each episode, in order: equal content, equal streams."""
@@ -98,8 +93,8 @@ class RowSource:
     @cached_property
     def _episodes_by_text(self) -> dict[tuple[str, str], list[int]]:
         episodes = defaultdict[tuple[str, str], list[int]](list)
-        for index, said in enumerate(self.episode_said):
-            episodes[said].append(index)
+        for index, text in enumerate(self._texts):
+            episodes[text["content"], text["instruction"]].append(index)
         return episodes
 
     @cached_property

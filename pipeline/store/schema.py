@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import zarr
 from zarr.codecs import BytesCodec, Crc32cCodec
-from zarr.storage import MemoryStore
 
 from pipeline.base.errors import StoreIncomplete
 from pipeline.store.repair_hints import mend
@@ -69,11 +68,6 @@ class ArraySpec:
     """As an array on disk is cut; None for one that follows the rule."""
 
     @property
-    def stored_dtype(self) -> str:
-        """What its numbers are: `bfloat16` where the array holds their bits."""
-        return self.attributes.get("dtype", self.dtype.name)
-
-    @property
     def row_bytes(self) -> int:
         """Bytes of one row."""
         return math.prod(self.shape[1:]) * self.dtype.itemsize
@@ -106,12 +100,7 @@ class ArraySpec:
         start = chunk * self.chunk_rows
         return range(start, min(start + self.chunk_rows, self.shape[0]))
 
-    @property
-    def document(self) -> dict[str, Any]:
-        """The array's zarr metadata as JSON."""
-        return self.create(MemoryStore()).metadata.to_dict()
-
-    def create(self, root: Path | MemoryStore) -> "zarr.Array[Any]":
+    def create(self, root: Path | dict[str, Any]) -> "zarr.Array[Any]":
         """Write the array's zarr metadata below `root`."""
         return zarr.create_array(
             store=root,
@@ -219,10 +208,7 @@ def array_spec(name: str, shape: tuple[int, ...], dtype: str | None = None) -> A
 
 
 def read_specs(root: Path) -> dict[str, ArraySpec]:
-    """The arrays of a store or a build on disk, by name.
-
-    Raises `StoreIncomplete` where one is missing.
-    """
+    """The arrays of a store or a build on disk, by name, as `read_spec` reads them."""
     return {name: read_spec(root, name) for name in ARRAY_NAMES}
 
 
@@ -233,9 +219,7 @@ def read_spec(root: Path, name: str) -> ArraySpec:
     """
     try:
         array = zarr.open_array(root, path=name, mode="r")
-    except FileNotFoundError:
-        raise StoreIncomplete(f"{root}: the array {name} is missing. {mend(root)}") from None
-    except (ValueError, KeyError, TypeError) as error:
+    except (FileNotFoundError, ValueError, KeyError, TypeError) as error:
         raise StoreIncomplete(
             f"{root / name / 'zarr.json'}: not the metadata of a zarr array ({error}). {mend(root)}"
         ) from None

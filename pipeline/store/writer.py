@@ -25,6 +25,9 @@ from pipeline.store.metadata import metadata_damage, note_metadata
 from pipeline.store.paths import STORE, part_path
 from pipeline.store.schema import CHECKSUMS, FEATURES, INCREMENTAL, KEYS, ArraySpec, chunk_path
 
+Rows = Sequence[int] | NDArray[np.int64]
+"""Store-global VL rows, in any order."""
+
 
 class StoreBuild:
     """An unfinished store.
@@ -120,18 +123,12 @@ class StoreBuild:
             return self._environments.index(environment)
 
     def commit(
-        self,
-        rows: Sequence[int] | NDArray[np.int64],
-        features: NDArray[Any],
-        keys: Sequence[bytes],
-        environment: int,
+        self, rows: Rows, features: NDArray[Any], keys: Sequence[bytes], environment: int
     ) -> None:
         """Write feature rows (row, slot, dim), wait for the disk, then mark them as done."""
         self.mark(rows, keys, self.write_features(rows, features), environment)
 
-    def write_features(
-        self, rows: Sequence[int] | NDArray[np.int64], features: NDArray[Any]
-    ) -> NDArray[np.uint32]:
+    def write_features(self, rows: Rows, features: NDArray[Any]) -> NDArray[np.uint32]:
         """Write feature rows (row, slot, dim) and wait for the disk; their checksums, for `mark`.
 
         Another process or host may call it, with rows that nobody else writes.
@@ -143,11 +140,7 @@ class StoreBuild:
         return row_checksums(features)
 
     def mark(
-        self,
-        rows: Sequence[int] | NDArray[np.int64],
-        keys: Sequence[bytes],
-        checksums: NDArray[np.uint32],
-        environment: int,
+        self, rows: Rows, keys: Sequence[bytes], checksums: NDArray[np.uint32], environment: int
     ) -> None:
         """Say that feature rows are on disk: their keys, their environment, at last the checksums.
 
@@ -220,7 +213,7 @@ class StoreBuild:
         return self._files[name]
 
 
-def _runs(rows: Sequence[int] | NDArray[np.int64]) -> list[NDArray[np.intp]]:
+def _runs(rows: Rows) -> list[NDArray[np.intp]]:
     """Where among `rows` each run of consecutive ones stands, in order."""
     order = np.argsort(rows, kind="stable")
     gaps = np.flatnonzero(np.diff(np.asarray(rows, np.int64)[order]) != 1) + 1

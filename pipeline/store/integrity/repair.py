@@ -10,7 +10,6 @@ from contextlib import closing
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from pipeline.base.durable import disk_full_named, sync
@@ -72,21 +71,7 @@ def carry_rows(store: Path, build: StoreBuild, verification: Verification) -> in
         build.files(name).close()
         for path in build.files(name).paths:  # of zeros, where it was laid out anew
             path.unlink(missing_ok=True)
-    _carry(store, build, verification, sound)
-    return int(sound.sum())
-
-
-def put_in_place(build: StoreBuild, store: Path) -> None:
-    """Make it the build of the store that `stages.extract` goes on with."""
-    build.close()
-    sync_folders(build.part)
-    replace_folder(build.part, part_path(store), STORE)
-
-
-def _carry(
-    store: Path, build: StoreBuild, verification: Verification, sound: NDArray[np.bool_]
-) -> None:
-    """Link the chunk files in which everything is sound; of the others, copy the sound rows."""
+    # Chunk files in which everything is sound are linked; of the others, sound rows are copied.
     spec, damaged = build.specs[FEATURES], verification.damaged_chunks(FEATURES)
     environments = read_attributes(store).get("environment", [])
     step = max(1, _BLOCK_BYTES // max(1, spec.row_bytes))
@@ -107,6 +92,14 @@ def _carry(
                 build.mark(rows, [*map(bytes, keys)], row_checksums(values), number)
         files.sync()
     build.files(CHECKSUMS).sync()
+    return int(sound.sum())
+
+
+def put_in_place(build: StoreBuild, store: Path) -> None:
+    """Make it the build of the store that `stages.extract` goes on with."""
+    build.close()
+    sync_folders(build.part)
+    replace_folder(build.part, part_path(store), STORE)
 
 
 def _copy(path: Path, to: Path) -> None:

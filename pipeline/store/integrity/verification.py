@@ -7,9 +7,9 @@ build stores: the trailers prove that they hold what was written.
 
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -82,8 +82,6 @@ class Verification:
     """Of the store that was checked: another may have taken its place since."""
     rows: int
     """Feature rows that could be read and were checked."""
-    row_bytes: int
-    """Of the rows of all arrays."""
     bytes: int
     """Of the chunk files that were read, with the padding behind the last rows."""
     seconds: float
@@ -124,9 +122,8 @@ class Verification:
     def summary(self) -> str:
         """For people: how much was checked, how fast."""
         return (
-            f"{self.store}: checked {self.rows} feature rows, {size(self.row_bytes)} of rows in "
-            f"{size(self.bytes)} of files, in {self.seconds:.1f} s "
-            f"({self.bytes / 1e9 / max(self.seconds, 1e-9):.2f} GB/s)"
+            f"{self.store}: checked {self.rows} feature rows, {size(self.bytes)} of files, in "
+            f"{self.seconds:.1f} s ({self.bytes / 1e9 / max(self.seconds, 1e-9):.2f} GB/s)"
         )
 
 
@@ -150,23 +147,31 @@ def verify(path: Path, threads: int, workers: int | str = 0) -> Verification:
         for chunk in range(spec.chunk_count)
     ]
     total = sum(spec.chunk_count * spec.chunk_bytes for spec in specs.values())
-    with tqdm(total=total, desc="verify", unit="B", unit_scale=True, disable=None) as bar:
-        reports = list(_run(checks, threads, workers, bar))
-    if workers:
-        _refuse_blind_workers(path, reports)
+    reports: list[ChunkReport] = []
+    with (
+        tqdm(total=total, desc="verify", unit="B", unit_scale=True, disable=None) as bar,
+        closing(_run_on_cluster(checks, workers) if workers else _run(checks, threads)) as running,
+    ):
+        for report in running:
+            bar.update(report.bytes)
+            reports.append(report)
+    if workers and any(report.bytes == 0 and report.path.exists() for report in reports):
+        raise StoreIncomplete(  # a file that is here and not there is no damage
+            f"{path}: expected the workers to see the store under this path, they find no file. "
+            "Put it on a file system that they share, or set verify.workers=0."
+        )
+    reports.sort(key=lambda report: (ARRAY_NAMES.index(report.array), report.rows.start))
     bad = [report for report in reports if report.damage or report.faults.any()]
     lost = {report.array for report in bad if report.damage}
     store = _naming_store(path, attributes, specs, lost) if bad and not issues else None
     issues += [issue for report in bad for issue in _issues(report, specs[report.array], store)]
     issues += strange_files(path, specs)
     refuse_replaced(path, inode)
-    read = [(report, _rows_read(report, specs[report.array])) for report in reports]
     bad_rows = [report.rows.start + np.flatnonzero(report.faults) for report in reports]
     return Verification(
         store=path,
         inode=inode,
-        rows=sum(rows for report, rows in read if report.array == FEATURES),
-        row_bytes=sum(rows * specs[report.array].row_bytes for report, rows in read),
+        rows=sum(int((report.faults != UNREADABLE).sum()) for report in reports),
         bytes=sum(report.bytes for report in reports),
         seconds=time.monotonic() - begun,
         issues=tuple(issues),
@@ -259,13 +264,14 @@ def strange_files(root: Path, specs: Mapping[str, ArraySpec]) -> Iterator[Issue]
 def _differences(root: Path, spec: ArraySpec, lengths: dict[str, int]) -> Iterator[str]:
     """Where the metadata of an array depart from the contract, and from `lengths` by axis."""
     allowed = ("float32", "float16", *(["bfloat16"] if spec.name == FEATURES else []))
-    dtype = spec.stored_dtype if spec.stored_dtype in allowed else "float32"
+    stored = spec.attributes.get("dtype", spec.dtype.name)
+    dtype = stored if stored in allowed else "float32"
     chunk_rows = None if spec.chunk_rows % ROW_MULTIPLE else spec.chunk_rows
     contract = array_spec(spec.name, spec.shape, dtype)
     if len(contract.dimensions) != len(spec.shape):
         yield f"expected the axes {contract.dimensions}, found the shape {spec.shape}"
         return
-    expected = replace(contract, stored_chunk_rows=chunk_rows).document
+    expected = replace(contract, stored_chunk_rows=chunk_rows).create({}).metadata.to_dict()
     actual = zarr.open_array(root, path=spec.name, mode="r").metadata.to_dict()
     for key, (wanted, found) in differences(expected, actual).items():
         yield f"expected the {key} {wanted}, found {found}"
@@ -279,22 +285,14 @@ def _metadata_issue(root: Path, what: str, array: str = "") -> Issue:
     return Issue(severity="error", kind="metadata", message=what, stream=array, file=file)
 
 
-def _run(
-    checks: Sequence[Callable[[], ChunkReport]], threads: int, workers: int | str, bar: "tqdm[Any]"
-) -> Iterator[ChunkReport]:
-    """What each check gives, in order."""
-    if workers:
-        yield from _run_on_cluster(checks, workers, bar)
-        return
+def _run(checks: Sequence[Callable[[], ChunkReport]], threads: int) -> Generator[ChunkReport]:
     with ThreadPoolExecutor(threads) as pool:
-        for report in pool.map(lambda check: check(), checks):
-            bar.update(report.bytes)
-            yield report
+        yield from pool.map(lambda check: check(), checks)
 
 
 def _run_on_cluster(
-    checks: Sequence[Callable[[], ChunkReport]], workers: int | str, bar: "tqdm[Any]"
-) -> list[ChunkReport]:
+    checks: Sequence[Callable[[], ChunkReport]], workers: int | str
+) -> Generator[ChunkReport]:
     from distributed import Client, as_completed
 
     from pipeline.base.scheduler import client_of, private_cluster, quiet
@@ -309,17 +307,7 @@ def _run_on_cluster(
             client = stack.enter_context(Client(cluster, set_as_default=False))
         futures = [client.submit(check, pure=False) for check in checks]
         for _, report in as_completed(futures, loop=client.loop, with_results=True):
-            bar.update(report.bytes)
-        return cast("list[ChunkReport]", client.gather(futures))
-
-
-def _refuse_blind_workers(path: Path, reports: Sequence[ChunkReport]) -> None:
-    """A file that is here and not there is no damage."""
-    if any(report.bytes == 0 and report.path.exists() for report in reports):
-        raise StoreIncomplete(
-            f"{path}: expected the workers to see the store under this path, they find no file. "
-            "Put it on a file system that they share, or set verify.workers=0."
-        )
+            yield cast("ChunkReport", report)
 
 
 def _naming_store(
@@ -330,10 +318,6 @@ def _naming_store(
     if needed & lost:
         return None
     return FeatureStore(path, attributes, {name: map_array(path, specs[name]) for name in needed})
-
-
-def _rows_read(report: ChunkReport, spec: ArraySpec) -> int:
-    return min(report.bytes // spec.row_bytes, len(report.rows))
 
 
 def _issues(report: ChunkReport, spec: ArraySpec, store: FeatureStore | None) -> Iterator[Issue]:
