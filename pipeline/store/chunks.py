@@ -48,34 +48,33 @@ def check_row_checksums(
 
 
 def check_trailers(root: Path, but: Collection[str] = ()) -> None:
-    """Read a finished store once, every byte of it, with a bar on a terminal.
+    """Read a finished store once, every byte of it.
 
     The arrays named in `but` are left out. Raises `StoreIncomplete` where a chunk does not give the
     checksum that was written behind it, or the metadata do not give their digest.
     """
     check_metadata(root)
-    specs = [spec for name, spec in read_specs(root).items() if name not in but]
-    total = sum(spec.chunk_count * spec.chunk_bytes for spec in specs)
-    with tqdm(
-        total=total, desc="checksums", unit="B", unit_scale=True, leave=False, disable=None
-    ) as bar:
-        for spec in specs:
-            check_chunks(root, spec)
-            bar.update(spec.chunk_count * spec.chunk_bytes)
+    check_chunks(root, *(spec for name, spec in read_specs(root).items() if name not in but))
 
 
-def check_chunks(root: Path, spec: ArraySpec) -> None:
+def check_chunks(root: Path, *specs: ArraySpec) -> None:
     """Raise `StoreIncomplete` where a chunk of a finished store does not give its trailer."""
-    if damage := find_damage(root, spec):
+    if damage := find_damage(root, *specs):
         raise StoreIncomplete(
             f"{damage}, so that nothing can be taken from this store. {mend(root)}"
         )
 
 
-def find_damage(root: Path, spec: ArraySpec) -> str | None:
-    """The first chunk file of an array that does not give its trailer, and what is wrong."""
-    reports = ((path, read_chunk(path, spec).damage) for path in chunk_paths(root, spec))
-    return next((f"{path}: {damage}" for path, damage in reports if damage), None)
+def find_damage(root: Path, *specs: ArraySpec) -> str | None:
+    """The first chunk file of these arrays that does not give its trailer, and what is wrong.
+
+    With a bar on a terminal where it takes longer than a second.
+    """
+    files = [(path, spec) for spec in specs for path in chunk_paths(root, spec)]
+    for path, spec in tqdm(files, "checksums", unit="file", leave=False, disable=None, delay=1):
+        if damage := read_chunk(path, spec).damage:
+            return f"{path}: {damage}"
+    return None
 
 
 def read_rows(root: Path, spec: ArraySpec, start: int = 0, stop: int | None = None) -> NDArray[Any]:

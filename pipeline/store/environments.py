@@ -6,7 +6,6 @@ file of its own; sealing folds it into ranges of rows in the store's attributes.
 
 import json
 import os
-from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,10 +18,8 @@ from pipeline.base.durable import sync
 
 def environment_at(ranges: Sequence[Mapping[str, Any]], row: int) -> dict[str, Any]:
     """What a row was computed with, by the ranges of a store; empty where it is not noted."""
-    at = bisect_right(ranges, row, key=lambda noted: noted["rows"][0]) - 1
-    if at < 0 or row >= ranges[at]["rows"][1]:
-        return {}
-    return {name: value for name, value in ranges[at].items() if name != "rows"}
+    noted = next((noted for noted in ranges if row in range(*noted["rows"])), {})
+    return {name: value for name, value in noted.items() if name != "rows"}
 
 
 def runs_of(rows: NDArray[np.int64]) -> list[range]:

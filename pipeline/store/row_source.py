@@ -105,9 +105,8 @@ class RowSource:
     @cached_property
     def _texts(self) -> list[dict[str, Any]]:
         index = [name for name in self.specs if name.startswith("episode/")]
-        if not self._finished and any(
-            find_damage(self.path, self.specs[name]) for name in ["vl/frame_time", *index]
-        ):
+        read = [self.specs[name] for name in ("vl/frame_time", *index)]
+        if not self._finished and find_damage(self.path, *read):
             return []  # rows are known by their keys alone, frame by frame
         return read_texts({name: self._read(name) for name in index})
 

@@ -101,7 +101,7 @@ class StoreBuild:
         if what := metadata_damage(self.part):
             return f"{self.part / 'zarr.json'}: {what}"
         known = (spec for name, spec in self.specs.items() if name not in INCREMENTAL)
-        return next(filter(None, (find_damage(self.part, spec) for spec in known)), None)
+        return find_damage(self.part, *known)
 
     def missing(self) -> NDArray[np.int64]:
         """The feature rows that are not there, in order.

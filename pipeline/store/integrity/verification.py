@@ -55,6 +55,7 @@ FAULTS = (
     "NaN or infinity",
 )
 """How a feature row is, in words."""
+_Error = partial(Issue, severity="error")
 
 
 @dataclass(frozen=True)
@@ -161,10 +162,13 @@ def verify(path: Path, threads: int, workers: int | str = 0) -> Verification:
             "Put it on a file system that they share, or set verify.workers=0."
         )
     reports.sort(key=lambda report: (ARRAY_NAMES.index(report.array), report.rows.start))
-    bad = [report for report in reports if report.damage or report.faults.any()]
-    lost = {report.array for report in bad if report.damage}
-    store = _naming_store(path, attributes, specs, lost) if bad and not issues else None
-    issues += [issue for report in bad for issue in _issues(report, specs[report.array], store)]
+    # Rows are named by episode and time, where that part of the store is sound.
+    names = [name for name in specs if name.startswith("episode/") or name.endswith("/time")]
+    store = None
+    if not issues and not any(report.damage for report in reports if report.array in names):
+        maps = {name: map_array(path, specs[name]) for name in names}
+        store = FeatureStore(path, attributes, maps)
+    issues += [issue for report in reports for issue in _issues(report, specs[report.array], store)]
     issues += strange_files(path, specs)
     refuse_replaced(path, inode)
     bad_rows = [report.rows.start + np.flatnonzero(report.faults) for report in reports]
@@ -258,7 +262,7 @@ def strange_files(root: Path, specs: Mapping[str, ArraySpec]) -> Iterator[Issue]
     for path in sorted(files):
         if path not in expected and not str(path).startswith(unjudged):
             what = "has no place in a store, look at it and remove it"
-            yield Issue(severity="error", kind="strange file", message=what, file=path)
+            yield _Error(kind="strange file", message=what, file=path)
 
 
 def _differences(root: Path, spec: ArraySpec, lengths: dict[str, int]) -> Iterator[str]:
@@ -281,8 +285,7 @@ def _differences(root: Path, spec: ArraySpec, lengths: dict[str, int]) -> Iterat
 
 
 def _metadata_issue(root: Path, what: str, array: str = "") -> Issue:
-    file = root / array / "zarr.json"
-    return Issue(severity="error", kind="metadata", message=what, stream=array, file=file)
+    return _Error(kind="metadata", message=what, stream=array, file=root / array / "zarr.json")
 
 
 def _run(checks: Sequence[Callable[[], ChunkReport]], threads: int) -> Generator[ChunkReport]:
@@ -310,35 +313,19 @@ def _run_on_cluster(
             yield cast("ChunkReport", report)
 
 
-def _naming_store(
-    path: Path, attributes: Mapping[str, Any], specs: Mapping[str, ArraySpec], lost: set[str]
-) -> FeatureStore | None:
-    """The store, as far as rows are named by it; None where that part of it is damaged."""
-    needed = {name for name in specs if name.startswith("episode/") or name.endswith("/time")}
-    if needed & lost:
-        return None
-    return FeatureStore(path, attributes, {name: map_array(path, specs[name]) for name in needed})
-
-
 def _issues(report: ChunkReport, spec: ArraySpec, store: FeatureStore | None) -> Iterator[Issue]:
     """The damage of a chunk file, and each run of feature rows with one fault."""
     rows, stream = report.rows, report.array.partition("/")[0]
     if report.damage:
-        yield Issue(
-            severity="error",
-            kind="chunk",
-            message=f"{report.damage}; rows {rows.start} to {rows.stop - 1} of {spec.name}"
-            + _name(store, stream, rows),
-            stream=report.array,
-            file=report.path,
-            chunk=rows.start // spec.chunk_rows,
-        )
+        where = f"rows {rows.start} to {rows.stop - 1} of {spec.name}{_name(store, stream, rows)}"
+        what, chunk = f"{report.damage}; {where}", rows.start // spec.chunk_rows
+        yield _Error(kind="chunk", message=what, stream=spec.name, file=report.path, chunk=chunk)
     for run in np.split(np.arange(len(report.faults)), np.flatnonzero(np.diff(report.faults)) + 1):
         if len(run) and (fault := report.faults[run[0]]):
             bad = rows[run[0] : run[-1] + 1]
             words = f"row {bad[0]}" if len(bad) == 1 else f"rows {bad[0]} to {bad[-1]}"
             message = f"VL {words}: {FAULTS[fault]}{_name(store, 'vl', bad)}"
-            yield Issue(severity="error", kind="feature rows", message=message, stream=FEATURES)
+            yield _Error(kind="feature rows", message=message, stream=FEATURES)
 
 
 def _name(store: FeatureStore | None, stream: str, rows: range) -> str:
