@@ -73,12 +73,14 @@ def read_attributes(root: Path) -> dict[str, Any]:
             f"{restore_command(root)}"
         )
     if "schema" not in attributes:
-        part = root if build else part_path(root)
-        found = described(root) if there(root) and not build else "nothing there"
-        found = f"only the unfinished build {part}" if part.exists() else found
+        part, found = root if build else part_path(root), "nothing there"
+        if part.exists():
+            found = f"only the unfinished build {part}"
+        elif there(root):
+            found = f"{described(root)}: name another place"
         target = root.with_name(root.name.removesuffix(".part").removesuffix(".repair"))
         raise StoreIncomplete(
-            f"{root}: no finished store ({found}). Name one, or run {extract_command(target)}."
+            f"{root}: no finished store ({found}). Run {extract_command(target)}."
         )
     if attributes["schema"] != SCHEMA:
         raise StoreMismatch(
