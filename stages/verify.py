@@ -34,7 +34,7 @@ def main(params: Params) -> None:
     """Check, and repair or compute rows again where asked to; raises where something is wrong."""
     store = params.verify.store or params.extract.store
     checked = verify(store, params.verify.threads, params.verify.workers)
-    print("\n".join([checked.summary(), *checked.notes]))
+    print(checked.summary())
     if not checked.sound:
         if not params.verify.repair:
             lines = [f"{store}: the store is damaged:", *checked.lines(), checked.advice()]

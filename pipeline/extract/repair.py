@@ -27,7 +27,7 @@ from pipeline.store.integrity.repair import (
     put_in_place,
     repair_build,
 )
-from pipeline.store.integrity.structure import read_arrays
+from pipeline.store.integrity.verification import read_arrays
 from pipeline.store.paths import MERGED, STORE
 from pipeline.store.repair_hints import extract_command, gc_command
 from pipeline.store.schema import INCREMENTAL

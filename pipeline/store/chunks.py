@@ -8,7 +8,6 @@ import errno
 import os
 import shutil
 from collections.abc import Callable, Collection, Iterator
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from pipeline.base.durable import disk_full_named, sync
 from pipeline.base.errors import StoreIncomplete
 from pipeline.store.metadata import check_metadata
 from pipeline.store.repair_hints import mend
-from pipeline.store.schema import TRAILER_BYTES, ArraySpec, chunk_paths, read_specs
+from pipeline.store.schema import TRAILER_BYTES, ArraySpec, chunk_path, chunk_paths, read_specs
 
 BLOCK_BYTES = 4 * 2**20
 """Read at a time: it is still in the processor's cache when it is checked."""
@@ -43,32 +42,58 @@ def check_row_checksums(
     bad = start + np.flatnonzero(row_checksums(features) != wanted)
     if bad.size:
         raise StoreIncomplete(
-            f"{chunk_paths(store, spec)[bad[0] // spec.chunk_rows]}: rows {bad[0]} to {bad[-1]} of "
+            f"{chunk_path(store, spec, bad[0] // spec.chunk_rows)}: rows {bad[0]} to {bad[-1]} of "
             f"{spec.name} do not give their checksum: the store is damaged. {mend(store)}"
         )
 
 
 def check_trailers(root: Path, but: Collection[str] = ()) -> None:
-    """Read a finished store once, every byte of it, with a bar on a terminal.
+    """Read a finished store once, every byte of it.
 
     The arrays named in `but` are left out. Raises `StoreIncomplete` where a chunk does not give the
     checksum that was written behind it, or the metadata do not give their digest.
     """
     check_metadata(root)
-    specs = [spec for name, spec in read_specs(root).items() if name not in but]
-    total = sum(spec.chunk_count * spec.chunk_bytes for spec in specs)
-    with tqdm(
-        total=total, desc="checksums", unit="B", unit_scale=True, leave=False, disable=None
-    ) as bar:
-        for spec in specs:
-            with closing(ChunkFiles(root, spec, writable=False)) as files:
-                files.check(bar.update)
+    check_chunks(root, *(spec for name, spec in read_specs(root).items() if name not in but))
+
+
+def check_chunks(root: Path, *specs: ArraySpec) -> None:
+    """Raise `StoreIncomplete` where a chunk of a finished store does not give its trailer."""
+    if damage := find_damage(root, *specs):
+        raise StoreIncomplete(
+            f"{damage}, so that nothing can be taken from this store. {mend(root)}"
+        )
+
+
+def find_damage(root: Path, *specs: ArraySpec) -> str | None:
+    """The first chunk file of these arrays that does not give its trailer, and what is wrong.
+
+    With a bar on a terminal where it takes longer than a second.
+    """
+    files = [(path, spec) for spec in specs for path in chunk_paths(root, spec)]
+    for path, spec in tqdm(files, "checksums", unit="file", leave=False, disable=None, delay=1):
+        if damage := read_chunk(path, spec).damage:
+            return f"{path}: {damage}"
+    return None
 
 
 def read_rows(root: Path, spec: ArraySpec, start: int = 0, stop: int | None = None) -> NDArray[Any]:
-    """Rows start..stop - 1 of an array of a store or a build, or all, as they are on disk."""
-    with closing(ChunkFiles(root, spec, writable=False)) as files:
-        return files.read(start, (spec.shape[0] if stop is None else stop) - start)
+    """Rows start..stop - 1 of an array of a store or a build, or all, as they are on disk.
+
+    Raises `StoreIncomplete` where a chunk file is missing or ends before them.
+    """
+    count = (spec.shape[0] if stop is None else stop) - start
+    rows = np.zeros((count, *spec.shape[1:]), spec.dtype)
+    for chunk, offset, data in _parts(spec, start, rows):
+        path, what = chunk_path(root, spec, chunk), "the file ends early"
+        try:
+            with path.open("rb", buffering=0) as file:
+                if _read_into(file.fileno(), data, offset) == len(data):
+                    continue
+        except FileNotFoundError:
+            what = "no such file"
+        raise StoreIncomplete(f"{path}: {what}. {mend(root)}")
+    return rows
 
 
 @dataclass(frozen=True)
@@ -120,21 +145,16 @@ def read_chunk(
 
 
 class ChunkFiles:
-    """Row-wise access to the files of one array of a build.
+    """The files of one array of a build, written by row.
 
-    Those of a store that is only read from, which may lie where nothing can be written, are opened
-    with `writable=False`. A linked chunk belongs to another store too: `write` skips it, or copies
-    it first when the array is `owned`. Rows of an `owned` array have checksums of their own, which
-    the caller compares.
+    A linked chunk belongs to another store too: `write` skips it, or copies it first when the array
+    is `owned`. Rows of an `owned` array have checksums of their own, which the caller compares.
     """
 
-    def __init__(
-        self, root: Path, spec: ArraySpec, *, writable: bool = True, owned: bool = False
-    ) -> None:
+    def __init__(self, root: Path, spec: ArraySpec, *, owned: bool = False) -> None:
         self._root = root
         self.spec = spec
         self.paths = chunk_paths(root, spec)
-        self._writable = writable
         self._owned = owned
         self._descriptors: dict[int, int] = {}
         self._unsynced: set[int] = set()
@@ -176,7 +196,7 @@ class ChunkFiles:
         block = np.ascontiguousarray(values, self.spec.dtype)
         assert block.shape[1:] == self.spec.shape[1:], (block.shape, self.spec)
         assert start + len(block) <= self.spec.shape[0], (start, len(block), self.spec)
-        for chunk, offset, data in self._parts(start, block):
+        for chunk, offset, data in _parts(self.spec, start, block):
             if self.is_linked(chunk):
                 if not self._owned:
                     continue
@@ -190,28 +210,8 @@ class ChunkFiles:
             self._unsynced.add(chunk)
 
     def read(self, start: int, count: int) -> NDArray[Any]:
-        """Consecutive rows as they are on disk."""
-        rows = np.zeros((count, *self.spec.shape[1:]), self.spec.dtype)
-        for chunk, offset, data in self._parts(start, rows):
-            if _read_into(self._descriptor(chunk), data, offset) < len(data):
-                raise self._incomplete(chunk, "the file ends early")
-        return rows
-
-    def damage(self, chunk: int) -> str | None:
-        """What is wrong with a chunk file of a finished store; None where it gives its trailer."""
-        return read_chunk(self.paths[chunk], self.spec).damage
-
-    def check(self, checked: Callable[[int], object] = lambda size: None) -> None:
-        """Raise `StoreIncomplete` where a chunk of a finished store does not give its trailer.
-
-        `checked` is told the bytes of each sound chunk.
-        """
-        for chunk in range(len(self.paths)):
-            if what := self.damage(chunk):
-                raise self._incomplete(
-                    chunk, f"{what}, so that nothing can be taken from this store"
-                )
-            checked(self.spec.chunk_bytes)
+        """Consecutive rows as they are on disk, of whatever process or host wrote them."""
+        return read_rows(self._root, self.spec, start, start + count)
 
     def sync(self) -> None:
         """Return once everything written has reached the disk."""
@@ -247,11 +247,10 @@ class ChunkFiles:
                     continue
                 self._unlink(chunk)  # its other name is no store's: a copy of the build, say
             state = read_chunk(path, self.spec)
-            if state.bytes < self.spec.chunk_bytes:
-                raise self._incomplete(chunk, "the file ends early")
             if state.damage:
-                if path.stat().st_size == sealed and not self._owned:
-                    raise self._incomplete(chunk, state.damage)
+                whole = state.bytes >= self.spec.chunk_bytes
+                if not whole or (path.stat().st_size == sealed and not self._owned):
+                    raise StoreIncomplete(f"{path}: {state.damage}. {mend(self._root)}")
                 self._write_trailer(chunk, state.crc)
             with disk_full_named(path):
                 os.fsync(self._descriptor(chunk))
@@ -290,29 +289,22 @@ class ChunkFiles:
             if len(self._descriptors) >= _MOST_OPEN:
                 self.sync()
                 self.close()
-            writable = self._writable and not self.is_linked(chunk)
-            flags = os.O_RDWR | os.O_CREAT if writable else os.O_RDONLY
-            try:
-                self._descriptors[chunk] = os.open(self.paths[chunk], flags, 0o644)
-            except FileNotFoundError:
-                raise self._incomplete(chunk, "no such file") from None
+            self._descriptors[chunk] = os.open(self.paths[chunk], os.O_RDWR | os.O_CREAT, 0o644)
         return self._descriptors[chunk]
 
-    def _incomplete(self, chunk: int, what: str) -> StoreIncomplete:
-        return StoreIncomplete(f"{self.paths[chunk]}: {what}. {mend(self._root)}")
 
-    def _parts(
-        self, start: int, rows: NDArray[Any]
-    ) -> Iterator[tuple[int, int, NDArray[np.uint8]]]:
-        """(chunk, offset in its file, bytes) of consecutive rows from `start`, chunk by chunk."""
-        if not rows.nbytes:
-            return
-        raw, done = rows.reshape(len(rows), -1).view(np.uint8), 0
-        while done < len(raw):
-            chunk, inside = divmod(start + done, self.spec.chunk_rows)
-            taken = min(len(raw) - done, self.spec.chunk_rows - inside)
-            yield chunk, inside * self.spec.row_bytes, raw[done : done + taken].reshape(-1)
-            done += taken
+def _parts(
+    spec: ArraySpec, start: int, rows: NDArray[Any]
+) -> Iterator[tuple[int, int, NDArray[np.uint8]]]:
+    """(chunk, offset in its file, bytes) of consecutive rows from `start`, chunk by chunk."""
+    if not rows.nbytes:
+        return
+    raw, done = rows.reshape(len(rows), -1).view(np.uint8), 0
+    while done < len(raw):
+        chunk, inside = divmod(start + done, spec.chunk_rows)
+        taken = min(len(raw) - done, spec.chunk_rows - inside)
+        yield chunk, inside * spec.row_bytes, raw[done : done + taken].reshape(-1)
+        done += taken
 
 
 def _read_into(descriptor: int, into: NDArray[np.uint8], offset: int) -> int:

@@ -6,7 +6,6 @@ file of its own; sealing folds it into ranges of rows in the store's attributes.
 
 import json
 import os
-from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,10 +18,8 @@ from pipeline.base.durable import sync
 
 def environment_at(ranges: Sequence[Mapping[str, Any]], row: int) -> dict[str, Any]:
     """What a row was computed with, by the ranges of a store; empty where it is not noted."""
-    at = bisect_right(ranges, row, key=lambda noted: noted["rows"][0]) - 1
-    if at < 0 or row >= ranges[at]["rows"][1]:
-        return {}
-    return {name: value for name, value in ranges[at].items() if name != "rows"}
+    noted = next((noted for noted in ranges if row in range(*noted["rows"])), {})
+    return {name: value for name, value in noted.items() if name != "rows"}
 
 
 def runs_of(rows: NDArray[np.int64]) -> list[range]:
@@ -74,8 +71,8 @@ class EnvironmentLog:
 
     def ranges(self) -> list[dict[str, Any]]:
         """`[{"rows": [start, stop], **environment}, ...]`, in order."""
-        known, numbers = self._known(), self._numbers()
-        ranges, start = [], 0
+        known, ranges, start = self._known(), [], 0
+        numbers = np.fromfile(self._of_row, "<u2") if self._of_row.exists() else np.zeros(0, "<u2")
         for run in np.split(numbers, np.flatnonzero(np.diff(numbers)) + 1):
             if len(run):
                 ranges.append({"rows": [start, start + len(run)], **known[run[0]]})
@@ -84,12 +81,8 @@ class EnvironmentLog:
 
     def remove(self) -> None:
         """Forget it; a kill between the two leaves nothing that would be folded again."""
-        self._listed.unlink(missing_ok=True)
-        self._of_row.unlink(missing_ok=True)
-        self._temporary.unlink(missing_ok=True)
+        for path in (self._listed, self._of_row, self._temporary):
+            path.unlink(missing_ok=True)
 
     def _known(self) -> list[dict[str, Any]]:
         return json.loads(self._listed.read_text()) if self._listed.exists() else []
-
-    def _numbers(self) -> NDArray[np.uint16]:
-        return np.fromfile(self._of_row, "<u2") if self._of_row.exists() else np.zeros(0, "<u2")

@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,30 +65,13 @@ def read_episodes(
     )
 
 
-class Ticks(Protocol):
-    """An episode's ticks, with indices into its own streams: `pipeline.data.timeline.Timeline`."""
-
-    @property
-    def time(self) -> NDArray[np.float64]: ...
-    @property
-    def action(self) -> NDArray[np.float32]: ...
-    @property
-    def vl_row(self) -> NDArray[np.int64]: ...
-    @property
-    def vl_time(self) -> NDArray[np.float64]: ...
-    @property
-    def sensor_end(self) -> NDArray[np.int64]: ...
-    @property
-    def state_end(self) -> NDArray[np.int64]: ...
-
-    def frame_times(self, views: Sequence[str]) -> NDArray[np.float64]: ...
-
-
 @dataclass(frozen=True)
 class EpisodeRows:
     """How many rows of each stream an episode has, and what is said of it."""
 
-    ticks: Ticks
+    ticks: Any
+    """A `pipeline.data.timeline.Timeline`, or what says the same: ticks with indices into the
+    episode's own streams."""
     readings: int
     states: int
     source: str

@@ -33,26 +33,36 @@ def build_lock(target: Path) -> Generator[None]:
     The kernel releases it when the process ends, however it ends, so what a dead process of this
     host left behind means nothing. A shared file system may keep flock to each host, or not have
     it: there the holder's name and the time of the file, renewed every 10 s, are believed for a
-    minute. Raises `StoreLocked` naming the process that holds it.
+    minute. Raises `StoreLocked` naming the process that holds it, `ConfigError` where the file is
+    none of this project's.
     """
     path = target.with_name(target.name + ".lock")
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a+", encoding="utf-8") as file:
-        locked = _flock(file, fcntl.LOCK_EX)
-        holder = _holder(file)
+        locked, holder = _flock(file, fcntl.LOCK_EX), _holder(file)
+        elsewhere = bool(holder) and not (locked and _is_here(holder))
+        held = (
+            f"{target}: being built by {holder or 'another process'} ({path}). Wait for it or stop "
+            "it, then run the same command again."
+        )
         if locked is False:
-            raise StoreLocked(_held(target, path, holder))
+            raise StoreLocked(held)
         if not path.exists() or path.stat().st_ino != os.fstat(file.fileno()).st_ino:
             # Tidied away before it was locked: a lock on it excludes nobody.
             raise StoreLocked(f"{path}: removed by another process just now; run the same again.")
-        if locked is None:
-            print(
-                f"{path}: this file system has no locks; two builds begun within the same instant "
-                "would not see each other",
-                file=sys.stderr,
+        if elsewhere and not _HELD.match(holder):
+            raise ConfigError(
+                f"{path}: expected the lock of {target}, found a file that this project did not "
+                f"write. It was left as it is: move it away, or name another place than {target}."
             )
-        if holder and not (locked and _is_here(holder)):
-            _refuse_living(file, target, path, holder)
+        if elsewhere and (age_s := _age_s(file)) < _STALE_S:
+            raise StoreLocked(
+                f"{held} It gave a sign of life {age_s:.0f} s ago; if it was killed, wait until "
+                f"that is {_STALE_S:.0f} s."
+            )
+        if locked is None:
+            what = "this file system has no locks: two builds begun at once do not see each other"
+            print(f"{path}: {what}", file=sys.stderr)
         file.truncate(0)
         file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
         file.flush()
@@ -90,22 +100,13 @@ def _flock(file: TextIO, how: int) -> bool | None:
     return True
 
 
-def _refuse_living(file: TextIO, target: Path, path: Path, holder: str) -> None:
-    """Raise where another host's process, or one that flock cannot see, gave a sign of life."""
-    if not _HELD.match(holder):
-        raise ConfigError(
-            f"{path}: expected the lock of {target}, found a file that this project did not write. "
-            f"It was left as it is: move it away, or name another place than {target}."
-        )
+def _age_s(file: TextIO) -> float:
+    """Seconds since the file's time by the clock of its own host; the time stays as it is."""
     seen = os.fstat(file.fileno()).st_mtime_ns
-    os.utime(file.fileno())  # both times by the clock of the file's own host
+    os.utime(file.fileno())
     age_s = (os.fstat(file.fileno()).st_mtime_ns - seen) / 1e9
-    if age_s < _STALE_S:
-        os.utime(file.fileno(), ns=(seen, seen))
-        raise StoreLocked(
-            f"{_held(target, path, holder)} It gave a sign of life {age_s:.0f} s ago; if it was "
-            f"killed, wait until that is {_STALE_S:.0f} s."
-        )
+    os.utime(file.fileno(), ns=(seen, seen))
+    return age_s
 
 
 def _is_here(holder: str) -> bool:
@@ -115,13 +116,6 @@ def _is_here(holder: str) -> bool:
 def _holder(file: TextIO) -> str:
     file.seek(0)
     return file.read().strip()
-
-
-def _held(target: Path, path: Path, holder: str) -> str:
-    return (
-        f"{target}: being built by {holder or 'another process'} ({path}). Wait for it or stop it, "
-        "then run the same command again."
-    )
 
 
 @contextmanager

@@ -6,6 +6,7 @@ root's without the digest itself. Written when a build is finished.
 
 import hashlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,21 +19,22 @@ from pipeline.store.schema import ARRAY_NAMES, GROUPS
 ATTRIBUTE = "metadata_digest"
 
 
-def note_metadata(root: Path) -> None:
-    """Write the digest into the root's attributes; running it again changes nothing."""
-    actual, stored = _digests(root)
-    if actual != stored:
-        group = zarr.open_group(root, mode="r+")
-        group.attrs.put({**group.attrs.asdict(), ATTRIBUTE: actual})
+def note_metadata(root: Path, attributes: Mapping[str, Any] | None = None) -> None:
+    """Write attributes into the root, or those that it has, and the digest with them."""
+    digest, _ = _digests(root, attributes)
+    group = zarr.open_group(root, mode="r+")
+    attributes = group.attrs.asdict() if attributes is None else attributes
+    kept = {name: value for name, value in attributes.items() if name != ATTRIBUTE}
+    group.attrs.put({**kept, ATTRIBUTE: digest})
 
 
 def metadata_damage(root: Path) -> str | None:
-    """What is wrong with the metadata; None where they give their digest, or have none.
+    """What is wrong with the metadata; None where they give their digest.
 
     Raises `StoreIncomplete` where they cannot be read.
     """
     actual, stored = _digests(root)
-    if stored in (None, actual):
+    if stored == actual:
         return None
     return f"the metadata were changed: expected their digest {stored}, found {actual}"
 
@@ -43,9 +45,12 @@ def check_metadata(root: Path) -> None:
         raise StoreIncomplete(f"{root / 'zarr.json'}: {what}. {mend(root)}")
 
 
-def _digests(root: Path) -> tuple[str, Any]:
-    """That of the metadata as they are, and the one that stands in the attributes."""
+def _digests(root: Path, attributes: Mapping[str, Any] | None = None) -> tuple[str, Any]:
+    """That of the metadata as they are, or would be with other attributes of the root, and the one
+    that stands in the attributes."""
     documents = {place: _read(root / place / "zarr.json") for place in ("", *GROUPS, *ARRAY_NAMES)}
+    if attributes is not None:
+        documents[""]["attributes"] = dict(attributes)
     stored = documents[""].get("attributes", {}).pop(ATTRIBUTE, None)
     text = json.dumps(documents, sort_keys=True)
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest(), stored

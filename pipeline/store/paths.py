@@ -62,25 +62,26 @@ def read_plan(store: Path) -> str | None:
 def read_attributes(root: Path) -> dict[str, Any]:
     """The root attributes of a finished store.
 
-    Raises `StoreIncomplete` where there is none, only a build of it, or one that lost them, and
-    `StoreMismatch` where it follows another schema or something else lies there.
+    Raises `StoreIncomplete` where there is none, only a build of it, one that lost them or
+    something else, and `StoreMismatch` where it follows another schema or is an archive.
     """
     build = root.name.endswith(".part")  # which looks like a store until its files are read
-    if build or not (root / "zarr.json").exists():
-        part = root if build else part_path(root)
-        if not build and there(root) and not STORE.owns(root):
-            raise _foreign(root)
-        what = f"only the unfinished build {part}" if part.exists() else "nothing there"
-        target = root.with_name(root.name.removesuffix(".part").removesuffix(".repair"))
-        raise StoreIncomplete(f"{root}: no finished store ({what}). Run {extract_command(target)}.")
-    attributes = _attributes(root)
+    attributes = {} if build else _attributes(root)
     if "archive" in attributes:
         raise StoreMismatch(
             f"{root}: expected a store, found an archive of one. Restore it first: "
             f"{restore_command(root)}"
         )
     if "schema" not in attributes:
-        raise _foreign(root)
+        part, found = root if build else part_path(root), "nothing there"
+        if part.exists():
+            found = f"only the unfinished build {part}"
+        elif there(root):
+            found = f"{described(root)}: name another place"
+        target = root.with_name(root.name.removesuffix(".part").removesuffix(".repair"))
+        raise StoreIncomplete(
+            f"{root}: no finished store ({found}). Run {extract_command(target)}."
+        )
     if attributes["schema"] != SCHEMA:
         raise StoreMismatch(
             f"{root}: expected store schema {SCHEMA}, found {attributes['schema']!r}. "
@@ -108,13 +109,6 @@ def refuse_replaced(store: Path, before: Inode | None) -> None:
             f"{store}: another store took its place while it was being read. Run the same command "
             "again."
         )
-
-
-def _foreign(root: Path) -> StoreMismatch:
-    return StoreMismatch(
-        f"{root}: no finished store: expected what this project wrote, found {described(root)}. "
-        "Name a store that stages.extract made, which never writes in place of anything else."
-    )
 
 
 def _attributes(path: Path) -> dict[str, Any]:

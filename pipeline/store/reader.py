@@ -136,9 +136,7 @@ class FeatureStore:
     def tick_step(self) -> float:
         """The median time from a tick to the next of its episode, in s; NaN where there is none."""
         steps = np.diff(self._arrays["tick/time"])
-        starts = self._arrays["episode/tick_start"]
-        between = np.unique(starts[(starts > 0) & (starts < self.ticks)]) - 1
-        steps = np.delete(steps, between)
+        steps = steps[np.diff(self.episode_of(np.arange(self.ticks))) == 0]
         return float(np.median(steps)) if len(steps) else float("nan")
 
     def feature_age(self, ticks: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -184,10 +182,7 @@ class FeatureStore:
     ) -> "tuple[Batch, Selection]":
         """The first half of `gather`: all but the wide fields of a batch, and where those lie."""
         if min(lags) < 0:
-            raise ValueError(
-                "a lag goes back in time and cannot be negative: "
-                "feature_lag={}, sensor_lag_s={}, state_lag_s={}".format(*lags)
-            )
+            raise ValueError(f"a lag goes back in time and cannot be negative, found {lags}")
         tick = np.asarray(ticks, np.int64)
         if tick.size and (tick.min() < 0 or tick.max() >= self.ticks):
             raise IndexError(f"{self.path}: ticks lie in 0..{self.ticks - 1}, asked for {tick}")
@@ -212,16 +207,12 @@ class FeatureStore:
         """The second half of `gather`: the wide fields of `batch`, without those named in `but`."""
         self._gatherer.copy(selection, batch, but)
 
-    def empty_batch(
-        self,
-        batch: int,
-        horizon: int,
-        sensor_window: int,
-        state_window: int,
-        but: Collection[str] = (),
-    ) -> "Batch":
-        """Buffers for `gather(..., out=)`; those named in `but` have a shape, but no memory."""
-        return self._gatherer.empty_batch(batch, horizon, sensor_window, state_window, but)
+    def empty_batch(self, *sizes: int, but: Collection[str] = ()) -> "Batch":
+        """Buffers for `gather(..., out=)`: batch, horizon, sensor_window and state_window.
+
+        Those named in `but` have a shape, but no memory.
+        """
+        return self._gatherer.empty_batch(*sizes, but=but)
 
     def tensor(self, field: str) -> "Tensor":
         """The map that a wide field of a batch (`WIDE`) is gathered from, row by row."""
@@ -263,14 +254,11 @@ def place(store: FeatureStore, stream: str, row: int) -> str:
 
 def map_array(root: Path, spec: ArraySpec) -> NDArray[Any]:
     """The map of an array; `StoreIncomplete` where a chunk file has another size than it must."""
-    paths = chunk_paths(root, spec)
-    wanted = spec.chunk_bytes + TRAILER_BYTES
+    paths, wanted = chunk_paths(root, spec), f"{spec.chunk_bytes + TRAILER_BYTES} bytes"
     for path in paths:
-        size = path.stat().st_size if path.exists() else None
-        if size != wanted:
-            actual = "no file" if size is None else f"{size} bytes"
+        actual = f"{path.stat().st_size} bytes" if path.exists() else "no file"
+        if actual != wanted:
             raise StoreIncomplete(
-                f"{path}: expected {wanted} bytes, found {actual}: the store is damaged. "
-                f"{mend(root)}"
+                f"{path}: expected {wanted}, found {actual}: the store is damaged. {mend(root)}"
             )
     return map_flat(paths, spec.chunk_bytes, spec.shape, spec.dtype)

@@ -23,11 +23,10 @@ def gc_command(path: Path) -> str:
     return f"python -m stages.store gc {shlex.quote(str(path))} --remove"
 
 
-def restore_command(archive: Path, store: Path | None = None) -> str:
-    """Makes a store from its archive; where none is named, one beside it."""
-    if store is None:
-        name = archive.stem.removesuffix(".archive")
-        store = archive.with_name(f"{name if name != archive.stem else name + '.restored'}.zarr")
+def restore_command(archive: Path) -> str:
+    """Makes a store from its archive, beside it."""
+    name = archive.stem.removesuffix(".archive")
+    store = archive.with_name(f"{name if name != archive.stem else name + '.restored'}.zarr")
     places = f"--set {_set('archive.output', archive)} --set {_set('archive.store', store)}"
     return f"python -m stages.archive --restore {places}"
 
@@ -36,11 +35,7 @@ def mend(path: Path) -> str:
     """What to do about a damaged store or build, of which `path` is the folder or a file in it."""
     folder, store = _owner(path)
     if folder != store:
-        what = "the store of before" if folder.suffix == ".previous" else "an unfinished build"
-        return (
-            f"It lies in {what}. Remove that with {gc_command(folder)}, then run "
-            f"{extract_command(store)}."
-        )
+        return f"Remove it with {gc_command(folder)}, then run {extract_command(store)}."
     return (
         f"Run python -m stages.verify --repair --set {_set('verify.store', store)}, which keeps "
         "what is sound, then what it says."
@@ -52,15 +47,11 @@ def start_over(path: Path) -> str:
     folder, store = _owner(path)
     if folder != store:
         return mend(path)
-    lost = (
+    return (
         "Without them its feature rows are of no use, and --repair cannot begin. Remove or rename "
-        f"{store}, then run {extract_command(store)}, which computes all of it"
+        f"{store}, then run {extract_command(store)}, which computes all of it, or python -m "
+        "stages.archive --restore, which takes it from an archive."
     )
-    archive = store.with_name(f"{store.stem}.archive.zarr")
-    if not (archive / "zarr.json").exists():
-        return f"{lost}."
-    restore = restore_command(archive, store)
-    return f"{lost}; or, in place of that, restore it from the archive beside it: {restore}."
 
 
 def _owner(path: Path) -> tuple[Path, Path]:

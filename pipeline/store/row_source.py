@@ -1,7 +1,6 @@
 """Take over what another store or an abandoned build already knows."""
 
 from collections import defaultdict
-from contextlib import closing
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import zarr
 from numpy.typing import NDArray
 
 from pipeline.base.errors import StoreIncomplete
-from pipeline.store.chunks import ChunkFiles, row_checksums
+from pipeline.store.chunks import check_chunks, find_damage, read_rows, row_checksums
 from pipeline.store.environments import EnvironmentLog, environment_at
 from pipeline.store.episodes import read_texts
 from pipeline.store.schema import CHECKSUMS, FEATURES, KEYS, ArraySpec, read_specs
@@ -28,7 +27,6 @@ class RowSource:
         self.path = path
         self.specs: dict[str, ArraySpec] = read_specs(path)
         self.attrs: dict[str, Any] = zarr.open_group(path, mode="r").attrs.asdict()
-        self._features = ChunkFiles(path, self.specs[FEATURES], writable=False)
         self._arrays: dict[str, NDArray[Any]] = {}
 
     @property
@@ -40,11 +38,6 @@ class RowSource:
     def episode_digests(self) -> list[str]:
         """The digest of each episode, in order: equal digest, equal rows."""
         return [text["digest"] for text in self._texts]
-
-    @property
-    def episode_said(self) -> list[tuple[str, str]]:
-        """Content digest and instruction of each episode, in order."""
-        return [(text["content"], text["instruction"]) for text in self._texts]
 
     @cached_property
     def episode_contents(self) -> list[str]:
@@ -84,7 +77,7 @@ class RowSource:
         if row is None:
             return None
         try:
-            values = self._features.read(row, 1)
+            values = read_rows(self.path, self.specs[FEATURES], row, row + 1)
         except StoreIncomplete:  # its file is cut short or gone: the row is computed again
             return None
         return values[0] if row_checksums(values)[0] == self._read(CHECKSUMS)[row] else None
@@ -94,14 +87,14 @@ class RowSource:
         return environment_at(self._environments, self.rows[key])
 
     def close(self) -> None:
-        """Close its files."""
-        self._features.close()
+        """Forget what was read."""
+        self._arrays.clear()
 
     @cached_property
     def _episodes_by_text(self) -> dict[tuple[str, str], list[int]]:
         episodes = defaultdict[tuple[str, str], list[int]](list)
-        for index, said in enumerate(self.episode_said):
-            episodes[said].append(index)
+        for index, text in enumerate(self._texts):
+            episodes[text["content"], text["instruction"]].append(index)
         return episodes
 
     @cached_property
@@ -112,7 +105,8 @@ class RowSource:
     @cached_property
     def _texts(self) -> list[dict[str, Any]]:
         index = [name for name in self.specs if name.startswith("episode/")]
-        if not self._finished and any(map(self._is_damaged, ["vl/frame_time", *index])):
+        read = [self.specs[name] for name in ("vl/frame_time", *index)]
+        if not self._finished and find_damage(self.path, *read):
             return []  # rows are known by their keys alone, frame by frame
         return read_texts({name: self._read(name) for name in index})
 
@@ -121,15 +115,10 @@ class RowSource:
         """Whether every chunk has a trailer; those of feature rows in a build have none yet."""
         return self.path.suffix in (".zarr", ".previous")
 
-    def _is_damaged(self, name: str) -> bool:
-        with closing(ChunkFiles(self.path, self.specs[name], writable=False)) as files:
-            return any(files.damage(chunk) for chunk in range(len(files.paths)))
-
     def _read(self, name: str) -> NDArray[Any]:
         """All of a small array, read once."""
         if name not in self._arrays:
-            with closing(ChunkFiles(self.path, self.specs[name], writable=False)) as files:
-                if self._finished:
-                    files.check()
-                self._arrays[name] = files.read(0, self.specs[name].shape[0])
+            if self._finished:
+                check_chunks(self.path, self.specs[name])
+            self._arrays[name] = read_rows(self.path, self.specs[name])
         return self._arrays[name]

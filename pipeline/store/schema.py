@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import zarr
 from zarr.codecs import BytesCodec, Crc32cCodec
-from zarr.storage import MemoryStore
 
 from pipeline.base.errors import StoreIncomplete
 from pipeline.store.repair_hints import mend
@@ -69,11 +68,6 @@ class ArraySpec:
     """As an array on disk is cut; None for one that follows the rule."""
 
     @property
-    def stored_dtype(self) -> str:
-        """What its numbers are: `bfloat16` where the array holds their bits."""
-        return self.attributes.get("dtype", self.dtype.name)
-
-    @property
     def row_bytes(self) -> int:
         """Bytes of one row."""
         return math.prod(self.shape[1:]) * self.dtype.itemsize
@@ -106,12 +100,7 @@ class ArraySpec:
         start = chunk * self.chunk_rows
         return range(start, min(start + self.chunk_rows, self.shape[0]))
 
-    @property
-    def document(self) -> dict[str, Any]:
-        """The array's zarr metadata as JSON."""
-        return self.create(MemoryStore()).metadata.to_dict()
-
-    def create(self, root: Path | MemoryStore) -> "zarr.Array[Any]":
+    def create(self, root: Path | dict[str, Any]) -> "zarr.Array[Any]":
         """Write the array's zarr metadata below `root`."""
         return zarr.create_array(
             store=root,
@@ -129,9 +118,13 @@ class ArraySpec:
 
 
 def chunk_paths(root: Path, spec: ArraySpec) -> list[Path]:
-    """The chunk files of an array on disk, in order, under the default chunk keys of zarr v3."""
-    zeros = ["0"] * (len(spec.shape) - 1)
-    return [Path(root, spec.name, "c", str(chunk), *zeros) for chunk in range(spec.chunk_count)]
+    """The chunk files of an array on disk, in order."""
+    return [chunk_path(root, spec, chunk) for chunk in range(spec.chunk_count)]
+
+
+def chunk_path(root: Path, spec: ArraySpec, chunk: int) -> Path:
+    """A chunk file of an array on disk, under the default chunk keys of zarr v3."""
+    return Path(root, spec.name, "c", str(chunk), *["0"] * (len(spec.shape) - 1))
 
 
 @dataclass(frozen=True)
@@ -194,25 +187,28 @@ def arrays(sizes: Sizes, features_dtype: str, sensor_dtype: str) -> dict[str, Ar
         "key_byte": KEY_BYTES,
         "byte": sizes.text_bytes,
     }
-    bfloat16 = features_dtype == "bfloat16"
-    chosen = {FEATURES: "u2" if bfloat16 else features_dtype, "sensor/values": sensor_dtype}
+    chosen = {FEATURES: features_dtype, "sensor/values": sensor_dtype}
     return {
-        name: ArraySpec(
-            name,
-            tuple(lengths[axis] for axis in axes),
-            np.dtype(chosen.get(name, code)).newbyteorder("<"),
-            tuple(axis.removeprefix("key_") for axis in axes),
-            {"dtype": "bfloat16"} if bfloat16 and name == FEATURES else {},
-        )
-        for name, (code, *axes) in _ARRAYS.items()
+        name: array_spec(name, tuple(lengths[axis] for axis in axes), chosen.get(name))
+        for name, (_, *axes) in _ARRAYS.items()
     }
 
 
-def read_specs(root: Path) -> dict[str, ArraySpec]:
-    """The arrays of a store or a build on disk, by name.
+def array_spec(name: str, shape: tuple[int, ...], dtype: str | None = None) -> ArraySpec:
+    """An array as the contract says; `dtype` is one of `DTYPES` where params choose it."""
+    code, *axes = _ARRAYS[name]
+    bits = name == FEATURES and dtype == "bfloat16"
+    return ArraySpec(
+        name,
+        shape,
+        np.dtype("u2" if bits else code or dtype).newbyteorder("<"),
+        tuple(axis.removeprefix("key_") for axis in axes),
+        {"dtype": dtype} if bits else {},
+    )
 
-    Raises `StoreIncomplete` where one is missing.
-    """
+
+def read_specs(root: Path) -> dict[str, ArraySpec]:
+    """The arrays of a store or a build on disk, by name, as `read_spec` reads them."""
     return {name: read_spec(root, name) for name in ARRAY_NAMES}
 
 
@@ -223,9 +219,7 @@ def read_spec(root: Path, name: str) -> ArraySpec:
     """
     try:
         array = zarr.open_array(root, path=name, mode="r")
-    except FileNotFoundError:
-        raise StoreIncomplete(f"{root}: the array {name} is missing. {mend(root)}") from None
-    except (ValueError, KeyError, TypeError) as error:
+    except (FileNotFoundError, ValueError, KeyError, TypeError) as error:
         raise StoreIncomplete(
             f"{root / name / 'zarr.json'}: not the metadata of a zarr array ({error}). {mend(root)}"
         ) from None

@@ -9,7 +9,6 @@ rename puts the build in its place.
 
 import os
 from collections.abc import Mapping, Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +19,14 @@ from numpy.typing import NDArray
 from pipeline.base.durable import disk_full_named, put_in_place, sync
 from pipeline.base.errors import StoreIncomplete
 from pipeline.base.ownership import begin_folder
-from pipeline.store.chunks import ChunkFiles, row_checksums
+from pipeline.store.chunks import ChunkFiles, find_damage, read_chunk, read_rows, row_checksums
 from pipeline.store.environments import EnvironmentLog
-from pipeline.store.metadata import ATTRIBUTE as METADATA_DIGEST
 from pipeline.store.metadata import metadata_damage, note_metadata
 from pipeline.store.paths import STORE, part_path
-from pipeline.store.schema import CHECKSUMS, FEATURES, INCREMENTAL, KEYS, ArraySpec
+from pipeline.store.schema import CHECKSUMS, FEATURES, INCREMENTAL, KEYS, ArraySpec, chunk_path
+
+Rows = Sequence[int] | NDArray[np.int64]
+"""Store-global VL rows, in any order."""
 
 
 class StoreBuild:
@@ -69,12 +70,10 @@ class StoreBuild:
 
         One that does not give its trailer is left to be written anew.
         """
-        with closing(ChunkFiles(source, source_spec, writable=False)) as known:
-            for chunk in range(self.linkable(name, source_spec, rows)):
-                if known.damage(chunk) is not None:
-                    continue
-                if not self.files(name).link(chunk, known.paths[chunk]):
-                    return
+        for chunk in range(self.linkable(name, source_spec, rows)):
+            path = chunk_path(source, source_spec, chunk)
+            if not read_chunk(path, source_spec).damage and not self.files(name).link(chunk, path):
+                return
 
     def write(self, name: str, start: int, values: NDArray[Any]) -> None:
         """Write consecutive rows of a stream, tick or episode array."""
@@ -92,8 +91,7 @@ class StoreBuild:
                 files.write_trailers()
         with disk_full_named(self.part):
             zarr.open_group(self.part, path="vl", mode="r+").attrs.put(dict(vl_attributes))
-            zarr.open_group(self.part, mode="r+").attrs.put({**attributes, "plan": self.plan})
-            note_metadata(self.part)
+            note_metadata(self.part, {**attributes, "plan": self.plan})
 
     def layout_damage(self) -> str | None:
         """What is wrong with streams, ticks, episodes or metadata of a laid-out build, and where.
@@ -102,26 +100,21 @@ class StoreBuild:
         """
         if what := metadata_damage(self.part):
             return f"{self.part / 'zarr.json'}: {what}"
-        for name in (name for name in self.specs if name not in INCREMENTAL):
-            files = self.files(name)
-            for chunk, path in enumerate(files.paths):
-                if what := files.damage(chunk):
-                    return f"{path}: {what}"
-        return None
+        known = (spec for name, spec in self.specs.items() if name not in INCREMENTAL)
+        return find_damage(self.part, *known)
 
     def missing(self) -> NDArray[np.int64]:
         """The feature rows that are not there, in order.
 
         A row whose bytes do not give its checksum is not there.
         """
-        rows = self.specs[FEATURES].shape[0]
-        checksums = self.files(CHECKSUMS).read(0, rows)
-        step = max(1, 2**26 // max(1, self.specs[FEATURES].row_bytes))
-        for start in range(0, rows, step):
+        spec, checksums = self.specs[FEATURES], read_rows(self.part, self.specs[CHECKSUMS])
+        step = max(1, 2**26 // max(1, spec.row_bytes))
+        for start in range(0, len(checksums), step):
             stored = checksums[start : start + step]
             if stored.any():
-                found = row_checksums(self.files(FEATURES).read(start, len(stored)))
-                stored[found != stored] = 0
+                features = read_rows(self.part, spec, start, start + len(stored))
+                stored[row_checksums(features) != stored] = 0
         return np.flatnonzero(checksums == 0)
 
     def environment_index(self, environment: Mapping[str, Any]) -> int:
@@ -130,18 +123,12 @@ class StoreBuild:
             return self._environments.index(environment)
 
     def commit(
-        self,
-        rows: Sequence[int] | NDArray[np.int64],
-        features: NDArray[Any],
-        keys: Sequence[bytes],
-        environment: int,
+        self, rows: Rows, features: NDArray[Any], keys: Sequence[bytes], environment: int
     ) -> None:
         """Write feature rows (row, slot, dim), wait for the disk, then mark them as done."""
         self.mark(rows, keys, self.write_features(rows, features), environment)
 
-    def write_features(
-        self, rows: Sequence[int] | NDArray[np.int64], features: NDArray[Any]
-    ) -> NDArray[np.uint32]:
+    def write_features(self, rows: Rows, features: NDArray[Any]) -> NDArray[np.uint32]:
         """Write feature rows (row, slot, dim) and wait for the disk; their checksums, for `mark`.
 
         Another process or host may call it, with rows that nobody else writes.
@@ -153,11 +140,7 @@ class StoreBuild:
         return row_checksums(features)
 
     def mark(
-        self,
-        rows: Sequence[int] | NDArray[np.int64],
-        keys: Sequence[bytes],
-        checksums: NDArray[np.uint32],
-        environment: int,
+        self, rows: Rows, keys: Sequence[bytes], checksums: NDArray[np.uint32], environment: int
     ) -> None:
         """Say that feature rows are on disk: their keys, their environment, at last the checksums.
 
@@ -185,24 +168,12 @@ class StoreBuild:
 
     def finish(self) -> None:
         """The first half of `seal`: all of the store is on the disk, still beside its place."""
-        self.files(FEATURES).close()  # a file system over the network shows what others wrote anew
         missing = self.missing()
         if missing.size:
             raise StoreIncomplete(
                 f"{self.part}: {missing.size} feature rows are missing, the first is {missing[0]}. "
                 "Run stages.extract again; it computes what is missing."
             )
-        self._seal_arrays()
-        with disk_full_named(self.part):
-            self._note_environments()
-            if (self.part / "zarr.json").exists():  # a restoration writes the archived one after
-                note_metadata(self.part)
-        for partial in self.part.rglob("*.partial"):  # of a write that was killed
-            partial.unlink()
-        self.close()
-        sync_folders(self.part)
-
-    def _seal_arrays(self) -> None:
         try:
             for name in self.specs:
                 self.files(name).seal()
@@ -213,6 +184,16 @@ class StoreBuild:
                 f"{damage}: the disk did not keep what was written. Run the same command again: it "
                 "writes streams, ticks and episodes anew and keeps the feature rows."
             ) from None
+        with disk_full_named(self.part):
+            if self._environments.noted:
+                attributes = zarr.open_group(self.part, mode="r").attrs.asdict()
+                ranges = self._environments.ranges()
+                note_metadata(self.part, attributes | {"environment": ranges})
+            self._environments.remove()
+        for partial in self.part.rglob("*.partial"):  # of a write that was killed
+            partial.unlink()
+        self.close()
+        sync_folders(self.part)
 
     def put_in_place(self) -> None:
         """The second half of `seal`: an instant."""
@@ -231,18 +212,8 @@ class StoreBuild:
             self._files[name] = ChunkFiles(self.part, self.specs[name], owned=owned)
         return self._files[name]
 
-    def _note_environments(self) -> None:
-        """Fold the environment of each row into the attributes."""
-        if self._environments.noted:
-            group = zarr.open_group(self.part, mode="r+")
-            ranges = self._environments.ranges()
-            attributes = group.attrs.asdict()
-            attributes.pop(METADATA_DIGEST, None)  # noted again when this is in
-            group.attrs.put({**attributes, "environment": ranges})
-        self._environments.remove()
 
-
-def _runs(rows: Sequence[int] | NDArray[np.int64]) -> list[NDArray[np.intp]]:
+def _runs(rows: Rows) -> list[NDArray[np.intp]]:
     """Where among `rows` each run of consecutive ones stands, in order."""
     order = np.argsort(rows, kind="stable")
     gaps = np.flatnonzero(np.diff(np.asarray(rows, np.int64)[order]) != 1) + 1

@@ -110,7 +110,10 @@ class TestInventory:
         [
             (lambda store: (store / "zarr.json").write_text("{"), "not a zarr group"),
             (lambda store: (store / "zarr.json").unlink(), "no finished store"),
-            (lambda store: shutil.rmtree(store / "tick/action"), "tick/action is missing"),
+            (
+                lambda store: shutil.rmtree(store / "tick/action"),
+                "not the metadata",
+            ),
             (lambda store: (store / "state/values/c/0/0").unlink(), "found no file"),
             (lambda store: os.truncate(store / "vl/features/c/0/0/0", 99), "found 99 bytes"),
         ],

@@ -6,29 +6,20 @@ rename at the end. So a kill leaves the damaged store as it was and nothing half
 """
 
 import shutil
-from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from pipeline.base.durable import disk_full_named, sync
 from pipeline.base.durable import put_in_place as replace_folder
 from pipeline.base.ownership import begin_folder
-from pipeline.store.chunks import ChunkFiles, row_checksums
+from pipeline.store.chunks import ChunkFiles, read_rows, row_checksums
 from pipeline.store.environments import environment_runs
 from pipeline.store.integrity.verification import Verification
 from pipeline.store.paths import STORE, part_path, read_attributes, read_plan, refuse_replaced
-from pipeline.store.schema import (
-    FEATURES,
-    INCREMENTAL,
-    KEYS,
-    ArraySpec,
-    chunk_paths,
-    read_specs,
-)
+from pipeline.store.schema import CHECKSUMS, FEATURES, INCREMENTAL, KEYS, chunk_paths, read_specs
 from pipeline.store.writer import StoreBuild, sync_folders
 
 _BLOCK_BYTES = 2**26
@@ -74,12 +65,33 @@ def carry_rows(store: Path, build: StoreBuild, verification: Verification) -> in
     sound = np.ones(build.specs[FEATURES].shape[0], np.bool_)
     sound[verification.bad_rows] = False
     for chunk in verification.damaged_chunks(KEYS):
-        sound[_slice(build.specs[KEYS].chunk_rows_of(chunk))] = False
+        rows = build.specs[KEYS].chunk_rows_of(chunk)
+        sound[rows.start : rows.stop] = False
     for name in INCREMENTAL:
         build.files(name).close()
         for path in build.files(name).paths:  # of zeros, where it was laid out anew
             path.unlink(missing_ok=True)
-    _carry(store, build, verification, sound)
+    # Chunk files in which everything is sound are linked; of the others, sound rows are copied.
+    spec, damaged = build.specs[FEATURES], verification.damaged_chunks(FEATURES)
+    environments = read_attributes(store).get("environment", [])
+    step = max(1, _BLOCK_BYTES // max(1, spec.row_bytes))
+    with closing(ChunkFiles(build.part, spec)) as files:  # which leaves linked chunks as they are
+        for chunk, path in enumerate(chunk_paths(store, spec)):
+            rows = spec.chunk_rows_of(chunk)
+            if chunk not in damaged and sound[rows.start : rows.stop].all():
+                files.link(chunk, path)
+        for name in INCREMENTAL:
+            build.files(name).allocate()
+        for environment, run in environment_runs(environments, np.flatnonzero(sound)):
+            number = build.environment_index(environment)
+            for start in range(run.start, run.stop, step):
+                rows = run[start - run.start :][:step]
+                values = read_rows(store, spec, start, rows.stop)
+                files.write(start, values)
+                keys = read_rows(store, build.specs[KEYS], start, rows.stop)
+                build.mark(rows, [*map(bytes, keys)], row_checksums(values), number)
+        files.sync()
+    build.files(CHECKSUMS).sync()
     return int(sound.sum())
 
 
@@ -90,48 +102,7 @@ def put_in_place(build: StoreBuild, store: Path) -> None:
     replace_folder(build.part, part_path(store), STORE)
 
 
-def _carry(
-    store: Path, build: StoreBuild, verification: Verification, sound: NDArray[np.bool_]
-) -> None:
-    """Link the chunk files in which everything is sound; of the others, copy the sound rows."""
-    spec, files = build.specs[FEATURES], build.files(FEATURES)
-    damaged = verification.damaged_chunks(FEATURES)
-    environments = read_attributes(store).get("environment", [])
-    with (
-        closing(ChunkFiles(store, spec, writable=False)) as features,
-        closing(ChunkFiles(store, build.specs[KEYS], writable=False)) as keys,
-    ):
-        for chunk, path in enumerate(features.paths):
-            if chunk not in damaged and sound[_slice(spec.chunk_rows_of(chunk))].all():
-                files.link(chunk, path)
-        for name in INCREMENTAL:
-            build.files(name).allocate()
-        for environment, run in environment_runs(environments, np.flatnonzero(sound)):
-            number = build.environment_index(environment)
-            for block in _blocks(run, spec):
-                values = features.read(block.start, len(block))
-                if not files.is_linked(block.start // spec.chunk_rows):
-                    files.write(block.start, values)
-                names = [key.tobytes() for key in keys.read(block.start, len(block))]
-                build.mark(block, names, row_checksums(values), number)
-        for name in INCREMENTAL:
-            build.files(name).sync()
-
-
 def _copy(path: Path, to: Path) -> None:
     to.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(path, to)
     sync(to)
-
-
-def _blocks(rows: range, spec: ArraySpec) -> Iterator[range]:
-    """These rows in pieces of one chunk each, which memory holds."""
-    step, start = max(1, _BLOCK_BYTES // max(1, spec.row_bytes)), rows.start
-    while start < rows.stop:
-        end_of_chunk = (start // spec.chunk_rows + 1) * spec.chunk_rows
-        yield (block := range(start, min(start + step, end_of_chunk, rows.stop)))
-        start = block.stop
-
-
-def _slice(rows: range) -> slice:
-    return slice(rows.start, rows.stop)

@@ -1,51 +1,61 @@
-"""Check a whole store: structure, files, the checksum of every row, NaN.
+"""Check a whole store: metadata, files, the checksum of every row, NaN.
 
 Every byte is read once, a chunk file at a time in blocks of a few megabytes, by several threads or
 by dask workers on hosts that see the store. What the arrays say of each other is left to those who
 build stores: the trailers prove that they hold what was written.
 """
 
+import os
 import time
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+import zarr
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from pipeline.base.differences import differences
 from pipeline.base.errors import StoreIncomplete
 from pipeline.base.finite import non_finite
 from pipeline.base.format import size
 from pipeline.base.issue import Issue
-from pipeline.store.chunks import ChunkFiles, read_chunk, read_rows, row_checksums
-from pipeline.store.environments import runs_of
-from pipeline.store.integrity.structure import (
-    check_attributes,
-    check_digest,
-    read_arrays,
-    strange_files,
-)
-from pipeline.store.metadata import ATTRIBUTE
+from pipeline.store.chunks import find_damage, read_chunk, read_rows, row_checksums
+from pipeline.store.metadata import metadata_damage
 from pipeline.store.paths import Inode, inode_of, read_attributes, read_plan, refuse_replaced
 from pipeline.store.reader import FeatureStore, map_array, place
 from pipeline.store.repair_hints import mend
-from pipeline.store.schema import CHECKSUMS, FEATURES, STREAMS, ArraySpec, chunk_paths
+from pipeline.store.schema import (
+    ARRAY_NAMES,
+    CHECKSUMS,
+    FEATURES,
+    GROUPS,
+    ROW_MULTIPLE,
+    STREAMS,
+    ArraySpec,
+    array_spec,
+    chunk_path,
+    chunk_paths,
+    read_spec,
+)
 
 MOST_LINES = 20
 """Of one kind that are shown; the rest is counted."""
-UNREADABLE = "not in its file"
-UNWRITTEN = "was never written (its checksum is 0)"
-CHANGED = "its bytes do not give its checksum"
-NOT_FINITE = "NaN or infinity"
-_BESIDE = (CHECKSUMS, "vl/slot_valid")
-"""What feature rows are judged by."""
-_NO_DIGEST = "an earlier version wrote it without a metadata_digest: attributes cannot be checked"
+SOUND, UNREADABLE, UNWRITTEN, CHANGED, NOT_FINITE = range(5)
+FAULTS = (
+    "",
+    "not in its file",
+    "was never written (its checksum is 0)",
+    "its bytes do not give its checksum",
+    "NaN or infinity",
+)
+"""How a feature row is, in words."""
+_Error = partial(Issue, severity="error")
 
 
 @dataclass(frozen=True)
@@ -53,16 +63,15 @@ class ChunkReport:
     """How one chunk file is."""
 
     array: str
-    chunk: int
     path: Path
+    rows: range
+    """Of the array, those of padding left out."""
     bytes: int
     """That were read."""
-    rows: int
-    """That could be read, those of padding left out."""
     damage: str | None
     """What is wrong with the file as a file."""
-    faults: Mapping[str, NDArray[np.int64]]
-    """Feature rows that cannot be used, by what is wrong with them."""
+    faults: NDArray[np.uint8]
+    """How each feature row is, an index into `FAULTS`; empty for another array."""
 
 
 @dataclass(frozen=True)
@@ -74,8 +83,6 @@ class Verification:
     """Of the store that was checked: another may have taken its place since."""
     rows: int
     """Feature rows that could be read and were checked."""
-    row_bytes: int
-    """Of the rows of all arrays."""
     bytes: int
     """Of the chunk files that were read, with the padding behind the last rows."""
     seconds: float
@@ -83,8 +90,6 @@ class Verification:
     """Of metadata, chunk files and feature rows, `stream` being the array, and strange files."""
     bad_rows: NDArray[np.int64]
     """The VL rows whose features cannot be used, ascending."""
-    notes: tuple[str, ...]
-    """What could not be checked."""
 
     @property
     def sound(self) -> bool:
@@ -117,11 +122,9 @@ class Verification:
 
     def summary(self) -> str:
         """For people: how much was checked, how fast."""
-        rate = self.bytes / 1e9 / self.seconds if self.seconds else 0.0
         return (
-            f"{self.store}: checked {self.rows} feature rows, {size(self.row_bytes)} of "
-            f"rows in {size(self.bytes)} of files, in {self.seconds:.1f} s "
-            f"({rate:.2f} GB/s)"
+            f"{self.store}: checked {self.rows} feature rows, {size(self.bytes)} of files, in "
+            f"{self.seconds:.1f} s ({self.bytes / 1e9 / max(self.seconds, 1e-9):.2f} GB/s)"
         )
 
 
@@ -137,101 +140,111 @@ def verify(path: Path, threads: int, workers: int | str = 0) -> Verification:
     attributes = read_attributes(path)
     read_plan(path)  # without one, nothing of it can be kept
     specs, issues = read_arrays(path)
-    issues += check_attributes(path, attributes)
-    issues += [] if issues else check_digest(path)
-    notes = () if issues or ATTRIBUTE in attributes else (_NO_DIGEST,)
+    if not issues and (what := metadata_damage(path)):
+        issues.append(_metadata_issue(path, what))
     checks = [
         partial(check_chunk, path, specs, name, chunk)
         for name, spec in specs.items()
         for chunk in range(spec.chunk_count)
     ]
     total = sum(spec.chunk_count * spec.chunk_bytes for spec in specs.values())
-    with tqdm(total=total, desc="verify", unit="B", unit_scale=True, disable=None) as bar:
-        reports = list(_run(checks, threads, workers, bar))
-    if workers:
-        _refuse_blind_workers(path, reports)
-    bad = [report for report in reports if report.damage or report.faults]
-    store = _naming_store(path, attributes, specs, issues, bad) if bad else None
-    for report in bad:
-        issues += _chunk_issues(report, specs[report.array], store)
-    faults = {
-        what: np.concatenate([report.faults[what] for report in bad if what in report.faults])
-        for what in dict.fromkeys(what for report in bad for what in report.faults)
-    }
-    issues += _row_issues(faults, store)
+    reports: list[ChunkReport] = []
+    with (
+        tqdm(total=total, desc="verify", unit="B", unit_scale=True, disable=None) as bar,
+        closing(_run_on_cluster(checks, workers) if workers else _run(checks, threads)) as running,
+    ):
+        for report in running:
+            bar.update(report.bytes)
+            reports.append(report)
+    if workers and any(report.bytes == 0 and report.path.exists() for report in reports):
+        raise StoreIncomplete(  # a file that is here and not there is no damage
+            f"{path}: expected the workers to see the store under this path, they find no file. "
+            "Put it on a file system that they share, or set verify.workers=0."
+        )
+    reports.sort(key=lambda report: (ARRAY_NAMES.index(report.array), report.rows.start))
+    # Rows are named by episode and time, where that part of the store is sound.
+    names = [name for name in specs if name.startswith("episode/") or name.endswith("/time")]
+    store = None
+    if not issues and not any(report.damage for report in reports if report.array in names):
+        maps = {name: map_array(path, specs[name]) for name in names}
+        store = FeatureStore(path, attributes, maps)
+    issues += [issue for report in reports for issue in _issues(report, specs[report.array], store)]
     issues += strange_files(path, specs)
     refuse_replaced(path, inode)
+    bad_rows = [report.rows.start + np.flatnonzero(report.faults) for report in reports]
     return Verification(
         store=path,
         inode=inode,
-        rows=sum(report.rows for report in reports if report.array == FEATURES),
-        row_bytes=sum(report.rows * specs[report.array].row_bytes for report in reports),
+        rows=sum(int((report.faults != UNREADABLE).sum()) for report in reports),
         bytes=sum(report.bytes for report in reports),
         seconds=time.monotonic() - begun,
         issues=tuple(issues),
-        bad_rows=np.unique(np.concatenate([np.zeros(0, np.int64), *faults.values()])),
-        notes=notes,
+        bad_rows=np.concatenate([np.zeros(0, np.int64), *bad_rows]),
     )
 
 
-def judge_rows(
-    features: NDArray[Any], checksums: NDArray[np.uint32], slot_valid: NDArray[np.uint8]
-) -> dict[str, NDArray[np.bool_]]:
-    """Which feature rows (row, slot, dim) cannot be used, (row,) each, by what is wrong.
-
-    `checksums` (row,) and `slot_valid` (row, slot) are as the store holds them: a NaN in a slot
-    that is not valid is nobody's.
-    """
-    broken = non_finite(features).any(axis=2) & (slot_valid != 0)
-    changed = checksums != row_checksums(features)
-    return {
-        NOT_FINITE: broken.any(axis=1),
-        UNWRITTEN: checksums == 0,
-        CHANGED: changed & (checksums != 0),
-    }
+def read_arrays(root: Path) -> tuple[dict[str, ArraySpec], list[Issue]]:
+    """The arrays whose metadata can be read and are as the contract says, and what is not."""
+    specs: dict[str, ArraySpec] = {}
+    issues: list[Issue] = []
+    lengths: dict[str, int] = {}
+    # The arrays that hold nothing but positions come last, and say how long the others must be.
+    for name in reversed(ARRAY_NAMES):
+        try:
+            spec = read_spec(root, name)
+            wrong = list(_differences(root, spec, lengths))
+        except StoreIncomplete as error:
+            wrong = [str(error)]
+        else:
+            if not wrong:
+                specs[name] = spec
+        issues += [_metadata_issue(root, what, name) for what in wrong]
+    return {name: specs[name] for name in ARRAY_NAMES if name in specs}, issues
 
 
 def check_chunk(root: Path, specs: Mapping[str, ArraySpec], array: str, chunk: int) -> ChunkReport:
     """Read a chunk file once, in blocks; runs in any process that sees the store."""
-    spec, path = specs[array], chunk_paths(root, specs[array])[chunk]
-    rows, faults = spec.chunk_rows_of(chunk), defaultdict[str, list[NDArray[np.int64]]](list)
+    spec, path = specs[array], chunk_path(root, specs[array], chunk)
+    rows = spec.chunk_rows_of(chunk)
+    faults = np.full(len(rows) if array == FEATURES else 0, UNREADABLE, np.uint8)
 
     def judge(first: int, block: NDArray[Any]) -> None:
-        start = rows.start + first
-        values = block[: max(0, rows.stop - start)]  # the rest is padding
-        if len(values):
-            beside = (_beside(root, specs, name, start, values) for name in _BESIDE)
-            for what, bad in judge_rows(values, *beside).items():
-                faults[what].append(start + np.flatnonzero(bad))
+        values = block[: max(0, len(rows) - first)]  # the rest is padding
+        if array == FEATURES and len(values):
+            judged = _judge_rows(root, specs, rows.start + first, values)
+            faults[first : first + len(values)] = judged
 
-    file = read_chunk(path, spec, *([judge] if array == FEATURES else []))
-    read = min(file.bytes // spec.row_bytes, len(rows))
-    if array == FEATURES:
-        faults[UNREADABLE].append(np.arange(rows.start + read, rows.stop))
-    joined = {what: np.concatenate(parts) for what, parts in faults.items() if any(map(len, parts))}
-    by_checksum = joined.keys() & {CHANGED, UNWRITTEN}
-    if by_checksum and not file.damage and _checksums_are_damaged(root, specs, rows):
-        joined = {what: bad for what, bad in joined.items() if what not in by_checksum}
-    return ChunkReport(array, chunk, path, file.bytes, read, file.damage, joined)
+    file = read_chunk(path, spec, judge)
+    by_checksum = (faults == UNWRITTEN) | (faults == CHANGED)
+    # Where their checksums are lost, those of a sound file are good.
+    if not file.damage and by_checksum.any():
+        lost = CHECKSUMS not in specs or find_damage(root, specs[CHECKSUMS])
+        faults[by_checksum & bool(lost)] = SOUND
+    return ChunkReport(array, path, rows, file.bytes, file.damage, faults)
 
 
-def _beside(
-    root: Path, specs: Mapping[str, ArraySpec], name: str, start: int, features: NDArray[Any]
-) -> NDArray[Any]:
-    """The same rows of another array; ones where that cannot be read, as is said of its file."""
+def _judge_rows(
+    root: Path, specs: Mapping[str, ArraySpec], start: int, features: NDArray[Any]
+) -> NDArray[np.int64]:
+    """How each feature row (row, slot, dim) from `start` is, (row,) indices into `FAULTS`.
+
+    A NaN in a slot that is not valid is nobody's. Where checksums or validity cannot be read, as is
+    said of their files, no checksum is right and every slot is valid.
+    """
+    stop = start + len(features)
     try:
-        return read_rows(root, specs[name], start, start + len(features))
+        checksums = read_rows(root, specs[CHECKSUMS], start, stop)
     except (KeyError, StoreIncomplete):
-        return np.ones(features.shape[: 1 if name == CHECKSUMS else 2], np.uint8)
-
-
-def _checksums_are_damaged(root: Path, specs: Mapping[str, ArraySpec], rows: range) -> bool:
-    """Whether the checksums of these rows are lost: then those of a sound file are good."""
-    if CHECKSUMS not in specs:
-        return True
-    with closing(ChunkFiles(root, specs[CHECKSUMS], writable=False)) as files:
-        chunks = {row // files.spec.chunk_rows for row in (rows.start, rows.stop - 1)}
-        return any(files.damage(chunk) for chunk in chunks)
+        checksums = np.ones(len(features), np.uint32)
+    try:
+        valid = read_rows(root, specs["vl/slot_valid"], start, stop)
+    except (KeyError, StoreIncomplete):
+        valid = np.ones(features.shape[:2], np.uint8)
+    broken = (non_finite(features).any(axis=2) & (valid != 0)).any(axis=1)
+    changed = checksums != row_checksums(features)
+    return np.select(
+        [broken, checksums == 0, changed], [NOT_FINITE, UNWRITTEN, CHANGED], default=SOUND
+    )
 
 
 def capped(lines: Sequence[str], kind: str) -> list[str]:
@@ -240,22 +253,49 @@ def capped(lines: Sequence[str], kind: str) -> list[str]:
     return [*lines[:MOST_LINES], *([f"and {more} more {kind}"] if more > 0 else [])]
 
 
-def _run(
-    checks: Sequence[Callable[[], ChunkReport]], threads: int, workers: int | str, bar: "tqdm[Any]"
-) -> Iterator[ChunkReport]:
-    """What each check gives, in order."""
-    if workers:
-        yield from _run_on_cluster(checks, workers, bar)
+def strange_files(root: Path, specs: Mapping[str, ArraySpec]) -> Iterator[Issue]:
+    """Files that have no place in a store."""
+    expected = {root / place / "zarr.json" for place in ("", *GROUPS, *ARRAY_NAMES)}
+    expected |= {path for spec in specs.values() for path in chunk_paths(root, spec)}
+    unjudged = tuple(str(root / name) + "/" for name in ARRAY_NAMES if name not in specs)
+    files = (Path(folder) / file for folder, _, names in os.walk(root) for file in names)
+    for path in sorted(files):
+        if path not in expected and not str(path).startswith(unjudged):
+            what = "has no place in a store, look at it and remove it"
+            yield _Error(kind="strange file", message=what, file=path)
+
+
+def _differences(root: Path, spec: ArraySpec, lengths: dict[str, int]) -> Iterator[str]:
+    """Where the metadata of an array depart from the contract, and from `lengths` by axis."""
+    allowed = ("float32", "float16", *(["bfloat16"] if spec.name == FEATURES else []))
+    stored = spec.attributes.get("dtype", spec.dtype.name)
+    dtype = stored if stored in allowed else "float32"
+    chunk_rows = None if spec.chunk_rows % ROW_MULTIPLE else spec.chunk_rows
+    contract = array_spec(spec.name, spec.shape, dtype)
+    if len(contract.dimensions) != len(spec.shape):
+        yield f"expected the axes {contract.dimensions}, found the shape {spec.shape}"
         return
+    expected = replace(contract, stored_chunk_rows=chunk_rows).create({}).metadata.to_dict()
+    actual = zarr.open_array(root, path=spec.name, mode="r").metadata.to_dict()
+    for key, (wanted, found) in differences(expected, actual).items():
+        yield f"expected the {key} {wanted}, found {found}"
+    for axis, length in zip(contract.dimensions, spec.shape, strict=True):
+        if axis != "byte" and lengths.setdefault(axis, length) != length:
+            yield f"expected the shape to have {lengths[axis]} along {axis}, found {length}"
+
+
+def _metadata_issue(root: Path, what: str, array: str = "") -> Issue:
+    return _Error(kind="metadata", message=what, stream=array, file=root / array / "zarr.json")
+
+
+def _run(checks: Sequence[Callable[[], ChunkReport]], threads: int) -> Generator[ChunkReport]:
     with ThreadPoolExecutor(threads) as pool:
-        for report in pool.map(lambda check: check(), checks):
-            bar.update(report.bytes)
-            yield report
+        yield from pool.map(lambda check: check(), checks)
 
 
 def _run_on_cluster(
-    checks: Sequence[Callable[[], ChunkReport]], workers: int | str, bar: "tqdm[Any]"
-) -> list[ChunkReport]:
+    checks: Sequence[Callable[[], ChunkReport]], workers: int | str
+) -> Generator[ChunkReport]:
     from distributed import Client, as_completed
 
     from pipeline.base.scheduler import client_of, private_cluster, quiet
@@ -270,64 +310,27 @@ def _run_on_cluster(
             client = stack.enter_context(Client(cluster, set_as_default=False))
         futures = [client.submit(check, pure=False) for check in checks]
         for _, report in as_completed(futures, loop=client.loop, with_results=True):
-            bar.update(report.bytes)
-        return cast("list[ChunkReport]", client.gather(futures))
+            yield cast("ChunkReport", report)
 
 
-def _refuse_blind_workers(path: Path, reports: Sequence[ChunkReport]) -> None:
-    """A file that is here and not there is no damage."""
-    if any(report.bytes == 0 and report.path.exists() for report in reports):
-        raise StoreIncomplete(
-            f"{path}: expected the workers to see the store under this path, they find no file. "
-            "Put it on a file system that they share, or set verify.workers=0."
-        )
-
-
-def _naming_store(
-    path: Path,
-    attributes: Mapping[str, Any],
-    specs: Mapping[str, ArraySpec],
-    issues: Sequence[Issue],
-    bad: Sequence[ChunkReport],
-) -> FeatureStore | None:
-    """The store, as far as rows are named by it; None where that part of it is damaged."""
-    needed = [name for name in specs if name.startswith("episode/") or name.endswith("/time")]
-    lost = any(report.damage for report in bad if report.array in needed)
-    if issues or lost:
-        return None
-    return FeatureStore(path, attributes, {name: map_array(path, specs[name]) for name in needed})
-
-
-def _chunk_issues(
-    report: ChunkReport, spec: ArraySpec, store: FeatureStore | None
-) -> Iterator[Issue]:
+def _issues(report: ChunkReport, spec: ArraySpec, store: FeatureStore | None) -> Iterator[Issue]:
+    """The damage of a chunk file, and each run of feature rows with one fault."""
+    rows, stream = report.rows, report.array.partition("/")[0]
     if report.damage:
-        rows, stream = spec.chunk_rows_of(report.chunk), report.array.partition("/")[0]
-        named = _name(store, stream, rows) if stream in STREAMS else ""
-        yield Issue(
-            severity="error",
-            kind="chunk",
-            message=f"{report.damage}; rows {rows.start} to {rows.stop - 1} of {spec.name}{named}",
-            stream=report.array,
-            file=report.path,
-            chunk=report.chunk,
-        )
-
-
-def _row_issues(
-    faults: Mapping[str, NDArray[np.int64]], store: FeatureStore | None
-) -> Iterator[Issue]:
-    """Of each run of feature rows with one fault."""
-    for what, bad in faults.items():
-        for run in runs_of(bad):
-            rows = f"row {run[0]}" if len(run) == 1 else f"rows {run[0]} to {run[-1]}"
-            message = f"VL {rows}: {what}{_name(store, 'vl', run)}"
-            yield Issue(severity="error", kind="feature rows", message=message, stream=FEATURES)
+        where = f"rows {rows.start} to {rows.stop - 1} of {spec.name}{_name(store, stream, rows)}"
+        what, chunk = f"{report.damage}; {where}", rows.start // spec.chunk_rows
+        yield _Error(kind="chunk", message=what, stream=spec.name, file=report.path, chunk=chunk)
+    for run in np.split(np.arange(len(report.faults)), np.flatnonzero(np.diff(report.faults)) + 1):
+        if len(run) and (fault := report.faults[run[0]]):
+            bad = rows[run[0] : run[-1] + 1]
+            words = f"row {bad[0]}" if len(bad) == 1 else f"rows {bad[0]} to {bad[-1]}"
+            message = f"VL {words}: {FAULTS[fault]}{_name(store, 'vl', bad)}"
+            yield _Error(kind="feature rows", message=message, stream=FEATURES)
 
 
 def _name(store: FeatureStore | None, stream: str, rows: range) -> str:
     """Which rows of which episodes these are."""
-    if store is None:
+    if store is None or stream not in STREAMS:
         return ""
     ends = dict.fromkeys((rows[0], rows[-1]))
     return "; " + " to ".join(place(store, stream, row) for row in ends)
