@@ -3,7 +3,7 @@
 import math
 import os
 import time
-from collections.abc import Iterator, Sequence, Sized
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from pipeline.base.config import Params
@@ -66,10 +66,8 @@ def check_disk(taken: int, estimate: str, target: Path, free: int, begun: int) -
         text += f"; {target} is finished"
     if taken - begun <= free:
         return ok("disk", text)
-    remedy = (
-        "make room, set extract.store to another disk, extract.dtype to float16, or fewer "
-        "vlm.pooling slots"
-    )
+    remedy = "make room, set extract.store to another disk, extract.dtype to float16, or fewer "
+    remedy += "vlm.pooling slots"
     return (note if target.exists() else missing)("disk", text, remedy)
 
 
@@ -99,9 +97,8 @@ def measure(recordings: Sequence[Recording], params: Params) -> tuple[list[Strea
             break
         try:
             state, sensor = recording.state(), recording.sensor()
-            line = build_timeline(
-                recording, data.action_hz, data.vlm_reuse_count, rotation, state, sensor
-            )
+            rates = data.action_hz, data.vlm_reuse_count
+            line = build_timeline(recording, *rates, rotation, state, sensor)
             read.append((line, sensor, state))
         except RecordingError as error:
             bad.append(str(error))
@@ -113,23 +110,19 @@ def estimated_bytes(read: Sequence[Streams], episodes: int, params: Params) -> i
 
     Raises `VLMError` where the checkpoint does not fit the params.
     """
-    views = {view for line, _, _ in read for view in line.frames}
-    # A digest decides nothing of a size, and reading every weight for it takes long.
-    spec = feature_spec(params.vlm, params.extract.dtype, sorted(views), lambda path: "")
     lines = [line for line, _, _ in read]
     sensors = [sensor for _, sensor, _ in read if sensor]
     states = [state for _, _, state in read if state]
-
-    def in_all(times: Iterator[Sized]) -> int:
-        return math.ceil(sum(map(len, times)) * episodes / len(read))
-
+    views = {view for line in lines for view in line.frames}
+    # A digest decides nothing of a size, and reading every weight for it takes long.
+    spec = feature_spec(params.vlm, params.extract.dtype, sorted(views), lambda path: "")
     sizes = Sizes(
-        episodes=episodes,
-        ticks=in_all(line.time for line in lines),
-        vl_rows=in_all(line.vl_time for line in lines),
-        readings=in_all(stream.time for stream in sensors),
-        states=in_all(stream.time for stream in states),
-        text_bytes=_TEXT_BYTES * episodes,
+        episodes=len(read),
+        ticks=sum(len(line.time) for line in lines),
+        vl_rows=sum(len(line.vl_time) for line in lines),
+        readings=sum(len(stream.time) for stream in sensors),
+        states=sum(len(stream.time) for stream in states),
+        text_bytes=_TEXT_BYTES * len(read),
         slots=len(spec.slots) * spec.variants,
         dim=spec.dim,
         views=len(views),
@@ -138,7 +131,7 @@ def estimated_bytes(read: Sequence[Streams], episodes: int, params: Params) -> i
         state_dim=max((len(stream.channels.names) for stream in states), default=0),
     )
     specs = arrays(sizes, params.extract.dtype, params.extract.sensor_dtype).values()
-    return sum(spec.data_bytes for spec in specs)
+    return math.ceil(sum(spec.data_bytes for spec in specs) * episodes / len(read))
 
 
 def used_bytes(folder: Path) -> int:
