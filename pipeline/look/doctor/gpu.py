@@ -83,10 +83,8 @@ def check_gpus(gpus: Sequence[GPU], driver: bool, dtype: str) -> Iterator[Issue]
         text = f"{build}; this machine has a GPU driver, but torch says: {_why_unseen()}"
         yield note("GPU", text, _SEE_GPU)
     else:
-        text = (
-            "this machine has no GPU driver: the CPU does for the demo, not for a real checkpoint"
-        )
-        yield note("GPU", f"{build}; {text}")
+        text = f"{build}; this machine has no GPU driver: the CPU does for the demo, not for more"
+        yield note("GPU", text)
     for index, gpu in enumerate(gpus):
         text = f"{gpu.name}, {size(gpu.memory)}"
         if dtype != "bfloat16" or gpu.bfloat16:

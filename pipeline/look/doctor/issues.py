@@ -31,8 +31,9 @@ def described(title: str, issues: Sequence[Issue]) -> list[str]:
         severity = "missing" if issue.severity == "error" else issue.severity
         head = f"  {severity:<8} {issue.kind:<18} ".ljust(_INDENT)
         for begin, text in ((head, issue.message), (f"{'-> ':>{_INDENT}}", issue.remedy)):
-            indent = {"initial_indent": begin, "subsequent_indent": " " * len(begin)}
             # A path or an option is copied, so it is never broken.
-            whole = {"break_long_words": False, "break_on_hyphens": False}
-            lines += textwrap.wrap(text, WIDTH, **indent, **whole)
+            wrapper = textwrap.TextWrapper(
+                WIDTH, begin, " " * len(begin), break_long_words=False, break_on_hyphens=False
+            )
+            lines += wrapper.wrap(text)
     return [*lines, ""]

@@ -231,8 +231,8 @@ def chunks(
             chunk = predictions.predicted[place, predictions.valid[place], dimension]
             ahead = time_s[predictions.ticks[place] - episode.ticks.start :][: len(chunk)]
             axis.axvline(ahead[0], color=INK, lw=0.8, ls=":", zorder=1)
-            marked = {"color": _CHUNK, "lw": 2, "marker": "o", "markevery": [0], "ms": 5}
-            axis.plot(ahead, chunk, zorder=6, label=label, **marked)
+            axis.plot(ahead, chunk, color=_CHUNK, lw=2, zorder=6, label=label)
+            axis.plot(ahead[0], chunk[0], color=_CHUNK, marker="o", ms=5, zorder=6)
             label = ""
         axis.label_outer()
     axes[-1].set_xlabel("time since the episode began [s]")

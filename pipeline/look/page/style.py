@@ -44,8 +44,11 @@ GRID = "#dddddd"
 RECORDED = INK
 PALETTE = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
 """Of what has no colour of its own; Okabe and Ito's, less what is lost on white or on black."""
-_CJK = ["Noto Sans CJK KR", "Noto Sans CJK JP", "Noto Sans CJK SC", "NanumGothic", "Malgun Gothic"]
-_CJK += ["Microsoft YaHei", "Yu Gothic", "Apple SD Gothic Neo", "Hiragino Sans", "PingFang SC"]
+_CJK = (
+    *("Noto Sans CJK KR", "Noto Sans CJK JP", "Noto Sans CJK SC"),
+    *("NanumGothic", "Malgun Gothic", "Microsoft YaHei", "Yu Gothic"),
+    *("Apple SD Gothic Neo", "Hiragino Sans", "PingFang SC"),
+)
 """Fonts of Debian, Windows and macOS with what Chinese, Japanese and Korean names are made of."""
 NO_FONT = (
     "A name has letters that no font of this machine has: PNG files show boxes in their place. "

@@ -110,8 +110,8 @@ class _PageWriter:
         self._jinja.filters |= {"prose": prose, "breakable": breakable}
         self._jinja.filters |= {"place": place_of, "places": places_of}
         limits = {"open": OPEN_GROUPS, "named": NAMED_PLACES, "listed": MOST_PLACES}
-        limits["findings"] = FINDINGS
-        self._blocks: Any = self._jinja.get_template("blocks.html", globals=limits).module
+        shown = {**limits, "findings": FINDINGS}
+        self._blocks: Any = self._jinja.get_template("blocks.html", globals=shown).module
 
     def html(self, report: Report, pictures: Sequence[str]) -> str:
         """The whole page; its pictures are written on the way."""

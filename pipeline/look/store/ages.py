@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -76,7 +77,7 @@ def draw_ages(ages: Ages) -> Figure:
     edges = np.linspace(low, high, _BINS + 1)
     for number, (name, age) in enumerate(finite.items()):
         shares = np.histogram(age, edges)[0] * (100 / max(1, len(age)))
-        style = {"lw": 1.6} if number else {"fill": True, "alpha": 0.55}
+        style: dict[str, Any] = {"lw": 1.6} if number else {"fill": True, "alpha": 0.55}
         axis.stairs(shares, edges, color=PALETTE[number % len(PALETTE)], label=name, **style)
     if np.isfinite(ages.period_s):
         axis.axvline(ages.period_s, color=INK, ls="--", lw=1.2, label="one VL row")

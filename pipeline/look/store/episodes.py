@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
+from numpy.typing import NDArray
 
 from pipeline.base.issue import Issue
 from pipeline.base.table import Table
@@ -24,6 +25,9 @@ _GAP_STEPS = 5
 _RARE, _USUAL = 0.05, 0.8
 _SEEN = (("#D55E00", "absent"), ("#E69F00", "by some"), ("#0072B2", "seen by all ticks"))
 _NAMED_EPISODES = 16
+
+
+Times = Sequence[float] | NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -47,20 +51,13 @@ class EpisodeCoverage:
         return slice(self.episode.ticks.start, self.episode.ticks.stop)
 
     def issue(
-        self, kind: str, stream: str, text: str, times: Sequence[float] = (), error: bool = False
+        self, kind: str, stream: str, text: str, times: Times = (), error: bool = False
     ) -> Issue:
         """An issue of this episode; `times` are (start, stop) in s since its first tick."""
         start_s, stop_s = map(float, times) if len(times) else (None, None)
-        return Issue(
-            severity="error" if error else "warning",
-            kind=kind,
-            message=text,
-            source=self.episode.source,
-            episode=self.episode.id,
-            stream=stream,
-            start_s=start_s,
-            stop_s=stop_s,
-        )
+        severity = "error" if error else "warning"
+        place = partial(Issue, source=self.episode.source, episode=self.episode.id, stream=stream)
+        return place(severity=severity, kind=kind, message=text, start_s=start_s, stop_s=stop_s)
 
 
 def read_coverage(store: FeatureStore, episode: Episode) -> EpisodeCoverage:

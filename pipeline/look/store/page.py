@@ -1,5 +1,6 @@
 """A store -> its page: what is in it, what looks wrong, and what it was made of."""
 
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,8 +9,9 @@ from pipeline.base.config import InspectParams
 from pipeline.base.errors import StoreIncomplete
 from pipeline.base.format import duration, size
 from pipeline.base.issue import Issue
+from pipeline.base.table import Table
 from pipeline.look.page.blocks import Document, Issues, Report, Section, Text
-from pipeline.look.store import ages, channels, duplicates, episodes, features, sizes
+from pipeline.look.store import ages, channels, duplicates, episodes, features
 from pipeline.look.store.ages import Ages
 from pipeline.look.store.channels import StreamSummary
 from pipeline.look.store.duplicates import Duplicates
@@ -18,7 +20,9 @@ from pipeline.look.store.features import FeatureNorms
 from pipeline.store import FeatureStore, check_trailers
 from pipeline.store.gather import WIDE
 from pipeline.store.repair_hints import extract_command
+from pipeline.store.schema import read_specs
 
+METADATA = "metadata"
 _NOTHING = (
     "Nothing: clocks have no gaps, every stream is where others of its kind are, channels move, "
     "features follow the scene, and no recording is there twice."
@@ -70,8 +74,8 @@ def inspect_store(path: str | Path, params: InspectParams) -> StoreView:
         *features.find_feature_issues(norms, coverage),
         *duplicates.find_duplicate_issues(same, coverage),
     )
-    taken = sizes.read_sizes(store.path)
-    return StoreView(store, coverage, age, taken, norms, same, statistics, issues)
+    sizes = read_sizes(store.path)
+    return StoreView(store, coverage, age, sizes, norms, same, statistics, issues)
 
 
 def store_report(view: StoreView) -> Report:
@@ -96,7 +100,7 @@ def store_report(view: StoreView) -> Report:
             Section("What looks wrong", [Issues(view.issues, _NOTHING), _checked(view)]),
             Section("Coverage", episodes.show_coverage(view.episodes)),
             Section("Age of the features", ages.show_ages(view.ages)),
-            Section("Size", [sizes.tabulate_sizes(store.path, view.sizes)]),
+            Section("Size", [tabulate_sizes(store.path, view.sizes)]),
             Section("Features", features.show_features(view.features, view.episodes)),
             Section("Duplicates", duplicates.show_duplicates(view.duplicates, view.episodes)),
             Section("Channels", channels.show_channels(view.statistics)),
@@ -124,3 +128,33 @@ def _checked(view: StoreView) -> Text:
         f"Metadata, clocks, offsets and the features of {rows} VL rows give the checksums that "
         f"were written with them; the rest was not read: `{command}` reads every byte."
     )
+
+
+def read_sizes(path: Path) -> dict[str, int]:
+    """Bytes of the blocks that the files of each array take: values, padding and trailers.
+
+    The largest first; `metadata` are all files that are no chunk. Together they are all files below
+    `path`.
+    """
+    sizes: dict[str, int] = defaultdict(int)
+    for file in path.rglob("*"):
+        if file.is_file():
+            # The first two folders of a chunk's path name its array.
+            owner = "/".join(file.relative_to(path).parts[:2])
+            sizes[METADATA if file.name == "zarr.json" else owner] += file.stat().st_blocks * 512
+    return dict(sorted(sizes.items(), key=lambda item: -item[1]))
+
+
+def tabulate_sizes(path: Path, sizes: Mapping[str, int]) -> Table:
+    """A row an array of the store at `path`."""
+    specs, total = read_specs(path), sum(sizes.values())
+    rows: list[tuple[object, ...]] = []
+    for name, taken in sizes.items():
+        shape, dtype, chunks = "", "", 0
+        if name in specs:
+            spec = specs[name]
+            shape = " × ".join(f"{count:,}" for count in spec.shape)
+            dtype, chunks = spec.attributes.get("dtype", spec.dtype.name), spec.chunk_count
+        rows.append((name, shape, dtype, chunks, taken / 2**20, 100 * taken / total))
+    heads = ("array", "shape", "dtype", "chunks", "on the disk [MiB]", "share [%]")
+    return Table(heads, rows, "Bytes on the disk by array.")

@@ -17,8 +17,7 @@ from pipeline.base.errors import StoreIncomplete, StoreMismatch
 from pipeline.look.store.channels import summarize_streams
 from pipeline.look.store.episodes import EpisodeCoverage, find_episode_issues
 from pipeline.look.store.features import look_at_features, read_slot, sample_rows
-from pipeline.look.store.page import StoreView, inspect_store
-from pipeline.look.store.sizes import tabulate_sizes
+from pipeline.look.store.page import StoreView, inspect_store, tabulate_sizes
 from pipeline.store import Episode, FeatureStore
 from pipeline.store.metadata import note_metadata
 
