@@ -30,7 +30,8 @@ def examine(params: Params) -> Generator[tuple[str, list[Issue]]]:
         try:
             issues = list(import_module(f"pipeline.look.doctor.{module}").check(params))
         except (ImportError, PipelineError) as error:
-            issues = [missing(module, str(error), "install or mend that, and run this again")]
+            text = f"cannot be looked at: {error}"
+            issues = [missing(module, text, "install or mend that, and run this again")]
         except OSError as error:
             issues = [note(module, f"not known: {error}", "look at that path")]
         yield title, issues
