@@ -33,7 +33,7 @@ from collections.abc import Iterator
 from pipeline.base.config import Params
 from pipeline.base.ownership import REPORT, claim
 from pipeline.look.page.blocks import Issues, Report
-from pipeline.look.page.issues import FINDINGS, group_issues, place_of
+from pipeline.look.page.issues import FINDINGS, group_issues, place_of, places_of
 from pipeline.look.page.style import boxes
 from pipeline.look.page.writing import write_report
 from pipeline.look.recording.page import recordings_report
@@ -66,9 +66,9 @@ def summary(report: Report) -> Iterator[str]:
     if not groups:
         yield issues.none
     for group in groups[:SHOWN]:
-        first = group.issues[0]
-        place = f", the first {place_of(first)}" if len(group.issues) > 1 else ""
-        yield f"{group.severity}: {group.kind}: {group.where}{place}"
+        first = group[0]
+        place = f", the first {place_of(first)}" if len(group) > 1 else ""
+        yield f"{first.severity}: {first.kind}: {places_of(group)}{place}"
         yield f"    {' '.join(first.message.split())}"
     if len(groups) > SHOWN:
         yield f"… and {len(groups) - SHOWN} more on the page and in {FINDINGS}"

@@ -13,14 +13,7 @@ from pipeline.base.memory import available_bytes
 from pipeline.look.doctor.gpu import GPU, read_gpus, usable_device
 from pipeline.look.doctor.issues import missing, note, ok
 from pipeline.simulation.demo_recordings import MARKER
-from pipeline.vlm.checkpoint_folder import (
-    adapter_files,
-    cached_checkpoint,
-    could_be_hub_id,
-    tensor_headers,
-    tokenizer_files,
-    weight_files,
-)
+from pipeline.vlm import checkpoint_folder
 
 _BYTES = {"float32": 4, "float16": 2, "bfloat16": 2}
 _EXAMPLE = "set vlm.checkpoint to a folder or a hub id, such as Qwen/Qwen2.5-VL-3B-Instruct"
@@ -36,16 +29,16 @@ def check(params: Params) -> Iterator[Issue]:
         yield absent_checkpoint(params)
         return
     try:
-        files = weight_files(folder)
-        tokenizer_files(folder)
+        files = checkpoint_folder.weight_files(folder)
+        checkpoint_folder.tokenizer_files(folder)
         weights = [path for path in files if path.suffix == ".safetensors"]
-        shapes = [shape for path in weights for _, shape in tensor_headers(path).values()]
+        headers = [checkpoint_folder.tensor_headers(path) for path in weights]
     except VLMError as error:
         own = Path(vlm.checkpoint).expanduser().is_dir()
         remedy = "copy it again" if own else f"hf download --force-download {vlm.checkpoint}"
         yield missing("vlm.checkpoint", str(error), remedy)
         return
-    count = sum(map(math.prod, shapes))
+    count = sum(math.prod(shape) for header in headers for _, shape in header.values())
     here = f"{vlm.checkpoint}, whole, {count:,} parameters"
     if str(folder) != vlm.checkpoint:
         here += " (in the hub's cache)"
@@ -66,7 +59,9 @@ def local_folder(checkpoint: str, revision: str | None) -> Path | None:
     folder = Path(checkpoint).expanduser()
     if folder.is_dir():
         return folder
-    return cached_checkpoint(checkpoint, revision) if could_be_hub_id(checkpoint) else None
+    if not checkpoint_folder.could_be_hub_id(checkpoint):
+        return None
+    return checkpoint_folder.cached_checkpoint(checkpoint, revision)
 
 
 def absent_checkpoint(params: Params) -> Issue:
@@ -75,7 +70,7 @@ def absent_checkpoint(params: Params) -> Issue:
     if Path(checkpoint) == params.demo.checkpoint:
         text = f"{checkpoint}: the demo's checkpoint is not written yet"
         return missing("vlm.checkpoint", text, "python -m stages.demo (or dvc repro)")
-    if not could_be_hub_id(checkpoint):
+    if not checkpoint_folder.could_be_hub_id(checkpoint):
         text = f"{checkpoint}: no such folder, and no hub id"
         return missing("vlm.checkpoint", text, _EXAMPLE)
     text = f"{checkpoint}: no such folder, and no complete copy in the hub's cache"
@@ -88,12 +83,11 @@ def absent_checkpoint(params: Params) -> Issue:
 
 def check_adapter(adapter: str) -> Issue:
     """`vlm.adapter`."""
-    folder = local_folder(adapter, None)
-    if folder is None:
-        text = f"{adapter}: not on this machine"
-        return missing("vlm.adapter", text, "set vlm.adapter to its folder, or to null")
     try:
-        adapter_files(folder)
+        folder = local_folder(adapter, None)
+        if folder is None:
+            raise VLMError(f"{adapter}: not on this machine")
+        checkpoint_folder.adapter_files(folder)
     except VLMError as error:
         return missing("vlm.adapter", str(error), "copy it again, or set vlm.adapter to null")
     return ok("vlm.adapter", adapter)

@@ -18,6 +18,11 @@ from pipeline.look.doctor.issues import missing, note, ok
 from pipeline.vlm.loading import attention_backend
 
 FLASH = "pip install flash-attn --no-build-isolation"
+_SEE_GPU = (
+    "look at CUDA_VISIBLE_DEVICES and nvidia-smi (in a container, start it with --gpus all); then "
+    "update the driver, or pip install --force-reinstall torch from the index that "
+    "pytorch.org/get-started names for the driver's CUDA version"
+)
 _DRIVERS = ("/proc/driver/nvidia/version", "/dev/kfd")
 """There where an NVIDIA or an AMD driver is."""
 
@@ -74,17 +79,12 @@ def check_gpus(gpus: Sequence[GPU], driver: bool, dtype: str) -> Iterator[Issue]
     build = f"torch {torch.__version__}, built for {made_for}"
     if gpus:
         yield ok("build", build)
-    elif not driver:
-        text = f"{build}; this machine has no GPU driver, so everything runs on the CPU: "
-        yield note("GPU", f"{text}well enough for the demo, not for a 3B or 7B checkpoint")
-    else:
+    elif driver:
         text = f"{build}; this machine has a GPU driver, but torch says: {_why_unseen()}"
-        remedy = (
-            "look at CUDA_VISIBLE_DEVICES and nvidia-smi (in a container, start it with --gpus "
-            "all); then update the driver, or pip install --force-reinstall torch from the index "
-            "that pytorch.org/get-started names for the driver's CUDA version"
-        )
-        yield note("GPU", text, remedy)
+        yield note("GPU", text, _SEE_GPU)
+    else:
+        text = f"{build}; this machine has no GPU driver: the CPU does for the demo, not for more"
+        yield note("GPU", text)
     for index, gpu in enumerate(gpus):
         text = f"{gpu.name}, {size(gpu.memory)}"
         if dtype != "bfloat16" or gpu.bfloat16:

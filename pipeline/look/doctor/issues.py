@@ -7,8 +7,6 @@ from pipeline.base.issue import Issue
 
 WIDTH = 100
 _INDENT = 30
-_WORDS = {"error": "missing"}
-"""What the terminal calls a severity, where that is not its own word."""
 
 
 def ok(subject: str, message: str) -> Issue:
@@ -30,21 +28,12 @@ def described(title: str, issues: Sequence[Issue]) -> list[str]:
     """A group of issues as lines of at most `WIDTH` columns."""
     lines = [title]
     for issue in issues:
-        head = f"  {_WORDS.get(issue.severity, issue.severity):<8} {issue.kind:<18} "
-        lines += _wrapped(issue.message, head.ljust(_INDENT))
-        if issue.remedy:
-            lines += _wrapped(issue.remedy, f"{'-> ':>{_INDENT}}")
+        severity = "missing" if issue.severity == "error" else issue.severity
+        head = f"  {severity:<8} {issue.kind:<18} ".ljust(_INDENT)
+        for begin, text in ((head, issue.message), (f"{'-> ':>{_INDENT}}", issue.remedy)):
+            # A path or an option is copied, so it is never broken.
+            wrapper = textwrap.TextWrapper(
+                WIDTH, begin, " " * len(begin), break_long_words=False, break_on_hyphens=False
+            )
+            lines += wrapper.wrap(text)
     return [*lines, ""]
-
-
-def _wrapped(text: str, head: str) -> list[str]:
-    # A path or an option is copied, so it is never broken.
-    wrapped = textwrap.wrap(
-        text,
-        WIDTH,
-        initial_indent=head,
-        subsequent_indent=" " * len(head),
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
-    return wrapped or [head]

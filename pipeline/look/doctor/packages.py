@@ -3,7 +3,7 @@
 import sys
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
-from importlib.metadata import PackageNotFoundError, version
+from importlib import metadata
 from pathlib import Path
 
 from packaging.requirements import Requirement
@@ -36,8 +36,8 @@ def installed_version(name: str) -> str | None:
     if name == "python":
         return ".".join(map(str, sys.version_info[:3]))
     try:
-        return version(name)
-    except PackageNotFoundError:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
         return None
 
 
@@ -45,28 +45,19 @@ def check_required(
     lines: Sequence[str], version_of: Callable[[str], str | None]
 ) -> Iterator[Issue]:
     """One line for all that are as they should be, and one for each that is not."""
-    wanted = {line: Requirement(line) for line in lines}
-    versions = {requirement.name: version_of(requirement.name) for requirement in wanted.values()}
-    bad = {
-        line: requirement.name
-        for line, requirement in wanted.items()
-        if not _fits(requirement, versions[requirement.name])
-    }
-    shown = ", ".join(
-        f"{name} {versions[name]}"
-        for name in _SHOWN
-        if name in versions and name not in bad.values()
-    )
-    yield ok("packages", f"{len(wanted) - len(bad)} of {len(wanted)} as they should be: {shown}")
-    for line, name in bad.items():
+    good: dict[str, str] = {}
+    bad: list[Issue] = []
+    for line in lines:
+        wanted = Requirement(line)
+        name, version = wanted.name, version_of(wanted.name)
+        # A build such as 2.13.0+cpu, or a nightly, is what its number says.
+        if version and wanted.specifier.contains(version.split("+")[0], prereleases=True):
+            good[name] = version
+            continue
         remedy = f"pip install '{line}'"
         if name == "python":
             remedy = "make a virtual environment with another Python and install again"
-        yield missing(name, f"expected {line}, found {versions[name] or 'none'}", remedy)
-
-
-def _fits(wanted: Requirement, version: str | None) -> bool:
-    # A build such as 2.13.0+cpu, or a nightly, is what its number says.
-    return version is not None and wanted.specifier.contains(
-        version.split("+")[0], prereleases=True
-    )
+        bad.append(missing(name, f"expected {line}, found {version or 'none'}", remedy))
+    shown = ", ".join(f"{name} {good[name]}" for name in _SHOWN if name in good)
+    yield ok("packages", f"{len(good)} of {len(lines)} as they should be: {shown}")
+    yield from bad

@@ -3,17 +3,18 @@
 import math
 import os
 import time
-from collections.abc import Iterator, Sequence, Sized
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from pipeline.base.config import Params
+from pipeline.base.config import DataParams, Params
 from pipeline.base.durable import free_bytes
 from pipeline.base.errors import RecordingError
 from pipeline.base.format import size
 from pipeline.base.issue import Issue
 from pipeline.base.memory import memory_bytes
-from pipeline.data import Recording, Stream, open_recordings
-from pipeline.data.timeline import Timeline, build_timeline, choose_action_rotation
+from pipeline.data import Recording, open_recordings
+from pipeline.data.episode import ReadEpisode, read_episode
+from pipeline.data.timeline import choose_action_rotation
 from pipeline.look.doctor.checkpoint import local_folder
 from pipeline.look.doctor.data import unusable
 from pipeline.look.doctor.issues import missing, note, ok
@@ -26,9 +27,6 @@ MOST_READ = 100
 _TEXT_BYTES = 400
 """Roughly what an episode's instruction and path take."""
 
-Streams = tuple[Timeline, Stream | None, Stream | None]
-"""Ticks, sensor and state of an episode."""
-
 
 def check(params: Params) -> Iterator[Issue]:
     """The store of `params`, without loading the model or decoding a frame."""
@@ -39,20 +37,19 @@ def check(params: Params) -> Iterator[Issue]:
     try:
         recordings = open_recordings(data.sources, data.root, data.views).recordings
     except RecordingError:
-        yield note("size", "not known before the recordings can be read; see above")
-        return
-    counts, bad = measure(recordings, params)
+        recordings = ()
+    read, bad = measure(recordings, data)
     if bad:
         text = f"{len(bad)} episode(s) read for the size cannot be used, first: {bad[0]}"
         yield unusable("episodes", text, data.on_bad_episode)
-    if not counts:
+    if not read:
         yield note("size", "not known: no episode could be read; see above")
         return
     episodes = len(recordings) - len(bad)
-    taken = estimated_bytes(counts, episodes, params)
+    taken = estimated_bytes(read, episodes, params)
     estimate = f"about {size(taken)} for {episodes} episodes"
-    if len(counts) < episodes:
-        estimate += f", judged by {len(counts)} of them"
+    if len(read) < episodes:
+        estimate += f", judged by {len(read)} of them"
     yield check_disk(taken, estimate, target, free_bytes(target), used_bytes(part_path(target)))
     yield check_page_cache(taken, memory_bytes())
 
@@ -66,10 +63,8 @@ def check_disk(taken: int, estimate: str, target: Path, free: int, begun: int) -
         text += f"; {target} is finished"
     if taken - begun <= free:
         return ok("disk", text)
-    remedy = (
-        "make room, set extract.store to another disk, extract.dtype to float16, or fewer "
-        "vlm.pooling slots"
-    )
+    remedy = "make room, set extract.store to another disk, extract.dtype to float16, or fewer "
+    remedy += "vlm.pooling slots"
     return (note if target.exists() else missing)("disk", text, remedy)
 
 
@@ -82,63 +77,53 @@ def check_page_cache(taken: int, memory: int) -> Issue:
     return note("page cache", text, remedy)
 
 
-def measure(recordings: Sequence[Recording], params: Params) -> tuple[list[Streams], list[str]]:
-    """Timeline, sensor and state of a few episodes, read within `BUDGET_S`.
-
-    And why others of them cannot be used.
-    """
-    data = params.data
+def measure(
+    recordings: Sequence[Recording], data: DataParams
+) -> tuple[list[ReadEpisode], list[str]]:
+    """A few episodes, read within `BUDGET_S`, and why others of them cannot be used."""
     rotation = choose_action_rotation(data.action_rotation, recordings)
     # An order whose every beginning comes from all over: the golden ratio's.
     order = sorted(range(len(recordings)), key=lambda at: at * 0.6180339887498949 % 1)
-    read: list[Streams] = []
+    read: list[ReadEpisode] = []
     bad: list[str] = []
     until = time.monotonic() + BUDGET_S
     for recording in (recordings[at] for at in order[:MOST_READ]):
         if (read or bad) and time.monotonic() > until:
             break
         try:
-            state, sensor = recording.state(), recording.sensor()
-            line = build_timeline(
-                recording, data.action_hz, data.vlm_reuse_count, rotation, state, sensor
-            )
-            read.append((line, sensor, state))
+            reuse = data.vlm_reuse_count
+            read.append(read_episode(recording, data.action_hz, reuse, rotation))
         except RecordingError as error:
             bad.append(str(error))
     return read, bad
 
 
-def estimated_bytes(read: Sequence[Streams], episodes: int, params: Params) -> int:
+def estimated_bytes(read: Sequence[ReadEpisode], episodes: int, params: Params) -> int:
     """About what `extract.plan=true` computes, where all episodes are like those read.
 
     Raises `VLMError` where the checkpoint does not fit the params.
     """
-    views = {view for line, _, _ in read for view in line.frames}
+    lines = [episode.timeline for episode in read]
+    embodiments = [episode.embodiment for episode in read]
+    views = {view for line in lines for view in line.frames}
     # A digest decides nothing of a size, and reading every weight for it takes long.
     spec = feature_spec(params.vlm, params.extract.dtype, sorted(views), lambda path: "")
-    lines = [line for line, _, _ in read]
-    sensors = [sensor for _, sensor, _ in read if sensor]
-    states = [state for _, _, state in read if state]
-
-    def in_all(times: Iterator[Sized]) -> int:
-        return math.ceil(sum(map(len, times)) * episodes / len(read))
-
     sizes = Sizes(
-        episodes=episodes,
-        ticks=in_all(line.time for line in lines),
-        vl_rows=in_all(line.vl_time for line in lines),
-        readings=in_all(stream.time for stream in sensors),
-        states=in_all(stream.time for stream in states),
-        text_bytes=_TEXT_BYTES * episodes,
+        episodes=len(read),
+        ticks=sum(len(line.time) for line in lines),
+        vl_rows=sum(len(line.vl_time) for line in lines),
+        readings=sum(episode.readings for episode in read),
+        states=sum(episode.states for episode in read),
+        text_bytes=_TEXT_BYTES * len(read),
         slots=len(spec.slots) * spec.variants,
         dim=spec.dim,
         views=len(views),
-        action_dim=len(lines[0].action_channels.names),
-        sensor_channels=max((len(stream.channels.names) for stream in sensors), default=0),
-        state_dim=max((len(stream.channels.names) for stream in states), default=0),
+        action_dim=len(embodiments[0].action.names),
+        sensor_channels=max(len(embodiment.sensor.names) for embodiment in embodiments),
+        state_dim=max(len(embodiment.state.names) for embodiment in embodiments),
     )
     specs = arrays(sizes, params.extract.dtype, params.extract.sensor_dtype).values()
-    return sum(spec.data_bytes for spec in specs)
+    return math.ceil(sum(spec.data_bytes for spec in specs) * episodes / len(read))
 
 
 def used_bytes(folder: Path) -> int:

@@ -1,9 +1,9 @@
 """The page of several evaluations side by side; it knows no recordings, as that of one does."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 
-from pipeline.base.table import Table
 from pipeline.evaluate.experiments import Experiment, experiment_table
 from pipeline.evaluate.tables import FOOTNOTE
 from pipeline.look.evaluation import pictures as plots
@@ -14,24 +14,15 @@ from pipeline.look.page.writing import sentence
 def comparison_report(experiments: Sequence[Experiment]) -> Report:
     """The page of these experiments, of which the first are no better than the last."""
     best = min(experiments, key=lambda experiment: experiment.error)
-    table = experiment_table(experiments)
-    columns, rows = table.columns, table.rows
-    edge = columns.index("expert")
-    errors = Table(
-        columns[:edge],
-        [row[:edge] for row in rows],
-        f"Mean absolute errors. {sentence(FOOTNOTE)}",
-        frozenset({experiments.index(best)}),
+    table = replace(
+        experiment_table(experiments),
+        caption=f"Mean errors; samples are chunks whose mean was judged. {sentence(FOOTNOTE)}",
+        strong=frozenset({experiments.index(best)}),
     )
     picture = Picture(
         "experiments",
         "Held-out error of each experiment, coloured by expert; the baselines are lines.",
         partial(plots.comparison_of_experiments, experiments),
-    )
-    own = Table(
-        [columns[0], *columns[edge:]],
-        [(row[0], *row[edge:]) for row in rows[: len(experiments)]],
-        "What they are; samples: chunks a tick whose mean was judged.",
     )
     return Report(
         title="Experiments side by side",
@@ -40,5 +31,5 @@ def comparison_report(experiments: Sequence[Experiment]) -> Report:
             "of all of them."
         ),
         tiles=(("lowest held-out error [training std]", f"{best.error:.3f}"), ("by", best.name)),
-        sections=(Section("Errors", (errors, picture, own)),),
+        sections=(Section("Errors", (table, picture)),),
     )

@@ -1,16 +1,16 @@
 """The pictures that say where in the model, and where in the image, the action is found."""
 
+from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.image import AxesImage
+from numpy.typing import NDArray
 
 from pipeline.evaluate.probe import ProbeResult, ProbeStudy, SlotName, ranked
-from pipeline.look.page.style import RECORDED, canvas, legend_below, write
+from pipeline.look.page.style import RECORDED, canvas, draw_map, legend_below, write
 
 _BARS = 20
 """Choices that a picture still shows legibly."""
@@ -37,29 +37,45 @@ def heat_map(study: ProbeStudy) -> Figure:
     plain = [result for result in study.slots if result.name.cell is None]
     poolings = list({result.name.pooling: None for result in study.groups})
     named = sorted([*study.groups, *plain], key=lambda result: poolings.index(result.name.pooling))
-    kinds = {_column(result.name): None for result in named}
-    rows = {_row(result.name): None for result in study.slots}
-    maps = _maps(study)
-    shown = sorted(maps, key=lambda place: _best(maps[place]), reverse=True)[:_MAPS]
-    lines = -(-len(shown) // _MAPS_A_ROW)
-    seen = [*named, *(result for place in shown for result in maps[place])]
+    rows = list(dict.fromkeys(_row(result.name) for result in study.slots))
+    maps: dict[str, list[ProbeResult]] = defaultdict(list)
+    for result in study.slots:
+        if result.name.cell is not None:
+            maps[f"{_row(result.name)}, {result.name.view}"].append(result)
+    best = {title: max(result.best.mean for result in cells) for title, cells in maps.items()}
+    shown = sorted(maps, key=lambda title: best[title], reverse=True)[:_MAPS]
+    seen = [*named, *(result for title in shown for result in maps[title])]
     values = [result.best.mean for result in seen]
     limits = _limits(values if study.streams is None else [*values, study.streams.mean])
-    columns = max(1, min(_MAPS_A_ROW, len(shown)))
-    height = 1.8 + 0.5 * len(rows) + 2.2 * lines
-    figure = canvas(max(8.5, 2.0 + 1.25 * len(kinds), 1.5 + 2.3 * columns), height)
+
+    columns, lines = max(1, min(_MAPS_A_ROW, len(shown))), -(-len(shown) // _MAPS_A_ROW)
+    kinds = list(dict.fromkeys(_column(result.name) for result in named))
+    width = max(8.5, 2.0 + 1.25 * len(kinds), 1.5 + 2.3 * columns)
+    figure = canvas(width, 1.8 + 0.5 * len(rows) + 2.2 * lines)
     ratios = [0.6 + 0.5 * len(rows)] + [2.2] * lines
     panels = figure.add_gridspec(1 + lines, columns, height_ratios=ratios)
-    axes = [figure.add_subplot(panels[0, :])]
-    image = _overview(axes[0], study, list(rows), list(kinds), limits)
+    overview = figure.add_subplot(panels[0, :])
+    # A group of one slot is that slot.
+    places = [(rows.index(_row(r.name)), kinds.index(_column(r.name))) for r in named]
+    image = draw_map(overview, _grid(places, named), limits)
+    overview.set_xticks(range(len(kinds)), kinds)
+    overview.set_yticks(range(len(rows)), rows)
+    for index, title in enumerate(shown):
+        axis = figure.add_subplot(panels[1 + index // _MAPS_A_ROW, index % _MAPS_A_ROW])
+        cells = [result.name.cell or (0, 0) for result in maps[title]]
+        draw_map(axis, _grid(cells, maps[title]), limits)
+        axis.set(xticks=[], yticks=[])
+        axis.set_title(title, fontsize=9)
+
+    extend = "min" if min(values) < limits[0] else "neither"
+    bar = figure.colorbar(image, ax=figure.axes, label="held-out R², alone", extend=extend)
     if study.streams is not None:
-        axes[0].set_title(f"state + sensor alone: {study.streams.mean:.2f}", fontsize=9)
-    for index, place in enumerate(shown):
-        line, column = divmod(index, _MAPS_A_ROW)
-        axis = figure.add_subplot(panels[1 + line, column])
-        axes.append(axis)
-        _cells(axis, maps[place], ", ".join(place), limits)
-    _scale(figure, axes, image, study, min(values) < limits[0])
+        alone = study.streams.mean
+        overview.set_title(f"state + sensor alone: {alone:.2f}", fontsize=9)
+        bar.set_label(
+            f"held-out R², beside state + sensor\n(line: state + sensor alone, {alone:.2f})"
+        )
+        bar.ax.axhline(max(alone, limits[0]), color="#D55E00", lw=2.5)
     words = "Where a linear reader finds the action"
     if len(shown) < len(maps):
         words += f" (the {len(shown)} best of {len(maps)} maps of a view; all are in slots.csv)"
@@ -75,25 +91,26 @@ def bars(study: ProbeStudy) -> Figure:
     shown = ranked(study.groups)[:_BARS][::-1]
     figure = canvas(8.5, 2.4 + 0.55 * len(shown))
     axis = figure.subplots()
-    at = np.arange(len(shown))
     kinds = [("alone", _ALONE, [result.alone for result in shown])]
     if study.streams is not None:
         kinds.append(("beside state + sensor", _BESIDE, [result.best for result in shown]))
-    for offset, (label, colour, scores) in enumerate(kinds):
-        heights = [score.mean for score in scores]
-        errors = [score.error for score in scores]
-        where = at + (0.2 - 0.4 * offset if len(kinds) > 1 else 0)
+    height = 0.76 / len(kinds)
+    for number, (label, colour, scores) in enumerate(kinds):
+        where = np.arange(len(shown)) + height * ((len(kinds) - 1) / 2 - number)
+        means, errors = [score.mean for score in scores], [score.error for score in scores]
         style = {"ecolor": RECORDED, "capsize": 3, "lw": 1}
-        height = 0.38 if len(kinds) > 1 else 0.6
-        axis.barh(where, heights, height, xerr=errors, color=colour, label=label, error_kw=style)
-        for place, value in zip(where, heights, strict=True):
-            if value < _LEAST:
-                _off_axis(axis, float(place), value)
-    _state_sensor(axis, study)
+        axis.barh(where, means, height, xerr=errors, color=colour, label=label, error_kw=style)
+        for place, mean in zip(where, means, strict=True):
+            if mean < _LEAST:
+                axis.text(
+                    _LEAST + 0.005, place, f"◀ {mean:.2f}", va="center", color="white", size=8
+                )
+    if study.streams is not None:
+        _mark_streams(axis, study.streams.mean)
     axis.axvline(0, color=RECORDED, lw=1)
     low, high = axis.get_xlim()
     axis.set_xlim(max(low, _LEAST), min(max(high, 0.1), 1.0))
-    axis.set_yticks(at, [_bar_name(result) for result in shown])
+    axis.set_yticks(range(len(shown)), [_bar_name(result) for result in shown])
     axis.grid(axis="y", visible=False)
     axis.set_xlabel("held-out R², mean over channels and steps (lines: standard error over folds)")
     legend_below(figure, axis, 3)
@@ -101,96 +118,19 @@ def bars(study: ProbeStudy) -> Figure:
     return figure
 
 
-def _state_sensor(axis: Axes, study: ProbeStudy) -> None:
+def _mark_streams(axis: Axes, mean: float) -> None:
     """Where state + sensor are by themselves, if only in the legend."""
-    if study.streams is None:
-        return
-    mean = study.streams.mean
-    label = "state + sensor alone"
-    if mean < _LEAST:
-        label += f" ({mean:.2f}, left of the axis)"
+    beyond = f" ({mean:.2f}, left of the axis)" if mean < _LEAST else ""
+    label = f"state + sensor alone{beyond}"
     axis.axvline(max(mean, _LEAST), color=RECORDED, ls="--", lw=1.8, label=label)
 
 
-def _off_axis(axis: Axes, place: float, value: float) -> None:
-    """On the bar, at the left end of the axis."""
-    words = f"◀ {value:.2f}"
-    axis.text(_LEAST + 0.005, place, words, ha="left", va="center", color="white", size=8)
-
-
-def _overview(
-    axis: Axes,
-    study: ProbeStudy,
-    rows: Sequence[str],
-    kinds: Sequence[str],
-    limits: tuple[float, float],
-) -> AxesImage:
-    """Groups and whole views; a group of one slot is that slot."""
-    grid = np.full((len(rows), len(kinds)), np.nan)
-    plain = [result for result in study.slots if result.name.cell is None]
-    for result in [*plain, *study.groups]:
-        grid[rows.index(_row(result.name)), kinds.index(_column(result.name))] = result.best.mean
-    image = _map(axis, grid, limits)
-    axis.set_xticks(range(len(kinds)), kinds)
-    axis.set_yticks(range(len(rows)), rows)
-    _number(axis, grid, image)
-    return image
-
-
-def _cells(axis: Axes, results: list[ProbeResult], title: str, limits: tuple[float, float]) -> None:
-    """Where in the image of a view: its cells, top left first."""
-    places = [cell for result in results if (cell := result.name.cell) is not None]
-    shape = (1 + max(row for row, _ in places), 1 + max(column for _, column in places))
-    grid = np.full(shape, np.nan)
+def _grid(places: Sequence[tuple[int, int]], results: Sequence[ProbeResult]) -> NDArray[np.float64]:
+    """Scores at their (row, column); NaN where there is none."""
+    grid = np.full(np.max(places, axis=0) + 1, np.nan)
     for place, result in zip(places, results, strict=True):
         grid[place] = result.best.mean
-    image = _map(axis, grid, limits)
-    axis.set_xticks([])
-    axis.set_yticks([])
-    axis.set_title(title, fontsize=9)
-    _number(axis, grid, image)
-
-
-def _scale(
-    figure: Figure, axes: Sequence[Axes], image: AxesImage, study: ProbeStudy, below: bool
-) -> None:
-    """The colours' numbers, and among them state + sensor by themselves."""
-    known = study.streams
-    words = "alone" if known is None else "beside state + sensor"
-    if known is not None:
-        words += f"\n(line: state + sensor alone, {known.mean:.2f})"
-    bar = figure.colorbar(
-        image, ax=axes, label=f"held-out R², {words}", extend="min" if below else "neither"
-    )
-    if known is not None:
-        bar.ax.axhline(max(known.mean, image.get_clim()[0]), color="#D55E00", lw=2.5)
-
-
-def _map(axis: Axes, grid: np.ndarray, limits: tuple[float, float]) -> AxesImage:
-    colours = mpl.colormaps["viridis"].with_extremes(bad="none")
-    axis.grid(visible=False)
-    return axis.imshow(grid, cmap=colours, vmin=limits[0], vmax=limits[1], aspect="auto")
-
-
-def _number(axis: Axes, grid: np.ndarray, image: AxesImage) -> None:
-    for (row, column), value in np.ndenumerate(grid):
-        if np.isfinite(value):
-            low, high = image.get_clim()
-            colour = "white" if value < low + 0.6 * (high - low) else "black"
-            axis.text(column, row, f"{value:.2f}", ha="center", va="center", color=colour, size=8)
-
-
-def _maps(study: ProbeStudy) -> dict[tuple[str, str], list[ProbeResult]]:
-    """The slots that are cells, by layer and view."""
-    maps: dict[tuple[str, str], list[ProbeResult]] = {}
-    for result in study.slots:
-        if result.name.cell is not None:
-            maps.setdefault((_row(result.name), str(result.name.view)), []).append(result)
-    return maps
-
-
-def _best(cells: Sequence[ProbeResult]) -> float:
-    return max(result.best.mean for result in cells)
+    return grid
 
 
 def _limits(values: Sequence[float]) -> tuple[float, float]:

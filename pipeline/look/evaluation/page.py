@@ -1,25 +1,18 @@
 """The page of an evaluation: how well a policy does, where it errs, and what it was made of."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import cache, partial
-from typing import Any
+
+from matplotlib.figure import Figure
 
 from pipeline.base.digests import file_digest
 from pipeline.base.table import Table
+from pipeline.evaluate import tables
 from pipeline.evaluate.ablation import AblationStudy
 from pipeline.evaluate.episode_frames import read_episode_frames, shown_ticks
 from pipeline.evaluate.evaluation import Evaluation
 from pipeline.evaluate.names import with_unit
-from pipeline.evaluate.tables import (
-    ABLATION_FOOTNOTE,
-    FOOTNOTE,
-    HEADINGS,
-    ablation_table,
-    best_baseline,
-    error_table,
-    evaluated_on,
-    still_dimensions,
-)
 from pipeline.look.evaluation import pictures as plots
 from pipeline.look.page.blocks import Block, Document, Picture, Report, Section, Text
 from pipeline.look.page.writing import sentence
@@ -32,8 +25,18 @@ _INSTANTS = 5
 """Ticks of an episode at which its frames are shown."""
 _EPISODES = 40
 """Rows of the table of episodes."""
-_NAMES = 8
-"""Channels of a stream named in the params; an A-scan has a thousand."""
+_CAPTIONS = {
+    "dimensions": "Mean absolute error of policy and baselines by dimension, of those that vary.",
+    "scatter": "Predicted against recorded next action at the held-out ticks; a cloud that lies "
+    "flat says that the policy tells no cases apart.",
+    "horizon": "Mean absolute error of policy and baselines by how far ahead an action lies.",
+    "dimension_horizon": "The policy's error in each dimension (rows) and step of the chunk "
+    "(columns), in units of the dimension's training standard deviation.",
+    "episodes": "Mean absolute error of policy and baselines in each held-out episode.",
+    "timeline": "Every action dimension over the episodes of lowest and highest error.",
+    "modalities": "The error with one stream ablated as a multiple of that with all intact.",
+    "curves": "The training by its steps; dashed, the step of the checkpoint.",
+}
 
 
 def evaluation_report(evaluation: Evaluation) -> Report:
@@ -43,6 +46,8 @@ def evaluation_report(evaluation: Evaluation) -> Report:
     page.
     """
     comparison, policy = evaluation.comparison, evaluation.judged["policy"]
+    # The overall error counts dimensions that hardly move like the others.
+    still = tables.still_dimensions(comparison)
     return Report(
         title=f"Evaluation of {evaluation.name}",
         summary=(
@@ -50,7 +55,7 @@ def evaluation_report(evaluation: Evaluation) -> Report:
             f"{policy['step']}, {policy['parameters']:,} parameters, judged on "
             f"{comparison.ticks:,} held-out ticks of {len(comparison.episodes)} episode(s) of "
             f"{evaluation.store.path.name}, {policy['samples']} chunk(s) a tick."
-            f"{_beaten(comparison)}{_still(comparison)}"
+            f"{_beaten(comparison)}{f' {sentence(still)}' if still else ''}"
         ),
         tiles=_tiles(comparison),
         sections=(
@@ -64,6 +69,11 @@ def evaluation_report(evaluation: Evaluation) -> Report:
     )
 
 
+def _picture(draw: Callable[..., Figure], *shown: object) -> Picture:
+    """A picture that is called like the function that draws it."""
+    return Picture(draw.__name__, _CAPTIONS[draw.__name__], partial(draw, *shown))
+
+
 def _beaten(comparison: Comparison) -> str:
     """A sentence on the groups in which a baseline is better, which the overall error hides."""
     worse = [
@@ -74,22 +84,15 @@ def _beaten(comparison: Comparison) -> str:
     return f" A baseline is better in {', '.join(worse)}." if worse else ""
 
 
-def _still(comparison: Comparison) -> str:
-    """A sentence on the dimensions that hardly move, which the overall error counts like others."""
-    words = still_dimensions(comparison)
-    return f" {sentence(words)}" if words else ""
-
-
 def _tiles(comparison: Comparison) -> list[tuple[str, str]]:
     tiles = [("overall error [training std]", f"{comparison.overall('policy'):.3f}")]
-    ways = [("of the best baseline's", comparison)]
+    ways = {"of the best baseline's": comparison}
     if comparison.low_variance():
-        ways.append(("the same, without what hardly moves", comparison.without_low_variance()))
-    for words, judged in ways:
+        ways["the same, without what hardly moves"] = comparison.without_low_variance()
+    for words, judged in ways.items():
         if (relative := judged.relative()) is not None:
-            tiles.append(
-                (f"{words} ({HEADINGS[best_baseline(judged)]})", f"{100 * relative:.0f} %")
-            )
+            label = f"{words} ({tables.HEADINGS[tables.best_baseline(judged)]})"
+            tiles.append((label, f"{100 * relative:.0f} %"))
     tiles += [
         (with_unit(group.name, group.unit), f"{comparison.group_mae('policy', group):.3g}")
         for group in comparison.varying_groups()
@@ -98,88 +101,38 @@ def _tiles(comparison: Comparison) -> list[tuple[str, str]]:
 
 
 def _baselines(comparison: Comparison) -> list[Block]:
-    errors = error_table(comparison)
+    errors = tables.error_table(comparison)
     return [
         Text(
             "Mean absolute errors over all steps of the chunk, of the policy and of three rules "
             "that see nothing. `overall` counts each channel in units of its training standard "
             "deviation; below 1, `policy / best` beats the best rule."
         ),
-        Table(
-            errors.columns,
-            errors.rows,
-            caption=sentence(FOOTNOTE),
-            strong=frozenset({len(errors.rows) - 1}),
+        replace(
+            errors, caption=sentence(tables.FOOTNOTE), strong=frozenset({len(errors.rows) - 1})
         ),
-        Picture(
-            "dimensions",
-            "Mean absolute error of policy and baselines in each action dimension that varies.",
-            partial(plots.dimensions, comparison),
-        ),
+        _picture(plots.dimensions, comparison),
     ]
 
 
 def _dimensions(evaluation: Evaluation) -> list[Block]:
     comparison = evaluation.comparison
-    columns = ["dimension", "unit", *(HEADINGS[method] for method in METHODS), "policy RMSE"]
+    columns = ["dimension", "unit", *(tables.HEADINGS[method] for method in METHODS), "policy RMSE"]
     scores = comparison.scores
-    rows = [
-        (
-            *(name, unit),
-            *(float(scores[method].mae[index]) for method in METHODS),
-            float(scores["policy"].rmse[index]),
-        )
-        for index, (name, unit) in enumerate(zip(comparison.names, comparison.units, strict=True))
-    ]
+    errors = [*(scores[method].mae for method in METHODS), scores["policy"].rmse]
+    rows = list(zip(comparison.names, comparison.units, *errors, strict=True))
     return [
         Table(columns, rows, caption="Mean absolute error by dimension, and the policy's RMSE."),
-        Picture(
-            "scatter",
-            "Predicted against recorded next action at the held-out ticks: on the line the policy "
-            "does what was recorded; a cloud that lies flat says that it tells no cases apart.",
-            partial(plots.scatter, comparison, evaluation.predictions),
-        ),
-        _steps(comparison, evaluation.store.action_hz),
-        Picture(
-            "horizon",
-            "Mean absolute error of policy and baselines by how far ahead an action lies.",
-            partial(plots.horizon, comparison, evaluation.store.action_hz),
-        ),
-        Picture(
-            "dimension_horizon",
-            "The policy's error in each dimension (rows) and step of the chunk (columns), in units "
-            "of the dimension's training standard deviation.",
-            partial(plots.dimension_horizon, comparison),
-        ),
+        _picture(plots.scatter, comparison, evaluation.predictions),
+        _picture(plots.horizon, comparison, evaluation.store.action_hz),
+        _picture(plots.dimension_horizon, comparison),
     ]
-
-
-def _steps(comparison: Comparison, action_hz: float | None) -> Table:
-    """Errors of the policy and of the best baseline, a row a step of the chunk."""
-    best, groups = best_baseline(comparison), comparison.varying_groups()
-    columns = ["steps ahead", *([] if action_hz is None else ["ms ahead"])]
-    for group in groups:
-        columns += [with_unit(group.name, group.unit), HEADINGS[best]]
-    errors = [
-        group.mean(comparison.scores[method].mae_horizon).tolist()
-        for group in groups
-        for method in ("policy", best)
-    ]
-    rows = [
-        (step, *([] if action_hz is None else [round(1000 * step / action_hz)]), *values)
-        for step, values in enumerate(zip(*errors, strict=True))
-    ]
-    caption = (
-        "The policy's mean absolute error by steps ahead, where 0 is the tick's own action; beside "
-        f"each, that of the best baseline ({HEADINGS[best]})."
-    )
-    return Table(columns, rows, caption=caption)
 
 
 def _episodes(evaluation: Evaluation) -> list[Block]:
     """All held-out episodes by error."""
     comparison, store = evaluation.comparison, evaluation.store
-    best = best_baseline(comparison)
+    best = tables.best_baseline(comparison)
     errors = {method: comparison.overall_by_episode(method) for method in ("policy", best)}
     rows: list[tuple[object, ...]] = []
     for place in comparison.ranked()[::-1][:_EPISODES]:
@@ -190,20 +143,11 @@ def _episodes(evaluation: Evaluation) -> list[Block]:
     caption = "Overall error [training std] by episode, the worst first"
     if len(rows) < len(comparison.episodes):
         caption += f"; the worst {len(rows)} of {len(comparison.episodes)}"
-    heads = ["episode", "held-out ticks", "policy", HEADINGS[best], "policy / baseline"]
+    heads = ["episode", "held-out ticks", "policy", tables.HEADINGS[best], "policy / baseline"]
     return [
         Table(heads, rows, f"{caption}."),
-        Picture(
-            "episodes",
-            "Mean absolute error of policy and baselines in each held-out episode.",
-            partial(plots.episodes, comparison, store),
-        ),
-        Picture(
-            "timeline",
-            "Every action dimension over the episodes of lowest and highest error: recorded, and "
-            "what the policy would do next.",
-            partial(plots.timeline, comparison, evaluation.predictions, store),
-        ),
+        _picture(plots.episodes, comparison, store),
+        _picture(plots.timeline, comparison, evaluation.predictions, store),
     ]
 
 
@@ -246,59 +190,32 @@ def _whole(predictions: Predictions, index: int) -> Ticks:
 
 def _modalities(study: AblationStudy | None) -> list[Block]:
     if study is None:
-        return [
-            Text(
-                "Not judged: `evaluate.modalities` is off, or no held-out tick lies 200 ms into "
-                "its episode."
-            )
-        ]
-    table = ablation_table(study)
+        text = "Not judged: `evaluate.modalities` is off, or no held-out tick lies 200 ms into its "
+        return [Text(f"{text}episode.")]
+    words = f"{sentence(tables.evaluated_on(study))} {sentence(tables.ABLATION_FOOTNOTE)} An error "
+    words += (
+        "that stays says that the policy does not use the stream, or that others tell it the same."
+    )
     return [
-        Text(
-            f"{sentence(evaluated_on(study))} {sentence(ABLATION_FOOTNOTE)} An error that stays "
-            "says that the policy does not use the stream, or that others tell it the same."
-        ),
-        Table(table.columns, table.rows, strong=frozenset({0})),
+        Text(words),
+        replace(tables.ablation_table(study), caption=""),
         *(Text(sentence(note)) for note in study.notes),
-        Picture(
-            "modalities",
-            "The error with one stream ablated as a multiple of the error with all intact.",
-            partial(plots.modalities, study),
-        ),
+        _picture(plots.modalities, study),
     ]
 
 
 def _training(evaluation: Evaluation) -> list[Block]:
     if not evaluation.curves.curves:
         return [Text(evaluation.curves.absence)]
-    return [
-        Picture(
-            "curves",
-            "Loss on training batches, error on held-out ticks and learning rate over the steps "
-            "of the training; dashed, the step of the checkpoint.",
-            partial(plots.curves, evaluation.curves, evaluation.checkpoint.step),
-        )
-    ]
+    return [_picture(plots.curves, evaluation.curves, evaluation.checkpoint.step)]
 
 
 def _documents(evaluation: Evaluation) -> list[Block]:
     checkpoint = evaluation.checkpoint
     source = {key: value for key, value in checkpoint.source.items() if key != "feature_spec"}
-    streams = {name: _shortened(words) for name, words in source.pop("streams").items()}
     return [
-        Document(
-            "train_head, as the checkpoint was trained", checkpoint.params.model_dump(mode="json")
-        ),
+        Document("train_head, as trained", checkpoint.params.model_dump(mode="json")),
         Document("Feature spec of its store", checkpoint.source["feature_spec"]),
-        Document("Streams and ticks of its store", {**source, "streams": streams}),
+        Document("Streams and ticks of its store", source),
         Document("What was judged, and on what (judged.json)", evaluation.judged),
     ]
-
-
-def _shortened(words: Any) -> Any:
-    """A stream's names and units, the first few of many."""
-    if isinstance(words, Mapping):
-        return {key: _shortened(value) for key, value in words.items()}
-    if isinstance(words, list) and len(words) > _NAMES:
-        return [*words[:_NAMES], f"… {len(words)} in all"]
-    return words

@@ -3,17 +3,17 @@
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure, SubFigure
+from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from pipeline.evaluate.ablation import Ablated, AblationStudy
-from pipeline.evaluate.curves import TrainingCurve, TrainingCurves
+from pipeline.evaluate.ablation import AblationStudy
+from pipeline.evaluate.curves import TrainingCurves
 from pipeline.evaluate.experiments import Experiment
 from pipeline.evaluate.names import with_unit
 from pipeline.evaluate.tables import ABLATION_FOOTNOTE, best_baseline
@@ -25,8 +25,10 @@ from pipeline.look.page.style import (
     RECORDED,
     STYLES,
     canvas,
+    draw_map,
     legend_below,
     logarithmic,
+    shorten_middle,
 )
 from pipeline.store import Episode, FeatureStore, episode_name
 from pipeline.train.predictions import BASELINES, METHODS, Predictions
@@ -41,15 +43,13 @@ _CHUNK = PALETTE[5]
 """Of whole chunks."""
 _NUMBERED_STEPS = 16
 """Steps of a chunk up to which a cell has room for its number."""
-_DARK, _LIGHT = "#111111", "#ffffff"
-"""Ink on a coloured cell, which is the same in light and in dark."""
 _POLICY = STYLES["policy"]["color"]
 _CURVES = {
-    "train/loss": ("training loss", PALETTE[0], True),
-    "val/error": ("held-out error [training std]", PALETTE[5], False),
-    "lr": ("learning rate", PALETTE[2], False),
+    "train/loss": ("training loss", PALETTE[0]),
+    "val/error": ("held-out error [training std]", PALETTE[5]),
+    "lr": ("learning rate", PALETTE[2]),
 }
-"""TrainingCurve -> what its axis says, colour, and whether to draw decades of it logarithmic."""
+"""TrainingCurve -> what its axis says, and its colour."""
 _ABLATIONS = {
     "zeroed": "#0072B2",
     "missing": "#56B4E9",
@@ -65,11 +65,10 @@ def dimensions(comparison: Comparison) -> Figure:
     shown = comparison.varying()
     figure = canvas(9.0, 0.42 * len(shown) + 2.0)
     axis = figure.subplots()
-    lines = np.arange(len(shown))
     for method in METHODS:
         errors = comparison.in_training_std(comparison.scores[method].mae)
-        axis.plot(errors, lines, **_marked(method, linestyle=""))
-    axis.set_yticks(lines, _dimension_names(comparison))
+        axis.plot(errors, range(len(shown)), **_marked(method, linestyle=""))
+    axis.set_yticks(range(len(shown)), _dimension_names(comparison))
     axis.set_ylim(len(shown) - 0.5, -0.5)
     axis.set_xlim(left=0)
     axis.set_xlabel("mean absolute error [training std] (left is better)")
@@ -83,18 +82,9 @@ def dimension_horizon(comparison: Comparison) -> Figure:
     errors = comparison.in_training_std(comparison.scores["policy"].mae_horizon).T
     figure = canvas(9.0, 0.42 * len(errors) + 1.9)
     axis = figure.subplots()
-    axis.grid(visible=False)
-    worst = float(np.nanmax(errors)) or 1.0
-    colours = mpl.colormaps["viridis_r"]
-    image = axis.imshow(errors, colours, vmin=0, vmax=worst, aspect="auto", interpolation="nearest")
-    bar = figure.colorbar(image, ax=axis, pad=0.02)
-    bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
-    bar.set_label("error [training std]")
-    if errors.shape[1] <= _NUMBERED_STEPS:
-        for (row, step), error in np.ndenumerate(errors):
-            if np.isfinite(error):
-                ink = _LIGHT if error > 0.55 * worst else _DARK
-                axis.text(step, row, f"{error:.2f}", ha="center", va="center", color=ink)
+    limits = (0, float(np.nanmax(errors)) or 1.0)
+    image = draw_map(axis, errors, limits, "viridis_r", errors.shape[1] <= _NUMBERED_STEPS)
+    figure.colorbar(image, ax=axis, pad=0.02, label="error [training std]")
     axis.set_yticks(range(len(errors)), _dimension_names(comparison))
     axis.xaxis.set_major_locator(MaxNLocator(integer=True))
     axis.set_xlabel("steps ahead")
@@ -104,6 +94,7 @@ def dimension_horizon(comparison: Comparison) -> Figure:
 
 def horizon(comparison: Comparison, action_hz: float | None) -> Figure:
     """Mean absolute error by how far ahead an action lies, a panel an action group."""
+    ahead = "steps ahead" if action_hz is None else f"steps ahead [{1000 / action_hz:.0f} ms each]"
     groups = comparison.varying_groups()
     figure = canvas(max(4.6 * len(groups), 9.4), 4.4)
     axes = figure.subplots(1, len(groups), squeeze=False)[0]
@@ -111,10 +102,7 @@ def horizon(comparison: Comparison, action_hz: float | None) -> Figure:
         for method in METHODS:
             errors = group.mean(comparison.scores[method].mae_horizon)
             axis.plot(np.arange(len(errors)), errors, **_marked(method))
-        axis.set_title(_group_title(comparison, group))
-        axis.set_xlabel(
-            "steps ahead" if action_hz is None else f"steps ahead [{1000 / action_hz:.0f} ms each]"
-        )
+        axis.set(title=_group_title(comparison, group), xlabel=ahead)
         axis.set_ylabel(with_unit("mean absolute error", group.unit))
         axis.set_ylim(bottom=0)
         axis.xaxis.get_major_locator().set_params(integer=True)
@@ -138,8 +126,8 @@ def episodes(comparison: Comparison, store: FeatureStore) -> Figure:
         for method in METHODS:
             errors = group.mean(comparison.scores[method].mae_episode)[order]
             axis.plot(errors, lines, **_marked(method, linestyle=""))
-        axis.set_title(_group_title(comparison, group))
-        axis.set_xlabel(with_unit("mean absolute error", group.unit))
+        label = with_unit("mean absolute error", group.unit)
+        axis.set(title=_group_title(comparison, group), xlabel=label)
         axis.set_xlim(left=0)
     axes[0].set_yticks(lines, [_short_name(store.episodes[comparison.episodes[i]]) for i in order])
     axes[0].set_ylim(-0.6, len(order) - 0.4)
@@ -170,10 +158,9 @@ def scatter(comparison: Comparison, predictions: Predictions) -> Figure:
         axis.set(xlim=(low, high), ylim=(low, high), aspect="equal")
         axis.locator_params(nbins=4)
         axis.ticklabel_format(scilimits=(-2, 4), useOffset=False)
-        unit = comparison.units[index]
-        axis.set_title(with_unit(comparison.names[index], unit))
-        axis.set_xlabel(with_unit("recorded", unit))
-        axis.set_ylabel(with_unit("policy", unit))
+        name, unit = comparison.names[index], comparison.units[index]
+        axis.set(xlabel=with_unit("recorded", unit), ylabel=with_unit("policy", unit))
+        axis.set_title(with_unit(name, unit))
     figure.suptitle("Next action at held-out ticks: on the line, the policy does what was recorded")
     return figure
 
@@ -193,7 +180,9 @@ def timeline(comparison: Comparison, predictions: Predictions, store: FeatureSto
     for row, axis in enumerate(axes[:, 0]):
         axis.set_ylabel(with_unit(comparison.names[row], comparison.units[row]))
         if comparison.scale[row] == 0:
-            _widen_range(axis)
+            # Rounding noise of a channel that never varies must not fill its panel.
+            low, high = axis.get_ylim()
+            axis.set_ylim(min(low, high - 0.2), max(high, low + 0.2))
     figure.align_ylabels(axes[:, 0])
     legend_below(figure, axes[0, 0], 2)
     figure.suptitle("Held-out episodes: the recorded action, and what the policy would do next")
@@ -215,75 +204,54 @@ def chunks(
     """
     time_s = _episode_time(store, episode)
     shown = comparison.varying()
-    tall = 1.15 * len(shown) + 1.2
     width = _CHUNKS_WIDTH / max(3, len(instants))
     shapes = [[image.shape for image in images] for images in frames.values()]
     heights = [width * max(shape[0] / shape[1] for shape in view) for view in shapes]
-    above_in = [sum(heights) + 0.5] if heights else []
-    figure = canvas(_CHUNKS_WIDTH, sum(above_in) + tall)
-    parts = figure.subfigures(len(above_in) + 1, 1, height_ratios=[*above_in, tall], squeeze=False)
-    below: SubFigure = parts[-1, 0]
-    if heights:
-        _show_frames(parts[0, 0], frames, time_s[instants - episode.ticks.start])
-    axes = below.subplots(len(shown), 1, squeeze=False, sharex=True)[:, 0]
-    for axis, dimension in zip(axes, shown, strict=True):
+    heights += [1.15] * len(shown)
+    figure = canvas(_CHUNKS_WIDTH, sum(heights) + 1.7)
+    grid = figure.add_gridspec(len(heights), len(instants), height_ratios=heights)
+    for row, (view, images) in enumerate(frames.items()):
+        for column, image in enumerate(images):
+            axis = figure.add_subplot(grid[row, column])
+            axis.imshow(image)
+            axis.set(xticks=[], yticks=[], ylabel="" if column else view)
+            axis.grid(visible=False)
+            axis.spines[:].set_visible(False)
+            if row == 0:
+                axis.set_title(f"{time_s[instants[column] - episode.ticks.start]:.1f} s")
+    axes: list[Axes] = []
+    places = np.flatnonzero(np.isin(predictions.ticks, instants))
+    for row, dimension in enumerate(shown, len(frames)):
+        axis = figure.add_subplot(grid[row, :], sharex=axes[0] if axes else None)
+        axes.append(axis)
         _plot_next_actions(axis, dimension, predictions, episode, time_s)
-        _plot_chunks(axis, dimension, predictions, episode, time_s, instants)
         axis.set_ylabel(with_unit(comparison.names[dimension], comparison.units[dimension]))
+        label = "policy, whole chunk at the dotted ticks"
+        for place in places:
+            chunk = predictions.predicted[place, predictions.valid[place], dimension]
+            ahead = time_s[predictions.ticks[place] - episode.ticks.start :][: len(chunk)]
+            axis.axvline(ahead[0], color=INK, lw=0.8, ls=":", zorder=1)
+            axis.plot(ahead, chunk, color=_CHUNK, lw=2, zorder=6, label=label)
+            axis.plot(ahead[0], chunk[0], color=_CHUNK, marker="o", ms=5, zorder=6)
+            label = ""
+        axis.label_outer()
     axes[-1].set_xlabel("time since the episode began [s]")
-    below.align_ylabels(axes)
-    handles, labels = axes[0].get_legend_handles_labels()
-    below.legend(handles, labels, loc="outside lower center", ncols=3)
+    figure.align_ylabels(axes)
+    legend_below(figure, axes[0], 3)
     error = comparison.overall_by_episode("policy")[comparison.episodes.index(episode.index)]
     figure.suptitle(f"{_short_name(episode)}: overall error {error:.3f} [training std]")
     return figure
 
 
-def _show_frames(
-    figure: SubFigure, frames: Mapping[str, Sequence[NDArray[np.uint8]]], times: NDArray[Any]
-) -> None:
-    axes = figure.subplots(len(frames), len(times), squeeze=False)
-    for row, (view, images) in zip(axes, frames.items(), strict=True):
-        for axis, image in zip(row, images, strict=True):
-            axis.imshow(image)
-            axis.set(xticks=[], yticks=[])
-            axis.grid(visible=False)
-            axis.spines[:].set_visible(False)
-        row[0].set_ylabel(view)
-    for axis, time_s in zip(axes[0], times, strict=True):
-        axis.set_title(f"{time_s:.1f} s")
-
-
 def _plot_next_actions(
-    axis: Axes,
-    dimension: int,
-    predictions: Predictions,
-    episode: Episode,
-    time_s: NDArray[np.float64],
+    axis: Axes, dimension: int, predictions: Predictions, episode: Episode, time_s: NDArray[Any]
 ) -> None:
+    """Recorded and predicted; `time_s` (tick,) counts from the episode's begin."""
     here = predictions.episodes == episode.index
     at = time_s[predictions.ticks[here] - episode.ticks.start]
     recorded, predicted = predictions.recorded[here, 0], predictions.predicted[here, 0]
     axis.plot(at, recorded[:, dimension], color=RECORDED, lw=2.2, label="recorded")
     axis.plot(at, predicted[:, dimension], color=_POLICY, lw=1.6, label="policy, next action")
-
-
-def _plot_chunks(
-    axis: Axes,
-    dimension: int,
-    predictions: Predictions,
-    episode: Episode,
-    time_s: NDArray[np.float64],
-    instants: NDArray[np.int64],
-) -> None:
-    label = "policy, whole chunk at the dotted ticks"
-    for place in np.flatnonzero(np.isin(predictions.ticks, instants)):
-        chunk = predictions.predicted[place, predictions.valid[place], dimension]
-        ahead = time_s[predictions.ticks[place] - episode.ticks.start :][: len(chunk)]
-        axis.axvline(ahead[0], color=INK, lw=0.8, ls=":", zorder=1)
-        axis.plot(ahead, chunk, color=_CHUNK, lw=2, zorder=6, label=label)
-        axis.plot(ahead[:1], chunk[:1], color=_CHUNK, marker="o", ms=5, zorder=6)
-        label = ""
 
 
 def curves(logged: TrainingCurves, step: int) -> Figure:
@@ -292,24 +260,18 @@ def curves(logged: TrainingCurves, step: int) -> Figure:
     figure = canvas(max(4.2 * len(shown), 8.4), 3.4)
     axes = figure.subplots(1, len(shown), squeeze=False, sharex=True)[0]
     for axis, name in zip(axes, shown, strict=True):
-        _plot_curve(axis, name, logged.curves[name])
+        curve, (title, colour) = logged.curves[name], _CURVES.get(name, (name, PALETTE[4]))
+        marker = "o" if len(curve.step) <= 30 else ""
+        axis.plot(curve.step, curve.value, color=colour, marker=marker, markersize=4)
+        # Within a decade a logarithmic axis has nothing but odd numbers to show.
+        if 0 < 10 * curve.value.min() <= curve.value.max():
+            logarithmic(axis)
+        else:
+            axis.set_ylim(bottom=min(0.0, float(curve.value.min())))
+        axis.set(title=title, xlabel="step")
         axis.axvline(step, color=INK, lw=1, ls="--")
     figure.suptitle(f"Course of the training; the checkpoint judged here is of step {step}")
     return figure
-
-
-def _plot_curve(axis: Axes, name: str, curve: TrainingCurve) -> None:
-    title, colour, by_decades = _CURVES.get(name, (name, PALETTE[4], False))
-    marker = "o" if len(curve.step) <= 30 else ""
-    axis.plot(curve.step, curve.value, color=colour, marker=marker, markersize=4)
-    # Within a decade a logarithmic axis has nothing but odd numbers to show.
-    if by_decades and 0 < 10 * curve.value.min() <= curve.value.max():
-        logarithmic(axis)
-        axis.grid(which="minor", lw=0.4)
-    else:
-        axis.set_ylim(bottom=min(0.0, float(curve.value.min())))
-    axis.set_title(title)
-    axis.set_xlabel("step")
 
 
 def modalities(study: AblationStudy) -> Figure:
@@ -322,11 +284,22 @@ def modalities(study: AblationStudy) -> Figure:
     ]
     widths = [len(panel) for panel in panels]
     figure = canvas(max(0.95 * sum(widths) + 1.5, 7.5), 4.6)
-    axes = figure.subplots(
-        1, len(panels), squeeze=False, sharey=True, gridspec_kw={"width_ratios": widths}
-    )[0]
+    axes = figure.subplots(1, len(panels), squeeze=False, sharey=True, width_ratios=widths)[0]
+    unit, best = study.intact.overall("policy") or 1.0, best_baseline(study.intact)
+    intact, blind = (study.intact.overall(method) / unit for method in ("policy", best))
     for axis, panel in zip(axes, panels, strict=True):
-        _plot_ablations(axis, panel, study)
+        heights = [ablated.comparison.overall("policy") / unit for ablated in panel]
+        colours = [_ABLATIONS[ablated.how.split()[0]] for ablated in panel]
+        bars = axis.bar(range(len(panel)), heights, color=colours, width=0.7)
+        # On a ground of its own, for a line may pass behind a number.
+        ground = {"facecolor": GRID, "edgecolor": "none", "pad": 1}
+        axis.bar_label(bars, fmt="%.2f", padding=3, bbox=ground)
+        axis.axhline(intact, color=_POLICY, lw=1.8, label="policy, all streams intact")
+        label = f"best {LABELS[best]}, which sees nothing"
+        axis.axhline(blind, color=INK, lw=1.8, ls="--", label=label)
+        axis.set_xticks(range(len(panel)), [ablated.how.replace(" ", "\n", 1) for ablated in panel])
+        axis.grid(axis="x", visible=False)
+        axis.set_title(panel[0].stream)
     axes[0].set_ylabel("held-out error / error with all streams intact")
     axes[0].set_ylim(0, 1.12 * axes[0].get_ylim()[1])
     legend_below(figure, axes[0], 2)
@@ -339,51 +312,21 @@ def modalities(study: AblationStudy) -> Figure:
     return figure
 
 
-def _plot_ablations(axis: Axes, panel: Sequence[Ablated], study: AblationStudy) -> None:
-    unit = study.intact.overall("policy") or 1.0
-    heights = [ablated.comparison.overall("policy") / unit for ablated in panel]
-    colours = [_ABLATIONS[ablated.how.split()[0]] for ablated in panel]
-    bars = axis.bar(range(len(panel)), heights, color=colours, width=0.7)
-    # On a ground of its own, for a line may pass behind a number.
-    ground = {"facecolor": GRID, "edgecolor": "none", "pad": 1}
-    axis.bar_label(bars, fmt="%.2f", padding=3, bbox=ground)
-    best = best_baseline(study.intact)
-    intact, blind = (study.intact.overall(method) / unit for method in ("policy", best))
-    axis.axhline(intact, color=_POLICY, lw=1.8, label="policy, all streams intact")
-    label = f"best {LABELS[best]}, which sees nothing"
-    axis.axhline(blind, color=INK, lw=1.8, ls="--", label=label)
-    axis.set_xticks(range(len(panel)), [ablated.how.replace(" ", "\n", 1) for ablated in panel])
-    axis.grid(axis="x", visible=False)
-    axis.set_title(panel[0].stream)
-
-
 def comparison_of_experiments(experiments: Sequence[Experiment]) -> Figure:
     """Held-out error of each experiment, coloured by expert, and the baselines as lines."""
     figure = canvas(9.0, 0.36 * len(experiments) + 2.6)
     axis = figure.subplots()
-    for index, expert in enumerate(
-        dict.fromkeys(experiment.model_type for experiment in experiments)
-    ):
-        places = [
-            at for at, experiment in enumerate(experiments) if experiment.model_type == expert
-        ]
-        errors = [experiments[at].error for at in places]
-        colour = _EXPERTS[index % len(_EXPERTS)]
-        axis.barh(places, errors, color=colour, height=0.72, label=expert.replace("_", " "))
-    for method in BASELINES:
-        error, style = experiments[0].overall[method], STYLES[method]
-        line = {"color": style["color"], "ls": style["linestyle"]}
-        axis.axvline(error, lw=2, label=LABELS[method], **line)
-    for place, experiment in enumerate(experiments):
+    experts = [experiment.model_type for experiment in experiments]
+    colours = dict(zip(dict.fromkeys(experts), cycle(_EXPERTS), strict=False))
+    for place, (expert, experiment) in enumerate(zip(experts, experiments, strict=True)):
+        label = expert.replace("_", " ") if experts.index(expert) == place else ""
+        axis.barh(place, experiment.error, 0.72, color=colours[expert], label=label)
         # Beside the panel: at its bar's end a number would lie on the baselines that are near.
-        axis.annotate(
-            f"{experiment.error:.3f}",
-            (1, place),
-            xycoords=axis.get_yaxis_transform(),
-            xytext=(6, 0),
-            textcoords="offset points",
-            va="center",
-        )
+        number = f"{experiment.error:.3f}"
+        axis.text(1.01, place, number, transform=axis.get_yaxis_transform(), va="center")
+    for method in BASELINES:
+        style = {key: STYLES[method][key] for key in ("color", "linestyle")}
+        axis.axvline(experiments[0].overall[method], lw=2, label=LABELS[method], **style)
     axis.set_yticks(range(len(experiments)), [experiment.name for experiment in experiments])
     axis.invert_yaxis()
     axis.grid(axis="y", visible=False)
@@ -418,19 +361,10 @@ def _group_title(comparison: Comparison, group: ActionGroup) -> str:
 
 def _short_name(episode: Episode) -> str:
     """`episode_name`, its middle left out where it is too long for a title."""
-    name = episode_name(episode)
-    return name if len(name) <= 44 else f"{name[:14]}…{name[-28:]}"
+    return shorten_middle(episode_name(episode), 14, 28)
 
 
 def _episode_time(store: FeatureStore, episode: Episode) -> NDArray[np.float64]:
     """(tick,) s since the episode began."""
     time_s = store.array("tick/time")[episode.ticks.start : episode.ticks.stop]
     return time_s - time_s[0]
-
-
-def _widen_range(axis: Axes) -> None:
-    """Keep a channel that never varies from filling its panel with rounding noise."""
-    low, high = axis.get_ylim()
-    middle = (low + high) / 2
-    half = max((high - low) / 2, 0.1 * max(1.0, abs(middle)))
-    axis.set_ylim(middle - half, middle + half)

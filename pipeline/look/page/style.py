@@ -13,11 +13,15 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib import font_manager
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.ticker import NullFormatter, StrMethodFormatter
+from numpy.typing import NDArray
 
 from pipeline.base.durable import disk_full_named, fresh
 
@@ -68,12 +72,8 @@ def families() -> list[str]:
 
 RC: dict[Any, Any] = {
     "figure.constrained_layout.use": True,
-    "text.color": INK,
-    "axes.edgecolor": INK,
-    "axes.labelcolor": INK,
-    "xtick.color": INK,
-    "ytick.color": INK,
-    "hatch.color": INK,
+    **dict.fromkeys(("text.color", "axes.edgecolor", "axes.labelcolor"), INK),
+    **dict.fromkeys(("xtick.color", "ytick.color", "hatch.color"), INK),
     # A name from a recording is no TeX, whatever dollars it has.
     "text.parse_math": False,
     # Else the ids inside an SVG are drawn by chance.
@@ -130,6 +130,30 @@ def canvas(width: float, height: float) -> Figure:
     figure = Figure(figsize=(width, height))
     FigureCanvasAgg(figure)
     return figure
+
+
+def draw_map(
+    axis: Axes,
+    grid: NDArray[Any],
+    limits: tuple[float, float],
+    colours: str | Colormap = "viridis",
+    numbered: bool = True,
+) -> AxesImage:
+    """The (row, column) values as coloured cells, numbered in an ink that shows; NaN is empty."""
+    low, high = limits
+    axis.grid(visible=False)
+    image = axis.imshow(grid, colours, vmin=low, vmax=high, aspect="auto", interpolation="nearest")
+    for (row, column), value in np.ndenumerate(grid) if numbered else ():
+        if np.isfinite(value):
+            light = np.dot(image.to_rgba(value)[:3], (0.3, 0.6, 0.1)) > 0.5
+            ink = "#111111" if light else "#ffffff"
+            axis.text(column, row, f"{value:.2f}", ha="center", va="center", color=ink, size=8)
+    return image
+
+
+def shorten_middle(name: str, begin: int, end: int) -> str:
+    """A name with an ellipsis for its middle, where it is longer than both ends."""
+    return name if len(name) <= begin + end + 1 else f"{name[:begin]}…{name[-end:]}"
 
 
 def logarithmic(axis: Axes) -> None:

@@ -13,7 +13,7 @@ from pipeline.look.page.style import GRID, INK, PALETTE
 
 RASTER_DPI = 144
 """Of what is drawn as points of an image inside the SVG."""
-POINT_PX = 96 / 72
+POINTS_INCH, POINT_PX = 72, 96 / 72
 PHOTO_BYTES, PHOTO_RATIO, PHOTO_QUALITY = 2**15, 3, 88
 """An image of at least so many bytes that JPEG makes so many times smaller is a photograph."""
 FONTS = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Noto Sans', sans-serif"
@@ -39,20 +39,14 @@ def inline_svg(figure: Figure, name: str, label: str) -> str:
             metadata={"Date": None, "Creator": None, "Format": None, "Type": None},
         )
     text = written.getvalue()
-    head, body = re.match(r".*?<svg([^>]*)>(.*)</svg>\s*$", text, re.DOTALL).groups()  # pyright: ignore[reportOptionalMemberAccess]
-    return _opening(head, label) + _body(body, name) + "</svg>"
-
-
-def _opening(head: str, label: str) -> str:
-    """The `<svg …>` tag: sized by its box, no wider than it was drawn, and named."""
-    box = re.search(r'viewBox="([^"]*)"', head)
-    assert box is not None, head
-    width, height = (float(value) * POINT_PX for value in box[1].split()[2:])
-    # What has no colour of its own is black in SVG: give it the ink too.
+    body = re.sub(r"^.*?<svg[^>]*>|</svg>\s*$", "", text, flags=re.DOTALL)
+    width, height = POINTS_INCH * figure.get_size_inches()
+    # No wider than it was drawn. What has no colour of its own is black in SVG: the ink, too.
     return (
-        f'<svg viewBox="{box[1]}" xmlns:xlink="http://www.w3.org/1999/xlink" fill="currentColor" '
-        f'style="--w:{width:.0f};--h:{height:.0f}" role="img" aria-label="{escape(label)}">'
-        f"<title>{escape(label)}</title>"
+        f'<svg viewBox="0 0 {width:g} {height:g}" xmlns:xlink="http://www.w3.org/1999/xlink" '
+        f'fill="currentColor" style="--w:{width * POINT_PX:.0f};--h:{height * POINT_PX:.0f}" '
+        f'role="img" aria-label="{escape(label)}"><title>{escape(label)}</title>'
+        f"{_body(body, name)}</svg>"
     )
 
 

@@ -7,6 +7,7 @@ forbids the rest. The same report gives the same bytes.
 import json
 import re
 import warnings
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,17 +20,9 @@ from tqdm import tqdm
 from pipeline.base.durable import disk_full_named, sync
 from pipeline.base.ownership import REPORT, OutputKind, begin_folder, release, remove_folder
 from pipeline.base.table import Table
-from pipeline.look.page.blocks import (
-    Block,
-    Document,
-    Issues,
-    Picture,
-    Report,
-    Section,
-    Text,
-    Tokens,
-)
-from pipeline.look.page.issues import FINDINGS, findings_csv, group_issues, place_of
+from pipeline.look.page import blocks
+from pipeline.look.page.blocks import Document, Issues, Picture, Report, Section, Text, Tokens
+from pipeline.look.page.issues import FINDINGS, findings_csv, group_issues, place_of, places_of
 from pipeline.look.page.style import NO_FONT, RC, boxes, write
 from pipeline.look.page.svg import inline_svg
 
@@ -40,6 +33,8 @@ NAMED_PLACES = 3
 """Of a group, those that show at once; all of them unfold."""
 MOST_PLACES = 300
 """Of a group, those that the page lists; more stand in `findings.csv` only."""
+MOST_ITEMS, NAMED_ITEMS = 48, 8
+"""Of a longer list in a document, such as the channels of an A-scan, the first stand there."""
 _WRITTEN = re.compile(r'<meta name="pictures" content="([^"]*)">')
 _TEMPORARY = OutputKind("a page in the making", Path.is_dir)
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
@@ -56,7 +51,10 @@ def write_report(folder: Path, report: Report) -> list[Path]:
     file stem.
     """
     names = [picture.name for picture in report.blocks(Picture)]
-    _check_names(names)
+    if len(set(names)) < len(names) or not all(map(_NAME.fullmatch, names)):
+        raise ValueError(
+            f"expected names of pictures that are plain file stems, each once: {names}"
+        )
     temporary = folder / f".{PAGE}.new"
     with disk_full_named(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -91,18 +89,9 @@ def _pictures_of(page: Path) -> set[str]:
     """Files of the pictures that were written with a page; of no page, none."""
     if not page.is_file():
         return set()
-    with page.open(encoding="utf-8", errors="replace") as file:
-        written = _WRITTEN.search(file.read(2**16))
+    written = _WRITTEN.search(page.read_text(encoding="utf-8", errors="replace"))
     names = written[1].split() if written else []
     return {f"{name}.png" for name in names if _NAME.fullmatch(name)}
-
-
-def _check_names(names: Sequence[str]) -> None:
-    for name in names:
-        if not _NAME.fullmatch(name):
-            raise ValueError(f"a picture's name is a plain file stem, found {name!r}")
-        if names.count(name) > 1:
-            raise ValueError(f"the picture {name!r} stands twice in the report")
 
 
 class _PageWriter:
@@ -110,7 +99,7 @@ class _PageWriter:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._anchors: set[str] = {"top"}
+        self._anchors = Counter(["top"])
         self._jinja = Environment(
             loader=FileSystemLoader(Path(__file__).parent / "templates"),
             autoescape=True,
@@ -118,14 +107,11 @@ class _PageWriter:
             trim_blocks=True,
             lstrip_blocks=True,
         )
-        self._jinja.filters |= {"prose": prose, "breakable": breakable, "place": place_of}
-        limits = {
-            "open": OPEN_GROUPS,
-            "named": NAMED_PLACES,
-            "listed": MOST_PLACES,
-            "findings": FINDINGS,
-        }
-        self._blocks: Any = self._jinja.get_template("blocks.html", globals=limits).module
+        self._jinja.filters |= {"prose": prose, "breakable": breakable}
+        self._jinja.filters |= {"place": place_of, "places": places_of}
+        limits = {"open": OPEN_GROUPS, "named": NAMED_PLACES, "listed": MOST_PLACES}
+        shown = {**limits, "findings": FINDINGS}
+        self._blocks: Any = self._jinja.get_template("blocks.html", globals=shown).module
 
     def html(self, report: Report, pictures: Sequence[str]) -> str:
         """The whole page; its pictures are written on the way."""
@@ -148,14 +134,11 @@ class _PageWriter:
 
     def _anchor(self, title: str) -> str:
         stem = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-") or "section"
-        anchor, count = stem, 1
-        while anchor in self._anchors:
-            count += 1
-            anchor = f"{stem}-{count}"
-        self._anchors.add(anchor)
-        return anchor
+        self._anchors[stem] += 1
+        count = self._anchors[stem]
+        return stem if count == 1 else f"{stem}-{count}"
 
-    def _block(self, block: Block) -> Markup:
+    def _block(self, block: blocks.Block) -> Markup:
         match block:
             case Text():
                 return self._blocks.text(block.words)
@@ -213,6 +196,8 @@ def _entry(depth: int, key: str, value: Any) -> list[tuple[int, str, str]]:
     if isinstance(value, list | tuple) and any(isinstance(item, Mapping | list) for item in value):
         inside = [line for item in value for line in _entry(depth + 1, "-", item)]
         return [(depth, key, ""), *inside]
+    if isinstance(value, list | tuple) and len(value) > MOST_ITEMS:
+        value = [*value[:NAMED_ITEMS], f"… {len(value):,} in all"]
     if isinstance(value, str) and value.isprintable() and value == value.strip() != "":
         return [(depth, key, value)]
     return [(depth, key, json.dumps(value, ensure_ascii=False, default=str))]

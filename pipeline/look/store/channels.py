@@ -6,7 +6,6 @@ from functools import partial
 from itertools import groupby
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -14,7 +13,7 @@ from pipeline.base.channels import PROFILE_CHANNELS, named, unnumbered
 from pipeline.base.issue import Issue
 from pipeline.data import Channels
 from pipeline.look.page.blocks import Block, Picture, Text
-from pipeline.look.page.style import GRID, PALETTE, canvas
+from pipeline.look.page.style import GRID, PALETTE, canvas, legend_below
 from pipeline.look.recording.channels import (
     ChannelStatistics,
     statistics_of,
@@ -61,7 +60,7 @@ def summarize_streams(
             values = values[rows]
             by_channel = tuple(statistics_of(stream, channels.names, channels.units, values))
             still = None if stream == "sensor" else still_channels(channels, values)
-            text = "" if still is None else still[1]
+            text = still[1] if still else ""
             statistics.append(StreamSummary(stream, total, len(rows), by_channel, text))
     return tuple(statistics)
 
@@ -75,14 +74,12 @@ def evenly(total: int, most: int) -> NDArray[np.int64]:
 def show_channels(statistics: Sequence[StreamSummary]) -> list[Block]:
     """How much was looked at, the profiles as a picture, and every channel in a table."""
     looked_at = ", ".join(
-        f"{summary.stream}: all {summary.rows:,} rows"
-        if summary.looked_at == summary.rows
-        else f"{summary.stream}: {summary.looked_at:,} of {summary.rows:,}, evenly spread"
+        f"{summary.looked_at:,} of {summary.rows:,} rows of {summary.stream}"
         for summary in statistics
     )
     table = statistics_table([channel for summary in statistics for channel in summary.channels])
     blocks: list[Block] = [
-        Text(f"Over the whole store, before any normalisation. Looked at: {looked_at}."),
+        Text(f"Of the whole store, before any normalisation. Looked at, evenly: {looked_at}."),
         replace(table, caption=table.caption.replace("Over the whole episode", "Physical units")),
     ]
     if profiles := list(find_profiles(statistics)):
@@ -96,10 +93,8 @@ def find_profiles(
 ) -> Iterator[tuple[ChannelStatistics, ...]]:
     """Runs of channels that make a profile, such as an A-scan."""
     for stream in statistics:
-        for _, run in groupby(
-            stream.channels, key=lambda channel: (unnumbered(channel.name), channel.unit)
-        ):
-            channels = tuple(run)
+        runs = groupby(stream.channels, lambda channel: (unnumbered(channel.name), channel.unit))
+        for channels in (tuple(run) for _, run in runs):
             if len(channels) >= PROFILE_CHANNELS:
                 yield channels
 
@@ -109,45 +104,42 @@ def draw_profiles(profiles: Sequence[Sequence[ChannelStatistics]]) -> Figure:
     figure = canvas(8.5, 0.6 + 2.6 * len(profiles))
     axes = figure.subplots(len(profiles), 1, squeeze=False)[:, 0]
     for axis, channels in zip(axes, profiles, strict=True):
-        _band(axis, channels)
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3)
+        at, first = np.arange(len(channels)), channels[0]
+        kinds = ("minimum", "low", "median", "high", "maximum")
+        minimum, low, median, high, maximum = (
+            [getattr(channel, kind) for channel in channels] for kind in kinds
+        )
+        axis.fill_between(at, minimum, maximum, color=GRID, label="least to greatest")
+        axis.fill_between(at, low, high, color=PALETTE[4], alpha=0.5, lw=0, label="1 to 99 %")
+        axis.plot(at, median, color=PALETTE[0], lw=1.2, label="median")
+        axis.set_ylabel(f"{first.stream} [{first.unit}]" if first.unit else first.stream)
+        axis.set_xlabel(f"channel: {first.name} to {channels[-1].name}")
+        axis.margins(x=0)
+    legend_below(figure, axes[0], 3)
     return figure
-
-
-def _band(axis: Axes, channels: Sequence[ChannelStatistics]) -> None:
-    at, first = np.arange(len(channels)), channels[0]
-    lines = [
-        (channel.minimum, channel.low, channel.median, channel.high, channel.maximum)
-        for channel in channels
-    ]
-    minimum, low, median, high, maximum = np.array(lines).T
-    axis.fill_between(at, minimum, maximum, color=GRID, label="least to greatest")
-    axis.fill_between(at, low, high, color=PALETTE[4], alpha=0.5, lw=0, label="1 to 99 %")
-    axis.plot(at, median, color=PALETTE[0], lw=1.2, label="median")
-    axis.set_ylabel(f"{first.stream} [{first.unit}]" if first.unit else first.stream)
-    axis.set_xlabel(f"channel: {first.name} to {channels[-1].name}")
-    axis.margins(x=0)
 
 
 def find_channel_issues(statistics: Sequence[StreamSummary]) -> Iterator[Issue]:
     """Channels that never change, hardly move, or hold what is no number."""
     for stream in statistics:
-        issue = partial(Issue, stream=stream.stream)
-        channels, names = stream.channels, [channel.name for channel in stream.channels]
+        names, rows = (
+            [channel.name for channel in stream.channels],
+            f"{stream.looked_at} rows looked at",
+        )
+        broken = [at for at, channel in enumerate(stream.channels) if not np.isfinite(channel.mean)]
         # The gripper of pose-derived actions is 1 by definition.
         flat = [
             at
-            for at, channel in enumerate(channels)
+            for at, channel in enumerate(stream.channels)
             if channel.minimum == channel.maximum
             and (channel.name, channel.minimum) != ("gripper", 1)
         ]
-        if flat:
-            text = f"{named(names, flat)}: one value in all {stream.looked_at} rows looked at"
-            yield issue(severity="warning", kind="flat channel", message=text)
-        if stream.still:
-            yield issue(severity="warning", kind="still channel", message=stream.still)
-        broken = [at for at, channel in enumerate(channels) if not np.isfinite(channel.mean)]
-        if broken:
-            text = f"{named(names, broken)}: NaN or infinite in {stream.looked_at} rows looked at"
-            yield issue(severity="error", kind="not finite", message=text)
+        texts = {
+            "flat channel": f"{named(names, flat)}: one value in all {rows}" if flat else "",
+            "still channel": stream.still,
+            "not finite": f"{named(names, broken)}: NaN or infinite in {rows}" if broken else "",
+        }
+        for kind, text in texts.items():
+            severity = "error" if kind == "not finite" else "warning"
+            if text:
+                yield Issue(severity=severity, kind=kind, message=text, stream=stream.stream)

@@ -1,7 +1,7 @@
 """Which VL rows of a store have equal keys: recordings that are there twice."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -75,17 +75,15 @@ def show_duplicates(duplicates: Duplicates, episodes: Sequence[EpisodeCoverage])
     )
     if not duplicates.pairs:
         return [text]
-    rows = [
-        (
-            *(episodes[pair.first].name, pair.rows[0], pair.time_s[0]),
-            *(episodes[pair.second].name, pair.rows[1], pair.time_s[1]),
-        )
-        for pair in duplicates.pairs[:_LISTED]
-    ]
-    count = len(duplicates.pairs)
-    shown = f"all {count:,}" if count <= _LISTED else f"the first {_LISTED} of {count:,}"
+    rows: list[tuple[object, ...]] = []
+    for pair in duplicates.pairs[:_LISTED]:
+        first, second = (episodes[index].name for index in (pair.first, pair.second))
+        rows.append((first, pair.rows[0], pair.time_s[0], second, pair.rows[1], pair.time_s[1]))
     heads = ("episode", "rows", "at [s]", "other episode", "rows ", "at [s] ")
-    return [text, Table(heads, rows, f"Rows with equal keys, in different episodes: {shown}.")]
+    return [
+        text,
+        Table(heads, rows, f"Rows with equal keys, by pairs of episodes, {_LISTED} at most."),
+    ]
 
 
 def find_duplicate_issues(
@@ -96,6 +94,5 @@ def find_duplicate_issues(
         if pair.share >= _SAME_SHARE:
             text = f"{pair.rows[0]} of its VL rows have the very frames and prompt of "
             text += f"{pair.rows[1]} rows of {episodes[pair.second].name}"
-            yield episodes[pair.first].issue(
-                "same recording", "vl/key", text, (pair.time_s[0], None)
-            )
+            issue = episodes[pair.first].issue("same recording", "vl/key", text)
+            yield replace(issue, start_s=pair.time_s[0])

@@ -1,21 +1,21 @@
 """What each episode of a store has: how long it is, which streams and views its ticks see."""
 
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import BoundaryNorm, ListedColormap
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from pipeline.base.issue import Issue, Severity
+from pipeline.base.issue import Issue
 from pipeline.base.table import Table
 from pipeline.look.page.blocks import Block, Picture
-from pipeline.look.page.style import INK, PALETTE, canvas
+from pipeline.look.page.style import INK, PALETTE, canvas, draw_map, shorten_middle
 from pipeline.store import Episode, FeatureStore, episode_name
 
 ROWS = 100
@@ -25,8 +25,9 @@ _GAP_STEPS = 5
 _RARE, _USUAL = 0.05, 0.8
 _SEEN = (("#D55E00", "absent"), ("#E69F00", "by some"), ("#0072B2", "seen by all ticks"))
 _NAMED_EPISODES = 16
-_NAME_ENDS = 6, 15
-"""Characters of a long name's begin and end that are shown."""
+
+
+Times = Sequence[float] | NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -50,32 +51,17 @@ class EpisodeCoverage:
         return slice(self.episode.ticks.start, self.episode.ticks.stop)
 
     def issue(
-        self,
-        kind: str,
-        stream: str,
-        message: str,
-        span: tuple[float | None, float | None] = (None, None),
-        severity: Severity = "warning",
+        self, kind: str, stream: str, text: str, times: Times = (), error: bool = False
     ) -> Issue:
-        """An issue of this episode; `span` is (start, stop) in s since its first tick."""
-        return Issue(
-            severity=severity,
-            kind=kind,
-            message=message,
-            source=self.episode.source,
-            episode=self.episode.id,
-            stream=stream,
-            start_s=span[0],
-            stop_s=span[1],
-        )
+        """An issue of this episode; `times` are (start, stop) in s since its first tick."""
+        start_s, stop_s = map(float, times) if len(times) else (None, None)
+        severity = "error" if error else "warning"
+        place = partial(Issue, source=self.episode.source, episode=self.episode.id, stream=stream)
+        return place(severity=severity, kind=kind, message=text, start_s=start_s, stop_s=stop_s)
 
 
-def read_coverage(store: FeatureStore) -> tuple[EpisodeCoverage, ...]:
-    """Every episode, in the order of the store."""
-    return tuple(_coverage_of(store, episode) for episode in store.episodes)
-
-
-def _coverage_of(store: FeatureStore, episode: Episode) -> EpisodeCoverage:
+def read_coverage(store: FeatureStore, episode: Episode) -> EpisodeCoverage:
+    """What an episode's ticks see."""
     ticks = slice(episode.ticks.start, episode.ticks.stop)
     time = store.array("tick/time")[ticks]
     seen = {
@@ -100,7 +86,7 @@ def show_coverage(episodes: Sequence[EpisodeCoverage]) -> list[Block]:
         counts = len(own.ticks), round(part.seconds, 2), len(own.vl_rows)
         rows.append((own.source, own.id, own.instruction, *counts, _lacking(part.covered)))
     return [
-        _sources(episodes),
+        _tabulate_sources(episodes),
         Picture(
             "coverage",
             "Length of each episode, and below it which streams and views its ticks see.",
@@ -110,7 +96,8 @@ def show_coverage(episodes: Sequence[EpisodeCoverage]) -> list[Block]:
     ]
 
 
-def _sources(episodes: Sequence[EpisodeCoverage]) -> Table:
+def _tabulate_sources(episodes: Sequence[EpisodeCoverage]) -> Table:
+    """A row a source; of several, their sum."""
     parts: dict[str, list[EpisodeCoverage]] = defaultdict(list)
     for episode in episodes:
         parts[episode.episode.source].append(episode)
@@ -120,14 +107,12 @@ def _sources(episodes: Sequence[EpisodeCoverage]) -> Table:
     for name, part in parts.items():
         own = [coverage.episode for coverage in part]
         seconds = round(sum(coverage.seconds for coverage in part), 1)
+        kinds = ("ticks", "vl_rows", "readings", "states")
+        counts = [sum(len(getattr(episode, kind)) for episode in own) for kind in kinds]
         formats = ", ".join(sorted({episode.format for episode in own}))
         instructions = len({episode.instruction for episode in own})
-        ticks, *counts = (
-            sum(len(getattr(episode, kind)) for episode in own)
-            for kind in ("ticks", "vl_rows", "readings", "states")
-        )
-        rows.append((name, formats, instructions, len(own), ticks, seconds, *counts))
-    heads = ("source", "format", "instructions", "episodes", "ticks", "length [s]", "VL rows")
+        rows.append((name, formats, instructions, len(own), seconds, *counts))
+    heads = ("source", "format", "instructions", "episodes", "length [s]", "ticks", "VL rows")
     strong = frozenset({len(rows) - 1} if len(parts) > 1 else ())
     return Table((*heads, "sensor readings", "state readings"), rows, strong=strong)
 
@@ -145,32 +130,23 @@ def _lacking(covered: Mapping[str, float]) -> str:
 def draw_coverage(episodes: Sequence[EpisodeCoverage]) -> Figure:
     """Length of each episode above, and below which streams and views its ticks see."""
     streams = list(episodes[0].covered)
-    source_of = [episode.episode.source for episode in episodes]
-    sources = list(dict.fromkeys(source_of))
+    source_of = np.array([episode.episode.source for episode in episodes])
+    sources = list(dict.fromkeys(source_of.tolist()))
+    seconds = np.array([episode.seconds for episode in episodes])
     figure = canvas(9.0, 3.8 + 0.3 * len(streams))
     ratios = (2.2, 0.3 * len(streams) + 0.2)
     above, below = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": ratios})
     for number, source in enumerate(sources):
-        own = [at for at, name in enumerate(source_of) if name == source]
-        seconds = [episodes[at].seconds for at in own]
-        above.bar(own, seconds, 0.9, color=PALETTE[number % len(PALETTE)], label=source)
+        own = np.flatnonzero(source_of == source)
+        above.bar(own, seconds[own], 0.9, color=PALETTE[number % len(PALETTE)], label=source)
     above.set_ylabel("length [s]")
     above.grid(axis="x", visible=False)
     shares = np.array([[episode.covered[name] for episode in episodes] for name in streams])
     # 0 absent, 1 seen by some ticks, 2 by all.
     levels = (shares > 0) + np.floor(shares)
-    mesh = below.pcolormesh(
-        np.arange(-0.5, len(episodes)),
-        np.arange(-0.5, len(streams)),
-        levels,
-        cmap=ListedColormap([colour for colour, _ in _SEEN]),
-        norm=BoundaryNorm([-0.5, 0.5, 1.5, 2.5], 3),
-        rasterized=True,
-    )
-    mesh.set_edgecolor("face")
+    colours = ListedColormap([colour for colour, _ in _SEEN])
+    draw_map(below, levels, (0, 2), colours, numbered=False)
     below.set_yticks(range(len(streams)), streams)
-    below.invert_yaxis()
-    below.grid(visible=False)
     mark_sources(below, episodes)
     patches = [Patch(color=colour, label=label) for colour, label in reversed(_SEEN)]
     figure.legend(handles=patches, loc="outside lower center", ncols=3)
@@ -186,21 +162,15 @@ def mark_sources(axis: Axes, episodes: Sequence[EpisodeCoverage], line: str = IN
     for start in starts[1:]:
         axis.axvline(start - 0.5, color=line, lw=1.0)
     if len(episodes) <= _NAMED_EPISODES:
-        names = [
-            _short(episode.episode.id if len(starts) == 1 else episode.name) for episode in episodes
-        ]
+        names = [part.episode.id if len(starts) == 1 else part.name for part in episodes]
+        # Both ends: where it belongs, and what tells it from its neighbours.
+        names = [shorten_middle(name, 6, 15) for name in names]
         axis.set_xticks(range(len(episodes)), names, rotation=45, ha="right")
         return
-    spans = list(zip(starts, [*starts[1:], len(episodes)], strict=True))
-    middles = [(start + stop - 1) / 2 for start, stop in spans]
-    axis.set_xticks(middles, [f"{sources[start]}\n{stop - start}" for start, stop in spans])
+    counts = np.diff([*starts, len(episodes)])
+    labels = [f"{sources[start]}\n{count}" for start, count in zip(starts, counts, strict=True)]
+    axis.set_xticks(starts + (counts - 1) / 2, labels)
     axis.set_xlabel("episodes, by source")
-
-
-def _short(name: str) -> str:
-    """Of a long name, both ends: where it belongs and what tells it from its neighbours."""
-    begin, end = _NAME_ENDS
-    return name if len(name) <= begin + end + 1 else f"{name[:begin]}…{name[-end:]}"
 
 
 def find_episode_issues(
@@ -210,36 +180,26 @@ def find_episode_issues(
     there = {name for episode in episodes for name, share in episode.covered.items() if share}
     for episode in episodes:
         time = store.array("tick/time")[episode.ticks]
-        yield from _gaps(episode, time)
+        steps = np.diff(time)
+        usual = float(np.median(steps)) if len(steps) else 0.0
+        gaps = np.flatnonzero(steps > _GAP_STEPS * usual)
+        if usual > 0 and len(gaps):
+            at = int(steps.argmax())
+            text = f"{len(gaps)} gap(s), the widest {steps[at]:.2f} s without a tick; a step is "
+            text += f"usually {usual:.3f} s"
+            yield episode.issue("gap", "ticks", text, time[[at, at + 1]] - time[0])
         if len(time) < FEW_TICKS:
             text = f"{len(time)} ticks ({episode.seconds:.1f} s); expected at least {FEW_TICKS}"
             yield episode.issue("short episode", "ticks", text)
-        if len(time):
-            yield from _missing(episode, there)
+        # An episode without a tick has no stream to miss.
+        for name, share in episode.covered.items() if len(time) else ():
+            stream = name if name in ("sensor", "state") else f"view {name}"
+            if name in there and not share:
+                yield episode.issue("missing", stream, "no tick sees it; other episodes have it")
+            elif 0 < share < 1:
+                text = f"only {share:.0%} of the ticks see it"
+                yield episode.issue("partly missing", stream, text)
     yield from _instructions(episodes)
-
-
-def _gaps(episode: EpisodeCoverage, time: NDArray[np.float64]) -> Iterator[Issue]:
-    """The widest gap of an episode's ticks."""
-    steps = np.diff(time)
-    usual = float(np.median(steps)) if len(steps) else 0.0
-    gaps = np.flatnonzero(steps > _GAP_STEPS * usual)
-    if usual > 0 and len(gaps):
-        at = int(steps.argmax())
-        text = f"{len(gaps)} gap{'s' * (len(gaps) > 1)}, the widest {steps[at]:.2f} s without a "
-        text += f"tick; a step is usually {usual:.3f} s"
-        span = (float(time[at] - time[0]), float(time[at + 1] - time[0]))
-        yield episode.issue("gap", "ticks", text, span)
-
-
-def _missing(episode: EpisodeCoverage, there: Collection[str]) -> Iterator[Issue]:
-    """Streams and views that others have, and this episode has not or not for all its ticks."""
-    for name, share in episode.covered.items():
-        stream = name if name in ("sensor", "state") else f"view {name}"
-        if name in there and not share:
-            yield episode.issue("missing", stream, "no tick sees it; other episodes have it")
-        elif 0 < share < 1:
-            yield episode.issue("partly missing", stream, f"only {share:.0%} of the ticks see it")
 
 
 def _instructions(episodes: Sequence[EpisodeCoverage]) -> Iterator[Issue]:

@@ -4,14 +4,13 @@ One slot of at most `inspect.points` VL rows is in memory at a time. Of augmente
 plain frames are looked at.
 """
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import groupby
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -23,11 +22,11 @@ from pipeline.base.errors import StoreIncomplete
 from pipeline.base.finite import non_finite
 from pipeline.base.issue import Issue
 from pipeline.look.page.blocks import Block, Picture, Text
-from pipeline.look.page.style import GRID, INK, PALETTE, canvas
+from pipeline.look.page.style import GRID, PALETTE, canvas, draw_map
 from pipeline.look.store.channels import evenly
 from pipeline.look.store.episodes import EpisodeCoverage, mark_sources
 from pipeline.store import FEATURES, FeatureStore, place
-from pipeline.store.chunks import row_checksums
+from pipeline.store.integrity.verification import CHANGED, UNWRITTEN, judge_rows
 from pipeline.store.repair_hints import mend
 
 DEAD = 1e-3
@@ -91,9 +90,10 @@ def sample_rows(store: FeatureStore, most: int) -> SampledRows:
 
 def check_rows(store: FeatureStore, rows: NDArray[np.int64]) -> None:
     """Raise `StoreIncomplete` where one of these VL rows does not give its checksum."""
-    features, wanted = store.array(FEATURES), store.array("vl/checksum")
-    for block in _blocks(rows, features[:1].nbytes):
-        bad = block[row_checksums(features[block]) != wanted[block]]
+    arrays = [store.array(name) for name in (FEATURES, "vl/checksum", "vl/slot_valid")]
+    for block in _blocks(rows, arrays[0][:1].nbytes):
+        faults = judge_rows(*(array[block] for array in arrays))
+        bad = block[faults[CHANGED] | faults[UNWRITTEN]]
         if len(bad):
             raise StoreIncomplete(
                 f"{store.path}: expected features that give their checksum, found {len(bad)} VL "
@@ -118,7 +118,8 @@ def look_at_features(store: FeatureStore, sampled: SampledRows) -> FeatureNorms:
         variation[slot] = _variation(values[valid])
         for episode in np.unique(sampled.episode[valid]):
             within[episode, slot] = _variation(values[valid & (sampled.episode == episode)])
-    names = slot_names(store)[:slots]  # variants repeat them
+    # Variants repeat the names.
+    names = tuple(_slot_name(document) for document in store.attrs["slots"][:slots])
     return FeatureNorms(sampled, names, norm, variation, within, broken)
 
 
@@ -129,12 +130,8 @@ def read_slot(store: FeatureStore, rows: NDArray[np.int64], slot: int) -> NDArra
     return np.concatenate(blocks).astype(np.float32, copy=False)
 
 
-def slot_names(store: FeatureStore) -> tuple[str, ...]:
-    """(slot,) of all variants, in a few words each."""
-    return tuple(_slot_name(document) for document in store.attrs["slots"])
-
-
 def _slot_name(document: Mapping[str, Any]) -> str:
+    """A slot of any variant, in a few words."""
     cell = ",".join(map(str, document.get("cell") or ()))
     layer = f"layer {document['layer']}{'' if document['norm'] else ' no norm'}"
     return " ".join(filter(None, (layer, document["pooling"], document.get("view"), cell)))
@@ -190,34 +187,25 @@ def draw_norms(norms: FeatureNorms, episodes: Sequence[EpisodeCoverage]) -> Figu
         left.plot(far, slot, "x", color=PALETTE[5], label="outlier", zorder=4)
     left.set_xlabel("norm of the features")
     left.set_ylim(slots - 0.5, -0.5)
-    _name_slots(left, norms.names)
-    _draw_by_episode(figure, right, norms, episodes, middle)
-    figure.legend(*left.get_legend_handles_labels(), loc="outside lower left", ncols=3)
-    return figure
-
-
-def _draw_by_episode(
-    figure: Figure,
-    axis: Axes,
-    norms: FeatureNorms,
-    episodes: Sequence[EpisodeCoverage],
-    middle: NDArray[np.float64],
-) -> None:
-    """The median length in each episode beside that over all, as a map."""
-    ratio = np.full((len(middle), len(episodes)), np.nan)
+    # Of many slots, the first of those that differ in their cell only.
+    stems = [re.sub(r" \d+,\d+$", "", name) for name in norms.names]
+    if slots <= _NAMED_SLOTS:
+        stems = norms.names
+    first = [number for number in range(slots) if stems[number] not in stems[:number]]
+    left.set_yticks(first, [stems[number] for number in first])
+    ratio = np.full((slots, len(episodes)), np.nan)
     for index in np.unique(norms.sampled.episode):
         (median,) = _quantiles(norms.norm[norms.sampled.episode == index], (0.5,))
         ratio[:, index] = median / middle
     most = max(0.02, *np.abs(ratio[np.isfinite(ratio)] - 1))
-    axis.set_facecolor(GRID)
-    image = axis.imshow(
-        ratio, _AROUND, aspect="auto", interpolation="nearest", vmin=1 - most, vmax=1 + most
-    )
-    axis.grid(visible=False)
-    axis.tick_params(left=False)
+    right.set_facecolor(GRID)
+    image = draw_map(right, ratio, (1 - most, 1 + most), _AROUND, numbered=False)
+    right.tick_params(left=False)
     # The map is light on a dark page too, where ink is white.
-    mark_sources(axis, episodes, "#222222")
-    figure.colorbar(image, ax=axis, label="median in the episode / in all", pad=0.02)
+    mark_sources(right, episodes, "#222222")
+    figure.colorbar(image, ax=right, label="median in the episode / in all", pad=0.02)
+    figure.legend(*left.get_legend_handles_labels(), loc="outside lower left", ncols=3)
+    return figure
 
 
 def _quantiles(norm: NDArray[np.float32], shares: Sequence[float]) -> NDArray[np.float64]:
@@ -226,28 +214,6 @@ def _quantiles(norm: NDArray[np.float32], shares: Sequence[float]) -> NDArray[np
     there = np.isfinite(norm).any(axis=0)
     out[:, there] = np.nanquantile(norm[:, there], shares, axis=0)
     return out
-
-
-def _name_slots(axis: Axes, names: Sequence[str]) -> None:
-    """Every slot where they are few, else runs that differ in their cell only."""
-    if len(names) <= _NAMED_SLOTS:
-        axis.set_yticks(range(len(names)), names)
-        return
-    middles: list[float] = []
-    labels: list[str] = []
-    start = 0
-    for stem, run in groupby(names, key=_without_cell):
-        count = len(list(run))
-        middles.append(start + (count - 1) / 2)
-        labels.append(stem if count == 1 else f"{stem} ({count})")
-        start += count
-        axis.axhline(start - 0.5, color=INK, lw=0.6)
-    axis.set_yticks(middles, labels)
-
-
-def _without_cell(name: str) -> str:
-    stem, _, last = name.rpartition(" ")
-    return stem if "," in last else name
 
 
 def find_outliers(norms: FeatureNorms) -> NDArray[np.float64]:
@@ -275,39 +241,25 @@ def find_feature_issues(
         text += "black?)"
         yield Issue(severity="warning", kind="dead slot", message=text, stream=FEATURES)
     far = find_outliers(norms)
+    still = (norms.within < DEAD) & (norms.variation >= DEAD)
     for index, episode in enumerate(episodes):
         own = np.flatnonzero(norms.sampled.episode == index)
-        if len(own):
-            yield from _issues_of(episode, norms, own, far)
-
-
-def _issues_of(
-    episode: EpisodeCoverage,
-    norms: FeatureNorms,
-    own: NDArray[np.int64],
-    far: NDArray[np.float64],
-) -> Iterator[Issue]:
-    """Of the rows `own` of an episode."""
-    time = norms.sampled.time[own]
-    row, slot = np.nonzero(norms.broken[own])
-    if len(row):
-        text = f"{len(np.unique(row))} VL row(s) with features that are NaN or infinite, the first "
-        text += f"in slot {norms.names[slot[0]]} at {time[row[0]]:.2f} s; left out of all that is "
-        text += "shown of features. Training refuses them: extract these rows anew"
-        span = (float(time[row[0]]), float(time[row[-1]]))
-        yield episode.issue("not finite", FEATURES, text, span, "error")
-    index = int(norms.sampled.episode[own[0]])
-    still = (norms.within[index] < DEAD) & (norms.variation >= DEAD)
-    if still.any() and len(own) >= _STILL_ROWS:
-        text = f"{named(norms.names, np.flatnonzero(still).tolist())}: the same in all {len(own)} "
-        text += "VL rows looked at of this episode; expected them to follow the scene"
-        yield episode.issue("still features", FEATURES, text)
-    row, slot = np.nonzero(far[own])
-    if len(row):
-        worst = far[own][row, slot].argmax()
-        column, name = norms.norm[:, slot[worst]], norms.names[slot[worst]]
-        text = f"{len(row)} feature norm(s) far from the rest, the furthest "
-        text += f"{column[own[row[worst]]]:.4g} in slot {name}, of which the median is "
-        text += f"{np.nanmedian(column):.4g}"
-        span = (float(time[row[0]]), float(time[row[-1]]))
-        yield episode.issue("feature norm", FEATURES, text, span)
+        time = norms.sampled.time[own]
+        if len(row := np.nonzero(norms.broken[own])[0]):
+            text = f"{len(np.unique(row))} VL row(s) with features that are NaN or infinite, the "
+            text += f"first in slot {norms.names[norms.broken[own[row[0]]].argmax()]} at "
+            text += f"{time[row[0]]:.2f} s; left out of all that is shown of features. Training "
+            text += "refuses them: extract these rows anew"
+            yield episode.issue("not finite", FEATURES, text, time[row[[0, -1]]], error=True)
+        if len(own) >= _STILL_ROWS and still[index].any():
+            text = f"{named(norms.names, np.flatnonzero(still[index]).tolist())}: the same in all "
+            text += f"{len(own)} VL rows looked at of this episode; expected them to follow the "
+            text += "scene"
+            yield episode.issue("still features", FEATURES, text)
+        if len(row := np.nonzero(far[own])[0]):
+            worst, slot = np.unravel_index(far[own].argmax(), far[own].shape)
+            column = norms.norm[:, slot]
+            text = f"{len(row)} feature norm(s) far from the rest, the furthest "
+            text += f"{column[own[worst]]:.4g} in slot {norms.names[slot]}, of which the median is "
+            text += f"{np.nanmedian(column):.4g}"
+            yield episode.issue("feature norm", FEATURES, text, time[row[[0, -1]]])

@@ -1,49 +1,32 @@
 """A store -> its page: what is in it, what looks wrong, and what it was made of."""
 
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from pipeline.base.config import InspectParams
 from pipeline.base.errors import StoreIncomplete
 from pipeline.base.format import duration, size
 from pipeline.base.issue import Issue
-from pipeline.look.page.blocks import Block, Document, Issues, Report, Section, Text
-from pipeline.look.store.ages import Ages, find_age_issues, read_ages, show_ages
-from pipeline.look.store.channels import (
-    StreamSummary,
-    find_channel_issues,
-    show_channels,
-    summarize_streams,
-)
-from pipeline.look.store.duplicates import (
-    Duplicates,
-    find_duplicate_issues,
-    find_duplicates,
-    show_duplicates,
-)
-from pipeline.look.store.episodes import (
-    EpisodeCoverage,
-    find_episode_issues,
-    read_coverage,
-    show_coverage,
-)
-from pipeline.look.store.features import (
-    FeatureNorms,
-    check_rows,
-    find_feature_issues,
-    look_at_features,
-    sample_rows,
-    show_features,
-)
-from pipeline.look.store.sizes import ArraySize, read_sizes, tabulate_sizes
+from pipeline.base.table import Table
+from pipeline.look.page.blocks import Document, Issues, Report, Section, Text
+from pipeline.look.store import ages, channels, duplicates, episodes, features
+from pipeline.look.store.ages import Ages
+from pipeline.look.store.channels import StreamSummary
+from pipeline.look.store.duplicates import Duplicates
+from pipeline.look.store.episodes import EpisodeCoverage
+from pipeline.look.store.features import FeatureNorms
 from pipeline.store import FeatureStore, check_trailers
 from pipeline.store.gather import WIDE
 from pipeline.store.repair_hints import extract_command
+from pipeline.store.schema import read_specs
 
-_CHANNELS = 16
-"""Of a stream, that its description names."""
+METADATA = "metadata"
+_NOTHING = (
+    "Nothing: clocks have no gaps, every stream is where others of its kind are, channels move, "
+    "features follow the scene, and no recording is there twice."
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +36,8 @@ class StoreView:
     store: FeatureStore
     episodes: tuple[EpisodeCoverage, ...]
     ages: Ages
-    sizes: tuple[ArraySize, ...]
+    sizes: Mapping[str, int]
+    """Bytes on the disk, as `read_sizes` gives them."""
     features: FeatureNorms
     duplicates: Duplicates
     statistics: tuple[StreamSummary, ...]
@@ -72,34 +56,26 @@ def inspect_store(path: str | Path, params: InspectParams) -> StoreView:
     Raises `StoreIncomplete` where it is not there, unfinished, damaged or without an episode,
     `StoreMismatch` where it is an archive or follows another schema, each saying what to run.
     """
-    store = _open_checked(Path(path))
-    sampled = sample_rows(store, params.points)
-    check_rows(store, sampled.rows)
-    episodes, age, statistics = read_coverage(store), read_ages(store), summarize_streams(store)
-    features, duplicates = look_at_features(store, sampled), find_duplicates(store)
-    issues = [
-        *find_episode_issues(store, episodes),
-        *find_age_issues(store, episodes, age),
-        *find_channel_issues(statistics),
-        *find_feature_issues(features, episodes),
-        *find_duplicate_issues(duplicates, episodes),
-    ]
-    sizes = read_sizes(store.path)
-    return StoreView(store, episodes, age, sizes, features, duplicates, statistics, tuple(issues))
-
-
-def _open_checked(path: Path) -> FeatureStore:
-    """A finished store with something in it, of which all but the wide arrays is as it was written.
-
-    All that is said of a store rests on its metadata and its narrow arrays.
-    """
     store = FeatureStore.open(path)
-    check_trailers(path, but=tuple(WIDE.values()))
+    check_trailers(store.path, but=tuple(WIDE.values()))
     if not len(store.array("vl/time")):
         raise StoreIncomplete(
-            f"{path}: expected VL rows to look at, found none. Run {extract_command(path)}."
+            f"{path}: expected VL rows to look at, found none. Run {extract_command(store.path)}."
         )
-    return store
+    sampled = features.sample_rows(store, params.points)
+    features.check_rows(store, sampled.rows)
+    coverage = tuple(episodes.read_coverage(store, episode) for episode in store.episodes)
+    age, statistics = ages.read_ages(store), channels.summarize_streams(store)
+    norms, same = features.look_at_features(store, sampled), duplicates.find_duplicates(store)
+    issues = (
+        *episodes.find_episode_issues(store, coverage),
+        *ages.find_age_issues(store, coverage, age),
+        *channels.find_channel_issues(statistics),
+        *features.find_feature_issues(norms, coverage),
+        *duplicates.find_duplicate_issues(same, coverage),
+    )
+    sizes = read_sizes(store.path)
+    return StoreView(store, coverage, age, sizes, norms, same, statistics, issues)
 
 
 def store_report(view: StoreView) -> Report:
@@ -107,6 +83,11 @@ def store_report(view: StoreView) -> Report:
     store = view.store
     rate = "as recorded" if store.action_hz is None else f"at {store.action_hz:g} Hz"
     reuse = store.vlm_reuse_count
+    documents = (
+        Document("Feature spec", store.spec),
+        Document("Streams", store.streams),
+        Document("Computed with", {"environments of VL rows": store.attrs["environment"]}),
+    )
     return Report(
         title=f"Store: {store.path.name}",
         summary=(
@@ -116,14 +97,14 @@ def store_report(view: StoreView) -> Report:
         ),
         tiles=_tiles(view),
         sections=(
-            Section("What looks wrong", [_issues(view), _checked(view)]),
-            Section("Coverage", show_coverage(view.episodes)),
-            Section("Age of the features", show_ages(view.ages)),
-            Section("Size", [tabulate_sizes(view.sizes)]),
-            Section("Features", show_features(view.features, view.episodes)),
-            Section("Duplicates", show_duplicates(view.duplicates, view.episodes)),
-            Section("Channels", show_channels(view.statistics)),
-            Section("What it was made of", _documents(store)),
+            Section("What looks wrong", [Issues(view.issues, _NOTHING), _checked(view)]),
+            Section("Coverage", episodes.show_coverage(view.episodes)),
+            Section("Age of the features", ages.show_ages(view.ages)),
+            Section("Size", [tabulate_sizes(store.path, view.sizes)]),
+            Section("Features", features.show_features(view.features, view.episodes)),
+            Section("Duplicates", duplicates.show_duplicates(view.duplicates, view.episodes)),
+            Section("Channels", channels.show_channels(view.statistics)),
+            Section("What it was made of", documents),
         ),
     )
 
@@ -134,17 +115,9 @@ def _tiles(view: StoreView) -> list[tuple[str, str]]:
         ("length", duration(sum(episode.seconds for episode in view.episodes))),
         ("ticks", f"{view.store.ticks:,}"),
         ("VL rows", f"{view.features.sampled.total:,}"),
-        ("on the disk", size(sum(array.disk_bytes for array in view.sizes))),
+        ("on the disk", size(sum(view.sizes.values()))),
         ("findings", f"{len(view.issues):,}"),
     ]
-
-
-def _issues(view: StoreView) -> Issues:
-    return Issues(
-        view.issues,
-        "Nothing: clocks have no gaps, every stream is where others of its kind are, channels "
-        "move, features follow the scene, and no recording is there twice.",
-    )
 
 
 def _checked(view: StoreView) -> Text:
@@ -153,35 +126,35 @@ def _checked(view: StoreView) -> Text:
     command = f"python -m stages.verify --set verify.store={view.store.path}"
     return Text(
         f"Metadata, clocks, offsets and the features of {rows} VL rows give the checksums that "
-        "were written with them. Those of sensor, state and actions were not read"
-        f"{'' if looked_at == total else ', nor those of the other rows'}: `{command}` reads every "
-        "byte."
+        f"were written with them; the rest was not read: `{command}` reads every byte."
     )
 
 
-def _documents(store: FeatureStore) -> list[Block]:
-    computed = {
-        f"VL rows {entry['rows'][0]} to {entry['rows'][1] - 1}": {
-            name: value for name, value in entry.items() if name != "rows"
-        }
-        for entry in store.attrs["environment"]
-    }
-    streams = {
-        name: document if name == "views" else _stream(document)
-        for name, document in store.streams.items()
-    }
-    return [
-        Document("Feature spec", store.spec),
-        Document("Streams", streams),
-        Document("Computed with", computed),
-    ]
+def read_sizes(path: Path) -> dict[str, int]:
+    """Bytes of the blocks that the files of each array take: values, padding and trailers.
+
+    The largest first; `metadata` are all files that are no chunk. Together they are all files below
+    `path`.
+    """
+    sizes: dict[str, int] = defaultdict(int)
+    for file in path.rglob("*"):
+        if file.is_file():
+            # The first two folders of a chunk's path name its array.
+            owner = "/".join(file.relative_to(path).parts[:2])
+            sizes[METADATA if file.name == "zarr.json" else owner] += file.stat().st_blocks * 512
+    return dict(sorted(sizes.items(), key=lambda item: -item[1]))
 
 
-def _stream(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Channels with their units; of a thousand, the first."""
-    pairs = list(zip(document["names"], document["units"], strict=True))
-    channels = {name: unit or "no unit" for name, unit in pairs[:_CHANNELS]}
-    if len(pairs) > _CHANNELS:
-        channels["…"] = f"{len(pairs) - _CHANNELS:,} more"
-    kind = {"kind": document["kind"]} if "kind" in document else {}
-    return {**kind, "channels": channels}
+def tabulate_sizes(path: Path, sizes: Mapping[str, int]) -> Table:
+    """A row an array of the store at `path`."""
+    specs, total = read_specs(path), sum(sizes.values())
+    rows: list[tuple[object, ...]] = []
+    for name, taken in sizes.items():
+        shape, dtype, chunks = "", "", 0
+        if name in specs:
+            spec = specs[name]
+            shape = " × ".join(f"{count:,}" for count in spec.shape)
+            dtype, chunks = spec.attributes.get("dtype", spec.dtype.name), spec.chunk_count
+        rows.append((name, shape, dtype, chunks, taken / 2**20, 100 * taken / total))
+    heads = ("array", "shape", "dtype", "chunks", "on the disk [MiB]", "share [%]")
+    return Table(heads, rows, "Bytes on the disk by array.")

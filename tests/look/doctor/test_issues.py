@@ -37,12 +37,10 @@ def only(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], None]:
 
 def test_lines_stay_within_the_width_and_words_whole() -> None:
     command = "pip install --force-reinstall torch --index-url https://a.example/" + "x" * 20
-    lines = described(
-        "A group", [ok("subject", "word " * 40), note("other", "found", command), ok("s", "")]
-    )
+    lines = described("A group", [ok("subject", "word " * 40), note("other", "found", command)])
     assert lines[0] == "A group" and lines[-1] == ""
     assert all(len(line) <= WIDTH for line in lines)
-    assert sum(line.startswith("  ok ") for line in lines) == 2
+    assert sum(line.startswith("  ok ") for line in lines) == 1
     assert "https://a.example/" + "x" * 20 in "\n".join(lines)
     starts = {line.index("word") for line in lines if "word" in line}
     assert starts == {30}, "found stands in one column"

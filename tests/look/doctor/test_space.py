@@ -71,7 +71,7 @@ def test_the_estimate_is_what_extraction_takes(
     }
     params = Params.model_validate(document)
     opened = open_recordings(params.data.sources, recordings)
-    read, bad = measure(opened.recordings, params)
+    read, bad = measure(opened.recordings, params.data)
     assert len(read) == 4 and not bad
     before = estimated_bytes(read, 4, params)
     assert estimated_bytes(read, 400, params) == pytest.approx(100 * before, rel=1e-2)
@@ -100,7 +100,7 @@ def test_without_recordings_the_size_is_not_known(tmp_path: Path, demo_checkpoin
         "vlm": {"checkpoint": str(demo_checkpoint)},
     }
     (issue,) = check(Params.model_validate(document))
-    assert issue.severity == "note" and "before the recordings can be read" in issue.message
+    assert issue.severity == "note" and "no episode could be read" in issue.message
 
 
 @pytest.mark.parametrize(("on_bad", "level"), [("stop", "error"), ("skip", "note")])

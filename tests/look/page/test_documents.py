@@ -20,6 +20,12 @@ def test_documents_keep_their_order_and_depth() -> None:
     ]
 
 
+def test_of_a_long_list_the_first_items_stand_there() -> None:
+    names = [f"sensor_{index}" for index in range(1026)]
+    ((_, key, value),) = document_lines({"names": names})
+    assert key == "names" and value.endswith('"sensor_7", "… 1,026 in all"]')
+
+
 def test_long_names_break_between_their_words() -> None:
     assert breakable("/lab/run_1<b>") == "/lab/<wbr>run_<wbr>1&lt;b&gt;"
 

@@ -74,7 +74,7 @@ def test_coverage_marks_what_is_absent(flawed):
     with mpl.rc_context(RC):
         above, below = EVERY["coverage"](flawed).axes
     assert sum(len(one) for one in above.containers) == 6
-    shown = np.asarray(below.collections[0].get_array()).reshape(3, 6)
+    shown = np.asarray(below.images[0].get_array())
     assert shown.tolist() == [[2] * 6, [2] * 6, [0, 2, 2, 2, 2, 2]]
     assert [label.get_text() for label in below.get_yticklabels()] == ["sensor", "state", "View1"]
 

@@ -17,7 +17,7 @@ from pipeline.base.errors import StoreIncomplete, StoreMismatch
 from pipeline.look.store.channels import summarize_streams
 from pipeline.look.store.episodes import EpisodeCoverage, find_episode_issues
 from pipeline.look.store.features import look_at_features, read_slot, sample_rows
-from pipeline.look.store.page import StoreView, inspect_store
+from pipeline.look.store.page import StoreView, inspect_store, tabulate_sizes
 from pipeline.store import Episode, FeatureStore
 from pipeline.store.metadata import note_metadata
 
@@ -74,21 +74,20 @@ class TestFacts:
         assert np.array_equal(found.newest, expected)
         rows = store.array("tick/vl_row")
         alone = store.array("tick/time") - store.array("vl/frame_time")[rows, 0]
-        assert np.allclose(found.by_view[:, 0], alone, equal_nan=True)
-        assert np.isnan(found.by_view[rows == 3]).all()
+        assert np.allclose(found.by_view["View1"], alone, equal_nan=True)
+        assert np.isnan(found.by_view["View1"][rows == 3]).all()
         assert found.period_s == pytest.approx(0.3)
 
     def test_sizes_are_all_bytes_on_the_disk(self, path):
         view = look(path)
         files = [Path(folder, name) for folder, _, names in os.walk(path) for name in names]
-        assert sum(one.disk_bytes for one in view.sizes) == sum(
-            file.stat().st_blocks * 512 for file in files
-        )
-        assert sum(one.chunks for one in view.sizes) == sum(
+        assert sum(view.sizes.values()) == sum(file.stat().st_blocks * 512 for file in files)
+        rows = {row[0]: row for row in tabulate_sizes(path, view.sizes).rows}
+        assert sum(row[3] for row in rows.values()) == sum(
             file.name != "zarr.json" for file in files
         )
-        features = next(one for one in view.sizes if one.name == "vl/features")
-        assert features.shape == FeatureStore.open(path).array("vl/features").shape
+        shape = FeatureStore.open(path).array("vl/features").shape
+        assert rows["vl/features"][1] == " × ".join(map(str, shape))
 
     def test_coverage_is_counted_by_episode(self, path, plant):
         plant(path, "vl/frame_time", lambda shown: shown.__setitem__(slice(0, ROWS // 2), np.nan))
