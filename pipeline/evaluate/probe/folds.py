@@ -59,23 +59,19 @@ def fold_by_recording(
             f"each is predicted from the others, found {recordings}. Add recordings to "
             "data.sources and run stages.extract, or set a shorter probe.horizon."
         )
-    notes = _notes(store, recordings, horizon)
     count = min(folds, recordings)
-    if count < folds:
-        notes.append(f"{recordings} recordings make {recordings} folds, not {folds}")
-    fold = part = _deal(group, count)
-    if count == 2:
-        # What is trained on is then a single fold, of which one half chooses the other's penalty.
-        part = 2 * fold
-        row = store.array("tick/vl_row")[ticks]
-        for held in range(2):
-            here = fold == held
-            several = len(np.unique(group[here])) > 1
-            part[here] += _deal(group[here] if several else row[here] > np.median(row[here]), 2)
+    notes = _notes(store, recordings, folds, horizon)
+    # Of two folds only one is trained on: one half of it chooses the other's penalty.
     parts = 4 if count == 2 else count
+    if recordings >= parts:
+        part = _deal(group, parts)
+    else:
+        part, row = 2 * _deal(group, 2), store.array("tick/vl_row")[ticks]
+        for held in (0, 2):
+            part += (part == held) & (row > np.median(row[part == held]))
     if max_ticks is not None and max_ticks < len(ticks):
         read = np.linspace(0, len(ticks) - 1, max_ticks).round().astype(np.int64)
-        ticks, fold, part = ticks[read], fold[read], part[read]
+        ticks, part = ticks[read], part[read]
         notes.append(f"{len(ticks)} of the ticks are read, evenly spread (probe.max_ticks)")
     if len(np.unique(part)) < parts:
         raise StoreMismatch(
@@ -83,30 +79,27 @@ def fold_by_recording(
             "what it would train on, has none. Give a store with more or longer recordings, a "
             "larger probe.max_ticks or a smaller probe.horizon."
         )
-    return ProbeFolds(ticks, fold, part, recordings, tuple(notes))
+    return ProbeFolds(ticks, part * count // parts, part, recordings, tuple(notes))
 
 
 def _deal(group: NDArray[np.generic], hands: int) -> NDArray[np.int64]:
     """(tick,) which hand has each: whole groups, in hands of about as many ticks."""
     hand = np.zeros(len(group), np.int64)
-    if len(np.unique(group)) < hands:
-        return hand
     for index, (_, held) in enumerate(GroupKFold(hands).split(group, groups=group)):
         hand[held] = index
     return hand
 
 
-def _notes(store: FeatureStore, recordings: int, horizon: int) -> list[str]:
-    """Why there are fewer ticks and recordings than the store has ticks and episodes."""
+def _notes(store: FeatureStore, recordings: int, folds: int, horizon: int) -> list[str]:
+    """Why there are fewer ticks, recordings and folds than one may expect."""
     notes = []
     if horizon > 1:
-        notes.append(
-            f"of {store.ticks} ticks, the last {horizon - 1} of each episode are left out, as "
-            f"their chunk of {horizon} would pass its end"
-        )
+        notes.append(f"the last {horizon - 1} ticks of each episode lack a whole chunk: left out")
     if recordings < len(store.episodes):
         notes.append(
             f"{len(store.episodes)} episodes make {recordings} recordings: those of one recording "
             f"in several formats count once, and those shorter than {horizon} ticks not at all"
         )
+    if recordings < folds:
+        notes.append(f"{recordings} recordings make {recordings} folds, not {folds}")
     return notes

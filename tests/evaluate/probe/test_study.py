@@ -9,19 +9,11 @@ import pytest
 
 from pipeline.base.config import ProbeParams
 from pipeline.base.errors import NumericsError
-from pipeline.evaluate.probe import (
-    ProbeFolds,
-    ProbeResult,
-    ProbeScore,
-    ProbeStudy,
-    SlotName,
-    advice,
-    metrics,
-    probe,
-    ranked,
-    recommend,
-    table,
-)
+from pipeline.evaluate.probe.folds import ProbeFolds
+from pipeline.evaluate.probe.inputs import SlotName
+from pipeline.evaluate.probe.ridge import ProbeScore
+from pipeline.evaluate.probe.study import ProbeResult, ProbeStudy, probe, ranked, recommend
+from pipeline.evaluate.probe.tables import advice, metrics, table
 from pipeline.store import FeatureStore
 
 PENALTIES = (1e-3, 1e-1, 1.0, 10.0)
@@ -203,7 +195,7 @@ def test_a_store_without_streams_is_ranked_alone(
     study = probed(FeatureStore.open(tiny_store(tmp_path, sensor_channels=0, state_dim=0)))
     assert study.streams is None
     assert all(one.beside is None and one.best is one.alone for one in study.slots)
-    assert "beside: " not in table(study)
+    assert "without features" not in table(study)
 
 
 def test_the_cheapest_of_those_that_are_tied_is_recommended(

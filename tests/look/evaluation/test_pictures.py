@@ -14,7 +14,10 @@ from matplotlib.figure import Figure
 from pipeline.evaluate.ablation import Ablated, AblationStudy
 from pipeline.evaluate.curves import TrainingCurve, TrainingCurves
 from pipeline.evaluate.experiments import Experiment
-from pipeline.evaluate.probe import ProbeFolds, ProbeResult, ProbeScore, ProbeStudy, SlotName
+from pipeline.evaluate.probe.folds import ProbeFolds
+from pipeline.evaluate.probe.inputs import SlotName
+from pipeline.evaluate.probe.ridge import ProbeScore
+from pipeline.evaluate.probe.study import ProbeResult, ProbeStudy
 from pipeline.look.evaluation import draw_probe as probe
 from pipeline.look.evaluation import pictures as plots
 from pipeline.look.page.style import write
