@@ -80,7 +80,7 @@ def table(study: ProbeStudy) -> str:
     single = [result for result in ranked(study.slots) if result.name != result.name.group]
     for result in [*ranked(study.groups), *single[:TOP]]:
         several = f" ({len(result.slots)} slots)" if len(result.slots) > 1 else ""
-        rows.append([result.name.label + several, result.inputs, result.valid_share])
+        rows.append([result.name.label + several, result.inputs, f"{result.valid_share:.0%}"])
         rows[-1] += [*_figures(result.alone), *_figures(result.beside), *study.gain(result)]
     heads = ["what is read", "inputs", "valid", "R2 alone", "+-", "R2 beside", "+-", "gain", "+-"]
     lines = [
