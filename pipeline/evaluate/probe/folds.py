@@ -13,18 +13,12 @@ from pipeline.train.split import episodes_by_recording
 
 @dataclass(frozen=True, eq=False)
 class ProbeFolds:
-    """The ticks that are read, ascending, the fold that holds each out, and its part of the fold.
-
-    The penalty is chosen by leaving out one part at a time of those that are trained on: a whole
-    fold, or a half where there are two folds only. No part divides a VL row.
-    """
+    """The ticks that are read, ascending, and the fold that holds each out."""
 
     ticks: NDArray[np.int64]
     """(tick,) store-global; the whole action chunk of each lies within its episode."""
     fold: NDArray[np.int64]
     """(tick,)"""
-    part: NDArray[np.int64]
-    """(tick,) counted over all folds."""
     recordings: int
     notes: tuple[str, ...]
     """What the reader of a score has to know about the folds."""
@@ -61,33 +55,20 @@ def fold_by_recording(
         )
     count = min(folds, recordings)
     notes = _notes(store, recordings, folds, horizon)
-    # Of two folds only one is trained on: one half of it chooses the other's penalty.
-    parts = 4 if count == 2 else count
-    if recordings >= parts:
-        part = _deal(group, parts)
-    else:
-        part, row = 2 * _deal(group, 2), store.array("tick/vl_row")[ticks]
-        for held in (0, 2):
-            part += (part == held) & (row > np.median(row[part == held]))
+    fold = np.empty(len(ticks), np.int64)
+    for index, (_, held) in enumerate(GroupKFold(count).split(group, groups=group)):
+        fold[held] = index
     if max_ticks is not None and max_ticks < len(ticks):
         read = np.linspace(0, len(ticks) - 1, max_ticks).round().astype(np.int64)
-        ticks, part = ticks[read], part[read]
+        ticks, fold = ticks[read], fold[read]
         notes.append(f"{len(ticks)} of the ticks are read, evenly spread (probe.max_ticks)")
-    if len(np.unique(part)) < parts:
+    if len(np.unique(fold)) < count:
         raise StoreMismatch(
-            f"{store.path}: too few ticks to hold recordings out in turn: one of {count} folds, or "
-            "what it would train on, has none. Give a store with more or longer recordings, a "
-            "larger probe.max_ticks or a smaller probe.horizon."
+            f"{store.path}: too few ticks to hold recordings out in turn: one of {count} folds has "
+            "none. Give a store with more or longer recordings, a larger probe.max_ticks or a "
+            "smaller probe.horizon."
         )
-    return ProbeFolds(ticks, part * count // parts, part, recordings, tuple(notes))
-
-
-def _deal(group: NDArray[np.generic], hands: int) -> NDArray[np.int64]:
-    """(tick,) which hand has each: whole groups, in hands of about as many ticks."""
-    hand = np.zeros(len(group), np.int64)
-    for index, (_, held) in enumerate(GroupKFold(hands).split(group, groups=group)):
-        hand[held] = index
-    return hand
+    return ProbeFolds(ticks, fold, recordings, tuple(notes))
 
 
 def _notes(store: FeatureStore, recordings: int, folds: int, horizon: int) -> list[str]:

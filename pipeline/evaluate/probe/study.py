@@ -107,9 +107,7 @@ def probe(store: FeatureStore, params: ProbeParams) -> ProbeStudy:
     targets = _targets(store, folds, params.horizon)
 
     def score(inputs: Inputs, known: Inputs | None = None, of_known: Sequence[float] = ()):
-        return cross_validate(
-            inputs, targets, folds.part, folds.fold, params.penalties, known, of_known
-        )
+        return cross_validate(inputs, targets, folds.fold, params.penalties, known, of_known)
 
     def result(own: tuple[int, ...]) -> ProbeResult:
         inputs, valid = read_slots(store, rows, folds.fold[first], own)

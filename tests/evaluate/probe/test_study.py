@@ -246,7 +246,7 @@ def study_of(
     known: ProbeScore | None, *groups: tuple[int, ProbeScore, ProbeScore | None]
 ) -> ProbeStudy:
     """Groups of so many slots, alone and beside what is known."""
-    folds = ProbeFolds(np.arange(45), np.arange(45) // 9, np.arange(45) // 9, 5, ())
+    folds = ProbeFolds(np.arange(45), np.arange(45) // 9, 5, ())
     results = tuple(
         ProbeResult(SlotName(layer, True, "mean"), tuple(range(slots)), 8, 8, 1.0, alone, beside)
         for layer, (slots, alone, beside) in enumerate(groups)

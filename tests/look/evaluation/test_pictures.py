@@ -409,7 +409,7 @@ def probed(streams: bool = True, layers: int = 2) -> ProbeStudy:
                 for pooling, count in (("mean", 1), ("view_mean", 2), ("grid", 8))
             ]
     fold = np.arange(30) // 10
-    folds = ProbeFolds(np.arange(30), fold, fold, 3, ())
+    folds = ProbeFolds(np.arange(30), fold, 3, ())
     known = score(0.2) if streams else None
     return ProbeStudy(2, ("dx",), folds, score(-0.01), known, 5, tuple(slots), tuple(groups))
 
