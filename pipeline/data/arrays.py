@@ -111,7 +111,7 @@ def read_csv(path: Path, columns: Sequence[str]) -> NDArray[np.float64]:
     Raises `RecordingError` naming missing columns, the line of a row that is longer or shorter than
     the header, or the line and column of a bad cell.
     """
-    header, (_, *lines) = csv_header(path), [*_csv_lines(path)] or [()]
+    header, lines = csv_header(path), [*_csv_lines(path)][1:]
     missing = [name for name in columns if name not in header]
     if missing:
         raise RecordingError(

@@ -69,8 +69,8 @@ def write_new(
         _write_state_csv(folder / "robot_states.csv", episode, time)
     else:
         states = episode.states(time)
-        members = {"robot_states": states, "joints": states[:, :6], "poses": states[:, 6:]}
-        np.savez_compressed(folder / "robot_states.npz", **members)
+        joints, poses, file = states[:, :6], states[:, 6:], folder / "robot_states.npz"
+        np.savez_compressed(file, robot_states=states, joints=joints, poses=poses)
     length, stride = windows
     # (window, channel, reading) -> (window, reading, channel)
     data = sliding_window_view(episode.sensor, length, axis=0)[::stride].transpose(0, 2, 1)
