@@ -38,7 +38,7 @@ def test_the_slot_that_carries_the_action_is_first(
     assert first.slots == (3,)
     assert first.alone.mean > 0.99
     gain = study.gain(first)
-    assert gain is not None and gain[0] > 0.9
+    assert gain[0] is not None and gain[0] > 0.9
     assert study.streams is not None
     assert abs(study.streams.mean) < 0.1
     for other in others:
