@@ -22,7 +22,8 @@ if __name__ == "__main__":  # here, for --help waits for no import below
 
 from pipeline.base.config import Params
 from pipeline.base.ownership import REPORT, claim, refuse_foreign, release
-from pipeline.evaluate.probe import advice, probe, table, write_tables
+from pipeline.evaluate.probe.study import probe
+from pipeline.evaluate.probe.tables import advice, table, write_tables
 from pipeline.look.evaluation.draw_probe import write_probe_plots
 from pipeline.store import FeatureStore, check_trailers
 

@@ -5,7 +5,7 @@ import json
 import math
 import zipfile
 import zlib
-from collections.abc import Collection, Generator, Mapping, Sequence
+from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -102,11 +102,7 @@ def _words(array: NDArray[Any], where: str) -> NDArray[Any]:
 
 def csv_header(path: Path) -> list[str]:
     """Column names of a CSV."""
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            return [name.strip() for name in next(csv.reader(file), [])]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise RecordingError(f"{path}: cannot be read as CSV: {error}") from None
+    return [name.strip() for name in next(_csv_lines(path), (0, []))[1]]
 
 
 def read_csv(path: Path, columns: Sequence[str]) -> NDArray[np.float64]:
@@ -115,64 +111,49 @@ def read_csv(path: Path, columns: Sequence[str]) -> NDArray[np.float64]:
     Raises `RecordingError` naming missing columns, the line of a row that is longer or shorter than
     the header, or the line and column of a bad cell.
     """
-    header = csv_header(path)
+    header, lines = csv_header(path), [*_csv_lines(path)][1:]
     missing = [name for name in columns if name not in header]
     if missing:
         raise RecordingError(
             f"{path}: missing column(s) {', '.join(missing)}; it has {_listed(header)}"
         )
-    places = [header.index(name) for name in columns]
+    places = {name: header.index(name) for name in columns}
+    table = np.empty((len(lines), len(columns)))
+    for values, (line, row) in zip(table, lines, strict=True):
+        _check_width(f"{path}, line {line}", row, header)
+        for index, (name, place) in enumerate(places.items()):
+            try:
+                values[index] = float(row[place])
+            except ValueError:
+                raise RecordingError(
+                    f"{path}, line {line}, column {name!r}: {row[place]!r} is not a number"
+                ) from None
+    return table
+
+
+def _csv_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Number and cells of each line that is not empty."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.reader(file)
-            next(reader)
-            lines = [(reader.line_num, row) for row in reader if row]
+            yield from ((reader.line_num, row) for row in reader if row)
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise RecordingError(f"{path}: cannot be read as CSV: {error}") from None
-    _check_widths(path, lines, header)
-    try:
-        table = np.array([[row[place] for place in places] for _, row in lines], np.float64)
-    except ValueError:
-        raise _bad_cell(path, lines, places, columns) from None
-    return table.reshape(len(lines), len(columns))
 
 
-_Lines = Sequence[tuple[int, Sequence[str]]]
-
-
-def _check_widths(path: Path, lines: _Lines, header: Sequence[str]) -> None:
+def _check_width(where: str, row: Sequence[str], header: Sequence[str]) -> None:
     """Raise `RecordingError` for a row of more or fewer cells than the header names.
 
     Which cell is missing or too many cannot be known, so every channel may be a neighbour's. Empty
     cells at the end, as a last comma makes them, shift nothing.
     """
     expected = len(header)
-    wrong = [
-        (line, len(row))
-        for line, row in lines
-        if len(row) != expected and any((*row[expected:], *header[len(row) :]))
-    ]
-    if wrong:
-        line, cells = wrong[0]
-        why = "the line is cut off" if cells < expected else "its channels would be shifted"
+    if len(row) != expected and any((*row[expected:], *header[len(row) :])):
+        why = "the line is cut off" if len(row) < expected else "its channels would be shifted"
         raise RecordingError(
-            f"{path}, line {line}: expected {expected} cells as in the header, found {cells}; "
-            f"{why} ({len(wrong)} such line(s) of {len(lines)}). Mend or delete the line"
+            f"{where}: expected {expected} cells as in the header, found {len(row)}; {why}. Mend "
+            "or delete the line"
         )
-
-
-def _bad_cell(
-    path: Path, lines: _Lines, places: Sequence[int], columns: Sequence[str]
-) -> RecordingError:
-    for line, row in lines:
-        for place, name in zip(places, columns, strict=True):
-            try:
-                float(row[place])
-            except ValueError:
-                return RecordingError(
-                    f"{path}, line {line}, column {name!r}: {row[place]!r} is not a number"
-                )
-    return RecordingError(f"{path}: cannot be read as a table of numbers")
 
 
 def read_json(path: Path) -> dict[str, Any]:

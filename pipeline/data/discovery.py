@@ -82,11 +82,12 @@ def episode_folders(source: Source, root: Path) -> list[tuple[Path, FormatReader
             )
         episodes = [pair for match in matches for pair in _episodes(match, source)]
         if not episodes:
-            hint = meant(matches[0])
+            wanted = [source.format] if source.format in READERS else list(READERS)
+            markers = ", or ".join(READERS[format].marker for format in wanted)
             raise RecordingError(
                 f"source {source.name!r}: {pattern!r} matches {len(matches)} folder(s), none with "
-                f"an episode in it; looked under {full} for folders with "
-                f"{_wanted_markers(source)}. {hint or 'Mend the path or format'}"
+                f"an episode in it; looked under {full} for folders with {markers}. "
+                f"{meant(matches[0]) or 'Mend the path or format'}"
             )
         for folder, reader in episodes:
             _check_name(source, folder)
@@ -202,9 +203,3 @@ def listing(folder: Path) -> list[str]:
         return os.listdir(folder)
     except OSError as error:
         raise RecordingError(f"{folder}: cannot be listed: {error}") from None
-
-
-def _wanted_markers(source: Source) -> str:
-    if source.format != "auto":
-        return READERS[source.format].marker
-    return ", or ".join(reader.marker for reader in READERS.values())

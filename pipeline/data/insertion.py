@@ -5,6 +5,7 @@ Channels, the task folder's name as instruction, JPEG views, robot states and se
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -47,13 +48,9 @@ class InsertionRecording(FileRecording):
         return Stream(POSES, state.time, np.ascontiguousarray(state.values[:, len(_JOINTS) :]))
 
     def files(self) -> list[Path]:
-        frames = [
-            path
-            for view, paths in self._view_files().items()
-            if self._wants(view)
-            for path in paths
-        ]
-        return sorted({*filter(None, self._data_files()), *frames})
+        data = (path for path in self._data_files() if path is not None and path.is_file())
+        views = (paths for view, paths in self._view_files().items() if self._wants(view))
+        return sorted({*data, *chain.from_iterable(views)})
 
     def all_views(self) -> Sequence[str]:
         return list(self._view_files())
@@ -62,8 +59,11 @@ class InsertionRecording(FileRecording):
         return absolute(self.path).parent.name.replace("_", " ")
 
     def _cameras(self) -> Mapping[str, CameraStream]:
-        wanted = {v: paths for v, paths in self._view_files().items() if self._wants(v)}
-        return {view: JpegCamera(view, paths) for view, paths in wanted.items()}
+        return {
+            view: JpegCamera(view, paths)
+            for view, paths in self._view_files().items()
+            if self._wants(view)
+        }
 
     @abstractmethod
     def _view_files(self) -> Mapping[str, list[Path]]:
@@ -71,13 +71,17 @@ class InsertionRecording(FileRecording):
 
     @abstractmethod
     def _data_files(self) -> Sequence[Path | None]:
-        """The files that are not frames; None for one that the episode does without."""
+        """Where files that are not frames are, or would be."""
 
 
-def promised(metadata: Mapping[str, Any], *keys: str) -> str:
-    """The first of these entries that there is, as text; '' where none is, or it says nothing."""
-    said = next(((key, metadata[key]) for key in keys if metadata.get(key) is not None), None)
-    return f"{said[0]} {said[1]}" if said and said[1] else ""
+def promised(metadata: Mapping[str, Any], **keys: Sequence[str]) -> dict[str, str]:
+    """What says that a stream was recorded, by stream: the first of its keys that there is."""
+    told: dict[str, str] = {}
+    for stream, names in keys.items():
+        said = [(key, metadata[key]) for key in names if metadata.get(key) is not None]
+        if said and said[0][1]:
+            told[stream] = f"{said[0][0]} {said[0][1]}"
+    return told
 
 
 def robot_state_file(folder: Path) -> Path | None:

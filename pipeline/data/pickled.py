@@ -89,11 +89,8 @@ class PickledRecording(InsertionRecording):
     def nominal(self) -> Nominal:
         """The streams that the pickle's metadata count; its rates are those of the clocks made."""
         metadata = self._metadata(self._document())
-        told = {
-            "sensor": promised(metadata, "has_sensor"),
-            "state": promised(metadata, "num_robot_states"),
-        }
-        return Nominal(streams={k: v for k, v in told.items() if v}, where=f"{MARKER}'s metadata")
+        told = promised(metadata, sensor=("has_sensor",), state=("num_robot_states",))
+        return Nominal(streams=told, where=f"{MARKER}'s metadata")
 
     def _document(self) -> Mapping[str, Any]:
         # Not kept: thousands of episodes stay open, and each pickle carries its sensor rows.
@@ -186,8 +183,7 @@ class PickledRecording(InsertionRecording):
         }
 
     def _data_files(self) -> Sequence[Path | None]:
-        sensor = self.path / _SENSOR_FILE
-        return [self._pickle, sensor if sensor.is_file() else None, robot_state_file(self.path)]
+        return [self._pickle, self.path / _SENSOR_FILE, robot_state_file(self.path)]
 
 
 def _pure(recorded: str) -> PurePath:

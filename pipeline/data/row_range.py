@@ -90,11 +90,9 @@ class RowFrames:
         Raises as `RowRange.of` and the recordings' `cameras` do.
         """
         for episode, inside in by_episode(rows, self.vl_start):
-            for start in range(0, len(inside), most or len(inside)):
-                part = inside[start : start + (most or len(inside))]
-                times = self.frame_time[part]
-                cameras = self._cameras(episode)
-                yield RowRange.of(self._recordings[episode], cameras, part, times, self._views)
+            recording, cameras = self._recordings[episode], self._cameras(episode)
+            for part in np.split(inside, range(most, len(inside), most) if most else []):
+                yield RowRange.of(recording, cameras, part, self.frame_time[part], self._views)
 
 
 def by_episode(
@@ -102,6 +100,5 @@ def by_episode(
 ) -> Iterator[tuple[int, NDArray[np.int64]]]:
     """The episodes that rows, ascending, are of, and the rows of each."""
     episode = np.searchsorted(vl_start, rows, side="right") - 1
-    for part in np.split(rows, np.flatnonzero(np.diff(episode)) + 1):
-        if len(part):
-            yield int(np.searchsorted(vl_start, part[0], side="right")) - 1, part
+    for index in np.unique(episode).tolist():
+        yield index, rows[episode == index]

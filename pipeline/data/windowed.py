@@ -82,18 +82,18 @@ class WindowedRecording(InsertionRecording):
     def nominal(self) -> Nominal:
         """Raises `RecordingError` where `metadata.json` counts frames in anything but a number."""
         rates = {"sensor": self._sensor_hz, "state": self._robot_hz}
-        told = {
-            "sensor": promised(self._metadata, "sensor_windows_count", "sensor_hz"),
-            "state": promised(self._metadata, "robot_states_count", "robot_hz"),
-        }
         frames = self._number("camera_frames_count")
         listed = self._metadata.get("camera_views")
         return Nominal(
-            {name: rate for name, rate in rates.items() if rate is not None},
-            {name: entry for name, entry in told.items() if entry},
-            tuple(map(str, listed)) if isinstance(listed, list) else (),
-            None if frames is None else int(frames),
-            MARKER,
+            rates_hz={name: rate for name, rate in rates.items() if rate is not None},
+            streams=promised(
+                self._metadata,
+                sensor=("sensor_windows_count", "sensor_hz"),
+                state=("robot_states_count", "robot_hz"),
+            ),
+            views=tuple(map(str, listed)) if isinstance(listed, list) else (),
+            frames=None if frames is None else int(frames),
+            where=MARKER,
         )
 
     def _recorded_instruction(self) -> str:
@@ -115,6 +115,4 @@ class WindowedRecording(InsertionRecording):
         return list_views(self.path / "images")
 
     def _data_files(self) -> Sequence[Path | None]:
-        sensor = self.path / _SENSOR_FILE
-        state = robot_state_file(self.path)
-        return [self._metadata_file, sensor if sensor.is_file() else None, state]
+        return [self._metadata_file, self.path / _SENSOR_FILE, robot_state_file(self.path)]

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.errors import RecordingError
+from pipeline.base.finite import first_non_finite
 from pipeline.data.arrays import Numbers
 
 _OVERLAP = 0.75
@@ -81,12 +82,9 @@ def _strides(
 
 def _check_finite(windows: Numbers, where: str) -> None:
     for index, window in enumerate(windows):
-        bad = ~np.isfinite(window)
-        if bad.any():
-            reading, channel = np.argwhere(bad)[0]
+        if (bad := first_non_finite(window)) is not None:
             raise RecordingError(
-                f"{where}: {window[reading, channel]} in window {index}, reading {reading}, "
-                f"channel {channel}"
+                f"{where}: {window[bad]} in window {index}, reading {bad[0]}, channel {bad[1]}"
             )
 
 

@@ -87,12 +87,11 @@ def evaluate_ablation(
     settled = _settled(store, ticks)
     if not len(settled):
         return None
-    notes: list[str] = []
-    if len(settled) < len(ticks):
-        notes.append(
-            f"intact is not the error above: {len(ticks) - len(settled)} of {len(ticks)} held-out "
-            "ticks are left out, so near their episode's start that a delay would reach beyond it"
-        )
+    left_out = len(ticks) - len(settled)
+    notes = [
+        f"intact is not the error above: {left_out} of {len(ticks)} held-out ticks are left "
+        "out, so near their episode's start that a delay would reach beyond it"
+    ] * (left_out > 0)
     count = min(len(settled), MOST_TICKS)
     ticks = settled[np.linspace(0, len(settled) - 1, count).round().astype(np.int64)]
     windows, device = Windows.of(checkpoint.params), next(policy.parameters()).device
@@ -104,21 +103,14 @@ def evaluate_ablation(
             ways.append((stream, how, feed_maker(store, windows, device, alter=alter)))
         for how, lags in delays(store, stream).items():
             ways.append((stream, how, feed_maker(store, windows, device, lags)))
+    seen = (store, ticks, windows, batch_size, checkpoint.normalization, False, samples)
     bar = tqdm(ways, "ablating streams", unit="way", disable=None if progress else True)
-    intact, *comparisons = (
-        evaluate_policy(
-            policy,
-            *(store, ticks, windows, batch_size, checkpoint.normalization),
-            samples=samples,
-            feed=feed,
-        )[0]
-        for *_, feed in bar
-    )
+    comparisons = [evaluate_policy(policy, *seen, feed)[0] for *_, feed in bar]
     ablated = (
         Ablated(stream, how, comparison)
-        for (stream, how, _), comparison in zip(ways[1:], comparisons, strict=True)
+        for (stream, how, _), comparison in zip(ways[1:], comparisons[1:], strict=True)
     )
-    return AblationStudy(intact, tuple(ablated), tuple(notes), samples)
+    return AblationStudy(comparisons[0], tuple(ablated), tuple(notes), samples)
 
 
 def feed_maker(
@@ -151,10 +143,7 @@ def _alterations(
     if _knows_missing(checkpoint, store, stream):
         ways["missing"] = missing(stream)
     else:
-        notes.append(
-            f"{stream} missing: not judged, for in training it never was (train_head."
-            f"drop_{stream} 0), so that the embedding for it has learned nothing"
-        )
+        notes.append(f"{stream} missing: not judged, as training never showed it (drop_{stream} 0)")
     donors = donors_of(store, ticks, stream)
     if donors is None:
         notes.append(f"{stream} shuffled: not judged, it takes two held-out episodes with it")
@@ -162,15 +151,7 @@ def _alterations(
         windows = Windows.of(checkpoint.params)
         ways["shuffled"] = exchanged(stream, store, windows, ticks, donors)
     if stream == "features":
-        late = list(delays(store, stream))
-        other = [f"{ms}" for ms in DELAYS_MS if f"delayed {ms} ms" not in late]
-        if other:
-            evaluated = ", ".join(how.removeprefix("delayed ") for how in late)
-            notes.append(
-                f"features delayed: they change every {_row_ms(store):.0f} ms only "
-                f"(vlm_reuse_count {store.vlm_reuse_count}) and go back whole VL rows, at least "
-                f"one: judged {evaluated}; {', '.join(other)} ms end within a row"
-            )
+        notes.append(f"features delayed: by whole VL rows, of {_row_ms(store):.0f} ms each")
     return ways, notes
 
 

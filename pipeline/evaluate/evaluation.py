@@ -65,31 +65,18 @@ def evaluate_checkpoint(
         f"{len(checkpoint.held_out_ticks)} episode(s) in {store.path}, device {device}, "
         f"{judged['policy']['samples']} chunk(s) a tick"
     )
+    seen = (policy, store, ticks, Windows.of(checkpoint.params), wanted.batch_size)
     comparison, predictions = evaluate_policy(
-        policy,
-        store,
-        ticks,
-        Windows.of(checkpoint.params),
-        wanted.batch_size,
-        checkpoint.normalization,
-        progress=True,
-        samples=wanted.samples,
+        *seen, checkpoint.normalization, progress=True, samples=wanted.samples
     )
     study = None
     if wanted.modalities:
         study = evaluate_ablation(
             checkpoint, policy, store, ticks, wanted.batch_size, wanted.samples, progress=True
         )
+    curves = read_curves(checkpoint)
     return Evaluation(
-        name=str(folder),
-        checkpoint=checkpoint,
-        store=store,
-        comparison=comparison,
-        predictions=predictions,
-        study=study,
-        judged=judged,
-        curves=read_curves(checkpoint),
-        recordings=recordings,
+        str(folder), checkpoint, store, comparison, predictions, study, judged, curves, recordings
     )
 
 

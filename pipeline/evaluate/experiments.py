@@ -24,16 +24,10 @@ _OVERALL = (OVERALL, "training std")
 _SAME = 1e-4
 """Relative difference of two baselines that rounding on another machine explains."""
 _SHARED = {
-    "on": (
-        "evaluations on the same held-out ticks",
-        "Evaluate all of them on the same recordings",
-    ),
-    "drawn": (
-        "evaluations of stochastic policies from as many samples and ticks a batch",
-        "Evaluate all of them with one evaluate.samples and evaluate.batch_size",
-    ),
+    "on": ("on the same held-out ticks", "recordings"),
+    "drawn": ("from as many samples and ticks a batch", "evaluate.samples and evaluate.batch_size"),
 }
-"""By key of `JUDGED`: what evaluations in one table share, and what to do where they do not."""
+"""By key of `JUDGED`: how evaluations in one table are alike, and by what they become so."""
 
 
 @dataclass(frozen=True)
@@ -86,23 +80,19 @@ def read_experiments(reports: Path) -> tuple[Experiment, ...]:
             f"{JUDGED}, found none. Run stages.evaluate for each with its own evaluate.output "
             "there, or dvc repro experiments/dvc.yaml."
         )
-    documents = {folder: _read_document(folder) for folder in folders}
-    for key in _SHARED:
-        alike = {f.name: what[key] for f, what in documents.items() if what[key] is not None}
-        for (name, what), (other, other_what) in pairwise(alike.items()):
+    documents, experiments = zip(*(_read_experiment(folder) for folder in folders), strict=True)
+    for key, (alike, remedy) in _SHARED.items():
+        pairs = zip(experiments, documents, strict=True)
+        shared = [(one.name, document[key]) for one, document in pairs if document[key] is not None]
+        for (name, what), (other, other_what) in pairwise(shared):
             if differing := differences(what, other_what):
-                expected, remedy = _SHARED[key]
                 lines = [f"  {line} ({other})" for line in describe(differing, f" ({name}), ")]
                 raise ConfigError(
-                    "\n".join(
-                        (
-                            f"compare.reports: expected {expected} in {reports}, but they differ:",
-                            *lines,
-                            f"{remedy}, or move those that do not belong away.",
-                        )
-                    )
+                    f"compare.reports: expected evaluations {alike} in {reports}, but:\n"
+                    + "\n".join(lines)
+                    + f"\nEvaluate all of them with one {remedy}, or move those that do not belong "
+                    "away."
                 )
-    experiments = [_experiment(folder, what["policy"]) for folder, what in documents.items()]
     for experiment, other in pairwise(experiments):
         _check_baselines(reports, experiment, other)
     return tuple(sorted(experiments, key=_order))
@@ -120,9 +110,9 @@ def experiment_table(experiments: Sequence[Experiment], trained: bool = False) -
     for experiment in experiments:
         errors = (experiment.errors[group]["policy"] for group in groups)
         kind = (experiment.model_type, experiment.fusion_strategy, experiment.samples)
-        seconds = None if experiment.training_s is None else round(experiment.training_s)
         rows.append([experiment.name, *errors, experiment.relative, *kind, experiment.parameters])
-        rows[-1].append(seconds)
+        seconds = experiment.training_s
+        rows[-1].append(None if seconds is None else round(seconds))
     for method in BASELINES:
         errors = (experiments[0].errors[group][method] for group in groups)
         rows.append([f"baseline: {HEADINGS[method]}", *errors, None, "", "", None, None, None])
@@ -155,16 +145,28 @@ def _key(group: tuple[str, str]) -> str:
     return OVERALL if group == _OVERALL else ActionGroup(*group, ()).key
 
 
-def _experiment(folder: Path, policy: Mapping[str, Any]) -> Experiment:
+def _read_experiment(folder: Path) -> tuple[dict[str, Any], Experiment]:
+    """What `JUDGED` says, and the experiment."""
+    file = folder / ERRORS
     try:
-        return Experiment(
-            name=folder.name,
-            errors=_read_errors(folder),
-            training_s=_training_seconds(Path(policy["logs"])),
-            **{key: value for key, value in policy.items() if key != "logs"},
-        )
-    except (KeyError, TypeError) as error:
-        raise _no_evaluation(folder, f"it lacks {error}") from None
+        rows = csv.DictReader(file.read_text(encoding="utf-8").splitlines())
+        errors = {
+            (row["group"], row["unit"]): {method: float(row[method]) for method in METHODS}
+            for row in rows
+        }
+        errors = {_OVERALL: errors.pop(_OVERALL), **errors}
+        file = folder / JUDGED
+        document = json.loads(file.read_text(encoding="utf-8"))
+        policy = dict(document["policy"])
+        seconds = _training_seconds(Path(policy.pop("logs")))
+        experiment = Experiment(folder.name, errors=errors, training_s=seconds, **policy)
+        return {key: document[key] for key in _SHARED}, experiment
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ConfigError(
+            f"compare.reports: expected the output of stages.evaluate in {folder}, but {file.name} "
+            f"cannot be read ({type(error).__name__}: {error}). Evaluate that experiment again "
+            "with this version, or move the folder away."
+        ) from None
 
 
 def _training_seconds(logs: Path) -> float | None:
@@ -174,19 +176,6 @@ def _training_seconds(logs: Path) -> float | None:
         return None
     rows = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines(), delimiter="\t"))
     return float(rows[-1]["trained_s"]) if rows and rows[-1].get("trained_s") else None
-
-
-def _read_errors(folder: Path) -> dict[tuple[str, str], dict[str, float]]:
-    """Of `OVERALL`, which comes first, and each action group, by method."""
-    rows = csv.DictReader(_read_text(folder, ERRORS).splitlines())
-    try:
-        errors = {
-            (row["group"], row["unit"]): {method: float(row[method]) for method in METHODS}
-            for row in rows
-        }
-    except ValueError as error:
-        raise _no_evaluation(folder, f"{ERRORS} cannot be read: {error}") from None
-    return {_OVERALL: errors.pop(_OVERALL), **errors}
 
 
 def _check_baselines(reports: Path, experiment: Experiment, other: Experiment) -> None:
@@ -203,38 +192,8 @@ def _check_baselines(reports: Path, experiment: Experiment, other: Experiment) -
                 )
 
 
-def _read_document(folder: Path) -> dict[str, Any]:
-    text = _read_text(folder, JUDGED)
-    try:
-        document = json.loads(text)
-    except ValueError as error:
-        raise _no_evaluation(folder, f"{JUDGED} is no JSON: {error}") from None
-    for key in ("policy", *_SHARED):
-        if key not in document:
-            raise _no_evaluation(folder, f"it lacks {key!r} in {JUDGED}")
-    return document
-
-
-def _read_text(folder: Path, name: str) -> str:
-    try:
-        return (folder / name).read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise _no_evaluation(folder, f"it has no {name}") from None
-
-
-def _no_evaluation(folder: Path, why: str) -> ConfigError:
-    return ConfigError(
-        f"compare.reports: expected the output of stages.evaluate in {folder}, but {why}. Evaluate "
-        "that experiment again with this version, or move the folder away."
-    )
-
-
 def _order(experiment: Experiment) -> tuple[int, int, str]:
-    """The order of params.yaml's choices, what is none of them last."""
+    """The order of params.yaml's choices."""
     experts, fusions = get_args(ModelType), get_args(FusionStrategy)
     expert, fusion = experiment.model_type, experiment.fusion_strategy
-    return (
-        experts.index(expert) if expert in experts else len(experts),
-        fusions.index(fusion) if fusion in fusions else len(fusions),
-        experiment.name,
-    )
+    return experts.index(expert), fusions.index(fusion), experiment.name

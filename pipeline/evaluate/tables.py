@@ -3,6 +3,8 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pipeline.base.channels import named
 from pipeline.base.durable import write_document
 from pipeline.base.table import Table
@@ -10,7 +12,7 @@ from pipeline.evaluate.ablation import AblationStudy
 from pipeline.evaluate.names import rounded, with_unit
 from pipeline.store import FeatureStore
 from pipeline.train.predictions import BASELINES, METHODS, Predictions
-from pipeline.train.scores import Comparison
+from pipeline.train.scores import ActionGroup, Comparison
 
 FOOTNOTE = (
     "repeat last: at an episode's first tick, which has none before it, it does nothing; where "
@@ -21,6 +23,7 @@ METRICS = "metrics.json"
 ERRORS = "errors.csv"
 """The file with the errors of all methods, a line an action group and one `OVERALL`."""
 OVERALL = "overall"
+_STD = "training std"
 HEADINGS = {
     "policy": "policy",
     "zero_action": "zero",
@@ -56,17 +59,23 @@ def best_baseline(comparison: Comparison) -> str:
 def error_table(comparison: Comparison) -> Table:
     """Mean absolute errors of policy and baselines, a row an action group, the overall one last."""
     rows = [
-        [
-            with_unit(group.name, group.unit),
-            *(comparison.group_mae(method, group) for method in METHODS),
-            comparison.relative(group),
-        ]
-        for group in comparison.groups
+        [_heading(group), *_errors(comparison, group), comparison.relative(group)]
+        for group in (*comparison.groups, None)
     ]
-    overall = (comparison.overall(method) for method in METHODS)
-    rows.append(["overall [training std]", *overall, comparison.relative()])
     heads = (HEADINGS[method] for method in METHODS)
     return Table(["mean absolute error", *heads, "policy / best"], rows)
+
+
+def _heading(group: ActionGroup | None) -> str:
+    """The name of a group with its unit, or of the overall error."""
+    return with_unit(OVERALL, _STD) if group is None else with_unit(group.name, group.unit)
+
+
+def _errors(comparison: Comparison, group: ActionGroup | None) -> list[float]:
+    """Of each method, in the group's unit; of None, overall."""
+    if group is None:
+        return [comparison.overall(method) for method in METHODS]
+    return [comparison.group_mae(method, group) for method in METHODS]
 
 
 def still_dimensions(comparison: Comparison) -> str:
@@ -74,16 +83,15 @@ def still_dimensions(comparison: Comparison) -> str:
     still = comparison.low_variance()
     if not still:
         return ""
-    names = named(comparison.names, list(still))
     largest = max(still, key=lambda index: comparison.scale[index] / still[index])
     moving = comparison.without_low_variance()
-    relative, best = moving.relative(), HEADINGS[best_baseline(moving)]
-    beside = "" if relative is None else f", {relative:.2f} times the best baseline's ({best})"
+    relative = moving.relative() or np.nan
     return (
-        f"hardly moving: {names} (training std at most {comparison.scale[largest]:.2g}, where "
-        f"{still[largest]:.2g} is usual for such dimensions), {len(still)} of the "
-        f"{len(comparison.varying())} dimensions in the overall error; without, it is "
-        f"{moving.overall('policy'):.3f}{beside}"
+        f"hardly moving: {named(comparison.names, list(still))} (training std at most "
+        f"{comparison.scale[largest]:.2g}, where {still[largest]:.2g} is usual for such "
+        f"dimensions), {len(still)} of the {len(comparison.varying())} dimensions in the overall "
+        f"error; without, it is {moving.overall('policy'):.3f}, {relative:.2f} times the best "
+        f"baseline's ({HEADINGS[best_baseline(moving)]})"
     )
 
 
@@ -98,19 +106,18 @@ def ablation_table(study: AblationStudy) -> Table:
 
     Two words, the errors of each group and the overall one, and the latter's multiple of intact.
     """
+    best, intact = best_baseline(study.intact), study.intact.overall("policy")
     groups = study.intact.varying_groups()
-
-    def row(stream: str, how: str, comparison: Comparison, method: str = "policy") -> list[Any]:
-        overall, intact = comparison.overall(method), study.intact.overall("policy")
+    ways = [("all", "intact", study.intact, "policy")]
+    ways += [(way.stream, way.how, way.comparison, "policy") for way in study.ablated]
+    ways.append(("none", best.replace("_", " "), study.intact, best))
+    rows: list[list[Any]] = []
+    for stream, how, comparison, method in ways:
         errors = (comparison.group_mae(method, group) for group in groups)
-        return [stream, how, *errors, overall, overall / intact if intact > 0 else None]
-
-    best = best_baseline(study.intact)
-    rows = [row("all", "intact", study.intact)]
-    rows += [row(ablated.stream, ablated.how, ablated.comparison) for ablated in study.ablated]
-    rows.append(row("none", best.replace("_", " "), study.intact, best))
-    names = (with_unit(group.name, group.unit) for group in groups)
-    heads = ["stream", "policy sees it", *names, "overall [training std]", "times intact"]
+        overall = comparison.overall(method)
+        rows.append([stream, how, *errors, overall, overall / intact if intact > 0 else None])
+    names = map(_heading, (*groups, None))
+    heads = ["stream", "policy sees it", *names, "times intact"]
     return Table(heads, rows, caption=ABLATION_FOOTNOTE, strong=frozenset({0}))
 
 
@@ -142,7 +149,7 @@ def write_tables(
     point, as `dvc plots` takes them; the rest is for others.
     """
     files = {
-        ERRORS: _errors(comparison),
+        ERRORS: _group_errors(comparison),
         "dimensions.csv": _dimensions(comparison),
         "horizon.csv": _horizon(comparison),
         "steps.csv": _steps(comparison),
@@ -155,44 +162,40 @@ def write_tables(
     return [folder / METRICS, *(files[name].write_csv(folder / name) for name in files)]
 
 
-def _errors(comparison: Comparison) -> Table:
+def _group_errors(comparison: Comparison) -> Table:
     rows: list[list[Any]] = [
         [
-            *(group.name, group.unit),
-            *(comparison.group_mae(method, group) for method in METHODS),
+            group.name,
+            group.unit,
+            *_errors(comparison, group),
             comparison.group_rmse("policy", group),
         ]
         for group in comparison.groups
     ]
-    overall = (comparison.overall(method) for method in METHODS)
-    rows.append([OVERALL, "training std", *overall, None])
+    rows.append([OVERALL, _STD, *_errors(comparison, None), None])
     return Table(["group", "unit", *METHODS, "policy_rmse"], rows)
 
 
 def _dimensions(comparison: Comparison) -> Table:
     scores = [comparison.scores[method] for method in METHODS]
+    errors = np.array([*(score.mae for score in scores), *(score.rmse for score in scores)])
     rows = [
-        [
-            *(name, unit),
-            *(score.mae[index] for score in scores),
-            *(score.rmse[index] for score in scores),
-        ]
-        for index, (name, unit) in enumerate(zip(comparison.names, comparison.units, strict=True))
+        [*dimension, *values]
+        for *dimension, values in zip(
+            comparison.names, comparison.units, errors.T.tolist(), strict=True
+        )
     ]
-    errors = (f"{method}_{error}" for error in ("mae", "rmse") for method in METHODS)
-    return Table(["dimension", "unit", *errors], rows)
+    heads = (f"{method}_{error}" for error in ("mae", "rmse") for method in METHODS)
+    return Table(["dimension", "unit", *heads], rows)
 
 
 def _horizon(comparison: Comparison) -> Table:
     scores = [comparison.scores[method] for method in METHODS]
+    errors = [*(score.mae_horizon for score in scores), *(score.rmse_horizon for score in scores)]
     rows = [
-        [
-            *(step, name, unit),
-            *(score.mae_horizon[step, index] for score in scores),
-            *(score.rmse_horizon[step, index] for score in scores),
-        ]
-        for step in range(len(scores[0].mae_horizon))
-        for index, (name, unit) in enumerate(zip(comparison.names, comparison.units, strict=True))
+        [step, *dimension, *values]
+        for step, of_step in enumerate(np.stack(errors, axis=-1).tolist())
+        for *dimension, values in zip(comparison.names, comparison.units, of_step, strict=True)
     ]
     rmse = (f"{method}_rmse" for method in METHODS)
     return Table(["steps_ahead", "dimension", "unit", *METHODS, *rmse], rows)
@@ -201,8 +204,8 @@ def _horizon(comparison: Comparison) -> Table:
 def _steps(comparison: Comparison) -> Table:
     """The overall error [training std] by steps ahead."""
     scores = [comparison.scores[method].mae_horizon for method in METHODS]
-    errors = [comparison.in_training_std(score).mean(axis=-1).tolist() for score in scores]
-    rows = [[step, *values] for step, values in enumerate(zip(*errors, strict=True))]
+    errors = np.array([comparison.in_training_std(score).mean(axis=-1) for score in scores])
+    rows = [[step, *values] for step, values in enumerate(errors.T.tolist())]
     return Table(["steps_ahead", *METHODS], rows)
 
 
@@ -219,13 +222,13 @@ def _episodes(comparison: Comparison, store: FeatureStore) -> Table:
 
 
 def _predictions(comparison: Comparison, predictions: Predictions, store: FeatureStore) -> Table:
-    rows: list[list[Any]] = []
     time_s = store.array("tick/time")[predictions.ticks]
-    for place, index in enumerate(predictions.episodes):
-        episode = store.episodes[index]
-        pairs = zip(predictions.recorded[place, 0], predictions.predicted[place, 0], strict=True)
-        values = (value for pair in pairs for value in pair)
-        rows.append([episode.source, episode.id, f"{time_s[place]:.3f}", *values])
+    first = np.stack([predictions.recorded[:, 0], predictions.predicted[:, 0]], axis=-1)
+    episodes = (store.episodes[index] for index in predictions.episodes)
+    rows = [
+        [episode.source, episode.id, f"{time:.3f}", *values.flat]
+        for episode, time, values in zip(episodes, time_s, first, strict=True)
+    ]
     columns = (f"{name}_{what}" for name in comparison.names for what in ("recorded", "predicted"))
     return Table(["source", "episode", "time_s", *columns], rows)
 
@@ -234,25 +237,24 @@ def _ablation_errors(study: AblationStudy | None) -> Table:
     """Error by stream, way to ablate it, and action group."""
     rows: list[list[Any]] = []
     if study is not None:
-        best = best_baseline(study.intact)
-        for ablated in study.ablated:
-            named = (ablated.stream, ablated.how)
-            compared = [(ablated.comparison, "policy"), (study.intact, "policy")]
-            compared.append((study.intact, best))
-            for group in study.intact.groups:
-                errors = (comparison.group_mae(method, group) for comparison, method in compared)
-                rows.append([*named, group.name, group.unit, *errors])
-            overall = (comparison.overall(method) for comparison, method in compared)
-            rows.append([*named, OVERALL, "training std", *overall])
+        best = METHODS.index(best_baseline(study.intact))
+        for way in study.ablated:
+            for group in (*study.intact.groups, None):
+                name = (OVERALL, _STD) if group is None else (group.name, group.unit)
+                error, intact = _errors(way.comparison, group)[0], _errors(study.intact, group)
+                rows.append([way.stream, way.how, *name, error, intact[0], intact[best]])
     errors = ("error", "intact_error", "best_baseline_error")
     return Table(["stream", "how", "group", "unit", *errors], rows)
 
 
 def _streams(study: AblationStudy | None) -> Table:
     """The overall error by way to ablate a stream, and what of the intact."""
-    rows: list[list[Any]] = []
-    if study is not None:
-        for ablated in study.ablated:
-            errors = (study.times_intact(ablated), ablated.comparison.overall("policy"))
-            rows.append([f"{ablated.stream} {ablated.how}", *errors])
+    rows = (
+        []
+        if study is None
+        else [
+            [f"{way.stream} {way.how}", study.times_intact(way), way.comparison.overall("policy")]
+            for way in study.ablated
+        ]
+    )
     return Table(["spoilt", "times_intact", "overall_error"], rows)

@@ -9,6 +9,7 @@ other params are replaced, and nothing that the demo did not write is ever touch
 import json
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -77,24 +78,23 @@ def _simulated(number: int, episodes: int, seed: int, progress: "tqdm[Any]") -> 
         progress.update()
 
 
+def _write_episodes(
+    write: Callable[[Path, SimulatedEpisode], None], folder: Path, episodes: Episodes
+) -> None:
+    for episode in episodes:
+        write(folder / TASK, episode)
+
+
 def _write_new_set(folder: Path, episodes: Episodes) -> None:
     for index, episode in enumerate(episodes):
         windows = OVERLAPPING if index % _OVERLAPPING_EVERY == 1 else ABUTTING
         write_new(folder / TASK, episode, windows, index % _ROBOT_CLOCK_EVERY == 2)
 
 
-def _each(write: Callable[[Path, SimulatedEpisode], None]) -> Write:
-    def write_set(folder: Path, episodes: Episodes) -> None:
-        for episode in episodes:
-            write(folder / TASK, episode)
-
-    return write_set
-
-
 _SETS: Final[dict[str, Write]] = {
-    "raw": _each(write_raw),
+    "raw": partial(_write_episodes, write_raw),
     "new": _write_new_set,
-    "old": _each(write_old),
+    "old": partial(_write_episodes, write_old),
     "lerobot": write_lerobot,
 }
 
@@ -102,10 +102,16 @@ _SETS: Final[dict[str, Write]] = {
 def _finished_sets(root: Path, wanted: dict[str, int]) -> list[str]:
     """The sets already there as wanted, after removing the demo's own that are not."""
     refuse_foreign(root, "demo.recordings")
-    if not (root / MARKER).exists():
+    path = root / MARKER
+    if not path.exists():
         return []
-    marked = _marked(root)
-    written = [name for name in marked["sets"] if (root / name).is_dir()]
+    try:
+        marked = json.loads(path.read_text(encoding="utf-8"))
+        written = [name for name in marked["sets"] if (root / name).is_dir()]
+    except (ValueError, KeyError, TypeError) as error:
+        raise ConfigError(
+            f"{path}: expected a JSON object with 'sets' ({error}); remove {root} and run again"
+        ) from None
     strange = [name for name in _SETS if (root / name).exists() and name not in written]
     if strange:
         raise ConfigError(
@@ -126,17 +132,6 @@ def refuse_foreign(folder: Path, setting: str) -> None:
             f"{folder} is there and has no {MARKER}: the demo did not write it and leaves it "
             f"alone; move it away, or set {setting} to another folder"
         )
-
-
-def _marked(root: Path) -> dict[str, Any]:
-    path = root / MARKER
-    try:
-        marked = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ConfigError(f"{path}: not JSON ({error}); remove {root} and run again") from None
-    if not isinstance(marked, dict) or not isinstance(marked.get("sets"), list):
-        raise ConfigError(f"{path}: expected an object with 'sets'; remove {root} and run again")
-    return marked
 
 
 def _mark(root: Path, wanted: dict[str, int], finished: list[str]) -> None:

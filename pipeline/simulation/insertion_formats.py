@@ -5,7 +5,6 @@ Each writes one episode into its task's folder, as that generation of the record
 
 import json
 import pickle
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
@@ -70,12 +69,8 @@ def write_new(
         _write_state_csv(folder / "robot_states.csv", episode, time)
     else:
         states = episode.states(time)
-        np.savez_compressed(
-            folder / "robot_states.npz",
-            robot_states=states,
-            joints=states[:, :6],
-            poses=states[:, 6:],
-        )
+        joints, poses, file = states[:, :6], states[:, 6:], folder / "robot_states.npz"
+        np.savez_compressed(file, robot_states=states, joints=joints, poses=poses)
     length, stride = windows
     # (window, channel, reading) -> (window, reading, channel)
     data = sliding_window_view(episode.sensor, length, axis=0)[::stride].transpose(0, 2, 1)
@@ -130,37 +125,25 @@ def write_old(task: Path, episode: SimulatedEpisode) -> None:
         "image": images,
         "sensor_data": {"force": sensor[:, :1].copy(), "fpi": sensor[:, 1:].copy()},
         "instruction": INSTRUCTION,
-        "metadata": _old_metadata(folder.name, rows, len(states), episode),
+        "metadata": {
+            "episode_name": folder.name,
+            "robot_hz": float(STATE_HZ),
+            "action_hz": float(TICK_HZ),
+            "num_actions": rows,
+            "num_robot_states": len(states),
+            "duration_seconds": episode.duration_s,
+            "has_sensor": True,
+        },
     }
     (folder / "data.pkl").write_bytes(pickle.dumps(document, protocol=4))
-
-
-def _old_metadata(
-    name: str, actions: int, states: int, episode: SimulatedEpisode
-) -> Mapping[str, object]:
-    return {
-        "episode_name": name,
-        "robot_hz": float(STATE_HZ),
-        "action_hz": float(TICK_HZ),
-        "num_actions": actions,
-        "num_robot_states": states,
-        "duration_seconds": episode.duration_s,
-        "has_sensor": True,
-    }
 
 
 def _write_state_csv(path: Path, episode: SimulatedEpisode, time: NDArray[np.float64]) -> None:
     header = ("recv_timestamp", CLOCK, "send_timestamp", "force_placeholder", *STATE.names)
     clocks = [time + 0.004, time, time + 0.002, np.zeros(len(time))]
     table = np.column_stack([*clocks, episode.states(time)])
-    np.savetxt(
-        path,
-        table,
-        delimiter=",",
-        header=",".join(header),
-        comments="",
-        fmt=["%.6f"] * 3 + ["%.1f"] + ["%.5f"] * len(STATE.names),
-    )
+    formats = ["%.6f"] * 3 + ["%.1f"] + ["%.5f"] * len(STATE.names)
+    np.savetxt(path, table, formats, delimiter=",", header=",".join(header), comments="")
 
 
 def _write_frames(

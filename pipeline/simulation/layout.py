@@ -118,11 +118,6 @@ def _orientations(
 
 
 def _tissue(rng: np.random.Generator) -> Tissue:
-    return Tissue(
-        stiffness_n_mm=float(rng.uniform(0.9, 1.3)),
-        stiffening_n_mm2=float(rng.uniform(0.5, 0.9)),
-        puncture_n=float(rng.uniform(0.9, 1.3)),
-        cutting_n=float(rng.uniform(0.2, 0.3)),
-        friction_n_mm=float(rng.uniform(0.1, 0.18)),
-        layer_depth_mm=float(rng.uniform(2.0, 3.2)),
-    )
+    """Drawn field by field, in their order."""
+    ranges = [(0.9, 1.3), (0.5, 0.9), (0.9, 1.3), (0.2, 0.3), (0.1, 0.18), (2.0, 3.2)]
+    return Tissue(*(float(rng.uniform(*within)) for within in ranges))

@@ -49,15 +49,14 @@ def write_lerobot(root: Path, episodes: Iterable[SimulatedEpisode]) -> None:
         statistics.append(_statistics(columns, frames))
     meta = root / "meta"
     meta.mkdir()
-    _write_lines(meta / "tasks.jsonl", [{"task_index": 0, "task": INSTRUCTION}])
-    _write_lines(
-        meta / "episodes.jsonl",
-        [{"episode_index": i, "tasks": [INSTRUCTION], "length": n} for i, n in enumerate(lengths)],
-    )
-    _write_lines(
-        meta / "episodes_stats.jsonl",
-        [{"episode_index": i, "stats": stats} for i, stats in enumerate(statistics)],
-    )
+    told = {"tasks": [INSTRUCTION]}
+    for name, rows in {
+        "tasks": [{"task_index": 0, "task": INSTRUCTION}],
+        "episodes": [{"episode_index": i, **told, "length": n} for i, n in enumerate(lengths)],
+        "episodes_stats": [{"episode_index": i, "stats": s} for i, s in enumerate(statistics)],
+    }.items():
+        lines = "".join(json.dumps(row) + "\n" for row in rows)
+        (meta / f"{name}.jsonl").write_text(lines, encoding="utf-8")
     (meta / "info.json").write_text(json.dumps(_info(lengths), indent=4), encoding="utf-8")
 
 
@@ -124,14 +123,14 @@ def _statistics(
     columns: Mapping[str, NDArray[Any]], frames: Mapping[str, NDArray[np.uint8]]
 ) -> dict[str, Any]:
     """LeRobot's per-episode statistics; images in 0..1, a value a colour, shaped (3, 1, 1)."""
-    stats = {name: _of(values.reshape(len(values), -1)) for name, values in columns.items()}
+    stats: dict[str, Any] = {
+        name: {**_of(values.reshape(len(values), -1)), "count": [len(values)]}
+        for name, values in columns.items()
+    }
     for key, images in frames.items():
         colours = _of(images.reshape(-1, 3) / 255)
-        stats[key] = {
-            name: np.reshape(value, (3, 1, 1)).tolist()
-            for name, value in colours.items()
-            if name != "count"
-        } | {"count": [len(images)]}
+        stats[key] = {name: np.reshape(colours[name], (3, 1, 1)).tolist() for name in colours}
+        stats[key]["count"] = [len(images)]
     return stats
 
 
@@ -141,7 +140,6 @@ def _of(rows: NDArray[Any]) -> dict[str, list[Any]]:
         "max": rows.max(0).tolist(),
         "mean": rows.mean(0, dtype=np.float64).tolist(),
         "std": rows.std(0, dtype=np.float64).tolist(),
-        "count": [len(rows)],
     }
 
 
@@ -165,7 +163,6 @@ def _info(lengths: list[int]) -> dict[str, Any]:
 
 def _features() -> dict[str, Any]:
     """`units` beside `names` is this project's extension; other readers pass over it."""
-    streams = {"observation.state": STATE, "action": ACTION}
     video = {
         "video.height": HEIGHT,
         "video.width": WIDTH,
@@ -176,31 +173,14 @@ def _features() -> dict[str, Any]:
         "video.channels": 3,
         "has_audio": False,
     }
-    return {
-        **{
-            name: {
-                "dtype": "float32",
-                "shape": [len(channels.names)],
-                "names": list(channels.names),
-                "units": list(channels.units),
-            }
-            for name, channels in streams.items()
-        },
-        **{
-            key: {
-                "dtype": "video",
-                "shape": [HEIGHT, WIDTH, 3],
-                "names": ["height", "width", "channel"],
-                "info": video,
-            }
-            for key in _KEYS.values()
-        },
-        **{
-            name: {"dtype": dtype, "shape": [1], "names": None}
-            for name, dtype in _INDEX_FEATURES.items()
-        },
-    }
-
-
-def _write_lines(path: Path, rows: list[dict[str, Any]]) -> None:
-    path.write_text("".join(json.dumps(row) + "\n" for row in rows), encoding="utf-8")
+    features: dict[str, Any] = {}
+    for name, channels in (("observation.state", STATE), ("action", ACTION)):
+        names, units = list(channels.names), list(channels.units)
+        features[name] = {"dtype": "float32", "shape": [len(names)], "names": names, "units": units}
+    for key in _KEYS.values():
+        names = ["height", "width", "channel"]
+        shape = [HEIGHT, WIDTH, 3]
+        features[key] = {"dtype": "video", "shape": shape, "names": names, "info": video}
+    for name, dtype in _INDEX_FEATURES.items():
+        features[name] = {"dtype": dtype, "shape": [1], "names": None}
+    return features

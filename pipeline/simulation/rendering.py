@@ -43,6 +43,8 @@ _STICKER, _MARK, _LASER = (250, 250, 246), (214, 24, 30), (226, 40, 40)
 _STEEL, _HUB, _ARM = (70, 74, 84), (20, 44, 140), (120, 124, 132)
 
 _Point = NDArray[np.float64]
+_Draw = ImageDraw.ImageDraw
+_Colour = tuple[int, int, int]
 
 
 def render(view: str, scene: Scene) -> NDArray[np.uint8]:
@@ -58,13 +60,12 @@ def _exposure(brightness: float) -> NDArray[np.uint8]:
     return np.minimum(np.rint(np.arange(256) * brightness), 255).astype(np.uint8)
 
 
-def _draw_side(draw: ImageDraw.ImageDraw, scene: Scene) -> None:
+def _draw_side(draw: _Draw, scene: Scene) -> None:
     stripe = _MIDDLE[0] + _SIDE_PX_MM * float(scene.target_mm @ _ACROSS)
     half = _SIDE_PX_MM * _MARK_MM / 2
     draw.rectangle((stripe - half, 0, stripe + half, _SIZE[1]), fill=_LASER)
-    tip = np.array(
-        [_MIDDLE[0] + _SIDE_PX_MM * float(scene.needle_mm @ _ACROSS), _GUARD_TOP * _SIZE[1]]
-    )
+    across = _MIDDLE[0] + _SIDE_PX_MM * float(scene.needle_mm @ _ACROSS)
+    tip = np.array([across, _GUARD_TOP * _SIZE[1]])
     hub = tip + _SIDE_PX_MM * np.array([float(scene.lean_mm @ _ACROSS), -HUB_MM])
     # The tip goes a little behind the guard, so that its end never shows.
     _line(draw, hub, tip + 0.1 * (tip - hub), _SIDE_PX_MM * _SHAFT_MM, _STEEL)
@@ -73,7 +74,7 @@ def _draw_side(draw: ImageDraw.ImageDraw, scene: Scene) -> None:
     draw.rectangle((0, _GUARD_TOP * _SIZE[1], *_SIZE), fill=_GUARD)
 
 
-def _draw_above(draw: ImageDraw.ImageDraw, scene: Scene) -> None:
+def _draw_above(draw: _Draw, scene: Scene) -> None:
     _phantom(draw, _on_bench(np.zeros(2)), _on_bench(scene.target_mm), _BENCH_PX_MM)
     tip, hub = _on_bench(scene.needle_mm), _on_bench(scene.needle_mm + scene.lean_mm)
     _line(draw, hub, np.array([hub[0], -1.0]), _BENCH_PX_MM * _ARM_MM, _ARM)
@@ -81,14 +82,14 @@ def _draw_above(draw: ImageDraw.ImageDraw, scene: Scene) -> None:
     _disc(draw, hub, _BENCH_PX_MM * _HUB_RADIUS_MM, _HUB)
 
 
-def _draw_from_hand(draw: ImageDraw.ImageDraw, scene: Scene) -> None:
+def _draw_from_hand(draw: _Draw, scene: Scene) -> None:
     bench = _from_tip(-scene.needle_mm)
     _phantom(draw, bench, _from_tip(scene.target_mm - scene.needle_mm), _HAND_PX_MM)
     _line(draw, _MIDDLE, _SIZE.astype(np.float64), 2 * _HAND_PX_MM * _SHAFT_MM, _STEEL)
     _disc(draw, _MIDDLE, _HAND_PX_MM * _SHAFT_MM * 1.4, _HUB)
 
 
-def _phantom(draw: ImageDraw.ImageDraw, middle: _Point, target: _Point, px_mm: float) -> None:
+def _phantom(draw: _Draw, middle: _Point, target: _Point, px_mm: float) -> None:
     low, high = middle - px_mm * _PHANTOM_MM, middle + px_mm * _PHANTOM_MM
     draw.rounded_rectangle(
         (*low, *high), radius=px_mm * 1.5, fill=_SKIN, outline=_SKIN_EDGE, width=int(px_mm / 2)
@@ -107,19 +108,11 @@ def _from_tip(offset_mm: _Point) -> _Point:
     return _MIDDLE + _HAND_PX_MM * offset_mm * [1.0, -1.0]
 
 
-def _disc(
-    draw: ImageDraw.ImageDraw, middle: _Point, radius: float, colour: tuple[int, int, int]
-) -> None:
+def _disc(draw: _Draw, middle: _Point, radius: float, colour: _Colour) -> None:
     draw.ellipse((*(middle - radius), *(middle + radius)), fill=colour)
 
 
-def _line(
-    draw: ImageDraw.ImageDraw,
-    start: _Point,
-    end: _Point,
-    width_px: float,
-    colour: tuple[int, int, int],
-) -> None:
+def _line(draw: _Draw, start: _Point, end: _Point, width_px: float, colour: _Colour) -> None:
     draw.line((*start, *end), fill=colour, width=round(width_px))
 
 

@@ -13,18 +13,12 @@ from pipeline.train.split import episodes_by_recording
 
 @dataclass(frozen=True, eq=False)
 class ProbeFolds:
-    """The ticks that are read, ascending, the fold that holds each out, and its part of the fold.
-
-    The penalty is chosen by leaving out one part at a time of those that are trained on: a whole
-    fold, or a half where there are two folds only. No part divides a VL row.
-    """
+    """The ticks that are read, ascending, and the fold that holds each out."""
 
     ticks: NDArray[np.int64]
     """(tick,) store-global; the whole action chunk of each lies within its episode."""
     fold: NDArray[np.int64]
     """(tick,)"""
-    part: NDArray[np.int64]
-    """(tick,) counted over all folds."""
     recordings: int
     notes: tuple[str, ...]
     """What the reader of a score has to know about the folds."""
@@ -59,54 +53,34 @@ def fold_by_recording(
             f"each is predicted from the others, found {recordings}. Add recordings to "
             "data.sources and run stages.extract, or set a shorter probe.horizon."
         )
-    notes = _notes(store, recordings, horizon)
     count = min(folds, recordings)
-    if count < folds:
-        notes.append(f"{recordings} recordings make {recordings} folds, not {folds}")
-    fold = part = _deal(group, count)
-    if count == 2:
-        # What is trained on is then a single fold, of which one half chooses the other's penalty.
-        part = 2 * fold
-        row = store.array("tick/vl_row")[ticks]
-        for held in range(2):
-            here = fold == held
-            several = len(np.unique(group[here])) > 1
-            part[here] += _deal(group[here] if several else row[here] > np.median(row[here]), 2)
-    parts = 4 if count == 2 else count
+    notes = _notes(store, recordings, folds, horizon)
+    fold = np.empty(len(ticks), np.int64)
+    for index, (_, held) in enumerate(GroupKFold(count).split(group, groups=group)):
+        fold[held] = index
     if max_ticks is not None and max_ticks < len(ticks):
         read = np.linspace(0, len(ticks) - 1, max_ticks).round().astype(np.int64)
-        ticks, fold, part = ticks[read], fold[read], part[read]
+        ticks, fold = ticks[read], fold[read]
         notes.append(f"{len(ticks)} of the ticks are read, evenly spread (probe.max_ticks)")
-    if len(np.unique(part)) < parts:
+    if len(np.unique(fold)) < count:
         raise StoreMismatch(
-            f"{store.path}: too few ticks to hold recordings out in turn: one of {count} folds, or "
-            "what it would train on, has none. Give a store with more or longer recordings, a "
-            "larger probe.max_ticks or a smaller probe.horizon."
+            f"{store.path}: too few ticks to hold recordings out in turn: one of {count} folds has "
+            "none. Give a store with more or longer recordings, a larger probe.max_ticks or a "
+            "smaller probe.horizon."
         )
-    return ProbeFolds(ticks, fold, part, recordings, tuple(notes))
+    return ProbeFolds(ticks, fold, recordings, tuple(notes))
 
 
-def _deal(group: NDArray[np.generic], hands: int) -> NDArray[np.int64]:
-    """(tick,) which hand has each: whole groups, in hands of about as many ticks."""
-    hand = np.zeros(len(group), np.int64)
-    if len(np.unique(group)) < hands:
-        return hand
-    for index, (_, held) in enumerate(GroupKFold(hands).split(group, groups=group)):
-        hand[held] = index
-    return hand
-
-
-def _notes(store: FeatureStore, recordings: int, horizon: int) -> list[str]:
-    """Why there are fewer ticks and recordings than the store has ticks and episodes."""
+def _notes(store: FeatureStore, recordings: int, folds: int, horizon: int) -> list[str]:
+    """Why there are fewer ticks, recordings and folds than one may expect."""
     notes = []
     if horizon > 1:
-        notes.append(
-            f"of {store.ticks} ticks, the last {horizon - 1} of each episode are left out, as "
-            f"their chunk of {horizon} would pass its end"
-        )
+        notes.append(f"the last {horizon - 1} ticks of each episode lack a whole chunk: left out")
     if recordings < len(store.episodes):
         notes.append(
             f"{len(store.episodes)} episodes make {recordings} recordings: those of one recording "
             f"in several formats count once, and those shorter than {horizon} ticks not at all"
         )
+    if recordings < folds:
+        notes.append(f"{recordings} recordings make {recordings} folds, not {folds}")
     return notes

@@ -1,6 +1,6 @@
 """What a regression reads at a tick: features of a row, and state and sensor before the tick."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -40,13 +40,6 @@ class SlotName:
     pooling: str
     view: str | None = None
     cell: tuple[int, int] | None = None
-
-    @classmethod
-    def from_document(cls, document: Mapping[str, Any]) -> "SlotName":
-        """As the store's attributes name it."""
-        cell = document.get("cell")
-        names: Any = {key: document.get(key) for key in ("layer", "norm", "pooling", "view")}
-        return cls(**names, cell=None if cell is None else (cell[0], cell[1]))
 
     @property
     def group(self) -> "SlotName":

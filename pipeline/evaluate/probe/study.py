@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from pydantic import TypeAdapter
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
@@ -57,10 +58,10 @@ class ProbeStudy:
     """In the store's order."""
     groups: tuple[ProbeResult, ...]
 
-    def gain(self, result: ProbeResult) -> tuple[float, float] | None:
+    def gain(self, result: ProbeResult) -> tuple[float, float] | tuple[None, None]:
         """What a result adds to state + sensor, and the standard error of that by fold."""
         if self.streams is None or result.beside is None:
-            return None
+            return None, None
         apart = result.beside.by_fold - self.streams.by_fold
         return result.beside.mean - self.streams.mean, standard_error(apart)
 
@@ -94,7 +95,7 @@ def probe(store: FeatureStore, params: ProbeParams) -> ProbeStudy:
     """
     folds = fold_by_recording(store, params.folds, params.horizon, params.max_ticks)
     slots, dim = store.feature_shape
-    names = [SlotName.from_document(document) for document in store.attrs["slots"][:slots]]
+    names = TypeAdapter(list[SlotName]).validate_python(store.attrs["slots"][:slots])
     singles = {(index,): name for index, name in enumerate(names)}
     groups = {
         tuple(index for index, name in enumerate(names) if name.group == group): group
@@ -106,9 +107,7 @@ def probe(store: FeatureStore, params: ProbeParams) -> ProbeStudy:
     targets = _targets(store, folds, params.horizon)
 
     def score(inputs: Inputs, known: Inputs | None = None, of_known: Sequence[float] = ()):
-        return cross_validate(
-            inputs, targets, folds.part, folds.fold, params.penalties, known, of_known
-        )
+        return cross_validate(inputs, targets, folds.fold, params.penalties, known, of_known)
 
     def result(own: tuple[int, ...]) -> ProbeResult:
         inputs, valid = read_slots(store, rows, folds.fold[first], own)
@@ -168,27 +167,29 @@ def recommend(study: ProbeStudy) -> Recommendation | None:
     """
     for reading in ("beside", "alone"):
         floor = [study.mean_action]
-        scores = {group: group.alone for group in study.groups}
-        if reading == "beside":
-            floor += [] if study.streams is None else [study.streams]
-            scores = {group: group.beside for group in study.groups if group.beside is not None}
-        gains = {
-            group: score.mean - max(other.mean for other in floor)
-            for group, score in scores.items()
-            if all(_is_better(score, other) for other in floor)
+        if reading == "beside" and study.streams is not None:
+            floor.append(study.streams)
+        read = ((group, getattr(group, reading)) for group in study.groups)
+        scores: dict[ProbeResult, ProbeScore] = {
+            group: score
+            for group, score in read
+            if score is not None and all(_is_better(score, other) for other in floor)
         }
-        if gains:
-            best, *others = sorted(gains, key=lambda group: gains[group], reverse=True)
-            tied = tuple(
-                group
-                for group in others
-                if not _is_better(scores[best], scores[group]) and gains[group] >= gains[best] / 2
-            )
-            chosen = min(
-                [best, *tied],
-                key=lambda group: (len(group.slots), group.name.layer, -scores[group].mean),
-            )
-            return Recommendation(reading, best, chosen, tied)
+        if not scores:
+            continue
+        best, *others = sorted(scores, key=lambda group: scores[group].mean, reverse=True)
+        known = max(other.mean for other in floor)
+        half = (scores[best].mean + known) / 2
+        tied = tuple(
+            group
+            for group in others
+            if not _is_better(scores[best], scores[group]) and scores[group].mean >= half
+        )
+        chosen = min(
+            [best, *tied],
+            key=lambda group: (len(group.slots), group.name.layer, -scores[group].mean),
+        )
+        return Recommendation(reading, best, chosen, tied)
     return None
 
 

@@ -1,19 +1,22 @@
 """Results of a probe -> what is printed and what is written."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pipeline.base.durable import write_document
-from pipeline.base.table import NOTHING, Table
+from pipeline.base.table import Table
 from pipeline.evaluate.names import rounded
 from pipeline.evaluate.probe.ridge import ProbeScore
 from pipeline.evaluate.probe.study import ProbeResult, ProbeStudy, ranked, recommend
 
 TOP = 12
 """Slots that are printed; the tables have all."""
+_Figures = tuple[float, float] | tuple[None, None]
+"""A score and its standard error over the folds, or none."""
 
 
 def write_tables(folder: Path, study: ProbeStudy) -> list[Path]:
@@ -21,16 +24,16 @@ def write_tables(folder: Path, study: ProbeStudy) -> list[Path]:
 
     The last has R^2 by channel and step of the chunk, of the baseline and of each group.
     """
-    lines = {
-        "slots.csv": [_row(study, result) for result in ranked(study.slots)],
+    of_groups = ("slots", "channels", "inputs")
+    slots = [_row(study, result) for result in ranked(study.slots)]
+    tables = {
+        "slots.csv": [{k: v for k, v in row.items() if k not in of_groups} for row in slots],
         "groups.csv": [_row(study, result) for result in ranked(study.groups)],
         "targets.csv": _target_rows(study),
     }
-    for line in lines["slots.csv"]:
-        del line["slots"], line["channels"], line["inputs"]
     write_document(folder / "metrics.json", metrics(study))
     files = [folder / "metrics.json"]
-    for name, rows in lines.items():
+    for name, rows in tables.items():
         table = Table(list(rows[0]), [list(row.values()) for row in rows])
         files.append(table.write_csv(folder / name))
     return files
@@ -68,37 +71,29 @@ def metrics(study: ProbeStudy) -> dict[str, Any]:
 
 def table(study: ProbeStudy) -> str:
     """The groups and the best slots, ranked, below the baselines."""
-    baselines = {"mean action": (0, study.mean_action)}
+    baselines = [("mean action", 0, study.mean_action)]
     if study.streams is not None:
-        baselines["state + sensor, without features"] = (study.stream_inputs, study.streams)
+        baselines.append(("state + sensor, without features", study.stream_inputs, study.streams))
     rows: list[list[Any]] = [
-        [name, inputs, "", _short(score.mean), _short(score.error), *[""] * 4]
-        for name, (inputs, score) in baselines.items()
+        [name, inputs, None, *_figures(score), *[None] * 4] for name, inputs, score in baselines
     ]
     single = [result for result in ranked(study.slots) if result.name != result.name.group]
     for result in [*ranked(study.groups), *single[:TOP]]:
         several = f" ({len(result.slots)} slots)" if len(result.slots) > 1 else ""
-        figures = [*_figures(result.alone), *_figures(result.beside)]
-        figures += study.gain(result) or (None, None)
         rows.append([result.name.label + several, result.inputs, f"{result.valid_share:.0%}"])
-        rows[-1] += map(_short, figures)
+        rows[-1] += [*_figures(result.alone), *_figures(result.beside), *study.gain(result)]
     heads = ["what is read", "inputs", "valid", "R2 alone", "+-", "R2 beside", "+-", "gain", "+-"]
     lines = [
         f"R2 of the action chunk of {study.horizon} ticks on recordings that were held out, mean "
         "over channels and steps (1: exact, 0: no better than their mean)",
         f"{len(study.folds.ticks)} ticks of {study.folds.recordings} recordings in "
         f"{study.folds.count} folds; +-: standard error over folds",
+        "beside: together with state + sensor; gain: what that adds to them, fold by fold",
+        *Table(heads, rows).text(),
+        *study.folds.notes,
+        "inputs fewer than channels are their main directions over all folds",
+        "valid: the share of ticks that have a slot; elsewhere its mean is read",
     ]
-    if study.streams is not None:
-        lines.append(
-            "beside: together with state + sensor; gain: what that adds to them. Choices are "
-            "compared by their gains fold by fold, as some folds are harder for everyone"
-        )
-    lines += [*Table(heads, rows).text(), *study.folds.notes]
-    if any(0 < result.inputs < result.channels for result in study.groups):
-        lines.append("inputs fewer than channels are their main directions over all folds")
-    if any(result.valid_share < 1 for result in study.slots):
-        lines.append("valid: the share of ticks that have a slot; elsewhere its mean is read")
     if len(single) > TOP:
         lines.append(f"the other {len(single) - TOP} slots are in slots.csv")
     return "\n".join(lines)
@@ -107,32 +102,24 @@ def table(study: ProbeStudy) -> str:
 def advice(study: ProbeStudy) -> str:
     """The lines of params.yaml that the evidence supports, and how sure it is."""
     advised = recommend(study)
-    beside = study.streams is not None
     if advised is None:
-        over = "state + sensor, nor alone over the mean action" if beside else "the mean action"
         return (
-            f"no recommendation: no choice gains over {over}, by more than one standard error and "
-            "in most folds. So this store does not show that a linear reader gains from features; "
-            "more recordings may."
+            "no recommendation: no choice gains over state + sensor, nor alone over the mean "
+            "action, by more than one standard error and in most folds. So this store does not "
+            "show that a linear reader gains from features; more recordings may."
         )
     lines = []
-    if beside and advised.reading == "alone":
+    if study.streams is not None and advised.reading == "alone":
         lines.append(
-            "features alone predict better than the mean action; beside state + sensor no choice "
-            "is better than both these and the mean action, by more than one standard error and in "
-            "most folds. What follows rests on R2 alone."
+            "features alone predict better than the mean action, but none gains beside state + "
+            "sensor: what follows rests on R2 alone."
         )
     if advised.tied:
-        labels = "; ".join(result.name.label for result in advised.tied)
         lines.append(
             f"the best ({advised.best.name.label}) is not ahead of these by more than one standard "
-            f"error of their difference by fold, and in most folds: {labels}. Of all of them the "
-            "one with the fewest slots is recommended."
+            f"error and in most folds: {'; '.join(tied.name.label for tied in advised.tied)}. Of "
+            "all of them the one with the fewest slots is recommended."
         )
-    elif len(study.groups) > 1:
-        lines.append("no other choice is level with it, fold by fold, or keeps half of its gain")
-    else:
-        lines.append("the only choice in this store: extract more layers or poolings to compare")
     name = advised.chosen.name
     lines.append(
         f"recommended for params.yaml: vlm: {{layers: [{name.layer}], "
@@ -164,7 +151,7 @@ def _row(study: ProbeStudy, result: ProbeResult) -> dict[str, Any]:
     for reading, score in scores.items():
         row[f"r2_{reading}"], row[f"r2_{reading}_error"] = _figures(score)
     row["r2_state_sensor"], _ = _figures(study.streams)
-    row["gain"], row["gain_error"] = study.gain(result) or (None, None)
+    row["gain"], row["gain_error"] = study.gain(result)
     for reading, score in scores.items():
         row[f"penalty_{reading}"] = None if score is None else float(np.median(score.penalties))
     return row
@@ -178,21 +165,16 @@ def _target_rows(study: ProbeStudy) -> list[dict[str, Any]]:
         named = {head: _row(study, result)[head] for head in ("layer", "norm", "pooling")}
         scores = {"alone": result.alone, "beside": result.beside, "state_sensor": study.streams}
         for index, (step, channel) in enumerate(targets):
-            r2 = {
-                f"r2_{reading}": None if score is None else score.by_target[index]
-                for reading, score in scores.items()
-            }
-            rows.append({**named, "step": step, "channel": channel, **r2})
+            row = {**named, "step": step, "channel": channel}
+            for reading, score in scores.items():
+                row[f"r2_{reading}"] = None if score is None else score.by_target[index]
+            rows.append(row)
     return rows
 
 
-def _figures(score: ProbeScore | None) -> tuple[float | None, float | None]:
+def _figures(score: ProbeScore | None) -> _Figures:
     return (None, None) if score is None else (score.mean, score.error)
 
 
-def _document(figures: tuple[float | None, float | None] | None) -> dict[str, float]:
-    return rounded(dict(zip(("r2", "error"), figures or (), strict=False)))
-
-
-def _short(figure: float | None) -> str:
-    return NOTHING if figure is None else f"{figure: .3f}"
+def _document(figures: Sequence[float | None]) -> dict[str, float]:
+    return rounded(dict(zip(("r2", "error"), figures, strict=True)))

@@ -9,7 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from pipeline.evaluate.probe import ProbeResult, ProbeStudy, SlotName, ranked
+from pipeline.evaluate.probe.inputs import SlotName
+from pipeline.evaluate.probe.study import ProbeResult, ProbeStudy, ranked
 from pipeline.look.page.style import RECORDED, canvas, draw_map, legend_below, write
 
 _BARS = 20

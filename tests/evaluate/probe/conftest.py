@@ -78,24 +78,20 @@ def nested() -> Callable[..., tuple[np.ndarray, np.ndarray]]:
         known: int = 0,
         of_known: tuple[float, ...] = (),
     ) -> tuple[np.ndarray, np.ndarray]:
-        r2, chosen = [], []
-        for held in np.unique(fold):
-            train = fold != held
-            lost = np.zeros(len(penalties))
-            ridges = [np.full(x.shape[1], penalty) for penalty in penalties]
-            for ridge in ridges:
+        held_out = np.unique(fold)
+        r2 = np.empty((len(penalties), len(held_out), y.shape[1]))
+        for at, penalty in enumerate(penalties):
+            for held in held_out:
+                train = fold != held
+                ridge = np.full(x.shape[1], penalty)
                 ridge[x.shape[1] - known :] = of_known[held] if known else 0
-            varies = y[train].std(0) > STILL * y.std(0)
-            for out in np.unique(fold[train]):
-                inside, test = train & (fold != out), fold == out
-                for index, ridge in enumerate(ridges):
-                    error = (y[test] - predicted(x[inside], y[inside], x[test], ridge)) ** 2
-                    lost[index] += (error[:, varies] / y[train][:, varies].var(0)).sum()
-            best = int(lost.argmin())
-            error = (y[~train] - predicted(x[train], y[train], x[~train], ridges[best])) ** 2
-            with np.errstate(divide="ignore", invalid="ignore"):
-                r2.append(1 - error.mean(0) / y.var(0))
-            chosen.append(penalties[best])
-        return np.array(r2), np.array(chosen)
+                error = (y[~train] - predicted(x[train], y[train], x[~train], ridge)) ** 2
+                with np.errstate(divide="ignore", invalid="ignore"):
+                    r2[at, held] = 1 - error.mean(0) / y.var(0)
+        chosen = []
+        for held in held_out:
+            ticks = np.array([(fold == other).sum() * (other != held) for other in held_out])
+            chosen.append(int(((r2[:, :, y.std(0) > 0].sum(2)) * ticks).sum(1).argmax()))
+        return r2[chosen, held_out], np.array(penalties)[chosen]
 
     return score

@@ -14,7 +14,10 @@ from matplotlib.figure import Figure
 from pipeline.evaluate.ablation import Ablated, AblationStudy
 from pipeline.evaluate.curves import TrainingCurve, TrainingCurves
 from pipeline.evaluate.experiments import Experiment
-from pipeline.evaluate.probe import ProbeFolds, ProbeResult, ProbeScore, ProbeStudy, SlotName
+from pipeline.evaluate.probe.folds import ProbeFolds
+from pipeline.evaluate.probe.inputs import SlotName
+from pipeline.evaluate.probe.ridge import ProbeScore
+from pipeline.evaluate.probe.study import ProbeResult, ProbeStudy
 from pipeline.look.evaluation import draw_probe as probe
 from pipeline.look.evaluation import pictures as plots
 from pipeline.look.page.style import write
@@ -406,7 +409,7 @@ def probed(streams: bool = True, layers: int = 2) -> ProbeStudy:
                 for pooling, count in (("mean", 1), ("view_mean", 2), ("grid", 8))
             ]
     fold = np.arange(30) // 10
-    folds = ProbeFolds(np.arange(30), fold, fold, 3, ())
+    folds = ProbeFolds(np.arange(30), fold, 3, ())
     known = score(0.2) if streams else None
     return ProbeStudy(2, ("dx",), folds, score(-0.01), known, 5, tuple(slots), tuple(groups))
 
