@@ -255,15 +255,13 @@ def statistics_of(
 def statistics_table(statistics: Sequence[ChannelStatistics]) -> Table:
     """A row a channel; channels that differ by a number in their names are one from 24 on."""
     rows: list[tuple[object, ...]] = []
-    for _, like in groupby(statistics, lambda one: (one.stream, unnumbered(one.name), one.unit)):
-        group = [astuple(one) for one in like]
+    for _, like in groupby(statistics, lambda c: (c.stream, unnumbered(c.name), c.unit)):
+        group = [astuple(channel) for channel in like]
         rows += group if len(group) < PROFILE_CHANNELS else [_joint_row(group)]
-    caption = "Over the whole episode, before any normalisation."
-    if len(rows) < len(statistics):
-        caption += (
-            " A row of many channels shows the lowest minimum, the highest maximum, and of the rest"
-            " the median over the channels."
-        )
+    caption = (
+        "Over the whole episode, before any normalisation. A row of many channels shows the lowest "
+        "minimum, the highest maximum, and of the rest the median over the channels."
+    )
     return Table(_HEADS, rows, caption)
 
 

@@ -443,8 +443,10 @@ def _draw_lane(axis: Axes, clock: Clock, lane: int, zero: float) -> None:
         if gap.stop_s - zero >= low and gap.start_s - zero <= high
     ]
     # One artist for all: thousands of gaps as patches take many seconds.
-    hatched = {"facecolor": "none", "edgecolor": GAP_COLOUR, "hatchcolor": GAP_COLOUR}
-    axis.broken_barh(spans, (lane - _HALF, 2 * _HALF), hatch="////", lw=1.4, zorder=3, **hatched)
+    axis.broken_barh(
+        spans, (lane - _HALF, 2 * _HALF), facecolor="none", hatch="////", lw=1.4,
+        edgecolor=GAP_COLOUR, hatchcolor=GAP_COLOUR,
+    )  # fmt: skip
 
 
 def _draw_reuse(
@@ -465,6 +467,7 @@ def _draw_reuse(
         across, low = [ticks[0], ticks[0], ticks[-1], ticks[-1]], tick_lane - 0.5
         axis.plot(across, [row_lane + _HALF, low, low, tick_lane - _HALF], color=colour, lw=1.6)
         if line.vl_time[row] >= near[0]:
-            at, newest = line.vl_time[row], [time[row] for time in line.frame_time.values()]
+            at = float(line.vl_time[row])
+            newest = [time[row] for time in line.frame_time.values()]
             words = f" row {row}" + (f", {1000 * (at - max(newest)):.0f} ms old" if newest else "")
             axis.text(at - zero, row_lane, words, color=colour, size=8, va="center", clip_on=True)

@@ -56,7 +56,9 @@ def camera_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
     if not (ticks := spread_ticks(view, params.inspect.ticks)):
         return []
     shown, broken = read_frames(view, ticks)
-    blocks: list[Block] = [Text(f"{one.stream} is not shown: {one.message}") for one in broken]
+    blocks: list[Block] = [
+        Text(f"{issue.stream} is not shown: {issue.message}") for issue in broken
+    ]
     if shown:
         caption = (
             f"What each view shows at {len(ticks)} ticks, evenly from the first to the last: the "

@@ -131,8 +131,9 @@ def draw_samples(
     heights = [column * frame.shape[0] / frame.shape[1] for frame in views.values()]
     heights += [_PANEL_IN] * len(rows)
     figure = canvas(column * len(samples) + _BESIDE_IN, sum(heights) + 1.8)
-    grid = {"squeeze": False, "sharey": "row", "height_ratios": heights}
-    axes = figure.subplots(len(heights), len(samples), **grid)
+    axes = figure.subplots(
+        len(heights), len(samples), squeeze=False, sharey="row", height_ratios=heights
+    )
     for place, sample in enumerate(samples):
         axes[0, place].set_title(_sample_title(view, sample.tick), fontsize=_SMALL)
         for line_axes, (name, frame) in zip(axes, sample.frames.items(), strict=False):

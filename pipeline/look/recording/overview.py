@@ -33,7 +33,6 @@ COUNT_TOLERANCE = 0.1
 # Times as fast a camera is one of another kind, whose frames are not compared in number.
 OTHER_RATE = 1.8
 
-
 _warning = partial(Issue, severity="warning")
 
 
@@ -75,8 +74,10 @@ class EpisodeSummary:
 
     def warn(self, kind: str, stream: str, message: str) -> None:
         """Add a warning."""
-        place = {"source": self.source, "episode": self.episode, "stream": stream}
-        self.issues.append(_warning(kind=kind, message=message, **place))
+        source, episode = self.source, self.episode
+        self.issues.append(
+            _warning(kind=kind, message=message, source=source, episode=episode, stream=stream)
+        )
 
 
 @dataclass(frozen=True)
@@ -95,12 +96,12 @@ class RecordingsOverview:
     @property
     def issues(self) -> tuple[Issue, ...]:
         """Those of all, then episode by episode."""
-        return (*self.common, *(issue for one in self.summaries for issue in one.issues))
+        return (*self.common, *(issue for summary in self.summaries for issue in summary.issues))
 
     @property
     def views(self) -> tuple[str, ...]:
         """Of any recording, sorted."""
-        return tuple(sorted({view for one in self.summaries for view in one.frames}))
+        return tuple(sorted({view for summary in self.summaries for view in summary.frames}))
 
     def choose(self, count: int) -> tuple[int, ...]:
         """At most `count` places in `summaries` to look at closely, in their order.
@@ -117,7 +118,7 @@ class RecordingsOverview:
 
 def worst_first(summaries: Sequence[EpisodeSummary]) -> list[int]:
     """Their places, those with most errors, then most warnings, first."""
-    counts = [(-one.errors, -one.warnings) for one in summaries]
+    counts = [(-summary.errors, -summary.warnings) for summary in summaries]
     return sorted(range(len(summaries)), key=counts.__getitem__)
 
 
@@ -239,20 +240,20 @@ def _frame_counts(view: EpisodeView, nominal: Nominal) -> Iterator[Issue]:
 def _warn_of_missing(summaries: Sequence[EpisodeSummary]) -> None:
     """Of what most of a source's episodes of that format have, and no issue says why it lacks."""
     alike: dict[tuple[str, str], list[EpisodeSummary]] = defaultdict(list)
-    for one in summaries:
-        alike[one.source, one.format].append(one)
+    for summary in summaries:
+        alike[summary.source, summary.format].append(summary)
     for group in alike.values():
-        held = Counter(name for one in group for name in one.counts)
+        held = Counter(name for summary in group for name in summary.counts)
         usual = {name for name, count in held.items() if 2 * count > len(group)}
-        for one in group:
-            explained = {name for issue in one.issues for name in issue.stream.split(", ")}
+        for summary in group:
+            explained = {name for issue in summary.issues for name in issue.stream.split(", ")}
             if "cameras" in explained:
                 explained |= {name for name in usual if name.startswith("view ")}
             if "state" in explained:
                 explained.add("poses")  # its columns
-            if lacking := sorted(usual - one.counts.keys() - explained):
+            if lacking := sorted(usual - summary.counts.keys() - explained):
                 message = "not there; most episodes of this source have it"
-                one.warn("missing", ", ".join(lacking), message)
+                summary.warn("missing", ", ".join(lacking), message)
 
 
 def _digest_motion(view: EpisodeView) -> dict[str, str]:
@@ -273,21 +274,21 @@ def _digest_motion(view: EpisodeView) -> dict[str, str]:
 def _warn_of_duplicates(summaries: Sequence[EpisodeSummary]) -> None:
     """Of episodes that were there before: they agree in all digests that both have, and in one."""
     firsts: dict[tuple[str, str], list[EpisodeSummary]] = defaultdict(list)
-    for one in summaries:
-        for first in (first for digest in one.digests.items() for first in firsts[digest]):
-            common = sorted(one.digests.keys() & first.digests.keys(), reverse=True)
-            if all(one.digests[name] == first.digests[name] for name in common):
-                source = "" if first.source == one.source else f"{first.source}/"
+    for summary in summaries:
+        for first in (first for digest in summary.digests.items() for first in firsts[digest]):
+            common = sorted(summary.digests.keys() & first.digests.keys(), reverse=True)
+            if all(summary.digests[name] == first.digests[name] for name in common):
+                source = "" if first.source == summary.source else f"{first.source}/"
                 message = (
                     f"the same recording as {source}{first.episode} ({first.path}): all values of "
                     f"{' and '.join(common)} are equal, and nothing else was compared; it would "
                     "count twice. Leave one of them out of data.sources"
                 )
-                one.warn("duplicate recording", "", message)
+                summary.warn("duplicate recording", "", message)
                 break
         else:
-            for digest in one.digests.items():
-                firsts[digest].append(one)
+            for digest in summary.digests.items():
+                firsts[digest].append(summary)
 
 
 def _not_opened(opened: Opened) -> Iterator[Issue]:

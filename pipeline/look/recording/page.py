@@ -89,9 +89,9 @@ def _tiles(overview: RecordingsOverview) -> list[tuple[str, str]]:
     errors = sum(issue.severity == "error" for issue in issues)
     return [
         ("episodes", f"{len(summaries):,}"),
-        ("recorded", duration(sum(one.duration_s for one in summaries))),
-        ("ticks", f"{sum(one.ticks for one in summaries):,}"),
-        ("VL rows", f"{sum(one.vl_rows for one in summaries):,}"),
+        ("recorded", duration(sum(summary.duration_s for summary in summaries))),
+        ("ticks", f"{sum(summary.ticks for summary in summaries):,}"),
+        ("VL rows", f"{sum(summary.vl_rows for summary in summaries):,}"),
         ("cameras", f"{len(overview.views)}"),
         ("errors", f"{errors:,}"),
         ("warnings", f"{len(issues) - errors:,}"),
@@ -107,18 +107,17 @@ def _episodes_table(overview: RecordingsOverview, chosen: Sequence[int]) -> Tabl
     ]  # fmt: skip
     rows = [
         (
-            one.source, one.episode, one.errors, one.warnings, one.duration_s, one.ticks,
-            one.vl_rows, _frames(one.frames), one.counts.get("sensor", 0),
-            one.counts.get("state", 0), one.format, one.instruction,
+            summary.source, summary.episode, summary.errors, summary.warnings, summary.duration_s,
+            summary.ticks, summary.vl_rows, _frames(summary.frames),
+            *(summary.counts.get(stream, 0) for stream in ("sensor", "state")), summary.format,
+            summary.instruction,
         )
-        for one in (summaries[at] for at in shown)
+        for summary in (summaries[at] for at in shown)
     ]  # fmt: skip
-    caption = "Those in bold are shown in detail below. Readings are the sensor's."
-    if len(shown) < len(summaries):
-        caption += (
-            f" {len(shown)} of {len(summaries):,} episodes are listed, those with most findings "
-            "among them; all were checked."
-        )
+    caption = (
+        "Those in bold are shown in detail below. Readings are the sensor's. Listed are "
+        f"{len(shown)} of {len(summaries):,} episodes, those with most findings among them."
+    )
     strong = frozenset(row for row, index in enumerate(shown) if index in chosen)
     return Table(heads, rows, caption, strong)
 
@@ -135,15 +134,19 @@ def _episode_section(
     overview: RecordingsOverview, index: int, view: EpisodeView, draw: Draw, params: Params
 ) -> Section:
     """Everything of one episode."""
-    one = overview.summaries[index]
-    blocks: list[Block] = [Text(f"`{one.path}`, format {one.format}: “{one.instruction or '–'}”")]
+    summary = overview.summaries[index]
+    blocks: list[Block] = [
+        Text(f"`{summary.path}`, format {summary.format}: “{summary.instruction or '–'}”")
+    ]
     if len(overview.summaries) > 1:
-        blocks.append(Issues(one.issues, "Nothing looks wrong in this episode."))
-    several = len({one.source for one in overview.summaries}) > 1
-    errors = [f" Not read: {issue.message}" for issue in one.issues if issue.severity == "error"]
+        blocks.append(Issues(summary.issues, "Nothing looks wrong in this episode."))
+    several = len({summary.source for summary in overview.summaries}) > 1
+    errors = [
+        f" Not read: {issue.message}" for issue in summary.issues if issue.severity == "error"
+    ]
     absent = Text(f"This episode has nothing of this.{''.join(errors)}")
     return Section(
-        f"{one.source} / {one.episode}" if several else one.episode,
+        f"{summary.source} / {summary.episode}" if several else summary.episode,
         blocks,
         [
             Section(title, blocks_of(view, draw, params) or [absent])

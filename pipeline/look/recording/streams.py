@@ -58,8 +58,8 @@ RULE = (
     f"{_ENTER:g} times its noise (in newtons by {_LEAST_N:g} at least) until it is back within "
     f"{100 * _LEAVE / _ENTER:.0f} % of that."
 )
-# A standard deviation that outliers do not raise.
-_spread = partial(median_abs_deviation, axis=0, scale="normal")
+# A standard deviation, of normal noise, that outliers do not raise.
+_spread = partial(median_abs_deviation, axis=0, scale=1 / 1.4826)
 
 
 class Group(NamedTuple):
@@ -190,8 +190,10 @@ def plot_curves(
 def legend_beside(axis: Axes) -> None:
     """The legend of a panel, right of it; in columns where it is long."""
     columns = 1 + len(axis.get_legend_handles_labels()[1]) // 8
-    place = {"loc": "center left", "bbox_to_anchor": (1.005, 0.5)}
-    axis.legend(**place, fontsize=8, ncols=columns, handlelength=1.6)
+    place = 1.005, 0.5
+    axis.legend(
+        loc="center left", bbox_to_anchor=place, fontsize=8, ncols=columns, handlelength=1.6
+    )
 
 
 def _panels(groups: Sequence[Group]) -> tuple[Figure, list[Axes]]:

@@ -39,7 +39,7 @@ class Subject:
             raise RecordingError(f"{error}{_stores_below(self.sources, self.root)}") from None
         if not opened.recordings:
             lines = [f"{self.name}: none of {len(opened.bad)} episode(s) can be looked at:"]
-            lines += [f"  {one.where}: {one.reason}" for one in opened.bad]
+            lines += [f"  {bad.where}: {bad.reason}" for bad in opened.bad]
             raise RecordingError("\n".join(lines))
         return opened
 
