@@ -68,8 +68,8 @@ class ProbeParams(Section):
     penalties: tuple[Annotated[float, Field(gt=0)], ...] = Field(
         default=(1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0), min_length=1
     )
-    """Ridge penalties a row, of standardised inputs; each fold takes the best one on the episodes
-    that it trains on."""
+    """Ridge penalties a row, of standardised inputs; each fold takes the one that is best
+    on the other folds."""
     max_ticks: int | None = Field(default=20_000, ge=1)
     """Ticks used at most, evenly spread over all episodes; null uses all. Memory grows with it."""
     sensor_window: int = Field(default=65, ge=1)

@@ -3,9 +3,10 @@
 Issues are flat, still, frozen and saturated channels, and outliers.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import astuple, dataclass
 from itertools import groupby
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +19,8 @@ from pipeline.base.table import Table
 from pipeline.data import Channels, Stream
 from pipeline.look.page.blocks import Block
 from pipeline.look.recording.clocks import usual_step
-from pipeline.look.recording.contact import force_columns
 from pipeline.look.recording.episode import Draw, EpisodeView, runs
+from pipeline.look.recording.streams import force_columns
 
 # A sensor whose channels all repeat for as long stands still.
 FROZEN_S = 0.5
@@ -46,70 +47,56 @@ def find_channel_issues(view: EpisodeView) -> Iterator[Issue]:
     """Issues of kind flat channel, still channel, frozen, saturated, action and state outlier."""
     for name, stream in view.streams.items():
         if name != "poses" and len(stream.time) >= _FEWEST:
-            yield from _flat(view, name, stream)
+            if flat := _describe_flat(stream):
+                yield view.issue("flat channel", name, flat)
             # The depths of a scan are not all equally bright.
-            still = None if name == "sensor" else still_channels(stream.channels, stream.values)
-            if still is not None:
-                yield view.issue("still channel", name, still[1], *_whole(stream))
+            if name != "sensor" and (still := describe_still(stream.channels, stream.values)):
+                yield view.issue("still channel", name, still)
     if view.sensor is not None and len(view.sensor.time) >= _FEWEST:
         yield from _frozen(view, view.sensor)
         yield from _saturated(view, view.sensor)
-    if (line := view.timeline) is not None:
-        ticks = Stream(line.action_channels, line.time, line.action)
-        yield from _outliers(view, "action", "tick", ticks)
+    if view.timeline is not None:
+        yield from _outliers(view, "action", "tick", view.shown["action"])
     if view.state is not None:
         yield from _outliers(view, "state", "row", view.state)
 
 
-def still_channels(
-    channels: Channels, values: NDArray[np.floating]
-) -> tuple[list[int], str] | None:
-    """Columns that hardly move beside others of their kind, such as joints, and their unit.
+def describe_still(channels: Channels, values: NDArray[np.floating]) -> str:
+    """Names channels that hardly move beside others of their kind, such as joints; '' for none.
 
-    And what is said of them; None where there are none. `values` are (row, channel).
+    `values` are (row, channel).
     """
     names, varies = channels.names, np.ptp(values, axis=0) > 0
     std = np.where(varies, values.std(axis=0, dtype=np.float64), 0)
     usual = hardly_moving(std, names, channels.units)
     if not usual:
-        return None
-    columns = list(usual)
-    largest = max(columns, key=lambda column: std[column] / usual[column])
-    return columns, (
-        f"{named(names, columns)} hardly move{'s' * (len(columns) == 1)}: a standard deviation of "
+        return ""
+    largest = max(usual, key=lambda column: std[column] / usual[column])
+    return (
+        f"{named(names, [*usual])} hardly move{'s' * (len(usual) == 1)}: a standard deviation of "
         f"{std[largest]:.2g} at most, where {usual[largest]:.2g} is usual for such channels; "
         "training scales every channel to unit spread, so that their noise would count like a "
         "motion"
     )
 
 
-def _whole(stream: Stream) -> tuple[float, float]:
-    return float(stream.time[0]), float(stream.time[-1])
-
-
-def _flat(view: EpisodeView, name: str, stream: Stream) -> Iterator[Issue]:
-    """Channels of one value; a gripper's is no issue: many tasks never move it."""
-    flat = stream.values.max(axis=0) == stream.values.min(axis=0)
+def _describe_flat(stream: Stream) -> str:
+    """Names channels of one value; a gripper's is no issue: many tasks never move it."""
+    flat = np.ptp(stream.values, axis=0) == 0
     names = stream.channels.names
     columns = [c for c in np.flatnonzero(flat).tolist() if "gripper" not in names[c].lower()]
     if not columns:
-        return
-    if len(columns) == 1:
-        which = f"{names[columns[0]]} is {stream.values[0, columns[0]]:g} throughout"
-    else:
-        which = f"{len(columns)} of {len(names)} channels never change: {named(names, columns)}"
-    others = "no channel varies" if flat.all() else "the others vary"
-    yield view.issue("flat channel", name, f"{which}; {others}", *_whole(stream))
+        return ""
+    return f"{len(columns)} of {len(names)} channels never change: {named(names, columns)}"
 
 
 def _frozen(view: EpisodeView, sensor: Stream) -> Iterator[Issue]:
     """Spans in which the whole sensor, or all of it but the force, repeats one reading."""
     force = force_columns(sensor)
-    others = [column for column in range(sensor.values.shape[1]) if column not in force]
-    columns = others or force
-    if (sensor.values.max(axis=0) == sensor.values.min(axis=0))[columns].all():
+    columns = [column for column in range(sensor.values.shape[1]) if column not in force] or force
+    if not np.ptp(sensor.values, axis=0)[columns].any():
         return  # flat throughout, which is told already
-    what = "all channels but the force" if force and others else "all channels"
+    what = "all channels" if columns == force or not force else "all channels but the force"
     for start, stop in runs(_repeats(sensor.values, columns)):
         begin, end = float(sensor.time[start]), float(sensor.time[stop])
         if end - begin >= FROZEN_S:
@@ -156,45 +143,52 @@ def _outliers(view: EpisodeView, name: str, entry: str, stream: Stream) -> Itera
 
 
 def _saturated(view: EpisodeView, sensor: Stream) -> Iterator[Issue]:
-    """Channels that are clipped, in one line for each end of the range."""
-    values, names = sensor.values, sensor.channels.names
-    wide = _wide_columns(sensor)
-    largest, smallest = values.max(axis=0), values.min(axis=0)
-    for end, own, outermost in (("upper", largest, np.max), ("lower", smallest, np.min)):
-        reached = own.copy()
-        # Channels of one converter end at one value.
-        if wide:
-            reached[wide] = outermost(own[wide])
-        at_end = (own == reached) & (own != 0) & (largest > smallest)
-        standing = [
-            column
-            for column in np.flatnonzero(at_end).tolist()
-            if (values[:, column] == own[column]).mean() >= CLIPPED_SHARE
-            # What many depths reach together at most is no rest, however long one stands there.
-            and ((end == "upper" and column in wide) or not _rests(sensor, column, own[column]))
-        ]
-        clipped = [column for column in standing if _clipped(values[:, column], own[column])]
-        together = sum(column in wide for column in clipped) >= TOGETHER
-        columns = [c for c in standing if (together if c in wide else c in clipped)]
+    """Channels that are clipped, a line for each end of the range."""
+    names, force = sensor.channels.names, force_columns(sensor)
+    wide = [column for column in range(len(names)) if column not in force]
+    if len({sensor.channels.units[column] for column in wide}) != 1 or len(wide) < _WIDE:
+        wide = []
+    # Channels of one converter end at one value.
+    groups = [wide] * bool(wide) + [[c] for c in range(len(names)) if c not in wide]
+    for end, outermost in (("upper", np.max), ("lower", np.min)):
+        ends = outermost(sensor.values, axis=0)
+        columns = [c for group in groups for c in _clipped(sensor, group, ends, outermost)]
         if not columns:
             continue
-        places = np.flatnonzero((values[:, columns] == own[columns]).any(axis=1))
-        first = values[places[0], columns]
+        places = np.flatnonzero((sensor.values[:, columns] == ends[columns]).any(axis=1))
         message = (
             f"{named(names, columns)} ({len(columns)} of {len(names)} channels) stand at the {end} "
-            f"end of their range, {first[first == own[columns]][0]:g}, in "
-            f"{100 * len(places) / len(values):.1f} % of the readings, first at "
+            f"end of their range, {ends[columns[0]]:g}, in "
+            f"{100 * len(places) / len(sensor.time):.1f} % of the readings, first at "
             f"{sensor.time[places[0]] - view.zero:.2f} s; expected under {100 * CLIPPED_SHARE:g} %"
         )
         yield view.issue("saturated", "sensor", message, *sensor.time[places[[0, -1]]].tolist())
 
 
-def _wide_columns(sensor: Stream) -> list[int]:
-    """The channels beside the force, where they are many of one unit, such as an A-scan."""
-    force = force_columns(sensor)
-    columns = [c for c in range(len(sensor.channels.names)) if c not in force]
-    one_unit = len({sensor.channels.units[column] for column in columns}) == 1
-    return columns if one_unit and len(columns) >= _WIDE else []
+def _clipped(
+    sensor: Stream, columns: list[int], ends: NDArray[np.floating], outermost: Callable[..., Any]
+) -> list[int]:
+    """Those of these columns that stand at the end of their common range, else none.
+
+    Far more readings stand there than at the value next to it, some in a row; of many columns in
+    `TOGETHER` at least. A channel of two values is a switch, which has no value next to its end.
+    """
+    end, standing, clipped = outermost(ends[columns]), list[int](), 0
+    for column in columns:
+        values = sensor.values[:, column]
+        at_end = values == end
+        if end == 0 or at_end.mean() < CLIPPED_SHARE or at_end.all():
+            continue
+        # What many depths reach together at most is no rest, however long one stands there.
+        if (len(columns) == 1 or outermost is np.min) and _rests(sensor, column, end):
+            continue
+        standing.append(column)
+        others = values[~at_end]
+        beside = np.count_nonzero(others == outermost(others))
+        in_a_row = max(stop - start for start, stop in runs(at_end)) >= CLIPPED_RUN
+        several = others.min() < others.max()
+        clipped += several and in_a_row and np.count_nonzero(at_end) >= PILED_UP * beside
+    return standing if clipped >= min(TOGETHER, len(columns)) else []
 
 
 def _rests(sensor: Stream, column: int, end: np.float32) -> bool:
@@ -207,19 +201,6 @@ def _rests(sensor: Stream, column: int, end: np.float32) -> bool:
         return True
     mostly = abs(float(end) - float(np.median(values))) <= AT_REST * float(np.ptp(values))
     return mostly and abs(end) < np.abs(values).max()
-
-
-def _clipped(values: NDArray[np.float32], end: np.float32) -> bool:
-    """Whether far more readings stand at the end than at the value next to it, some in a row.
-
-    A channel of two values is a switch, which has no value next to its end.
-    """
-    at_end = values == end
-    others = values[~at_end]
-    if others.min() == others.max() or max(b - a for a, b in runs(at_end)) < CLIPPED_RUN:
-        return False
-    beside = others[np.argmin(np.abs(others - end))]
-    return bool(np.count_nonzero(at_end) >= PILED_UP * np.count_nonzero(others == beside))
 
 
 # Channels worked on at a time: sorting copies what it looks at.
@@ -254,20 +235,9 @@ def statistics_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Blo
 
 
 def channel_statistics(view: EpisodeView) -> Iterator[ChannelStatistics]:
-    """Statistics of every channel that could be read, over all of the episode's entries.
-
-    Streams `sensor`, `state`, `poses` where they are not columns of the state, and `action`: what
-    the ticks have, which is derived from poses in some formats; as recorded where there is no tick.
-    """
-    line = view.timeline
-    for name, stream in view.streams.items():
-        shown_below = name == "action" and line is not None
-        if not shown_below and not (name == "poses" and view.poses_are_state):
-            channels = stream.channels
-            yield from statistics_of(name, channels.names, channels.units, stream.values)
-    if line is not None:
-        channels = line.action_channels
-        yield from statistics_of("action", channels.names, channels.units, line.action)
+    """Statistics of every channel that a page shows, over all of the episode's entries."""
+    for name, stream in view.shown.items():
+        yield from statistics_of(name, stream.channels.names, stream.channels.units, stream.values)
 
 
 def statistics_of(
@@ -285,15 +255,13 @@ def statistics_of(
 def statistics_table(statistics: Sequence[ChannelStatistics]) -> Table:
     """A row a channel; channels that differ by a number in their names are one from 24 on."""
     rows: list[tuple[object, ...]] = []
-    for _, like in groupby(statistics, lambda one: (one.stream, unnumbered(one.name), one.unit)):
-        group = [astuple(one) for one in like]
+    for _, like in groupby(statistics, lambda c: (c.stream, unnumbered(c.name), c.unit)):
+        group = [astuple(channel) for channel in like]
         rows += group if len(group) < PROFILE_CHANNELS else [_joint_row(group)]
-    caption = "Over the whole episode, before any normalisation."
-    if len(rows) < len(statistics):
-        caption += (
-            " A row of many channels shows the lowest minimum, the highest maximum, and of the rest"
-            " the median over the channels."
-        )
+    caption = (
+        "Over the whole episode, before any normalisation. A row of many channels shows the lowest "
+        "minimum, the highest maximum, and of the rest the median over the channels."
+    )
     return Table(_HEADS, rows, caption)
 
 

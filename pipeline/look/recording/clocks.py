@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
@@ -64,18 +64,11 @@ class Gap(NamedTuple):
         return self.stop_s - self.start_s
 
 
-class _Jump(NamedTuple):
-    """What shows that a clock was set, and by how much that takes it apart from others."""
-
-    why: str
-    apart_s: float
-
-
 @dataclass(frozen=True)
 class Clock:
     """When a stream was sampled: `time` (entry,) s.
 
-    `name` is `View1`, `sensor`, `state`, `poses`, `action`, `ticks` or `VL rows`.
+    `name` is `view View1`, `sensor`, `state`, `poses`, `action`, `ticks` or `VL rows`.
     """
 
     name: str
@@ -121,20 +114,16 @@ class Clock:
         return float(small.std()) if len(small) > 1 else float("nan")
 
 
-def read_clocks(view: EpisodeView) -> tuple[Clock, ...]:
-    """Every clock of the episode: cameras, streams, then ticks and VL rows.
-
-    Poses that stand at the state's times have no clock of their own and are left out.
-    """
-    clocks = [Clock(name, "camera", camera.time) for name, camera in view.cameras.items()]
-    for name, stream in view.streams.items():
-        same = view.state is not None and np.array_equal(view.state.time, stream.time)
-        if name != "poses" or not same:
-            clocks.append(Clock(name, "stream", stream.time))
+def read_clocks(view: EpisodeView) -> list[Clock]:
+    """Every clock of the episode: cameras and streams, then ticks and VL rows."""
+    clocks = [
+        Clock(name, "camera" if name.startswith("view ") else "stream", time)
+        for name, time in view.clocks.items()
+    ]
     if view.timeline is not None:
         clocks.append(Clock("ticks", "tick", view.timeline.time))
         clocks.append(Clock("VL rows", "vl_row", view.timeline.vl_time))
-    return tuple(clocks)
+    return clocks
 
 
 def merge_equal(clocks: Iterable[Clock]) -> list[Clock]:
@@ -142,15 +131,12 @@ def merge_equal(clocks: Iterable[Clock]) -> list[Clock]:
 
     So a gap in the rows of a LeRobot episode is one gap and not one of each view and stream.
     """
-    merged: list[Clock] = []
+    alike: dict[bytes, list[Clock]] = {}
     for clock in clocks:
-        for place, other in enumerate(merged):
-            if np.array_equal(other.time, clock.time):
-                merged[place] = replace(other, name=f"{other.name}, {clock.name}")
-                break
-        else:
-            merged.append(clock)
-    return merged
+        alike.setdefault(clock.time.tobytes(), []).append(clock)
+    return [
+        replace(group[0], name=", ".join(clock.name for clock in group)) for group in alike.values()
+    ]
 
 
 def usual_step(time: NDArray[np.float64]) -> float:
@@ -168,14 +154,13 @@ def find_clock_issues(view: EpisodeView, nominal: Nominal) -> Iterator[Issue]:
 
     A gap shorter than the ticks are apart is none: no tick sees less by it.
     """
-    recorded = [Clock(name, "stream", time) for name, time in view.clocks.items()]
+    recorded = [clock for clock in read_clocks(view) if clock.kind in ("camera", "stream")]
     for clock in merge_equal(recorded):
         expected = [nominal.rates_hz[n] for n in clock.name.split(", ") if n in nominal.rates_hz]
         yield from _gaps(view, clock, _find_jumps(clock, recorded))
         yield from _repeated(view, clock)
-        if clock.name.startswith("view "):
-            promised = f", {expected[0]:.3g} Hz by {nominal.where}" if expected else ""
-            yield from _dropped(view, clock, promised)
+        if clock.kind == "camera":
+            yield from _dropped(view, clock)
         if expected and len(clock.time) > 2:
             yield from _rate(view, clock, expected[0], nominal.where)
     if len(recorded) > 1:
@@ -197,70 +182,53 @@ def _usual(time: NDArray[np.float64]) -> tuple[float, float]:
     return (mean, float(kept[-1])) if median < _BURSTS * mean else (median, median)
 
 
-def _gaps(view: EpisodeView, clock: Clock, jumps: Mapping[Gap, _Jump]) -> Iterator[Issue]:
+def _gaps(view: EpisodeView, clock: Clock, jumps: Mapping[Gap, str]) -> Iterator[Issue]:
+    line, camera = view.timeline, clock.name.split(", ")[0].removeprefix("view ")
     for gap in clock.gaps:
         if gap.length_s <= _tick_s(view):
             continue
-        since = f"{gap.start_s - view.zero:.2f} s"
+        kind, since = "gap", f"{gap.start_s - view.zero:.2f} s"
+        message = f"no entry for {gap.length_s:.2f} s from {since}, expected one every "
+        message += f"{clock.step_s:.3g} s"
         if gap in jumps:
             kind, moved = "clock jump", gap.length_s - clock.step_s
-            message = f"the clock jumps by {moved:.2f} s at {since}: {jumps[gap].why}"
-        else:
-            kind, expected = "gap", f"expected one every {clock.step_s:.3g} s"
-            message = f"no entry for {gap.length_s:.2f} s from {since}, {expected}"
-        yield view.issue(kind, clock.name, message + _oldest_there(view, clock, gap), *gap)
+            message = f"the clock jumps by {moved:.2f} s at {since}: {jumps[gap]}"
+        if line is not None and camera in view.cameras:
+            newest = line.frame_time[camera][line.vl_row]
+            ages = (line.time - newest)[newest == gap.start_s]
+            if len(ages):
+                message += f"; ticks see a frame up to {ages.max():.2f} s old"
+        yield view.issue(kind, clock.name, message, *gap)
 
 
-def _oldest_there(view: EpisodeView, clock: Clock, gap: Gap) -> str:
-    """What a camera's gap does to the ticks."""
-    line, name = view.timeline, clock.name.split(", ")[0].removeprefix("view ")
-    if line is None or name not in view.cameras:
-        return ""
-    shown = line.frame_time[name][line.vl_row]
-    ages = (line.time - shown)[shown == gap.start_s]
-    return f"; ticks see a frame up to {ages.max():.2f} s old" if len(ages) else ""
-
-
-def _find_jumps(clock: Clock, recorded: Sequence[Clock]) -> dict[Gap, _Jump]:
-    """Where a clock was set, the longest jump first, rather than lacks entries.
+def _find_jumps(clock: Clock, recorded: Sequence[Clock]) -> dict[Gap, str]:
+    """Where a clock was set, the longest jump first, rather than lacks entries; and what shows it.
 
     A clock that was set ends apart from those without such a step, and near them less the step; one
-    that lacks entries ends with them. Where all have such a step, it was set if the step is longer
-    than all its others.
+    that lacks entries ends with them.
     """
-    jumps: dict[Gap, _Jump] = {}
+    jumps: dict[Gap, str] = {}
     end = float(clock.time[-1])
     for gap in sorted(clock.gaps, key=lambda gap: -gap.length_s):
-        ends = np.array([one.time[-1] for one in recorded if _longest(one) < gap.length_s / 2])
-        if not len(ends):
-            rest = float(np.ptp(clock.time)) - gap.length_s
-            if gap.length_s > rest:
-                jumps[gap] = _Jump(f"all its other steps together make {rest:.2f} s", 0.0)
-            continue
+        ends = np.array(
+            [c.time[-1] for c in recorded if np.diff(c.time).max(initial=0) < gap.length_s / 2]
+        )
         moved = gap.length_s - clock.step_s
-        apart, left = np.abs(end - ends).min(), np.abs(end - moved - ends).min()
-        if apart >= LOST_S and left < apart / 2:
-            why = f"it ends {apart:.2f} s from the nearest other clock, {left:.2f} s without"
-            jumps[gap] = _Jump(f"{why} the jump", moved)
+        apart, left = (np.abs(at - ends).min(initial=np.inf) for at in (end, end - moved))
+        if LOST_S <= apart < np.inf and left < apart / 2:
+            jumps[gap] = f"it ends {apart:.2f} s from the nearest other clock, {left:.2f} s without"
             end -= moved
     return jumps
-
-
-def _longest(clock: Clock) -> float:
-    return float(np.diff(clock.time).max(initial=0))
 
 
 def _repeated(view: EpisodeView, clock: Clock) -> Iterator[Issue]:
     still = int(np.count_nonzero(np.diff(clock.time) == 0))
     if still > REPEATED * (len(clock.time) - 1):
-        message = (
-            f"{still} of {len(clock.time)} entries have the time of the entry before; "
-            "expected each its own time"
-        )
+        message = f"{still} of {len(clock.time)} entries have the time of the entry before"
         yield view.issue("repeated times", clock.name, message)
 
 
-def _dropped(view: EpisodeView, clock: Clock, promised: str) -> Iterator[Issue]:
+def _dropped(view: EpisodeView, clock: Clock) -> Iterator[Issue]:
     """A camera that loses frames one by one; gaps are told apart.
 
     Its place is the shortest span that holds half of the long steps.
@@ -275,15 +243,14 @@ def _dropped(view: EpisodeView, clock: Clock, promised: str) -> Iterator[Issue]:
     long, lost = len(places), float(steps.sum()) / clock.step_s - len(steps)
     if long < DROPPED or min(long, lost) <= DROPPED_SHARE * len(steps):
         return
-    half = (long + 1) // 2
-    starts, stops = begun[places], (begun + steps)[places]
-    most = int(np.argmin(stops[half - 1 :] - starts[: long - half + 1]))
-    span = float(starts[most]), float(stops[most + half - 1])
+    starts, stops = begun[places], (begun + steps)[places][(long - 1) // 2 :]
+    most = int(np.argmin(stops - starts[: len(stops)]))
+    span = float(starts[most]), float(stops[most])
     message = (
         f"{long} of {len(steps)} steps take at least {DROPPED_STEP:g} times the usual "
         f"{1e3 * clock.step_s:.0f} ms (up to {1e3 * steps.max():.0f} ms), half of them from "
         f"{span[0] - view.zero:.2f} to {span[1] - view.zero:.2f} s: there is time for {lost:.0f} "
-        f"more frames; {len(steps) / steps.sum():.1f} Hz on average{promised}"
+        f"more frames; {len(steps) / steps.sum():.1f} Hz on average"
     )
     yield view.issue("dropped frames", clock.name, message, *span)
 
@@ -299,30 +266,25 @@ def _rate(view: EpisodeView, clock: Clock, expected_hz: float, where: str) -> It
 
 def _lost_ticks(view: EpisodeView, recorded: Sequence[Clock]) -> Iterator[Issue]:
     """What a stream costs that begins after most of the others or ends before most of them."""
-    two = len(recorded) == 2
-    have = "the other stream has" if two else "most streams have"
-    do = "the other stream does" if two else "most streams do"
     starts = [float(clock.time[0]) for clock in recorded]
     # A clock that was set ends where it would have without.
     stops = [
-        float(clock.time[-1]) - sum(jump.apart_s for jump in _find_jumps(clock, recorded).values())
+        clock.time[-1] - sum(gap.length_s - clock.step_s for gap in _find_jumps(clock, recorded))
         for clock in recorded
     ]
     middle = (len(recorded) - 1) // 2
-    for edge, extreme, usual, verb in (
-        (starts, max(starts), sorted(starts)[middle], f"begins {{:.2f}} s after {have}"),
-        (stops, min(stops), sorted(stops)[-1 - middle], f"ends {{:.2f}} s before {do}"),
+    for edge, extreme, usual, words in (
+        (starts, max(starts), sorted(starts)[middle], "begins {:.2f} s after most others"),
+        (stops, min(stops), sorted(stops)[-1 - middle], "ends {:.2f} s before most others"),
     ):
-        lost = abs(extreme - usual)
+        lost, tick_s, length_s = abs(extreme - usual), _tick_s(view), view.duration_s
         near = min(LOST_S, lost) / 2
         late = [c for c, at in zip(recorded, edge, strict=True) if abs(at - extreme) <= near]
-        own_s = max(clock.step_s for clock in late)
-        allowed = (LOST_SHARE * view.duration_s, LOST_TICKS * _tick_s(view), DROPPED_STEP * own_s)
-        if lost >= LOST_S or lost > max(allowed):
+        steps = (DROPPED_STEP * clock.step_s for clock in late)
+        if lost >= LOST_S or lost > max(LOST_SHARE * length_s, LOST_TICKS * tick_s, *steps):
             message = (
-                f"{verb.format(lost)}; no tick can stand there (about {lost / _tick_s(view):.0f} "
-                f"ticks, {100 * lost / view.duration_s:.0f} % of the episode's "
-                f"{view.duration_s:.2f} s)"
+                f"{words.format(lost)}; no tick can stand there (about {lost / tick_s:.0f} ticks, "
+                f"{100 * lost / length_s:.0f} % of the episode)"
             )
             names = ", ".join(clock.name for clock in late)
             yield view.issue("lost ticks", names, message, *sorted((extreme, usual)))
@@ -353,21 +315,17 @@ def _old_frames(view: EpisodeView) -> Iterator[Issue]:
 
 
 GAP_COLOUR = "#D55E00"
-_COLOURS = {"stream": PALETTE[4], "camera": PALETTE[0], "vl_row": PALETTE[2], "tick": INK}
-_MEANINGS = (
-    ("reading", "stream"),
-    ("frame", "camera"),
-    ("VL row, age of its newest frame; lines: the frames it took", "vl_row"),
-    ("tick; number: ticks since its VL row", "tick"),
-)
+# Colour and meaning of a stroke, in the order of the lanes: what feeds a lane stands above it.
+_KINDS = {
+    "stream": (PALETTE[4], "reading"),
+    "camera": (PALETTE[0], "frame"),
+    "vl_row": (PALETTE[2], "VL row, age of its newest frame; lines: the frames it took"),
+    "tick": (INK, "tick; brackets: the ticks of a VL row"),
+}
 # Strokes that a lane has room for: of entries nearer than that, one is drawn.
 _STROKES = 1500
-# Gaps of a lane whose length is written, the longest ones.
-_GAP_LABELS = 8
-# VL rows and ticks that have room for words, and how many rows are shown from near.
-_ROW_LABELS, _TICK_LABELS, _ROWS_NEAR = 12, 60, 5
-# Seconds shown from near: without VL rows, and with rows that follow fast.
-_NEAR_S, _LEAST_NEAR_S = 1.5, 0.5
+# VL rows shown from near, and seconds without any.
+_ROWS_NEAR, _NEAR_S = 5, 1.5
 # Of a lane: how far its marks reach up and down.
 _HALF = 0.36
 
@@ -377,30 +335,22 @@ def clock_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
     clocks = read_clocks(view)
     if not clocks:
         return []
-    return [
-        draw(
-            "clocks",
-            "When each stream was sampled, over the whole episode and a stretch from near (grey "
-            "above), and which VL row serves which ticks. Gaps are marked; rates are usual ones.",
-            draw_lanes,
-        ),
-        clock_table(view, clocks),
-    ]
+    caption = (
+        "When each stream was sampled, over the whole episode and a stretch from near (grey above),"
+        " and which VL row serves which ticks. Gaps are marked."
+    )
+    return [draw("clocks", caption, draw_lanes), clock_table(view, clocks)]
 
 
 def clock_table(view: EpisodeView, clocks: Sequence[Clock]) -> Table:
-    """Rates, jitter and gaps by clock; jitter in a unit in which the largest is at least 1."""
-    largest = np.nanmax([clock.jitter_s for clock in clocks] + [0.0])
-    unit, size = next((u for u in (("s", 1.0), ("ms", 1e-3)) if largest >= u[1]), ("µs", 1e-6))
-    heads = [
-        *("clock", "entries", "first [s]", "last [s]"),
-        *("usual rate [Hz]", "on average [Hz]", f"jitter [{unit}]", "gaps"),
-    ]
+    """Rates, jitter and gaps by clock."""
+    heads = ("clock", "entries", "first [s]", "last [s]")
+    heads += ("usual rate [Hz]", "on average [Hz]", "jitter [ms]", "gaps")
     rows = [
         (
             *(clock.name, len(clock.time)),
             *(clock.time[at] - view.zero if len(clock.time) else None for at in (0, -1)),
-            *(clock.rate_hz, clock.mean_rate_hz, clock.jitter_s / size, len(clock.gaps)),
+            *(clock.rate_hz, clock.mean_rate_hz, 1000 * clock.jitter_s, len(clock.gaps)),
         )
         for clock in clocks
     ]
@@ -416,17 +366,16 @@ def draw_lanes(view: EpisodeView) -> Figure:
     """A lane a clock: over the whole episode, and about five VL rows from near.
 
     From near, lines lead from each frame to the VL row that took it, and brackets from the row to
-    the ticks that reuse it, numbered by how many ticks old it is for them. Streams that were
-    sampled by one clock share a lane.
+    the ticks that reuse it. Streams that were sampled by one clock share a lane.
     """
     clocks = _in_reading_order(read_clocks(view))
-    near = _choose_near(view, clocks)
-    start = min(clock.time[0] for clock in clocks)
-    stop = max(clock.time[-1] for clock in clocks)
+    start = min(float(clock.time[0]) for clock in clocks)
+    stop = max(float(clock.time[-1]) for clock in clocks)
+    near = _choose_near(view, clocks, start, stop)
     room = 0.01 * max(stop - start, 1e-3)
     heights = [0.34 * len(clocks) + 0.3, 0.46 * len(clocks) + 0.5]
     figure = canvas(11.0, sum(heights) + 1.6)
-    whole, detail = figure.subplots(2, 1, gridspec_kw={"height_ratios": heights})
+    whole, detail = figure.subplots(2, 1, height_ratios=heights)
     for axis, span in ((whole, (start - room, stop + room)), (detail, near)):
         axis.set_xlim(span[0] - view.zero, span[1] - view.zero)
         for lane, clock in enumerate(clocks):
@@ -437,54 +386,47 @@ def draw_lanes(view: EpisodeView) -> Figure:
         axis.tick_params(axis="y", length=0)
     whole.axvspan(near[0] - view.zero, near[1] - view.zero, color=GRID, lw=0, zorder=0.3)
     whole.set_title("the whole episode (grey: the stretch below)", loc="left", fontsize=10)
-    for lane, clock in enumerate(clocks):
-        place = {"xycoords": whole.get_yaxis_transform(), "va": "center", "size": 8}
-        whole.annotate(_describe(clock), (1.005, lane), **place)
     if view.timeline is not None:
         lanes = {clock.name: lane for lane, clock in enumerate(clocks)}
         _draw_reuse(detail, view.timeline, view.zero, lanes, near)
     detail.set_title(f"from near: {near[1] - near[0]:.2f} s", loc="left", fontsize=10)
     detail.set_xlabel("time since the recording began [s]")
-    meanings = _MEANINGS if view.timeline is not None else _MEANINGS[:2]
-    patches = [Patch(color=_COLOURS[kind], label=label) for label, kind in meanings]
+    kinds = {clock.kind for clock in clocks}
+    patches = [Patch(color=c, label=label) for kind, (c, label) in _KINDS.items() if kind in kinds]
     patches.append(Patch(facecolor="none", edgecolor=GAP_COLOUR, hatch="////", label="gap"))
     figure.legend(handles=patches, loc="outside lower center", ncols=3, fontsize=8.5)
     return figure
 
 
-def _merge_streams(clocks: Sequence[Clock]) -> list[Clock]:
-    """The clocks, streams with the very same times as one whose name lists theirs."""
-    streams = merge_equal(clock for clock in clocks if clock.kind == "stream")
-    return [*streams, *(clock for clock in clocks if clock.kind != "stream")]
-
-
 def _in_reading_order(clocks: Sequence[Clock]) -> list[Clock]:
-    """Those with an entry: streams, cameras, VL rows, ticks. What feeds a lane stands above it."""
-    shown = [clock for clock in _merge_streams(clocks) if len(clock.time)]
-    return sorted(shown, key=lambda clock: [*_COLOURS].index(clock.kind))
+    """Those with an entry, by kind; streams with the very same times are one of all their names."""
+    shown = [clock for clock in clocks if len(clock.time)]
+    streams = merge_equal(clock for clock in shown if clock.kind == "stream")
+    others = [clock for clock in shown if clock.kind != "stream"]
+    return sorted([*streams, *others], key=lambda clock: [*_KINDS].index(clock.kind))
 
 
-def _choose_near(view: EpisodeView, clocks: Sequence[Clock]) -> tuple[float, float]:
-    """The stretch (start, stop) in s that is shown from near: five VL rows, around a gap if any.
+def _choose_near(
+    view: EpisodeView, clocks: Sequence[Clock], start: float, stop: float
+) -> tuple[float, float]:
+    """The stretch in s that is shown from near: five VL rows, around a gap if any.
 
     The first gap of a camera comes before those of other streams; without one, the middle.
     """
     line = view.timeline
-    start = min(float(clock.time[0]) for clock in clocks)
-    stop = max(float(clock.time[-1]) for clock in clocks)
-    step = usual_step(line.vl_time) if line is not None else float("nan")
-    width = max(_ROWS_NEAR * step, _LEAST_NEAR_S) if step > 0 else _NEAR_S
+    step = float("nan") if line is None else usual_step(line.vl_time)
+    width = min(_ROWS_NEAR * step if step > 0 else _NEAR_S, max(stop - start, 1e-3))
     by_kind = sorted(clocks, key=lambda clock: clock.kind != "camera")
-    gaps = [gap for clock in by_kind for gap in clock.gaps]
+    gap = next((gap for clock in by_kind for gap in clock.gaps), None)
     # Of a gap longer than the stretch, where it begins.
-    middle = min(sum(gaps[0]) / 2, gaps[0].start_s + width / 4) if gaps else (start + stop) / 2
-    begin = middle - width / 2
+    around = (start + stop) / 2 if gap is None else min(sum(gap) / 2, gap.start_s + width / 4)
+    begin = around - width / 2
     if line is not None:
         # From just before a row, so that it is seen with all of its ticks.
         row = max(int(np.searchsorted(line.vl_time, begin + width / 10, side="right")) - 1, 0)
         begin = float(line.vl_time[row]) - width / 10
     begin = max(min(begin, stop - width), start)
-    return begin, min(begin + width, max(stop, begin + 1e-3))
+    return begin, begin + width
 
 
 def _draw_lane(axis: Axes, clock: Clock, lane: int, zero: float) -> None:
@@ -494,63 +436,38 @@ def _draw_lane(axis: Axes, clock: Clock, lane: int, zero: float) -> None:
     places = ((time - low) / (high - low) * _STROKES).astype(np.int64)
     time = time[np.unique(places, return_index=True)[1]]
     width = 1.6 if len(time) < _STROKES / 6 else 1.0
-    axis.vlines(time, lane - _HALF, lane + _HALF, colors=_COLOURS[clock.kind], lw=width)
-    gaps = [(gap.start_s - zero, gap.stop_s - zero) for gap in clock.gaps]
-    gaps = [(start, stop) for start, stop in gaps if stop >= low and start <= high]
-    boxes = [
-        [(start, lane - _HALF), (stop, lane - _HALF), (stop, lane + _HALF), (start, lane + _HALF)]
-        for start, stop in gaps
+    axis.vlines(time, lane - _HALF, lane + _HALF, colors=_KINDS[clock.kind][0], lw=width)
+    spans = [
+        (gap.start_s - zero, gap.length_s)
+        for gap in clock.gaps
+        if gap.stop_s - zero >= low and gap.start_s - zero <= high
     ]
-    # One for all: thousands of gaps as patches take many seconds.
-    hatched = PolyCollection(
-        boxes, facecolor="none", edgecolor=GAP_COLOUR, hatchcolor=GAP_COLOUR, hatch="////", lw=1.4,
-        zorder=3,
+    # One artist for all: thousands of gaps as patches take many seconds.
+    axis.broken_barh(
+        spans, (lane - _HALF, 2 * _HALF), facecolor="none", hatch="////", lw=1.4,
+        edgecolor=GAP_COLOUR, hatchcolor=GAP_COLOUR,
     )  # fmt: skip
-    axis.add_collection(hatched, autolim=False)
-    for start, stop in sorted(gaps, key=lambda gap: gap[0] - gap[1])[:_GAP_LABELS]:
-        axis.text(
-            (max(start, low) + min(stop, high)) / 2, lane - _HALF, f"{stop - start:.2g} s",
-            color=GAP_COLOUR, size=8, ha="center", va="bottom", clip_on=True,
-        )  # fmt: skip
-
-
-def _describe(clock: Clock) -> str:
-    """Rate, jitter and count in one line."""
-    if not np.isfinite(clock.rate_hz):
-        return f"{len(clock.time):,}"
-    # Below a microsecond it is the float's own rounding.
-    jitter = f" ± {1000 * clock.jitter_s:.2g} ms" if clock.jitter_s > 1e-6 else ""
-    return f"{clock.rate_hz:.4g} Hz{jitter}, {len(clock.time):,} entries"
 
 
 def _draw_reuse(
     axis: Axes, line: Timeline, zero: float, lanes: Mapping[str, int], near: tuple[float, float]
 ) -> None:
     """Lines from frames to VL rows and brackets from VL rows to ticks, between two instants."""
-    colour = _COLOURS["vl_row"]
+    colour = _KINDS["vl_row"][0]
     row_lane, tick_lane = lanes["VL rows"], lanes["ticks"]
-    served = [np.flatnonzero(line.vl_row == row) for row in range(len(line.vl_time))]
-    rows = [
-        row
-        for row, ticks in enumerate(served)
-        if line.time[ticks[-1]] >= near[0] and line.vl_time[row] <= near[1]
-    ]
+    rows = np.unique(line.vl_row[(line.time >= near[0]) & (line.vl_time[line.vl_row] <= near[1])])
     for name, time in line.frame_time.items():
-        ends = [
-            [(time[row] - zero, lanes[name]), (line.vl_time[row] - zero, row_lane - _HALF)]
-            for row in rows
-        ]
-        axis.add_collection(LineCollection(ends, colors=colour, label=f"took {name}"))
-        axis.plot(time[rows] - zero, [lanes[name]] * len(rows), "o", ms=5, color=colour, zorder=4)
+        lane = lanes[f"view {name}"]
+        tops = [(at - zero, lane) for at in time[rows]]
+        ends = zip(tops, [(at - zero, row_lane - _HALF) for at in line.vl_time[rows]], strict=True)
+        axis.add_collection(LineCollection([*ends], colors=colour, label=f"took {name}"))
+        axis.plot(time[rows] - zero, [lane] * len(rows), "o", ms=5, color=colour, zorder=4)
     for row in rows:
-        ticks = line.time[served[row]] - zero
+        ticks = line.time[line.vl_row == row] - zero
         across, low = [ticks[0], ticks[0], ticks[-1], ticks[-1]], tick_lane - 0.5
         axis.plot(across, [row_lane + _HALF, low, low, tick_lane - _HALF], color=colour, lw=1.6)
-        if len(rows) <= _ROW_LABELS and line.vl_time[row] >= near[0]:
-            newest = max((time[row] for time in line.frame_time.values()), default=None)
-            age = "" if newest is None else f", {1000 * (line.vl_time[row] - newest):.0f} ms old"
-            place = line.vl_time[row] - zero, row_lane
-            axis.text(*place, f" row {row}{age}", color=colour, size=8, va="center", clip_on=True)
-        for since, tick in enumerate(ticks if len(rows) * len(ticks) <= _TICK_LABELS else ()):
-            place = tick, tick_lane + 0.42
-            axis.text(*place, str(since), size=7, ha="center", va="top", clip_on=True)
+        if line.vl_time[row] >= near[0]:
+            at = float(line.vl_time[row])
+            newest = [time[row] for time in line.frame_time.values()]
+            words = f" row {row}" + (f", {1000 * (at - max(newest)):.0f} ms old" if newest else "")
+            axis.text(at - zero, row_lane, words, color=colour, size=8, va="center", clip_on=True)

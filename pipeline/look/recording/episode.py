@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -23,7 +23,6 @@ from pipeline.look.page.blocks import Picture
 
 # What a damaged recording raises: a reader's word, or a disk's.
 BROKEN = (RecordingError, OSError)
-_Part = TypeVar("_Part")
 
 
 @dataclass(frozen=True)
@@ -36,14 +35,14 @@ class EpisodeView:
     """
 
     recording: Recording
-    timeline: Timeline | None
     cameras: Mapping[str, CameraStream]
     sensor: Stream | None
     state: Stream | None
-    poses: Stream | None
     action: RecordedAction | None
-    issues: tuple[Issue, ...]
-    zero: float
+    poses: Stream | None = None
+    timeline: Timeline | None = None
+    issues: tuple[Issue, ...] = ()
+    zero: float = 0.0
     instruction: str | None = None
     action_rotation: ActionRotation = "rotvec"
 
@@ -60,34 +59,39 @@ class EpisodeView:
         return cameras | {name: stream.time for name, stream in self.streams.items()}
 
     @property
-    def poses_are_state(self) -> bool:
-        """Whether the poses are columns of the state, so that showing them adds nothing."""
-        if self.poses is None or self.state is None:
-            return False
-        return set(self.poses.channels.names) <= set(self.state.channels.names)
+    def shown(self) -> dict[str, Stream]:
+        """The streams that a page shows, by name.
+
+        The action is what the ticks have, as recorded where there is no tick; poses that are
+        columns of the state are left out.
+        """
+        streams, line = self.streams, self.timeline
+        if {"poses", "state"} <= streams.keys():
+            poses, state = (streams[name].channels.names for name in ("poses", "state"))
+            if set(poses) <= set(state):
+                del streams["poses"]
+        if line is not None:
+            streams["action"] = Stream(line.action_channels, line.time, line.action)
+        return streams
 
     @property
     def duration_s(self) -> float:
         """From the first to the last instant of all clocks; 0 where nothing could be read."""
-        return (
-            max((float(time[-1]) for time in self.clocks.values()), default=self.zero) - self.zero
-        )
+        last = max((float(time[-1]) for time in self.clocks.values()), default=self.zero)
+        return last - self.zero
 
     def issue(
         self, kind: str, stream: str, message: str, *span: float, severity: Severity = "warning"
     ) -> Issue:
-        """An issue of this episode; `span` is its start and stop, nothing for all of the stream."""
-        start_s, stop_s = span or (None, None)
+        """An issue of this episode; `span` is its start and stop, nothing for all of the stream.
+
+        Its times are seconds since `zero`, as a page counts them.
+        """
+        start_s, stop_s = (at - self.zero for at in span) if span else (None, None)
         return Issue(
-            severity=severity,
-            kind=kind,
-            message=message,
-            source=self.recording.source,
-            episode=self.recording.id,
-            stream=stream,
-            start_s=start_s,
-            stop_s=stop_s,
-        )
+            severity=severity, kind=kind, message=message, start_s=start_s, stop_s=stop_s,
+            source=self.recording.source, episode=self.recording.id, stream=stream,
+        )  # fmt: skip
 
 
 # Makes a picture of an episode from a name, a caption and what draws it.
@@ -103,30 +107,31 @@ def view_episode(recording: Recording, data: DataParams, rotation: ActionRotatio
     """
     broken: dict[str, str] = {}
 
-    def attempt(stream: str, read: Callable[[], _Part]) -> _Part | None:
+    def attempt(stream: str) -> Any:
         try:
-            return read()
+            return getattr(recording, stream)()
         except BROKEN as error:
             broken[stream] = str(error)
             return None
 
-    view = EpisodeView(
-        recording=recording,
-        timeline=None,
-        cameras=attempt("cameras", recording.cameras) or {},
-        sensor=attempt("sensor", recording.sensor),
-        state=attempt("state", recording.state),
-        poses=None,
-        action=attempt("action", recording.action),
-        issues=(),
-        zero=0.0,
-        instruction=attempt("instruction", lambda: recording.instruction),
-        action_rotation=rotation,
-    )
+    parts = {name: attempt(name) for name in ("cameras", "sensor", "state", "action")}
+    parts["cameras"] = parts["cameras"] or {}
+    view = EpisodeView(recording, **parts, action_rotation=rotation)
+    try:
+        view = replace(view, instruction=recording.instruction)
+    except BROKEN as error:
+        broken["instruction"] = str(error)
     # Poses are most often columns of the state, whose issue has said what is wrong.
     if "state" not in broken:
-        view = replace(view, poses=attempt("poses", recording.poses))
-    issues = _unreadable(view, broken)
+        view = replace(view, poses=attempt("poses"))
+    # One broken file breaks every stream that is in it: its message stands once.
+    issues = [
+        view.issue(
+            "unreadable", ", ".join(s for s in broken if broken[s] == message), message,
+            severity="error",
+        )
+        for message in dict.fromkeys(broken.values())
+    ]  # fmt: skip
     if view.action is not None or view.poses is not None or not {"action", "state"} & {*broken}:
         try:
             view = replace(view, timeline=_timeline(view, data))
@@ -143,19 +148,6 @@ def runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """
     edges = np.flatnonzero(np.diff(flags, prepend=False, append=False)).reshape(-1, 2)
     return [(int(start), int(stop)) for start, stop in edges]
-
-
-def _unreadable(view: EpisodeView, broken: Mapping[str, str]) -> list[Issue]:
-    """One broken file breaks every stream that is in it: its message stands once."""
-    return [
-        view.issue(
-            "unreadable",
-            ", ".join(stream for stream, reason in broken.items() if reason == message),
-            message,
-            severity="error",
-        )
-        for message in dict.fromkeys(broken.values())
-    ]
 
 
 def _timeline(view: EpisodeView, data: DataParams) -> Timeline:

@@ -18,8 +18,10 @@ and a single such camera only when it never changes at all.
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -54,7 +56,9 @@ def camera_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
     if not (ticks := spread_ticks(view, params.inspect.ticks)):
         return []
     shown, broken = read_frames(view, ticks)
-    blocks: list[Block] = [Text(f"{one.stream} is not shown: {one.message}") for one in broken]
+    blocks: list[Block] = [
+        Text(f"{issue.stream} is not shown: {issue.message}") for issue in broken
+    ]
     if shown:
         caption = (
             f"What each view shows at {len(ticks)} ticks, evenly from the first to the last: the "
@@ -95,21 +99,24 @@ def draw_views(view: EpisodeView, ticks: Sequence[int]) -> Figure:
     time = view.timeline.time[list(ticks)]
     heights = [_COLUMN_IN * row[0].shape[0] / row[0].shape[1] + 0.25 for row in frames.values()]
     figure = canvas(_COLUMN_IN * max(len(ticks), 2) + 0.4, sum(heights) + 0.6)
-    axes = figure.subplots(
-        len(frames), len(ticks), squeeze=False, gridspec_kw={"height_ratios": heights}
-    )
+    axes = figure.subplots(len(frames), len(ticks), squeeze=False, height_ratios=heights)
     for line, (name, row) in zip(axes, frames.items(), strict=True):
         ages = time - view.cameras[name].time[_shown_at(view, name, ticks)]
         for axis, frame, age in zip(line, row, ages, strict=True):
-            axis.set(xticks=[], yticks=[])
-            axis.grid(visible=False)
-            axis.imshow(frame)
+            draw_frame(axis, frame)
             axis.set_xlabel(f"{1000 * age:.0f} ms old", fontsize=8, labelpad=2)
-            axis.spines[:].set_visible(False)
         line[0].set_ylabel(name)
     for axis, tick, at in zip(axes[0], ticks, time - view.zero, strict=True):
         axis.set_title(f"tick {tick}, {at:.2f} s", fontsize=10)
     return figure
+
+
+def draw_frame(axis: Axes, frame: NDArray[np.uint8]) -> None:
+    """A frame (height, width, 3) RGB without ticks and grid."""
+    axis.imshow(frame)
+    axis.set(xticks=[], yticks=[])
+    axis.grid(visible=False)
+    axis.spines[:].set_visible(False)
 
 
 @dataclass(frozen=True)
@@ -150,10 +157,7 @@ def _shown_at(view: EpisodeView, name: str, ticks: Sequence[int]) -> NDArray[np.
 
 
 def _look(view: EpisodeView, name: str, camera: CameraStream) -> _Looked:
-    frames, repeats = len(camera.time), camera.repeats()
-    index = _neighbours(frames, MOST_FRAMES if repeats is None else 2 * RUNS)
-    compared = index if repeats is None else np.arange(frames)
-    equal = np.zeros(max(0, len(index) - 1), np.bool_) if repeats is None else repeats
+    count, repeats = len(camera.time), camera.repeats()
     sizes: dict[int, tuple[int, ...]] = {}
     blank: dict[int, bool] = {}
     if repeats is not None and view.timeline is not None:
@@ -162,25 +166,24 @@ def _look(view: EpisodeView, name: str, camera: CameraStream) -> _Looked:
             blank = dict(zip(served, map(_is_blank, thumbnails), strict=True))
         if (known := camera.sizes(served)) is not None:
             sizes |= zip(served, map(tuple, known.tolist()), strict=True)
-    wanted = not blank
-    differing: list[float] = []
+    index = _neighbours(count, MOST_FRAMES if repeats is None else 2 * RUNS)
+    wanted, shares = not blank, np.zeros(max(0, len(index) - 1))
     before: NDArray[np.uint8] | None = None
     for place, frame in enumerate(camera.read(index.tolist())):
         number = int(index[place])
         sizes[number] = frame.shape[:2]
         if wanted:
             blank[number] = _is_blank(frame)
-        if before is not None and before.shape == frame.shape:
-            differs = _share_differing(before, frame)
-            if compared is index:
-                equal[place - 1] = differs == 0
-            if differs and number == index[place - 1] + 1:
-                differing.append(differs)
+        if before is not None:
+            shares[place - 1] = _share_differing(before, frame)
         before = frame
-    noisy = bool(differing) and float(np.percentile(differing, 10)) > NOISY
-    if noisy and compared is not index:
-        noisy = min(_beside(camera, equal), default=1.0) > NOISY
-    return _Looked(compared, equal, blank, noisy, dict(sorted(sizes.items())))
+    differing = shares[(shares > 0) & (np.diff(index) == 1)]
+    noisy = len(differing) > 0 and float(np.percentile(differing, 10)) > NOISY
+    sizes = dict(sorted(sizes.items()))
+    if repeats is None:
+        return _Looked(index, shares == 0, blank, noisy, sizes)
+    noisy = noisy and min(_beside(camera, repeats), default=1.0) > NOISY
+    return _Looked(np.arange(count), repeats, blank, noisy, sizes)
 
 
 def _is_blank(frame: NDArray[np.uint8]) -> bool:
@@ -216,59 +219,53 @@ def _resized(view: EpisodeView, name: str, seen: _Looked) -> Iterator[Issue]:
     if changes:
         old, new = (f"{sizes[at][1]} x {sizes[at][0]} (frame {at})" for at in changes[0])
         span = float(time[changes[0][1]]), float(time[changes[-1][1]])
-        more = f"; {len(changes)} changes in all" if len(changes) > 1 else ""
-        message = f"frames change from {old} to {new} at {span[0] - view.zero:.2f} s{more}"
-        yield view.issue("frame size", f"view {name}", f"{message}; expected one size", *span)
+        message = f"frames change from {old} to {new}; {len(changes)} changes, expected one size"
+        yield view.issue("frame size", f"view {name}", message, *span)
 
 
 def _dead(view: EpisodeView, name: str, blank: Mapping[int, bool]) -> Iterator[Issue]:
-    kind, stream, time = "dead camera", f"view {name}", view.cameras[name].time
-    frames = list(blank)
+    time, frames = view.cameras[name].time, list(blank)
+    issue, expected = partial(view.issue, "dead camera", f"view {name}"), "expected a picture"
     if frames and all(blank.values()):
-        message = f"all {len(frames)} frames looked at are of one colour; expected a picture"
-        yield view.issue(kind, stream, message)
+        yield issue(f"all {len(frames)} frames looked at are of one colour; {expected}")
         return
     for first, stop in runs(np.array(list(blank.values()), np.bool_)):
         start, last = frames[first], frames[stop - 1]
         span = float(time[start]), float(time[last])
-        message = (
+        yield issue(
             f"{stop - first} of the {len(frames)} frames looked at are of one colour: frames "
-            f"{start} to {last}, {span[0] - view.zero:.2f} to {span[1] - view.zero:.2f} s; "
-            "expected a picture"
+            f"{start} to {last}, from {span[0] - view.zero:.2f} s; {expected}",
+            *span,
         )
-        yield view.issue(kind, stream, message, *span)
 
 
 def _duplicates(view: EpisodeView, name: str, looked: Mapping[str, _Looked]) -> Iterator[Issue]:
-    seen, kind, stream = looked[name], "duplicate frames", f"view {name}"
+    seen, issue = looked[name], partial(view.issue, "duplicate frames", f"view {name}")
     time, pairs = view.cameras[name].time, len(seen.equal)
-    among = "" if len(seen.index) == len(time) else " looked at"
     if pairs >= STILL_PAIRS and seen.equal.all():
-        message = f"all {len(seen.index)} frames{among} are one picture; expected a running camera"
-        yield view.issue(kind, stream, message)
+        yield issue(f"all {pairs + 1} frames looked at are one picture; expected a running camera")
         return
     single = seen.equal.copy()
     for first, last in runs(seen.equal):
-        start, stop = (int(seen.index[place]) for place in (first, last))
+        start, stop = seen.index[[first, last]].tolist()
         span = float(time[start]), float(time[stop])
         long = last - first >= (DUPLICATES if seen.noisy else STILL_PAIRS)
         if long and (seen.noisy or _others_move(view, name, looked, *span)):
             single[first:last] = False
             why = "elsewhere no frame is that before" if seen.noisy else "other views move"
-            message = (
-                f"frames {start} to {stop}{among} are one picture, {span[1] - span[0]:.2f} s from "
-                f"{span[0] - view.zero:.2f} s; {why}"
+            yield issue(
+                f"frames {start} to {stop} are one picture, {span[1] - span[0]:.2f} s from "
+                f"{span[0] - view.zero:.2f} s; {why}",
+                *span,
             )
-            yield view.issue(kind, stream, message, *span)
     again = time[seen.index[1:][single]]
     if seen.noisy and len(again) >= DUPLICATES and len(again) > DUPLICATE_SHARE * pairs:
-        instants = ", ".join(f"{at - view.zero:.2f}" for at in again[:DUPLICATES])
-        message = (
-            f"{len(again)} of {pairs} frames compared are the picture before, first at "
-            f"{instants} s, last at {again[-1] - view.zero:.2f} s; the camera is slower than its "
-            "frames are stamped, or frames were stored twice"
+        yield issue(
+            f"{len(again)} of {pairs} frames compared are the picture before, the first at "
+            f"{again[0] - view.zero:.2f} s; the camera is slower than its frames are stamped, or "
+            "frames were stored twice",
+            *again[[0, -1]].tolist(),
         )
-        yield view.issue(kind, stream, message, float(again[0]), float(again[-1]))
 
 
 def _others_move(
@@ -276,10 +273,9 @@ def _others_move(
 ) -> bool:
     """Whether every other camera's pictures change between two instants, and there is another."""
 
-    def differing(other: str) -> int:
-        compared = view.cameras[other].time[looked[other].index]
-        inside = (compared[:-1] >= start_s) & (compared[1:] <= stop_s)
-        return int(np.count_nonzero(inside & ~looked[other].equal))
-
-    counts = [differing(other) for other in looked if other != name]
+    counts: list[int] = []
+    for other in looked.keys() - {name}:
+        time = view.cameras[other].time[looked[other].index]
+        inside = (time[:-1] >= start_s) & (time[1:] <= stop_s)
+        counts.append(int(np.count_nonzero(inside & ~looked[other].equal)))
     return bool(counts) and min(counts) >= MOVING_PAIRS

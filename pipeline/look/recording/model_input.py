@@ -7,7 +7,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -21,11 +21,10 @@ from pipeline.base.digests import LEDGER_SUFFIX as LEDGER
 from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.base.errors import PipelineError, RecordingError
 from pipeline.base.table import Table
-from pipeline.data import Channels
 from pipeline.look.page.blocks import Block, Document, Text, TokenRun, Tokens
 from pipeline.look.page.style import INK, canvas
 from pipeline.look.recording.episode import BROKEN, Draw, EpisodeView
-from pipeline.look.recording.frames import read_frames
+from pipeline.look.recording.frames import draw_frame, read_frames
 from pipeline.look.recording.streams import Group, group_channels, legend_beside, plot_curves
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 from pipeline.vlm.preparation import Preparer
@@ -63,16 +62,13 @@ def sample_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
     except BROKEN as error:
         return [Text(f"No sample can be made: {error}")]
     lengths = window_lengths(params)
-    return [
-        draw(
-            "samples",
-            f"{len(samples)} training samples side by side: the frames, the sensor and state "
-            f"windows that end at the tick, and the chunk of {lengths['action']} actions that "
-            "begins at it. The first is the episode's first tick, the last its last.",
-            lambda view: draw_samples(view, samples, lengths),
-        ),
-        batch_table(samples, lengths),
-    ]
+    caption = (
+        f"{len(samples)} training samples side by side: the frames, the sensor and state windows "
+        f"that end at the tick, and the chunk of {lengths['action']} actions that begins at it. "
+        "The first is the episode's first tick, the last its last."
+    )
+    picture = draw("samples", caption, lambda view: draw_samples(view, samples, lengths))
+    return [picture, batch_table(samples, lengths)]
 
 
 def window_lengths(params: Params) -> dict[str, int]:
@@ -125,31 +121,24 @@ def draw_samples(
     chunk that lie past its end and are masked. States are drawn as what they changed since the
     first of the window.
     """
-    line = view.timeline
-    assert line is not None
-    channels: dict[str, Channels] = {name: one.channels for name, one in view.streams.items()}
-    channels["action"] = line.action_channels
     rows = [
-        (name, group) for name in samples[0].windows for group in group_channels(channels[name])
+        (name, group)
+        for name in samples[0].windows
+        for group in group_channels(view.shown[name].channels)
     ]
-    views = list(samples[0].frames)
-    column = (_WIDTH_IN - _BESIDE_IN) / len(samples)
-    column = min(max(column, _LEAST_COLUMN_IN), _COLUMN_IN)
-    shapes = [samples[0].frames[name].shape for name in views]
-    heights = [*(column * shape[0] / shape[1] for shape in shapes), *[_PANEL_IN] * len(rows)]
+    views = samples[0].frames
+    column = float(np.clip((_WIDTH_IN - _BESIDE_IN) / len(samples), _LEAST_COLUMN_IN, _COLUMN_IN))
+    heights = [column * frame.shape[0] / frame.shape[1] for frame in views.values()]
+    heights += [_PANEL_IN] * len(rows)
     figure = canvas(column * len(samples) + _BESIDE_IN, sum(heights) + 1.8)
-    grid = {"height_ratios": heights}
     axes = figure.subplots(
-        len(heights), len(samples), squeeze=False, sharey="row", gridspec_kw=grid
+        len(heights), len(samples), squeeze=False, sharey="row", height_ratios=heights
     )
-    for axis, sample in zip(axes[0], samples, strict=True):
-        axis.set_title(_sample_title(view, sample.tick), fontsize=_SMALL)
-    for line_axes, name in zip(axes, views, strict=False):
-        for axis, sample in zip(line_axes, samples, strict=True):
-            axis.imshow(sample.frames[name])
-            axis.set(xticks=[], yticks=[])
-            axis.grid(visible=False)
-        line_axes[0].set_ylabel(name, fontsize=_SMALL)
+    for place, sample in enumerate(samples):
+        axes[0, place].set_title(_sample_title(view, sample.tick), fontsize=_SMALL)
+        for line_axes, (name, frame) in zip(axes, sample.frames.items(), strict=False):
+            draw_frame(line_axes[place], frame)
+            line_axes[0].set_ylabel(name, fontsize=_SMALL)
     for line_axes, (name, group) in zip(axes[len(views) :], rows, strict=True):
         values = [sample.windows[name][:, group.indices] for sample in samples]
         _draw_row(line_axes, name, group, values, lengths[name])
@@ -207,7 +196,7 @@ def _draw_row(
     axes[(len(axes) - 1) // 2].set_xlabel(along, fontsize=_SMALL)
     if len(group.names) > 1 and not group.profile:
         # The last sample's window is the fullest: a single reading has a marker, not a line.
-        legend_beside(axes[-1], fontsize=_SMALL)
+        legend_beside(axes[-1])
 
 
 def _sample_title(view: EpisodeView, tick: int) -> str:
@@ -216,44 +205,12 @@ def _sample_title(view: EpisodeView, tick: int) -> str:
     assert line is not None
     row = line.vl_row[tick]
     old = tick - int(np.argmax(line.vl_row == row))
-    newest = max((time[row] for time in line.frame_time.values()), default=None)
-    age = "" if newest is None else f"\nnewest frame {1000 * (line.time[tick] - newest):.0f} ms old"
+    newest = [time[row] for time in line.frame_time.values()]
+    age = f"\nnewest frame {1000 * (line.time[tick] - max(newest)):.0f} ms old" if newest else ""
     return (
         f"tick {tick} of {len(line.time)}\nat {line.time[tick] - view.zero:.2f} s\n"
         f"reuses VL row {row},\n{old} {'tick' if old == 1 else 'ticks'} old{age}"
     )
-
-
-class PromptToken(NamedTuple):
-    """One token of the prompt as the model gets it; `view` is an image token's camera."""
-
-    text: str
-    kind: TokenKind
-    view: str | None = None
-
-
-@dataclass(frozen=True)
-class PromptView:
-    """The prompt of one VL row: as text before image tokens are repeated, and as tokens.
-
-    `pixels` (height, width) are those that each image has for the model, `recorded` by view those
-    that its frames have.
-    """
-
-    text: str
-    tokens: tuple[PromptToken, ...]
-    pixels: tuple[int, int]
-    recorded: Mapping[str, tuple[int, ...]]
-
-    @property
-    def image_tokens(self) -> dict[str, int]:
-        """How many there are by view, in the order of the prompt."""
-        return dict(Counter(token.view for token in self.tokens if token.view is not None))
-
-    @property
-    def special(self) -> dict[str, int]:
-        """How often each special token stands there, the image's included, by its name."""
-        return dict(Counter(token.text for token in self.tokens if token.kind != "text"))
 
 
 def prompt_blocks(view: EpisodeView, params: Params, views: Sequence[str]) -> list[Block]:
@@ -263,20 +220,20 @@ def prompt_blocks(view: EpisodeView, params: Params, views: Sequence[str]) -> li
     except PipelineError as error:
         return [
             Text(
-                "Neither the prompt nor the feature spec can be shown: "
-                f"{str(error).rstrip('.')}. Name a checkpoint that is here with "
-                "`--set vlm.checkpoint=FOLDER`; the demo's is written by `python -m stages.demo`."
+                f"Neither the prompt nor the feature spec can be shown: {str(error).rstrip('.')}. "
+                "Name a checkpoint that is here with `--set vlm.checkpoint=FOLDER`; the demo's is "
+                "written by `python -m stages.demo`."
             )
         ]
     try:
-        blocks = _token_blocks(view_prompt(view, params.vlm, spec))
+        blocks = show_prompt(view, params.vlm, spec)
     except PipelineError as error:
         blocks = [Text(f"The prompt cannot be shown: {error}")]
     return [*blocks, Document("Feature spec: what decides what a feature is", spec.attrs())]
 
 
-def view_prompt(view: EpisodeView, vlm: VLMParams, spec: FeatureSpec) -> PromptView:
-    """The prompt of the episode's first VL row.
+def show_prompt(view: EpisodeView, vlm: VLMParams, spec: FeatureSpec) -> list[Block]:
+    """The prompt of the episode's first VL row: its tokens, and tables of images and specials.
 
     Loads the checkpoint's tokenizer and settings, no weight. Raises `VLMError` where the checkpoint
     is not there or the instruction holds a control token, and `RecordingError` where the episode
@@ -284,23 +241,39 @@ def view_prompt(view: EpisodeView, vlm: VLMParams, spec: FeatureSpec) -> PromptV
     """
     if view.instruction is None or view.timeline is None:
         raise RecordingError(f"{view.recording.path}: has no instruction to read, or no tick")
-    shown, broken = read_frames(view, [0])
+    frames, broken = read_frames(view, [0])
     if broken:
         raise RecordingError(broken[0].message)
-    frames = {name: row[0] for name, row in shown.items()}
     preparer = Preparer(vlm, spec)
-    prepared = preparer.prepare(view.instruction, frames)
-    layout = prepared.layout
-    size = layout.grid[0] * layout.grid[1]
-    views = {
-        place: name for name, start in layout.image_starts for place in range(start, start + size)
-    }
-    tokens = tuple(
-        PromptToken(*preparer.describe(token), views.get(place))
-        for place, token in enumerate(prepared.token_ids.tolist())
-    )
-    recorded = {name: frame.shape[:2] for name, frame in frames.items()}
-    return PromptView(prepared.prompt, tokens, spec.image_size, recorded)
+    row = preparer.prepare(view.instruction, {name: shown[0] for name, shown in frames.items()})
+    size, starts = row.layout.grid[0] * row.layout.grid[1], dict(row.layout.image_starts)
+    views = {place + start: name for name, start in starts.items() for place in range(size)}
+    tokens = [
+        (*preparer.describe(token), views.get(place))
+        for place, token in enumerate(row.token_ids.tolist())
+    ]
+    special = Counter(text for text, kind, _ in tokens if kind != "text")
+    pixels = spec.image_size
+    return [
+        Text(
+            f"{len(tokens):,} tokens: {len(views):,} of images, {len(tokens) - len(views):,} "
+            f"others. Each image is {pixels[0]} × {pixels[1]} pixels for the model. Attention is "
+            "causal: a token sees only what stands before it."
+        ),
+        Tokens(fold_tokens(tokens)),
+        Table(
+            ["view", "recorded [pixels]", "for the model [pixels]", "drawn out", "image tokens"],
+            [
+                (name, f"{high} × {wide}", "{} × {}".format(*pixels), stretch, size)
+                for name in starts
+                for high, wide in [frames[name][0].shape[:2]]
+                for stretch in [describe_stretch((high, wide), pixels)]
+            ],
+            "Image tokens by view; sizes are height × width, the model's those of "
+            "`vlm.image_resize_height` and `vlm.image_resize_width`",
+        ),
+        Table(["token", "times"], list(special.items()), "Special tokens by name"),
+    ]
 
 
 def remembered_spec(params: Params, views: Sequence[str]) -> FeatureSpec:
@@ -340,42 +313,18 @@ def describe_stretch(recorded: tuple[int, ...], pixels: tuple[int, int]) -> str 
     return f"{more:.0%} in {'width' if wider > 1 else 'height'}" if more > _STRETCHED else None
 
 
-def fold_tokens(tokens: Sequence[PromptToken]) -> list[TokenRun]:
-    """Text as one run, special tokens one by one, those of an image folded to a count."""
+def fold_tokens(tokens: Sequence[tuple[str, TokenKind, str | None]]) -> list[TokenRun]:
+    """Text as one run, special tokens one by one, those of an image folded to a count.
+
+    A token is its text, its kind, and the view whose image it stands for.
+    """
     folded: list[TokenRun] = []
-    for (kind, view), like in groupby(tokens, lambda token: (token.kind, token.view)):
-        texts = [token.text for token in like]
-        if kind == "image":
+    for (kind, view), like in groupby(tokens, lambda token: token[1:]):
+        texts = [text for text, _, _ in like]
+        if kind == "special":
+            folded += [TokenRun(text, kind) for text in texts]
+        elif kind == "image":
             folded.append(TokenRun(texts[0], kind, f"× {len(texts):,}, {view}"))
         else:
-            texts = texts if kind == "special" else ["".join(texts)]
-            folded += [TokenRun(text, kind) for text in texts]
+            folded.append(TokenRun("".join(texts), kind))
     return folded
-
-
-def _token_blocks(prompt: PromptView) -> list[Block]:
-    images, pixels = sum(prompt.image_tokens.values()), _size(prompt.pixels)
-    sizes = [
-        (name, _size(size), pixels, describe_stretch(size, prompt.pixels), count)
-        for name, count in prompt.image_tokens.items()
-        for size in [prompt.recorded[name]]
-    ]
-    return [
-        Text(
-            f"{len(prompt.tokens):,} tokens: {images:,} of images, {len(prompt.tokens) - images:,} "
-            f"others. Each image is {pixels} pixels for the model. Attention is "
-            "causal: a token sees only what stands before it."
-        ),
-        Tokens(fold_tokens(prompt.tokens)),
-        Table(
-            ["view", "recorded [pixels]", "for the model [pixels]", "drawn out", "image tokens"],
-            sizes,
-            "Image tokens by view; sizes are height × width, the model's those of "
-            "`vlm.image_resize_height` and `vlm.image_resize_width`",
-        ),
-        Table(["token", "times"], list(prompt.special.items()), "Special tokens by name"),
-    ]
-
-
-def _size(size: tuple[int, ...]) -> str:
-    return f"{size[0]} × {size[1]}"

@@ -1,8 +1,14 @@
-"""Every recording looked over, one in memory at a time."""
+"""Every recording looked over, one in memory at a time, and everything that looks wrong in it.
+
+Each kind's rule and thresholds stand in `clocks`, `channels` and `frames`; what is not there at
+all, here. Most rules look for what is unlike the rest of the same episode, so that no expectation
+about the robot is needed.
+"""
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from hashlib import blake2b
 from pathlib import Path
 
@@ -10,21 +16,32 @@ import numpy as np
 from tqdm import tqdm
 
 from pipeline.base.config import Params
-from pipeline.base.errors import StoreMismatch
+from pipeline.base.errors import RecordingError, StoreMismatch
 from pipeline.base.issue import Issue
 from pipeline.data import Opened, Recording
 from pipeline.data.embodiment import Embodiment, common_embodiment
+from pipeline.data.reader import FileRecording
+from pipeline.data.recording import Nominal
 from pipeline.data.timeline import ActionRotation, choose_action_rotation, rate_notes
+from pipeline.look.recording.channels import find_channel_issues
+from pipeline.look.recording.clocks import find_clock_issues, usual_step
 from pipeline.look.recording.episode import EpisodeView, view_episode
-from pipeline.look.recording.issues import find_issues
+from pipeline.look.recording.frames import find_frame_issues
+
+# Share of its frames that a view may lack; two frames are never too few.
+COUNT_TOLERANCE = 0.1
+# Times as fast a camera is one of another kind, whose frames are not compared in number.
+OTHER_RATE = 1.8
+
+_warning = partial(Issue, severity="warning")
 
 
 @dataclass
 class EpisodeSummary:
     """One episode in a line.
 
-    `zero` is the first instant of all clocks, which times of issues are shown from; `counts` are
-    entries by clock (`EpisodeView.clocks`), `digests` what its motion comes to (`_digest_motion`).
+    `counts` are entries by clock (`EpisodeView.clocks`), `digests` what its motion comes to
+    (`_digest_motion`).
     """
 
     source: str
@@ -32,7 +49,6 @@ class EpisodeSummary:
     format: str
     path: Path
     instruction: str | None
-    zero: float
     duration_s: float
     ticks: int
     vl_rows: int
@@ -59,7 +75,9 @@ class EpisodeSummary:
     def warn(self, kind: str, stream: str, message: str) -> None:
         """Add a warning."""
         source, episode = self.source, self.episode
-        self.issues.append(_warning(kind, message, source, episode=episode, stream=stream))
+        self.issues.append(
+            _warning(kind=kind, message=message, source=source, episode=episode, stream=stream)
+        )
 
 
 @dataclass(frozen=True)
@@ -78,24 +96,12 @@ class RecordingsOverview:
     @property
     def issues(self) -> tuple[Issue, ...]:
         """Those of all, then episode by episode."""
-        return (*self.common, *(issue for one in self.summaries for issue in one.issues))
+        return (*self.common, *(issue for summary in self.summaries for issue in summary.issues))
 
     @property
     def views(self) -> tuple[str, ...]:
         """Of any recording, sorted."""
-        return tuple(sorted({view for one in self.summaries for view in one.frames}))
-
-    def since_start(self, issues: Iterable[Issue]) -> list[Issue]:
-        """The issues with times as a page counts them: from the first instant of their episode."""
-        zeros = {(one.source, one.episode): one.zero for one in self.summaries}
-        shifted: list[Issue] = []
-        for issue in issues:
-            zero = zeros.get((issue.source, issue.episode), 0.0)
-            start_s, stop_s = (
-                None if at is None else at - zero for at in (issue.start_s, issue.stop_s)
-            )
-            shifted.append(replace(issue, start_s=start_s, stop_s=stop_s))
-        return shifted
+        return tuple(sorted({view for summary in self.summaries for view in summary.frames}))
 
     def choose(self, count: int) -> tuple[int, ...]:
         """At most `count` places in `summaries` to look at closely, in their order.
@@ -112,7 +118,7 @@ class RecordingsOverview:
 
 def worst_first(summaries: Sequence[EpisodeSummary]) -> list[int]:
     """Their places, those with most errors, then most warnings, first."""
-    counts = [(-one.errors, -one.warnings) for one in summaries]
+    counts = [(-summary.errors, -summary.warnings) for summary in summaries]
     return sorted(range(len(summaries)), key=counts.__getitem__)
 
 
@@ -134,11 +140,16 @@ def survey_recordings(opened: Opened, params: Params) -> RecordingsOverview:
             rates.append((recording.source, line.recorded_hz, line.fastest_hz))
     _warn_of_missing(summaries)
     _warn_of_duplicates(summaries)
-    common = [*_not_opened(opened), *_apart(embodiments)]
+    common = list(_not_opened(opened))
+    try:
+        if embodiments:
+            common_embodiment(embodiments, "store", "Inspect and extract them apart.")
+    except StoreMismatch as error:
+        common.append(Issue(severity="error", kind="embodiment", message=str(error)))
     # Where ticks are not the recorded rows.
     for source, note in rate_notes(rates, params.data.action_hz).items():
-        message = f"{note}; with data.action_hz null the recorded rows are the ticks"
-        common.append(_warning("tick rate", message, source, stream="ticks"))
+        note += "; with data.action_hz null the recorded rows are the ticks"
+        common.append(_warning(kind="tick rate", message=note, source=source, stream="ticks"))
     return RecordingsOverview(tuple(summaries), tuple(common), rotation)
 
 
@@ -150,7 +161,6 @@ def _summarise(view: EpisodeView) -> EpisodeSummary:
         format=recording.format,
         path=recording.path,
         instruction=view.instruction,
-        zero=view.zero,
         duration_s=view.duration_s,
         ticks=0 if line is None else len(line.time),
         vl_rows=0 if line is None else len(line.vl_time),
@@ -160,23 +170,90 @@ def _summarise(view: EpisodeView) -> EpisodeSummary:
     )
 
 
+def find_issues(view: EpisodeView) -> tuple[Issue, ...]:
+    """The issues of this episode, those of reading it included: errors first, then by time."""
+    issues = [*view.issues, *_beside_nominal(view)]
+    issues += [*find_channel_issues(view), *find_frame_issues(view)]
+    issues.sort(key=lambda issue: (issue.severity != "error", issue.start_s or float("-inf")))
+    return tuple(issues)
+
+
+def _beside_nominal(view: EpisodeView) -> Iterator[Issue]:
+    """What is unlike what the recording says of itself, and what clocks show without that."""
+    try:
+        nominal = view.recording.nominal()
+    except RecordingError as error:
+        nominal = Nominal()
+        # What keeps a stream from being read, too, has been told with it.
+        if str(error) not in {issue.message for issue in view.issues}:
+            yield view.issue("unreadable", "metadata", str(error))
+    for mistake in nominal.mistakes:
+        yield view.issue("wrong metadata", "", mistake)
+    yield from find_clock_issues(view, nominal)
+    yield from _missing(view, nominal)
+    yield from _frame_counts(view, nominal)
+
+
+def _missing(view: EpisodeView, nominal: Nominal) -> Iterator[Issue]:
+    """Streams, cameras and views that are not there, or are no views."""
+    unread = {name for issue in view.issues for name in issue.stream.split(", ")}
+    for name, entry in nominal.streams.items():
+        if name not in view.streams and name not in unread:
+            message = f"no file holds it, but {nominal.where} says {entry}: copy the file, too"
+            yield view.issue("missing", name, message)
+    for name in view.recording.depth_views():
+        message = "a depth map by the metadata, no picture: it is no view, the VLM is not shown it"
+        yield view.issue("depth view", f"view {name}", message)
+    if not isinstance(view.recording, FileRecording) or "cameras" in unread:
+        return
+    # Those that `data.views` leaves out, too.
+    recorded, empty = view.recording.all_views(), view.recording.empty_views()
+    if not view.cameras:
+        left_out = f"; data.views leaves out {', '.join(recorded)}" if recorded else ""
+        message = f"no camera has a frame{left_out}: the VLM would see no picture"
+        yield view.issue("missing", "cameras", message)
+    for name in empty:
+        yield view.issue("missing", f"view {name}", "its folder is there and holds no frame")
+    for name in {*nominal.views} - {*empty}:
+        if not any(other == name or other.startswith(f"{name}_") for other in recorded):
+            message = f"no frame; {nominal.where} lists {', '.join(nominal.views)}"
+            yield view.issue("missing", f"view {name}", message)
+
+
+def _frame_counts(view: EpisodeView, nominal: Nominal) -> Iterator[Issue]:
+    """Too few frames, by the metadata or beside another view of the same rate."""
+    cameras = {name: (len(c.time), usual_step(c.time)) for name, c in view.cameras.items()}
+    most = max((count for count, _ in cameras.values()), default=0)
+    promised = nominal.frames or 0
+    if promised - most > max(2, COUNT_TOLERANCE * promised):
+        message = f"{most} frames in the view that has most, {nominal.where} says {promised}"
+        yield view.issue("frame count", "cameras", message)
+    for name, (count, step) in cameras.items():
+        # A rig can have a slow and a fast camera.
+        alike = [n for n, at in cameras.values() if max(at, step) < OTHER_RATE * min(at, step)]
+        expected = max(alike, default=0)
+        if expected - count > max(2, COUNT_TOLERANCE * expected):
+            message = f"{count} frames, another view of its rate has {expected}"
+            yield view.issue("frame count", f"view {name}", message)
+
+
 def _warn_of_missing(summaries: Sequence[EpisodeSummary]) -> None:
     """Of what most of a source's episodes of that format have, and no issue says why it lacks."""
     alike: dict[tuple[str, str], list[EpisodeSummary]] = defaultdict(list)
-    for one in summaries:
-        alike[one.source, one.format].append(one)
+    for summary in summaries:
+        alike[summary.source, summary.format].append(summary)
     for group in alike.values():
-        held = Counter(name for one in group for name in one.counts)
+        held = Counter(name for summary in group for name in summary.counts)
         usual = {name for name, count in held.items() if 2 * count > len(group)}
-        for one in group:
-            explained = {name for issue in one.issues for name in issue.stream.split(", ")}
+        for summary in group:
+            explained = {name for issue in summary.issues for name in issue.stream.split(", ")}
             if "cameras" in explained:
                 explained |= {name for name in usual if name.startswith("view ")}
             if "state" in explained:
                 explained.add("poses")  # its columns
-            if lacking := sorted(usual - one.counts.keys() - explained):
+            if lacking := sorted(usual - summary.counts.keys() - explained):
                 message = "not there; most episodes of this source have it"
-                one.warn("missing", ", ".join(lacking), message)
+                summary.warn("missing", ", ".join(lacking), message)
 
 
 def _digest_motion(view: EpisodeView) -> dict[str, str]:
@@ -197,51 +274,31 @@ def _digest_motion(view: EpisodeView) -> dict[str, str]:
 def _warn_of_duplicates(summaries: Sequence[EpisodeSummary]) -> None:
     """Of episodes that were there before: they agree in all digests that both have, and in one."""
     firsts: dict[tuple[str, str], list[EpisodeSummary]] = defaultdict(list)
-    for one in summaries:
-        for first in (first for digest in one.digests.items() for first in firsts[digest]):
-            common = sorted(one.digests.keys() & first.digests.keys(), reverse=True)
-            if all(one.digests[name] == first.digests[name] for name in common):
-                source = "" if first.source == one.source else f"{first.source}/"
-                one.warn(
-                    "duplicate recording",
-                    "",
+    for summary in summaries:
+        for first in (first for digest in summary.digests.items() for first in firsts[digest]):
+            common = sorted(summary.digests.keys() & first.digests.keys(), reverse=True)
+            if all(summary.digests[name] == first.digests[name] for name in common):
+                source = "" if first.source == summary.source else f"{first.source}/"
+                message = (
                     f"the same recording as {source}{first.episode} ({first.path}): all values of "
                     f"{' and '.join(common)} are equal, and nothing else was compared; it would "
-                    "count twice. Leave one of them out of data.sources",
+                    "count twice. Leave one of them out of data.sources"
                 )
+                summary.warn("duplicate recording", "", message)
                 break
         else:
-            for digest in one.digests.items():
-                firsts[digest].append(one)
+            for digest in summary.digests.items():
+                firsts[digest].append(summary)
 
 
 def _not_opened(opened: Opened) -> Iterator[Issue]:
+    error = partial(Issue, severity="error", kind="unreadable")
     for bad in opened.bad:
-        source, episode = bad.source, bad.where.name
-        message = bad.reason
-        yield Issue(
-            severity="error", kind="unreadable", message=message, source=source, episode=episode
-        )
+        yield error(message=bad.reason, source=bad.source, episode=bad.where.name)
     by_source: dict[str, list[str]] = defaultdict(list)
     for line in opened.missing:
         source, _, message = line.partition(": ")
         by_source[source].append(message)
     for source, messages in by_source.items():
         more = f" ({len(messages)} such episodes in all)" if len(messages) > 1 else ""
-        yield _warning("missing", f"{messages[0]}{more}", source)
-
-
-def _apart(embodiments: Sequence[tuple[Recording, Embodiment]]) -> Iterator[Issue]:
-    """An issue where the recordings cannot stand in one store."""
-    try:
-        if embodiments:
-            common_embodiment(embodiments, "store", "Inspect and extract them apart.")
-    except StoreMismatch as error:
-        yield Issue(severity="error", kind="embodiment", message=str(error))
-
-
-def _warning(kind: str, message: str, source: str, episode: str = "", stream: str = "") -> Issue:
-    return Issue(
-        severity="warning", kind=kind, message=message,
-        source=source, episode=episode, stream=stream,
-    )  # fmt: skip
+        yield _warning(kind="missing", message=f"{messages[0]}{more}", source=source)

@@ -1,13 +1,29 @@
-"""What was felt and how the robot moved: the pictures of sensor, state, poses and actions."""
+"""What was felt and how the robot moved: contact, and the pictures of sensor, state and actions.
+
+The rule of contact, by the force alone: at the start the needle is clear, so the median force of
+the first `_REST_S` is rest; the noise is what the force does from reading to reading and within
+that time. The force, smoothed by a running median, is in contact from where it leaves rest by
+`_ENTER` times its noise until it is back within `_LEAVE` times: hysteresis, as in O. H. Schmitt,
+"A thermionic trigger", Journal of Scientific Instruments 15(1), 1938. A force in newtons has to
+leave rest by `_LEAST_N` at least.
+
+Its limits: a recording that begins in contact shows only what presses harder or less; a sensor that
+drifts by more than the threshold makes a contact seem to begin early, or to last when the needle
+has glided out of tissue; a touch below the threshold is none.
+"""
 
 from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.rcsetup import cycler
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+from scipy.stats import median_abs_deviation
 
 from pipeline.base.channels import PROFILE_CHANNELS, unnumbered
 from pipeline.base.config import Params
@@ -15,12 +31,11 @@ from pipeline.data import Channels, Stream
 from pipeline.data.timeline import last_at
 from pipeline.look.page.blocks import Block
 from pipeline.look.page.style import PALETTE, canvas
-from pipeline.look.recording.clocks import Clock
-from pipeline.look.recording.contact import RULE, Contact, contacts
-from pipeline.look.recording.episode import Draw, EpisodeView
+from pipeline.look.recording.clocks import Clock, usual_step
+from pipeline.look.recording.episode import Draw, EpisodeView, runs
 
 CONTACT_COLOUR = "#E69F00"
-_LINES = ("-", "--", ":")
+_LINES = cycler(ls=("-", "--", ":")) * cycler(color=PALETTE)
 _WIDTH_IN, _PANEL_IN, _SMALL_IN, _IMAGE_IN = 10.0, 1.75, 1.0, 2.6
 # Of the span of a group: where its channels move less than this, their changes are drawn.
 _STANDS_STILL = 0.2
@@ -28,6 +43,23 @@ _STANDS_STILL = 0.2
 _BITMAP, _COLUMNS = 5000, 1200
 # Seconds that an image covers at least.
 _LEAST_S = 1e-3
+
+
+_REST_S = 0.5
+_SMOOTHED_S = 0.02
+_ENTER, _LEAVE = 6.0, 3.0
+_LEAST_N = 0.05
+# Contacts nearer than this are one; shorter ones are none.
+_APART_S, _SHORTEST_S = 0.1, 0.05
+
+# The rule in a sentence, for a caption.
+RULE = (
+    f"In contact: from where the force leaves its median of the first {_REST_S:g} s by "
+    f"{_ENTER:g} times its noise (in newtons by {_LEAST_N:g} at least) until it is back within "
+    f"{100 * _LEAVE / _ENTER:.0f} % of that."
+)
+# A standard deviation, of normal noise, that outliers do not raise.
+_spread = partial(median_abs_deviation, axis=0, scale=1 / 1.4826)
 
 
 class Group(NamedTuple):
@@ -66,13 +98,10 @@ def sensor_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
     """The picture of the sensor, contact marked; empty without one."""
     if view.sensor is None:
         return []
-    spans = ", ".join(
-        f"{start - view.zero:.2f}–{stop - view.zero:.2f} s" for start, stop in contacts(view)
-    )
-    touching = f"Contact, by the force alone: {spans}." if spans else "No contact in the force."
+    spans = [f"{start - view.zero:.2f}–{stop - view.zero:.2f} s" for start, stop in contacts(view)]
     caption = (
-        f"The sensor's {len(view.sensor.channels.names):,} channels over time, contact shaded. "
-        f"{touching} {RULE}"
+        f"The sensor's {len(view.sensor.channels.names):,} channels over time. Contact (shaded), "
+        f"by the force alone: {', '.join(spans) or 'none'}. {RULE}"
     )
     return [draw("sensor", caption, draw_sensor)]
 
@@ -93,11 +122,19 @@ def draw_sensor(view: EpisodeView) -> Figure:
     assert view.sensor is not None
     groups = group_channels(view.sensor.channels)
     figure, axes = _panels(groups)
+    spans = np.array(contacts(view)).reshape(-1, 2) - view.zero
     for axis, group in zip(axes, groups, strict=True):
-        (_draw_profile if group.profile else _draw_curves)(axis, view.sensor, group, view.zero)
-        _mark_contacts(axis, contacts(view), view.zero, bool(group.profile))
-        if not group.profile:
-            legend_beside(axis)
+        if group.profile:
+            _draw_profile(axis, view.sensor, group, view.zero)
+            # Over an image edges alone, which hide nothing of it.
+            for edge in spans.ravel():
+                axis.axvline(edge, color=CONTACT_COLOUR, lw=1.4, ls="--")
+            continue
+        _draw_curves(axis, view.sensor, group, view.zero)
+        for number, span in enumerate(spans):
+            label = "" if number else "in contact"
+            axis.axvspan(*span, color=CONTACT_COLOUR, alpha=0.22, lw=0, label=label)
+        legend_beside(axis)
     return figure
 
 
@@ -107,27 +144,21 @@ def draw_motion(view: EpisodeView) -> Figure:
     Where channels of a panel lie so far apart that none would be seen to move, it shows what they
     changed since the first reading, and the legend where each began.
     """
-    line = view.timeline
-    streams: dict[str, Stream | None] = {
-        "state": view.state,
-        "poses": None if view.poses_are_state else view.poses,
-        "actions as recorded": view.action if line is None else None,
-        "actions at the ticks": line and Stream(line.action_channels, line.time, line.action),
-    }
     panels = [
-        (title, stream, group)
-        for title, stream in streams.items()
-        if stream is not None
+        (name, stream, group)
+        for name, stream in view.shown.items()
+        if name != "sensor"
         for group in group_channels(stream.channels)
     ]
     figure, axes = _panels([group for _, _, group in panels])
+    actions = "actions as recorded" if view.timeline is None else "actions at the ticks"
     titled = ""
-    for axis, (title, stream, group) in zip(axes, panels, strict=True):
-        held = title.startswith("actions")
+    for axis, (name, stream, group) in zip(axes, panels, strict=True):
+        held = name == "action"
         _draw_curves(axis, stream, group, view.zero, held=held, changes=not held)
-        axis.set_title(title if title != titled else "", loc="left")
+        axis.set_title("" if name == titled else actions if held else name, loc="left")
         legend_beside(axis)
-        titled = title
+        titled = name
     return figure
 
 
@@ -142,40 +173,36 @@ def plot_curves(
 
     `held` holds each value until the next. Long curves are a bitmap in the page.
     """
-    for index, label in enumerate(labels):
-        axis.plot(
-            time,
-            values[:, index],
-            color=PALETTE[index % len(PALETTE)],
-            ls=_LINES[index // len(PALETTE) % len(_LINES)],
-            lw=1.3,
-            # A label that begins with an underscore would drop out of the legend.
-            label=f" {label}" if label.startswith("_") else label,
-            drawstyle="steps-post" if held else "default",
-            # A single reading makes no line.
-            marker="." if len(time) == 1 else None,
-            rasterized=len(time) > _BITMAP,
-        )
+    axis.set_prop_cycle(_LINES)
+    axis.plot(
+        time,
+        values,
+        lw=1.3,
+        # A label that begins with an underscore would drop out of the legend.
+        label=[f" {label}" if label.startswith("_") else label for label in labels],
+        drawstyle="steps-post" if held else "default",
+        # A single reading makes no line.
+        marker="." if len(time) == 1 else None,
+        rasterized=len(time) > _BITMAP,
+    )
 
 
-def legend_beside(axis: Axes, of: Axes | None = None, fontsize: float = 8) -> None:
-    """The legend of a panel, or of another one, right of it; in columns where it is long."""
-    handles, labels = (of or axis).get_legend_handles_labels()
+def legend_beside(axis: Axes) -> None:
+    """The legend of a panel, right of it; in columns where it is long."""
+    columns = 1 + len(axis.get_legend_handles_labels()[1]) // 8
+    place = 1.005, 0.5
     axis.legend(
-        handles, labels, loc="center left", bbox_to_anchor=(1.005, 0.5), fontsize=fontsize,
-        ncols=1 + len(labels) // 8, handlelength=1.6,
-    )  # fmt: skip
+        loc="center left", bbox_to_anchor=place, fontsize=8, ncols=columns, handlelength=1.6
+    )
 
 
 def _panels(groups: Sequence[Group]) -> tuple[Figure, list[Axes]]:
     heights = [
-        _IMAGE_IN if group.profile else _SMALL_IN if len(group.names) == 1 else _PANEL_IN
+        _IMAGE_IN if group.profile else _PANEL_IN if group.names[1:] else _SMALL_IN
         for group in groups
     ]
     figure = canvas(_WIDTH_IN, sum(heights) + 0.5)
-    axes = figure.subplots(
-        len(groups), 1, squeeze=False, sharex=True, gridspec_kw={"height_ratios": heights}
-    )[:, 0]
+    axes = figure.subplots(len(groups), squeeze=False, sharex=True, height_ratios=heights)[:, 0]
     axes[-1].set_xlabel("time since the recording began [s]")
     figure.align_ylabels(axes)
     return figure, list(axes)
@@ -208,13 +235,9 @@ def _draw_profile(axis: Axes, stream: Stream, group: Group, zero: float) -> None
     image = stream.values[shown][:, group.indices].T
     image[:, columns - stream.time[shown] >= clock.shortest_gap_s] = np.nan
     low, high = np.nanpercentile(image, (1, 99.5))
-    drawn = axis.imshow(
-        image,
-        vmin=low,
-        vmax=high if high > low else low + 1,
-        aspect="auto",
-        extent=(stream.time[0] - zero, stop - zero, len(image) - 0.5, -0.5),
-    )
+    extent = (stream.time[0] - zero, stop - zero, len(image) - 0.5, -0.5)
+    high = high if high > low else low + 1
+    drawn = axis.imshow(image, vmin=low, vmax=high, aspect="auto", extent=extent)
     axis.grid(visible=False)
     axis.set_ylabel(f"depth: channel of {group.profile}")
     # Beside the panel: taken from it, its time axis would no longer stand below the curves'.
@@ -223,13 +246,51 @@ def _draw_profile(axis: Axes, stream: Stream, group: Group, zero: float) -> None
     axis.figure.colorbar(drawn, cax=bar, label=f"{group.profile} {unit}", extend="both")
 
 
-def _mark_contacts(axis: Axes, spans: Sequence[Contact], zero: float, over_image: bool) -> None:
-    """Shaded over curves; over an image two edges, which hide nothing of it."""
-    for number, (start, stop) in enumerate(spans):
-        if over_image:
-            for edge in (start - zero, stop - zero):
-                axis.axvline(edge, color=CONTACT_COLOUR, lw=1.4, ls="--")
-        else:
-            label = "in contact" if number == 0 else None
-            edges = start - zero, stop - zero
-            axis.axvspan(*edges, color=CONTACT_COLOUR, alpha=0.22, lw=0, label=label)
+class Contact(NamedTuple):
+    """A span in which the needle touches something, by the force alone."""
+
+    start_s: float
+    stop_s: float
+
+
+def contacts(view: EpisodeView) -> tuple[Contact, ...]:
+    """Spans of contact, in order; none where there is no sensor or it has no force channel.
+
+    Several force channels (a wrench) count by the length of their departure from rest.
+    """
+    if view.sensor is None:
+        return ()
+    columns = force_columns(view.sensor)
+    if not columns or len(view.sensor.time) < 3:
+        return ()
+    time = view.sensor.time
+    force = view.sensor.values[:, columns].astype(np.float64)
+    resting = time <= time[0] + _REST_S
+    # Where times only repeat there is no step, and nothing is smoothed.
+    window = max(1, round(_SMOOTHED_S / (usual_step(time) or _SMOOTHED_S))) | 1
+    smooth = median_filter(force, size=(window, 1), mode="nearest")
+    rest = np.median(smooth[resting], axis=0)
+    # Of the smoothed force, by the steps of the raw one, which hold no slow motion; and at rest.
+    noise = _spread(np.diff(force, axis=0)) / np.sqrt(2 * window) + _spread(smooth[resting])
+    least = _LEAST_N if {view.sensor.channels.units[column] for column in columns} == {"N"} else 0.0
+    departure = np.linalg.norm(smooth - rest, axis=1)
+    enter = max(_ENTER * float(np.linalg.norm(noise)), least)
+    spans: list[Contact] = []
+    for start, stop in runs((departure > enter * _LEAVE / _ENTER) & (departure > 0)):
+        reached = np.flatnonzero(departure[start:stop] >= enter)
+        if len(reached):
+            # To the first reading after it, or the last.
+            begin, end = time[start + reached[0]], time[min(stop, len(time) - 1)]
+            if spans and begin - spans[-1].stop_s < _APART_S:
+                begin = spans.pop().start_s
+            spans.append(Contact(float(begin), float(end)))
+    return tuple(span for span in spans if span.stop_s - span.start_s >= _SHORTEST_S)
+
+
+def force_columns(sensor: Stream) -> list[int]:
+    """The columns of a sensor whose names say force."""
+    return [
+        column
+        for column, name in enumerate(sensor.channels.names)
+        if "force" in name.lower() or name.lower() in ("fx", "fy", "fz")
+    ]

@@ -14,7 +14,6 @@ from pipeline.base.ownership import REPORT, refuse_foreign
 from pipeline.data import Opened, open_recordings
 from pipeline.data.discovery import hub_hint, meant
 
-ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".zst", ".rar")
 STORE = (".zarr", ".zarr.part")
 
 
@@ -40,7 +39,7 @@ class Subject:
             raise RecordingError(f"{error}{_stores_below(self.sources, self.root)}") from None
         if not opened.recordings:
             lines = [f"{self.name}: none of {len(opened.bad)} episode(s) can be looked at:"]
-            lines += [f"  {one.where}: {one.reason}" for one in opened.bad]
+            lines += [f"  {bad.where}: {bad.reason}" for bad in opened.bad]
             raise RecordingError("\n".join(lines))
         return opened
 
@@ -60,7 +59,11 @@ def subject_of(params: Params) -> Subject:
         return Subject(names, wanted.output, None, params.data.sources, params.data.root)
     for place in places:
         _check(place, params.data.root)
-    matches = [Path(match) for place in places for match in sorted(_matches(place))]
+    matches = [
+        Path(match)
+        for place in places
+        for match in sorted(glob.glob(place, recursive=True)) or [place]  # noqa: PTH207
+    ]
     stores = [path for path in matches if _is_store(path)]
     if stores and len(matches) > 1:
         raise ConfigError(
@@ -69,7 +72,10 @@ def subject_of(params: Params) -> Subject:
         )
     folder = _folder(wanted, places)
     refuse_foreign(folder, REPORT)
-    source = Source(name=_last(places), path=tuple(places), format=wanted.format)
+    # The last part of the first path that is no pattern.
+    parts = [part for part in Path(places[0]).absolute().parts if not glob.has_magic(part)]
+    name = parts[-1].strip("/") or "recordings"
+    source = Source(name=name, path=tuple(places), format=wanted.format)
     return Subject(" ".join(places), folder, stores[0] if stores else None, (source,), Path())
 
 
@@ -80,33 +86,24 @@ def _check(place: str, root: Path) -> None:
         return
     if not path.exists():
         raise ConfigError(f"inspect.path: {path} is not there. {_there_is(place, root)}")
-    packed = path.suffix.lower() in ARCHIVES
-    remedy = (
-        "Unpack it, then look at the folder that comes out."
-        if packed
-        else (
-            meant(path.absolute())
-            or "Name the folder of the whole recording: of LeRobot's, the one that holds meta/"
-        )
+    remedy = meant(path.absolute()) or (
+        "Unpack it if it is packed. Name the folder of the whole recording: of LeRobot's, the one "
+        "that holds meta/"
     )
-    kind = "packed file" if packed else "file"
-    raise ConfigError(f"inspect.path: expected a folder, found the {kind} {path}. {remedy}")
+    raise ConfigError(f"inspect.path: expected a folder, found the file {path}. {remedy}")
 
 
 def _check_output(folder: Path) -> None:
     """Raise `ConfigError` now for what would stop the page once everything has been read."""
     places = [folder.absolute(), *folder.absolute().parents]
     there = next(place for place in places if place.exists())
-    store = next(filter(_is_store, places), None)
+    wrong = "" if os.access(there, os.W_OK | os.X_OK) else f"{there} cannot be written to"
     if not there.is_dir():
         wrong = f"expected a folder, found the file {there}"
-    elif store is not None:
+    for store in filter(_is_store, places):
         wrong = f"{folder} lies in the store {store}, where nothing else may be"
-    elif not os.access(there, os.W_OK | os.X_OK):
-        wrong = f"{there} cannot be written to"
-    else:
-        return
-    raise ConfigError(f"inspect.output: {wrong}. Name another: --set inspect.output=FOLDER")
+    if wrong:
+        raise ConfigError(f"inspect.output: {wrong}. Name another: --set inspect.output=FOLDER")
 
 
 def _there_is(place: str, root: Path) -> str:
@@ -115,20 +112,14 @@ def _there_is(place: str, root: Path) -> str:
     if (root / path).exists():
         return f"It is under data.root: python -m stages.inspect '{root / path}'"
     parent = next(folder for folder in path.absolute().parents if folder.is_dir())
-    below = path.absolute().relative_to(parent).parts[0]
     names = sorted(name for name in os.listdir(parent) if not name.startswith("."))
-    close = get_close_matches(below, names, n=3)
+    close = get_close_matches(path.absolute().relative_to(parent).parts[0], names, n=3)
     if close:
         return f"Did you mean {' or '.join(str(parent / name) for name in close)}?"
     hint = hub_hint(place, Path())
     if hint and path.parts[:1] != root.parts[:1]:  # data/demo, before the demo is written
         return hint
-    listed = ", ".join(names[:8]) + (" …" if len(names) > 8 else "")
-    return f"In {parent} there is {listed or 'nothing'}"
-
-
-def _matches(place: str) -> list[str]:
-    return glob.glob(place, recursive=True) or [place]  # noqa: PTH207
+    return f"In {parent} there is {', '.join(names[:8]) or 'nothing'}"
 
 
 def _is_store(path: Path) -> bool:
@@ -141,9 +132,9 @@ def _is_store(path: Path) -> bool:
 def _stores_below(sources: Sequence[Source], root: Path) -> str:
     """What to say where a folder without recordings holds stores."""
     folders = [root / place for source in sources for place in source.paths]
-    stores = [path for folder in folders if folder.is_dir() for path in sorted(folder.iterdir())]
-    stores = [path for path in stores if _is_store(path)]
-    return f". There is a store: python -m stages.inspect {stores[0]}" if stores else ""
+    paths = [path for folder in folders if folder.is_dir() for path in sorted(folder.iterdir())]
+    store = next(filter(_is_store, paths), None)
+    return f". There is a store: python -m stages.inspect {store}" if store else ""
 
 
 def _folder(wanted: InspectParams, places: Sequence[str]) -> Path:
@@ -157,9 +148,3 @@ def _folder(wanted: InspectParams, places: Sequence[str]) -> Path:
     name = re.sub(r"[^\w.-]+", "_", words).strip("_.")
     more = f"_and_{len(places) - 1}_more" if len(places) > 1 else ""
     return wanted.output / f"{name or 'here'}{more}"
-
-
-def _last(places: Sequence[str]) -> str:
-    """The last part of the first path that is no pattern: the source's name on the page."""
-    parts = [part for part in Path(places[0]).absolute().parts if not glob.has_magic(part)]
-    return parts[-1].strip("/") or "recordings"

@@ -16,9 +16,9 @@ from pipeline.look.page.blocks import Block, Picture, Text
 from pipeline.look.page.style import GRID, PALETTE, canvas, legend_below
 from pipeline.look.recording.channels import (
     ChannelStatistics,
+    describe_still,
     statistics_of,
     statistics_table,
-    still_channels,
 )
 from pipeline.store import FeatureStore
 
@@ -59,9 +59,8 @@ def summarize_streams(
             rows = evenly(total, max(2, sample_bytes // (4 * values.shape[1])))
             values = values[rows]
             by_channel = tuple(statistics_of(stream, channels.names, channels.units, values))
-            still = None if stream == "sensor" else still_channels(channels, values)
-            text = still[1] if still else ""
-            statistics.append(StreamSummary(stream, total, len(rows), by_channel, text))
+            still = "" if stream == "sensor" else describe_still(channels, values)
+            statistics.append(StreamSummary(stream, total, len(rows), by_channel, still))
     return tuple(statistics)
 
 

@@ -66,15 +66,13 @@ def test_a_clock_that_was_set_twice_jumps_twice(find: Find) -> None:
 
 def test_where_all_clocks_pause_none_loses_ticks_by_it(find: Find) -> None:
     asleep = {"sensor": set_by(FAST[:9685], 15, at=10), "state": set_by(SLOW[:1510], 15, at=10)}
-    assert {issue.kind for issue in find(asleep)} == {"clock jump", "gap"}
+    assert {issue.kind for issue in find(asleep)} == {"gap"}
 
 
 def test_clocks_that_were_set_together_are_no_witness_of_each_other(find: Find) -> None:
     late = {f"view View{place}": set_by(CAMERA + 0.03 * place, 5) for place in (1, 2, 5)}
     found = find({"sensor": FAST, "state": SLOW, **late})
     assert [issue.kind for issue in found] == ["clock jump"] * 3
-    found = find({"sensor": set_by(FAST, 3600), "state": set_by(SLOW, 3600)})
-    assert [issue.kind for issue in found] == ["clock jump"] * 2
 
 
 @pytest.mark.parametrize("stop", [35, 55])
@@ -92,13 +90,13 @@ def test_a_gap_of_a_stream_that_was_stopped_late_is_no_jump(find: Find) -> None:
 def test_a_stream_that_ends_early(find: Find) -> None:
     (early,) = find({"sensor": FAST, "state": SLOW[:4000]})
     assert (early.kind, early.stream) == ("lost ticks", "state")
-    assert "ends 20.01 s before the other stream does" in early.message
+    assert "ends 20.01 s before most others" in early.message
     found = find({"sensor": set_by(FAST, 5), "state": SLOW[:4000], "view View1": CAMERA})
     assert [(issue.kind, issue.stream) for issue in found] == [
         ("clock jump", "sensor"),
         ("lost ticks", "state"),
     ]
-    assert "ends 19.91 s before most streams do" in found[1].message
+    assert "ends 19.91 s before most others" in found[1].message
 
 
 @pytest.mark.parametrize("start", [0.3, -0.3])

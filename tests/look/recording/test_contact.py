@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from pipeline.data import Channels, Stream
-from pipeline.look.recording.contact import Contact, contacts, force_columns
 from pipeline.look.recording.episode import EpisodeView
+from pipeline.look.recording.streams import Contact, contacts, force_columns
 from pipeline.simulation.insertion import TICK_HZ
 from pipeline.simulation.recorder import SimulatedEpisode, simulate_episode
 

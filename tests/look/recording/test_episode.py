@@ -11,7 +11,7 @@ from pipeline.look.recording.channels import channel_statistics
 from pipeline.look.recording.clocks import read_clocks
 from pipeline.look.recording.episode import EpisodeView
 from pipeline.look.recording.frames import read_frames, spread_ticks
-from pipeline.look.recording.issues import find_issues
+from pipeline.look.recording.overview import find_issues
 
 Look = Callable[..., EpisodeView]
 
@@ -67,7 +67,8 @@ def test_a_backwards_clock_leaves_the_other_streams(copied, look: Look, change_c
     assert view.state is None and view.poses is None and view.timeline is None
     assert view.sensor is not None and len(view.cameras) == 3
     assert find_issues(view) == (issue,)
-    assert {one.name for one in read_clocks(view)} == {"View1", "View2", "View5", "sensor"}
+    views = {"view View1", "view View2", "view View5"}
+    assert {clock.name for clock in read_clocks(view)} == views | {"sensor"}
     assert spread_ticks(view, 5) == []
 
 
@@ -82,9 +83,16 @@ def test_a_truncated_file_is_told_once(copied, look: Look) -> None:
     assert not view.clocks and view.zero == 0 and view.duration_s == 0
     assert view.instruction is None
     assert find_issues(view) == (issue,)
-    assert read_clocks(view) == () and not list(channel_statistics(view))
+    assert read_clocks(view) == [] and not list(channel_statistics(view))
     with pytest.raises(RecordingError):
         _ = view.recording.instruction
+
+
+def test_issues_count_time_from_the_first_instant(healthy: Path, look: Look) -> None:
+    view = look(healthy / "raw")
+    issue = view.issue("gap", "sensor", "", view.zero + 0.5, view.zero + 1)
+    assert view.zero > 1e9 and (issue.start_s, issue.stop_s) == (0.5, 1)
+    assert view.issue("gap", "sensor", "").start_s is None
 
 
 def test_streams_that_never_meet_leave_no_ticks(copied, look: Look, change_npz) -> None:

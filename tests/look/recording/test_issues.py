@@ -48,8 +48,7 @@ def test_a_real_camera_that_loses_frames(shared_data: Path) -> None:
     }
     assert found == {
         "episode_000000": "13 of 175 steps take at least 1.5 times the usual 99 ms (up to 233 ms), "
-        "half of them from 11.93 to 14.36 s: there is time for 18 more frames; 9.2 Hz on average, "
-        "10 Hz by meta/info.json"
+        "half of them from 11.93 to 14.36 s: there is time for 18 more frames; 9.2 Hz on average"
     }
 
 
@@ -142,9 +141,7 @@ class TestCameras:
         )
         assert "frames 30 to 33 are one picture" in issue.message
 
-    def test_every_second_frame_twice(
-        self, copied: Copied, look: Callable[..., EpisodeView], issues_of: Find
-    ) -> None:
+    def test_every_second_frame_twice(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("raw")
         noisy(folder, "View1")
         paths = frames(folder, "View1")
@@ -155,9 +152,6 @@ class TestCameras:
         assert f"{len(paths) // 2} of {len(paths) - 1} frames" in issue.message
         twice = [time_of(path) for path in paths[1::2]]
         assert (issue.start_s, issue.stop_s) == (twice[0], twice[-1])
-        zero = look(folder, views=["View1"]).zero
-        said = ", ".join(f"{time - zero:.2f}" for time in twice[:3])
-        assert f"first at {said} s, last at {twice[-1] - zero:.2f} s" in issue.message
 
     def test_frames_that_change_in_size(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("raw")
@@ -177,7 +171,7 @@ class TestCameras:
         for path in paths[1:]:
             path.write_bytes(paths[0].read_bytes())
         (issue,) = issues_of(folder, views=["View5"])
-        assert f"all {len(paths)} frames are one picture" in issue.message
+        assert f"all {len(paths)} frames looked at are one picture" in issue.message
 
     def test_a_frame_that_cannot_be_decoded(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("raw")
@@ -440,9 +434,8 @@ class TestChannels:
 
         change_csv(only(folder, "robot_state_*.csv"), hold)
         (issue,) = issues_of(folder)
-        assert issue.message == "joint_3 is 12.5 throughout; the others vary"
-        assert issue.start_s is not None and issue.stop_s is not None
-        assert issue.stop_s - issue.start_s > 6
+        assert issue.message == "1 of 12 channels never change: joint_3"
+        assert issue.start_s is None
 
     def test_a_joint_that_hardly_moves(self, copied: Copied, issues_of: Find, change_csv) -> None:
         folder = copied("raw")
@@ -463,8 +456,6 @@ class TestChannels:
         (issue,) = issues_of(folder)
         assert (issue.kind, issue.stream, issue.severity) == ("still channel", "state", "warning")
         assert issue.message.startswith("joint_3 hardly moves: a standard deviation of ")
-        assert issue.start_s is not None and issue.stop_s is not None
-        assert issue.stop_s - issue.start_s > 6
 
     def test_a_frozen_scan(self, copied: Copied, issues_of: Find, change_npz) -> None:
         folder = copied("raw")

@@ -197,19 +197,3 @@ def test_the_choice_spreads_over_sound_episodes(healthy: Path) -> None:
     assert found.choose(1) == (8,) and found.choose(2) == (3, 8)
     assert found.choose(5) == (0, 3, 7, 8, 10)
     assert np.array_equal(found.choose(99), np.arange(11))
-
-
-def test_issues_count_time_as_the_page_does(healthy: Path) -> None:
-    (one,) = survey(Source(name="s", path=str(healthy / "old"))).summaries
-    gap = Issue(
-        severity="warning",
-        kind="gap",
-        message="",
-        source="s",
-        episode=one.episode,
-        start_s=one.zero + 0.5,
-    )
-    whole = replace(gap, start_s=None)
-    found = RecordingsOverview((one,), (), "rotvec").since_start([gap, whole])
-    assert [issue.start_s for issue in found] == [pytest.approx(0.5), None]
-    assert [issue.stop_s for issue in found] == [None, None]

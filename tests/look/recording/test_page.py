@@ -90,7 +90,7 @@ def test_all_episodes_are_checked_and_some_are_shown(
         shutil.copytree(episode, tmp_path / f"episode_{index}")
     report = report_of(params_of(tmp_path, "inspect.episodes=2"))
     table = next(report.blocks(Table))
-    assert [row[0] for row in table.rows] == [f"episode_{index}" for index in range(4)]
+    assert [row[1] for row in table.rows] == [f"episode_{index}" for index in range(4)]
     # The copies of the first have issues, so that they come before it.
     assert table.strong == {1, 2}
     titles = [section.title for section in report.sections]

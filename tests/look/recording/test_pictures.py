@@ -13,15 +13,14 @@ from PIL import Image
 
 from pipeline.base.channels import unnumbered
 from pipeline.base.config import Params
-from pipeline.base.table import Table
 from pipeline.data import Channels, Stream
 from pipeline.look.page.blocks import Picture, Text
 from pipeline.look.recording.channels import statistics_blocks
 from pipeline.look.recording.clocks import Clock, clock_blocks, clock_table, draw_lanes
-from pipeline.look.recording.contact import contacts
 from pipeline.look.recording.episode import EpisodeView
 from pipeline.look.recording.frames import camera_blocks, draw_views
 from pipeline.look.recording.streams import (
+    contacts,
     draw_motion,
     draw_sensor,
     group_channels,
@@ -176,7 +175,8 @@ def test_long_curves_are_bitmaps_that_keep_every_extreme(felt: Felt) -> None:
 def test_lanes_show_every_clock_once_with_its_gap(view: EpisodeView) -> None:
     whole, near = draw_lanes(view).axes
     names = [label.get_text() for label in whole.get_yticklabels()]
-    assert names == ["sensor", "state", "View1", "View2", "View5", "VL rows", "ticks"]
+    views = ["view View1", "view View2", "view View5"]
+    assert names == ["sensor", "state, poses", *views, "VL rows", "ticks"]
     assert view.state is not None
     (gap,) = Clock("state", "stream", view.state.time).gaps
     for axis in (whole, near):
@@ -186,15 +186,13 @@ def test_lanes_show_every_clock_once_with_its_gap(view: EpisodeView) -> None:
     assert near.get_xlim()[0] < gap.start_s - view.zero < near.get_xlim()[1]
 
 
-def test_many_gaps_are_one_artist_and_the_longest_have_words(felt: Felt) -> None:
+def test_many_gaps_are_one_artist(felt: Felt) -> None:
     time = np.cumsum(np.where(np.arange(4000) % 40, 0.1, 0.5 + np.arange(4000) / 4000))
     view = felt(("force",), ("N",), time, np.zeros((4000, 1)))
     alone = replace(view, timeline=None, state=None, poses=None, cameras={})
     whole, _ = draw_lanes(alone).axes
     (drawn,) = [one for one in whole.collections if one.get_hatch()]
     assert len(drawn.get_paths()) == 99 and not whole.patches[1:]
-    said = [text.get_text() for text in whole.texts if text.get_text().endswith(" s")]
-    assert len(said) == 8 and min(said) >= "1.4 s"
 
 
 def test_lines_lead_from_the_frame_to_its_row_and_brackets_to_its_ticks(view: EpisodeView) -> None:
@@ -239,18 +237,11 @@ def test_without_streams_there_is_nothing_to_show(view: EpisodeView, draw) -> No
         assert blocks(empty, draw, PARAMS) == []
 
 
-@pytest.mark.parametrize(
-    ("jitter_s", "unit"), [(0.027, "ms"), (9.2e-4, "µs"), (1.5, "s"), (0.0, "µs")]
-)
-def test_jitter_is_told_in_a_unit_of_its_size(
-    view: EpisodeView, jitter_s: float, unit: str
-) -> None:
-    steps = 10.0 + jitter_s * np.tile([1, -1], 50)
+def test_jitter_is_told_in_milliseconds(view: EpisodeView) -> None:
+    steps = 10.0 + 0.027 * np.tile([1, -1], 50)
     table = clock_table(view, [Clock("state", "stream", np.cumsum(steps))])
-    assert isinstance(table, Table)
-    place = table.columns.index(f"jitter [{unit}]")
-    size = {"s": 1, "ms": 1e-3, "µs": 1e-6}[unit]
-    assert table.rows[0][place] == pytest.approx(jitter_s / size, rel=0.02, abs=1e-3)
+    place = list(table.columns).index("jitter [ms]")
+    assert table.rows[0][place] == pytest.approx(27, rel=0.02)
 
 
 def test_channels_of_one_unit_share_a_panel_and_profiles_and_grippers_are_apart() -> None:

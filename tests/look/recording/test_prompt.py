@@ -10,17 +10,20 @@ from pipeline.base import digests
 from pipeline.base.config import Params, VLMParams, load_params
 from pipeline.base.digests import ContentDigests
 from pipeline.base.errors import RecordingError, VLMError
+from pipeline.base.table import Table
+from pipeline.look.page.blocks import Text, Tokens
 from pipeline.look.recording.episode import EpisodeView
 from pipeline.look.recording.model_input import (
     LEDGER,
-    PromptToken,
     describe_stretch,
     digest_ledger,
     fold_tokens,
     remembered_spec,
-    view_prompt,
+    show_prompt,
 )
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
+from pipeline.vlm.preparation import Preparer
+from pipeline.vlm.processor import TokenKind
 
 Look = Callable[..., EpisodeView]
 PARAMS = Path(__file__).resolve().parents[3] / "params.yaml"
@@ -93,39 +96,41 @@ class TestPrompt:
 
     def test_it_is_what_the_model_gets(self, healthy: Path, look: Look, vlm, spec) -> None:
         view = look(healthy / "old")
-        prompt = view_prompt(view, vlm, spec)
-        assert view.instruction is not None and view.instruction in prompt.text
-        assert prompt.pixels == (56, 84)
+        text, prompt, sizes, special = show_prompt(view, vlm, spec)
+        assert isinstance(text, Text) and isinstance(prompt, Tokens)
+        assert isinstance(sizes, Table) and isinstance(special, Table)
+        words = "".join(run.text for run in prompt.runs)
+        assert view.instruction is not None and view.instruction in words
         # 14-pixel patches, merged two by two.
-        assert prompt.image_tokens == {"View1": 6, "View2": 6, "View5": 6}
-        assert list(prompt.image_tokens) == ["View1", "View2", "View5"]
-        assert prompt.special["<|vision_start|>"] == prompt.special["<|vision_end|>"] == 3
-        assert prompt.special["<|image_pad|>"] == 18
-        assert prompt.special["<|im_start|>"] == prompt.text.count("<|im_start|>")
-        images = [token for token in prompt.tokens if token.kind == "image"]
-        assert len(images) == 18 and {token.view for token in images[:6]} == {"View1"}
-        shrunk, last = "", None
-        for token in prompt.tokens:
-            shrunk += "" if token.kind == "image" and token.view == last else token.text
-            last = token.view
-        assert shrunk == prompt.text
+        assert [(row[0], row[2], row[4]) for row in sizes.rows] == [
+            (name, "56 × 84", 6) for name in ("View1", "View2", "View5")
+        ]
+        assert "18 of images" in text.words
+        times = dict(special.rows)
+        assert times["<|vision_start|>"] == times["<|vision_end|>"] == 3
+        assert times["<|image_pad|>"] == 18
+        assert times["<|im_start|>"] == words.count("<|im_start|>")
+        images = [run.note for run in prompt.runs if run.kind == "image"]
+        assert images == ["× 6, View1", "× 6, View2", "× 6, View5"]
+        # The folded tokens are the rendered prompt, with one placeholder an image.
+        assert words == Preparer(vlm, spec).render(view.instruction, list(view.cameras))
 
     def test_a_letter_of_several_tokens_is_spelled_out(self, healthy, look, vlm, spec) -> None:
         view = replace(look(healthy / "old"), instruction="바늘")
-        prompt = view_prompt(view, vlm, spec)
-        assert "바늘" in prompt.text
-        assert all("\ufffd" not in token.text and token.text for token in prompt.tokens)
+        _, prompt, *_ = show_prompt(view, vlm, spec)
+        assert isinstance(prompt, Tokens)
+        assert all(run.text and "\ufffd" not in run.text for run in prompt.runs)
 
     def test_what_stands_in_its_way(self, healthy, look: Look, vlm: VLMParams, spec) -> None:
         view = look(healthy / "old")
         with pytest.raises(VLMError, match="no such folder"):
-            view_prompt(view, vlm.model_copy(update={"checkpoint": "./none"}), spec)
+            show_prompt(view, vlm.model_copy(update={"checkpoint": "./none"}), spec)
         with pytest.raises(VLMError, match="control token"):
-            view_prompt(replace(view, instruction="<|im_end|>"), vlm, spec)
+            show_prompt(replace(view, instruction="<|im_end|>"), vlm, spec)
         with pytest.raises(RecordingError, match="has no instruction"):
-            view_prompt(replace(view, instruction=None), vlm, spec)
+            show_prompt(replace(view, instruction=None), vlm, spec)
         with pytest.raises(RecordingError, match="no tick"):
-            view_prompt(replace(view, timeline=None), vlm, spec)
+            show_prompt(replace(view, timeline=None), vlm, spec)
 
 
 def test_what_the_model_sees_in_another_shape_is_said() -> None:
@@ -135,12 +140,10 @@ def test_what_the_model_sees_in_another_shape_is_said() -> None:
 
 
 def test_image_tokens_are_folded_view_by_view() -> None:
-    def token(text: str, kind: str, view: str | None = None) -> PromptToken:
-        return PromptToken(text, kind, view)  # pyright: ignore[reportArgumentType]
-
-    tokens = [token("<s>", "special"), token("<e>", "special"), token("a", "text")]
-    tokens += [token("b", "text"), *[token("<i>", "image", "View1")] * 3]
-    tokens += [token("<i>", "image", "View2")]
+    tokens: list[tuple[str, TokenKind, str | None]] = [
+        *(("<s>", "special", None), ("<e>", "special", None), ("a", "text", None)),
+        *(("b", "text", None), *[("<i>", "image", "View1")] * 3, ("<i>", "image", "View2")),
+    ]
     assert [(run.text, run.kind, run.note) for run in fold_tokens(tokens)] == [
         ("<s>", "special", ""),
         ("<e>", "special", ""),
