@@ -9,9 +9,8 @@ import time
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager
 from dataclasses import astuple, dataclass, replace
-from typing import Protocol, Self
+from typing import Self
 
 import numpy as np
 import torch
@@ -77,13 +76,6 @@ class Windows:
             params.sensor_window if params.sensor_enabled else 1,
             params.state_window if params.robot_state_enabled else 1,
         )
-
-
-class Feed(Iterable[tuple[BatchIndices, Batch]], AbstractContextManager["Feed"], Protocol):
-    """Batches in the order of a plan: what a training and an evaluation iterate over."""
-
-    waited_s: float
-    """Time that the consumer has spent waiting for data."""
 
 
 class DeviceStore:

@@ -1,6 +1,6 @@
 """What going on with a run takes beyond its policy, as safetensors and JSON, and the way back."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor, nn
 
+from pipeline.base.differences import describe, differences
 from pipeline.base.durable import (
     damaged,
     read_document,
@@ -25,6 +26,7 @@ from pipeline.train.run import TRAINER_DOCUMENT, TRAINER_WEIGHTS, TrainingRun
 from pipeline.train.world import World
 
 _KINDS = ("weights", "average", "optimizer")
+_DOCUMENT = ("step", "columns", "best_error", "stalled", "trained_s", "rows")
 
 
 @dataclass(frozen=True)
@@ -42,13 +44,13 @@ class TrainerState:
     optimizer: Mapping[str, Tensor]
     history: Float64[Tensor, "step column"]
     """A row for every step so far."""
-    columns: tuple[str, ...]
+    columns: Sequence[str]
     best_error: float | None
     stalled: int
     """Evaluations since the best one."""
     trained_s: float
     """Seconds of training so far, over all starts."""
-    rows: tuple[Row, ...]
+    rows: Sequence[Row]
 
 
 def write_trainer(folder: Path, state: TrainerState) -> None:
@@ -57,15 +59,7 @@ def write_trainer(folder: Path, state: TrainerState) -> None:
         f"{kind}:{name}": value for kind in _KINDS for name, value in getattr(state, kind).items()
     }
     digest = write_tensors(folder / TRAINER_WEIGHTS, tensors | {"history:": state.history})
-    document = {
-        "step": state.step,
-        "columns": list(state.columns),
-        "best_error": state.best_error,
-        "stalled": state.stalled,
-        "trained_s": state.trained_s,
-        "rows": [[step, dict(metrics)] for step, metrics in state.rows],
-        "weights_sha256": digest,
-    }
+    document = {name: getattr(state, name) for name in _DOCUMENT} | {"weights_sha256": digest}
     write_with_digest(folder / TRAINER_DOCUMENT, document)
 
 
@@ -74,15 +68,14 @@ def read_trainer(folder: Path) -> TrainerState:
     path = folder / TRAINER_DOCUMENT
     try:
         document = read_document(path)
-        kinds: dict[str, Any] = {kind: {} for kind in (*_KINDS, "history")}
-        stored = read_tensors(folder / TRAINER_WEIGHTS, document.pop("weights_sha256"))
+        tensors: dict[str, dict[str, Tensor]] = {kind: {} for kind in (*_KINDS, "history")}
+        stored = read_tensors(folder / TRAINER_WEIGHTS, document["weights_sha256"])
         for key, value in stored.items():
             kind, _, name = key.partition(":")
-            kinds[kind][name] = value
-        history = kinds.pop("history")[""]
-        columns = tuple(document.pop("columns"))
-        rows = tuple((step, metrics) for step, metrics in document.pop("rows"))
-        return TrainerState(**document, **kinds, history=history, columns=columns, rows=rows)
+            tensors[kind][name] = value
+        history = tensors.pop("history")[""]
+        rest: dict[str, Any] = {name: document[name] for name in _DOCUMENT}
+        return TrainerState(history=history, **tensors, **rest)
     except PipelineError:
         raise
     except (KeyError, TypeError, ValueError) as error:
@@ -100,12 +93,11 @@ def load_weights(
     """
     wanted = {name: tuple(value.shape) for name, value in parameters.items()}
     stored = {name: tuple(value.shape) for name, value in tensors.items()}
-    if wanted != stored:
-        name = next(n for n in (*wanted, *stored) if wanted.get(n) != stored.get(n))
+    if differing := describe(differences(stored, wanted)):
         raise CheckpointMismatch(
-            f"{place}: expected what learns in this run, {len(wanted)} parameters; at {name} that "
-            f"is {wanted.get(name)}, the checkpoint has {stored.get(name)}. Remove {place} to "
-            "begin anew, or use the version of this code that wrote it."
+            f"{place}: expected what learns in this run, {len(wanted)} parameters; {differing[0]} "
+            f"(the checkpoint -> the run). Remove {place} to begin anew, or use the version of "
+            "this code that wrote it."
         )
     for name, parameter in parameters.items():
         parameter.copy_(tensors[name])
@@ -116,7 +108,7 @@ def read_last(run: TrainingRun, world: World) -> tuple[Normalization, PolicyShap
 
     Raises `CheckpointIncomplete` or `CheckpointMismatch`.
     """
-    tensors: dict[str, Mapping[str, Tensor]] = {kind: {} for kind in _KINDS}
+    tensors: dict[str, Mapping[str, Tensor]] = {}
 
     def read() -> tuple[Normalization, PolicyShape, TrainerState]:
         checkpoint, state = load_policy(run.last), read_trainer(run.last)
@@ -126,5 +118,5 @@ def read_last(run: TrainingRun, world: World) -> tuple[Normalization, PolicyShap
         return checkpoint.normalization, checkpoint.shape, rest
 
     normalization, shape, rest = world.shared(read)
-    sent = {kind: world.tensors(tensors[kind]) for kind in _KINDS}
+    sent = {kind: world.tensors(tensors.get(kind, {})) for kind in _KINDS}
     return normalization, shape, replace(rest, **sent)

@@ -88,13 +88,10 @@ def _why_missing(episode: Episode, sources: set[str], opened: Opened) -> str:
 
 
 def _refuse(store: FeatureStore, wrong: Sequence[tuple[Episode, str]]) -> None:
-    lines = [f"  {episode_name(episode)}: {why}" for episode, why in wrong[:_SHOWN]]
-    if len(wrong) > _SHOWN:
-        lines.append(f"  … and {len(wrong) - _SHOWN} more")
+    lines = "\n".join(f"  {episode_name(episode)}: {why}" for episode, why in wrong[:_SHOWN])
     raise StoreMismatch(
         f"{store.path}: expected the recordings that the store was extracted from, but of its "
-        f"{len(store.episodes)} episodes {len(wrong)} cannot be found as they were:\n"
-        + "\n".join(lines)
-        + f"\nPut the recordings back (data.root, data.sources), or extract a store of what is "
-        f"there now: {_EXTRACT}"
+        f"{len(store.episodes)} episodes {len(wrong)} cannot be found as they were, the first:\n"
+        f"{lines}\nPut the recordings back (data.root, data.sources), or extract a store of what "
+        f"is there now: {_EXTRACT}"
     )

@@ -7,10 +7,9 @@ to be decoded: so rows of one episode are read together and in order, and prepar
 import threading
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 import torch
@@ -78,13 +77,12 @@ class LiveBatch(Batch, LiveObservation):
     """A batch and the rows that its features are to be computed from, each distinct one once."""
 
 
-class LiveFeed(Iterator[tuple[BatchIndices, LiveBatch]]):
-    """A `Feed` that hands out `(indices, live batch)` for each entry of a plan, in its order.
+class LiveFeed(Prefetch):
+    """Hands out `(indices, live batch)` for each entry of a plan, in its order.
 
-    Streams come from a `Prefetch`; the distinct VL rows of each batch are decoded by `threads`
-    threads, as many batches ahead. Every variant of a row is the plain frames: others exist in the
-    store only. An exception in the plan, the store or a recording comes out of `next` at the batch
-    it belongs to. Use as a context manager, or call `close`.
+    The distinct VL rows of each batch are decoded by `threads` threads, as many batches ahead.
+    Every variant of a row is the plain frames: others exist in the store only. An exception in a
+    recording, too, comes out of `next` at the batch it belongs to.
     """
 
     def __init__(
@@ -97,17 +95,15 @@ class LiveFeed(Iterator[tuple[BatchIndices, LiveBatch]]):
         threads: int,
     ) -> None:
         self._vl_row, self._rows = store.array("tick/vl_row"), rows
-        self._coming: deque[tuple[NDArray[np.int64], list[Future[list[PreparedRow]]]]] = deque()
-        self.waited_s = 0.0
-        """Time that the consumer has spent waiting for data."""
+        self._decoding: deque[tuple[NDArray[np.int64], list[Future[list[PreparedRow]]]]] = deque()
         self._pool = ThreadPoolExecutor(threads, thread_name_prefix="decode")
         announced = (self._announce(indices) for indices in plan)
-        self._prefetch = Prefetch(store, announced, windows, device, buffers=threads + 1)
+        super().__init__(store, announced, windows, device, buffers=threads + 1)
 
     def __next__(self) -> tuple[BatchIndices, LiveBatch]:
+        indices, batch = super().__next__()
         started = time.perf_counter()
-        indices, batch = next(self._prefetch)
-        row_of, decoded = self._coming.popleft()
+        row_of, decoded = self._decoding.popleft()
         rows = [row for future in decoded for row in future.result()]
         self.waited_s += time.perf_counter() - started
         places = torch.from_numpy(row_of).to(batch.features.device)
@@ -115,19 +111,13 @@ class LiveFeed(Iterator[tuple[BatchIndices, LiveBatch]]):
 
     def close(self) -> None:
         """Stop all threads and wait for them."""
-        self._prefetch.close()
+        super().close()
         self._pool.shutdown(cancel_futures=True)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *raised: object) -> None:
-        self.close()
 
     def _announce(self, indices: BatchIndices) -> BatchIndices:
         """Begin with the rows of a batch; called in the thread that consumes the plan, in order."""
         distinct, row_of = np.unique(self._vl_row[indices.ticks], return_inverse=True)
         parts = by_episode(distinct, self._rows.vl_start)
         decoded = [self._pool.submit(self._rows.prepare, rows) for _, rows in parts]
-        self._coming.append((row_of.astype(np.int64), decoded))
+        self._decoding.append((row_of.astype(np.int64), decoded))
         return indices
