@@ -3,10 +3,8 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import torch
-from jaxtyping import Float64
 from torch import Tensor, nn
 
 from pipeline.base.differences import describe, differences
@@ -17,16 +15,13 @@ from pipeline.base.durable import (
     write_tensors,
     write_with_digest,
 )
-from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch, PipelineError
+from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch
 from pipeline.policy.checkpoint import load_policy
 from pipeline.policy.normalization import Normalization
 from pipeline.policy.observation import PolicyShape
 from pipeline.train.log import Row
 from pipeline.train.run import TRAINER_DOCUMENT, TRAINER_WEIGHTS, TrainingRun
 from pipeline.train.world import World
-
-_KINDS = ("weights", "average", "optimizer")
-_DOCUMENT = ("step", "columns", "best_error", "stalled", "trained_s", "rows")
 
 
 @dataclass(frozen=True)
@@ -37,29 +32,31 @@ class TrainerState:
     """
 
     step: int
-    weights: Mapping[str, Tensor]
-    """What learns, by its name in the trained module."""
-    average: Mapping[str, Tensor]
-    """The moving average of each of `weights`."""
-    optimizer: Mapping[str, Tensor]
-    history: Float64[Tensor, "step column"]
-    """A row for every step so far."""
     columns: Sequence[str]
+    """Of the history."""
     best_error: float | None
     stalled: int
     """Evaluations since the best one."""
     trained_s: float
     """Seconds of training so far, over all starts."""
     rows: Sequence[Row]
+    tensors: Mapping[str, Tensor]
+    """What learns (`weights:<name in the trained module>`), the moving `average:` of each, the
+    `optimizer:` state and the `history:`, a row for every step so far."""
+
+    def part(self, kind: str) -> dict[str, Tensor]:
+        """The tensors of one kind, by name."""
+        return {
+            key.removeprefix(f"{kind}:"): value
+            for key, value in self.tensors.items()
+            if key.startswith(f"{kind}:")
+        }
 
 
 def write_trainer(folder: Path, state: TrainerState) -> None:
     """Write the two files of a trainer's state into an existing folder."""
-    tensors = {
-        f"{kind}:{name}": value for kind in _KINDS for name, value in getattr(state, kind).items()
-    }
-    digest = write_tensors(folder / TRAINER_WEIGHTS, tensors | {"history:": state.history})
-    document = {name: getattr(state, name) for name in _DOCUMENT} | {"weights_sha256": digest}
+    document = {key: value for key, value in vars(state).items() if key != "tensors"}
+    document["weights_sha256"] = write_tensors(folder / TRAINER_WEIGHTS, state.tensors)
     write_with_digest(folder / TRAINER_DOCUMENT, document)
 
 
@@ -68,17 +65,9 @@ def read_trainer(folder: Path) -> TrainerState:
     path = folder / TRAINER_DOCUMENT
     try:
         document = read_document(path)
-        tensors: dict[str, dict[str, Tensor]] = {kind: {} for kind in (*_KINDS, "history")}
-        stored = read_tensors(folder / TRAINER_WEIGHTS, document["weights_sha256"])
-        for key, value in stored.items():
-            kind, _, name = key.partition(":")
-            tensors[kind][name] = value
-        history = tensors.pop("history")[""]
-        rest: dict[str, Any] = {name: document[name] for name in _DOCUMENT}
-        return TrainerState(history=history, **tensors, **rest)
-    except PipelineError:
-        raise
-    except (KeyError, TypeError, ValueError) as error:
+        tensors = read_tensors(folder / TRAINER_WEIGHTS, document.pop("weights_sha256"))
+        return TrainerState(**document, tensors=tensors)
+    except (KeyError, TypeError) as error:
         why = f"not what it must hold ({type(error).__name__}: {error})"
         raise CheckpointIncomplete(damaged(path, why)) from None
 
@@ -108,15 +97,13 @@ def read_last(run: TrainingRun, world: World) -> tuple[Normalization, PolicyShap
 
     Raises `CheckpointIncomplete` or `CheckpointMismatch`.
     """
-    tensors: dict[str, Mapping[str, Tensor]] = {}
+    tensors: dict[str, Tensor] = {}
 
     def read() -> tuple[Normalization, PolicyShape, TrainerState]:
         checkpoint, state = load_policy(run.last), read_trainer(run.last)
-        tensors.update({kind: getattr(state, kind) for kind in _KINDS})
+        tensors.update(state.tensors)
         # Tensors are not pickled with the rest, but sent one by one.
-        rest = replace(state, weights={}, average={}, optimizer={})
-        return checkpoint.normalization, checkpoint.shape, rest
+        return checkpoint.normalization, checkpoint.shape, replace(state, tensors={})
 
-    normalization, shape, rest = world.shared(read)
-    sent = {kind: world.tensors(tensors.get(kind, {})) for kind in _KINDS}
-    return normalization, shape, replace(rest, **sent)
+    normalization, shape, state = world.shared(read)
+    return normalization, shape, replace(state, tensors=world.tensors(tensors))

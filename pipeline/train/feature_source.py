@@ -24,8 +24,10 @@ class FeatureSource:
     eval_ticks: int | None = None
     """Held-out ticks evaluated at most during training; None: the trainer's own limit."""
 
-    def __init__(self, store: FeatureStore, on_device: Collection[str] = ()) -> None:
+    def __init__(self, store: FeatureStore, on_device: Collection[str] = (), *notes: str) -> None:
         self.store = store
+        self.notes = notes
+        """What to say of it, as lines for the user."""
         self._on_device = on_device
         self._resident: DeviceStore | None = None
 

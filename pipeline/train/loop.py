@@ -69,11 +69,8 @@ class Trainer:
         self.store, self.params, self.split, self.run = store, params, split, run
         self.world = World.current()
         self.device = process_device(params.device)
-        self._feed_note: list[str] = []
         if source is None:
-            on_device, note = choose_feed(params.feed, store, self.device)
-            self._feed_note = [note]
-            source = FeatureSource(store, on_device)
+            source = FeatureSource(store, *choose_feed(params.feed, store, self.device))
         self.source = source
         self.plan = Plan(store, params, split, self.world, run.section)
         self.step = 0
@@ -179,7 +176,7 @@ class Trainer:
         precision = "bfloat16 autocast" if self._bfloat16 else "float32"
         return [
             *lines,
-            *self._feed_note,
+            *self.source.notes,
             f"device {self.device} on {self.world.size} process(es), {precision}"
             f"{', compiled' if self.params.compile else ''}; "
             f"steps {self.step} to {self.params.max_steps}",
@@ -310,17 +307,21 @@ class Trainer:
 
         def save() -> None:
             assert log is not None
+            tensors = {"history:": self.history.tensor()}
+            for kind, named in (
+                ("weights", self.learning),
+                ("average", self.average.weights),
+                ("optimizer", optimizer_tensors(self.optimizer, self.module)),
+            ):
+                tensors |= {f"{kind}:{name}": value for name, value in named.items()}
             state = TrainerState(
                 step=self.step,
-                weights=dict(self.learning),
-                average=self.average.weights,
-                optimizer=optimizer_tensors(self.optimizer, self.module),
-                history=self.history.tensor(),
                 columns=self.history.columns,
                 best_error=self.stopping.best_error,
                 stalled=self.stopping.stalled,
                 trained_s=progress.trained_s,
                 rows=log.rows,
+                tensors=tensors,
             )
             self._save(self.run.last, {"train/loss": self.history.last("loss")}, state)
 
@@ -354,10 +355,10 @@ class Trainer:
         save_policy(folder, checkpoint, beside=write_beside)
 
     def _restore(self, state: TrainerState) -> None:
-        load_weights(self.learning, state.weights, self.run.last)
-        load_weights(self.average.weights, state.average, self.run.last)
-        restore_optimizer(self.optimizer, self.module, state.optimizer)
-        self.history = History(state.columns, state.history)
+        load_weights(self.learning, state.part("weights"), self.run.last)
+        load_weights(self.average.weights, state.part("average"), self.run.last)
+        restore_optimizer(self.optimizer, self.module, state.part("optimizer"))
+        self.history = History(state.columns, state.tensors["history:"])
         self.stopping.best_error, self.stopping.stalled = state.best_error, state.stalled
         self.step, self._earlier, self._trained_s = state.step, state.rows, state.trained_s
 
