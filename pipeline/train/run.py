@@ -16,7 +16,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.base.differences import describe, differences
+from pipeline.base.differences import differences
 from pipeline.base.durable import (
     damaged,
     put_in_place,
@@ -38,7 +38,7 @@ from pipeline.base.ownership import (
 from pipeline.policy.checkpoint import CHECKPOINT, DOCUMENT, SOURCE_KEYS, check_policy
 from pipeline.policy.normalization import Normalization
 from pipeline.store import FeatureStore, build_lock
-from pipeline.train.split import source_of
+from pipeline.train.split import list_differences, source_of
 
 if TYPE_CHECKING:
     from pipeline.policy.observation import PolicyShape
@@ -214,18 +214,14 @@ def _compare(part: Path, identity: Mapping[str, Any], section: str) -> str:
     source = prior.get("source")
     if not isinstance(source, dict) or {*SOURCE_KEYS} - {*source} or "decides" not in prior:
         raise CheckpointIncomplete(damaged(part / RUN, "not what it must hold"))
-    if differing := _lines(source, identity["source"]):
+    if differing := list_differences(source, identity["source"]):
         raise CheckpointMismatch(
             f"{part}: this unfinished run cannot go on, its store was another one "
             f"(the run -> the store now):\n{differing}\n"
             f"Remove {part} to begin anew, choose another {section}.output, or name the store "
             "it began with in train_head.store."
         )
-    return _lines(prior["decides"], identity["decides"])
-
-
-def _lines(expected: Any, actual: Any) -> str:
-    return "\n".join(f"  {line}" for line in describe(differences(expected, actual)))
+    return list_differences(prior["decides"], identity["decides"])
 
 
 def _has_checkpoint(part: Path) -> bool:

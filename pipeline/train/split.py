@@ -174,15 +174,18 @@ def source_of(store: FeatureStore) -> dict[str, Any]:
     return {key: getattr(store, "spec" if key == "feature_spec" else key) for key in SOURCE_KEYS}
 
 
+def list_differences(expected: Any, actual: Any) -> str:
+    """Where two documents differ, on an indented line each; empty where nowhere."""
+    return "\n".join(f"  {line}" for line in describe(differences(expected, actual)))
+
+
 def check_store(checkpoint: PolicyCheckpoint, store: FeatureStore) -> None:
     """Raise `CheckpointMismatch`, naming what differs, when the policy does not fit this store."""
-    differing = differences(checkpoint.source, source_of(store))
-    if differing:
-        lines = "\n".join(f"  {line}" for line in describe(differing))
+    if differing := list_differences(checkpoint.source, source_of(store)):
         raise CheckpointMismatch(
-            f"the checkpoint does not fit {store.path} (the checkpoint -> the store):\n{lines}\n"
-            "Name the store it was trained from in evaluate.store, extract with the params it was "
-            "trained with, or train again: python -m stages.train_head"
+            f"the checkpoint does not fit {store.path} (the checkpoint -> the store):\n"
+            f"{differing}\nName the store it was trained from in evaluate.store, extract with the "
+            "params it was trained with, or train again: python -m stages.train_head"
         )
 
 
