@@ -173,11 +173,12 @@ class Trainer:
         whole = sum(value.numel() for value in self.module.parameters())
         if learning < whole:
             lines.append(f"learns {learning:,} of {whole:,} parameters")
+        several = f" on {self.world.size} processes" if self.world.size > 1 else ""
         precision = "bfloat16 autocast" if self._bfloat16 else "float32"
         return [
             *lines,
             *self.source.notes,
-            f"device {self.device} on {self.world.size} process(es), {precision}"
+            f"device {self.device}{several}, {precision}"
             f"{', compiled' if self.params.compile else ''}; "
             f"steps {self.step} to {self.params.max_steps}",
             *describe_data(self.store, self.shape, self.params, self.split),

@@ -256,7 +256,7 @@ def test_two_processes_follow_the_curve_of_one_that_accumulates(
     done = train_alone(trainer, store, alone)
     out, err = process.communicate()
     assert process.returncode == 0, err
-    assert "device cpu on 2 process(es)" in out
+    assert "device cpu on 2 processes" in out
     assert out.count("parameters") == 1, "one process speaks"
     assert f"stopped early at step {done.step}" in out
     assert done.step < 24
