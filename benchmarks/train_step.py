@@ -24,8 +24,8 @@ from pipeline.base.config import TrainHeadParams, load_params
 from pipeline.policy.cost import flop_table
 from pipeline.store import Batch, FeatureStore
 from pipeline.store.gather import WIDE
-from pipeline.train.batches import BatchIndices, Feed, Windows
-from pipeline.train.feature_source import CachedFeatures
+from pipeline.train.batches import BatchIndices, Prefetch, Windows
+from pipeline.train.feature_source import FeatureSource
 from pipeline.train.loop import Trainer
 from pipeline.train.run import TrainingRun
 from pipeline.train.split import split_by_episode
@@ -43,7 +43,7 @@ _ENDLESS = range(10**9)
 class Contender:
     """Steps of one trainer with the batches of one feed, and how long they were waited for."""
 
-    def __init__(self, trainer: Trainer, feed: Feed | None, steps: int) -> None:
+    def __init__(self, trainer: Trainer, feed: Prefetch | None, steps: int) -> None:
         self._trainer, self._feed, self._steps = trainer, feed, steps
         self._batches = iter(_kept(trainer, steps) if feed is None else feed)
         self.wait_shares: list[float] = []
@@ -110,8 +110,8 @@ def measure(
     """Steps with each feed against steps with batches that are in RAM."""
     windows, device = Windows.of(trainer.params), trainer.device
     fronts = {
-        "mapped": CachedFeatures(trainer.store),
-        "device": CachedFeatures(trainer.store, WIDE),
+        "mapped": FeatureSource(trainer.store),
+        "device": FeatureSource(trainer.store, WIDE),
     }
     feeds = {
         name: front.feed(trainer.plan.parts_of(_ENDLESS), windows, device)

@@ -16,7 +16,7 @@ from pipeline.store import FeatureStore
 from pipeline.train.batches import Windows
 from pipeline.train.predictions import Predictions
 from pipeline.train.scores import Comparison, evaluate_policy
-from pipeline.train.split import held_out_ticks, named_as_in, source_of
+from pipeline.train.split import find_held_out, source_of
 
 JUDGED = "judged.json"
 """Its name in the folder of an evaluation, beside metrics.json."""
@@ -51,13 +51,13 @@ def evaluate_checkpoint(
 ) -> Evaluation:
     """The policy of the checkpoint in `folder`, on its held-out ticks of a store it fits.
 
-    `say` is told first what is evaluated on what. Raises `CheckpointMismatch` as `held_out_ticks`
+    `say` is told first what is evaluated on what. Raises `CheckpointMismatch` as `find_held_out`
     does, and `NumericsError` as `predict`.
     """
-    checkpoint, renamed = named_as_in(store, checkpoint)
-    if renamed:
-        say(renamed)
-    ticks = held_out_ticks(store, checkpoint.held_out_ticks, checkpoint.held_out_content)
+    names = checkpoint.held_out_ticks.keys()
+    ticks, checkpoint = find_held_out(store, checkpoint)
+    if renamed := names - checkpoint.held_out_ticks.keys():
+        say(f"held-out episodes renamed since the training: {len(renamed)}, told by their content")
     policy = checkpoint.policy(device)
     judged = judged_document(checkpoint, policy, store, wanted.samples, wanted.batch_size)
     say(

@@ -5,13 +5,12 @@ more in page faults than the gather itself, and a gather between two steps makes
 `DeviceStore` holds streams on the device and gathers there; `choose_feed` picks what it holds.
 """
 
-import queue
-import threading
 import time
+from collections import deque
 from collections.abc import Collection, Iterable, Iterator
-from contextlib import AbstractContextManager
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import astuple, dataclass, replace
-from typing import Literal, Protocol, Self
+from typing import Self
 
 import numpy as np
 import torch
@@ -28,7 +27,6 @@ from pipeline.store.gather import WIDE, Index, Selection, Window
 from pipeline.store.mapping import fitting
 
 Ticks = NDArray[np.int64]
-FeedName = Literal["auto", "mapped", "device"]
 _DEVICE_SHARE = 0.6
 """Of the device's free memory, what a store may fill: the rest is for the model and its step."""
 
@@ -78,13 +76,6 @@ class Windows:
             params.sensor_window if params.sensor_enabled else 1,
             params.state_window if params.robot_state_enabled else 1,
         )
-
-
-class Feed(Iterable[tuple[BatchIndices, Batch]], AbstractContextManager["Feed"], Protocol):
-    """Batches in the order of a plan: what a training and an evaluation iterate over."""
-
-    waited_s: float
-    """Time that the consumer has spent waiting for data."""
 
 
 class DeviceStore:
@@ -138,15 +129,16 @@ class DeviceStore:
 
 
 def choose_feed(
-    feed: FeedName, store: FeatureStore, device: torch.device, free: int | None = None
+    feed: str, store: FeatureStore, device: torch.device, free: int | None = None
 ) -> tuple[frozenset[str], str]:
     """Which wide fields of a batch live on the device, and a line on why.
 
     `device` takes the streams that fit into `free` bytes there (measured if None), the smallest
     first; `auto` takes a GPU if all fit.
     """
+    by = "auto" if feed == "auto" else "as train_head.feed says"
     if feed == "mapped":
-        return frozenset(), "feed: mapped, as train_head.feed says"
+        return frozenset(), f"feed: mapped ({by})"
     if feed == "auto" and device.type != "cuda":
         return frozenset(), f"feed: mapped (auto: training runs on the {device})"
     if free is None:
@@ -154,16 +146,16 @@ def choose_feed(
         free = torch.cuda.mem_get_info(device)[0] if on_gpu else available_bytes()
     wide = {name: store.tensor(name) for name in WIDE if store.tensor(name).nbytes}
     fields = fitting(wide, free, _DEVICE_SHARE)
-    whole = sum(tensor.nbytes for tensor in wide.values())
-    taken = sum(wide[name].nbytes for name in fields)
     room = (
-        f"{size(taken)} of {size(whole)} fit in {_DEVICE_SHARE:.0%} of the "
-        f"{size(free)} free on {device}"
+        f"{_DEVICE_SHARE:.0%} of the {size(free)} free on {device} hold "
+        f"{', '.join(fields) or 'nothing'} of {', '.join(wide)}"
     )
-    if feed == "auto" and taken < whole:
+    if feed == "auto" and len(fields) < len(wide):
         return frozenset(), f"feed: mapped (auto: {room})"
-    by = "auto" if feed == "auto" else "as train_head.feed says"
-    return frozenset(fields), f"feed: device ({by}; {room}: {', '.join(fields) or 'nothing'})"
+    return frozenset(fields), f"feed: device ({by}; {room})"
+
+
+_Filled = tuple[BatchIndices, Batch, Selection]
 
 
 @dataclass
@@ -171,10 +163,6 @@ class _Buffer:
     """A reused host batch, and the copy out of it that has to end before it is filled again."""
 
     batch: Batch | None = None
-    selection: Selection | None = None
-    """Where what the batch still lacks lies on the device."""
-    whole: Batch | None = None
-    """With that too; on CUDA only made when it is handed out."""
     copied: torch.cuda.Event | None = None
 
 
@@ -205,50 +193,44 @@ class Prefetch(Iterator[tuple[BatchIndices, Batch]]):
         assert buffers >= 2, "one buffer in use, one being filled"
         self.waited_s = 0.0
         """Time that the consumer has spent waiting for data."""
-        self._store = store
-        self._windows = windows
-        self._lags = lags
-        self._device = device
-        self._resident = resident
+        self._store, self._device, self._resident = store, device, resident
+        self._windows, self._lags = astuple(windows), astuple(lags)
         self._on_device = frozenset[str]() if resident is None else resident.fields
-        self._free: queue.SimpleQueue[_Buffer | None] = queue.SimpleQueue()
-        self._filled: queue.SimpleQueue[tuple[BatchIndices, _Buffer] | BaseException | None] = (
-            queue.SimpleQueue()
-        )
-        self._in_use: _Buffer | None = None
-        self._ended = False
+        self._plan = self._warmed(plan)
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="prefetch")
+        self._coming: deque[tuple[_Buffer, Future[_Filled | None]]] = deque()
         for _ in range(buffers):
-            self._free.put(_Buffer())
-        self._closing = threading.Event()
-        self._thread = threading.Thread(
-            target=self._work, args=(plan,), name="prefetch", daemon=True
-        )
-        self._thread.start()
+            self._begin(_Buffer())
+        self._in_use: _Buffer | None = None
 
     def __next__(self) -> tuple[BatchIndices, Batch]:
-        if self._ended:
+        if self._in_use is not None:
+            self._begin(self._in_use)
+        if not self._coming:
             raise StopIteration
-        self._release()
         started = time.perf_counter()
-        item = self._filled.get()
-        self.waited_s += time.perf_counter() - started
-        if not isinstance(item, tuple):
+        self._in_use, coming = self._coming.popleft()
+        try:
+            filled = coming.result()
+        except BaseException:
             self.close()
-            if item is None:
-                raise StopIteration
-            raise item
-        indices, self._in_use = item
-        started = time.perf_counter()
-        batch = self._deliver(self._in_use)
+            raise
+        if filled is None:
+            self.close()
+            raise StopIteration
+        indices, batch, selection = filled
+        if self._device.type == "cuda":
+            batch = self._complete(batch, selection).to(self._device, non_blocking=True)
+            self._in_use.copied = torch.cuda.Event()
+            self._in_use.copied.record(torch.cuda.current_stream(self._device))
         self.waited_s += time.perf_counter() - started
         return indices, batch
 
     def close(self) -> None:
         """Stop the thread and wait for it; the last batch handed out stays valid."""
-        self._ended = True
-        self._closing.set()
-        self._free.put(None)
-        self._thread.join()
+        self._in_use = None
+        self._coming.clear()
+        self._thread.shutdown(cancel_futures=True)
 
     def __enter__(self) -> Self:
         return self
@@ -256,49 +238,31 @@ class Prefetch(Iterator[tuple[BatchIndices, Batch]]):
     def __exit__(self, *raised: object) -> None:
         self.close()
 
-    def _deliver(self, buffer: _Buffer) -> Batch:
-        if self._device.type == "cpu":
-            assert buffer.whole is not None
-            return buffer.whole
-        delivered = self._complete(buffer).to(self._device, non_blocking=True)
-        buffer.copied = torch.cuda.Event()
-        buffer.copied.record(torch.cuda.current_stream(self._device))
-        return delivered
+    def _warmed(self, plan: Iterable[BatchIndices]) -> Iterator[BatchIndices]:
+        self._store.warm(but=self._on_device)
+        yield from plan
 
-    def _complete(self, buffer: _Buffer) -> Batch:
-        assert buffer.batch is not None and buffer.selection is not None
-        if self._resident is None:
-            return buffer.batch
-        return self._resident.complete(buffer.batch, buffer.selection)
+    def _begin(self, buffer: _Buffer) -> None:
+        self._coming.append((buffer, self._thread.submit(self._fill, buffer)))
 
-    def _release(self) -> None:
-        if self._in_use is not None:
-            self._free.put(self._in_use)
-            self._in_use = None
-
-    def _work(self, plan: Iterable[BatchIndices]) -> None:
-        try:
-            self._store.warm(but=self._on_device)
-            for indices in plan:
-                buffer = self._free.get()
-                if buffer is None or self._closing.is_set():
-                    return
-                self._fill(buffer, indices)
-                self._filled.put((indices, buffer))
-            self._filled.put(None)
-        except BaseException as error:  # it belongs to the thread that asks for the batch
-            self._filled.put(error)
-
-    def _fill(self, buffer: _Buffer, indices: BatchIndices) -> None:
+    def _fill(self, buffer: _Buffer) -> _Filled | None:
+        """The next batch of the plan; None at its end. For a GPU it lacks what lives there."""
+        indices = next(self._plan, None)
+        if indices is None:
+            return None
         if buffer.copied is not None:
             buffer.copied.synchronize()
-        windows, count = astuple(self._windows), len(indices.ticks)
+        count = len(indices.ticks)
         if buffer.batch is None or len(buffer.batch) != count:
-            empty = self._store.empty_batch(count, *windows, but=self._on_device)
+            empty = self._store.empty_batch(count, *self._windows, but=self._on_device)
             buffer.batch = empty.pin() if self._device.type == "cuda" else empty.touch()
-        _, buffer.selection = self._store.select(
-            indices.ticks, windows, astuple(self._lags), buffer.batch, indices.variants
+        batch, selection = self._store.select(
+            indices.ticks, self._windows, self._lags, buffer.batch, indices.variants
         )
-        self._store.copy(buffer.selection, buffer.batch, but=self._on_device)
-        if self._device.type == "cpu":
-            buffer.whole = self._complete(buffer)
+        self._store.copy(selection, batch, but=self._on_device)
+        if self._device.type != "cuda":
+            batch = self._complete(batch, selection)
+        return indices, batch, selection
+
+    def _complete(self, batch: Batch, selection: Selection) -> Batch:
+        return batch if self._resident is None else self._resident.complete(batch, selection)

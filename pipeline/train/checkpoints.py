@@ -1,14 +1,13 @@
 """What going on with a run takes beyond its policy, as safetensors and JSON, and the way back."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import torch
-from jaxtyping import Float64
 from torch import Tensor, nn
 
+from pipeline.base.differences import describe, differences
 from pipeline.base.durable import (
     damaged,
     read_document,
@@ -16,15 +15,13 @@ from pipeline.base.durable import (
     write_tensors,
     write_with_digest,
 )
-from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch, PipelineError
+from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch
 from pipeline.policy.checkpoint import load_policy
 from pipeline.policy.normalization import Normalization
 from pipeline.policy.observation import PolicyShape
 from pipeline.train.log import Row
 from pipeline.train.run import TRAINER_DOCUMENT, TRAINER_WEIGHTS, TrainingRun
 from pipeline.train.world import World
-
-_KINDS = ("weights", "average", "optimizer")
 
 
 @dataclass(frozen=True)
@@ -35,37 +32,31 @@ class TrainerState:
     """
 
     step: int
-    weights: Mapping[str, Tensor]
-    """What learns, by its name in the trained module."""
-    average: Mapping[str, Tensor]
-    """The moving average of each of `weights`."""
-    optimizer: Mapping[str, Tensor]
-    history: Float64[Tensor, "step column"]
-    """A row for every step so far."""
-    columns: tuple[str, ...]
+    columns: Sequence[str]
+    """Of the history."""
     best_error: float | None
     stalled: int
     """Evaluations since the best one."""
     trained_s: float
     """Seconds of training so far, over all starts."""
-    rows: tuple[Row, ...]
+    rows: Sequence[Row]
+    tensors: Mapping[str, Tensor]
+    """What learns (`weights:<name in the trained module>`), the moving `average:` of each, the
+    `optimizer:` state and the `history:`, a row for every step so far."""
+
+    def part(self, kind: str) -> dict[str, Tensor]:
+        """The tensors of one kind, by name."""
+        return {
+            key.removeprefix(f"{kind}:"): value
+            for key, value in self.tensors.items()
+            if key.startswith(f"{kind}:")
+        }
 
 
 def write_trainer(folder: Path, state: TrainerState) -> None:
     """Write the two files of a trainer's state into an existing folder."""
-    tensors = {
-        f"{kind}:{name}": value for kind in _KINDS for name, value in getattr(state, kind).items()
-    }
-    digest = write_tensors(folder / TRAINER_WEIGHTS, tensors | {"history:": state.history})
-    document = {
-        "step": state.step,
-        "columns": list(state.columns),
-        "best_error": state.best_error,
-        "stalled": state.stalled,
-        "trained_s": state.trained_s,
-        "rows": [[step, dict(metrics)] for step, metrics in state.rows],
-        "weights_sha256": digest,
-    }
+    document = {key: value for key, value in vars(state).items() if key != "tensors"}
+    document["weights_sha256"] = write_tensors(folder / TRAINER_WEIGHTS, state.tensors)
     write_with_digest(folder / TRAINER_DOCUMENT, document)
 
 
@@ -74,18 +65,9 @@ def read_trainer(folder: Path) -> TrainerState:
     path = folder / TRAINER_DOCUMENT
     try:
         document = read_document(path)
-        kinds: dict[str, Any] = {kind: {} for kind in (*_KINDS, "history")}
-        stored = read_tensors(folder / TRAINER_WEIGHTS, document.pop("weights_sha256"))
-        for key, value in stored.items():
-            kind, _, name = key.partition(":")
-            kinds[kind][name] = value
-        history = kinds.pop("history")[""]
-        columns = tuple(document.pop("columns"))
-        rows = tuple((step, metrics) for step, metrics in document.pop("rows"))
-        return TrainerState(**document, **kinds, history=history, columns=columns, rows=rows)
-    except PipelineError:
-        raise
-    except (KeyError, TypeError, ValueError) as error:
+        tensors = read_tensors(folder / TRAINER_WEIGHTS, document.pop("weights_sha256"))
+        return TrainerState(**document, tensors=tensors)
+    except (KeyError, TypeError) as error:
         why = f"not what it must hold ({type(error).__name__}: {error})"
         raise CheckpointIncomplete(damaged(path, why)) from None
 
@@ -100,12 +82,11 @@ def load_weights(
     """
     wanted = {name: tuple(value.shape) for name, value in parameters.items()}
     stored = {name: tuple(value.shape) for name, value in tensors.items()}
-    if wanted != stored:
-        name = next(n for n in (*wanted, *stored) if wanted.get(n) != stored.get(n))
+    if differing := describe(differences(stored, wanted)):
         raise CheckpointMismatch(
-            f"{place}: expected what learns in this run, {len(wanted)} parameters; at {name} that "
-            f"is {wanted.get(name)}, the checkpoint has {stored.get(name)}. Remove {place} to "
-            "begin anew, or use the version of this code that wrote it."
+            f"{place}: expected what learns in this run, {len(wanted)} parameters; {differing[0]} "
+            f"(the checkpoint -> the run). Remove {place} to begin anew, or use the version of "
+            "this code that wrote it."
         )
     for name, parameter in parameters.items():
         parameter.copy_(tensors[name])
@@ -116,15 +97,13 @@ def read_last(run: TrainingRun, world: World) -> tuple[Normalization, PolicyShap
 
     Raises `CheckpointIncomplete` or `CheckpointMismatch`.
     """
-    tensors: dict[str, Mapping[str, Tensor]] = {kind: {} for kind in _KINDS}
+    tensors: dict[str, Tensor] = {}
 
     def read() -> tuple[Normalization, PolicyShape, TrainerState]:
         checkpoint, state = load_policy(run.last), read_trainer(run.last)
-        tensors.update({kind: getattr(state, kind) for kind in _KINDS})
+        tensors.update(state.tensors)
         # Tensors are not pickled with the rest, but sent one by one.
-        rest = replace(state, weights={}, average={}, optimizer={})
-        return checkpoint.normalization, checkpoint.shape, rest
+        return checkpoint.normalization, checkpoint.shape, replace(state, tensors={})
 
-    normalization, shape, rest = world.shared(read)
-    sent = {kind: world.tensors(tensors[kind]) for kind in _KINDS}
-    return normalization, shape, replace(rest, **sent)
+    normalization, shape, state = world.shared(read)
+    return normalization, shape, replace(state, tensors=world.tensors(tensors))

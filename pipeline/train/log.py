@@ -192,10 +192,9 @@ class WandB:
                 "later), or take wandb out of train_head.loggers."
             ) from None
         self._from = self._run.starting_step
+        self.note = f"live: {self._run.url}"
         if self._run.offline:
             self.note = f"wandb is offline; wandb sync {self._run.settings.sync_dir} sends the run"
-        else:
-            self.note = f"live: {self._run.url}"
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
         """Send a point of each, unless it is there from before a stop."""
@@ -231,8 +230,7 @@ def check_loggers(params: TrainHeadParams) -> None:
     if troubles:
         raise ConfigError(
             "train_head.loggers: expected the package of each logger, cannot load "
-            f"{', '.join(troubles)}. "
-            "Run pip install 'vla-feature-cache[loggers]', in a checkout "
+            f"{', '.join(troubles)}. Run pip install 'vla-feature-cache[loggers]', in a checkout "
             "pip install -e '.[loggers]', or set train_head.loggers=[]."
         )
 
@@ -248,14 +246,14 @@ def open_loggers(params: TrainHeadParams, resumed: bool) -> list[Logger]:
     return loggers
 
 
-def speed_file(logs: Path) -> Path:
-    """Where a training writes its speed: beside its logs, for DVC tracks all that is in them."""
-    return _beside(logs, "speed.tsv")
-
-
 def _beside(logs: Path, name: str) -> Path:
-    """Where that lies which DVC must not hash."""
+    """Where that lies which carries the clock: DVC hashes all that is in the logs."""
     return logs.with_name(f"{logs.name}.{name}")
+
+
+def speed_file(logs: Path) -> Path:
+    """Where a training writes its speed."""
+    return _beside(logs, "speed.tsv")
 
 
 class TrainingLog:

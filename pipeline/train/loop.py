@@ -1,6 +1,6 @@
 """The one training loop: every expert, cached or live features, on one process or several."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from torch import Tensor
 from tqdm import tqdm
 
 from pipeline.base.config import TrainHeadParams
@@ -23,7 +23,7 @@ from pipeline.policy.policy import Policy, Trainable
 from pipeline.store import Batch, FeatureStore
 from pipeline.train.batches import BatchIndices, Ticks, Windows, choose_feed
 from pipeline.train.checkpoints import TrainerState, load_weights, read_last, write_trainer
-from pipeline.train.feature_source import CachedFeatures, FeatureSource
+from pipeline.train.feature_source import FeatureSource
 from pipeline.train.log import History, Row, TrainingLog, open_log
 from pipeline.train.optimizer import (
     WeightAverage,
@@ -69,27 +69,29 @@ class Trainer:
         self.store, self.params, self.split, self.run = store, params, split, run
         self.world = World.current()
         self.device = process_device(params.device)
-        self._feed_note: list[str] = []
         if source is None:
-            on_device, note = choose_feed(params.feed, store, self.device)
-            self._feed_note = [note]
-            source = CachedFeatures(store, on_device)
+            source = FeatureSource(store, *choose_feed(params.feed, store, self.device))
         self.source = source
         self.plan = Plan(store, params, split, self.world, run.section)
         self.step = 0
-        self.stopping = EarlyStopping.of(params, split)
+        if params.early_stopping is not None and not len(split.held_out):
+            raise ConfigError(
+                f"train_head.early_stopping is {params.early_stopping}, but nothing is held out "
+                f"that could stop getting better: train_head.val_fraction is "
+                f"{params.val_fraction:g}. Set it above 0, or train_head.early_stopping=null."
+            )
+        self.stopping = EarlyStopping(params.early_stopping)
         self.history = History()
-        self._earlier: tuple[Row, ...] = ()
+        self._earlier: Sequence[Row] = ()
         self._trained_s = 0.0
-        state: TrainerState | None = None
         if run.status == "resumed":
             self.normalization, self.shape, state = read_last(run, self.world)
+            self._build()
+            self._restore(state)
         else:
             self.normalization = self.world.shared(lambda: fit_normalization(store, split.train))
             self.shape = policy_shape(store, self.normalization)
-        self._build()
-        if state is not None:
-            self._restore(state)
+            self._build()
 
     def _build(self) -> None:
         """The policy behind its features, its optimizer, and the average of what learns.
@@ -99,9 +101,7 @@ class Trainer:
         params = self.params
         torch.manual_seed(params.seed)
         policy = Policy(params, self.shape, self.normalization)
-        self._trained = self.source.attach(policy)
-        assert isinstance(self._trained, nn.Module)
-        self.module: nn.Module = self._trained.to(self.device).train()
+        self.module = self.source.attach(policy).to(self.device).train()
         self.learning = trainable(self.module)
         """The parameters that learn, by name; the others are neither averaged nor kept."""
         self.world.spread(value.data for value in self.learning.values())
@@ -110,7 +110,7 @@ class Trainer:
         self.average = WeightAverage(self.module, params.ema_decay)
         self._bfloat16 = use_bfloat16(params.amp, self.device)
         self._terminal = TerminalStop(self.store, self.device) if params.terminal_stop else None
-        self._compiled = compiled(self._trained.loss, self.device) if params.compile else None
+        self._compiled = compiled(self.module.loss, self.device) if params.compile else None
 
     @property
     def policy(self) -> Policy:
@@ -118,8 +118,9 @@ class Trainer:
         return self.source.policy_of(self.module)
 
     @property
-    def averaged(self) -> nn.Module:
+    def averaged(self) -> Trainable:
         """The module with the averaged weights, which is evaluated and kept."""
+        assert isinstance(self.average.module, Trainable)
         return self.average.module
 
     def fit(self) -> None:
@@ -141,7 +142,7 @@ class Trainer:
             batches = iter(feed)
             while not self._over:
                 stopped = self._train_step(batches, interrupted)
-                progress.advance(self._loss)
+                progress.advance()
                 if self.step % self.params.eval_every == 0 or self._over:
                     self._evaluate(log, progress)
                 if self.step % LOG_EVERY == 0 or self._over:
@@ -164,24 +165,23 @@ class Trainer:
 
     def summary(self) -> list[str]:
         """What is trained, from what and on what, as lines for the user."""
-        several = f" on {self.world.size} processes" if self.world.size > 1 else ""
-        precision = "bfloat16 autocast" if self._bfloat16 else "float32"
-        lines, warnings = describe_data(self.store, self.shape, self.params, self.split)
-        lines += describe_cost(self.policy)
+        lines = describe_cost(self.policy)
         if self.module is not self.policy:
-            table = ", ".join(f"{part} {n:,}" for part, n in self._trained.parameter_table())
+            table = ", ".join(f"{part} {n:,}" for part, n in self.module.parameter_table())
             lines.append(f"parameters with what is before it: {table}")
         learning = sum(value.numel() for value in self.learning.values())
         whole = sum(value.numel() for value in self.module.parameters())
         if learning < whole:
             lines.append(f"learns {learning:,} of {whole:,} parameters")
+        several = f" on {self.world.size} processes" if self.world.size > 1 else ""
+        precision = "bfloat16 autocast" if self._bfloat16 else "float32"
         return [
             *lines,
-            *self._feed_note,
+            *self.source.notes,
             f"device {self.device}{several}, {precision}"
             f"{', compiled' if self.params.compile else ''}; "
             f"steps {self.step} to {self.params.max_steps}",
-            *warnings,
+            *describe_data(self.store, self.shape, self.params, self.split),
         ]
 
     @property
@@ -228,7 +228,7 @@ class Trainer:
         action, valid = batch.action, batch.action_valid
         if self._terminal is not None:
             action, valid = self._terminal.extend(action, valid)
-        loss_of = self._compiled or self._trained.loss
+        loss_of = self._compiled or self.module.loss
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self._bfloat16):
             loss, parts = loss_of(batch, action, valid)
         loss = loss * part.share
@@ -245,9 +245,7 @@ class Trainer:
             pace = progress.read()
             log.write(self.step, {f"train/{k}": v for k, v in means.items()} | {"lr": rate})
             log.write_speed(self.step, pace)
-            memory, waited = f"{pace.peak_memory / 2**30:.1f}G", f"{pace.data_wait_share:.0%}"
-            loss = f"{means['loss']:.4f}"
-            progress.note(loss=loss, lr=f"{rate:.1e}", wait=waited, mem=memory)
+            progress.show(pace, means["loss"], rate)
 
         self.world.shared(write)
 
@@ -256,11 +254,18 @@ class Trainer:
         self._check_finite()
         with progress.paused():
             metrics = self.world.shared(lambda: self._measure(log))
-            if not metrics or self.stopping.take(metrics["val/error"]):
+            best = not metrics or self.stopping.take(metrics["val/error"])
+            if metrics and self.world.first:
+                tqdm.write(
+                    f"step {self.step}: train loss {self.history.last('loss'):.4f}, held-out error "
+                    f"{metrics['val/error']:.4f} of the training std"
+                    f"{' (best so far)' if best else ''}"
+                )
+            if best:
                 self.world.shared(lambda: self._save(self.run.best, metrics))
 
     def _measure(self, log: TrainingLog | None) -> dict[str, float]:
-        """The held-out metrics, written down and said; none where nothing is held out.
+        """The held-out metrics, written down; none where nothing is held out.
 
         `val/error` in training standard deviations, `val/<group>` in the group's unit.
         """
@@ -268,10 +273,9 @@ class Trainer:
         ticks = evaluation_ticks(self.split.held_out, self.source.eval_ticks)
         if not len(ticks):
             return {}
-        module, windows = self.averaged, Windows.of(self.params)
-        assert isinstance(module, Trainable)
+        windows = Windows.of(self.params)
         comparison, _ = evaluate_policy(
-            module,
+            self.averaged,
             self.store,
             ticks,
             windows,
@@ -280,22 +284,11 @@ class Trainer:
             samples=self.params.eval_samples,
             feed=lambda plan: self.source.feed(plan, windows, self.device),
         )
-        error = comparison.overall("policy")
-        metrics = {"val/error": error} | {
+        metrics = {"val/error": comparison.overall("policy")} | {
             f"val/{group.key}": comparison.group_mae("policy", group) for group in comparison.groups
         }
         log.write(self.step, metrics)
-        tqdm.write(
-            f"step {self.step}: train loss {self.history.last('loss'):.4f}, held-out error "
-            f"{error:.4f} of the training std"
-            + (" (best so far)" if self.stopping.improves(error) else "")
-        )
         return metrics
-
-    def _loss(self) -> float:
-        """The loss of the newest step."""
-        self._check_finite()
-        return self.history.last("loss")
 
     def _check_finite(self) -> None:
         bad = self.history.settle()
@@ -315,17 +308,21 @@ class Trainer:
 
         def save() -> None:
             assert log is not None
+            tensors = {"history:": self.history.tensor()}
+            for kind, named in (
+                ("weights", self.learning),
+                ("average", self.average.weights),
+                ("optimizer", optimizer_tensors(self.optimizer, self.module)),
+            ):
+                tensors |= {f"{kind}:{name}": value for name, value in named.items()}
             state = TrainerState(
                 step=self.step,
-                weights=dict(self.learning),
-                average=self.average.weights,
-                optimizer=optimizer_tensors(self.optimizer, self.module),
-                history=self.history.tensor(),
                 columns=self.history.columns,
                 best_error=self.stopping.best_error,
                 stalled=self.stopping.stalled,
                 trained_s=progress.trained_s,
-                rows=tuple(log.rows),
+                rows=log.rows,
+                tensors=tensors,
             )
             self._save(self.run.last, {"train/loss": self.history.last("loss")}, state)
 
@@ -359,10 +356,10 @@ class Trainer:
         save_policy(folder, checkpoint, beside=write_beside)
 
     def _restore(self, state: TrainerState) -> None:
-        load_weights(self.learning, state.weights, self.run.last)
-        load_weights(self.average.weights, state.average, self.run.last)
-        restore_optimizer(self.optimizer, self.module, state.optimizer)
-        self.history = History(state.columns, state.history)
+        load_weights(self.learning, state.part("weights"), self.run.last)
+        load_weights(self.average.weights, state.part("average"), self.run.last)
+        restore_optimizer(self.optimizer, self.module, state.part("optimizer"))
+        self.history = History(state.columns, state.tensors["history:"])
         self.stopping.best_error, self.stopping.stalled = state.best_error, state.stalled
         self.step, self._earlier, self._trained_s = state.step, state.rows, state.trained_s
 
@@ -401,27 +398,9 @@ class EarlyStopping:
     best_error: float | None = None
     stalled: int = 0
 
-    @classmethod
-    def of(cls, params: TrainHeadParams, split: Split) -> "EarlyStopping":
-        """That of a run which begins.
-
-        Raises `ConfigError` where it is to stop early and nothing tells when.
-        """
-        if params.early_stopping is not None and not len(split.held_out):
-            raise ConfigError(
-                f"train_head.early_stopping is {params.early_stopping}, but nothing is held out "
-                f"that could stop getting better: train_head.val_fraction is "
-                f"{params.val_fraction:g}. Set it above 0, or train_head.early_stopping=null."
-            )
-        return cls(params.early_stopping)
-
-    def improves(self, error: float) -> bool:
-        """Whether an error is below all before it."""
-        return self.best_error is None or error < self.best_error
-
     def take(self, error: float) -> bool:
         """Take in the error of an evaluation; whether it is the best so far."""
-        better = self.improves(error)
+        better = self.best_error is None or error < self.best_error
         if better:
             self.best_error = error
         self.stalled = 0 if better else self.stalled + 1

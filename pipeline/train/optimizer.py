@@ -11,6 +11,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import ConfigError
+from pipeline.policy.policy import Trainable
 from pipeline.train.feature_source import FeatureSource
 
 
@@ -45,22 +46,18 @@ def make_optimizer(
 
 
 def peak_rates(
-    module: nn.Module, source: FeatureSource, params: TrainHeadParams
+    module: Trainable, source: FeatureSource, params: TrainHeadParams
 ) -> dict[str, float]:
-    """The peak learning rate of each parameter that does not have `params.lr`, by name.
+    """The peak learning rate of each parameter that learns, by name.
 
-    The source's word comes first, then `sensor_lr` for the sensor encoder.
+    The source's word comes first, then `sensor_lr` for the sensor encoder, then `lr`.
     """
     encoders = source.policy_of(module).encoders
-    sensor = encoders["sensor"].parameters() if "sensor" in encoders else ()
-    felt = {id(parameter) for parameter in sensor}
-    peaks = {}
+    sensor = {*encoders["sensor"].parameters()} if "sensor" in encoders else set[nn.Parameter]()
+    peaks: dict[str, float] = {}
     for name, parameter in trainable(module).items():
-        rate = source.parameter_lr(name)
-        if rate is None and id(parameter) in felt:
-            rate = params.sensor_lr
-        if rate is not None:
-            peaks[name] = rate
+        rates = source.parameter_lr(name), params.sensor_lr if parameter in sensor else None
+        peaks[name] = next((rate for rate in rates if rate is not None), params.lr)
     return peaks
 
 
@@ -171,12 +168,10 @@ def compiled(loss: Callable[..., Any], device: torch.device) -> Callable[..., An
         except BackendCompilerFailed as error:
             told = (line.strip() for line in str(error).splitlines())
             why = next((line for line in told if line and not line.startswith("backend=")), "")
-            needed = "a C++ compiler (g++ or clang++, or the one that CXX names)"
-            if device.type == "cuda":
-                needed = "Triton, a C compiler"
             raise ConfigError(
                 f"train_head.compile: torch {torch.__version__} fails to compile this policy for "
-                f"{device}: {why}. It takes {needed} and Python's headers: install them, or set "
+                f"{device}: {why}. It takes a C++ compiler (g++ or clang++, or the one that CXX "
+                "names; for a GPU Triton, too) and Python's headers: install them, or set "
                 "train_head.compile=false: the numbers are the same within float noise."
             ) from None
 

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Generator, Tensor
 from tqdm import tqdm
 
 from pipeline.base.errors import NumericsError
 from pipeline.base.finite import first_non_finite
-from pipeline.base.observation import Observation
 from pipeline.policy.policy import Trainable
 from pipeline.store import Batch, FeatureStore, place
 from pipeline.train.batches import BatchIndices, Prefetch, Ticks, Windows, cut_batches
@@ -63,10 +62,9 @@ def predict(
     store as it is, gathered ahead. `progress` shows a bar on a terminal. Raises `NumericsError`,
     naming episode, tick and time, where a prediction or a recorded action is NaN or infinite.
     """
-    assert isinstance(policy, nn.Module)
     device = next(policy.parameters()).device
     # On the CPU, so that every device is given the same noise.
-    generator = torch.Generator().manual_seed(_SEED)
+    generator = Generator().manual_seed(_SEED)
     plan = cut_batches(ticks, batch_size)
     predicted, recorded, valid = [], [], []
     with (
@@ -78,7 +76,7 @@ def predict(
     ):
         for indices, batch in batches:
             at = indices.ticks
-            action = _mean_chunk(policy, batch, len(at), samples, generator)
+            action = _mean_chunk(policy, batch, samples, generator)
             predicted.append(action.float().cpu().numpy())
             recorded.append(batch.action.cpu().numpy().copy())
             valid.append(batch.action_valid.cpu().numpy().astype(bool))
@@ -118,19 +116,13 @@ def baselines(
     }
 
 
-def _mean_chunk(
-    policy: Trainable,
-    observation: Observation,
-    ticks: int,
-    samples: int,
-    generator: torch.Generator,
-) -> Tensor:
+def _mean_chunk(policy: Trainable, batch: Batch, samples: int, generator: Generator) -> Tensor:
     """The mean of the sampled chunks, (tick, horizon, action_dim), in float32."""
     samples = samples if policy.stochastic else 1
-    at_once = max(1, _CHUNKS_AT_ONCE // ticks)
+    at_once = max(1, _CHUNKS_AT_ONCE // len(batch))
     total: Tensor | float = 0.0
     for done in range(0, samples, at_once):
-        chunks = policy.sample(observation, min(at_once, samples - done), generator)
+        chunks = policy.sample(batch, min(at_once, samples - done), generator)
         total = total + chunks.float().sum(dim=0)
     assert isinstance(total, Tensor)
     return total / samples

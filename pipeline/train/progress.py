@@ -3,7 +3,7 @@
 import resource
 import sys
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from contextlib import contextmanager
 from typing import NamedTuple, NoReturn, Self
 
@@ -15,7 +15,7 @@ from pipeline.base.config import TrainHeadParams
 from pipeline.base.format import duration
 from pipeline.policy.observation import PolicyShape
 from pipeline.store import FeatureStore
-from pipeline.train.batches import Feed
+from pipeline.train.batches import Prefetch
 from pipeline.train.sampling import ticks_by_source
 from pipeline.train.split import Split
 
@@ -44,45 +44,55 @@ class Progress:
 
     def __init__(
         self,
-        feed: Feed,
+        feed: Prefetch,
         device: torch.device,
         steps: range,
         trained_s: float = 0.0,
         shown: bool = True,
     ) -> None:
-        step, self._total = steps.start, steps.stop
         # None: shown where stderr is a terminal.
         self._bar: tqdm[NoReturn] = tqdm(
-            initial=step, total=self._total, unit="step", disable=None if shown else True
+            initial=steps.start, total=steps.stop, unit="step", disable=None if shown else True
         )
         self._writes_lines = shown and self._bar.disable
-        self._feed, self._device, self._step = feed, device, step
-        self._last_line = step, time.perf_counter()
-        self._last_reading = step, trained_s, feed.waited_s
+        self._feed, self._device, self._step, self._total = feed, device, steps.start, steps.stop
+        self._last_reading = self._step, trained_s, feed.waited_s
         self._before = trained_s
         self._since: float | None = time.perf_counter()
+        self._last_line = self._since
 
-    def advance(self, loss: Callable[[], float]) -> None:
-        """Count a step; `loss` gives its loss, and is only asked where a line is due."""
+    def advance(self) -> None:
+        """Count a step."""
         self._step += 1
         self._bar.update()
-        step, since = self._last_line
-        elapsed = time.perf_counter() - since
-        if not self._writes_lines or elapsed < EVERY_S:
-            return
-        steps_per_s = (self._step - step) / elapsed
-        left = duration((self._total - self._step) / steps_per_s)
-        print(
-            f"step {self._step} of {self._total}: train loss {loss():.4f}, "
-            f"{steps_per_s:.3g} steps/s, about {left} left",
-            file=sys.stderr,
-            flush=True,
-        )
-        self._last_line = self._step, time.perf_counter()
 
-    def note(self, **values: str) -> None:
-        """Show these behind the bar."""
-        self._bar.set_postfix(values)
+    def read(self) -> Pace:
+        """The figures at this step."""
+        step, trained, waited = self._last_reading
+        self._last_reading = self._step, self.trained_s, self._feed.waited_s
+        elapsed = max(self.trained_s - trained, 1e-9)
+        share = (self._feed.waited_s - waited) / elapsed
+        pace = (self._step - step) / elapsed
+        return Pace(pace, share, peak_memory_bytes(self._device), self.trained_s)
+
+    def show(self, pace: Pace, loss: float, lr: float) -> None:
+        """Show these behind the bar; without one in a line, where the last is a minute old."""
+        self._bar.set_postfix(
+            loss=f"{loss:.4f}",
+            lr=f"{lr:.1e}",
+            wait=f"{pace.data_wait_share:.0%}",
+            mem=f"{pace.peak_memory / 2**30:.1f}G",
+        )
+        now = time.perf_counter()
+        if self._writes_lines and now - self._last_line >= EVERY_S:
+            self._last_line = now
+            left = duration((self._total - self._step) / pace.steps_per_s)
+            print(
+                f"step {self._step} of {self._total}: train loss {loss:.4f}, "
+                f"{pace.steps_per_s:.3g} steps/s, about {left} left",
+                file=sys.stderr,
+                flush=True,
+            )
 
     @property
     def trained_s(self) -> float:
@@ -96,15 +106,6 @@ class Progress:
         self._before, self._since = self.trained_s, None
         yield
         self._since = time.perf_counter()
-
-    def read(self) -> Pace:
-        """The figures at this step."""
-        step, trained, waited = self._last_reading
-        self._last_reading = self._step, self.trained_s, self._feed.waited_s
-        now = self._last_reading
-        elapsed = max(now[1] - trained, 1e-9)
-        share = (now[2] - waited) / elapsed
-        return Pace((now[0] - step) / elapsed, share, peak_memory_bytes(self._device), now[1])
 
     def __enter__(self) -> Self:
         return self
@@ -126,8 +127,8 @@ def peak_memory_bytes(device: torch.device) -> int:
 
 def describe_data(
     store: FeatureStore, shape: PolicyShape, params: TrainHeadParams, split: Split
-) -> tuple[list[str], list[str]]:
-    """Lines on the store, its streams and the split; and warnings.
+) -> list[str]:
+    """Lines on the store, its streams and the split; warnings last.
 
     Those are of what the store has and the training episodes have not: a source, a stream.
     """
@@ -140,13 +141,11 @@ def describe_data(
     ]
     if split.note:
         lines.append(f"split: {split.note}")
+    lost: list[str] = []
     trained = ticks_by_source(store, split.train)
-    lost = [
-        f"source {source!r}: all of its episodes are held out. The policy is evaluated on them "
-        "and learns nothing from them"
-        for source, ticks in ticks_by_source(store, np.arange(store.ticks)).items()
-        if len(ticks) and not len(trained[source]) and params.mixture.get(source, 1) > 0
-    ]
+    for source, ticks in ticks_by_source(store, np.arange(store.ticks)).items():
+        if len(ticks) and not len(trained[source]) and params.mixture.get(source, 1) > 0:
+            lost.append(f"source {source!r}: all of its episodes are held out")
     for stream, stored, known, switch in (
         ("sensor", store.sensor_channels, shape.sensor_channels, "sensor_enabled"),
         ("state", store.state_dim, shape.state_dim, "robot_state_enabled"),
@@ -157,14 +156,10 @@ def describe_data(
         elif not getattr(params, switch):
             lines.append(f"{stream}: disabled by train_head.{switch}")
         elif not known:
-            lost.append(
-                f"{stream}: in the store, but absent from the training episodes. The policy learns "
-                "without it"
-            )
-    warnings = [
-        f"warning: {what}. Episodes are held out by the hash of their names, "
+            lost.append(f"{stream}: in the store, but absent from the training episodes")
+    return lines + [
+        f"warning: {what}. Nothing is learnt of it. Episodes are held out by a hash, "
         f"train_head.val_fraction {params.val_fraction:g} of them: set a smaller one (0 holds none "
         "out), or extract more episodes with it"
         for what in lost
     ]
-    return lines, warnings

@@ -8,14 +8,15 @@ stopped run goes on under `dvc repro` too. Without torch, which takes over a sec
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.base.differences import Differences, describe, differences
+from pipeline.base.differences import differences
 from pipeline.base.durable import (
     damaged,
     put_in_place,
@@ -37,7 +38,7 @@ from pipeline.base.ownership import (
 from pipeline.policy.checkpoint import CHECKPOINT, DOCUMENT, SOURCE_KEYS, check_policy
 from pipeline.policy.normalization import Normalization
 from pipeline.store import FeatureStore, build_lock
-from pipeline.train.split import source_of
+from pipeline.train.split import list_differences, source_of
 
 if TYPE_CHECKING:
     from pipeline.policy.observation import PolicyShape
@@ -160,11 +161,10 @@ def open_run(
         recover_folder(part / BEST, CHECKPOINT)
         recover_folder(part / LAST, CHECKPOINT)
     if (part / RUN).exists() and _has_checkpoint(part):
-        differing = _compare(part, identity, section)
-        if differing:
+        if differing := _compare(part, identity, section):
             notes.append(
                 f"{part} is an unfinished run of something else; it is put aside as "
-                f"{_aside(part)} (that run -> now):\n{_lines(differing)}"
+                f"{_aside(part)} (that run -> now):\n{differing}"
             )
         elif (part / LAST).exists():
             notes.append(f"resuming the run in {part}")
@@ -208,25 +208,20 @@ def _finished_notes(params: TrainHeadParams) -> tuple[str, ...]:
     return note, f"its curves are left where they were written, in {logs}, not in {params.logs}"
 
 
-def _compare(part: Path, identity: Mapping[str, Any], section: str) -> Differences:
+def _compare(part: Path, identity: Mapping[str, Any], section: str) -> str:
     """What else the unfinished run in `part` was to be; refused where its store was another."""
     prior = read_document(part / RUN)
     source = prior.get("source")
     if not isinstance(source, dict) or {*SOURCE_KEYS} - {*source} or "decides" not in prior:
         raise CheckpointIncomplete(damaged(part / RUN, "not what it must hold"))
-    differing = differences(source, identity["source"])
-    if differing:
+    if differing := list_differences(source, identity["source"]):
         raise CheckpointMismatch(
             f"{part}: this unfinished run cannot go on, its store was another one "
-            f"(the run -> the store now):\n{_lines(differing)}\n"
+            f"(the run -> the store now):\n{differing}\n"
             f"Remove {part} to begin anew, choose another {section}.output, or name the store "
             "it began with in train_head.store."
         )
-    return differences(prior["decides"], identity["decides"])
-
-
-def _lines(differing: Differences) -> str:
-    return "\n".join(f"  {line}" for line in describe(differing))
+    return list_differences(prior["decides"], identity["decides"])
 
 
 def _has_checkpoint(part: Path) -> bool:
@@ -266,11 +261,7 @@ def recordings_of(store: FeatureStore) -> dict[str, Any]:
     episodes = [[e.source, e.id, e.digest, len(e.ticks)] for e in store.episodes]
     digest = hashlib.blake2b(json.dumps(episodes).encode(), digest_size=16)
     digest.update(store.array("vl/key").tobytes())
-    return {
-        "episodes": len(store.episodes),
-        "ticks": store.ticks,
-        "digest": digest.hexdigest(),
-    }
+    return {"episodes": len(episodes), "ticks": store.ticks, "digest": digest.hexdigest()}
 
 
 def policy_shape(store: FeatureStore, normalization: Normalization) -> "PolicyShape":
@@ -317,17 +308,14 @@ class TrainedPolicy:
 
 def find_trained(folders: Sequence[Path]) -> list[TrainedPolicy]:
     """Every run, finished or not, and every single checkpoint at or below these folders."""
-    return [policy for folder in folders if folder.is_dir() for policy in _trained_below(folder)]
-
-
-def _trained_below(folder: Path) -> Iterator[TrainedPolicy]:
-    for name in (RUN, DOCUMENT):
-        if (folder / name).exists():
-            yield _read_trained(folder, folder / name)
-            return
-    for path in sorted(folder.iterdir()):
-        if path.is_dir() and not path.is_symlink():
-            yield from _trained_below(path)
+    trained: list[TrainedPolicy] = []
+    for folder, below, files in chain.from_iterable(map(os.walk, folders)):
+        below.sort()
+        document = next((name for name in (RUN, DOCUMENT) if name in files), None)
+        if document is not None:
+            below.clear()
+            trained.append(_read_trained(Path(folder), Path(folder, document)))
+    return trained
 
 
 def _read_trained(folder: Path, path: Path) -> TrainedPolicy:

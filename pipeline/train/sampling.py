@@ -6,6 +6,7 @@ All of it is a function of (seed, step).
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,20 +63,16 @@ class TickSampler:
                 f"ticks under weights {dict(weights)}"
             )
         self.batch_size, self.seed = batch_size, seed
+        self.count_drawn = _mixture(size).count_drawn
+        """How many of the first so many draws each source gave."""
         self.shares = {name: float(mass / sum(size.values())) for name, mass in size.items()}
-        self._mixture = _mixture(size)
         self._ticks = {name: ticks_by_source[name] for name in size}
-        self._orders: dict[tuple[str, int], Ticks] = {}
+        self._order = lru_cache(2 * len(size))(self._shuffle)
 
     def batch(self, step: int) -> Ticks:
         """The ticks (batch_size,) of this step, source by source: a function of (seed, step)."""
-        first = self.count_drawn(step * self.batch_size)
-        last = self.count_drawn((step + 1) * self.batch_size)
+        first, last = (self.count_drawn(n * self.batch_size) for n in (step, step + 1))
         return np.concatenate([self._range(name, first[name], last[name]) for name in self._ticks])
-
-    def count_drawn(self, draws: int) -> dict[str, int]:
-        """How many of the first `draws` ticks each source gave."""
-        return self._mixture.count_drawn(draws)
 
     def _range(self, name: str, start: int, stop: int) -> Ticks:
         """The draws [start, stop) of one source, across epochs."""
@@ -88,14 +85,10 @@ class TickSampler:
             start += taken
         return np.concatenate(parts) if parts else np.zeros(0, np.int64)
 
-    def _order(self, name: str, epoch: int) -> Ticks:
-        key = (name, epoch)
-        if key not in self._orders:
-            for old in [k for k in self._orders if k[0] == name]:
-                del self._orders[old]
-            entropy = (self.seed, hash64(name), epoch)
-            self._orders[key] = np.random.default_rng(entropy).permutation(len(self._ticks[name]))
-        return self._orders[key]
+    def _shuffle(self, name: str, epoch: int) -> Ticks:
+        """The order of a source's ticks in one epoch."""
+        rng = np.random.default_rng((self.seed, hash64(name), epoch))
+        return rng.permutation(len(self._ticks[name]))
 
 
 @dataclass(frozen=True)

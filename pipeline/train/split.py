@@ -1,7 +1,7 @@
 """Which ticks are trained on and which are held out; a checkpoint's held-out ticks found again."""
 
 import hashlib
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -174,15 +174,18 @@ def source_of(store: FeatureStore) -> dict[str, Any]:
     return {key: getattr(store, "spec" if key == "feature_spec" else key) for key in SOURCE_KEYS}
 
 
+def list_differences(expected: Any, actual: Any) -> str:
+    """Where two documents differ, on an indented line each; empty where nowhere."""
+    return "\n".join(f"  {line}" for line in describe(differences(expected, actual)))
+
+
 def check_store(checkpoint: PolicyCheckpoint, store: FeatureStore) -> None:
     """Raise `CheckpointMismatch`, naming what differs, when the policy does not fit this store."""
-    differing = differences(checkpoint.source, source_of(store))
-    if differing:
-        lines = "\n".join(f"  {line}" for line in describe(differing))
+    if differing := list_differences(checkpoint.source, source_of(store)):
         raise CheckpointMismatch(
-            f"the checkpoint does not fit {store.path} (the checkpoint -> the store):\n{lines}\n"
-            "Name the store it was trained from in evaluate.store, extract with the params it was "
-            "trained with, or train again: python -m stages.train_head"
+            f"the checkpoint does not fit {store.path} (the checkpoint -> the store):\n"
+            f"{differing}\nName the store it was trained from in evaluate.store, extract with the "
+            "params it was trained with, or train again: python -m stages.train_head"
         )
 
 
@@ -209,28 +212,35 @@ def held_out_contents(store: FeatureStore, names: Collection[str]) -> dict[str, 
     return {name: known[name] for name in names}
 
 
-def held_out_ticks(
-    store: FeatureStore, ranges: Mapping[str, tuple[int, int]], contents: Mapping[str, str]
-) -> NDArray[np.int64]:
-    """The store's ticks of `held_out_ranges`, ascending.
+def find_held_out(
+    store: FeatureStore, checkpoint: PolicyCheckpoint
+) -> tuple[NDArray[np.int64], PolicyCheckpoint]:
+    """The store's held-out ticks, ascending, and the checkpoint with the store's names of them.
 
-    Raises `CheckpointMismatch` where there are none, or where the store lacks an episode, has a
-    shorter one of that name, or one made from other files than `contents` says.
+    An episode whose source or folder was renamed since is told by the digest of its files. Raises
+    `CheckpointMismatch` where nothing is held out, or where the store lacks an episode, has a
+    shorter one of that name, or one made from other files.
     """
+    ranges, contents = checkpoint.held_out_ticks, checkpoint.held_out_content
     if not ranges:
         raise CheckpointMismatch(
             "the checkpoint lists no held-out episode, so nothing is left to evaluate it on: it "
             "was trained with train_head.val_fraction 0. Train with a fraction above 0."
         )
-    episodes = {episode_name(episode): episode for episode in store.episodes}
+    by_name = {episode_name(episode): episode for episode in store.episodes}
+    renamed = {e.content: e for name, e in by_name.items() if contents.get(name) != e.content}
+    held_out: list[tuple[Episode, tuple[int, int]]] = []
     wrong: list[str] = []
-    for name, (_, stop) in ranges.items():
-        if name not in episodes:
+    for name, (first, stop) in ranges.items():
+        episode = renamed.get(contents[name]) or by_name.get(name)
+        if episode is None:
             wrong.append(f"{name} is missing")
-        elif len(episodes[name].ticks) < stop:
+        elif len(episode.ticks) < stop:
             wrong.append(f"{name} is shorter")
-        elif episodes[name].content != contents.get(name):
+        elif episode.content != contents[name]:
             wrong.append(f"{name} is another recording, or the same one read otherwise since")
+        else:
+            held_out.append((episode, (first, stop)))
     if wrong:
         raise CheckpointMismatch(
             f"{store.path}: of the {len(ranges)} episodes that the checkpoint holds out, "
@@ -238,41 +248,11 @@ def held_out_ticks(
             f"{' …' if len(wrong) > 5 else ''}. Name the store it was trained from in "
             "evaluate.store, or train again."
         )
-    parts = [
-        np.arange(first, stop, dtype=np.int64) + episodes[name].ticks.start
-        for name, (first, stop) in ranges.items()
-    ]
-    return np.sort(np.concatenate(parts))
-
-
-def named_as_in(
-    store: FeatureStore, checkpoint: PolicyCheckpoint
-) -> tuple[PolicyCheckpoint, str | None]:
-    """The checkpoint with its held-out episodes under this store's names, and what to say of it.
-
-    An episode whose source or folder was renamed since is told by the digest of its files.
-    """
-    contents = checkpoint.held_out_content
-    ours = {episode_name(episode): episode.content for episode in store.episodes}
-    same = {name for name in contents if ours.get(name) == contents[name]}
-    free: dict[str, list[str]] = {}
-    for name in sorted(ours.keys() - same, reverse=True):
-        free.setdefault(ours[name], []).append(name)
-    now = {
-        name: free[content].pop() if name not in same and free.get(content) else name
-        for name, content in contents.items()
-    }
-    renamed = [f"{name} is {now[name]}" for name in contents if now[name] != name]
-    if not renamed or len(set(now.values())) < len(now):  # one of two under one name is not there
-        return checkpoint, None
     return (
+        np.unique(np.concatenate([np.array(e.ticks[slice(*part)]) for e, part in held_out])),
         replace(
             checkpoint,
-            held_out_ticks={
-                now.get(name, name): ticks for name, ticks in checkpoint.held_out_ticks.items()
-            },
-            held_out_content={now[name]: content for name, content in contents.items()},
+            held_out_ticks={episode_name(e): part for e, part in held_out},
+            held_out_content={episode_name(e): e.content for e, _ in held_out},
         ),
-        f"{len(renamed)} held-out episode(s) were renamed since the training and are told by their "
-        f"content: {', '.join(renamed[:3])}{' …' if len(renamed) > 3 else ''}",
     )

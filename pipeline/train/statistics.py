@@ -16,8 +16,6 @@ from pipeline.store import FeatureStore, place
 from pipeline.train.batches import Ticks
 
 CHUNK_BYTES = 64 * 2**20
-THREAD_BYTES = 2**20
-"""Of a part on average, below which it costs more to hand it to a thread than to read it."""
 Rows = range | NDArray[np.int64]
 """Rows of one of the store's arrays."""
 
@@ -68,8 +66,6 @@ def _fit(
         bar.update(len(rows))
         return values if valid is None else (values, valid)
 
-    size = sum(map(len, parts)) * _row_bytes(store, stream)
-    threads = threads if size >= THREAD_BYTES * len(parts) else 1
     try:
         return fit_channels([partial(read, rows) for rows in parts], what, threads=threads)
     except NumericsError:
@@ -106,13 +102,9 @@ def _readings(store: FeatureStore, ticks: Ticks, stream: str) -> list[Rows]:
 
 
 def _cut(store: FeatureStore, stream: str, rows: NDArray[np.int64]) -> list[Rows]:
-    step = max(1, CHUNK_BYTES // max(1, _row_bytes(store, stream)))
-    return [rows[start : start + step] for start in range(0, len(rows), step)]
-
-
-def _row_bytes(store: FeatureStore, stream: str) -> int:
     array = store.array(_ARRAYS[stream])
-    return array.dtype.itemsize * int(np.prod(array.shape[1:]))
+    step = max(1, CHUNK_BYTES // max(1, array.dtype.itemsize * int(np.prod(array.shape[1:]))))
+    return [rows[start : start + step] for start in range(0, len(rows), step)]
 
 
 def _read(

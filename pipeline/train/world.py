@@ -3,7 +3,7 @@
 import os
 import signal
 import threading
-from collections.abc import Callable, Generator, Iterable, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import timedelta
@@ -22,8 +22,8 @@ Outcome = TypeVar("Outcome")
 PATIENCE = timedelta(hours=12)
 """How long a process waits for another: rank 0 fits the normalisation and evaluates while others
 wait. A process that died is not waited for: torchrun ends the rest."""
-BUCKET_BYTES = 32 * 2**20
-"""Gradients are summed over the processes this many bytes at a time: few calls, little copied."""
+AT_ONCE = 32
+"""So many gradients are summed over the processes at a time: few calls, little copied."""
 PRECEDENCE = timedelta(seconds=5)
 """How long a process that fails waits for rank 0, which mostly fails of the same, to say so."""
 _SPEAKER = "speaker"
@@ -90,10 +90,11 @@ class World:
             for line in lines:
                 print(line, flush=True)
 
-    def sum(self, tensors: Iterable[Tensor]) -> None:
+    def sum(self, tensors: Sequence[Tensor]) -> None:
         """Replace each tensor by its sum over all processes."""
         if self.size > 1:
-            for bucket in _buckets(tensors):
+            for start in range(0, len(tensors), AT_ONCE):
+                bucket = tensors[start : start + AT_ONCE]
                 flat = torch.cat([tensor.reshape(-1) for tensor in bucket])
                 dist.all_reduce(flat)
                 parts = flat.split([tensor.numel() for tensor in bucket])
@@ -116,24 +117,18 @@ class World:
         flags = torch.tensor([stop, *(p.grad is not None for p in parameters)], dtype=torch.uint8)
         dist.all_reduce(flags, dist.ReduceOp.MAX)
         stop, *used = flags.bool().tolist()
-        gradients: list[Tensor] = []
         for parameter, anywhere in zip(parameters, used, strict=True):
             if anywhere and parameter.grad is None:
                 parameter.grad = torch.zeros_like(parameter)
-            if parameter.grad is not None:
-                gradients.append(parameter.grad)
-        self.sum([*sums.values(), *gradients])
+        self.sum([*sums.values(), *(p.grad for p in parameters if p.grad is not None)])
         return stop
 
     def tensors(self, named: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """The tensors in memory that rank 0 calls with, on every process, sent one by one."""
         if self.size == 1:
             return dict(named)
-        shapes = self.shared(lambda: {name: (v.shape, v.dtype) for name, v in named.items()})
-        received = {
-            name: named[name] if self.first else torch.empty(shape, dtype=dtype)
-            for name, (shape, dtype) in shapes.items()
-        }
+        shapes = self.shared(lambda: {name: value.to("meta") for name, value in named.items()})
+        received = {n: named.get(n, torch.empty_like(v, device="cpu")) for n, v in shapes.items()}
         self.spread(received.values())
         return received
 
@@ -199,20 +194,6 @@ def process_device(name: str) -> torch.device:
     return resolve_device(name)
 
 
-def _buckets(tensors: Iterable[Tensor]) -> Generator[list[Tensor]]:
-    """The tensors in their order, neighbours of one dtype together up to `BUCKET_BYTES`."""
-    bucket: list[Tensor] = []
-    size = 0
-    for tensor in tensors:
-        if bucket and (tensor.dtype != bucket[0].dtype or size + tensor.nbytes > BUCKET_BYTES):
-            yield bucket
-            bucket, size = [], 0
-        bucket.append(tensor)
-        size += tensor.nbytes
-    if bucket:
-        yield bucket
-
-
 @contextmanager
 def one_speaker(store: dist.Store, rank: int) -> Generator[None]:
     """Within it, what the user can mend is raised on one process; the others exit with code 2.
@@ -226,35 +207,25 @@ def one_speaker(store: dist.Store, rank: int) -> Generator[None]:
     except SaidByFirst:
         raise SystemExit(2) from None
     except (PipelineError, OSError) as error:
-        if not _speaks(store, rank):
-            raise SystemExit(2) from None
+        if rank > 0:
+            with suppress(RuntimeError, KeyboardInterrupt):
+                store.wait([_SPEAKER], PRECEDENCE)
+        # Where rank 0 held the store and is gone, an error is rather said twice than never.
+        with suppress(RuntimeError):
+            if store.compare_set(_SPEAKER, "", str(rank)) != str(rank).encode():
+                raise SystemExit(2) from None
         if rank == 0:
             raise
         raise PipelineError(f"process of rank {rank}: {error}") from error
-    except KeyboardInterrupt:
-        if rank > 0 or _spoken(store):
-            raise SystemExit(1) from None
-        raise
-    except RuntimeError:
-        # As gloo and NCCL say that another process is gone.
-        if _spoken(store):
-            raise SystemExit(2) from None
+    except (KeyboardInterrupt, RuntimeError) as error:
+        # A RuntimeError is how gloo and NCCL say that another process is gone.
+        stopped = isinstance(error, KeyboardInterrupt)
+        if (stopped and rank > 0) or _is_spoken(store):
+            raise SystemExit(1 if stopped else 2) from None
         raise
 
 
-def _speaks(store: dist.Store, rank: int) -> bool:
-    """Whether this process, of those that have failed, says so."""
-    try:
-        if rank > 0:
-            with suppress(dist.DistStoreError, KeyboardInterrupt):
-                store.wait([_SPEAKER], PRECEDENCE)
-        return store.compare_set(_SPEAKER, "", str(rank)) == str(rank).encode()
-    except RuntimeError:
-        # Rank 0 held the store and is gone: an error is rather said twice than never.
-        return True
-
-
-def _spoken(store: dist.Store) -> bool:
+def _is_spoken(store: dist.Store) -> bool:
     try:
         return store.check([_SPEAKER])
     except RuntimeError:

@@ -13,7 +13,8 @@ from pipeline.base.durable import read_document
 from pipeline.policy.checkpoint import load_policy
 from pipeline.policy.policy import Policy, Trainable
 from pipeline.store import FeatureStore
-from pipeline.train.batches import BatchIndices, Feed, Prefetch, Windows
+from pipeline.train.batches import BatchIndices, Prefetch, Windows
+from pipeline.train.feature_source import FeatureSource
 from pipeline.train.loop import Trainer
 from pipeline.train.run import open_run
 from pipeline.train.split import split_by_episode
@@ -48,32 +49,34 @@ class Adapted(Trainable):
         return [("adapter", self.adapter.weight.numel()), *self.policy.parameter_table()]
 
 
-class AdaptedFront:
+class AdaptedFront(FeatureSource):
     eval_ticks = 7
 
     def __init__(self, store: FeatureStore) -> None:
-        self.store = store
+        super().__init__(store)
         self.identity = {"adapter": "square"}
         self.judged: list[int] = []
 
     def attach(self, policy: Policy) -> Adapted:
         return Adapted(policy, self.store.feature_shape[1])
 
-    def policy_of(self, module: nn.Module) -> Policy:
+    def policy_of(self, module: Trainable) -> Policy:
         assert isinstance(module, Adapted)
         return module.policy
 
     def parameter_lr(self, name: str) -> float | None:
         return 1e-2 if name.startswith("adapter") else None
 
-    def feed(self, plan: Iterable[BatchIndices], windows: Windows, device: torch.device) -> Feed:
+    def feed(
+        self, plan: Iterable[BatchIndices], windows: Windows, device: torch.device
+    ) -> Prefetch:
         if isinstance(plan, Iterator):
             return Prefetch(self.store, plan, windows, device)
         plan = list(plan)
         self.judged.append(sum(len(draw.ticks) for draw in plan))
         return Prefetch(self.store, plan, windows, device)
 
-    def save(self, folder: Path, module: nn.Module) -> None:
+    def save(self, folder: Path, module: Trainable) -> None:
         assert isinstance(module, Adapted)
         (folder / "adapter").mkdir()
         torch.save(module.adapter.state_dict(), folder / "adapter/weights.pt")

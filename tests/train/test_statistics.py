@@ -116,7 +116,6 @@ def test_threads_change_no_bit(
     chunk_bytes: int,
 ) -> None:
     monkeypatch.setattr("pipeline.train.statistics.CHUNK_BYTES", chunk_bytes)
-    monkeypatch.setattr("pipeline.train.statistics.THREAD_BYTES", 0)
     monkeypatch.setattr("pipeline.policy.normalization._PIECE_VALUES", 40)
     store = FeatureStore.open(tiny_store(tmp_path))
     store.array("vl/slot_valid")[12, 1] = 0

@@ -4,7 +4,11 @@
 store's batches, `feature_source` stands before the policy in the one training loop.
 """
 
-from pipeline.train.finetuning.feature_source import LiveFeatures, next_steps, out_of_memory_named
-from pipeline.train.finetuning.params import head_params
+from pipeline.train.finetuning.feature_source import (
+    LiveFeatures,
+    head_params,
+    next_steps,
+    out_of_memory_named,
+)
 
 __all__ = ["LiveFeatures", "head_params", "next_steps", "out_of_memory_named"]

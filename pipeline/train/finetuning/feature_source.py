@@ -1,15 +1,14 @@
 """What stands before the policy when the model itself learns."""
 
-from collections.abc import Generator, Iterable, Mapping
+from collections.abc import Generator, Iterable
 from contextlib import contextmanager
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
 
 import torch
-from torch import nn
+from pydantic import ValidationError
 
-from pipeline.base.config import FinetuneParams, Params
+from pipeline.base.config import FinetuneParams, Params, TrainHeadParams
 from pipeline.base.digests import file_digest
 from pipeline.base.durable import read_document, write_with_digest
 from pipeline.base.errors import ConfigError
@@ -18,6 +17,7 @@ from pipeline.policy.live_policy import LivePolicy
 from pipeline.policy.policy import Policy, Trainable
 from pipeline.store import FeatureStore
 from pipeline.train.batches import BatchIndices, Windows
+from pipeline.train.feature_source import FeatureSource
 from pipeline.train.finetuning.recordings import (
     check_recordings,
     check_spec,
@@ -35,11 +35,8 @@ _FREE_TUNING = {"gradient_checkpointing"}
 """What of the tuning decides no number."""
 
 
-class LiveFeatures:
-    """A `FeatureSource` whose features come from a model that learns, over a store's recordings."""
-
-    identity: Mapping[str, Any]
-    eval_ticks: int | None
+class LiveFeatures(FeatureSource):
+    """Features from a model that learns, over a store's recordings."""
 
     def __init__(self, store: FeatureStore, params: Params, device: torch.device) -> None:
         """The model is loaded when a policy is attached.
@@ -47,6 +44,7 @@ class LiveFeatures:
         Raises `StoreMismatch` where `vlm` does not give the store's features, or a recording is
         missing or not what it was at extraction.
         """
+        super().__init__(store)
         recordings = find_recordings(store, params)
 
         def checked() -> FeatureSpec:
@@ -57,7 +55,7 @@ class LiveFeatures:
 
         # Once for all processes: they would read the same files and say the same.
         self._spec = World.current().shared(checked)
-        self._store, self._vlm, self._finetune = store, params.vlm, params.finetune
+        self._vlm, self._finetune = params.vlm, params.finetune
         self._compile, self._device = params.train_head.compile, device
         self._rows = LiveRows(store, recordings, Preparer(params.vlm, self._spec))
         self._base_digest = lru_cache(file_digest)
@@ -78,7 +76,7 @@ class LiveFeatures:
         live.vlm.check_shape(policy.shape.slots, policy.shape.feature_dim)
         return live
 
-    def policy_of(self, module: nn.Module) -> Policy:
+    def policy_of(self, module: Trainable) -> Policy:
         """The policy behind the model."""
         assert isinstance(module, LivePolicy)
         return module.policy
@@ -92,9 +90,9 @@ class LiveFeatures:
     ) -> LiveFeed:
         """Batches of the store with the rows of their ticks, decoded ahead of time."""
         threads = self._finetune.decode_threads
-        return LiveFeed(self._store, self._rows, plan, windows, device, threads)
+        return LiveFeed(self.store, self._rows, plan, windows, device, threads)
 
-    def save(self, folder: Path, module: nn.Module) -> None:
+    def save(self, folder: Path, module: Trainable) -> None:
         """Write what the model has learned, and into `policy.json` whose features the policy takes.
 
         It is evaluated on a store that was extracted with this adapter or checkpoint, and refused
@@ -109,22 +107,21 @@ class LiveFeatures:
 
     def summary(self) -> list[str]:
         """What learns and from which frames, as lines for the user."""
-        tuning, rows = self._finetune.tuning, len(self._store.array("vl/time"))
-        how = f"full, {' and '.join(tuning.towers)} tower"
-        if tuning.method == "lora":
-            how = f"lora of rank {tuning.lora_r} on the {' and '.join(tuning.towers)} tower"
+        tuning = self._finetune.tuning
+        rank = f" of rank {tuning.lora_r}" if tuning.method == "lora" else ""
         lines = [
-            f"tuning: {how}, peak learning rate {self._finetune.lr:g}; {rows} VL rows of "
-            f"{len(self._store.episodes)} recordings"
+            f"tuning: {tuning.method}{rank} on the {' and '.join(tuning.towers)} tower, peak "
+            f"learning rate {self._finetune.lr:g}; {len(self.store.array('vl/time'))} VL rows of "
+            f"{len(self.store.episodes)} recordings"
         ]
         if self._compile:
             lines.append(
                 "train_head.compile is true, but a tuning runs uncompiled: torch.compile cannot "
                 "take its batches of rows"
             )
-        if self._store.variants > 1:
+        if self.store.variants > 1:
             lines.append(
-                f"tuning: the store's {self._store.variants - 1} augmented variant(s) of each row "
+                f"tuning: the store's {self.store.variants - 1} augmented variant(s) of each row "
                 "are not used, the model sees the plain frames"
             )
         return lines
@@ -143,6 +140,33 @@ class LiveFeatures:
             return file_digest(path) if path.is_relative_to(folder) else self._base_digest(path)
 
         return feature_spec(vlm, storage, self._spec.views, digest)
+
+
+def head_params(params: Params) -> TrainHeadParams:
+    """`train_head` with what stands in `finetune` laid over it, and nothing compiled.
+
+    Raises `ConfigError` where that leaves nothing of the model to learn, or nothing to learn from.
+    """
+    if params.finetune.tuning.method == "none":
+        raise ConfigError(
+            "finetune.tuning.method is none, so nothing of the vision-language model would learn. "
+            "Set it to lora or full; a policy on the model as it is comes from the store alone: "
+            "python -m stages.train_head"
+        )
+    if not params.train_head.features_enabled:
+        raise ConfigError(
+            "train_head.features_enabled is false, so the policy would not see the model that is "
+            "tuned. Set it to true."
+        )
+    # `lr` is of the model alone; rows are objects of many shapes, which torch.compile cannot take.
+    given = {"lr": params.train_head.lr, "compile": False}
+    shared = TrainHeadParams.model_fields.keys() & FinetuneParams.model_fields.keys()
+    laid_over = {name: getattr(params.finetune, name) for name in shared} | given
+    try:
+        return TrainHeadParams.model_validate(params.train_head.model_dump() | laid_over)
+    except ValidationError as error:
+        problems = "; ".join(problem["msg"] for problem in error.errors())
+        raise ConfigError(f"finetune: {problems}") from None
 
 
 @contextmanager

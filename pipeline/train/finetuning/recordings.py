@@ -6,11 +6,11 @@ from contextlib import closing
 from tqdm import tqdm
 
 from pipeline.base.config import Params
-from pipeline.base.differences import describe, differences
 from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.base.errors import RecordingError, StoreMismatch
 from pipeline.data import Opened, Recording, content_digest, open_recordings
 from pipeline.store import Episode, FeatureStore, episode_name
+from pipeline.train.split import list_differences
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 
 _SHOWN = 5
@@ -63,10 +63,10 @@ def check_spec(store: FeatureStore, params: Params, digests: ContentDigests) -> 
     stored = store.spec
     spec = feature_spec(params.vlm, stored["storage_dtype"], stored["views"], digests.of)
     if spec.digest != stored["digest"]:
-        lines = "\n".join(f"  {line}" for line in describe(differences(stored, spec.attrs())))
         raise StoreMismatch(
             f"{store.path}: tuning begins with the model whose features the store holds, but its "
-            f"feature spec is not that of vlm (store -> vlm):\n{lines}\n"
+            f"feature spec is not that of vlm (store -> vlm):\n"
+            f"{list_differences(stored, spec.attrs())}\n"
             "Set vlm to what the store was extracted with, name another store in "
             f"train_head.store, or extract one with these params: {_EXTRACT}"
         )
@@ -88,13 +88,10 @@ def _why_missing(episode: Episode, sources: set[str], opened: Opened) -> str:
 
 
 def _refuse(store: FeatureStore, wrong: Sequence[tuple[Episode, str]]) -> None:
-    lines = [f"  {episode_name(episode)}: {why}" for episode, why in wrong[:_SHOWN]]
-    if len(wrong) > _SHOWN:
-        lines.append(f"  … and {len(wrong) - _SHOWN} more")
+    lines = "\n".join(f"  {episode_name(episode)}: {why}" for episode, why in wrong[:_SHOWN])
     raise StoreMismatch(
         f"{store.path}: expected the recordings that the store was extracted from, but of its "
-        f"{len(store.episodes)} episodes {len(wrong)} cannot be found as they were:\n"
-        + "\n".join(lines)
-        + f"\nPut the recordings back (data.root, data.sources), or extract a store of what is "
-        f"there now: {_EXTRACT}"
+        f"{len(store.episodes)} episodes {len(wrong)} cannot be found as they were, the first:\n"
+        f"{lines}\nPut the recordings back (data.root, data.sources), or extract a store of what "
+        f"is there now: {_EXTRACT}"
     )

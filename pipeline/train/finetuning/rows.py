@@ -6,19 +6,17 @@ to be decoded: so rows of one episode are read together and in order, and prepar
 
 import threading
 import time
-from collections import OrderedDict, deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections import deque
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Self
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pipeline.data import CameraStream, Recording
-from pipeline.data.row_range import RowRange
+from pipeline.data import Recording
+from pipeline.data.row_range import RowFrames, by_episode
 from pipeline.policy.observation import LiveObservation
 from pipeline.store import Batch, FeatureStore
 from pipeline.train.batches import BatchIndices, Prefetch, Windows
@@ -27,7 +25,7 @@ from pipeline.vlm.preparation import PreparedRow, Preparer
 CACHE_BYTES = 2**30
 """Of prepared rows that are kept: all of a small data set, so that it is decoded once."""
 _OPEN_EPISODES = 1024
-"""Whose lists of frames are kept."""
+"""Whose cameras are kept open, with their lists of frames."""
 
 
 class LiveRows:
@@ -41,65 +39,37 @@ class LiveRows:
         cache_bytes: int = CACHE_BYTES,
     ) -> None:
         """`recordings` are those of the store's episodes, in its order."""
-        self._recordings = recordings
+        self.vl_start = store.array("episode/vl_start")
+        frame_time, views = store.array("vl/frame_time"), store.spec["views"]
+        self._frames = RowFrames(recordings, self.vl_start, frame_time, views, _OPEN_EPISODES)
         self._preparer = preparer
-        self._views: list[str] = store.spec["views"]
-        self._instructions = [episode.instruction for episode in store.episodes]
-        self._vl_start = store.array("episode/vl_start")
-        self._frame_time = store.array("vl/frame_time")
-        self._cameras = lru_cache(_OPEN_EPISODES)(self._open_cameras)
-        self._kept: OrderedDict[int, PreparedRow] = OrderedDict()
+        self._kept: dict[int, PreparedRow] = {}
         self._room = cache_bytes
         self._lock = threading.Lock()
 
-    def by_episode(self, rows: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-        """Distinct rows by episode, ascending: those are best decoded together."""
-        distinct = np.unique(rows)
-        episodes = np.searchsorted(self._vl_start, distinct, side="right") - 1
-        return np.split(distinct, np.flatnonzero(np.diff(episodes)) + 1)
-
     def prepare(self, rows: NDArray[np.int64]) -> list[PreparedRow]:
-        """Rows of one episode, ascending.
+        """Rows, ascending, best of one episode: its videos are read in one pass, never backwards.
 
-        In one pass through each of its videos, which is never read backwards. Raises
-        `RecordingError` where a frame cannot be decoded.
+        Raises `RecordingError` where a frame cannot be decoded.
         """
-        prepared = {row: kept for row in rows.tolist() if (kept := self._take(row)) is not None}
-        absent = np.array([row for row in rows.tolist() if row not in prepared], np.int64)
-        if len(absent):
-            prepared |= self._decode(absent)
+        kept = {row: self._kept.get(row) for row in rows.tolist()}
+        prepared = {row: known for row, known in kept.items() if known is not None}
+        absent = np.array([row for row in kept if row not in prepared], np.int64)
+        for row_range in self._frames.ranges(absent):
+            for row, frames in row_range.read():
+                prepared[row] = self._preparer.prepare(row_range.recording.instruction, frames)
+                self._keep(row, prepared[row])
         return [prepared[row] for row in rows.tolist()]
 
-    def _decode(self, rows: NDArray[np.int64]) -> dict[int, PreparedRow]:
-        episode = int(np.searchsorted(self._vl_start, rows[0], side="right")) - 1
-        cameras = self._cameras(episode)
-        shown = self._frame_time[rows]
-        row_range = RowRange.of(self._recordings[episode], cameras, rows, shown, self._views)
-        prepared: dict[int, PreparedRow] = {}
-        for row, frames in row_range.read():
-            prepared[row] = self._preparer.prepare(self._instructions[episode], frames)
-            self._keep(row, prepared[row])
-        return prepared
-
-    def _open_cameras(self, episode: int) -> dict[str, CameraStream]:
-        return dict(self._recordings[episode].cameras())
-
-    def _take(self, row: int) -> PreparedRow | None:
-        with self._lock:
-            if row in self._kept:
-                self._kept.move_to_end(row)
-            return self._kept.get(row)
-
     def _keep(self, row: int, prepared: PreparedRow) -> None:
-        """Keep a row in place of those that were not asked for the longest."""
+        """Keep a row in place of those that are kept the longest."""
         with self._lock:
-            if row in self._kept:
-                return
-            self._kept[row] = prepared
-            self._room -= prepared.pixels.nbytes
+            if row not in self._kept:
+                self._kept[row] = prepared
+                self._room -= prepared.pixels.nbytes
             while self._room < 0:
-                _, oldest = self._kept.popitem(last=False)
-                self._room += oldest.pixels.nbytes
+                oldest = next(iter(self._kept))
+                self._room += self._kept.pop(oldest).pixels.nbytes
 
 
 @dataclass
@@ -107,13 +77,12 @@ class LiveBatch(Batch, LiveObservation):
     """A batch and the rows that its features are to be computed from, each distinct one once."""
 
 
-class LiveFeed(Iterator[tuple[BatchIndices, LiveBatch]]):
-    """A `Feed` that hands out `(indices, live batch)` for each entry of a plan, in its order.
+class LiveFeed(Prefetch):
+    """Hands out `(indices, live batch)` for each entry of a plan, in its order.
 
-    Streams come from a `Prefetch`; the distinct VL rows of each batch are decoded by `threads`
-    threads, as many batches ahead. Every variant of a row is the plain frames: others exist in the
-    store only. An exception in the plan, the store or a recording comes out of `next` at the batch
-    it belongs to. Use as a context manager, or call `close`.
+    The distinct VL rows of each batch are decoded by `threads` threads, as many batches ahead.
+    Every variant of a row is the plain frames: others exist in the store only. An exception in a
+    recording, too, comes out of `next` at the batch it belongs to.
     """
 
     def __init__(
@@ -126,17 +95,15 @@ class LiveFeed(Iterator[tuple[BatchIndices, LiveBatch]]):
         threads: int,
     ) -> None:
         self._vl_row, self._rows = store.array("tick/vl_row"), rows
-        self._coming: deque[tuple[NDArray[np.int64], list[Future[list[PreparedRow]]]]] = deque()
-        self.waited_s = 0.0
-        """Time that the consumer has spent waiting for data."""
+        self._decoding: deque[tuple[NDArray[np.int64], list[Future[list[PreparedRow]]]]] = deque()
         self._pool = ThreadPoolExecutor(threads, thread_name_prefix="decode")
         announced = (self._announce(indices) for indices in plan)
-        self._prefetch = Prefetch(store, announced, windows, device, buffers=threads + 1)
+        super().__init__(store, announced, windows, device, buffers=threads + 1)
 
     def __next__(self) -> tuple[BatchIndices, LiveBatch]:
+        indices, batch = super().__next__()
         started = time.perf_counter()
-        indices, batch = next(self._prefetch)
-        row_of, decoded = self._coming.popleft()
+        row_of, decoded = self._decoding.popleft()
         rows = [row for future in decoded for row in future.result()]
         self.waited_s += time.perf_counter() - started
         places = torch.from_numpy(row_of).to(batch.features.device)
@@ -144,20 +111,13 @@ class LiveFeed(Iterator[tuple[BatchIndices, LiveBatch]]):
 
     def close(self) -> None:
         """Stop all threads and wait for them."""
-        self._prefetch.close()
+        super().close()
         self._pool.shutdown(cancel_futures=True)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *raised: object) -> None:
-        self.close()
 
     def _announce(self, indices: BatchIndices) -> BatchIndices:
         """Begin with the rows of a batch; called in the thread that consumes the plan, in order."""
         distinct, row_of = np.unique(self._vl_row[indices.ticks], return_inverse=True)
-        decoded = [
-            self._pool.submit(self._rows.prepare, r) for r in self._rows.by_episode(distinct)
-        ]
-        self._coming.append((row_of.astype(np.int64), decoded))
+        parts = by_episode(distinct, self._rows.vl_start)
+        decoded = [self._pool.submit(self._rows.prepare, rows) for _, rows in parts]
+        self._decoding.append((row_of.astype(np.int64), decoded))
         return indices

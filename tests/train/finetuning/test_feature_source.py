@@ -22,7 +22,7 @@ from pipeline.train.finetuning import LiveFeatures, head_params, out_of_memory_n
 from pipeline.train.loop import Trainer
 from pipeline.train.run import open_run
 from pipeline.train.scores import evaluate_policy
-from pipeline.train.split import check_store, held_out_ticks, split_by_episode
+from pipeline.train.split import check_store, find_held_out, split_by_episode
 
 CPU = torch.device("cpu")
 
@@ -107,7 +107,7 @@ def test_what_is_kept_is_the_averaged_model_that_was_judged(
     check_store(best, store)
     with pytest.raises(CheckpointMismatch, match=r"feature_spec\.adapter"):
         check_store(best, base)
-    ticks = held_out_ticks(store, best.held_out_ticks, best.held_out_content)
+    ticks, _ = find_held_out(store, best)
     comparison, _ = evaluate_policy(
         best.policy(), store, ticks, Windows.of(best.params), 64, best.normalization
     )

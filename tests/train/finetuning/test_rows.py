@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.base.config import Params
 from pipeline.base.errors import RecordingError
+from pipeline.data.row_range import by_episode
 from pipeline.extract import extract
 from pipeline.simulation.lerobot_format import write_lerobot
 from pipeline.simulation.recorder import simulate_episode
@@ -48,7 +49,7 @@ def keys(store: FeatureStore, rows: NDArray[np.int64]) -> Counter[bytes]:
 def prepare_all(rows: LiveRows, wanted: NDArray[np.int64]) -> dict[int, PreparedRow]:
     return {
         row: prepared
-        for piece in rows.by_episode(wanted)
+        for _, piece in by_episode(np.unique(wanted), rows.vl_start)
         for row, prepared in zip(piece.tolist(), rows.prepare(piece), strict=True)
     }
 
@@ -96,14 +97,6 @@ def test_kept_rows_stay_within_their_bytes(
     for _ in range(2):
         none.prepare(np.array([last.start]))
     assert watched.keys.total() == 2
-
-
-def test_pieces_are_of_one_episode_each(store: FeatureStore, params: Callable[..., Params]) -> None:
-    rows, _ = live_rows(store, params())
-    starts = store.array("episode/vl_start")
-    wanted = np.array([starts[2] + 1, 0, starts[1] - 1, starts[2], 0])
-    pieces = [piece.tolist() for piece in rows.by_episode(wanted)]
-    assert pieces == [[0, starts[1] - 1], [starts[2], starts[2] + 1]]
 
 
 def test_a_frame_that_is_gone_is_named(
