@@ -10,12 +10,13 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from functools import partial
 from itertools import islice
 from multiprocessing import active_children, resource_tracker
+from pathlib import Path
 from typing import Any
 
 import dask
@@ -29,8 +30,9 @@ from pipeline.base.config import ExtractParams
 from pipeline.base.errors import ConfigError, NumericsError, PipelineError, RecordingError
 from pipeline.base.scheduler import client_of, private_cluster, quiet
 from pipeline.data.row_range import by_episode
-from pipeline.extract.engine import ExtractionJob, RowMarks, WrittenRows
-from pipeline.extract.worker import ExtractionPlugin, compute_rows
+from pipeline.extract.engine import RowMarks, WrittenRows
+from pipeline.extract.survey import Survey
+from pipeline.extract.worker import ExtractionJob, ExtractionPlugin, compute_rows
 from pipeline.store import FEATURES
 
 PAGE_BYTES = 4096
@@ -61,7 +63,11 @@ Result = Any
 
 
 def compute_on_cluster(
-    job: ExtractionJob, vl_start: NDArray[np.int64], missing: NDArray[np.int64], marks: RowMarks
+    surveyed: Survey,
+    known: Sequence[Path],
+    vl_start: NDArray[np.int64],
+    missing: NDArray[np.int64],
+    marks: RowMarks,
 ) -> float | None:
     """Have `extract.workers` compute every missing row; rows a second, None where too few to tell.
 
@@ -69,9 +75,10 @@ def compute_on_cluster(
     `VLMError`, `DiskFull`, `PipelineError` where the scheduler or all workers are lost. Raises
     `RecordingError` after all other rows where some could not be computed.
     """
-    extract, array = job.surveyed.params.extract, marks.build.specs[FEATURES]
+    extract, array = surveyed.params.extract, marks.build.specs[FEATURES]
+    job = ExtractionJob(surveyed, tuple(path.absolute() for path in known), Path.cwd())
     rows = _AUTO_RANGE_ROWS if extract.batch_size == "auto" else extract.batch_size
-    most = max(1, rows // job.surveyed.spec.variants)
+    most = max(1, rows // surveyed.spec.variants)
     # Where hosts may differ, no two ranges share a page of the file.
     together = 1 if job.local else rows_between_pages(array.row_bytes)
     ranges = ranges_of(missing, vl_start, array.chunk_rows, most, together)
@@ -171,8 +178,7 @@ class ClusterTasks:
     def _note_death(self, address: str) -> None:
         if address not in self._dead:
             self._dead.add(address)
-            said = f"the worker {address} died; what it had is computed again at the end"
-            tqdm.write(said, file=sys.stderr)
+            tqdm.write(f"the worker {address} died; its rows are computed again", file=sys.stderr)
         if not self._any_written and len(self._dead) >= _HOPELESS_DEATHS:
             raise PipelineError(
                 f"workers died again and again before a single row was written; last {address}. Do "
@@ -188,9 +194,9 @@ class ClusterTasks:
             )
         elif not isinstance(error, RecordingError | NumericsError):
             self._note_failure(rows, error)
-        path = self._job.surveyed.recordings[episode].path
-        told = str(path) in str(error)
-        return str(error) if told else f"{path}, VL rows {rows[0]} to {rows[-1]}: {error}"
+        path = str(self._job.surveyed.recordings[episode].path)
+        where = "" if path in str(error) else f"{path}, VL rows {rows[0]} to {rows[-1]}: "
+        return f"{where}{error}"
 
 
 def rows_between_pages(row_bytes: int) -> int:
@@ -274,8 +280,7 @@ def connected(extract: ExtractParams) -> Generator[Client]:
         else:
             with client_of(extract.workers, _SETTING) as client:
                 if not client.nthreads():
-                    said = "the scheduler has no worker yet; waiting for one"
-                    print(f"{extract.workers}: {said}", file=sys.stderr)
+                    print(f"{extract.workers}: waiting for a first worker", file=sys.stderr)
                 yield client
 
 
@@ -283,16 +288,21 @@ def connected(extract: ExtractParams) -> Generator[Client]:
 def _local_cluster(workers: int, extract: ExtractParams) -> Generator[LocalCluster]:
     """Worker processes of this host, all of them up; raises `PipelineError` where they cannot be.
 
-    Dask cannot be interrupted while they start without noise and orphans, so a thread starts them
-    and an interrupted coordinator kills what was begun: then that thread ends by itself.
+    One thread of each has the model, the others prepare. Dask cannot be interrupted while they
+    start without noise and orphans, so a thread starts them and an interrupted coordinator kills
+    what was begun: then that thread ends by itself.
     """
-    others = active_children()
+    cores = len(os.sched_getaffinity(0))
+    threads = os.environ.get("OMP_NUM_THREADS") or str(max(1, cores // workers))
+    env = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), threads)
+    start = partial(private_cluster, workers, 1 + extract.decode_threads, extract.retries, env)
+    others = set(active_children())
     with ThreadPoolExecutor(1) as pool:
         # Ctrl-C reaches the whole process group, but only the coordinator may act on it: threads
         # and processes, also workers begun again later, inherit the mask of the one that made them.
         resource_tracker.ensure_running()  # now, for it unblocks SIGINT in whoever starts it
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        starting = pool.submit(_started, workers, extract)
+        starting = pool.submit(start)
         try:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
             try:
@@ -307,21 +317,8 @@ def _local_cluster(workers: int, extract: ExtractParams) -> Generator[LocalClust
             yield cluster
         finally:
             while not starting.done():
-                for child in active_children():
-                    if child not in others:
-                        child.kill()
+                for child in set(active_children()) - others:
+                    child.kill()
                 time.sleep(_LOOK_EVERY_S)
             if starting.exception() is None:
                 starting.result().close()
-
-
-def _started(workers: int, extract: ExtractParams) -> LocalCluster:
-    """One thread of each process has the model, the others prepare.
-
-    A process that died is begun again however long its imports take (dask gives it up after 15 s).
-    """
-    cores = len(os.sched_getaffinity(0))
-    threads = os.environ.get("OMP_NUM_THREADS") or str(max(1, cores // workers))
-    names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-    env: dict[str, str] = dict.fromkeys(names, threads)
-    return private_cluster(workers, 1 + extract.decode_threads, extract.retries, env)

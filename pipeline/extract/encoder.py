@@ -48,8 +48,7 @@ class BatchSize:
         self._most = _MOST[device]
         self._best = (0.0, self.current)
         self._misses = 0
-        self._warm = False
-        self._timed: list[tuple[int, float]] = []
+        self._speeds: list[float] = []
 
     def note(self, size: int, tokens: int, seconds: float) -> None:
         """What a full batch of this size took.
@@ -58,12 +57,17 @@ class BatchSize:
         """
         if self.settled or size != self.current:  # one more was under way when it changed
             return
-        if not self._warm:
-            self._warm = True
+        self._speeds.append(tokens / max(seconds, 1e-9))
+        if len(self._speeds) <= _MEASURED:
             return
-        self._timed.append((tokens, seconds))
-        if len(self._timed) == _MEASURED:
-            self._decide(max(tokens / max(seconds, 1e-9) for tokens, seconds in self._timed))
+        speed = max(self._speeds[1:])  # the first batch warms up
+        self._speeds.clear()
+        if speed >= self._best[0] * _GAIN:
+            self._best, self._misses = (speed, self.current), 0
+        else:
+            self._misses += 1
+        self.settled = self._misses == _MISSES or self.current * 2 > self._most
+        self.current = self._best[1] if self.settled else self.current * 2
 
     def halve(self, failed: int, error: RuntimeError) -> None:
         """Go on with half of what did not fit; `VLMError` where that was a single row."""
@@ -72,23 +76,9 @@ class BatchSize:
                 f"out of memory with a single row ({error}). Use a GPU with more memory, a smaller "
                 "vlm.image_resize_height and _width, or fewer data.views."
             ) from error
-        self._settle(min(failed // 2, self._best[1]))
+        self.current, self.settled = min(failed // 2, self._best[1]), True
         torch.cuda.empty_cache()
         print(f"out of memory: going on with batches of {self.current}", file=sys.stderr)
-
-    def _decide(self, speed: float) -> None:
-        if speed >= self._best[0] * _GAIN:
-            self._best, self._misses = (speed, self.current), 0
-        else:
-            self._misses += 1
-        if self._misses == _MISSES or self.current * 2 > self._most:
-            self._settle(self._best[1])
-        else:
-            self.current *= 2
-            self._warm, self._timed = False, []
-
-    def _settle(self, size: int) -> None:
-        self.current, self.settled = size, True
 
 
 Encoded = tuple[list[ReadyRow], NDArray[Any]]
@@ -129,17 +119,15 @@ class Encoder:
         `NumericsError` that names the row, and variant, of a feature that is not finite, and
         `VLMError` where memory does not suffice for a single row.
         """
-        ahead: _Submitted | None = None
+        ahead: list[_Submitted] = []
         for batch in self._batches(rows):
             for submitted in self._submitted(batch):
-                if ahead is not None:
-                    yield from self._finished(ahead)
-                ahead = submitted
-                if all(one.done for one in submitted.passes):
-                    yield from self._finished(ahead)
-                    ahead = None
-        if ahead is not None:
-            yield from self._finished(ahead)
+                ahead.append(submitted)
+                keep = 0 if all(each.done for each in submitted.passes) else 1
+                while len(ahead) > keep:
+                    yield from self._finished(ahead.pop(0))
+        for submitted in ahead:
+            yield from self._finished(submitted)
 
     def _batches(self, rows: Iterable[ReadyRow]) -> Iterator[list[ReadyRow]]:
         """Full batches of equal shape as they come together, at last what is left of each shape.
@@ -181,12 +169,12 @@ class Encoder:
     def _finished(self, submitted: _Submitted) -> Iterator[Encoded]:
         rows = submitted.rows
         try:
-            features = [one.result()[0] for one in submitted.passes]
+            features = [part.result()[0] for part in submitted.passes]
         except NumericsError:
             for row in rows:  # alone, the one that is not finite names itself
                 yield [row], _stored([row], [self._alone(row, v) for v in range(self._variants)])
             return
-        seconds = sum(one.model_s for one in submitted.passes)
+        seconds = sum(part.model_s for part in submitted.passes)
         self.model_s += seconds
         if submitted.full is not None:
             tokens = len(rows) * self._variants * rows[0].variants[0].layout.length
