@@ -15,23 +15,22 @@ from pipeline.extract.rows import ReadyRow
 from pipeline.vlm.preparation import TokenLayout
 from pipeline.vlm.qwen import FrozenVLM, Pending
 
+# Fewer are slower on any device; where they do not fit, memory running out says so.
 _FIRST = 8
-"""Fewer are slower on any device; where they do not fit, memory running out says so."""
 
+# Past these, more rows gain nothing and only hold memory.
 _MOST = {"cpu": 64, "cuda": 512}
-"""Past these, more rows gain nothing and only hold memory."""
 
+# Batches of a size that are timed; the one before them warms up.
+#
+# The fastest counts: whatever else the machine does makes a batch slower, never faster.
 _MEASURED = 3
-"""Batches of a size that are timed; the one before them warms up.
 
-The fastest counts: whatever else the machine does makes a batch slower, never faster.
-"""
-
+# How much faster more rows must be to be worth their memory.
 _GAIN = 1.03
-"""How much faster more rows must be to be worth their memory."""
 
+# Sizes in a row that are no faster before the search ends: one may be a hiccup.
 _MISSES = 2
-"""Sizes in a row that are no faster before the search ends: one may be a hiccup."""
 
 
 class BatchSize:
@@ -81,18 +80,20 @@ class BatchSize:
         print(f"out of memory: going on with batches of {self.current}", file=sys.stderr)
 
 
+# Rows, and their features (row, variant x slot, dim) as they are stored.
 Encoded = tuple[list[ReadyRow], NDArray[Any]]
-"""Rows, and their features (row, variant x slot, dim) as they are stored."""
 
 
 @dataclass(frozen=True)
 class _Submitted:
-    """Rows that the model works on, variant after variant, in one pass or several."""
+    """Rows that the model works on, variant after variant, in one pass or several.
+
+    `full` is the batch size, where there are as many rows as it allows.
+    """
 
     rows: list[ReadyRow]
     passes: list[Pending]
     full: int | None
-    """The batch size, where there are as many rows as it allows."""
 
 
 class Encoder:
@@ -105,8 +106,7 @@ class Encoder:
         self, vlm: FrozenVLM, batch_size: int | Literal["auto"], variants: int = 1
     ) -> None:
         """With "auto" the first batches are measured, and the size settles where it is fastest."""
-        self.model_s = 0.0
-        """Seconds that the model worked on what was handed out so far."""
+        self.model_s = 0.0  # that the model worked on what was handed out so far
         self._vlm = vlm
         self.size = BatchSize(batch_size, vlm.device.type)
         self._variants = variants

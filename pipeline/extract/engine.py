@@ -39,29 +39,30 @@ from pipeline.vlm.preparation import Preparer
 if TYPE_CHECKING:
     from pipeline.extract.encoder import Encoder
 
+# Blocks that are written or wait for it; the model waits when there are more: a kill loses few.
 _WAITING = 2
-"""Blocks that are written or wait for it; the model waits when there are more: a kill loses few."""
 
+# Known or repeated rows that are written in one go: each time waits for the disk.
 _TOGETHER = 64
-"""Known or repeated rows that are written in one go: each time waits for the disk."""
 
 
 @dataclass(frozen=True)
 class ExtractionReport:
-    """What was done; the shares are of the time since the model was loaded, where one was here."""
+    """What was done; the shares are of the time since the model was loaded, where one was here.
+
+    `taken` rows come from an earlier store or build, `repeated` ones equal another that was
+    `computed`. The model worked `model_share` of the time and waited `waited_share` of it for
+    frames to be decoded and prepared.
+    """
 
     store: Path
     rows: int
     taken: int
-    """Rows taken over from an earlier store or build."""
     computed: int
     repeated: int
-    """Rows equal to another that was computed."""
     seconds: float
     model_share: float | None
-    """How much the model worked."""
     waited_share: float | None
-    """How much it waited for frames to be decoded and prepared."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +122,10 @@ class RowMarks:
 
 
 class RowEngine:
-    """The preparation and the model of one process, which is loaded when a row first needs it."""
+    """The preparation and the model of one process, which is loaded when a row first needs it.
+
+    `loaded_at` is `time.monotonic()` then, `waited_s` how long the model has waited for rows.
+    """
 
     def __init__(
         self, surveyed: Survey, frames: RowFrames, known: Sequence[RowSource], device: str
@@ -130,7 +134,6 @@ class RowEngine:
         self.frames = frames
         self.encoder: Encoder | None = None
         self.loaded_at = self.waited_s = 0.0
-        """`time.monotonic()` when the model was there, and how long it has waited for rows."""
         self._spec = surveyed.spec
         self._device = device
         self._preparation = RowPreparation(Preparer(self.params.vlm, self._spec), self._spec, known)
@@ -217,15 +220,8 @@ def fill(
     """
     begun, total = time.monotonic(), build.specs["vl/time"].shape[0]
     frames, extract = row_frames(build, surveyed), surveyed.params.extract
-    with tqdm(
-        None,
-        "extract",
-        total,
-        initial=total - len(missing),
-        unit="row",
-        disable=None,
-        smoothing=0.05,
-    ) as bar:
+    done = total - len(missing)
+    with tqdm(None, "extract", total, initial=done, unit="row", disable=None) as bar:
         marks = RowMarks(build, bar)
         missing = _take_over(surveyed, known, frames, missing, marks)
         rate = model_share = waited_share = None
@@ -243,17 +239,10 @@ def fill(
                 model_share, waited_share = engine.encoder.model_s / since, engine.waited_s / since
     if rate is not None:
         digests.note_rate(rate_name(surveyed), rate)
-    taken, computed, repeated = (marks.counts[of] for of in ("known", "computed", "repeated"))
-    return ExtractionReport(
-        build.target,
-        total,
-        taken,
-        computed,
-        repeated,
-        time.monotonic() - begun,
-        model_share,
-        waited_share,
-    )
+    of = marks.counts
+    seconds = time.monotonic() - begun
+    counts = of["known"], of["computed"], of["repeated"]
+    return ExtractionReport(build.target, total, *counts, seconds, model_share, waited_share)
 
 
 def _take_over(
@@ -299,12 +288,12 @@ def _known_blocks(rows: Sequence[KnownRow]) -> Iterator[FeatureBlock]:
 
 def compute_here(engine: RowEngine, missing: NDArray[np.int64], marks: RowMarks) -> None:
     """Compute and mark rows in this process: threads prepare, this one encodes, one commits."""
-    most = max(1, RANGE_ROWS // engine.params.vlm.variants)
 
     def ranges_ahead() -> int:
         """While the model has one batch, the next should be complete."""
         return 2 * engine.encoder.size.current // RANGE_ROWS + 1 if engine.encoder else 0
 
+    most = max(1, RANGE_ROWS // engine.params.vlm.variants)
     rows = in_background(
         engine.frames.ranges(missing, most),
         partial(engine.prepare, firsts={}),

@@ -17,8 +17,8 @@ from pipeline.store.paths import MERGED, STORE, is_store
 from pipeline.store.schema import read_specs
 
 Say = Callable[[str], None]
+# Entries of a feature spec that a message lists.
 _SHOWN = 6
-"""Entries of a feature spec that a message lists."""
 
 
 class StorePlaces:

@@ -27,33 +27,33 @@ from pipeline.vlm.feature_spec import FeatureSpec
 from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.qwen import FrozenVLM
 
+# Largest deviation of a number, relative to the root mean square of its slot, by the coarser of
+# compute and storage dtype.
+#
+# Measured with the demo checkpoint on a CPU, against batches of 8 on one thread: batches of 1 and
+# 3, two threads and eager attention move a number of 16 rows x 49 slots x 128 by at most 7e-6 in
+# float32, 0.012 in float16 and 0.070 in bfloat16 (two of its steps after four layers). Deeper
+# models gather more, so a few times that is allowed, and in float32, where nothing is lost by it,
+# a hundred times, for GPUs sum in other orders. What is wrong in earnest is far beyond: another
+# frame, prompt or weight moves numbers by about their own size.
 TOLERANCES = {"float32": 1e-3, "float16": 5e-2, "bfloat16": 3e-1}
-"""Largest deviation of a number, relative to the root mean square of its slot, by the coarser of
-compute and storage dtype.
-
-Measured with the demo checkpoint on a CPU, against batches of 8 on one thread: batches of 1 and 3,
-two threads and eager attention move a number of 16 rows x 49 slots x 128 by at most 7e-6 in
-float32, 0.012 in float16 and 0.070 in bfloat16 (two of its steps after four layers). Deeper models
-gather more, so a few times that is allowed, and in float32, where nothing is lost by it, a hundred
-times, for GPUs sum in other orders. What is wrong in earnest is far beyond: another frame, prompt
-or weight moves numbers by about their own size.
-"""
 
 
 @dataclass(frozen=True)
 class Deviation:
-    """How far one row of today is from the stored one."""
+    """How far one row of today is from the stored one.
+
+    `relative` is to the root mean square of the stored slot, the largest of all variants and slots,
+    which is in `slot`, counted over both. `same_pixels` where the key is that of the store: the
+    frames decode to the same pixels. `where` is recording and row.
+    """
 
     row: int
     absolute: float
     relative: float
-    """To the root mean square of the stored slot; the largest of all variants and slots."""
     slot: int
-    """In which the relative deviation is largest, counted over variants and slots."""
     same_pixels: bool
-    """Whether the key is that of the store: the frames decode to the same pixels."""
     where: str
-    """Recording and row."""
 
     def __str__(self) -> str:
         pixels = "" if self.same_pixels else "; the decoder of today gives other pixels"
@@ -65,15 +65,16 @@ class Deviation:
 
 @dataclass(frozen=True)
 class Reextraction:
-    """What came of it."""
+    """What came of it; of each row, the largest relative deviation first.
+
+    `unchecked` are ids of episodes whose recordings are not there as they were, `environment` is
+    where software or hardware of today is not that of the rows.
+    """
 
     deviations: tuple[Deviation, ...]
-    """Of each row, the largest relative deviation first."""
     tolerance: float
     unchecked: tuple[str, ...]
-    """Ids of episodes whose recordings are not there as they were."""
     environment: tuple[str, ...]
-    """Where software or hardware of today is not that of the rows."""
 
     @property
     def beyond(self) -> list[Deviation]:

@@ -116,7 +116,7 @@ def _begin(
         if isinstance(extract.workers, str) and taken < len(rows):
             from pipeline.extract.cluster import check_scheduler  # dask: a second to import
 
-            check_scheduler(extract)
+            check_scheduler(extract.workers)
         places.make_room(surveyed, say)
         places = StorePlaces(places.target)
         with row_sources(places.known, surveyed) as known:

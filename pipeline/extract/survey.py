@@ -29,11 +29,10 @@ from pipeline.vlm.preparation import Preparer
 
 @dataclass(frozen=True)
 class SurveyedEpisode:
-    """A recording and what its files hold."""
+    """A recording and what the store says of it, its digests too."""
 
     recording: Recording
     text: Mapping[str, str]
-    """What the store says of it, its digests too."""
 
     @property
     def content(self) -> str:
@@ -48,17 +47,19 @@ class SurveyedEpisode:
 
 @dataclass(frozen=True)
 class Survey:
-    """What is to be in the store."""
+    """What is to be in the store.
+
+    A data set's metadata list the `missing`, which are not among its files. `plan` is the digest of
+    all that decides what the store holds.
+    """
 
     params: Params
     episodes: tuple[SurveyedEpisode, ...]
     missing: tuple[str, ...]
-    """Listed by a data set's metadata, absent from its files."""
     bad: tuple[BadEpisode, ...]
     spec: FeatureSpec
     action_rotation: ActionRotation
     plan: str
-    """Digest of all that decides what the store holds."""
 
     @property
     def target(self) -> Path:

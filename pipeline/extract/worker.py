@@ -93,7 +93,10 @@ class ExtractionPlugin(WorkerPlugin):
         blocks: list[FeatureBlock] = []
         with self._model_turn:
             engine.encode(iter([prepared]), blocks.append)
-        return [self._written(block) for block in blocks]
+        with self._disk_turn:
+            if self._closed:
+                raise StoreIncomplete(f"{self.name} has ended; its rows are nobody's")
+            return [block.write(self._build) for block in blocks]
 
     def _opened(self) -> RowEngine:
         """The worker's engine; its files are opened on the first call."""
@@ -104,18 +107,10 @@ class ExtractionPlugin(WorkerPlugin):
                 self._known = [RowSource(path) for path in self.job.known]
                 specs = read_specs(part_path(surveyed.target))
                 self._build = StoreBuild(surveyed.target, specs, surveyed.plan)
-                frames, device = (
-                    row_frames(self._build, surveyed),
-                    device_of(self.job, self._number),
-                )
+                frames = row_frames(self._build, surveyed)
+                device = device_of(self.job, self._number)
                 self._engine = RowEngine(surveyed, frames, self._known, device)
             return self._engine
-
-    def _written(self, block: FeatureBlock) -> WrittenRows:
-        with self._disk_turn:
-            if self._closed:
-                raise StoreIncomplete(f"{self.name} has ended; its rows are nobody's")
-            return block.write(self._build)
 
 
 def _prepared(engine: RowEngine, rows: NDArray[np.int64]) -> list[Row]:

@@ -381,7 +381,7 @@ class TestRefusals:
     def test_a_wrong_address(self, changed, monkeypatch, address):
         monkeypatch.setattr("pipeline.base.scheduler.TIMEOUT_S", 1)
         wrong = changed(extract={"workers": address})
-        for reach in (run, lambda params: check_scheduler(params.extract)):
+        for reach in (run, lambda params: check_scheduler(params.extract.workers)):
             with pytest.raises(ConfigError, match="no dask scheduler answers at"):
                 reach(wrong)
 
