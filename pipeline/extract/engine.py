@@ -130,13 +130,13 @@ class RowEngine:
     def __init__(
         self, surveyed: Survey, frames: RowFrames, known: Sequence[RowSource], device: str
     ) -> None:
-        self.params = surveyed.params
+        self._vlm, self._extract = surveyed.params.vlm, surveyed.params.extract
         self.frames = frames
         self.encoder: Encoder | None = None
         self.loaded_at = self.waited_s = 0.0
-        self._spec = surveyed.spec
+        self._spec, self.variants = surveyed.spec, surveyed.spec.variants
         self._device = device
-        self._preparation = RowPreparation(Preparer(self.params.vlm, self._spec), self._spec, known)
+        self._preparation = RowPreparation(Preparer(self._vlm, self._spec), self._spec, known)
         self._environment: Mapping[str, Any] = {}
 
     def prepare(self, rows: RowRange, firsts: dict[bytes, int] | None) -> list[Row]:
@@ -189,10 +189,9 @@ class RowEngine:
             from pipeline.extract.encoder import Encoder
             from pipeline.vlm.qwen import FrozenVLM
 
-            extract = self.params.extract
-            vlm = FrozenVLM.load(self.params.vlm, self._spec, self._device, extract.compile)
+            vlm = FrozenVLM.load(self._vlm, self._spec, self._device, self._extract.compile)
             self._environment = vlm.environment
-            self.encoder = Encoder(vlm, extract.batch_size, self._spec.variants)
+            self.encoder = Encoder(vlm, self._extract.batch_size, self.variants)
             self.loaded_at = time.monotonic()
         return self.encoder
 
@@ -232,15 +231,14 @@ def fill(
             rate = compute_on_cluster(surveyed, places, frames.vl_start, missing, marks)
         elif len(missing):
             engine = RowEngine(surveyed, frames, known, extract.device)
-            compute_here(engine, missing, marks)
+            compute_here(engine, missing, marks, extract.decode_threads)
             if engine.encoder is not None:
                 since = time.monotonic() - engine.loaded_at
                 rate = marks.counts["computed"] / since
                 model_share, waited_share = engine.encoder.model_s / since, engine.waited_s / since
     if rate is not None:
         digests.note_rate(rate_name(surveyed), rate)
-    of = marks.counts
-    seconds = time.monotonic() - begun
+    of, seconds = marks.counts, time.monotonic() - begun
     counts = of["known"], of["computed"], of["repeated"]
     return ExtractionReport(build.target, total, *counts, seconds, model_share, waited_share)
 
@@ -286,18 +284,20 @@ def _known_blocks(rows: Sequence[KnownRow]) -> Iterator[FeatureBlock]:
         yield FeatureBlock("known", block, features, environment)
 
 
-def compute_here(engine: RowEngine, missing: NDArray[np.int64], marks: RowMarks) -> None:
+def compute_here(
+    engine: RowEngine, missing: NDArray[np.int64], marks: RowMarks, threads: int
+) -> None:
     """Compute and mark rows in this process: threads prepare, this one encodes, one commits."""
 
     def ranges_ahead() -> int:
         """While the model has one batch, the next should be complete."""
         return 2 * engine.encoder.size.current // RANGE_ROWS + 1 if engine.encoder else 0
 
-    most = max(1, RANGE_ROWS // engine.params.vlm.variants)
+    most = max(1, RANGE_ROWS // engine.variants)
     rows = in_background(
         engine.frames.ranges(missing, most),
         partial(engine.prepare, firsts={}),
-        engine.params.extract.decode_threads,
+        threads,
         ranges_ahead,
     )
     with _committing(marks) as put, closing(rows):

@@ -99,8 +99,8 @@ def _linkable(
         contents = [episode.surveyed.content for episode in checked]
         pairs = zip(source.episode_contents, contents, strict=False)
         same = len(list(takewhile(lambda pair: pair[0] == pair[1], pairs)))
-        readings = sum(episode.readings for episode in checked[:same])
-        states = sum(episode.states for episode in checked[:same])
+        readings = sum(episode.rows.readings for episode in checked[:same])
+        states = sum(episode.rows.states for episode in checked[:same])
         for stream, rows in (("sensor", readings), ("state", states)):
             for part in ("values", "time"):
                 yield source, f"{stream}/{part}", rows

@@ -79,21 +79,15 @@ class Survey:
 
 @dataclass(frozen=True)
 class CheckedEpisode:
-    """An episode that was read whole and found sound; its streams are let go again."""
+    """An episode that was read whole and found sound; its streams are let go again.
+
+    `rows` is what a store lists of it.
+    """
 
     surveyed: SurveyedEpisode
     timeline: Timeline
     embodiment: Embodiment
-    readings: int
-    states: int
-
-    @property
-    def rows(self) -> EpisodeRows:
-        """Its rows, as a store lists them."""
-        recording = self.surveyed.recording
-        return EpisodeRows(
-            self.timeline, self.readings, self.states, recording.source, self.surveyed.text
-        )
+    rows: EpisodeRows
 
 
 def survey(params: Params, digests: ContentDigests) -> Survey:
@@ -196,7 +190,9 @@ def _checked(episode: SurveyedEpisode, surveyed: Survey, preparer: Preparer) -> 
         raise RecordingError(f"{recording.path}: {error}") from None
     for view, camera in cameras.items():
         camera.check(np.unique(read.timeline.frames[view]).tolist())
-    return CheckedEpisode(episode, read.timeline, read.embodiment, read.readings, read.states)
+    source = recording.source
+    rows = EpisodeRows(read.timeline, read.readings, read.states, source, episode.text)
+    return CheckedEpisode(episode, read.timeline, read.embodiment, rows)
 
 
 def _refuse_bad(bad: Sequence[BadEpisode], of: int) -> None:
