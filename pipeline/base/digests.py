@@ -29,7 +29,6 @@ _APPLICATION = 0x564C4146
 _TABLES = (
     "file (path TEXT PRIMARY KEY, size INTEGER, mtime_ns INTEGER, digest TEXT)",
     "rate (what TEXT PRIMARY KEY, rows_per_s REAL)",
-    "batch_size (what TEXT PRIMARY KEY, rows INTEGER)",
     "bad (episode TEXT PRIMARY KEY, reason TEXT)",
     "text (what TEXT PRIMARY KEY, text TEXT)",
 )
@@ -126,14 +125,6 @@ class ContentDigests:
     def rate(self, what: str) -> float | None:
         """Rows a second of the last session under that name."""
         return self._known("SELECT rows_per_s FROM rate WHERE what = ?", (what,))
-
-    def note_batch_size(self, what: str, rows: int) -> None:
-        """Remember how many rows a batch were fastest, so that it is not searched again."""
-        self._write("INSERT OR REPLACE INTO batch_size VALUES (?, ?)", (what, rows))
-
-    def batch_size(self, what: str) -> int | None:
-        """The fastest batch size that is known under that name."""
-        return self._known("SELECT rows FROM batch_size WHERE what = ?", (what,))
 
     def note_bad(self, episode: str, reason: str) -> None:
         """Remember that the episode of this digest cannot be used."""

@@ -68,7 +68,7 @@ class RowFrames:
 
     def __init__(
         self,
-        recordings: Sequence[Recording],
+        recordings: Sequence[Recording] | Mapping[int, Recording],
         vl_start: NDArray[np.int64],
         frame_time: NDArray[np.float64],
         views: Sequence[str],

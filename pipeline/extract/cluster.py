@@ -10,12 +10,13 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from functools import partial
 from itertools import islice
 from multiprocessing import active_children, resource_tracker
+from pathlib import Path
 from typing import Any
 
 import dask
@@ -29,39 +30,44 @@ from pipeline.base.config import ExtractParams
 from pipeline.base.errors import ConfigError, NumericsError, PipelineError, RecordingError
 from pipeline.base.scheduler import client_of, private_cluster, quiet
 from pipeline.data.row_range import by_episode
-from pipeline.extract.engine import ExtractionJob, RowMarks, WrittenRows
-from pipeline.extract.worker import ExtractionPlugin, compute_rows
+from pipeline.extract.engine import RowMarks, WrittenRows
+from pipeline.extract.survey import Survey
+from pipeline.extract.worker import ExtractionJob, ExtractionPlugin, compute_rows
 from pipeline.store import FEATURES
 
 PAGE_BYTES = 4096
 
+# Rows a task where each worker finds its own batch size.
 _AUTO_RANGE_ROWS = 32
-"""Rows a task where each worker finds its own batch size."""
 
+# Tasks that the scheduler holds: enough for hundreds of workers, never millions.
 _TASKS_AHEAD = 1000
-"""Tasks that the scheduler holds: enough for hundreds of workers, never millions."""
 
+# So many workers dead, each with a task that dask gave up, before a row is written are no
+# recording's fault.
 _HOPELESS_DEATHS = 4
-"""So many workers dead, each with a task that dask gave up, before a row is written are no
-recording's fault."""
 
+# For processes of this machine to come back after a death, however long their imports take.
 _LOCAL_PATIENCE = {
     "distributed.deploy.lost-worker-timeout": "1h",
     "distributed.scheduler.no-workers-timeout": "120s",
 }
-"""For processes of this machine to come back after a death, however long their imports take."""
 
 _SETTING = "extract.workers"
 _LOOK_EVERY_S = 0.05
 
+# Rows that one task computes, ascending.
 Range = NDArray[np.int64]
-"""Rows that one task computes, ascending."""
+# Of a task: what it returned, or in its place an exception.
 Result = Any
-"""Of a task: what it returned, or in its place an exception."""
 
 
 def compute_on_cluster(
-    job: ExtractionJob, vl_start: NDArray[np.int64], missing: NDArray[np.int64], marks: RowMarks
+    surveyed: Survey,
+    known: Sequence[Path],
+    vl_start: NDArray[np.int64],
+    missing: NDArray[np.int64],
+    marks: RowMarks,
 ) -> float | None:
     """Have `extract.workers` compute every missing row; rows a second, None where too few to tell.
 
@@ -69,12 +75,13 @@ def compute_on_cluster(
     `VLMError`, `DiskFull`, `PipelineError` where the scheduler or all workers are lost. Raises
     `RecordingError` after all other rows where some could not be computed.
     """
-    extract, array = job.surveyed.params.extract, marks.build.specs[FEATURES]
+    extract, array = surveyed.params.extract, marks.build.specs[FEATURES]
+    job = ExtractionJob(surveyed, tuple(path.absolute() for path in known), Path.cwd())
     rows = _AUTO_RANGE_ROWS if extract.batch_size == "auto" else extract.batch_size
-    most = max(1, rows // job.surveyed.spec.variants)
+    most = max(1, rows // surveyed.spec.variants)
     # Where hosts may differ, no two ranges share a page of the file.
     together = 1 if job.local else rows_between_pages(array.row_bytes)
-    ranges = ranges_of(missing, vl_start, array.chunk_rows, most, together)
+    ranges = ranges_of(missing, most, together)
     begun, before = 0.0, 0
     with connected(extract) as client, _plugged(client, job):
         tasks = ClusterTasks(client, job, vl_start)
@@ -94,21 +101,22 @@ class ClusterTasks:
         self._client = client
         self._job = job
         self._vl_start = vl_start
-        self._given_up: list[Range] = []
         self._dead: set[str] = set()
         self._any_written = False
 
     def results(self, ranges: Iterable[Range]) -> Generator[list[WrittenRows]]:
         """What workers wrote; raises at the end what could not be computed."""
+        given_up: list[Range] = []
         for done in self._completed(ranges, self._job.surveyed.params.extract.retries):
             written = [block for _, result in done if isinstance(result, list) for block in result]
             self._any_written |= bool(written)
             yield written
             for rows, result in done:
                 if not isinstance(result, list):
-                    self._note_failure(rows, result)
+                    self._raise_unless_recording(result)
+                    given_up.append(rows)
         failed: dict[int, str] = {}
-        for rows in self._given_up:
+        for rows in given_up:
             for episode, inside in by_episode(rows, self._vl_start):
                 if episode not in failed:
                     (((_, result),),) = self._completed([inside], retries=0)
@@ -120,8 +128,7 @@ class ClusterTasks:
             reasons = "\n".join(f"  {failed[episode]}" for episode in sorted(failed))
             raise RecordingError(
                 f"{len(failed)} episodes could not be computed:\n{reasons}\nAll others are kept. "
-                "Mend or remove these recordings and run the same command again; it computes what "
-                "is missing."
+                "Mend or remove these recordings and run the same command again."
             )
 
     def _completed(
@@ -148,49 +155,40 @@ class ClusterTasks:
             completed.update(submitted(len(batch)))
             yield done
 
-    def _note_failure(self, rows: Range, error: Exception) -> None:
-        """Set a range aside that its recordings may be to blame for; raise what is not."""
+    def _raise_unless_recording(self, error: Exception) -> None:
+        """Raise what the recordings of a range cannot be to blame for."""
         if isinstance(error, CancelledError):
             raise PipelineError(
                 f"the connection to the dask scheduler was lost ({error}). The rows that were "
                 "written are kept: start the scheduler and its workers again, and run the same "
-                "command; it computes what is missing."
+                "command."
             )
         if isinstance(error, NoWorkerError):
             raise PipelineError(
-                "no worker has been there for two minutes: they were killed, or ran out of memory "
-                "as they began. The rows that were written are kept. Run the same command again, "
-                "with fewer extract.workers where memory is short."
+                "no worker has been there for two minutes: they were killed, or ran out of memory. "
+                "The rows that were written are kept. Run the same command again, with fewer "
+                "extract.workers where memory is short."
             )
         if not isinstance(error, KilledWorker | RecordingError | NumericsError):
             raise error
-        self._given_up.append(rows)
-        if isinstance(error, KilledWorker):
-            self._note_death(str(error.last_worker.address))
-
-    def _note_death(self, address: str) -> None:
-        if address not in self._dead:
-            self._dead.add(address)
-            said = f"the worker {address} died; what it had is computed again at the end"
-            tqdm.write(said, file=sys.stderr)
+        if isinstance(error, KilledWorker) and error.last_worker.address not in self._dead:
+            self._dead.add(error.last_worker.address)
+            tqdm.write(f"the worker {error.last_worker.address} died", file=sys.stderr)
         if not self._any_written and len(self._dead) >= _HOPELESS_DEATHS:
             raise PipelineError(
-                f"workers died again and again before a single row was written; last {address}. Do "
-                "they have enough memory for the model? Look at their logs, or run with "
-                "extract.workers=0."
+                "workers died again and again before a single row was written. Do they have enough "
+                "memory for the model? Look at their logs, or run with extract.workers=0."
             )
 
     def _reason(self, episode: int, rows: Range, error: Exception) -> str:
         """Why the rows of an episode could not be computed, alone."""
+        self._raise_unless_recording(error)
         if isinstance(error, KilledWorker):
-            error = RecordingError(
-                f"every worker died that computed them alone ({1 + error.allowed_failures} deaths)"
-            )
-        elif not isinstance(error, RecordingError | NumericsError):
-            self._note_failure(rows, error)
-        path = self._job.surveyed.recordings[episode].path
-        told = str(path) in str(error)
-        return str(error) if told else f"{path}, VL rows {rows[0]} to {rows[-1]}: {error}"
+            deaths = 1 + error.allowed_failures
+            error = RecordingError(f"every worker died that computed them alone ({deaths} deaths)")
+        path = str(self._job.surveyed.recordings[episode].path)
+        where = "" if path in str(error) else f"{path}, VL rows {rows[0]} to {rows[-1]}: "
+        return f"{where}{error}"
 
 
 def rows_between_pages(row_bytes: int) -> int:
@@ -201,30 +199,14 @@ def rows_between_pages(row_bytes: int) -> int:
     return PAGE_BYTES // math.gcd(row_bytes, PAGE_BYTES)
 
 
-def ranges_of(
-    missing: Range, vl_start: NDArray[np.int64], chunk_rows: int, most: int, together: int = 1
-) -> Iterator[Range]:
-    """Rows (ascending, of `missing`) that one task computes, range after range.
+def ranges_of(missing: Range, most: int, together: int = 1) -> list[Range]:
+    """Rows (ascending, of `missing`) that each task computes: as many as `most`, or a few more.
 
-    A range lies within one chunk and one episode (`vl_start`, (episode + 1,)) and has at most
-    `most` rows. Blocks of `together` rows are never cut: where hosts must not share a page, a
-    range may so hold more rows, or the end of one episode and the beginning of the next.
+    Blocks of `together` rows are never cut, for hosts must not share a page.
     """
-    episode = np.searchsorted(vl_start, missing, side="right")
-    block, chunk = missing // together, missing // chunk_rows
-    begin = last = 0
-    for start in [*(np.flatnonzero(np.diff(block)) + 1).tolist(), len(missing)]:
-        apart = last > begin and (
-            episode[last] != episode[last - 1]
-            or chunk[last] != chunk[last - 1]
-            or start - begin > most
-        )
-        if apart:
-            yield missing[begin:last]
-            begin = last
-        last = start
-    if begin < len(missing):
-        yield missing[begin:]
+    block = missing // together
+    begin = np.searchsorted(block, block)
+    return np.split(missing, np.flatnonzero(np.diff(begin // most)) + 1)
 
 
 @contextmanager
@@ -249,11 +231,10 @@ def _plugged(client: Client, job: ExtractionJob) -> Generator[None]:
             client.unregister_worker_plugin(job.name)
 
 
-def check_scheduler(extract: ExtractParams) -> None:
-    """Raise `ConfigError` where `extract.workers` is an address at which no scheduler answers."""
-    if isinstance(extract.workers, str):
-        with quiet(), client_of(extract.workers, _SETTING):
-            pass
+def check_scheduler(address: str) -> None:
+    """Raise `ConfigError` where no scheduler answers at the address of `extract.workers`."""
+    with quiet(), client_of(address, _SETTING):
+        pass
 
 
 @contextmanager
@@ -274,8 +255,7 @@ def connected(extract: ExtractParams) -> Generator[Client]:
         else:
             with client_of(extract.workers, _SETTING) as client:
                 if not client.nthreads():
-                    said = "the scheduler has no worker yet; waiting for one"
-                    print(f"{extract.workers}: {said}", file=sys.stderr)
+                    print(f"{extract.workers}: waiting for a first worker", file=sys.stderr)
                 yield client
 
 
@@ -283,16 +263,23 @@ def connected(extract: ExtractParams) -> Generator[Client]:
 def _local_cluster(workers: int, extract: ExtractParams) -> Generator[LocalCluster]:
     """Worker processes of this host, all of them up; raises `PipelineError` where they cannot be.
 
-    Dask cannot be interrupted while they start without noise and orphans, so a thread starts them
-    and an interrupted coordinator kills what was begun: then that thread ends by itself.
+    One thread of each has the model, the others prepare. Dask cannot be interrupted while they
+    start without noise and orphans, so a thread starts them and an interrupted coordinator kills
+    what was begun: then that thread ends by itself.
     """
-    others = active_children()
+    cores = len(os.sched_getaffinity(0))
+    threads = os.environ.get("OMP_NUM_THREADS") or str(max(1, cores // workers))
+    env: dict[str, str] = dict.fromkeys(
+        ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), threads
+    )
+    start = partial(private_cluster, workers, 1 + extract.decode_threads, extract.retries, env)
+    others = set(active_children())
     with ThreadPoolExecutor(1) as pool:
         # Ctrl-C reaches the whole process group, but only the coordinator may act on it: threads
         # and processes, also workers begun again later, inherit the mask of the one that made them.
         resource_tracker.ensure_running()  # now, for it unblocks SIGINT in whoever starts it
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        starting = pool.submit(_started, workers, extract)
+        starting = pool.submit(start)
         try:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
             try:
@@ -307,21 +294,8 @@ def _local_cluster(workers: int, extract: ExtractParams) -> Generator[LocalClust
             yield cluster
         finally:
             while not starting.done():
-                for child in active_children():
-                    if child not in others:
-                        child.kill()
+                for child in set(active_children()) - others:
+                    child.kill()
                 time.sleep(_LOOK_EVERY_S)
             if starting.exception() is None:
                 starting.result().close()
-
-
-def _started(workers: int, extract: ExtractParams) -> LocalCluster:
-    """One thread of each process has the model, the others prepare.
-
-    A process that died is begun again however long its imports take (dask gives it up after 15 s).
-    """
-    cores = len(os.sched_getaffinity(0))
-    threads = os.environ.get("OMP_NUM_THREADS") or str(max(1, cores // workers))
-    names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-    env: dict[str, str] = dict.fromkeys(names, threads)
-    return private_cluster(workers, 1 + extract.decode_threads, extract.retries, env)

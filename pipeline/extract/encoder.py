@@ -15,23 +15,22 @@ from pipeline.extract.rows import ReadyRow
 from pipeline.vlm.preparation import TokenLayout
 from pipeline.vlm.qwen import FrozenVLM, Pending
 
+# Fewer are slower on any device; where they do not fit, memory running out says so.
 _FIRST = 8
-"""Fewer are slower on any device; where they do not fit, memory running out says so."""
 
+# Past these, more rows gain nothing and only hold memory.
 _MOST = {"cpu": 64, "cuda": 512}
-"""Past these, more rows gain nothing and only hold memory."""
 
+# Batches of a size that are timed; the one before them warms up.
+#
+# The fastest counts: whatever else the machine does makes a batch slower, never faster.
 _MEASURED = 3
-"""Batches of a size that are timed; the one before them warms up.
 
-The fastest counts: whatever else the machine does makes a batch slower, never faster.
-"""
-
+# How much faster more rows must be to be worth their memory.
 _GAIN = 1.03
-"""How much faster more rows must be to be worth their memory."""
 
+# Sizes in a row that are no faster before the search ends: one may be a hiccup.
 _MISSES = 2
-"""Sizes in a row that are no faster before the search ends: one may be a hiccup."""
 
 
 class BatchSize:
@@ -48,8 +47,7 @@ class BatchSize:
         self._most = _MOST[device]
         self._best = (0.0, self.current)
         self._misses = 0
-        self._warm = False
-        self._timed: list[tuple[int, float]] = []
+        self._speeds: list[float] = []
 
     def note(self, size: int, tokens: int, seconds: float) -> None:
         """What a full batch of this size took.
@@ -58,12 +56,17 @@ class BatchSize:
         """
         if self.settled or size != self.current:  # one more was under way when it changed
             return
-        if not self._warm:
-            self._warm = True
+        self._speeds.append(tokens / max(seconds, 1e-9))
+        if len(self._speeds) <= _MEASURED:
             return
-        self._timed.append((tokens, seconds))
-        if len(self._timed) == _MEASURED:
-            self._decide(max(tokens / max(seconds, 1e-9) for tokens, seconds in self._timed))
+        speed = max(self._speeds[1:])  # the first batch warms up
+        self._speeds.clear()
+        if speed >= self._best[0] * _GAIN:
+            self._best, self._misses = (speed, self.current), 0
+        else:
+            self._misses += 1
+        self.settled = self._misses == _MISSES or self.current * 2 > self._most
+        self.current = self._best[1] if self.settled else self.current * 2
 
     def halve(self, failed: int, error: RuntimeError) -> None:
         """Go on with half of what did not fit; `VLMError` where that was a single row."""
@@ -72,37 +75,25 @@ class BatchSize:
                 f"out of memory with a single row ({error}). Use a GPU with more memory, a smaller "
                 "vlm.image_resize_height and _width, or fewer data.views."
             ) from error
-        self._settle(min(failed // 2, self._best[1]))
+        self.current, self.settled = min(failed // 2, self._best[1]), True
         torch.cuda.empty_cache()
         print(f"out of memory: going on with batches of {self.current}", file=sys.stderr)
 
-    def _decide(self, speed: float) -> None:
-        if speed >= self._best[0] * _GAIN:
-            self._best, self._misses = (speed, self.current), 0
-        else:
-            self._misses += 1
-        if self._misses == _MISSES or self.current * 2 > self._most:
-            self._settle(self._best[1])
-        else:
-            self.current *= 2
-            self._warm, self._timed = False, []
 
-    def _settle(self, size: int) -> None:
-        self.current, self.settled = size, True
-
-
+# Rows, and their features (row, variant x slot, dim) as they are stored.
 Encoded = tuple[list[ReadyRow], NDArray[Any]]
-"""Rows, and their features (row, variant x slot, dim) as they are stored."""
 
 
 @dataclass(frozen=True)
 class _Submitted:
-    """Rows that the model works on, variant after variant, in one pass or several."""
+    """Rows that the model works on, variant after variant, in one pass or several.
+
+    `full` is the batch size, where there are as many rows as it allows.
+    """
 
     rows: list[ReadyRow]
     passes: list[Pending]
     full: int | None
-    """The batch size, where there are as many rows as it allows."""
 
 
 class Encoder:
@@ -115,8 +106,7 @@ class Encoder:
         self, vlm: FrozenVLM, batch_size: int | Literal["auto"], variants: int = 1
     ) -> None:
         """With "auto" the first batches are measured, and the size settles where it is fastest."""
-        self.model_s = 0.0
-        """Seconds that the model worked on what was handed out so far."""
+        self.model_s = 0.0  # that the model worked on what was handed out so far
         self._vlm = vlm
         self.size = BatchSize(batch_size, vlm.device.type)
         self._variants = variants
@@ -129,17 +119,15 @@ class Encoder:
         `NumericsError` that names the row, and variant, of a feature that is not finite, and
         `VLMError` where memory does not suffice for a single row.
         """
-        ahead: _Submitted | None = None
+        ahead: list[_Submitted] = []
         for batch in self._batches(rows):
             for submitted in self._submitted(batch):
-                if ahead is not None:
-                    yield from self._finished(ahead)
-                ahead = submitted
-                if all(one.done for one in submitted.passes):
-                    yield from self._finished(ahead)
-                    ahead = None
-        if ahead is not None:
-            yield from self._finished(ahead)
+                ahead.append(submitted)
+                keep = 0 if all(each.done for each in submitted.passes) else 1
+                while len(ahead) > keep:
+                    yield from self._finished(ahead.pop(0))
+        for submitted in ahead:
+            yield from self._finished(submitted)
 
     def _batches(self, rows: Iterable[ReadyRow]) -> Iterator[list[ReadyRow]]:
         """Full batches of equal shape as they come together, at last what is left of each shape.
@@ -181,12 +169,12 @@ class Encoder:
     def _finished(self, submitted: _Submitted) -> Iterator[Encoded]:
         rows = submitted.rows
         try:
-            features = [one.result()[0] for one in submitted.passes]
+            features = [part.result()[0] for part in submitted.passes]
         except NumericsError:
             for row in rows:  # alone, the one that is not finite names itself
                 yield [row], _stored([row], [self._alone(row, v) for v in range(self._variants)])
             return
-        seconds = sum(one.model_s for one in submitted.passes)
+        seconds = sum(part.model_s for part in submitted.passes)
         self.model_s += seconds
         if submitted.full is not None:
             tokens = len(rows) * self._variants * rows[0].variants[0].layout.length

@@ -4,7 +4,6 @@ A `RowEngine` has the model of a process: that of the coordinator, or each dask 
 written counts once the coordinator has marked it. `fill` is the coordinator's side.
 """
 
-import json
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
@@ -22,7 +21,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from pipeline.base.digests import ContentDigests
-from pipeline.data.row_range import RowFrames, RowRange
+from pipeline.data.row_range import RowFrames, RowRange, by_episode
 from pipeline.extract.plan import rate_name
 from pipeline.extract.rows import (
     RANGE_ROWS,
@@ -40,60 +39,30 @@ from pipeline.vlm.preparation import Preparer
 if TYPE_CHECKING:
     from pipeline.extract.encoder import Encoder
 
+# Blocks that are written or wait for it; the model waits when there are more: a kill loses few.
 _WAITING = 2
-"""Blocks that are written or wait for it; the model waits when there are more: a kill loses few."""
 
+# Known or repeated rows that are written in one go: each time waits for the disk.
 _TOGETHER = 64
-"""Known or repeated rows that are written in one go: each time waits for the disk."""
 
 
 @dataclass(frozen=True)
 class ExtractionReport:
-    """What was done; the shares are of the time since the model was loaded, where one was here."""
+    """What was done; the shares are of the time since the model was loaded, where one was here.
+
+    `taken` rows come from an earlier store or build, `repeated` ones equal another that was
+    `computed`. The model worked `model_share` of the time and waited `waited_share` of it for
+    frames to be decoded and prepared.
+    """
 
     store: Path
     rows: int
     taken: int
-    """Rows taken over from an earlier store or build."""
     computed: int
     repeated: int
-    """Rows equal to another that was computed."""
     seconds: float
     model_share: float | None
-    """How much the model worked."""
     waited_share: float | None
-    """How much it waited for frames to be decoded and prepared."""
-
-
-@dataclass(frozen=True)
-class ExtractionJob:
-    """What every process of an extraction must know.
-
-    `known` are stores and builds of the same feature spec, `folder` is where the coordinator runs:
-    relative paths begin there.
-    """
-
-    surveyed: Survey
-    known: tuple[Path, ...]
-    folder: Path
-
-    @property
-    def name(self) -> str:
-        """Of its plugin: an extraction that was killed is replaced by the next on its store."""
-        return f"extraction of {self.surveyed.target.absolute()}"
-
-    @property
-    def local(self) -> bool:
-        """Whether all its processes are on the coordinator's host."""
-        return isinstance(self.surveyed.params.extract.workers, int)
-
-    def frames(self, build: StoreBuild) -> RowFrames:
-        """The frames of the laid-out build's rows, by the times in it: no stream is read again."""
-        vl_start, frame_time = (
-            build.files(name).read(0, build.specs[name].shape[0])
-            for name in ("episode/vl_start", "vl/frame_time")
-        )
-        return RowFrames(self.surveyed.recordings, vl_start, frame_time, self.surveyed.spec.views)
 
 
 @dataclass(frozen=True)
@@ -153,27 +122,21 @@ class RowMarks:
 
 
 class RowEngine:
-    """The preparation and the model of one process, which is loaded when a row first needs it."""
+    """The preparation and the model of one process, which is loaded when a row first needs it.
+
+    `loaded_at` is `time.monotonic()` then, `waited_s` how long the model has waited for rows.
+    """
 
     def __init__(
-        self,
-        job: ExtractionJob,
-        frames: RowFrames,
-        known: Sequence[RowSource],
-        device: str,
-        digests: ContentDigests | None = None,
+        self, surveyed: Survey, frames: RowFrames, known: Sequence[RowSource], device: str
     ) -> None:
-        """`digests` remember the best batch size from one extraction to the next."""
-        self.params = job.surveyed.params
+        self._vlm, self._extract = surveyed.params.vlm, surveyed.params.extract
         self.frames = frames
         self.encoder: Encoder | None = None
         self.loaded_at = self.waited_s = 0.0
-        """`time.monotonic()` when the model was there, and how long it has waited for rows."""
-        self._spec = job.surveyed.spec
+        self._spec, self.variants = surveyed.spec, surveyed.spec.variants
         self._device = device
-        self._digests = digests
-        preparer = Preparer(self.params.vlm, self._spec)
-        self._preparation = RowPreparation(preparer, self._spec, known)
+        self._preparation = RowPreparation(Preparer(self._vlm, self._spec), self._spec, known)
         self._environment: Mapping[str, Any] = {}
 
     def prepare(self, rows: RowRange, firsts: dict[bytes, int] | None) -> list[Row]:
@@ -198,7 +161,6 @@ class RowEngine:
                 done |= {row.row for row in batch}
                 if len(repeated) >= _TOGETHER:
                     put_repeated()
-            self._remember()
         put_repeated()
         assert not repeated, "a repeated row whose first was never computed"
 
@@ -227,23 +189,20 @@ class RowEngine:
             from pipeline.extract.encoder import Encoder
             from pipeline.vlm.qwen import FrozenVLM
 
-            extract, size = self.params.extract, self.params.extract.batch_size
-            vlm = FrozenVLM.load(self.params.vlm, self._spec, self._device, extract.compile)
+            vlm = FrozenVLM.load(self._vlm, self._spec, self._device, self._extract.compile)
             self._environment = vlm.environment
-            if size == "auto" and self._digests is not None:
-                size = self._digests.batch_size(self._size_name()) or "auto"
-            self.encoder = Encoder(vlm, size, self._spec.variants)
+            self.encoder = Encoder(vlm, self._extract.batch_size, self.variants)
             self.loaded_at = time.monotonic()
         return self.encoder
 
-    def _remember(self) -> None:
-        searched = self.params.extract.batch_size == "auto"
-        if searched and self._digests and self.encoder and self.encoder.size.settled:
-            self._digests.note_batch_size(self._size_name(), self.encoder.size.current)
 
-    def _size_name(self) -> str:
-        """Under which the best batch size of this model on this device is remembered."""
-        return f"{self._spec.digest} {json.dumps(self._environment, sort_keys=True)}"
+def row_frames(build: StoreBuild, surveyed: Survey) -> RowFrames:
+    """The frames of a laid-out build's rows, by the times in it: no stream is read again."""
+    vl_start, frame_time = (
+        build.files(name).read(0, build.specs[name].shape[0])
+        for name in ("episode/vl_start", "vl/frame_time")
+    )
+    return RowFrames(surveyed.recordings, vl_start, frame_time, surveyed.spec.views)
 
 
 def fill(
@@ -259,31 +218,29 @@ def fill(
     do; what was marked until then is kept.
     """
     begun, total = time.monotonic(), build.specs["vl/time"].shape[0]
-    job = ExtractionJob(surveyed, tuple(source.path.absolute() for source in known), Path.cwd())
-    frames, extract = job.frames(build), surveyed.params.extract
+    frames, extract = row_frames(build, surveyed), surveyed.params.extract
     done = total - len(missing)
-    with tqdm(
-        None, "extract", total, initial=done, unit="row", disable=None, smoothing=0.05
-    ) as bar:
+    with tqdm(None, "extract", total, initial=done, unit="row", disable=None) as bar:
         marks = RowMarks(build, bar)
         missing = _take_over(surveyed, known, frames, missing, marks)
-        rate, shares = None, (None, None)
+        rate = model_share = waited_share = None
         if len(missing) and extract.workers != 0:
             from pipeline.extract.cluster import compute_on_cluster  # dask: a second to import
 
-            rate = compute_on_cluster(job, frames.vl_start, missing, marks)
+            places = [source.path for source in known]
+            rate = compute_on_cluster(surveyed, places, frames.vl_start, missing, marks)
         elif len(missing):
-            engine = RowEngine(job, frames, known, extract.device, digests)
-            compute_here(engine, missing, marks)
+            engine = RowEngine(surveyed, frames, known, extract.device)
+            compute_here(engine, missing, marks, extract.decode_threads)
             if engine.encoder is not None:
                 since = time.monotonic() - engine.loaded_at
                 rate = marks.counts["computed"] / since
-                shares = engine.encoder.model_s / since, engine.waited_s / since
+                model_share, waited_share = engine.encoder.model_s / since, engine.waited_s / since
     if rate is not None:
         digests.note_rate(rate_name(surveyed), rate)
-    taken, computed, repeated = (marks.counts[of] for of in ("known", "computed", "repeated"))
-    seconds = time.monotonic() - begun
-    return ExtractionReport(build.target, total, taken, computed, repeated, seconds, *shares)
+    of, seconds = marks.counts, time.monotonic() - begun
+    counts = of["known"], of["computed"], of["repeated"]
+    return ExtractionReport(build.target, total, *counts, seconds, model_share, waited_share)
 
 
 def _take_over(
@@ -298,21 +255,22 @@ def _take_over(
     No frame is decoded. Returns the rows that are left.
     """
     taken: list[int] = []
-    found = _found(surveyed, known, frames, set(missing.tolist()))
-    while rows := list(islice(found, _TOGETHER)):
+    rows_known = _known_rows(surveyed, known, frames, missing)
+    while rows := list(islice(rows_known, _TOGETHER)):
         marks.mark(block.write(marks.build) for block in _known_blocks(rows))
         taken += [row.row for row in rows]
     return np.setdiff1d(missing, taken)
 
 
-def _found(
-    surveyed: Survey, known: Sequence[RowSource], frames: RowFrames, missing: set[int]
+def _known_rows(
+    surveyed: Survey, known: Sequence[RowSource], frames: RowFrames, missing: NDArray[np.int64]
 ) -> Iterator[KnownRow]:
-    for index, episode in enumerate(surveyed.episodes):
+    for index, rows in by_episode(missing, frames.vl_start):
+        episode = surveyed.episodes[index]
         of = episode.content, episode.recording.instruction
         keys = [(source, source.keys_of(*of)) for source in known]
-        for row in range(*frames.vl_start[index : index + 2]):
-            for source, by_frames in keys if row in missing else ():
+        for row in rows.tolist():
+            for source, by_frames in keys:
                 key = by_frames.get(frames.frame_time[row].tobytes())
                 if key is not None and (features := source.take(key)) is not None:
                     yield KnownRow(row, key, features, source.environment_of(key))
@@ -326,18 +284,20 @@ def _known_blocks(rows: Sequence[KnownRow]) -> Iterator[FeatureBlock]:
         yield FeatureBlock("known", block, features, environment)
 
 
-def compute_here(engine: RowEngine, missing: NDArray[np.int64], marks: RowMarks) -> None:
+def compute_here(
+    engine: RowEngine, missing: NDArray[np.int64], marks: RowMarks, threads: int
+) -> None:
     """Compute and mark rows in this process: threads prepare, this one encodes, one commits."""
-    most = max(1, RANGE_ROWS // engine.params.vlm.variants)
 
     def ranges_ahead() -> int:
         """While the model has one batch, the next should be complete."""
         return 2 * engine.encoder.size.current // RANGE_ROWS + 1 if engine.encoder else 0
 
+    most = max(1, RANGE_ROWS // engine.variants)
     rows = in_background(
         engine.frames.ranges(missing, most),
         partial(engine.prepare, firsts={}),
-        engine.params.extract.decode_threads,
+        threads,
         ranges_ahead,
     )
     with _committing(marks) as put, closing(rows):

@@ -15,9 +15,9 @@ from pipeline.base.format import size
 from pipeline.data import Stream
 from pipeline.data.timeline import Timeline
 from pipeline.extract.plan import store_bytes
-from pipeline.extract.survey import CheckedEpisode, Survey, embodiment_of, shown_path
+from pipeline.extract.survey import CheckedEpisode, Survey, embodiment_of
 from pipeline.store import SCHEMA, RowSource, Sizes, StoreBuild, arrays
-from pipeline.store.episodes import EpisodeRows, episode_arrays, episode_edges
+from pipeline.store.episodes import episode_arrays, episode_edges
 from pipeline.store.schema import ArraySpec
 from pipeline.vlm.feature_spec import FeatureSpec
 
@@ -53,8 +53,8 @@ def lay_out(
         build.link_unchanged(name, source.path, source.specs[name], rows)
     build.allocate()
     attributes = _attributes(checked, survey)
-    episodes, views = _episode_rows(checked, survey), survey.spec.views
-    for name, values in episode_arrays(episodes, attributes["sources"], views).items():
+    rows, views = [episode.rows for episode in checked], survey.spec.views
+    for name, values in episode_arrays(rows, attributes["sources"], views).items():
         build.write(name, 0, values)
     valid = [_slot_valid(episode.timeline, survey.spec) for episode in checked]
     build.write("vl/slot_valid", 0, np.concatenate(valid))
@@ -67,7 +67,7 @@ def lay_out(
 def build_arrays(checked: Sequence[CheckedEpisode], survey: Survey) -> dict[str, ArraySpec]:
     """The arrays that these episodes need."""
     embodiment, extract = embodiment_of(checked), survey.params.extract
-    edges = episode_edges(_episode_rows(checked, survey))
+    edges = episode_edges([episode.rows for episode in checked])
     ends = {kind: int(edge[-1]) for kind, edge in edges.items()}
     sizes = Sizes(
         episodes=len(checked),
@@ -86,23 +86,6 @@ def build_arrays(checked: Sequence[CheckedEpisode], survey: Survey) -> dict[str,
     return arrays(sizes, extract.dtype, extract.sensor_dtype)
 
 
-def _episode_rows(checked: Sequence[CheckedEpisode], survey: Survey) -> list[EpisodeRows]:
-    rows: list[EpisodeRows] = []
-    for episode in checked:
-        surveyed, recording = episode.surveyed, episode.surveyed.recording
-        text = {
-            "id": recording.id,
-            "path": shown_path(recording.path, survey.params.data.root),
-            "format": recording.format,
-            "instruction": recording.instruction,
-            "content": surveyed.content,
-            "digest": surveyed.digest,
-        }
-        readings, states = episode.readings, episode.states
-        rows.append(EpisodeRows(episode.timeline, readings, states, recording.source, text))
-    return rows
-
-
 def _linkable(
     build: StoreBuild, checked: Sequence[CheckedEpisode], known: Sequence[RowSource]
 ) -> Iterator[tuple[RowSource, str, int]]:
@@ -116,8 +99,8 @@ def _linkable(
         contents = [episode.surveyed.content for episode in checked]
         pairs = zip(source.episode_contents, contents, strict=False)
         same = len(list(takewhile(lambda pair: pair[0] == pair[1], pairs)))
-        readings = sum(episode.readings for episode in checked[:same])
-        states = sum(episode.states for episode in checked[:same])
+        readings = sum(episode.rows.readings for episode in checked[:same])
+        states = sum(episode.rows.states for episode in checked[:same])
         for stream, rows in (("sensor", readings), ("state", states)):
             for part in ("values", "time"):
                 yield source, f"{stream}/{part}", rows

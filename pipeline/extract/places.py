@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,8 @@ from pipeline.store.paths import MERGED, STORE, is_store
 from pipeline.store.schema import read_specs
 
 Say = Callable[[str], None]
+# Entries of a feature spec that a message lists.
 _SHOWN = 6
-"""Channels, or entries of a feature spec, that a message lists."""
 
 
 class StorePlaces:
@@ -29,11 +30,13 @@ class StorePlaces:
     """
 
     def __init__(self, target: Path) -> None:
-        self.target, self.part, self.previous = (target, part_path(target), previous_path(target))
+        self.target, self.part, self.previous = target, part_path(target), previous_path(target)
         self.begun, self.finished = read_plan(self.part), read_plan(target)
-        builds = sorted(target.parent.glob(f"{target.name}.known-*"))
-        numbered = [path for path in builds if path.name.rpartition("-")[2].isdigit()]
-        self.aside = [path for path in numbered if is_store(path)]
+        self.aside = [
+            path
+            for path in sorted(target.parent.glob(f"{target.name}.known-*"))
+            if path.name.rpartition("-")[2].isdigit() and is_store(path)
+        ]
         is_kept = KEPT.owns(self.previous) and read_plan(self.previous) is not None
         self.kept = [self.previous] if is_kept else []
 
@@ -77,28 +80,25 @@ class StorePlaces:
             for line in spec_differences(before, surveyed.spec.attrs()):
                 say(f"the unfinished build {self.part} is given up: {line}")
             return
-        number = len(self.aside)
-        while (aside := self.target.with_name(f"{self.target.name}.known-{number}")).exists():
-            number += 1
-        self.part.rename(aside)
+        names = (self.target.with_name(f"{self.target.name}.known-{n}") for n in count())
+        self.part.rename(next(path for path in names if not path.exists()))
 
     def keeping_note(self, surveyed: Survey) -> list[str]:
         """What a run says of episodes that it does not name: the store with them is kept once more.
 
         Raises `ConfigError` where something else lies where it would be kept.
         """
-        contents, lines = surveyed.contents, list[str]()
-        if lost := self._lost(surveyed):
+        lost, contents, lines = self._lost(surveyed), surveyed.contents, list[str]()
+        if lost:
             refuse_foreign(self.previous, KEPT)
-            lines = [
+            lines.append(
                 f"{self.target} holds {lost}: it is kept as {self.previous} until the next "
                 "successful run, which takes their rows from it where they are there again"
-            ]
+            )
             contents |= set(_contents(self.target) or ())
         for place in self.kept:
-            known = _contents(place)
-            gone = "all its" if known is None else sum(content not in contents for content in known)
-            then = "replaced by it" if lost else "removed"
+            known, then = _contents(place), "replaced by it" if lost else "removed"
+            gone = "all its" if known is None else sum(one not in contents for one in known)
             lines.append(
                 f"{place} is {then} when this run succeeds; {gone} episode(s) are only in there"
             )
@@ -135,10 +135,10 @@ class StorePlaces:
         follows the advice of a check may run under other params than that store's own. And those of
         a store or build without an episode in common, of another embodiment or other sources only.
         """
-        plans = {self.target: self.finished, self.part: self.begun}
-        for place in (place for place, plan in plans.items() if plan is not None):
-            with closing(RowSource(place)) as source:
-                _refuse_another(source, surveyed, embodiment)
+        for place, plan in ((self.target, self.finished), (self.part, self.begun)):
+            if plan is not None:
+                with closing(RowSource(place)) as source:
+                    _refuse_another(source, surveyed, embodiment)
         under_repair = self.finished is not None and self.finished == self.begun
         if not under_repair and not (self.finished or "").startswith(MERGED):
             return
@@ -167,30 +167,27 @@ def _refuse_another(source: RowSource, surveyed: Survey, embodiment: Embodiment)
     known = set(source.episode_contents)
     if not known or known & surveyed.contents or not source.rows:
         return
-    there, here = (source.attrs["sources"], sorted({one.source for one in surveyed.recordings}))
+    there, here = source.attrs["sources"], sorted({r.source for r in surveyed.recordings})
     before, now = source.attrs["streams"], embodiment.document()
     differing = [
-        f"{stream}: {_channels(before[stream])} there, {_channels(now[stream])} here"
+        f"; {stream}: {_channels(before[stream])} there, {_channels(now[stream])} here"
         for stream in ("action", "sensor", "state")
         if before[stream]["names"] and now[stream]["names"]
         if any(before[stream][key] != now[stream][key] for key in ("names", "units"))
     ]
     if differing or not set(there) & set(here):
-        why = [f"sources: {', '.join(there)} there, {', '.join(here)} here", *differing]
         raise StoreMismatch(
             f"{source.path}: holds the feature rows of {len(known)} episode(s), none "
-            "of which is in data.sources, and extraction would throw them away:\n"
-            + "\n".join(f"  {line}" for line in why)
-            + "\nName another store for these recordings, with --set extract.store=…, give the "
+            "of which is in data.sources, and extraction would throw them away (sources: "
+            f"{', '.join(there)} there, {', '.join(here)} here{''.join(differing)}).\n"
+            "Name another store for these recordings, with --set extract.store=…, give the "
             "--params it was made with, or move it away."
         )
 
 
 def _channels(stream: Mapping[str, Any]) -> str:
-    pairs = zip(stream["names"], stream["units"], strict=True)
-    named = [f"{name} ({unit})" if unit else name for name, unit in pairs]
-    listed = ", ".join(named if len(named) <= _SHOWN else [*named[: _SHOWN - 1], "…"])
-    return f"{len(named)} channels [{listed}]"
+    names, units = stream["names"], ", ".join(sorted(set(stream["units"])))
+    return f"{len(names)} channels [{names[0]} … {names[-1]}] ({units})"
 
 
 def _contents(store: Path) -> list[str] | None:
@@ -205,9 +202,11 @@ def _contents(store: Path) -> list[str] | None:
 def spec_differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     """What differs between two feature specs, without all that follows from it."""
     differing = differences(before, now)
-    follows = ("slots", "example_prompt")
-    first = {place: two for place, two in differing.items() if not place.startswith(follows)}
+    first = {
+        place: values
+        for place, values in differing.items()
+        if not place.startswith(("slots", "example_prompt"))
+    }
     lines = describe(first or differing)[:_SHOWN]
-    left = len(differing) - len(lines)
-    more = [f"{left} more entries, most of which follow from that"] if left else []
-    return [*lines, *more]
+    more = len(differing) - len(lines)
+    return [*lines, *([f"{more} more entries, most of which follow from that"] if more else [])]

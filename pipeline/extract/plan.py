@@ -1,14 +1,14 @@
 """What an extraction would do, and why; said before anything is done."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 from pipeline.base.digests import ContentDigests, joint_digest
 from pipeline.base.durable import free_bytes
 from pipeline.base.format import duration, size
 from pipeline.extract.places import StorePlaces, spec_differences
 from pipeline.extract.survey import CheckedEpisode, Survey
-from pipeline.store import FEATURES, RowSource, StoreBuild
+from pipeline.store import FEATURES, RowSource, StoreBuild, read_plan
 from pipeline.store.schema import ArraySpec
 
 _DECIDES_SPEED = ("weights", "adapter", "processor", "compute_dtype", "variants")
@@ -18,12 +18,15 @@ def plan_lines(
     build: StoreBuild,
     surveyed: Survey,
     digests: ContentDigests,
-    unchanged: int,
     known: int,
-    reasons: Sequence[str],
-    warnings: Sequence[str] = (),
+    reasons: Iterable[str],
+    before: RowSource | None = None,
+    unchanged: int | None = None,
 ) -> list[str]:
-    """What there is to do, for people: so many episodes are unchanged, so many rows known."""
+    """What there is to do, for people, where so many rows are known and episodes unchanged (all).
+
+    `before` is the store, or the begun build, that the new one takes the place of.
+    """
     rows, variants = build.specs[FEATURES].shape[0], surveyed.spec.variants
     left, rows_per_s = rows - known, digests.rate(rate_name(surveyed))
     if not left:
@@ -33,10 +36,11 @@ def plan_lines(
     else:
         time = f"about {duration(left / rows_per_s)} at {rows_per_s:.1f} rows/s, as last measured"
     needed, free = size(store_bytes(build.specs)), size(free_bytes(build.part))
+    episodes = len(surveyed.episodes)
     return [
-        *(f"WARNING: {warning}" for warning in (*warnings, *_dtype_warnings(surveyed, left))),
+        *(f"WARNING: {warning}" for warning in _warnings(surveyed, before, left)),
         *(f"why: {reason}" for reason in reasons),
-        f"episodes: {len(surveyed.episodes)}, {unchanged} of them unchanged",
+        f"episodes: {episodes}, {episodes if unchanged is None else unchanged} of them unchanged",
         f"rows: {rows}, {known} known, {left} to compute"
         + (f" in {variants} variants each" if left and variants > 1 else "")
         + (" (fewer where a key turns out to be known)" if left and known else ""),
@@ -56,15 +60,12 @@ def new_plan_lines(
     """`plan_lines` of a new build; `sources` are stores and builds of the same feature spec."""
     there = {digest for source in sources for digest in source.episode_digests}
     unchanged = sum(episode.digest in there for episode in surveyed.episodes)
-    place, plan = places.target, places.finished
-    if places.repaired:
-        place, plan = places.part, places.begun
-    before = None if plan is None else RowSource(place)
-    reasons = _reasons(surveyed, before, build.specs)
+    place = places.part if places.repaired else places.target
+    before = None if read_plan(place) is None else RowSource(place)
+    reasons = list(_reasons(surveyed, before, build.specs))
     if places.begun == surveyed.plan and (damage := places.layout_damage()):
         reasons = [f"{damage}; streams are laid out again, the feature rows are kept"]
-    warnings = [*_view_warnings(surveyed, before), *_rotation_warnings(surveyed)]
-    return plan_lines(build, surveyed, digests, unchanged, known, reasons, warnings)
+    return plan_lines(build, surveyed, digests, known, reasons, before, unchanged)
 
 
 def rate_name(surveyed: Survey) -> str:
@@ -83,85 +84,70 @@ def store_bytes(specs: dict[str, ArraySpec]) -> int:
     return sum(spec.data_bytes for spec in specs.values())
 
 
-def _reasons(surveyed: Survey, before: RowSource | None, specs: dict[str, ArraySpec]) -> list[str]:
+def _reasons(
+    surveyed: Survey, before: RowSource | None, specs: dict[str, ArraySpec]
+) -> Iterator[str]:
     """Why the store that is there, if any, will not do."""
     if before is None:
-        return ["there is no store yet"]
+        yield "there is no store yet"
+        return
     lines = spec_differences(before.attrs["feature_spec"], surveyed.spec.attrs())
-    why = [f"feature spec, {line}" for line in lines]
+    yield from (f"feature spec, {line}" for line in lines)
     digests, contents = set(before.episode_digests), set(before.episode_contents)
     changed = [episode for episode in surveyed.episodes if episode.digest not in digests]
-    new = sum(episode.content not in contents for episode in changed)
-    if new:
-        why.append(f"{new} episode(s) are new or their files changed, or how these are read")
-    if len(changed) > new:
-        why.append(
-            f"{len(changed) - new} episode(s) have another instruction, name, place, action_hz or "
-            "vlm_reuse_count"
-        )
+    same_files = sum(episode.content in contents for episode in changed)
     here = {episode.digest for episode in surveyed.episodes}
-    again = {episode.content for episode in changed}  # said above
+    again = {episode.content for episode in changed}  # said as the new ones are
     pairs = zip(before.episode_digests, before.episode_contents, strict=True)
     gone = sum(digest not in here and content not in again for digest, content in pairs)
-    if gone:
-        why.append(f"{gone} episode(s) of the store are gone or changed")
-    for name, spec in specs.items():
-        if name != FEATURES and before.specs[name].dtype != spec.dtype:
-            why.append(f"{name} was {before.specs[name].dtype}, is to be {spec.dtype}")
-    return why or ["the order of episodes, or how actions are derived, changed"]
+    for count, what in (
+        (len(changed) - same_files, "are new or their files changed, or how these are read"),
+        (same_files, "have another instruction, name, place, action_hz or vlm_reuse_count"),
+        (gone, "of the store are gone or changed"),
+    ):
+        if count:
+            yield f"{count} episode(s) {what}"
+    dtypes = [
+        f"{name} was {before.specs[name].dtype}, is to be {spec.dtype}"
+        for name, spec in specs.items()
+        if name != FEATURES and before.specs[name].dtype != spec.dtype
+    ]
+    yield from dtypes
+    if not (lines or changed or gone or dtypes):
+        yield "the order of episodes, or how actions are derived, changed"
 
 
-def _view_warnings(surveyed: Survey, before: RowSource | None) -> list[str]:
-    """Where a new view makes every row another one, with the way out."""
+def _warnings(surveyed: Survey, before: RowSource | None, missing: int) -> Iterator[str]:
+    """What may not be meant, each with the way out."""
+    params, recordings, views = surveyed.params, surveyed.recordings, surveyed.spec.views
     known: Sequence[str] = before.attrs["feature_spec"].get("views", ()) if before else ()
-    now, recordings = surveyed.spec.views, surveyed.recordings
-    added = [view for view in now if view not in known]
-    if not known or not added:
-        return []
-    having = sum(not set(added).isdisjoint(one.view_names()) for one in recordings)
-    kept = ", ".join(view for view in known if view in now)
-    return [
-        f"{having} of {len(recordings)} episode(s) have {', '.join(added)}, which the store "
-        "does not have. The model sees all views of a store at a time, so that every row of "
-        f"every episode is computed again. To keep the rows: --set 'data.views=[{kept}]'"
-    ]
+    if known and (added := set(views) - set(known)):
+        having = sum(not added.isdisjoint(recording.view_names()) for recording in recordings)
+        kept = ", ".join(view for view in known if view in views)
+        yield (
+            f"{having} of {len(recordings)} episode(s) have {', '.join(sorted(added))}, which the "
+            "store does not have. The model sees all views of a store at a time, so that every row "
+            f"of every episode is computed again. To keep the rows: --set 'data.views=[{kept}]'"
+        )
+    without = [recording.source for recording in recordings if not recording.has_poses]
+    if params.data.action_rotation == "auto" and 0 < len(without) < len(recordings):
+        yield (
+            f"{len(without)} of {len(recordings)} episode(s), of source(s) "
+            f"{', '.join(dict.fromkeys(without))}, have no poses, so that the actions of all "
+            "episodes are differences of Euler angles (euler_delta) in place of rotation vectors "
+            "(rotvec). To keep rotation vectors: leave these out of data.sources, or give them a "
+            "store of their own. To say that it is meant: --set data.action_rotation=euler_delta"
+        )
+    # What the workers of a dask scheduler have is not known.
+    if missing and params.vlm.dtype != "float32" and isinstance(params.extract.workers, int):
+        from pipeline.base.device import resolve_device  # torch takes a second to import
 
-
-def _rotation_warnings(surveyed: Survey) -> list[str]:
-    """Where some recordings decide how the actions of all are derived, with the way out."""
-    recordings = surveyed.recordings
-    without = [recording for recording in recordings if not recording.has_poses]
-    asked = surveyed.params.data.action_rotation
-    if asked != "auto" or not 0 < len(without) < len(recordings):
-        return []
-    sources = ", ".join(dict.fromkeys(recording.source for recording in without))
-    return [
-        f"{len(without)} of {len(recordings)} episode(s), of source(s) {sources}, have no "
-        "poses, so that the actions of all episodes are differences of Euler angles "
-        "(euler_delta) in place of rotation vectors (rotvec). To keep rotation vectors: leave "
-        "these out of data.sources, or give them a store of their own. To say that it is "
-        "meant: --set data.action_rotation=euler_delta"
-    ]
-
-
-def _dtype_warnings(surveyed: Survey, missing: int) -> list[str]:
-    """Whether so many rows would be computed in half precision on a CPU.
-
-    What the workers of a dask scheduler have is not known.
-    """
-    from pipeline.base.device import resolve_device  # torch takes a second to import
-
-    params = surveyed.params
-    narrow, workers = params.vlm.dtype, params.extract.workers
-    if not missing or narrow == "float32" or isinstance(workers, str):
-        return []
-    if resolve_device(params.extract.device).type != "cpu":
-        return []
-    return [
-        f"the model will run on the CPU in vlm.dtype {narrow}, which many CPUs only emulate, "
-        "slowly. Set vlm.dtype=float32, or extract on a GPU; decide before the first long run: a "
-        "feature's dtype is part of its identity, and no row is taken over by another dtype"
-    ]
+        if resolve_device(params.extract.device).type == "cpu":
+            yield (
+                f"the model will run on the CPU in vlm.dtype {params.vlm.dtype}, which many CPUs "
+                "only emulate, slowly. Set vlm.dtype=float32, or extract on a GPU, before the "
+                "first long run: no row is taken over by another dtype"
+            )
 
 
 def count_known(

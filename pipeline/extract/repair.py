@@ -11,14 +11,7 @@ from pipeline.base.errors import StoreMismatch
 from pipeline.base.ownership import remove_folder
 from pipeline.extract.layout import build_arrays, check_space, lay_out
 from pipeline.extract.survey import sound_episodes, survey
-from pipeline.store import (
-    FEATURES,
-    StoreBuild,
-    build_lock,
-    part_path,
-    read_plan,
-    recover,
-)
+from pipeline.store import FEATURES, StoreBuild, build_lock, part_path, read_plan, recover
 from pipeline.store.integrity import Verification
 from pipeline.store.integrity.repair import (
     carry_rows,
@@ -47,7 +40,14 @@ def repair(verification: Verification, params: Params, say: Say) -> None:
     with build_lock(store):
         recover(store)
         plan = read_plan(store) or ""
-        _refuse_other_build(store, plan)
+        part = part_path(store)
+        if (unfinished := read_plan(part)) is not None:
+            repairs = unfinished == plan
+            what = "a repair of it has begun" if repairs else "another build is unfinished"
+            raise StoreMismatch(
+                f"{part}: {what}. Run {_completed_by(store, unfinished)}, which completes it, or "
+                f"remove it: {gc_command(part)}"
+            )
         try:
             with disk_full_named(store):
                 _begin(verification, plan, params, say)
@@ -60,10 +60,12 @@ def _begin(verification: Verification, plan: str, params: Params, say: Say) -> N
     store, sound = verification.store, layout_is_sound(verification)
     if not sound:
         say("laying out streams, ticks and episodes again from the recordings")
-    build = copy_layout(store) if sound else _lay_out_anew(store, plan, params)
-    rows = build.specs[FEATURES].shape[0]
-    with closing(build):
-        readable = _rows_can_be_read(store, build)
+    with closing(copy_layout(store) if sound else _lay_out_anew(store, plan, params)) as build:
+        rows = build.specs[FEATURES].shape[0]
+        specs, _ = read_arrays(store)
+        readable = all(
+            name in specs and specs[name].shape == build.specs[name].shape for name in INCREMENTAL
+        )
         carried = carry_rows(store, build, verification) if readable else 0
         put_in_place(build, store)
     layout = "taken over as they are" if sound else "written again from the recordings"
@@ -80,17 +82,6 @@ def _completed_by(store: Path, plan: str) -> str:
     return extract_command(store)
 
 
-def _refuse_other_build(store: Path, plan: str) -> None:
-    unfinished = read_plan(part_path(store))
-    if unfinished is None:
-        return
-    what = "a repair of it has begun" if unfinished == plan else "another build is unfinished"
-    raise StoreMismatch(
-        f"{part_path(store)}: {what}. Run {_completed_by(store, unfinished)}, which completes it, "
-        f"or remove it: {gc_command(part_path(store))}"
-    )
-
-
 def _lay_out_anew(store: Path, plan: str, params: Params) -> StoreBuild:
     """Everything but the feature rows, from the recordings."""
     with closing(ContentDigests(ledger_path(store))) as digests:
@@ -98,19 +89,11 @@ def _lay_out_anew(store: Path, plan: str, params: Params) -> StoreBuild:
     if surveyed.plan != plan:
         raise StoreMismatch(
             f"{store}: metadata, streams, ticks or episodes are damaged, and the params describe "
-            "another store than this one (recordings, data, vlm or dtypes changed), so that they "
-            "cannot be written again. Restore the recordings and params, or run "
-            f"{_completed_by(store, plan)}, which takes over every row whose frames it knows."
+            "another store than this one (recordings, data, vlm or dtypes changed). Restore the "
+            f"recordings and params, or run {_completed_by(store, plan)}, which takes over every "
+            "row whose frames it knows."
         )
     build = StoreBuild(repair_build(store), build_arrays(checked, surveyed), plan)
     check_space(build, checked, ())
     lay_out(build, checked, surveyed, ())
     return build
-
-
-def _rows_can_be_read(store: Path, build: StoreBuild) -> bool:
-    """Whether the arrays of feature rows are there and are as the build's."""
-    specs, _ = read_arrays(store)
-    return all(
-        name in specs and specs[name].shape == build.specs[name].shape for name in INCREMENTAL
-    )

@@ -18,11 +18,10 @@ from pipeline.vlm.preparation import PreparedRow, Preparer
 Work = TypeVar("Work")
 Made = TypeVar("Made")
 
+# Rows that one thread decodes in one go: long enough for video, short enough for memory.
+#
+# Variants count as rows of their own here: they wait in memory alike.
 RANGE_ROWS = 16
-"""Rows that one thread decodes in one go: long enough for video, short enough for memory.
-
-Variants count as rows of their own here: they wait in memory alike.
-"""
 
 
 @dataclass(frozen=True)
@@ -37,24 +36,24 @@ class KnownRow:
 
 @dataclass(frozen=True)
 class ReadyRow:
-    """A row ready for the model."""
+    """A row ready for the model: its frames as they are, then augmented; all of one shape.
+
+    `where` is recording and row, for messages.
+    """
 
     row: int
     key: bytes
     variants: tuple[PreparedRow, ...]
-    """The frames as they are, then augmented; all of one shape."""
     where: str
-    """Recording and row, for messages."""
 
 
 @dataclass(frozen=True)
 class RepeatedRow:
-    """A row that shows and says what another row does."""
+    """A row that shows and says what another, `first`, does: that one the model is given."""
 
     row: int
     key: bytes
     first: int
-    """The row of the same key that the model is given."""
 
 
 Row = KnownRow | ReadyRow | RepeatedRow

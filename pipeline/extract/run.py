@@ -72,13 +72,13 @@ def _resume(
 ) -> ExtractionReport | None:
     """Go on with the build of this very plan; beside a finished store of it, that is its repair."""
     resolve_device(surveyed.params.extract.device)
-    build, episodes = places.begun_build(), len(surveyed.episodes)
+    build = places.begun_build()
     with closing(build), row_sources(places.known, surveyed) as known:
         missing = build.missing()
         done = build.specs[FEATURES].shape[0] - len(missing)
         repairs = places.finished == surveyed.plan
         doing = "completing the repair" if repairs else "continuing the interrupted build"
-        plan = plan_lines(build, surveyed, digests, episodes, done, [f"{doing} {build.part}"])
+        plan = plan_lines(build, surveyed, digests, done, [f"{doing} {build.part}"])
         for line in [*plan, *places.keeping_note(surveyed)]:
             say(line)
         if surveyed.params.extract.plan:
@@ -116,7 +116,7 @@ def _begin(
         if isinstance(extract.workers, str) and taken < len(rows):
             from pipeline.extract.cluster import check_scheduler  # dask: a second to import
 
-            check_scheduler(extract)
+            check_scheduler(extract.workers)
         places.make_room(surveyed, say)
         places = StorePlaces(places.target)
         with row_sources(places.known, surveyed) as known:

@@ -7,7 +7,8 @@ once and before anything expensive runs.
 """
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,36 +20,46 @@ from pipeline.base.digests import ContentDigests, joint_digest
 from pipeline.base.errors import RecordingError, VLMError
 from pipeline.data import BadEpisode, Recording, content_digest, open_recordings
 from pipeline.data.embodiment import Embodiment, common_embodiment
-from pipeline.data.episode import ReadEpisode, read_episode
+from pipeline.data.episode import read_episode
 from pipeline.data.timeline import ActionRotation, Timeline, choose_action_rotation
+from pipeline.store.episodes import EpisodeRows
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 from pipeline.vlm.preparation import Preparer
 
 
 @dataclass(frozen=True)
 class SurveyedEpisode:
-    """A recording and what its files hold."""
+    """A recording and what the store says of it, its digests too."""
 
     recording: Recording
-    content: str
-    """Digest of its files: equal content means equal streams."""
-    digest: str
-    """Digest of content and of everything else that decides what the store says of it."""
+    text: Mapping[str, str]
+
+    @property
+    def content(self) -> str:
+        """Digest of its files: equal content means equal streams."""
+        return self.text["content"]
+
+    @property
+    def digest(self) -> str:
+        """Digest of content and of everything else that decides what the store says of it."""
+        return self.text["digest"]
 
 
 @dataclass(frozen=True)
 class Survey:
-    """What is to be in the store."""
+    """What is to be in the store.
+
+    A data set's metadata list the `missing`, which are not among its files. `plan` is the digest of
+    all that decides what the store holds.
+    """
 
     params: Params
     episodes: tuple[SurveyedEpisode, ...]
     missing: tuple[str, ...]
-    """Listed by a data set's metadata, absent from its files."""
     bad: tuple[BadEpisode, ...]
     spec: FeatureSpec
     action_rotation: ActionRotation
     plan: str
-    """Digest of all that decides what the store holds."""
 
     @property
     def target(self) -> Path:
@@ -68,18 +79,15 @@ class Survey:
 
 @dataclass(frozen=True)
 class CheckedEpisode:
-    """An episode that was read whole and found sound; its streams are let go again."""
+    """An episode that was read whole and found sound; its streams are let go again.
+
+    `rows` is what a store lists of it.
+    """
 
     surveyed: SurveyedEpisode
     timeline: Timeline
     embodiment: Embodiment
-    readings: int
-    states: int
-
-    @classmethod
-    def of(cls, surveyed: SurveyedEpisode, read: ReadEpisode) -> "CheckedEpisode":
-        """What is kept of an episode that was read."""
-        return cls(surveyed, read.timeline, read.embodiment, read.readings, read.states)
+    rows: EpisodeRows
 
 
 def survey(params: Params, digests: ContentDigests) -> Survey:
@@ -96,15 +104,13 @@ def survey(params: Params, digests: ContentDigests) -> Survey:
     views: set[str] = set()
     for recording in tqdm(opened.recordings, "survey", unit="episode", disable=None, leave=False):
         try:
-            content = content_digest(recording, digests.of)
-            digest = _digest(recording, content, data, rotation)
-            if data.on_bad_episode == "skip" and (reason := digests.bad(digest)) is not None:
+            episode = _surveyed(recording, data, rotation, digests)
+            if data.on_bad_episode == "skip" and (reason := digests.bad(episode.digest)):
                 raise RecordingError(reason)
             views |= set(recording.view_names())
+            episodes.append(episode)
         except RecordingError as error:
             bad.append(BadEpisode(recording.source, recording.path, str(error)))
-            continue
-        episodes.append(SurveyedEpisode(recording, content, digest))
     if not episodes:
         _refuse_bad(bad, of=len(bad))
     spec = feature_spec(params.vlm, extract.dtype, sorted(views), digests.of, digests.text)
@@ -154,10 +160,9 @@ def check_episodes(
             sound.append(_checked(episode, surveyed, preparer))
         except RecordingError as error:
             failed.append((episode, str(error)))
-    recordings = [(episode.recording, reason) for episode, reason in failed]
     bad = [
         *surveyed.bad,
-        *(BadEpisode(recording.source, recording.path, reason) for recording, reason in recordings),
+        *(BadEpisode(e.recording.source, e.recording.path, reason) for e, reason in failed),
     ]
     if bad and (surveyed.params.data.on_bad_episode == "stop" or not sound):
         _refuse_bad(bad, of=len(sound) + len(bad))
@@ -175,14 +180,6 @@ def embodiment_of(checked: Sequence[CheckedEpisode]) -> Embodiment:
     )
 
 
-def shown_path(path: Path, root: Path) -> str:
-    """A path relative to the data root where it lies below, so that a store can move."""
-    try:
-        return Path(os.path.abspath(path)).relative_to(os.path.abspath(root)).as_posix()
-    except ValueError:
-        return os.path.abspath(path)
-
-
 def _checked(episode: SurveyedEpisode, surveyed: Survey, preparer: Preparer) -> CheckedEpisode:
     recording, data = episode.recording, surveyed.params.data
     read = read_episode(recording, data.action_hz, data.vlm_reuse_count, surveyed.action_rotation)
@@ -193,27 +190,35 @@ def _checked(episode: SurveyedEpisode, surveyed: Survey, preparer: Preparer) -> 
         raise RecordingError(f"{recording.path}: {error}") from None
     for view, camera in cameras.items():
         camera.check(np.unique(read.timeline.frames[view]).tolist())
-    return CheckedEpisode.of(episode, read)
+    source = recording.source
+    rows = EpisodeRows(read.timeline, read.readings, read.states, source, episode.text)
+    return CheckedEpisode(episode, read.timeline, read.embodiment, rows)
 
 
 def _refuse_bad(bad: Sequence[BadEpisode], of: int) -> None:
     """Raise one `RecordingError` that lists every bad episode."""
     lines = [f"{len(bad)} of {of} episodes cannot be used:"]
     for episode in bad:
-        told = str(episode.where) in episode.reason
-        reason = episode.reason if told else f"{episode.where}: {episode.reason}"
-        lines.append(f"  {episode.source}: {reason}")
+        where = "" if str(episode.where) in episode.reason else f"{episode.where}: "
+        lines.append(f"  {episode.source}: {where}{episode.reason}")
     lines.append("Mend or remove them, or leave them out with --set data.on_bad_episode=skip.")
     raise RecordingError("\n".join(lines))
 
 
-def _digest(recording: Recording, content: str, data: DataParams, rotation: ActionRotation) -> str:
-    return joint_digest(
-        content,
-        recording.source,
-        recording.id,
-        recording.format,
-        recording.instruction,
-        shown_path(recording.path, data.root),
-        repr((data.action_hz, data.vlm_reuse_count, rotation)),
-    )
+def _surveyed(
+    recording: Recording, data: DataParams, rotation: ActionRotation, digests: ContentDigests
+) -> SurveyedEpisode:
+    path = Path(os.path.abspath(recording.path))
+    with suppress(ValueError):  # a path below the data root is said from there: a store can move
+        path = path.relative_to(os.path.abspath(data.root))
+    text = {
+        "id": recording.id,
+        "path": path.as_posix(),
+        "format": recording.format,
+        "instruction": recording.instruction,
+        "content": content_digest(recording, digests.of),
+    }
+    said = (text["id"], text["format"], text["instruction"], text["path"])
+    decides = repr((data.action_hz, data.vlm_reuse_count, rotation))
+    digest = joint_digest(text["content"], recording.source, *said, decides)
+    return SurveyedEpisode(recording, text | {"digest": digest})

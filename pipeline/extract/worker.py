@@ -6,6 +6,7 @@ prepare.
 
 import socket
 import threading
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +17,9 @@ from numpy.typing import NDArray
 from pipeline.base.differences import describe, differences
 from pipeline.base.digests import file_digest
 from pipeline.base.errors import ConfigError, NumericsError, RecordingError, StoreIncomplete
-from pipeline.extract.engine import ExtractionJob, FeatureBlock, RowEngine, WrittenRows
+from pipeline.extract.engine import FeatureBlock, RowEngine, WrittenRows, row_frames
 from pipeline.extract.rows import Row
+from pipeline.extract.survey import Survey
 from pipeline.store import RowSource, StoreBuild, part_path, read_plan
 from pipeline.store.schema import read_specs
 from pipeline.vlm.feature_spec import feature_spec
@@ -38,6 +40,29 @@ def compute_rows(plugin: str, rows: NDArray[np.int64]) -> list[WrittenRows] | Ex
         return error
 
 
+@dataclass(frozen=True)
+class ExtractionJob:
+    """What every process of an extraction must know.
+
+    `known` are stores and builds of the same feature spec, `folder` is where the coordinator runs:
+    relative paths begin there.
+    """
+
+    surveyed: Survey
+    known: tuple[Path, ...]
+    folder: Path
+
+    @property
+    def name(self) -> str:
+        """Of its plugin: an extraction that was killed is replaced by the next on its store."""
+        return f"extraction of {self.surveyed.target.absolute()}"
+
+    @property
+    def local(self) -> bool:
+        """Whether all its processes are on the coordinator's host."""
+        return isinstance(self.surveyed.params.extract.workers, int)
+
+
 class ExtractionPlugin(WorkerPlugin):
     """A worker's half of an extraction; also on workers that join later."""
 
@@ -47,7 +72,7 @@ class ExtractionPlugin(WorkerPlugin):
 
     def setup(self, worker: Worker) -> None:
         """Prepare to begin with the first task; whatever fails then is that task's error."""
-        self._worker_name = worker.name
+        self._number = worker.name
         self._engine: RowEngine | None = None
         self._closed = False
         self._opening, self._model_turn, self._disk_turn = (threading.Lock() for _ in range(3))
@@ -68,26 +93,24 @@ class ExtractionPlugin(WorkerPlugin):
         blocks: list[FeatureBlock] = []
         with self._model_turn:
             engine.encode(iter([prepared]), blocks.append)
-        return [self._written(block) for block in blocks]
+        with self._disk_turn:
+            if self._closed:
+                raise StoreIncomplete(f"{self.name} has ended; its rows are nobody's")
+            return [block.write(self._build) for block in blocks]
 
     def _opened(self) -> RowEngine:
         """The worker's engine; its files are opened on the first call."""
+        surveyed = self.job.surveyed
         with self._opening:
             if self._engine is None:
                 check_place(self.job)
                 self._known = [RowSource(path) for path in self.job.known]
-                target, plan = self.job.surveyed.target, self.job.surveyed.plan
-                self._build = StoreBuild(target, read_specs(part_path(target)), plan)
-                frames = self.job.frames(self._build)
-                device = device_of(self.job, self._worker_name)
-                self._engine = RowEngine(self.job, frames, self._known, device)
+                specs = read_specs(part_path(surveyed.target))
+                self._build = StoreBuild(surveyed.target, specs, surveyed.plan)
+                frames = row_frames(self._build, surveyed)
+                device = device_of(self.job, self._number)
+                self._engine = RowEngine(surveyed, frames, self._known, device)
             return self._engine
-
-    def _written(self, block: FeatureBlock) -> WrittenRows:
-        with self._disk_turn:
-            if self._closed:
-                raise StoreIncomplete(f"{self.name} has ended; its rows are nobody's")
-            return block.write(self._build)
 
 
 def _prepared(engine: RowEngine, rows: NDArray[np.int64]) -> list[Row]:

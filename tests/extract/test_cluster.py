@@ -37,10 +37,9 @@ from pipeline.base.errors import (
 )
 from pipeline.extract import extract
 from pipeline.extract.cluster import check_scheduler, connected
-from pipeline.extract.engine import ExtractionJob
 from pipeline.extract.plan import rate_name
 from pipeline.extract.survey import Survey, survey
-from pipeline.extract.worker import check_place, device_of
+from pipeline.extract.worker import ExtractionJob, check_place, device_of
 from pipeline.store import FeatureStore, RowSource, StoreBuild, part_path, read_plan
 from pipeline.store.schema import ARRAY_NAMES, read_specs
 from pipeline.vlm.feature_spec import feature_spec
@@ -361,7 +360,7 @@ class TestDeaths:
     def edges(self, store: Path) -> dict[str, range]:
         build = RowSource(part_path(store))
         starts = build.episode_edges("vl")
-        said = [Path(one["id"]).name for one in build._said]
+        said = [Path(one["id"]).name for one in build._texts]
         build.close()
         spans = [range(*edges) for edges in pairwise(starts.tolist())]
         return dict(zip(said, spans, strict=True))
@@ -382,7 +381,7 @@ class TestRefusals:
     def test_a_wrong_address(self, changed, monkeypatch, address):
         monkeypatch.setattr("pipeline.base.scheduler.TIMEOUT_S", 1)
         wrong = changed(extract={"workers": address})
-        for reach in (run, lambda params: check_scheduler(params.extract)):
+        for reach in (run, lambda params: check_scheduler(params.extract.workers)):
             with pytest.raises(ConfigError, match="no dask scheduler answers at"):
                 reach(wrong)
 

@@ -1,13 +1,10 @@
 """Rows on their way: equal ones once, commits behind the model, and what a report says of it."""
 
-import shutil
 import threading
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from pipeline.base.digests import ContentDigests
 from pipeline.base.errors import DiskFull
 from pipeline.extract import extract
 from pipeline.extract.engine import RowEngine
@@ -119,23 +116,6 @@ def test_the_report_says_how_the_time_was_spent(params):
     assert 0 < report.model_share <= 1
     assert 0 <= report.waited_share < 1
     assert report.model_share + report.waited_share <= 1
-
-
-def test_a_batch_size_that_was_found_is_not_searched_again(changed, asked, monkeypatch):
-    monkeypatch.setattr("pipeline.extract.encoder._FIRST", 1)
-    monkeypatch.setattr("pipeline.extract.encoder._MOST", {"cpu": 2})
-    params = changed(extract={"batch_size": "auto"})
-    run(params)
-    assert asked[0] == 1
-    digests = ContentDigests(Path(f"{params.extract.store}.files.sqlite"))
-    ((name, size),) = digests._database.execute("SELECT * FROM batch_size").fetchall()
-    assert digests.batch_size(name) == size
-    digests.note_batch_size(name, 7)
-    digests.close()
-    shutil.rmtree(params.extract.store)
-    asked.clear()
-    run(params)
-    assert asked[0] == 7
 
 
 def test_pieces_are_made_in_order_as_far_ahead_as_is_asked():

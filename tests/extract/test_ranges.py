@@ -18,34 +18,15 @@ def missing_rows(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray]:
     return np.flatnonzero(chosen), edges
 
 
-@given(rows=missing_rows(), batch=st.integers(1, 6), chunk_rows=st.sampled_from([4, 8, 32]))
-def test_a_range_is_of_one_chunk_and_one_episode(rows, batch, chunk_rows):
-    missing, edges = rows
-    ranges = list(ranges_of(missing, edges, chunk_rows, batch))
+@given(rows=missing_rows(), batch=st.integers(1, 6), together=st.sampled_from([1, 2, 4]))
+def test_blocks_that_share_a_page_stay_together(rows, batch, together):
+    missing, _ = rows
+    ranges = ranges_of(missing, batch, together)
     assert np.concatenate([[], *ranges]).tolist() == missing.tolist()
-    for one in ranges:
-        assert 0 < len(one) <= batch
-        assert len(set(one // chunk_rows)) == 1
-        assert len(list(by_episode(one, edges))) == 1
-
-
-@given(
-    rows=missing_rows(), batch=st.integers(1, 6), shape=st.sampled_from([(4, 4), (8, 2), (32, 4)])
-)
-def test_blocks_that_share_a_page_stay_together(rows, batch, shape):
-    chunk_rows, together = shape
-    missing, edges = rows
-    ranges = list(ranges_of(missing, edges, chunk_rows, batch, together))
-    assert np.concatenate([[], *ranges]).tolist() == missing.tolist()
-    blocks = [set((one // together).tolist()) for one in ranges]
+    blocks = [set((part // together).tolist()) for part in ranges]
     assert sum(map(len, blocks)) == len(set().union(*blocks)), "a block stands in two ranges"
-    for one, its_blocks in zip(ranges, blocks, strict=True):
-        assert len(set(one // chunk_rows)) == 1
-        assert len(one) <= batch or len(its_blocks) == 1
-        for (_, before), (_, after) in zip(
-            list(by_episode(one, edges)), list(by_episode(one, edges))[1:], strict=False
-        ):
-            assert before[-1] // together == after[0] // together, "could have been cut there"
+    for part in ranges:
+        assert len(part) < batch + together
 
 
 @given(missing_rows())
@@ -56,7 +37,7 @@ def test_the_rows_of_a_range_are_told_apart_by_episode(rows):
 
 
 def test_a_batch_is_filled_where_nothing_forbids_it():
-    ranges = ranges_of(np.arange(10), np.array([0, 10]), 4096, 4)
+    ranges = ranges_of(np.arange(10), 4)
     assert [one.tolist() for one in ranges] == [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9]]
 
 
