@@ -81,7 +81,7 @@ def compute_on_cluster(
     most = max(1, rows // surveyed.spec.variants)
     # Where hosts may differ, no two ranges share a page of the file.
     together = 1 if job.local else rows_between_pages(array.row_bytes)
-    ranges = ranges_of(missing, most, together)
+    ranges = ranges_of(missing, most, array.chunk_rows, together)
     begun, before = 0.0, 0
     with connected(extract) as client, _plugged(client, job):
         tasks = ClusterTasks(client, job, vl_start)
@@ -199,14 +199,16 @@ def rows_between_pages(row_bytes: int) -> int:
     return PAGE_BYTES // math.gcd(row_bytes, PAGE_BYTES)
 
 
-def ranges_of(missing: Range, most: int, together: int = 1) -> list[Range]:
+def ranges_of(missing: Range, most: int, chunk_rows: int, together: int = 1) -> list[Range]:
     """Rows (ascending, of `missing`) that each task computes: as many as `most`, or a few more.
 
-    Blocks of `together` rows are never cut, for hosts must not share a page.
+    A range lies within one chunk. Blocks of `together` rows, which divide a chunk, are never cut,
+    for hosts must not share a page.
     """
-    block = missing // together
-    begin = np.searchsorted(block, block)
-    return np.split(missing, np.flatnonzero(np.diff(begin // most)) + 1)
+    chunk, block = missing // chunk_rows, missing // together
+    begin = np.searchsorted(block, block) - np.searchsorted(chunk, chunk)
+    cuts = (np.diff(begin // most) != 0) | (np.diff(chunk) != 0)
+    return np.split(missing, np.flatnonzero(cuts) + 1)
 
 
 @contextmanager

@@ -21,12 +21,13 @@ def missing_rows(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray]:
 @given(rows=missing_rows(), batch=st.integers(1, 6), together=st.sampled_from([1, 2, 4]))
 def test_blocks_that_share_a_page_stay_together(rows, batch, together):
     missing, _ = rows
-    ranges = ranges_of(missing, batch, together)
+    ranges = ranges_of(missing, batch, 8, together)
     assert np.concatenate([[], *ranges]).tolist() == missing.tolist()
     blocks = [set((part // together).tolist()) for part in ranges]
     assert sum(map(len, blocks)) == len(set().union(*blocks)), "a block stands in two ranges"
     for part in ranges:
         assert len(part) < batch + together
+        assert len(set((part // 8).tolist())) <= 1, "a range lies in two chunks"
 
 
 @given(missing_rows())
@@ -37,7 +38,7 @@ def test_the_rows_of_a_range_are_told_apart_by_episode(rows):
 
 
 def test_a_batch_is_filled_where_nothing_forbids_it():
-    ranges = ranges_of(np.arange(10), 4)
+    ranges = ranges_of(np.arange(10), 4, 4096)
     assert [one.tolist() for one in ranges] == [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9]]
 
 
