@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from pipeline.store import FeatureStore
+from pipeline.train.batches import Prefetch
 from pipeline.train.log import speed_file
 from pipeline.train.progress import Progress, describe_data, peak_memory_bytes
 from pipeline.train.run import policy_shape
@@ -24,10 +25,11 @@ Make = Callable[..., Any]
 CPU = torch.device("cpu")
 
 
-class Waiting:
+class Waiting(Prefetch):
     """Stands for a feed."""
 
-    waited_s = 0.0
+    def __init__(self) -> None:
+        self.waited_s = 0.0
 
 
 class Terminal(StringIO):
