@@ -35,7 +35,7 @@ class UnifiedBatch(Batch):
     """Equal for ticks that see the same frames."""
     instruction: list[str]
     images: list[Frames] | None = None
-    """Of each sample, without views that its episode lacks; samples of a VL row share the arrays."""
+    """Of each sample, without views that its episode lacks; those of a VL row share the arrays."""
     key: UInt8[Tensor, "batch 16"] | None = None
     """Digest of feature spec, prompt and frames: what the cached features are of."""
 

@@ -18,7 +18,6 @@ from transformers.utils import logging as transformers_logging
 from pipeline.base.config import VLMParams
 from pipeline.base.errors import VLMError
 from pipeline.vlm.checkpoint_folder import adapter_files, resolve_checkpoint, weight_files
-from pipeline.vlm.processor import PixelSettings
 from pipeline.vlm.vision import tower_attention
 
 _UNUSED = {"lm_head.weight"}
@@ -53,25 +52,19 @@ def cut(whole: Any, layers: int) -> Any:
     return whole
 
 
-def pixel_settings(vlm: VLMParams) -> PixelSettings:
-    """What the checkpoint's image processor does to a frame."""
-    folder = resolve_checkpoint(vlm.checkpoint, vlm.revision)
-    return PixelSettings.read(folder, (vlm.image_resize_height, vlm.image_resize_width))
-
-
-def environment(model: Any, device: torch.device) -> dict[str, str]:
+def environment(model: Any) -> dict[str, str]:
     """What may move a feature within its dtype's noise: backends, versions, device.
 
     Pillow is what stretches and augments frames.
     """
-    cuda = device.type == "cuda"
+    device = model.device
     return {
         "attention": str(model.language_model.config._attn_implementation),
         "vision_attention": tower_attention(model.visual),
         "torch": torch.__version__,
         "transformers": transformers.__version__,
         "pillow": PIL.__version__,
-        "device": torch.cuda.get_device_name(device) if cuda else device.type,
+        "device": (torch.cuda.get_device_name(device) if device.type == "cuda" else device.type),
     }
 
 
@@ -173,13 +166,6 @@ def _refuse_strange(folder: Path, missing: set[str], unexpected: set[str], what:
     if missing or unexpected:
         raise VLMError(
             f"{folder}: the {what}'s weights are not those of the model that it describes: "
-            f"missing {_some(missing)}, left over {_some(unexpected)}. Expected every weight, and "
-            f"no other. Copy or download the {what} again."
+            f"{len(missing)} missing {sorted(missing)[:4]}, {len(unexpected)} left over "
+            f"{sorted(unexpected)[:4]}. Copy or download the {what} again."
         )
-
-
-def _some(keys: set[str]) -> str:
-    if not keys:
-        return "none"
-    shown = ", ".join(sorted(keys)[:4])
-    return shown if len(keys) <= 4 else f"{shown} and {len(keys) - 4} more"

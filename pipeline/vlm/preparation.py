@@ -59,8 +59,7 @@ class Preparer:
         self._spec = spec
         self._augmentation = vlm.augmentation
         self._renderer = PromptRenderer(folder, vlm.prompt)
-        resize = (vlm.image_resize_height, vlm.image_resize_width)
-        self._settings = PixelSettings.read(folder, resize)
+        self._settings = PixelSettings.of(vlm)
         # An episode repeats its instruction in every row.
         self._rendered = lru_cache(maxsize=4096)(self._renderer.render)
         self._tokens = lru_cache(maxsize=4096)(self._expanded_tokens)
@@ -101,7 +100,7 @@ class Preparer:
         -1 is a sample whose frames are None. Raises `VLMError` for a view that is not the spec's
         and for what is not an RGB frame.
         """
-        rows: dict[bytes, PreparedRow] = {}
+        rows: list[PreparedRow] = []
         place: dict[bytes, int] = {}
         row_of: list[int] = []
         for given, instruction in zip(images, instructions, strict=True):
@@ -110,11 +109,11 @@ class Preparer:
                 continue
             frames = {view: _as_array(frame) for view, frame in given.items()}
             key = row_key(self._spec, self.render(instruction, tuple(frames)), frames)
-            if key not in rows:
+            if key not in place:
                 place[key] = len(rows)
-                rows[key] = self.prepare(instruction, frames)
+                rows.append(self.prepare(instruction, frames))
             row_of.append(place[key])
-        return list(rows.values()), row_of
+        return rows, row_of
 
     def prepare_variants(
         self, instruction: str, frames: Mapping[str, NDArray[np.uint8]], key: bytes
