@@ -137,14 +137,10 @@ class UnifiedVLADataset(Dataset[Sample]):
         same where sources and episodes have the names that they have in the store: the side
         follows from the hash of "source/id". Use `unified_collate_fn`.
         """
-        keys = None
-        if self._frames is not None:
-            keys = first_keys(self._frames)
+        keys = None if self._frames is None else first_keys(self._frames)
         split = split_by_episode(self.store, val_fraction, self.windows.horizon, keys)
-        train, held_out = (
-            Subset(self, np.flatnonzero(np.isin(self.ticks, side)).tolist())
-            for side in (split.train, split.held_out)
-        )
+        sides = (np.isin(self.ticks, side) for side in (split.train, split.held_out))
+        train, held_out = (Subset(self, np.flatnonzero(side).tolist()) for side in sides)
         return train, held_out
 
     def _seen(self, rows: NDArray[np.int64]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ A kill at any instant leaves the previous checkpoint or the new one.
 
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -131,10 +131,10 @@ def load_policy(folder: Path) -> PolicyCheckpoint:
     from pipeline.policy.observation import PolicyShape
 
     with _description(folder) as document:
-        shape = document["shape"]
+        shape = PolicyShape(**document["shape"])
         return PolicyCheckpoint(
             params=TrainHeadParams.model_validate(document["params"]["train_head"]),
-            shape=PolicyShape(**{**shape, "action_groups": tuple(shape["action_groups"])}),
+            shape=replace(shape, action_groups=tuple(shape.action_groups)),
             normalization=Normalization.from_document(document["normalization"]),
             source={key: document[key] for key in SOURCE_KEYS},
             held_out_ticks={

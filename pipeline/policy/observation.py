@@ -119,17 +119,15 @@ def build_observation(
         check_axes("images", index, {"batch": count}, first)
     else:
         index = torch.full((count,), -1, device=device)
-    missing = {
-        "features": torch.zeros(count, shape.slots, shape.feature_dim, device=device),
-        "slot_valid": torch.full((count, shape.slots), "features" in given, device=device),
-        "feature_age": torch.zeros(count, device=device),
-        "sensor": torch.zeros(count, params.sensor_window, shape.sensor_channels, device=device),
-        "state": torch.zeros(count, params.state_window, shape.state_dim, device=device),
+    window = params.sensor_window
+    fields = {
+        name: torch.zeros(count, *(window if n is None else n for n in a.values()), device=device)
+        for name, a in axes.items()
     }
-    for stream in ("sensor", "state"):
+    for stream, valid in VALIDITY.items():
         real = given[stream].shape[1] if stream in given else 0
-        missing[f"{stream}_valid"] = torch.full((count,), real, device=device)
-    fields = missing | {**given}
+        fields[valid] = torch.full_like(fields[valid], real, dtype=torch.int64)
+    fields |= given
     fields["slot_valid"] = fields["slot_valid"].bool()
     return LiveObservation(**fields, rows=rows, row_of=index)
 

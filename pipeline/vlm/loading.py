@@ -57,14 +57,14 @@ def environment(model: Any) -> dict[str, str]:
 
     Pillow is what stretches and augments frames.
     """
-    device = model.device
+    device, cuda = model.device, model.device.type == "cuda"
     return {
         "attention": str(model.language_model.config._attn_implementation),
         "vision_attention": tower_attention(model.visual),
         "torch": torch.__version__,
         "transformers": transformers.__version__,
         "pillow": PIL.__version__,
-        "device": (torch.cuda.get_device_name(device) if device.type == "cuda" else device.type),
+        "device": torch.cuda.get_device_name(device) if cuda else device.type,
     }
 
 
@@ -164,8 +164,9 @@ def adapted(whole: Any, vlm: VLMParams, dropout: float | None = None) -> Any:
 
 def _refuse_strange(folder: Path, missing: set[str], unexpected: set[str], what: str) -> None:
     if missing or unexpected:
+        lacks, has = (", ".join(sorted(keys)[:4]) or "none" for keys in (missing, unexpected))
         raise VLMError(
             f"{folder}: the {what}'s weights are not those of the model that it describes: "
-            f"{len(missing)} missing {sorted(missing)[:4]}, {len(unexpected)} left over "
-            f"{sorted(unexpected)[:4]}. Copy or download the {what} again."
+            f"missing {lacks} ({len(missing)} in all), left over {has} ({len(unexpected)} in all). "
+            f"Copy or download the {what} again."
         )

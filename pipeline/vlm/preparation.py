@@ -123,27 +123,18 @@ class Preparer:
         `key` is the row's (`row_key`): what is drawn depends on nothing else. All have one layout.
         """
         plain = self.prepare(instruction, frames)
-        others = range(1, self._spec.variants)
-        return (plain, *(self._augmented(plain, frames, key, variant) for variant in others))
-
-    def _augmented(
-        self,
-        plain: PreparedRow,
-        frames: Mapping[str, NDArray[np.uint8]],
-        key: bytes,
-        variant: int,
-    ) -> PreparedRow:
-        """A row whose images are changed at the model's size, where they are smallest."""
-        pixels = np.empty_like(plain.pixels)
-        height, width = self._settings.image_size
-        for place, image, (view, _) in zip(
-            pixels, plain.pixels, plain.layout.image_starts, strict=True
-        ):
-            seen_height, seen_width, _ = frames[view].shape
-            widened = (width / seen_width) / (height / seen_height)
-            drawn = Augmentation.drawn(self._augmentation, key, view, variant)
-            place[:] = drawn.apply(image, widened)
-        return replace(plain, pixels=pixels)
+        rows, (height, width) = [plain], self._settings.image_size
+        for variant in range(1, self._spec.variants):
+            pixels = np.empty_like(plain.pixels)
+            for place, image, (view, _) in zip(
+                pixels, plain.pixels, plain.layout.image_starts, strict=True
+            ):
+                # Changed at the model's size, where images are smallest.
+                widened = (width / frames[view].shape[1]) / (height / frames[view].shape[0])
+                drawn = Augmentation.drawn(self._augmentation, key, view, variant)
+                place[:] = drawn.apply(image, widened)
+            rows.append(replace(plain, pixels=pixels))
+        return tuple(rows)
 
     def _ordered(self, views: Sequence[str] | Mapping[str, object]) -> tuple[str, ...]:
         unknown = sorted(set(views) - set(self._spec.views))

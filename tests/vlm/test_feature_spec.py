@@ -269,7 +269,7 @@ def test_row_key_moves_with_spec_prompt_pixels_shape_and_view(
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"layers": [4]}, r"expected -4 to 3 for a model of 4 decoder layers, each layer once, found \[4\]"),
+        ({"layers": [4]}, r"expected -4 to 3 for a model of 4 decoder layers, .*found \[4\]"),
         ({"layers": [-5]}, r"found \[-5\]"),
         ({"layers": [-1, 3]}, r"each layer once, found \[-1, 3\]"),
         ({"pooling": ["mean", "mean"]}, r"vlm\.pooling: each may stand once"),
