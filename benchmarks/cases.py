@@ -9,7 +9,8 @@ from transformers import Qwen2_5_VLConfig
 from benchmarks.real_shape import random_model
 from benchmarks.workload import Workload
 from pipeline.base.config import Params
-from pipeline.vlm.loading import load_whole, pixel_settings
+from pipeline.vlm.loading import load_whole
+from pipeline.vlm.processor import PixelSettings
 from pipeline.vlm.qwen import FrozenVLM
 
 
@@ -52,7 +53,7 @@ def frozen_model(case: Case, workload: Workload, compiled: bool) -> FrozenVLM:
     if not case.real_shape:
         return FrozenVLM.load(vlm, spec, case.device, compiled)
     model = whole_model(case, workload.params).model
-    return FrozenVLM(model, pixel_settings(vlm), spec, torch.device(case.device), compiled)
+    return FrozenVLM(model, PixelSettings.of(vlm), spec, compiled)
 
 
 def whole_model(case: Case, params: Params) -> Any:

@@ -4,17 +4,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float64, Int64, UInt8
-from numpy.typing import NDArray
 from torch import Tensor
 
 from pipeline.base.errors import StoreMismatch
+from pipeline.data.row_range import Frames
 from pipeline.store import Batch
-
-Images = Mapping[str, NDArray[np.uint8]]
-"""Frames (height, width, 3) RGB by view; a view that the episode lacks is not in it."""
 
 Sample = Mapping[str, Any]
 """One tick: the fields of `UnifiedBatch` by name, without their batch axis."""
@@ -38,8 +34,8 @@ class UnifiedBatch(Batch):
     vl_row: Int64[Tensor, " batch"]
     """Equal for ticks that see the same frames."""
     instruction: list[str]
-    images: list[Images] | None = None
-    """Of each sample; samples of one VL row share the arrays."""
+    images: list[Frames] | None = None
+    """Of each sample, without views that its episode lacks; those of a VL row share the arrays."""
     key: UInt8[Tensor, "batch 16"] | None = None
     """Digest of feature spec, prompt and frames: what the cached features are of."""
 

@@ -1,9 +1,11 @@
 """Which episodes of a store a data set is of."""
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PurePath
 
+from pipeline.base.differences import describe, differences
 from pipeline.base.errors import StoreMismatch
 from pipeline.data import Recording
 from pipeline.data.reader import absolute
@@ -14,21 +16,14 @@ def check_store(
     store: FeatureStore, vlm_reuse_count: int, action_hz: float | None, action_rotation: str
 ) -> None:
     """Raise `StoreMismatch` where a store's ticks are others than these settings ask for."""
-    rotations = {"rx": "rotvec", "da": "euler_delta"}
-    names = store.streams["action"]["names"]
-    found = next((kind for name, kind in rotations.items() if name in names), "neither")
-    wanted: dict[str, tuple[object, object]] = {
-        "vlm_reuse_count": (vlm_reuse_count, store.vlm_reuse_count),
-        "action_hz": (action_hz, store.action_hz),
-    }
+    expected: dict[str, object] = {"vlm_reuse_count": vlm_reuse_count, "action_hz": action_hz}
+    actual: dict[str, object] = {name: getattr(store, name) for name in expected}
     if action_rotation != "auto":
-        wanted["action_rotation"] = (action_rotation, found)
-    wrong = [
-        f"{name}: expected {asked}, found {there}"
-        for name, (asked, there) in wanted.items()
-        if asked != there
-    ]
-    if wrong:
+        rotations = {"rx": "rotvec", "da": "euler_delta"}
+        names = store.streams["action"]["names"]
+        actual["action_rotation"] = next((rotations[n] for n in names if n in rotations), "neither")
+        expected["action_rotation"] = action_rotation
+    if wrong := describe(differences(expected, actual), " expected, found "):
         raise StoreMismatch(
             f"{store.path}: its ticks are not those asked for ({'; '.join(wrong)}). Ask for what "
             "the store has, or set these in params.yaml's data and run stages.extract again."
@@ -40,14 +35,14 @@ def episodes_of_format(store: FeatureStore, format: str) -> list[Episode]:
 
     Raises `StoreMismatch` where there is none.
     """
-    found = [one for one in store.episodes if format in ("auto", one.format)]
-    if not found:
-        has = ", ".join(sorted({one.format for one in store.episodes})) or "no episode"
+    episodes = [episode for episode in store.episodes if format in ("auto", episode.format)]
+    if not episodes:
+        formats = ", ".join(sorted({episode.format for episode in store.episodes})) or "none"
         raise StoreMismatch(
-            f"{store.path}: expected episodes of the format {format!r}, found {has}. Name another "
-            "format, or add such recordings to data.sources and run stages.extract again."
+            f"{store.path}: expected episodes of the format {format!r}, found {formats}. Name "
+            "another, or add such recordings to data.sources and run stages.extract again."
         )
-    return found
+    return episodes
 
 
 def episodes_of_recordings(store: FeatureStore, recordings: Sequence[Recording]) -> list[Episode]:
@@ -56,25 +51,23 @@ def episodes_of_recordings(store: FeatureStore, recordings: Sequence[Recording])
     An episode is known by its format, name and place: the store has paths relative to data.root.
     Raises `StoreMismatch` naming the recordings that the store does not have.
     """
-    by_name: dict[tuple[str, str], list[Episode]] = {}
+    by_name = defaultdict[tuple[str, str], list[Episode]](list)
     for episode in store.episodes:
-        by_name.setdefault((episode.format, _name(episode.id)), []).append(episode)
-    found: dict[int, Episode] = {}
+        by_name[episode.format, _name(episode.id)].append(episode)
+    known: dict[int, Episode] = {}
     absent: list[Path] = []
     for recording in recordings:
-        candidates = by_name.get((recording.format, _name(recording.id)), [])
-        match = [one for one in candidates if _same_place(one.path, recording.path)]
-        if not match:
-            absent.append(recording.path)
-        for episode in match:
-            found[episode.index] = replace(episode, source=recording.source)
+        alike = by_name[recording.format, _name(recording.id)]
+        same = [episode for episode in alike if _same_place(episode.path, recording.path)]
+        known |= {e.index: replace(e, source=recording.source) for e in same}
+        absent += [] if same else [recording.path]
     if absent:
         raise StoreMismatch(
             f"{store.path}: expected features of {len(recordings)} recordings, {len(absent)} of "
             f"them are not in it; first: {absent[0]}. Add them to data.sources and run "
             "stages.extract, or leave the store out to see frames."
         )
-    return list(found.values())
+    return list(known.values())
 
 
 def _name(id: str) -> str:

@@ -9,14 +9,16 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch.utils.data import Dataset, Subset
+from tqdm import tqdm
 
 from pipeline.base.config import Source
 from pipeline.base.errors import ConfigError, RecordingError
 from pipeline.compat.batch import Sample, UnifiedBatch
 from pipeline.compat.cached import check_store, episodes_of_format, episodes_of_recordings
-from pipeline.compat.frames import Frames
-from pipeline.compat.streams import in_memory, read_episodes
+from pipeline.compat.memory import first_keys, in_memory, read_frames
 from pipeline.data import Recording, open_recordings
+from pipeline.data.episode import read_episode
+from pipeline.data.row_range import RowFrames
 from pipeline.data.timeline import choose_action_rotation
 from pipeline.store import Episode, FeatureStore
 from pipeline.train.batches import Windows
@@ -72,12 +74,14 @@ class UnifiedVLADataset(Dataset[Sample]):
         store: FeatureStore | str | Path | None = None,
         recordings: Sequence[Recording] | None = None,
     ) -> None:
-        _check_one_of("format", format, get_args(Format))
-        _check_one_of("action_rotation", action_rotation, get_args(Rotation))
+        known = {"format": (format, Format), "action_rotation": (action_rotation, Rotation)}
+        for name, (value, kinds) in known.items():
+            if value not in get_args(kinds):
+                raise ConfigError(f"{name}: expected one of {get_args(kinds)}, found {value!r}")
         self.windows = Windows(horizon, sensor_window_size, state_window_size)
         self.vlm_reuse_count, self.action_hz = vlm_reuse_count, action_hz
         self.action_rotation: Rotation = action_rotation
-        self._sources = _sources(data, format, instruction)
+        self._sources = named_sources(() if data is None else data, format, instruction)
         self._format, self._views, self._given = format, views, recordings
         self._cached = FeatureStore.open(store) if isinstance(store, str | Path) else store
         if min(astuple(self.windows)) < 1 or vlm_reuse_count < 1:
@@ -85,15 +89,15 @@ class UnifiedVLADataset(Dataset[Sample]):
                 "horizon, windows and vlm_reuse_count count from 1, found "
                 f"{self.windows} and vlm_reuse_count={vlm_reuse_count}"
             )
-        if recordings is not None and not (data is None and instruction is None and views is None):
+        given = {"data": data, "instruction": instruction, "views": views}
+        if recordings is None:
+            del given["data"]
+        opened = recordings is not None or self._cached is not None
+        if opened and any(value is not None for value in given.values()):
             raise ConfigError(
-                "recordings are open already, but data, instruction and views are about opening "
-                "some. Leave these out, or recordings"
-            )
-        if self._cached is not None and (instruction is not None or views is not None):
-            raise ConfigError(
-                "instruction and views decide what a model sees, but the features of "
-                f"{self._cached.path} are computed already. Leave them out, or the store"
+                f"{', '.join(given)} decide how recordings are opened and seen, but the recordings "
+                "are open already, or their features computed. Leave these out, or recordings and "
+                "store"
             )
         self._open()
 
@@ -133,26 +137,20 @@ class UnifiedVLADataset(Dataset[Sample]):
         same where sources and episodes have the names that they have in the store: the side
         follows from the hash of "source/id". Use `unified_collate_fn`.
         """
-        keys = None
-        if self._frames is not None:
-            rows, of_frames = self._frames.first_keys()
-            keys = self.store.array("vl/key").copy()
-            keys[rows] = of_frames
+        keys = None if self._frames is None else first_keys(self._frames)
         split = split_by_episode(self.store, val_fraction, self.windows.horizon, keys)
-        train, held_out = (
-            Subset(self, np.flatnonzero(np.isin(self.ticks, side)).tolist())
-            for side in (split.train, split.held_out)
-        )
+        sides = (np.isin(self.ticks, side) for side in (split.train, split.held_out))
+        train, held_out = (Subset(self, np.flatnonzero(side).tolist()) for side in sides)
         return train, held_out
 
     def _seen(self, rows: NDArray[np.int64]) -> dict[str, Any]:
         if self._frames is None:
             return {"key": torch.from_numpy(self.store.array("vl/key")[rows])}
-        frames = self._frames.read(rows)
+        frames = read_frames(self._frames, rows)
         return {"images": [frames[row] for row in rows.tolist()]}
 
     def _open(self) -> None:
-        self._frames: Frames | None = None
+        self._frames: RowFrames | None = None
         if self._cached is None:
             self._read(self._recordings())
         else:
@@ -168,10 +166,11 @@ class UnifiedVLADataset(Dataset[Sample]):
 
     def _read(self, recordings: Sequence[Recording]) -> None:
         rotation = choose_action_rotation(self.action_rotation, recordings)
-        read = read_episodes(recordings, self.action_hz, self.vlm_reuse_count, rotation)
-        self.store = in_memory(read, self.action_hz, self.vlm_reuse_count)
+        settings = (self.action_hz, self.vlm_reuse_count)
+        bar = tqdm(recordings, "reading", unit="episode", disable=None, leave=False)
+        read = [read_episode(recording, *settings, rotation) for recording in bar]
+        self.store, self._frames = in_memory(read, *settings)
         self.episodes = self.store.episodes
-        self._frames = Frames(read, self.store.array("episode/vl_start"))
 
     def _recordings(self) -> Sequence[Recording]:
         if self._given:
@@ -183,9 +182,9 @@ class UnifiedVLADataset(Dataset[Sample]):
             )
         opened = open_recordings(self._sources, views=self._views)
         if opened.bad:
-            lines = [f"  {bad.source}: {bad.reason}" for bad in opened.bad]
+            lines = "".join(f"\n  {bad.source}: {bad.reason}" for bad in opened.bad)
             raise RecordingError(
-                "\n".join([f"{len(lines)} episodes cannot be used; mend or remove them:", *lines])
+                f"{len(opened.bad)} episodes cannot be used; mend or remove them:{lines}"
             )
         return opened.recordings
 
@@ -213,17 +212,10 @@ class NewAsyncInsertionDataset(UnifiedVLADataset):
         super().__init__(data, "new", **settings)
 
 
-def _check_one_of(name: str, found: str, known: Sequence[str]) -> None:
-    if found not in known:
-        raise ConfigError(f"{name}: expected one of {', '.join(known)}, found {found!r}")
-
-
-def _sources(
-    data: Place | Sequence[Place] | None, format: Format, instruction: str | None
+def named_sources(
+    data: Place | Sequence[Place], format: Format, instruction: str | None = None
 ) -> tuple[Source, ...]:
     """The named sources, and all bare paths as one that is named after the format."""
-    if data is None:
-        return ()
     places = [data] if isinstance(data, str | Path | Source) else list(data)
     named = [place for place in places if isinstance(place, Source)]
     paths = tuple(str(place) for place in places if not isinstance(place, Source))

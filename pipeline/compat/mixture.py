@@ -1,6 +1,6 @@
 """Old and new recordings in one loader, drawn by weight."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from torch.utils.data import DataLoader, Sampler
 
-from pipeline.base.config import Source
 from pipeline.base.errors import ConfigError
 from pipeline.compat.batch import unified_collate_fn
-from pipeline.compat.dataset import UnifiedVLADataset
+from pipeline.compat.dataset import UnifiedVLADataset, named_sources
 from pipeline.store import FeatureStore
 from pipeline.train.sampling import TickSampler
 
@@ -38,7 +37,14 @@ class MixtureBatches(Sampler[list[int]]):
         seed: int,
     ) -> None:
         sizes = {name: len(items) for name, items in by_source.items()}
-        _check(sizes, weights, batch_size)
+        foreign = set(weights) - set(sizes) or {w for w in weights.values() if not 0 <= w < inf}
+        drawn = [name for name, size in sizes.items() if size and weights.get(name, 1.0)]
+        if foreign or not drawn or batch_size < 1:
+            raise ConfigError(
+                "expected a batch_size from 1, and weights of these sources, finite and from 0, "
+                "one that has items above 0; found "
+                f"batch_size {batch_size}, items {sizes}, weights {dict(weights)}"
+            )
         # TickSampler weighs items; divided by their number, weights are those of sources.
         of_items = {name: weights.get(name, 1.0) / max(1, size) for name, size in sizes.items()}
         self._sampler = TickSampler(by_source, of_items, batch_size, seed)
@@ -89,12 +95,8 @@ def create_unified_dataloader(
     `batch_sampler` is the `MixtureBatches`, by which a run is resumed. Where only a `store` is
     named, its episodes are old and new by their formats. Raises what these raise.
     """
-    named = {"old": _paths(old_dataset_patterns), "new": _paths(new_dataset_path)}
-    sources = [
-        Source.model_validate({"name": name, "path": paths, "format": name})
-        for name, paths in named.items()
-        if paths
-    ]
+    old = named_sources(old_dataset_patterns, "old")
+    sources = [*old, *named_sources(new_dataset_path or (), "new")]
     dataset = UnifiedVLADataset(
         sources,
         horizon=horizon,
@@ -103,14 +105,18 @@ def create_unified_dataloader(
         store=store,
         **settings,
     )
-    drawn = np.array(
-        dataset.split(val_fraction)[0].indices if val_fraction else range(len(dataset))
-    )
+    drawn = dataset.split(val_fraction)[0].indices if val_fraction else range(len(dataset))
     items = {
-        name: of_name[np.isin(of_name, drawn)]
+        name: of_name[np.isin(of_name, np.array(drawn))]
         for name, of_name in dataset.items_by("source" if sources else "format").items()
     }
-    batches = MixtureBatches(items, _weights(items, old_weight, new_weight), batch_size, seed)
+    weights = {"old": old_weight, "new": new_weight}
+    if foreign := sorted(set(items) - set(weights)):
+        raise ConfigError(
+            f"the store has episodes of the formats {', '.join(foreign)} beside old and new ones, "
+            "and no weight is theirs. Name old_dataset_patterns and new_dataset_path"
+        )
+    batches = MixtureBatches(items, {name: weights[name] for name in items}, batch_size, seed)
     return DataLoader(
         dataset,
         batch_sampler=batches,
@@ -120,38 +126,3 @@ def create_unified_dataloader(
         multiprocessing_context=multiprocessing_context if num_workers else None,
         persistent_workers=bool(num_workers),
     )
-
-
-def _check(sizes: Mapping[str, int], weights: Mapping[str, float], batch_size: int) -> None:
-    if batch_size < 1:
-        raise ConfigError(f"batch_size: expected 1 or more items, found {batch_size}")
-    unknown = sorted(set(weights) - set(sizes))
-    if unknown:
-        raise ConfigError(
-            f"weights: expected names among {', '.join(sizes)}, found {', '.join(unknown)}"
-        )
-    wrong = {name: weight for name, weight in weights.items() if not 0 <= weight < inf}
-    if wrong:
-        raise ConfigError(f"weights: expected finite numbers from 0, found {wrong}")
-    if not any(size and weights.get(name, 1.0) for name, size in sizes.items()):
-        raise ConfigError(
-            f"nothing to draw from: {dict(sizes)} items under weights {dict(weights)}. Give a "
-            "source that has items a weight above 0"
-        )
-
-
-def _weights(names: Iterable[str], old_weight: float, new_weight: float) -> dict[str, float]:
-    weights = {"old": old_weight, "new": new_weight}
-    foreign = sorted(set(names) - set(weights))
-    if foreign:
-        raise ConfigError(
-            f"the store has episodes of the formats {', '.join(foreign)} beside old and new ones, "
-            "and no weight is theirs. Name old_dataset_patterns and new_dataset_path"
-        )
-    return {name: weights[name] for name in names}
-
-
-def _paths(given: str | Path | Sequence[str | Path] | None) -> tuple[str, ...]:
-    if given is None:
-        return ()
-    return tuple(map(str, [given] if isinstance(given, str | Path) else given))

@@ -17,7 +17,7 @@ from pipeline.base.config import FusionStrategy, ModelType, TrainHeadParams, Tun
 from pipeline.base.errors import ObservationError
 from pipeline.policy.live_policy import LivePolicy
 from pipeline.policy.normalization import ChannelStatistics, Normalization
-from pipeline.policy.observation import LiveObservation, PolicyShape, check_axes
+from pipeline.policy.observation import VALIDITY, LiveObservation, PolicyShape, check_axes
 from pipeline.policy.policy import Policy
 from pipeline.vlm.feature_spec import feature_shape
 
@@ -180,13 +180,11 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
         features: Any = None,
         sensor: Any = None,
         state: Any = None,
-        *,
-        slot_valid: Any = None,
-        feature_age: Any = None,
-        sensor_valid: Any = None,
-        state_valid: Any = None,
+        **validity: Any,
     ) -> LiveObservation:
         """The observation of what `forward` takes; equal frames and text share a row."""
+        if unknown := set(validity) - {*VALIDITY.values(), "feature_age"}:
+            raise TypeError(f"unexpected arguments: {', '.join(sorted(unknown))}")
         rows: list[PreparedRow] = []
         row_of = [] if images is None else [-1] * len(images)
         if images is not None and any(frames is not None for frames in images):
@@ -194,9 +192,7 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
                 wanted = f"expected {len(images)} instructions, one for each of images"
                 raise ObservationError(f"text: {wanted}, found {text!r}")
             rows, row_of = self._preparer.prepare_distinct(images, text)
-        streams = {"features": features, "slot_valid": slot_valid, "feature_age": feature_age}
-        streams |= {"sensor": sensor, "sensor_valid": sensor_valid}
-        streams |= {"state": state, "state_valid": state_valid}
+        streams = {"features": features, "sensor": sensor, "state": state, **validity}
         return self.policy.observe(streams, rows, row_of)
 
     @cached_property
@@ -208,16 +204,8 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
 
 def no_normalization(shape: PolicyShape) -> Normalization:
     """Statistics of this shape under which every stream stays as it is."""
-
-    def unit(*channels: int) -> ChannelStatistics:
-        return ChannelStatistics(np.zeros(channels), np.ones(channels), 0)
-
-    return Normalization(
-        action=unit(shape.action_dim),
-        features=unit(shape.slots, shape.feature_dim),
-        sensor=unit(shape.sensor_channels),
-        state=unit(shape.state_dim),
-    )
+    sizes = shape.channels.items()
+    return Normalization(**{n: ChannelStatistics(np.zeros(s), np.ones(s), 0) for n, s in sizes})
 
 
 def _with_seed_parts(head: Mapping[str, Any]) -> dict[str, Any]:

@@ -145,7 +145,7 @@ def _attributes(checked: Sequence[CheckedEpisode], survey: Survey) -> dict[str, 
     return {
         "schema": SCHEMA,
         "feature_spec": survey.spec.attrs(),
-        "slots": survey.spec.stored_slots(),
+        "slots": survey.spec.document["slots"],
         "sources": [source.name for source in data.sources],
         "streams": embodiment_of(checked).document() | {"views": list(survey.spec.views)},
         "action_hz": data.action_hz,

@@ -26,8 +26,11 @@ from pipeline.policy.noise_schedule import NoiseSchedule
 from pipeline.policy.observation import PolicyShape, action_groups
 from pipeline.policy.policy import Normalizer, Policy, Trainable
 from pipeline.policy.regression import RegressionActionExpert
-from pipeline.policy.sensor_encoder import ForceAwareSensorEncoder, SensorEncoder
-from pipeline.policy.state_encoder import RobotStateEncoder
+from pipeline.policy.window_encoders import (
+    ForceAwareSensorEncoder,
+    RobotStateEncoder,
+    SensorEncoder,
+)
 
 _LIVE = {
     "QwenVLAUnified",

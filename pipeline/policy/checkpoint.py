@@ -6,20 +6,17 @@ and units, the normalisation, the params and the ids of the episodes it has neve
 A kill at any instant leaves the previous checkpoint or the new one.
 """
 
-import json
-import sys
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from functools import cache
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.base.differences import Differences, differences
 from pipeline.base.durable import (
     DIGEST,
     check_digest,
+    damaged,
     read_tensors,
     read_with_digest,
     replace_folder,
@@ -41,8 +38,6 @@ if TYPE_CHECKING:
 FORMAT = 2
 WEIGHTS, DOCUMENT = "policy.safetensors", "policy.json"
 CHECKPOINT = OutputKind("a checkpoint of a policy", lambda folder: (folder / DOCUMENT).is_file())
-_OF_THE_RUN = ("feed", "loggers", "scratch")
-"""Keys of `train_head` that no policy depends on, and that had other values in the past."""
 SOURCE_KEYS = ("feature_spec", "streams", "action_hz", "vlm_reuse_count")
 
 
@@ -85,7 +80,7 @@ class PolicyCheckpoint:
             "step": self.step,
             "metrics": dict(self.metrics),
             "params": {"train_head": self.params.model_dump(mode="json")},
-            "shape": self.shape.document(),
+            "shape": asdict(self.shape),
             **self.source,
             "held_out_episodes": list(self.held_out_ticks),
             "held_out_ticks": {name: list(ticks) for name, ticks in self.held_out_ticks.items()},
@@ -131,15 +126,15 @@ def find_policy(path: Path) -> Path:
 def load_policy(folder: Path) -> PolicyCheckpoint:
     """The checkpoint at `folder`.
 
-    Raises `CheckpointIncomplete` naming the file that is missing, truncated or altered. Says on
-    stderr where the description is of a version that wrote no digest of it.
+    Raises `CheckpointIncomplete` naming the file that is missing, truncated or altered.
     """
     from pipeline.policy.observation import PolicyShape
 
     with _description(folder) as document:
+        shape = PolicyShape(**document["shape"])
         return PolicyCheckpoint(
-            params=_params(document),
-            shape=PolicyShape.from_document(document["shape"]),
+            params=TrainHeadParams.model_validate(document["params"]["train_head"]),
+            shape=replace(shape, action_groups=tuple(shape.action_groups)),
             normalization=Normalization.from_document(document["normalization"]),
             source={key: document[key] for key in SOURCE_KEYS},
             held_out_ticks={
@@ -161,7 +156,7 @@ def check_policy(folder: Path) -> TrainHeadParams:
     with _description(folder) as document:
         check_digest(folder / WEIGHTS, document["weights_sha256"])
         Normalization.from_document(document["normalization"])
-        return _params(document)
+        return TrainHeadParams.model_validate(document["params"]["train_head"])
 
 
 @contextmanager
@@ -170,7 +165,7 @@ def _description(folder: Path) -> Generator[dict[str, Any]]:
     path = folder / DOCUMENT
     document, has_digest = read_with_digest(path)
     if not has_digest:
-        _note_without_digest(path)
+        raise CheckpointIncomplete(damaged(path, f"it carries no {DIGEST}"))
     if document.get("format") != FORMAT:
         raise CheckpointMismatch(
             f"{path}: expected format {FORMAT}, found {document.get('format')!r}. "
@@ -185,26 +180,3 @@ def _description(folder: Path) -> Generator[dict[str, Any]]:
             f"{path}: not what a checkpoint's description must be ({type(error).__name__}: "
             f"{error}). Train it again."
         ) from None
-
-
-def _params(document: Mapping[str, Any]) -> TrainHeadParams:
-    given = document["params"]["train_head"]
-    return TrainHeadParams.model_validate_json(
-        json.dumps({key: value for key, value in given.items() if key not in _OF_THE_RUN})
-    )
-
-
-@cache
-def _note_without_digest(path: Path) -> None:
-    """Say it once in a process: a checkpoint is read several times."""
-    print(
-        f"{path}: it has no {DIGEST}, for an earlier version wrote it, so that nobody can tell "
-        "whether it was altered; it is taken as it is. Train it again to have it checked.",
-        file=sys.stderr,
-    )
-
-
-def source_differences(expected: Mapping[str, Any], actual: Mapping[str, Any]) -> Differences:
-    """Where what a checkpoint's store was and what another store is differ."""
-    first, second = ({key: source[key] for key in SOURCE_KEYS} for source in (expected, actual))
-    return differences(first, second)

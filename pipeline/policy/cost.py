@@ -1,15 +1,12 @@
 """What a policy costs: its parameters, and the arithmetic of one act."""
 
-from collections.abc import Callable
 from copy import deepcopy
-from functools import partial
 
 import torch
-from torch import Generator, Tensor
+from torch import Generator
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
-from pipeline.policy.observation import stream_validity
 from pipeline.policy.policy import Policy
 
 
@@ -29,23 +26,14 @@ def flop_table(policy: Policy) -> list[tuple[str, int]]:
         "state": (params.state_window, shape.state_dim),
     }
     blank = frozen.observe({name: torch.zeros(1, *size) for name, size in sizes.items()})
-    encoded: dict[str, Tensor] = {}
-    table: list[tuple[str, int]] = []
-
-    def count(name: str, work: Callable[[], Tensor]) -> Tensor:
-        # The fused attention kernels are not counted on every device; what they replace is.
-        with FlopCounterMode(display=False) as counter, sdpa_kernel(SDPBackend.MATH):
-            done = work()
-        table.append((name, counter.get_total_flops()))
-        return done
-
-    for name in frozen.encoders:
-        valid = stream_validity(blank, name)
-        encoded[name] = count(name, partial(frozen.encode, name, blank, valid))
-    context = count("fusion", partial(frozen.fusion, encoded))
-    generator = Generator(context.device).manual_seed(0)
-    count("expert", partial(frozen.expert.act, context, generator))
-    return table
+    generator = Generator(blank.features.device).manual_seed(0)
+    # The fused attention kernels are not counted on every device; what they replace is.
+    with FlopCounterMode(display=False) as counter, sdpa_kernel(SDPBackend.MATH):
+        frozen.act(blank, generator)
+    parts = {**dict(frozen.encoders.items()), "fusion": frozen.fusion}
+    counted = counter.get_flop_counts()  # by the class of what was called
+    table = [(n, sum(counted.get(type(part).__name__, {}).values())) for n, part in parts.items()]
+    return [*table, ("expert", counter.get_total_flops() - sum(flops for _, flops in table))]
 
 
 def describe_cost(policy: Policy) -> list[str]:

@@ -133,18 +133,17 @@ class GatedFusion(Fusion):
         self.gate = nn.Linear(sum(widths.values()), len(widths) * dim)
         self.read_out = read_out(dim, tokens)
 
-    def gates(self, encoded: Tokens) -> dict[str, Float[Tensor, "batch dim"]]:
+    def gates(
+        self, vectors: Mapping[str, Float[Tensor, "batch _"]]
+    ) -> dict[str, Float[Tensor, "batch dim"]]:
         """How much of each stream is let through, in (0, 1), by channel."""
-        return self._gates(self.vectors(encoded))
-
-    def _gates(self, vectors: Mapping[str, Tensor]) -> dict[str, Tensor]:
         opened = self.gate(torch.cat([*vectors.values()], dim=-1)).float().sigmoid()
         return dict(zip(vectors, opened.chunk(len(vectors), dim=-1), strict=True))
 
     def forward(self, encoded: Tokens) -> Context:
         """The context of `tokens` tokens."""
         vectors = self.vectors(encoded)
-        gates = self._gates(vectors)
+        gates = self.gates(vectors)
         parts = [gates[name] * torch.tanh(self.content[name](x)) for name, x in vectors.items()]
         return self.read_out(torch.stack(parts).sum(dim=0))
 

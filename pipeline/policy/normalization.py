@@ -3,11 +3,11 @@
 Numpy only; `pipeline.policy.policy.Normalizer` applies them to tensors.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from itertools import islice
+from itertools import chain, islice
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ Block = NDArray[Any] | tuple[NDArray[Any], NDArray[np.bool_]]
 """Rows of values, or such rows and which of their values are valid."""
 
 Reading = Block | Callable[[], Block]
-"""A block, or what reads one: on one of several threads, and again where an error is named."""
+"""A block, or what reads one on one of several threads."""
 
 _PIECE_VALUES = 4_194_304
 """Values converted to float64 at a time: 32 MB, whatever the size of the blocks."""
@@ -55,20 +55,11 @@ class ChannelStatistics:
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any]) -> "ChannelStatistics":
-        """The statistics of a `document`, bit for bit. Raises `CheckpointMismatch`."""
-        try:
-            mean = np.asarray(document["mean"], np.float64)
-            std = np.asarray(document["std"], np.float64)
-            count = int(document["count"])
-        except (KeyError, TypeError, ValueError) as error:
-            raise CheckpointMismatch(
-                f"normalisation: expected numbers under mean, std and count, found {error!r}"
-            ) from None
+        """The statistics of a `document`, bit for bit."""
+        mean, std = (np.asarray(document[name], np.float64) for name in ("mean", "std"))
         if mean.shape != std.shape:
-            raise CheckpointMismatch(
-                f"normalisation: mean has shape {mean.shape}, std {std.shape}; they must agree"
-            )
-        return cls(mean, std, count)
+            raise ValueError(f"mean of shape {mean.shape} and std of {std.shape}")
+        return cls(mean, std, int(document["count"]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,81 +78,60 @@ class Normalization:
     @classmethod
     def from_document(cls, document: Mapping[str, Any]) -> "Normalization":
         """The normalisation of a `document`, bit for bit. Raises `CheckpointMismatch`."""
-        if document.get("action") is None:
-            raise CheckpointMismatch("normalisation: expected statistics of `action`, found none")
-        streams = {
-            name: ChannelStatistics.from_document(document[name])
-            for name in cls.__dataclass_fields__
-            if document.get(name) is not None
-        }
-        return cls(**streams)
+        streams = {name: document.get(name) for name in cls.__dataclass_fields__}
+        try:
+            fitted = {n: ChannelStatistics.from_document(d) for n, d in streams.items() if d}
+            return cls(**fitted)
+        except (KeyError, TypeError, ValueError) as error:
+            raise CheckpointMismatch(
+                "normalisation: expected mean, std and count of `action` and of every stream that "
+                f"there is, found {error!r}"
+            ) from None
 
 
-def fit_channels(
-    blocks: Iterable[Reading], what: str, names: Sequence[str] | None = None, threads: int = 1
-) -> ChannelStatistics:
+def fit_channels(blocks: Iterable[Reading], what: str, threads: int = 1) -> ChannelStatistics:
     """Statistics over all rows of `blocks`, each (row, channel…) of floating point, in one pass.
 
     A block may be a pair (values, valid): `valid` is bool over the leading axes of `values`, such
     as (row, slot) for features (row, slot, dim), and what is not valid is neither checked nor
     counted. Moments are merged in float64 after Chan, Golub and LeVeque (1983), eq. 2.1, in the
-    order of the blocks: the same bits, however many `threads` read them.
-    Raises `NumericsError`, naming `what`, channel and row, on NaN, inf, or where there is no row.
+    order of the blocks: the same bits, however many `threads` read them. A few blocks are read at a
+    time, so that memory does not grow with their number.
+    Raises `NumericsError`, naming `what` and the channel, on NaN, inf, or where there is no row.
     """
-    moments: _Moments | None = None
-    rows = 0
-    for block, measured in _measured_in_order(blocks, what, threads):
-        for index, (piece, count) in enumerate(measured):
-            if not np.isfinite(piece.squares).all():
-                values, valid = next(islice(_pieces(block), index, None))
-                _refuse(values, valid, what, names, rows)
-            moments = piece if moments is None else _merge(moments, piece)
-            rows += count
-    if moments is None:
+    waiting, total = iter(blocks), None
+    with ThreadPoolExecutor(threads) as pool:
+        while some := list(islice(waiting, 2 * threads)):
+            for moments in chain.from_iterable(pool.map(partial(_measure, what=what), some)):
+                total = moments if total is None else _merge(total, moments)
+    if total is None:
         raise NumericsError(f"{what}: no rows to fit the normalisation on; check the split")
-    variance = moments.squares / np.maximum(moments.count, 1)
-    return ChannelStatistics(moments.mean, np.sqrt(variance), rows)
+    variance = total.squares / np.maximum(total.count, 1)
+    return ChannelStatistics(total.mean, np.sqrt(variance), total.rows)
 
 
 @dataclass(frozen=True)
 class _Moments:
     """`count` broadcasts to the channels; `squares` is the sum of squared distances to `mean`."""
 
+    rows: int
     count: NDArray[np.float64]
     mean: NDArray[np.float64]
     squares: NDArray[np.float64]
 
 
-def _measured_in_order(
-    blocks: Iterable[Reading], what: str, threads: int
-) -> Iterator[tuple[Reading, list[tuple[_Moments, int]]]]:
-    """Each block, and of each piece of it the moments and how many rows it has.
-
-    A few blocks at a time, so that memory does not grow with their number.
-    """
-    waiting = iter(blocks)
-    with ThreadPoolExecutor(threads) as pool:
-        while some := list(islice(waiting, 2 * threads)):
-            yield from zip(some, pool.map(partial(_measured, what=what), some), strict=True)
-
-
-def _measured(block: Reading, what: str) -> list[tuple[_Moments, int]]:
-    return [(_moments(*piece, what), len(piece[0])) for piece in _pieces(block)]
-
-
-def _pieces(block: Reading) -> Iterator[tuple[NDArray[Any], NDArray[np.bool_] | None]]:
+def _measure(block: Reading, what: str) -> list[_Moments]:
+    """The moments of a block, a piece at a time."""
     read = block() if callable(block) else block
     values, valid = read if isinstance(read, tuple) else (read, None)
-    channels = int(np.prod(values.shape[1:]))
-    rows = max(1, _PIECE_VALUES // max(1, channels))
-    for start in range(0, len(values), rows):
-        part = slice(start, start + rows)
-        yield values[part], None if valid is None else valid[part]
+    if not np.issubdtype(values.dtype, np.floating):
+        raise TypeError(f"{what}: expected floating point, found {values.dtype}")
+    rows = max(1, _PIECE_VALUES // max(1, int(np.prod(values.shape[1:]))))
+    pieces = (slice(start, start + rows) for start in range(0, len(values), rows))
+    return [_moments(values[at], None if valid is None else valid[at], what) for at in pieces]
 
 
 def _moments(values: NDArray[Any], valid: NDArray[np.bool_] | None, what: str) -> _Moments:
-    if not np.issubdtype(values.dtype, np.floating):
-        raise TypeError(f"{what}: expected floating point, found {values.dtype}")
     with np.errstate(invalid="ignore", over="ignore"):
         piece = values.astype(np.float64)
         if valid is None:
@@ -175,7 +145,14 @@ def _moments(values: NDArray[Any], valid: NDArray[np.bool_] | None, what: str) -
             mean = piece.sum(axis=0) / np.maximum(count, 1)
             piece = np.where(weight, piece - mean, 0.0)
         squares = np.einsum("r...,r...->...", piece, piece)
-    return _Moments(np.asarray(count), mean, squares)
+    if not np.isfinite(squares).all():
+        at = first_non_finite(values, valid)
+        actual = f"{values[at]} in channel {list(at[1:])}" if at else "values too large to square"
+        raise NumericsError(
+            f"{what}: expected finite numbers, found {actual}. Mend the recording and run "
+            "stages.extract again."
+        )
+    return _Moments(len(values), np.asarray(count), mean, squares)
 
 
 def _merge(left: _Moments, right: _Moments) -> _Moments:
@@ -183,29 +160,8 @@ def _merge(left: _Moments, right: _Moments) -> _Moments:
     delta = right.mean - left.mean
     share = right.count / np.maximum(count, 1)
     return _Moments(
+        left.rows + right.rows,
         count,
         left.mean + delta * share,
         left.squares + right.squares + delta * delta * left.count * share,
-    )
-
-
-def _refuse(
-    values: NDArray[Any],
-    valid: NDArray[np.bool_] | None,
-    what: str,
-    names: Sequence[str] | None,
-    first_row: int,
-) -> None:
-    at = first_non_finite(values, valid)
-    if at is None:
-        raise NumericsError(
-            f"{what}: values near row {first_row} are so large that their variance overflows"
-        )
-    row, *channel = at
-    place = ", ".join(str(i) for i in channel)
-    if names is not None and len(channel) == 1:
-        place = repr(names[channel[0]])
-    raise NumericsError(
-        f"{what}: expected finite numbers, found {values[at]} in row "
-        f"{first_row + row}, channel {place}. Mend the recording and run stages.extract again."
     )

@@ -1,7 +1,7 @@
 """What a policy is built for, and observations made by hand that are checked against it."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -9,13 +9,14 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.base.errors import CheckpointMismatch, ObservationError
+from pipeline.base.errors import ObservationError
 from pipeline.base.observation import Observation
 
-STREAMS = ("features", "sensor", "state")
-"""What a policy may have encoders of, in the order in which it builds them."""
+VALIDITY = {"features": "slot_valid", "sensor": "sensor_valid", "state": "state_valid"}
+"""What a policy may have encoders of, in the order in which it builds them, and the field that says
+what of it is real: (batch, slot) bool of the features, else (batch,) counts."""
 
-_GROUP_BY_UNIT = {"m": "translation", "cm": "translation", "mm": "translation"} | {
+_GROUP_BY_UNIT = dict.fromkeys(("m", "cm", "mm"), "translation") | {
     "deg": "rotation",
     "rad": "rotation",
 }
@@ -48,19 +49,15 @@ class PolicyShape:
     action_dim: int
     action_groups: tuple[str, ...]
 
-    def document(self) -> dict[str, Any]:
-        """The shape as JSON values."""
-        return asdict(self) | {"action_groups": list(self.action_groups)}
-
-    @classmethod
-    def from_document(cls, document: Mapping[str, Any]) -> "PolicyShape":
-        """The shape of a `document`. Raises `CheckpointMismatch`."""
-        fields = dict(document)
-        try:
-            fields["action_groups"] = tuple(fields["action_groups"])
-            return cls(**fields)
-        except (KeyError, TypeError) as error:
-            raise CheckpointMismatch(f"policy shape: {error!r} in {fields}") from None
+    @property
+    def channels(self) -> dict[str, tuple[int, ...]]:
+        """The shape of each stream's statistics, and of the action's."""
+        return {
+            "features": (self.slots, self.feature_dim),
+            "sensor": (self.sensor_channels,),
+            "state": (self.state_dim,),
+            "action": (self.action_dim,),
+        }
 
     def stream_axes(self, params: TrainHeadParams) -> dict[str, Axes]:
         """The axes behind the batch of each field of an `Observation` of this shape."""
@@ -92,13 +89,6 @@ def stream_of(field: str) -> str:
     return "features" if field in ("slot_valid", "feature_age") else field.removesuffix("_valid")
 
 
-def stream_validity(observation: Observation, stream: str) -> Tensor:
-    """What of a stream is real: (batch, slot) bool of the features, else (batch,) counts."""
-    if stream == "features":
-        return observation.slot_valid
-    return getattr(observation, f"{stream}_valid")
-
-
 def build_observation(
     shape: PolicyShape,
     params: TrainHeadParams,
@@ -118,7 +108,7 @@ def build_observation(
             raise ObservationError(
                 f"{name}: expected {stream_of(name)} beside it, of which it says what is real"
             )
-    first = next((name for name in STREAMS if name in given), "images")
+    first = next((name for name in VALIDITY if name in given), "images")
     index = torch.tensor(row_of, dtype=torch.int64, device=device)
     # The number of elements and not len, which a scalar lacks; its shape is refused all the same.
     count = given[first].shape[:1].numel() if first in given else len(index)
@@ -129,17 +119,15 @@ def build_observation(
         check_axes("images", index, {"batch": count}, first)
     else:
         index = torch.full((count,), -1, device=device)
-    missing = {
-        "features": torch.zeros(count, shape.slots, shape.feature_dim, device=device),
-        "slot_valid": torch.full((count, shape.slots), "features" in given, device=device),
-        "feature_age": torch.zeros(count, device=device),
-        "sensor": torch.zeros(count, params.sensor_window, shape.sensor_channels, device=device),
-        "state": torch.zeros(count, params.state_window, shape.state_dim, device=device),
+    window = params.sensor_window
+    fields = {
+        name: torch.zeros(count, *(window if n is None else n for n in a.values()), device=device)
+        for name, a in axes.items()
     }
-    for stream in ("sensor", "state"):
+    for stream, valid in VALIDITY.items():
         real = given[stream].shape[1] if stream in given else 0
-        missing[f"{stream}_valid"] = torch.full((count,), real, device=device)
-    fields = missing | {**given}
+        fields[valid] = torch.full_like(fields[valid], real, dtype=torch.int64)
+    fields |= given
     fields["slot_valid"] = fields["slot_valid"].bool()
     return LiveObservation(**fields, rows=rows, row_of=index)
 

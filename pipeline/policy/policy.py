@@ -18,17 +18,19 @@ from pipeline.policy.flow_matching import FlowMatchingActionExpert
 from pipeline.policy.fusion import build_fusion
 from pipeline.policy.normalization import ChannelStatistics, Normalization
 from pipeline.policy.observation import (
-    STREAMS,
+    VALIDITY,
     LiveObservation,
     PolicyShape,
     build_observation,
     stream_of,
-    stream_validity,
 )
 from pipeline.policy.regression import RegressionActionExpert
-from pipeline.policy.sensor_encoder import ForceAwareSensorEncoder, SensorEncoder
-from pipeline.policy.state_encoder import RobotStateEncoder
 from pipeline.policy.tensors import Chunk, Context, Losses, StepMask
+from pipeline.policy.window_encoders import (
+    ForceAwareSensorEncoder,
+    RobotStateEncoder,
+    SensorEncoder,
+)
 
 EXPERTS: dict[str, type[ActionExpert]] = {
     "regression": RegressionActionExpert,
@@ -101,6 +103,17 @@ class Normalizer(nn.Module):
         return values.to(self.mean.dtype) * self.scale + self.mean
 
 
+def build_normalizer(normalization: Normalization, name: str, shape: PolicyShape) -> Normalizer:
+    """That of a stream or the action. Raises `CheckpointMismatch` where it is of another shape."""
+    statistics, expected = getattr(normalization, name), shape.channels[name]
+    if statistics is None or statistics.mean.shape != expected:
+        raise CheckpointMismatch(
+            f"normalisation of {name}: expected statistics of shape {expected}, found "
+            f"{statistics and statistics.mean.shape}. Train again: python -m stages.train_head"
+        )
+    return Normalizer(statistics)
+
+
 class Policy(Trainable):
     """Encoders of the streams that are both present and enabled, fusion, expert.
 
@@ -118,9 +131,9 @@ class Policy(Trainable):
         self.params, self.shape = params, shape
         self.encoders, tokens = build_encoders(params, shape)
         self.normalizers = nn.ModuleDict(
-            {name: Normalizer(_fitting(normalization, name, shape)) for name in self.encoders}
+            {name: build_normalizer(normalization, name, shape) for name in self.encoders}
         )
-        self.action_normalizer = Normalizer(_fitting(normalization, "action", shape))
+        self.action_normalizer = build_normalizer(normalization, "action", shape)
         expert = params.expert
         self.fusion = build_fusion(params.fusion_strategy, tokens, expert.dim, expert.heads)
         self.expert = build_expert(params, shape)
@@ -190,7 +203,7 @@ class Policy(Trainable):
             for name, value in streams.items()
             if value is not None and stream_of(name) in self.encoders
         }
-        if not rows and given.keys().isdisjoint(STREAMS):
+        if not rows and given.keys().isdisjoint(VALIDITY):
             raise ObservationError(
                 f"expected images or at least one of {', '.join(self.encoders)}, found none of them"
             )
@@ -213,7 +226,7 @@ class Policy(Trainable):
         return encoder(values, valid).unsqueeze(1)
 
     def _validity(self, observation: Observation) -> dict[str, Tensor]:
-        return {name: stream_validity(observation, name) for name in self.encoders}
+        return {name: getattr(observation, VALIDITY[name]) for name in self.encoders}
 
 
 def build_encoders(
@@ -285,20 +298,3 @@ def drop_streams(
         name: valid.masked_fill(gone.view(-1, *[1] * (valid.ndim - 1)), 0)
         for (name, valid), gone in zip(validity.items(), dropped.unbind(dim=1), strict=True)
     }
-
-
-def _fitting(normalization: Normalization, name: str, shape: PolicyShape) -> ChannelStatistics:
-    expected = {
-        "features": (shape.slots, shape.feature_dim),
-        "sensor": (shape.sensor_channels,),
-        "state": (shape.state_dim,),
-        "action": (shape.action_dim,),
-    }[name]
-    statistics: ChannelStatistics | None = getattr(normalization, name)
-    actual = None if statistics is None else statistics.mean.shape
-    if statistics is None or actual != expected:
-        raise CheckpointMismatch(
-            f"normalisation of {name}: expected statistics of shape {expected}, found {actual}. "
-            "Train again: python -m stages.train_head"
-        )
-    return statistics

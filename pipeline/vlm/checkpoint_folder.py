@@ -15,6 +15,8 @@ _WANTED = ["*.json", "*.safetensors", "*.txt", "*.jinja"]
 _DTYPES = {"F32", "F16", "BF16"}
 """What safetensors calls the dtypes that weights may have."""
 
+_INDEX = "model.safetensors.index.json"
+
 
 def resolve_checkpoint(
     checkpoint: str, revision: str | None = None, setting: str = "vlm.checkpoint"
@@ -58,14 +60,14 @@ def cached_checkpoint(checkpoint: str, revision: str | None) -> Path | None:
 
 
 def _is_complete(folder: Path) -> bool:
+    if (folder / "adapter_config.json").exists():
+        return (folder / "adapter_model.safetensors").exists()
     try:
-        if (folder / "adapter_config.json").exists():
-            return (folder / "adapter_model.safetensors").exists()
         _present_weights(folder)
         tokenizer_files(folder)
-        return (folder / "preprocessor_config.json").exists()
     except VLMError:
         return False
+    return (folder / "preprocessor_config.json").exists()
 
 
 def _downloaded(checkpoint: str, revision: str | None, setting: str) -> Path:
@@ -90,14 +92,13 @@ def read_json(path: Path) -> dict[str, Any]:
     """A JSON object from a checkpoint's file; `VLMError` where it is missing or is not one."""
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise VLMError(
-            f"{path}: no such file, the checkpoint is incomplete. Copy or download it again."
-        ) from None
     except (OSError, ValueError) as error:
-        raise VLMError(f"{path}: cannot be read as JSON: {error}") from None
+        document = error
     if not isinstance(document, dict):
-        raise VLMError(f"{path}: expected a JSON object, found a {type(document).__name__}")
+        raise VLMError(
+            f"{path}: cannot be read as JSON, expected an object, found {document!r:.200}. Copy or "
+            "download the checkpoint again."
+        )
     return document
 
 
@@ -128,23 +129,19 @@ def _refuse_code(folder: Path) -> None:
         for code in _entries(read_json(path), "auto_map"):
             raise VLMError(
                 f"{path}: the checkpoint carries code of its own, which this project never runs: "
-                f"its auto_map names {json.dumps(code):.200}. Expected a checkpoint that "
-                "transformers' own classes read: set vlm.checkpoint (or vlm.adapter) to such a "
-                "checkpoint. If you know that the code changes no feature, remove auto_map from "
-                "that file and name transformers' own class."
+                f"its auto_map names {json.dumps(code):.200}. Take a checkpoint (or adapter) that "
+                "transformers' own classes read; if you know that the code changes no feature, "
+                "remove auto_map and name transformers' own class."
             )
 
 
 def _entries(document: Any, key: str) -> Iterator[Any]:
     """What stands under this key at any depth of a JSON document, if it is not empty."""
-    if isinstance(document, dict):
-        for name, value in document.items():
-            if name == key and value:
-                yield value
-            else:
-                yield from _entries(value, key)
-    elif isinstance(document, list):
-        for value in document:
+    if isinstance(document, dict) and document.get(key):
+        yield document[key]
+    inside = document.values() if isinstance(document, dict) else document
+    if isinstance(document, dict | list):
+        for value in inside:
             yield from _entries(value, key)
 
 
@@ -166,14 +163,13 @@ def tensor_headers(path: Path) -> dict[str, tuple[str, list[int]]]:
 def _refuse_other_dtypes(files: Sequence[Path]) -> None:
     """Raise `VLMError` where a weight is no float, which would be loaded as if it were one."""
     for path in (path for path in files if path.suffix == ".safetensors"):
-        dtypes = {name: dtype for name, (dtype, _) in tensor_headers(path).items()}
-        other = [f"{name} of {dtype}" for name, dtype in dtypes.items() if dtype not in _DTYPES]
+        headers = tensor_headers(path).items()
+        other = [f"{name} of {dtype}" for name, (dtype, _) in headers if dtype not in _DTYPES]
         if other:
             raise VLMError(
                 f"{path}: expected weights of float32, float16 or bfloat16 (F32, F16, BF16), "
-                f"found {len(other)} of {len(dtypes)} tensors of another dtype, such as "
-                f"{other[0]}. A quantized checkpoint gives other features: take the one that it "
-                "was made from, or save it dequantized."
+                f"found {len(other)} of {len(headers)} tensors of another dtype, such as "
+                f"{other[0]}. Take the checkpoint that was quantized, or save this one dequantized."
             )
 
 
@@ -187,18 +183,16 @@ def weight_files(folder: Path) -> list[Path]:
     if (folder / "adapter_config.json").exists():
         raise VLMError(
             f"{folder}: holds an adapter_config.json, so transformers could load an adapter "
-            "unasked. Expected a checkpoint alone: move the adapter to a folder of its own and "
-            "name that as vlm.adapter."
+            "unasked. Move the adapter to a folder of its own and name that as vlm.adapter."
         )
     files, whole = _present_weights(folder), folder / "model.safetensors"
-    index = folder / "model.safetensors.index.json"
-    shards = [path for path in files if path.suffix == ".safetensors"]
+    shards = {path for path in files if path.suffix == ".safetensors"}
     # transformers loads model.safetensors and passes the index over.
-    if index.exists() and whole.exists() and shards != [whole]:
+    if folder / _INDEX in files and whole.exists() and shards != {whole}:
         raise VLMError(
-            f"{folder}: ambiguous: it has both {whole.name} and {index.name}, which names "
-            f"{len(shards)} weight file(s). Remove {whole.name} if the shards are the checkpoint, "
-            f"else {index.name} and the shards."
+            f"{folder}: ambiguous: it has both {whole.name} and {_INDEX}, which names other "
+            f"files. Remove {whole.name} if the shards are the checkpoint, else {_INDEX} and the "
+            "shards."
         )
     read_config(folder)
     _refuse_other_dtypes(files)
@@ -206,32 +200,30 @@ def weight_files(folder: Path) -> list[Path]:
 
 
 def _present_weights(folder: Path) -> list[Path]:
-    shards = sorted(folder.glob("*.safetensors"))
-    index = folder / "model.safetensors.index.json"
-    if index.exists():
-        listed = {str(name) for name in read_json(index).get("weight_map", {}).values()}
-        missing = sorted(listed - {shard.name for shard in shards})
-        if missing:
-            raise VLMError(
-                f"{folder}: {index.name} names {len(listed)} weight files, missing: "
-                f"{', '.join(missing)}. Copy or download the checkpoint again."
-            )
-        shards = [*sorted(folder / name for name in listed), index]
-    if not shards:
+    weights = {path.name for path in folder.glob("*.safetensors")}
+    listed = weights
+    if (folder / _INDEX).exists():
+        listed = {str(name) for name in read_json(folder / _INDEX).get("weight_map", {}).values()}
+    if missing := sorted(listed - weights):
+        raise VLMError(
+            f"{folder}: {_INDEX} names {len(listed)} weight files, missing: "
+            f"{', '.join(missing)}. Copy or download the checkpoint again."
+        )
+    if not listed:
         raise VLMError(
             f"{folder}: no *.safetensors file. Expected a checkpoint in the hub's format; pickled "
             "weights (*.bin, *.pt) are not opened."
         )
     read_json(folder / "config.json")
-    return sorted([folder / "config.json", *shards])
+    beside = (name for name in ("config.json", _INDEX) if (folder / name).exists())
+    return sorted(folder / name for name in (*listed, *beside))
 
 
 def tokenizer_files(folder: Path) -> list[Path]:
     """Every file that decides the tokens, sorted; `VLMError` where there is no tokenizer."""
     whole = folder / "tokenizer.json"
     content = [whole] if whole.exists() else [folder / "vocab.json", folder / "merges.txt"]
-    missing = [path.name for path in content if not path.exists()]
-    if missing:
+    if not all(path.exists() for path in content):
         raise VLMError(
             f"{folder}: no tokenizer: expected tokenizer.json (or vocab.json with merges.txt). "
             "Copy or download the checkpoint again."
@@ -246,12 +238,11 @@ def adapter_files(folder: Path) -> list[Path]:
     Raises `VLMError` where one is missing or damaged, or its weights are no floats.
     """
     files = [folder / "adapter_config.json", folder / "adapter_model.safetensors"]
-    for path in files:
-        if not path.exists():
-            raise VLMError(
-                f"{path}: no such file. Expected a peft adapter folder with adapter_config.json "
-                "and adapter_model.safetensors (save it with `save_pretrained`)."
-            )
+    for path in (path for path in files if not path.exists()):
+        raise VLMError(
+            f"{path}: no such file. Expected a peft adapter folder with adapter_config.json "
+            "and adapter_model.safetensors (save it with `save_pretrained`)."
+        )
     _refuse_code(folder)
     _refuse_other_dtypes(files)
     return files

@@ -1,5 +1,6 @@
 """Prepared rows -> tensors on the model's device, without waiting for it."""
 
+import math
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -69,11 +70,8 @@ class Collator:
     ) -> None:
         """With `static`, batches of as many rows of one layout have one shape: images that are
         shown twice stay, and lengths are rounded up."""
-        self._model = model
-        self._settings = settings
-        self._places = places
-        self._tower = tower
-        self._static = static
+        self._model, self._tower = model, tower
+        self._settings, self._places, self._static = settings, places, static
         self._positions: dict[TokenLayout, Int64[Tensor, "3 token"]] = {}
         self._arrangements: dict[tuple[TokenLayout, ...], Arrangement] = {}
 
@@ -89,22 +87,20 @@ class Collator:
         pixels = self._pinned((len(distinct), *self._settings.image_size, 3), torch.uint8)
         for place, image in zip(pixels.numpy(), distinct, strict=True):
             place[:] = image
-        plan = self._tower.plan(len(distinct), self._device) if distinct else None
-        shown = torch.from_numpy(self._shown(which, plan))
         device = self._device
+        plan = self._tower.plan(len(distinct), device) if distinct else None
+        shown = np.empty(0, np.int64)
+        if plan is not None:
+            tokens = math.prod(self._settings.merged_grid)
+            shown = plan.place.reshape(-1, tokens)[which].reshape(-1)
+        sent_shown = sent(torch.from_numpy(shown), device)
         return TokenBatch(
-            arrangement, sent(token_ids, device), sent(pixels, device), plan, sent(shown, device)
+            arrangement, sent(token_ids, device), sent(pixels, device), plan, sent_shown
         )
 
     @property
     def _device(self) -> torch.device:
         return self._model.device
-
-    def _shown(self, which: list[int], plan: TowerPlan | None) -> NDArray[np.int64]:
-        if plan is None:
-            return np.empty(0, np.int64)
-        rows, columns = self._settings.merged_grid
-        return plan.place.reshape(-1, rows * columns)[which].reshape(-1)
 
     def _arrangement(self, layouts: tuple[TokenLayout, ...]) -> Arrangement:
         if layouts not in self._arrangements:
@@ -141,12 +137,11 @@ class Collator:
         if layout not in self._positions:
             kinds = torch.zeros(1, layout.length, dtype=torch.int64)
             kinds[0, torch.from_numpy(layout.image_tokens())] = 1
-            grid = (1, *self._settings.grid)
-            images = len(layout.image_starts)
+            grids = [(1, *self._settings.grid)] * len(layout.image_starts)
             positions, _ = self._model.get_rope_index(
                 torch.zeros_like(kinds),
                 mm_token_type_ids=kinds,
-                image_grid_thw=torch.tensor([grid] * images) if images else None,
+                image_grid_thw=torch.tensor(grids) if grids else None,
             )
             self._positions[layout] = positions[:, 0]
         return self._positions[layout]

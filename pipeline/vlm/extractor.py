@@ -14,7 +14,7 @@ from pipeline.vlm.pooling import pool
 from pipeline.vlm.preparation import PreparedRow
 from pipeline.vlm.processor import PixelSettings
 from pipeline.vlm.slots import Slot
-from pipeline.vlm.vision import TowerPlan, VisionTower
+from pipeline.vlm.vision import VisionTower
 
 _SHAPES = 64
 """Of batches, that are compiled: sizes that are tried, times prompt lengths, times views."""
@@ -50,17 +50,15 @@ class Extractor:
         places = slots[: len(slots) // len(self._reads)]
         self._tower = VisionTower(model.visual, settings.grid)
         self._collator = Collator(model, settings, places, self._tower, static=compiled)
-        self._compiled: dict[str, Callable[..., Tensor]] = {}
+        self._compiled: tuple[Callable[..., Tensor], ...] = ()
         if compiled:
             from torch._dynamo import config  # takes a second
 
             # Past this many shapes dynamo would go on uncompiled, and hardly say so.
             config.recompile_limit = _SHAPES
             mode = "reduce-overhead" if model.device.type == "cuda" else None
-            self._compiled = {
-                part.__name__: torch.compile(part, dynamic=False, mode=mode)
-                for part in (self._see, self._read)
-            }
+            parts = (self._tower.__call__, self._read)
+            self._compiled = tuple(torch.compile(p, dynamic=False, mode=mode) for p in parts)
 
     def extract(
         self, rows: Sequence[PreparedRow]
@@ -84,7 +82,7 @@ class Extractor:
         """
         if self._compiled:
             torch.compiler.cudagraph_mark_step_begin()
-        see, read = (self._compiled.get(part.__name__, part) for part in (self._see, self._read))
+        see, read = self._compiled or (self._tower, self._read)
         places = batch.arrangement
         embedded = self.model.language_model.embed_tokens(batch.token_ids)
         if batch.plan is not None:
@@ -94,11 +92,6 @@ class Extractor:
         masks = self._masks(embedded)
         return read(embedded, places.positions, masks, places.weights, places.real)
 
-    def _see(
-        self, patches: Float[Tensor, "patch value"], plan: TowerPlan
-    ) -> Float[Tensor, "token dim"]:
-        return self._tower(patches, plan)
-
     def _masks(self, embedded: Float[Tensor, "batch token dim"]) -> Mapping[str, Tensor | None]:
         """The mask of each kind of layer; None where the kernel itself is causal.
 
@@ -106,13 +99,8 @@ class Extractor:
         only cost its memory and the fast causal kernel.
         """
         text = self.model.language_model
-        given: dict[str, Any] = {
-            "config": text.config,
-            "inputs_embeds": embedded,
-            "attention_mask": None,
-            "past_key_values": None,
-            "position_ids": None,
-        }
+        none = dict.fromkeys(("attention_mask", "past_key_values", "position_ids"))
+        given: dict[str, Any] = {"config": text.config, "inputs_embeds": embedded, **none}
         masks: dict[str, Any] = {"full_attention": create_causal_mask(**given)}
         if text.has_sliding_layers:
             masks["sliding_attention"] = create_sliding_window_causal_mask(**given)

@@ -62,10 +62,6 @@ class FeatureSpec:
     variants: int
     """How many times a row holds the slots: the frames as they are, then augmented."""
 
-    def stored_slots(self) -> list[dict[str, Any]]:
-        """The slots of a whole row, in order: of each variant where there are several."""
-        return slot_documents(self.slots, self.variants)
-
     def attrs(self) -> dict[str, Any]:
         """The document with its digest, as a store keeps it."""
         return {"digest": self.digest, **self.document}
@@ -89,6 +85,7 @@ def feature_spec(
     layer_count, dim = _model_shape(folder)
     ordered = tuple(sorted(set(views)))
     slots = slots_of(vlm, layer_count, ordered)
+    adapter = resolve_checkpoint(vlm.adapter, setting="vlm.adapter") if vlm.adapter else None
 
     def read() -> str:
         return json.dumps(_read(folder, vlm, len(ordered)))
@@ -99,7 +96,7 @@ def feature_spec(
     document = {
         "extractor_version": EXTRACTOR_VERSION,
         "weights": _files_digest(weight_files(folder), digest_file),
-        "adapter": _adapter_digest(vlm.adapter, digest_file),
+        "adapter": adapter and _files_digest(adapter_files(adapter), digest_file),
         "tokenizer": _files_digest(tokenizer_files(folder), digest_file),
         "chat_template": rendered["chat_template"],
         "prompt": vlm.prompt,
@@ -128,8 +125,8 @@ def feature_shape(vlm: VLMParams, views: Sequence[str]) -> tuple[int, int]:
         return slots, _model_shape(folder)[1]
     if folder.parent.is_dir() or not could_be_hub_id(vlm.checkpoint):
         raise VLMError(
-            f"{vlm.checkpoint}: no such folder. Expected a checkpoint's folder or a hub id, as "
-            "Qwen/Qwen2.5-VL-3B-Instruct. The demo's is written by `python -m stages.demo`."
+            f"{vlm.checkpoint}: no such folder, and no hub id. The demo's checkpoint is written by "
+            "`python -m stages.demo`."
         )
     return slots, _WIDTH_OF_3B
 
@@ -138,12 +135,11 @@ def _read(folder: Path, vlm: VLMParams, views: int) -> dict[str, Any]:
     """The entries of the document that transformers has to read."""
     from pipeline.vlm.processor import PixelSettings, PromptRenderer
 
-    pixels = PixelSettings.read(folder, (vlm.image_resize_height, vlm.image_resize_width))
     renderer = PromptRenderer(folder, vlm.prompt)
     return {
         "chat_template": renderer.chat_template,
         "example_prompt": renderer.render(_PLACEHOLDER_INSTRUCTION, views),
-        "processor": pixels.document(),
+        "processor": PixelSettings.of(vlm).document(),
     }
 
 
@@ -164,11 +160,6 @@ def _read_digest(
             "views": views,
         }
     )
-
-
-def document_digest(attrs: Mapping[str, Any]) -> str:
-    """The digest that a spec, as a store keeps it, must carry."""
-    return _digest({name: value for name, value in attrs.items() if name != "digest"})
 
 
 def row_key(spec: FeatureSpec, prompt: str, frames: Mapping[str, NDArray[np.uint8]]) -> bytes:
@@ -219,13 +210,6 @@ def _augmentation(vlm: VLMParams) -> dict[str, Any]:
         return {}
     how = {"version": AUGMENTATION_VERSION, **vlm.augmentation.model_dump()}
     return {"variants": vlm.variants, "augmentation": how}
-
-
-def _adapter_digest(adapter: str | None, digest_file: Callable[[Path], str]) -> str | None:
-    if adapter is None:
-        return None
-    folder = resolve_checkpoint(adapter, setting="vlm.adapter")
-    return _files_digest(adapter_files(folder), digest_file)
 
 
 def _files_digest(files: Sequence[Path], digest_file: Callable[[Path], str]) -> str:

@@ -15,8 +15,9 @@ from pipeline.base.digests import file_digest
 from pipeline.base.errors import CheckpointMismatch, VLMError
 from pipeline.vlm.extractor import Extractor, layers_needed
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec, live_differences
-from pipeline.vlm.loading import load_model, pixel_settings
+from pipeline.vlm.loading import load_model
 from pipeline.vlm.preparation import PreparedRow
+from pipeline.vlm.processor import PixelSettings
 from pipeline.vlm.tuning import load_adapting, load_learning, save_adapter, save_checkpoint
 
 
@@ -89,7 +90,7 @@ class LiveVLM(nn.Module):
             # Image tokens are written into the embeddings in place, which a leaf would refuse;
             # without re-entrance checkpoints need no input that requires gradients.
             inner.disable_input_require_grads()
-        extractor = Extractor(inner, pixel_settings(vlm), spec.slots)
+        extractor = Extractor(inner, PixelSettings.of(vlm), spec.slots)
         live = cls(model.to(target), extractor, spec, vlm, tuning)
         live._beyond = beyond
         return live
@@ -116,8 +117,7 @@ class LiveVLM(nn.Module):
             raise CheckpointMismatch(
                 f"{self.vlm.checkpoint}: the policy was trained on other features than this model "
                 "gives (trained -> live):\n  " + "\n  ".join(lines) + "\nLoad the model with the "
-                "vlm params and the views that the policy's store was extracted with, or train a "
-                "policy on the features of this model."
+                "vlm params and views of the policy's store, or train on this model's features."
             )
 
     def check_shape(self, slots: int, feature_dim: int) -> None:
@@ -126,8 +126,7 @@ class LiveVLM(nn.Module):
             raise VLMError(
                 f"{self.vlm.checkpoint}: gives {len(self.spec.slots)} feature slots of width "
                 f"{self.spec.dim}, but the policy was built for {slots} of width {feature_dim}. "
-                f"Build it with feature_dim={self.spec.dim} and with the views, layers and pooling "
-                "of the model."
+                f"Build it with feature_dim={self.spec.dim} and the model's views and slots."
             )
 
     def save(self, folder: Path) -> None:

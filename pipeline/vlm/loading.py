@@ -18,7 +18,6 @@ from transformers.utils import logging as transformers_logging
 from pipeline.base.config import VLMParams
 from pipeline.base.errors import VLMError
 from pipeline.vlm.checkpoint_folder import adapter_files, resolve_checkpoint, weight_files
-from pipeline.vlm.processor import PixelSettings
 from pipeline.vlm.vision import tower_attention
 
 _UNUSED = {"lm_head.weight"}
@@ -53,18 +52,12 @@ def cut(whole: Any, layers: int) -> Any:
     return whole
 
 
-def pixel_settings(vlm: VLMParams) -> PixelSettings:
-    """What the checkpoint's image processor does to a frame."""
-    folder = resolve_checkpoint(vlm.checkpoint, vlm.revision)
-    return PixelSettings.read(folder, (vlm.image_resize_height, vlm.image_resize_width))
-
-
-def environment(model: Any, device: torch.device) -> dict[str, str]:
+def environment(model: Any) -> dict[str, str]:
     """What may move a feature within its dtype's noise: backends, versions, device.
 
     Pillow is what stretches and augments frames.
     """
-    cuda = device.type == "cuda"
+    device, cuda = model.device, model.device.type == "cuda"
     return {
         "attention": str(model.language_model.config._attn_implementation),
         "vision_attention": tower_attention(model.visual),
@@ -171,15 +164,9 @@ def adapted(whole: Any, vlm: VLMParams, dropout: float | None = None) -> Any:
 
 def _refuse_strange(folder: Path, missing: set[str], unexpected: set[str], what: str) -> None:
     if missing or unexpected:
+        lacks, has = (", ".join(sorted(keys)[:4]) or "none" for keys in (missing, unexpected))
         raise VLMError(
             f"{folder}: the {what}'s weights are not those of the model that it describes: "
-            f"missing {_some(missing)}, left over {_some(unexpected)}. Expected every weight, and "
-            f"no other. Copy or download the {what} again."
+            f"missing {lacks} ({len(missing)} in all), left over {has} ({len(unexpected)} in all). "
+            f"Copy or download the {what} again."
         )
-
-
-def _some(keys: set[str]) -> str:
-    if not keys:
-        return "none"
-    shown = ", ".join(sorted(keys)[:4])
-    return shown if len(keys) <= 4 else f"{shown} and {len(keys) - 4} more"

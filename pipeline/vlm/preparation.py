@@ -59,8 +59,7 @@ class Preparer:
         self._spec = spec
         self._augmentation = vlm.augmentation
         self._renderer = PromptRenderer(folder, vlm.prompt)
-        resize = (vlm.image_resize_height, vlm.image_resize_width)
-        self._settings = PixelSettings.read(folder, resize)
+        self._settings = PixelSettings.of(vlm)
         # An episode repeats its instruction in every row.
         self._rendered = lru_cache(maxsize=4096)(self._renderer.render)
         self._tokens = lru_cache(maxsize=4096)(self._expanded_tokens)
@@ -101,7 +100,7 @@ class Preparer:
         -1 is a sample whose frames are None. Raises `VLMError` for a view that is not the spec's
         and for what is not an RGB frame.
         """
-        rows: dict[bytes, PreparedRow] = {}
+        rows: list[PreparedRow] = []
         place: dict[bytes, int] = {}
         row_of: list[int] = []
         for given, instruction in zip(images, instructions, strict=True):
@@ -110,11 +109,11 @@ class Preparer:
                 continue
             frames = {view: _as_array(frame) for view, frame in given.items()}
             key = row_key(self._spec, self.render(instruction, tuple(frames)), frames)
-            if key not in rows:
+            if key not in place:
                 place[key] = len(rows)
-                rows[key] = self.prepare(instruction, frames)
+                rows.append(self.prepare(instruction, frames))
             row_of.append(place[key])
-        return list(rows.values()), row_of
+        return rows, row_of
 
     def prepare_variants(
         self, instruction: str, frames: Mapping[str, NDArray[np.uint8]], key: bytes
@@ -124,27 +123,18 @@ class Preparer:
         `key` is the row's (`row_key`): what is drawn depends on nothing else. All have one layout.
         """
         plain = self.prepare(instruction, frames)
-        others = range(1, self._spec.variants)
-        return (plain, *(self._augmented(plain, frames, key, variant) for variant in others))
-
-    def _augmented(
-        self,
-        plain: PreparedRow,
-        frames: Mapping[str, NDArray[np.uint8]],
-        key: bytes,
-        variant: int,
-    ) -> PreparedRow:
-        """A row whose images are changed at the model's size, where they are smallest."""
-        pixels = np.empty_like(plain.pixels)
-        height, width = self._settings.image_size
-        for place, image, (view, _) in zip(
-            pixels, plain.pixels, plain.layout.image_starts, strict=True
-        ):
-            seen_height, seen_width, _ = frames[view].shape
-            widened = (width / seen_width) / (height / seen_height)
-            drawn = Augmentation.drawn(self._augmentation, key, view, variant)
-            place[:] = drawn.apply(image, widened)
-        return replace(plain, pixels=pixels)
+        rows, (height, width) = [plain], self._settings.image_size
+        for variant in range(1, self._spec.variants):
+            pixels = np.empty_like(plain.pixels)
+            for place, image, (view, _) in zip(
+                pixels, plain.pixels, plain.layout.image_starts, strict=True
+            ):
+                # Changed at the model's size, where images are smallest.
+                widened = (width / frames[view].shape[1]) / (height / frames[view].shape[0])
+                drawn = Augmentation.drawn(self._augmentation, key, view, variant)
+                place[:] = drawn.apply(image, widened)
+            rows.append(replace(plain, pixels=pixels))
+        return tuple(rows)
 
     def _ordered(self, views: Sequence[str] | Mapping[str, object]) -> tuple[str, ...]:
         unknown = sorted(set(views) - set(self._spec.views))

@@ -12,8 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from pipeline.base.config import VLMParams
 from pipeline.base.errors import VLMError
-from pipeline.vlm.checkpoint_folder import read_config, read_json, tokenizer_files
+from pipeline.vlm.checkpoint_folder import (
+    read_config,
+    read_json,
+    resolve_checkpoint,
+    tokenizer_files,
+)
 
 _QWEN_IMAGE_TOKEN_ID = 151655
 """What a Qwen2.5-VL config means when it does not say."""
@@ -109,32 +115,25 @@ class PromptRenderer:
                 )
 
     def _check_vocabulary(self, config: dict[str, Any]) -> None:
-        image_token = self._tokenizer.convert_ids_to_tokens(self.image_token_id)
-        if image_token not in self._specials:
-            raise VLMError(
-                f"{self._folder}: config.json says image_token_id {self.image_token_id}, which the "
-                f"tokenizer reads as {image_token!r}. The tokenizer belongs to another checkpoint."
-            )
-        self._image_token: str = image_token
+        self._image_token: str = self._tokenizer.convert_ids_to_tokens(self.image_token_id)
         rows = int(config.get("text_config", config).get("vocab_size", 0))
-        if len(self._tokenizer) > rows:
+        if self._image_token not in self._specials or len(self._tokenizer) > rows:
             raise VLMError(
-                f"{self._folder}: the tokenizer has {len(self._tokenizer)} tokens, the model's "
-                f"vocabulary {rows}. The tokenizer belongs to another checkpoint."
+                f"{self._folder}: the tokenizer is another checkpoint's: it reads config.json's "
+                f"image_token_id {self.image_token_id} as {self._image_token!r}, and has "
+                f"{len(self._tokenizer)} tokens of a vocabulary of {rows}"
             )
 
     def _find_chat_template(self) -> str:
-        if isinstance(self._tokenizer.chat_template, str):
-            return self._tokenizer.chat_template
-        beside = self._folder / "chat_template.json"
-        if beside.exists():
+        template, beside = self._tokenizer.chat_template, self._folder / "chat_template.json"
+        if not isinstance(template, str) and beside.exists():
             template = read_json(beside).get("chat_template")
-            if isinstance(template, str):
-                return template
-        raise VLMError(
-            f"{self._folder}: no chat template in tokenizer_config.json, chat_template.jinja or "
-            "chat_template.json. Take the file from the checkpoint's hub page."
-        )
+        if not isinstance(template, str):
+            raise VLMError(
+                f"{self._folder}: no chat template in tokenizer_config.json, chat_template.jinja "
+                "or chat_template.json. Take the file from the checkpoint's hub page."
+            )
+        return template
 
 
 @dataclass(frozen=True)
@@ -168,28 +167,30 @@ class PixelSettings:
         return {key: list(v) if isinstance(v, tuple) else v for key, v in fields.items()}
 
     @classmethod
+    def of(cls, vlm: VLMParams) -> "PixelSettings":
+        """Those of the checkpoint of `vlm` for frames of the size that it asks for."""
+        folder = resolve_checkpoint(vlm.checkpoint, vlm.revision)
+        return cls.read(folder, (vlm.image_resize_height, vlm.image_resize_width))
+
+    @classmethod
     def read(cls, folder: Path, resize: tuple[int, int]) -> "PixelSettings":
         """The settings of a checkpoint folder for frames asked for at `resize` (height, width)."""
         from transformers import AutoImageProcessor
         from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import smart_resize
 
+        config = folder / "preprocessor_config.json"
         try:
             processor: Any = AutoImageProcessor.from_pretrained(
                 folder, local_files_only=True, trust_remote_code=False
             )
         except (OSError, ValueError, KeyError, TypeError) as error:
+            raise VLMError(f"{config}: missing or cannot be read: {error}") from error
+        kind = type(processor).__name__
+        steps = (processor.do_resize, processor.do_rescale, processor.do_normalize)
+        if not kind.startswith("Qwen2VLImageProcessor") or not all(steps):
             raise VLMError(
-                f"{folder}: preprocessor_config.json is missing or cannot be read: {error}"
-            ) from error
-        if not type(processor).__name__.startswith("Qwen2VLImageProcessor"):
-            raise VLMError(
-                f"{folder / 'preprocessor_config.json'}: expected a Qwen2VLImageProcessor, found "
-                f"{type(processor).__name__}"
-            )
-        if not (processor.do_rescale and processor.do_normalize and processor.do_resize):
-            raise VLMError(
-                f"{folder / 'preprocessor_config.json'}: expected do_resize, do_rescale and "
-                "do_normalize to be true, as in every Qwen2.5-VL"
+                f"{config}: expected a Qwen2VLImageProcessor with do_resize, do_rescale and "
+                f"do_normalize, as in every Qwen2.5-VL, found a {kind} with {steps}"
             )
         try:
             image_size = smart_resize(
@@ -202,15 +203,13 @@ class PixelSettings:
             raise VLMError(
                 f"vlm.image_resize_height and _width {resize[0]} x {resize[1]}: {error}"
             ) from error
+        same = ("patch_size", "merge_size", "temporal_patch_size", "rescale_factor")
         return cls(
             resize=resize,
             image_size=image_size,
-            patch_size=processor.patch_size,
-            merge_size=processor.merge_size,
-            temporal_patch_size=processor.temporal_patch_size,
-            rescale_factor=processor.rescale_factor,
             image_mean=tuple(processor.image_mean),
             image_std=tuple(processor.image_std),
+            **{name: getattr(processor, name) for name in same},
         )
 
 

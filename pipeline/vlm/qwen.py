@@ -15,7 +15,7 @@ from pipeline.base.device import resolve_device
 from pipeline.base.errors import NumericsError, VLMError
 from pipeline.vlm.extractor import Extractor, layers_needed
 from pipeline.vlm.feature_spec import FeatureSpec
-from pipeline.vlm.loading import environment, load_model, pixel_settings
+from pipeline.vlm.loading import environment, load_model
 from pipeline.vlm.preparation import PreparedRow, TokenLayout
 from pipeline.vlm.processor import PixelSettings
 
@@ -27,21 +27,16 @@ class FrozenVLM:
     """Attention backend, library versions and device: recorded, not part of the identity."""
 
     def __init__(
-        self,
-        model: Any,
-        settings: PixelSettings,
-        spec: FeatureSpec,
-        device: torch.device,
-        compiled: bool = False,
+        self, model: Any, settings: PixelSettings, spec: FeatureSpec, compiled: bool = False
     ) -> None:
-        """Wrap an inner `Qwen2_5_VLModel` that is already on `device`."""
+        """Wrap an inner `Qwen2_5_VLModel` that is already on its device."""
         self._model = model
         self._extractor = Extractor(model, settings, spec.slots, compiled)
         self._spec = spec
         self._storage_dtype = getattr(torch, spec.document["storage_dtype"])
         self._compiled = compiled
         self._fitted: dict[TokenLayout, set[int]] = defaultdict(set)
-        self.environment = environment(model, device) | ({"compiled": "true"} if compiled else {})
+        self.environment = environment(model) | ({"compiled": "true"} if compiled else {})
 
     @classmethod
     def load(
@@ -53,9 +48,8 @@ class FrozenVLM:
         batch of a shape takes minutes and the others less time. Raises `VLMError` where the
         folder is incomplete, a weight is missing or left over, or the adapter does not fit.
         """
-        target = resolve_device(device)
-        model = load_model(vlm, layers_needed(spec.slots), target)
-        return cls(model, pixel_settings(vlm), spec, target, compile)
+        model = load_model(vlm, layers_needed(spec.slots), resolve_device(device))
+        return cls(model, PixelSettings.of(vlm), spec, compile)
 
     @property
     def device(self) -> torch.device:

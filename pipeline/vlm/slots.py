@@ -25,16 +25,8 @@ class Slot:
 
     def document(self) -> dict[str, Any]:
         """The slot as JSON-able values, without what does not apply."""
-        document: dict[str, Any] = {
-            "layer": self.layer,
-            "norm": self.norm,
-            "pooling": self.pooling,
-        }
-        if self.view is not None:
-            document["view"] = self.view
-        if self.cell is not None:
-            document["cell"] = list(self.cell)
-        return document
+        document = {name: value for name, value in vars(self).items() if value is not None}
+        return document | ({"cell": list(self.cell)} if self.cell else {})
 
 
 def slots_of(vlm: VLMParams, layers: int, views: Sequence[str]) -> tuple[Slot, ...]:
@@ -76,17 +68,10 @@ def slot_documents(slots: Sequence[Slot], variants: int) -> list[dict[str, Any]]
 
 
 def _resolved_layers(layers: Sequence[int], count: int) -> tuple[int, ...]:
-    resolved: list[int] = []
-    for layer in layers:
-        index = layer + count if layer < 0 else layer
-        if not 0 <= index < count:
-            raise VLMError(
-                f"vlm.layers: expected {-count} to {count - 1} for a model of {count} decoder "
-                f"layers, found {layer}"
-            )
-        if index in resolved:
-            raise VLMError(
-                f"vlm.layers: {layer} is layer {index}, which is there already, in {list(layers)}"
-            )
-        resolved.append(index)
-    return tuple(resolved)
+    resolved = tuple(layer + count if layer < 0 else layer for layer in layers)
+    if not set(resolved) <= set(range(count)) or len(set(resolved)) < len(resolved):
+        raise VLMError(
+            f"vlm.layers: expected {-count} to {count - 1} for a model of {count} decoder layers, "
+            f"each layer once, found {list(layers)}"
+        )
+    return resolved

@@ -46,10 +46,9 @@ def load_adapting(
         beyond = _beyond(model, layers)
     cut(whole, layers)
     model.requires_grad_(False)
+    learning = tuple(f"base_model.model.{TOWERS[tower]}" for tower in tuning.towers)
     for name, parameter in model.named_parameters():
-        parameter.requires_grad = "lora_" in name and any(
-            name.startswith(f"base_model.model.{TOWERS[tower]}") for tower in tuning.towers
-        )
+        parameter.requires_grad = "lora_" in name and name.startswith(learning)
     model.peft_config["default"].base_model_name_or_path = vlm.checkpoint
     model.peft_config["default"].revision = vlm.revision
     return model, beyond
@@ -127,16 +126,13 @@ def _targets(whole: Any, tuning: TuningParams, layers: int) -> str:
     It goes into the adapter's config, where a set of names would stand in random order.
     """
     kept = "|".join(map(str, range(layers)))
+    towers = tuple(TOWERS[tower] for tower in tuning.towers)
     patterns: dict[str, None] = {}
     for name, module in whole.named_modules():
-        if isinstance(module, nn.Linear) and name.startswith(_prefixes(tuning)):
+        if isinstance(module, nn.Linear) and name.startswith(towers):
             pattern = re.sub(r"(blocks\\\.)\d+", r"\1\\d+", re.escape(name))
             patterns[re.sub(r"(layers\\\.)\d+", rf"\1({kept})", pattern)] = None
     return "|".join(patterns)
-
-
-def _prefixes(tuning: TuningParams) -> tuple[str, ...]:
-    return tuple(TOWERS[tower] for tower in tuning.towers)
 
 
 def _check_goes_on(model: Any, vlm: VLMParams, tuning: TuningParams) -> None:

@@ -123,25 +123,26 @@ class VisionTower:
 
     def _spans(
         self, images: int, lengths: list[int], device: torch.device
-    ) -> tuple[dict[str, Any], dict[str, Any]]:
+    ) -> tuple[dict[str, Any], ...]:
         """What a block is told of windows that stand one behind the other, and of whole images."""
         patches = sum(lengths) // images
         if self._flash:
-            windows, wholes = (
+            windowed, whole = ([0, *accumulate(of)] for of in (lengths, [patches] * images))
+            return tuple(
                 {
-                    "cu_seqlens": torch.tensor([0, *accumulate(sizes)], dtype=torch.int32).to(
-                        device
-                    ),
-                    "max_seqlen": max(sizes),
+                    "cu_seqlens": torch.tensor(edges, dtype=torch.int32).to(device),
+                    "max_seqlen": max(np.diff(edges).tolist()),
                 }
-                for sizes in (lengths, [patches] * images)
+                for edges in (windowed, whole)
             )
-            return windows, wholes
         counts = tuple((count // images, length) for length, count in Counter(lengths).items())
-        told = {"cu_seqlens": None, "max_seqlen": patches}
-        return (
-            told | {"windows": PatchWindows(images, counts)},
-            told | {"windows": PatchWindows(images, counts, whole=True)},
+        return tuple(
+            {
+                "cu_seqlens": None,
+                "max_seqlen": patches,
+                "windows": PatchWindows(images, counts, whole),
+            }
+            for whole in (False, True)
         )
 
 
@@ -174,10 +175,9 @@ def _grouped_attention(
     # Patches first: windows of equal length are then one view, without a copy.
     flat = [tensor[0].transpose(0, 1) for tensor in (query, key, value)]
     group = _of_images if windows.whole else _of_windows
+    options = {"scaling": scaling, "dropout": dropout, "is_causal": False}
     attended = [
-        attend(module, *batched, attention_mask, scaling=scaling, dropout=dropout, is_causal=False)[
-            0
-        ]
+        attend(module, *batched, attention_mask, **options)[0]
         for batched in zip(*(group(tensor, windows) for tensor in flat), strict=True)
     ]
     if windows.whole:
@@ -206,9 +206,5 @@ def _of_images(tensor: Float[Tensor, "patch head dim"], windows: PatchWindows) -
 _GROUPED = {"sdpa": "grouped_flash_sdpa", "eager": "grouped_flash_eager"}
 """A name has to hold "flash" for transformers to leave windows together."""
 
-AttentionInterface.register(
-    _GROUPED["sdpa"], partial(_grouped_attention, attend=sdpa_attention_forward)
-)
-AttentionInterface.register(
-    _GROUPED["eager"], partial(_grouped_attention, attend=eager_attention_forward)
-)
+for _kind, _attend in (("sdpa", sdpa_attention_forward), ("eager", eager_attention_forward)):
+    AttentionInterface.register(_GROUPED[_kind], partial(_grouped_attention, attend=_attend))

@@ -53,10 +53,10 @@ class TestShares:
     @pytest.mark.parametrize(
         ("weights", "batch_size", "said"),
         [
-            ({"old": -1.0}, 7, r"weights: .*from 0, found \{'old': -1\.0\}"),
-            ({"old": float("nan")}, 7, "weights: .*finite"),
-            ({"older": 1.0}, 7, "weights: .*old, new, found older"),
-            ({}, 0, "batch_size: expected 1 or more items, found 0"),
+            ({"old": -1.0}, 7, r"weights \{'old': -1\.0\}"),
+            ({"old": float("nan")}, 7, "finite"),
+            ({"older": 1.0}, 7, r"items \{'old': 3, 'new': 6\}, weights \{'older'"),
+            ({}, 0, "batch_size from 1.*found batch_size 0"),
         ],
     )
     def test_what_cannot_be_drawn_is_said_in_the_words_of_the_caller(
@@ -115,7 +115,7 @@ class TestLoader:
                 assert batch.tick.tolist() == loader.dataset.ticks[items].tolist()
 
     def test_a_negative_weight_is_refused(self, extracted: FeatureStore) -> None:
-        with pytest.raises(ConfigError, match=r"weights: .*'new': -3"):
+        with pytest.raises(ConfigError, match=r"weights .*'new': -3"):
             create_unified_dataloader(store=extracted, new_weight=-3.0)
 
     def test_draws_old_and_new_recordings_1_to_3(self, loader: Any) -> None:

@@ -237,9 +237,9 @@ class TestStore:
     @pytest.mark.parametrize(
         ("settings", "said"),
         [
-            ({"vlm_reuse_count": 5}, "vlm_reuse_count: expected 5, found 3"),
-            ({"action_hz": None}, "action_hz: expected None, found 10"),
-            ({"action_rotation": "euler_delta"}, "expected euler_delta, found rotvec"),
+            ({"vlm_reuse_count": 5}, "vlm_reuse_count: 5 expected, found 3"),
+            ({"action_hz": None}, "action_hz: null expected, found 10"),
+            ({"action_rotation": "euler_delta"}, '"euler_delta" expected, found "rotvec"'),
             ({"format": "lerobot"}, "'lerobot', found new, old"),
         ],
     )

@@ -16,7 +16,6 @@ from pipeline.policy.checkpoint import (
     find_policy,
     load_policy,
     save_policy,
-    source_differences,
 )
 from pipeline.policy.policy import Policy
 from pipeline.store import FeatureStore
@@ -119,7 +118,7 @@ def test_a_folder_or_a_run_is_found(checkpoint: PolicyCheckpoint, tmp_path: Path
         ({"shape": None}, "not what a checkpoint's description must be"),
         ({"held_out_ticks": {"left/a": 3}}, "not what a checkpoint's description must be"),
         ({"params": {"train_head": {"model_type": "oracle"}}}, "model_type"),
-        ({"normalization": {}}, "statistics of `action`"),
+        ({"normalization": {}}, "std and count of `action`"),
     ],
 )
 def test_a_description_that_is_none_is_named(
@@ -154,27 +153,14 @@ def test_an_altered_description_is_refused(
         load_policy(tmp_path / "best")
 
 
-def test_a_description_of_before_digests_is_taken_and_told(
-    checkpoint: PolicyCheckpoint, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    save_policy(tmp_path / "best", checkpoint)
-    path = tmp_path / "best/policy.json"
-    write_document(path, read_document(path))
-    for _ in range(2):
-        assert load_policy(tmp_path / "best").step == checkpoint.step
-    (line,) = capsys.readouterr().err.splitlines()
-    assert f"{path}: it has no document_sha256" in line
-
-
-def test_a_policy_that_was_trained_from_an_archive_is_taken(
+def test_a_description_without_its_digest_is_refused(
     checkpoint: PolicyCheckpoint, tmp_path: Path
 ) -> None:
     save_policy(tmp_path / "best", checkpoint)
     path = tmp_path / "best/policy.json"
-    document = read_document(path)
-    document["params"]["train_head"] |= {"feed": "compressed", "scratch": None}
-    write_with_digest(path, document)
-    assert load_policy(tmp_path / "best").params == checkpoint.params
+    write_document(path, read_document(path))
+    with pytest.raises(CheckpointIncomplete, match=r"policy\.json: .*no document_sha256"):
+        load_policy(tmp_path / "best")
 
 
 def test_weights_of_another_policy_are_refused(
@@ -194,13 +180,3 @@ def test_missing_weights_are_named(checkpoint: PolicyCheckpoint, tmp_path: Path)
     (tmp_path / "best/policy.safetensors").unlink()
     with pytest.raises(CheckpointIncomplete, match=r"policy\.safetensors.*no such file"):
         load_policy(tmp_path / "best")
-
-
-def test_specs_of_one_digest_are_the_same_whatever_else_they_say() -> None:
-    base = {"streams": {}, "action_hz": None, "vlm_reuse_count": 3}
-    one = base | {"feature_spec": {"digest": "a", "prompt": "x"}}
-    assert source_differences(one, base | {"feature_spec": {"digest": "a", "shown": 1}}) == {}
-    other = source_differences(one, base | {"feature_spec": {"digest": "b", "prompt": "y"}})
-    assert other == {"feature_spec.prompt": ("x", "y")}
-    only_digest = source_differences(one, base | {"feature_spec": {"digest": "b", "prompt": "x"}})
-    assert only_digest == {"feature_spec.digest": ("a", "b")}

@@ -137,7 +137,9 @@ class TestGates:
         self, fusion: GatedFusion, encoded: dict[str, Tensor]
     ) -> None:
         for scale in (1.0, 1e4):
-            gates = fusion.gates({name: scale * tokens for name, tokens in encoded.items()})
+            gates = fusion.gates(
+                fusion.vectors({name: scale * tokens for name, tokens in encoded.items()})
+            )
             assert list(gates) == list(SHAPES)
             for gate in gates.values():
                 assert gate.shape == (3, DIM)
@@ -147,9 +149,9 @@ class TestGates:
     def test_each_depends_on_every_stream(
         self, fusion: GatedFusion, encoded: dict[str, Tensor]
     ) -> None:
-        before = fusion.gates(encoded)
+        before = fusion.gates(fusion.vectors(encoded))
         for name, tokens in encoded.items():
-            after = fusion.gates(encoded | {name: torch.randn_like(tokens)})
+            after = fusion.gates(fusion.vectors(encoded | {name: torch.randn_like(tokens)}))
             assert all((after[gate] - before[gate]).abs().max() > 1e-3 for gate in SHAPES)
 
     def test_a_closed_gate_shuts_its_stream_out(
@@ -170,7 +172,7 @@ class TestGates:
         seen = []
         fusion.read_out.register_forward_pre_hook(lambda _, args: seen.append(args[0]))
         fusion(encoded)
-        x, gates = fusion.vectors(encoded), fusion.gates(encoded)
+        x, gates = fusion.vectors(encoded), fusion.gates(fusion.vectors(encoded))
         expected = sum(gates[name] * fusion.content[name](x[name]).tanh() for name in SHAPES)
         torch.testing.assert_close(seen[0], expected)
 

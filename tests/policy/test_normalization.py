@@ -28,7 +28,7 @@ def test_large_blocks_are_taken_in_pieces(monkeypatch: pytest.MonkeyPatch) -> No
     fitted = fit_channels([values], "features")
     np.testing.assert_allclose(fitted.std, values.astype(np.float64).std(axis=0), rtol=1e-9)
     values[77, 1, 2] = np.nan
-    with pytest.raises(NumericsError, match="row 77, channel 1, 2"):
+    with pytest.raises(NumericsError, match=r"found nan in channel \[1, 2\]"):
         fit_channels([values], "features")
 
 
@@ -56,19 +56,19 @@ def test_a_slot_that_is_never_valid_is_left_as_it_is() -> None:
 def test_bad_numbers_are_named(value: float) -> None:
     good, bad = np.zeros((10, 2), np.float32), np.zeros((10, 2), np.float32)
     bad[4, 1] = value
-    with pytest.raises(NumericsError, match=r"force trace: .* in row 14, channel 'torque'"):
-        fit_channels([good, bad], "force trace", ["force", "torque"])
+    with pytest.raises(NumericsError, match=r"force trace: .* in channel \[1\]"):
+        fit_channels([good, bad], "force trace")
 
 
 def test_float16_infinity_is_named() -> None:
     with np.errstate(over="ignore"):
         stored = np.array([[1.0], [7e4]]).astype(np.float16)
-    with pytest.raises(NumericsError, match="found inf in row 1, channel 0"):
+    with pytest.raises(NumericsError, match=r"found inf in channel \[0\]"):
         fit_channels([stored], "sensor")
 
 
 def test_overflow_is_named() -> None:
-    with pytest.raises(NumericsError, match="variance overflows"):
+    with pytest.raises(NumericsError, match="too large to square"):
         fit_channels([np.array([[1e300], [-1e300]])], "sensor")
 
 

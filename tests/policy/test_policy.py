@@ -1,4 +1,3 @@
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -12,7 +11,7 @@ from pipeline.policy.cost import describe_cost, flop_table
 from pipeline.policy.normalization import Normalization
 from pipeline.policy.observation import PolicyShape, action_groups
 from pipeline.policy.policy import Policy, Trainable, drop_streams
-from pipeline.policy.sensor_encoder import SensorEncoder
+from pipeline.policy.window_encoders import SensorEncoder
 
 BuildPolicy = Callable[..., Policy]
 Observe = Callable[..., Any]
@@ -282,12 +281,6 @@ def test_statistics_of_another_shape_are_refused(
         Policy(small_params(), wider, normalization)
     with pytest.raises(CheckpointMismatch, match=r"state: .* found None"):
         Policy(small_params(), shape, replace(normalization, state=None))
-
-
-def test_shape_survives_json(shape: PolicyShape) -> None:
-    assert PolicyShape.from_document(json.loads(json.dumps(shape.document()))) == shape
-    with pytest.raises(CheckpointMismatch, match="policy shape"):
-        PolicyShape.from_document({"slots": 3})
 
 
 def test_action_groups_go_by_name_and_unit() -> None:

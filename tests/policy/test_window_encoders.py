@@ -8,13 +8,13 @@ from torch import Tensor, nn
 
 from pipeline.base.errors import ConfigError
 from pipeline.policy.attention import right_aligned
-from pipeline.policy.sensor_encoder import (
+from pipeline.policy.window_encoders import (
     ForceAwareSensorEncoder,
     HalvingBlock,
+    RobotStateEncoder,
     SensorEncoder,
     resampled,
 )
-from pipeline.policy.state_encoder import RobotStateEncoder
 
 CHANNELS, WINDOW, OUTPUT = 9, 13, 24
 ENCODERS: dict[str, Callable[[], nn.Module]] = {

@@ -104,13 +104,12 @@ def test_variants_are_named_only_where_there_are_several(
         "compute_dtype",
         "storage_dtype",
     }
-    assert one.stored_slots() == [{"layer": 3, "norm": True, "pooling": "mean"}]
+    assert one.document["slots"] == [{"layer": 3, "norm": True, "pooling": "mean"}]
     three = spec_of(variants=3, pooling=["mean", "last"], augmentation={"crop": 0.8})
     assert three.slots == spec_of(pooling=["mean", "last"]).slots, "those of one variant"
-    assert [(slot["variant"], slot["pooling"]) for slot in three.stored_slots()] == [
+    assert [(slot["variant"], slot["pooling"]) for slot in three.document["slots"]] == [
         (variant, pooling) for variant in range(3) for pooling in ("mean", "last")
     ]
-    assert three.document["slots"] == three.stored_slots()
     assert three.document["variants"] == 3
     assert three.document["augmentation"] == {
         "version": 1,
@@ -270,9 +269,9 @@ def test_row_key_moves_with_spec_prompt_pixels_shape_and_view(
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"layers": [4]}, "expected -4 to 3 for a model of 4 decoder layers, found 4"),
-        ({"layers": [-5]}, "found -5"),
-        ({"layers": [-1, 3]}, "3 is layer 3, which is there already"),
+        ({"layers": [4]}, r"expected -4 to 3 for a model of 4 decoder layers, .*found \[4\]"),
+        ({"layers": [-5]}, r"found \[-5\]"),
+        ({"layers": [-1, 3]}, r"each layer once, found \[-1, 3\]"),
         ({"pooling": ["mean", "mean"]}, r"vlm\.pooling: each may stand once"),
         ({"norms": [True, True]}, r"vlm\.norms: each may stand once"),
         ({"checkpoint": "./nowhere"}, r"vlm\.checkpoint ./nowhere: no such folder"),

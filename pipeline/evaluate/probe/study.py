@@ -145,7 +145,7 @@ def probe(store: FeatureStore, params: ProbeParams) -> ProbeStudy:
 def _targets(store: FeatureStore, folds: ProbeFolds, horizon: int) -> Inputs:
     """The action chunk (step x channel) at each tick, standardised over the whole store."""
     action = store.array("tick/action")
-    statistics = fit_channels([action], "actions", store.streams["action"]["names"])
+    statistics = fit_channels([action], "actions")
     chunks = action[folds.ticks[:, None] + np.arange(horizon)].astype(np.float64)
     return ((chunks - statistics.mean) / statistics.scale).reshape(len(chunks), -1)
 

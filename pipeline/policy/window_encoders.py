@@ -1,4 +1,8 @@
-"""Encoder of the high-rate sensor window: residual stride-2 convolutions, then a transformer."""
+"""Encoders of the windows of readings, each one vector: of the sensor's and of the robot's state.
+
+The high-rate sensor goes through residual stride-2 convolutions, the state through strided patches;
+then each through a transformer.
+"""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -43,12 +47,49 @@ class HalvingBlock(nn.Module):
         return (halved + branch).masked_fill(absent, 0.0), valid
 
 
-class SensorEncoder(nn.Module):
+class WindowEncoder(nn.Module):
+    """What the encoders of a window share: a transformer over its tokens, and their mean.
+
+    Windows are right-aligned: the last `valid[i]` readings of row i are real, the rest is padding
+    that never reaches the output. Where `valid[i]` is 0 the output is a learned embedding.
+    """
+
+    def build_layers(
+        self, tokens: int, dim: int, layers: int, heads: int, expansion: int, output_dim: int
+    ) -> None:
+        """Draw the weights behind the tokens, after those that make them."""
+        self.position = learned(tokens, dim)
+        self.layers = nn.ModuleList(TransformerLayer(dim, heads, expansion) for _ in range(layers))
+        self.norm = nn.LayerNorm(dim)
+        self.project = nn.Linear(dim, output_dim)
+        self.missing = learned(output_dim)
+
+    def summarize(
+        self,
+        tokens: Float[Tensor, "batch token dim"],
+        present: Bool[Tensor, "batch token"],
+        valid: Int[Tensor, " batch"],
+    ) -> Float[Tensor, "batch output"]:
+        """The vector of a window from its tokens, of which those `present` stand on a reading."""
+        missing = (valid == 0).unsqueeze(-1)
+        tokens = tokens + self.position
+        # A row without any reading attends to zeros: softmax over nothing is NaN on some devices.
+        attended = present | missing
+        for layer in self.layers:
+            tokens = layer(tokens, attended)
+        encoded = self.project(masked_mean(self.norm(tokens), present))
+        return torch.where(missing, self.missing.to(encoded.dtype), encoded)
+
+
+def all_valid(values: Float[Tensor, "batch window channel"]) -> Int[Tensor, " batch"]:
+    """As many valid readings in each row as its window is long."""
+    return torch.full((len(values),), values.shape[1], device=values.device)
+
+
+class SensorEncoder(WindowEncoder):
     """One vector for a window of normalised readings, whatever its channels are.
 
-    Shapes (batch, window, channel) -> (batch, output_dim). Windows are right-aligned: the last
-    `valid[i]` of row i are readings, the rest is padding that never reaches the output. Where
-    `valid[i]` is 0 the output is a learned embedding.
+    Shapes (batch, window, channel) -> (batch, output_dim).
     """
 
     def __init__(
@@ -67,12 +108,7 @@ class SensorEncoder(nn.Module):
         tokens = window
         for _ in channels:
             tokens = (tokens + 1) // 2
-        dim = widths[-1]
-        self.position = learned(tokens, dim)
-        self.layers = nn.ModuleList(TransformerLayer(dim, heads, 2) for _ in range(layers))
-        self.norm = nn.LayerNorm(dim)
-        self.project = nn.Linear(dim, output_dim)
-        self.missing = learned(output_dim)
+        self.build_layers(tokens, widths[-1], layers, heads, 2, output_dim)
 
     def forward(
         self,
@@ -80,23 +116,14 @@ class SensorEncoder(nn.Module):
         valid: Int[Tensor, " batch"] | None = None,
     ) -> Float[Tensor, "batch output"]:
         """Encode; `valid` None means that every reading is real."""
-        batch, length, _ = values.shape
-        if valid is None:
-            valid = torch.full((batch,), length, device=values.device)
-        mask = right_aligned(valid, length)
-        if length != self.window:
+        valid = all_valid(values) if valid is None else valid
+        mask = right_aligned(valid, values.shape[1])
+        if values.shape[1] != self.window:
             values, mask = resampled(values, mask, self.window)
         values, mask = silenced(values, mask)
         for block in self.blocks:
             values, mask = block(values, mask)
-        missing = (valid == 0).unsqueeze(-1)
-        # A row without any reading attends to zeros: softmax over nothing is NaN on some devices.
-        attended = mask | missing
-        tokens = values + self.position
-        for layer in self.layers:
-            tokens = layer(tokens, attended)
-        encoded = self.project(masked_mean(self.norm(tokens), mask))
-        return torch.where(missing, self.missing.to(encoded.dtype), encoded)
+        return self.summarize(values, mask, valid)
 
 
 class ForceAwareSensorEncoder(nn.Module):
@@ -139,6 +166,43 @@ class ForceAwareSensorEncoder(nn.Module):
         """Encode; `valid` None means that every reading is real."""
         force, scan = values[..., :1], values[..., 1:]
         return torch.cat([self.force(force, valid), self.scan(scan, valid)], dim=-1)
+
+
+class RobotStateEncoder(WindowEncoder):
+    """One vector for a window of normalised robot states (6 joints and a pose: 12 wide).
+
+    Shapes (batch, window, dim) -> (batch, output_dim). `patch` readings make one token (10 at
+    100 Hz are one 10 Hz tick), which costs a tenth of a token a reading; each patch is told which
+    of its readings are real.
+    """
+
+    def __init__(
+        self,
+        state_dim: int = 12,
+        window: int = 100,
+        dim: int = 256,
+        layers: int = 2,
+        heads: int = 8,
+        output_dim: int = 512,
+        patch: int = 10,
+    ) -> None:
+        super().__init__()
+        self.patch = patch
+        self.embed = nn.Linear(patch * (state_dim + 1), dim)
+        self.build_layers(-(-window // patch), dim, layers, heads, 4, output_dim)
+
+    def forward(
+        self, values: Float[Tensor, "batch window dim"], valid: Int[Tensor, " batch"] | None = None
+    ) -> Float[Tensor, "batch output"]:
+        """Encode; `valid` None means that every reading is real."""
+        valid = all_valid(values) if valid is None else valid
+        short = -values.shape[1] % self.patch
+        mask = right_aligned(valid, values.shape[1] + short).unsqueeze(-1)
+        values = F.pad(values, (0, 0, short, 0)).masked_fill(~mask, 0.0)
+        values = torch.cat([values, mask.to(values.dtype)], dim=-1)
+        present = mask.squeeze(-1).unflatten(1, (-1, self.patch)).any(dim=-1)
+        tokens = self.embed(values.unflatten(1, (-1, self.patch)).flatten(2))
+        return self.summarize(tokens, present, valid)
 
 
 def silenced(
