@@ -338,7 +338,7 @@ def _spec(held: StoreContents) -> str:
         if entries.get(name)
     ]
     sensor = held.specs["sensor/values"].dtype.name
-    stored = f"{slots} slots x {dim} in {features.stored_dtype}"
+    stored = f"{slots} slots x {dim} in {features.attributes.get('dtype', features.dtype.name)}"
     return ", ".join([stored, f"sensor in {sensor}", *words])
 
 

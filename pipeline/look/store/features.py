@@ -26,7 +26,7 @@ from pipeline.look.page.style import GRID, PALETTE, canvas, draw_map
 from pipeline.look.store.channels import evenly
 from pipeline.look.store.episodes import EpisodeCoverage, mark_sources
 from pipeline.store import FEATURES, FeatureStore, place
-from pipeline.store.integrity.verification import CHANGED, UNWRITTEN, judge_rows
+from pipeline.store.chunks import row_checksums
 from pipeline.store.repair_hints import mend
 
 DEAD = 1e-3
@@ -90,10 +90,9 @@ def sample_rows(store: FeatureStore, most: int) -> SampledRows:
 
 def check_rows(store: FeatureStore, rows: NDArray[np.int64]) -> None:
     """Raise `StoreIncomplete` where one of these VL rows does not give its checksum."""
-    arrays = [store.array(name) for name in (FEATURES, "vl/checksum", "vl/slot_valid")]
-    for block in _blocks(rows, arrays[0][:1].nbytes):
-        faults = judge_rows(*(array[block] for array in arrays))
-        bad = block[faults[CHANGED] | faults[UNWRITTEN]]
+    features, checksums = store.array(FEATURES), store.array("vl/checksum")
+    for block in _blocks(rows, features[:1].nbytes):
+        bad = block[row_checksums(features[block]) != checksums[block]]
         if len(bad):
             raise StoreIncomplete(
                 f"{store.path}: expected features that give their checksum, found {len(bad)} VL "
