@@ -182,8 +182,16 @@ def is_ledger(path: Path) -> bool:
             header = file.read(100)
     except OSError:
         return True
-    sqlite = header.startswith(b"SQLite format 3\0")
-    return not header or (sqlite and int.from_bytes(header[68:72], "big") == _APPLICATION)
+    if not header.startswith(b"SQLite format 3\0"):
+        return not header
+    if application := int.from_bytes(header[68:72], "big"):
+        return application == _APPLICATION
+    try:  # of an earlier version, which left no application's id
+        with closing(_immutable(path)) as file:
+            made = {row[0] for row in file.execute("SELECT sql FROM sqlite_master")}
+    except sqlite3.DatabaseError:
+        return True
+    return not made or any("TABLE file (path TEXT" in str(text) for text in made)
 
 
 def _refuse_foreign(ledger: Path) -> None:

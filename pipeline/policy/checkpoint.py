@@ -6,9 +6,11 @@ and units, the normalisation, the params and the ids of the episodes it has neve
 A kill at any instant leaves the previous checkpoint or the new one.
 """
 
+import sys
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +18,6 @@ from pipeline.base.config import TrainHeadParams
 from pipeline.base.durable import (
     DIGEST,
     check_digest,
-    damaged,
     read_tensors,
     read_with_digest,
     replace_folder,
@@ -37,6 +38,8 @@ if TYPE_CHECKING:
 
 FORMAT = 2
 WEIGHTS, DOCUMENT = "policy.safetensors", "policy.json"
+_OF_THE_RUN = ("feed", "loggers", "scratch")
+"""Params of a run that tell nothing of its policy; earlier versions had others of them."""
 CHECKPOINT = OutputKind("a checkpoint of a policy", lambda folder: (folder / DOCUMENT).is_file())
 SOURCE_KEYS = ("feature_spec", "streams", "action_hz", "vlm_reuse_count")
 
@@ -106,6 +109,16 @@ def save_policy(
     replace_folder(folder, write, CHECKPOINT)
 
 
+@cache
+def _note_without_digest(path: Path) -> None:
+    """Say it once in a process: a checkpoint is read several times."""
+    print(
+        f"{path}: it has no {DIGEST}, for an earlier version wrote it, so that nobody can tell "
+        "whether it was altered; it is taken as it is. Train it again to have it checked.",
+        file=sys.stderr,
+    )
+
+
 def find_policy(path: Path) -> Path:
     """The checkpoint folder that `path` means: itself, or the best of a training's output.
 
@@ -133,7 +146,7 @@ def load_policy(folder: Path) -> PolicyCheckpoint:
     with _description(folder) as document:
         shape = PolicyShape(**document["shape"])
         return PolicyCheckpoint(
-            params=TrainHeadParams.model_validate(document["params"]["train_head"]),
+            params=_params(document),
             shape=replace(shape, action_groups=tuple(shape.action_groups)),
             normalization=Normalization.from_document(document["normalization"]),
             source={key: document[key] for key in SOURCE_KEYS},
@@ -156,7 +169,14 @@ def check_policy(folder: Path) -> TrainHeadParams:
     with _description(folder) as document:
         check_digest(folder / WEIGHTS, document["weights_sha256"])
         Normalization.from_document(document["normalization"])
-        return TrainHeadParams.model_validate(document["params"]["train_head"])
+        return _params(document)
+
+
+def _params(document: Mapping[str, Any]) -> TrainHeadParams:
+    given: Mapping[str, Any] = document["params"]["train_head"]
+    return TrainHeadParams.model_validate(
+        {name: value for name, value in given.items() if name not in _OF_THE_RUN}
+    )
 
 
 @contextmanager
@@ -165,7 +185,7 @@ def _description(folder: Path) -> Generator[dict[str, Any]]:
     path = folder / DOCUMENT
     document, has_digest = read_with_digest(path)
     if not has_digest:
-        raise CheckpointIncomplete(damaged(path, f"it carries no {DIGEST}"))
+        _note_without_digest(path)
     if document.get("format") != FORMAT:
         raise CheckpointMismatch(
             f"{path}: expected format {FORMAT}, found {document.get('format')!r}. "

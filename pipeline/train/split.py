@@ -228,16 +228,22 @@ def find_held_out(
             "was trained with train_head.val_fraction 0. Train with a fraction above 0."
         )
     by_name = {episode_name(episode): episode for episode in store.episodes}
-    renamed = {e.content: e for name, e in by_name.items() if contents.get(name) != e.content}
+    renamed: dict[str, list[Episode]] = {}
+    for name, episode in by_name.items():
+        if contents.get(name) != episode.content:
+            renamed.setdefault(episode.content, []).append(episode)
     held_out: list[tuple[Episode, tuple[int, int]]] = []
     wrong: list[str] = []
     for name, (first, stop) in ranges.items():
-        episode = renamed.get(contents[name]) or by_name.get(name)
+        episode, content = by_name.get(name), contents.get(name)
+        same = episode is not None and episode.content == content
+        if not same and (elsewhere := renamed.get(content or "")):
+            episode = elsewhere.pop()
         if episode is None:
             wrong.append(f"{name} is missing")
         elif len(episode.ticks) < stop:
             wrong.append(f"{name} is shorter")
-        elif episode.content != contents[name]:
+        elif episode.content != content:
             wrong.append(f"{name} is another recording, or the same one read otherwise since")
         else:
             held_out.append((episode, (first, stop)))

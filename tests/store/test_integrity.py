@@ -313,9 +313,9 @@ class TestStructure:
             check_trailers(store)
 
     def test_metadata_without_a_digest(self, store):
+        """As earlier versions wrote them."""
         edit(store / "zarr.json", lambda document: document["attributes"].pop("metadata_digest"))
-        (line,) = checked(store).lines()
-        assert "expected their digest None" in line
+        assert checked(store).sound
 
     @pytest.mark.parametrize(
         ("text", "said"),
