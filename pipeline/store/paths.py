@@ -77,7 +77,10 @@ def read_attributes(root: Path) -> dict[str, Any]:
         if part.exists():
             found = f"only the unfinished build {part}"
         elif there(root):
-            found = f"{described(root)}: name another place"
+            raise StoreIncomplete(
+                f"{root}: expected what this project wrote, found {described(root)}. It was left "
+                "as it is: name another place."
+            )
         target = root.with_name(root.name.removesuffix(".part").removesuffix(".repair"))
         raise StoreIncomplete(
             f"{root}: no finished store ({found}). Run {extract_command(target)}."

@@ -11,11 +11,13 @@ from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from pipeline.base.config import ProbeParams
+from pipeline.base.errors import NumericsError
+from pipeline.base.finite import first_non_finite
 from pipeline.evaluate.probe.folds import ProbeFolds, fold_by_recording
 from pipeline.evaluate.probe.inputs import Inputs, SlotName, read_slots, summarize
 from pipeline.evaluate.probe.ridge import ProbeScore, cross_validate, standard_error
 from pipeline.policy.normalization import fit_channels
-from pipeline.store import FeatureStore
+from pipeline.store import FeatureStore, place
 
 _ROUNDING = 1e-9
 """A gain below this is none."""
@@ -145,6 +147,12 @@ def probe(store: FeatureStore, params: ProbeParams) -> ProbeStudy:
 def _targets(store: FeatureStore, folds: ProbeFolds, horizon: int) -> Inputs:
     """The action chunk (step x channel) at each tick, standardised over the whole store."""
     action = store.array("tick/action")
+    if bad := first_non_finite(action):
+        raise NumericsError(
+            f"actions: expected finite numbers, found {action[bad]} at "
+            f"{place(store, 'tick', bad[0])}, channel {store.streams['action']['names'][bad[1]]!r}. Mend the recording and run "
+            "stages.extract again."
+        )
     statistics = fit_channels([action], "actions")
     chunks = action[folds.ticks[:, None] + np.arange(horizon)].astype(np.float64)
     return ((chunks - statistics.mean) / statistics.scale).reshape(len(chunks), -1)
