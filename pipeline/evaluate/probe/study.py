@@ -148,9 +148,10 @@ def _targets(store: FeatureStore, folds: ProbeFolds, horizon: int) -> Inputs:
     """The action chunk (step x channel) at each tick, standardised over the whole store."""
     action = store.array("tick/action")
     if bad := first_non_finite(action):
+        name = store.streams["action"]["names"][bad[1]]
         raise NumericsError(
             f"actions: expected finite numbers, found {action[bad]} at "
-            f"{place(store, 'tick', bad[0])}, channel {store.streams['action']['names'][bad[1]]!r}. Mend the recording and run "
+            f"{place(store, 'tick', bad[0])}, channel {name!r}. Mend the recording and run "
             "stages.extract again."
         )
     statistics = fit_channels([action], "actions")
