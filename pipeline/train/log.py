@@ -192,9 +192,10 @@ class WandB:
                 "later), or take wandb out of train_head.loggers."
             ) from None
         self._from = self._run.starting_step
-        self.note = f"live: {self._run.url}"
-        if self._run.offline:
+        if self._run.offline:  # where it warns of whoever asks for the address
             self.note = f"wandb is offline; wandb sync {self._run.settings.sync_dir} sends the run"
+        else:
+            self.note = f"live: {self._run.url}"
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
         """Send a point of each, unless it is there from before a stop."""

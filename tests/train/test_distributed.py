@@ -247,7 +247,7 @@ def test_two_processes_follow_the_curve_of_one_that_accumulates(
         "early_stopping": 1,
         "ema_decay": 0.0,
         "drop_sensor": 0.3,
-        "loggers": ["report", "tensorboard"],
+        "loggers": ["tensorboard"],
     }
     together = write("together", grad_accumulation=2, **chosen)
     process = torchrun(script, json.dumps(case(together)))
