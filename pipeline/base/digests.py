@@ -19,9 +19,7 @@ from pipeline.base.errors import (
     RecordingError,
     StoreLocked,
 )
-from pipeline.base.ownership import described
-
-LEDGER_SUFFIX = ".files.sqlite"
+from pipeline.base.ownership import LEDGER_SUFFIX, described
 
 _APPLICATION = 0x564C4146
 """SQLite's `application_id` of a ledger, in its header at bytes 68 to 71, big-endian."""

@@ -15,6 +15,9 @@ from pipeline.base.errors import ConfigError
 
 MARKER = ".vla-feature-cache"
 
+LEDGER_SUFFIX = ".files.sqlite"
+"""How the name of a store's ledger of file digests ends (`pipeline.base.digests`)."""
+
 _SPEED = "step\tsteps_per_s\tdata_wait_share\t"
 """How the speed begins that a training writes beside its logs (`pipeline.train.log`)."""
 
@@ -119,7 +122,7 @@ def begins_with(line: str) -> Callable[[Path], bool]:
 
 def _is_report(folder: Path) -> bool:
     """Whether a command that shows something wrote this folder, or has begun to."""
-    if any((folder / sign).exists() for sign in (".report.html.new", ".files.sqlite")):
+    if any((folder / sign).exists() for sign in (".report.html.new", LEDGER_SUFFIX)):
         return True
     if (folder / "judged.json").is_file() or _has_speed(folder):
         return True
@@ -161,4 +164,6 @@ def described(path: Path) -> str:
     if not path.is_dir():
         return "a file" if path.exists() else "a link to nothing"
     names = sorted(entry.name for entry in path.iterdir())
+    if not names:
+        return "an empty folder"
     return f"a folder with {', '.join(names[:3])}{' …' if len(names) > 3 else ''}"

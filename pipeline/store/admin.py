@@ -19,11 +19,11 @@ from typing import Any, Literal
 import numpy as np
 import zarr
 
-from pipeline.base.digests import LEDGER_SUFFIX, is_ledger
+from pipeline.base.digests import is_ledger
 from pipeline.base.durable import HELD, KEPT
 from pipeline.base.errors import ConfigError, PipelineError, StoreIncomplete, StoreLocked
 from pipeline.base.format import size
-from pipeline.base.ownership import OutputKind, remove_folder
+from pipeline.base.ownership import LEDGER_SUFFIX, OutputKind, remove_folder
 from pipeline.base.table import Table
 from pipeline.store.archive import ARCHIVE, is_archive, read_manifest
 from pipeline.store.chunks import read_rows

@@ -78,8 +78,8 @@ def read_attributes(root: Path) -> dict[str, Any]:
             found = f"only the unfinished build {part}"
         elif there(root):
             raise StoreIncomplete(
-                f"{root}: expected what this project wrote, found {described(root)}. It was left "
-                "as it is: name another place."
+                f"{root}: no finished store, found {described(root)}. It was left as it is: name "
+                "another place."
             )
         target = root.with_name(root.name.removesuffix(".part").removesuffix(".repair"))
         raise StoreIncomplete(
