@@ -1,10 +1,11 @@
-"""The arm that carries the needle: its pose convention and a stand-in for its joints.
+"""The arm that carries the needle: its pose convention, how it moves, a stand-in for its joints.
 
 A pose is x y z of the needle's tip in mm and a b r in degrees, both in the base frame, with the
 rotation R = Rx(a)·Ry(b)·Rz(r) (mobile XYZ). The needle points down (-z) when the arm is upright.
 """
 
-from typing import Literal
+from dataclasses import dataclass
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,3 +84,56 @@ def euler_actions(poses: NDArray[np.float64]) -> NDArray[np.float32]:
     steps = np.diff(poses, axis=0)
     steps[:, 3:] = wrapped_deg(steps[:, 3:])
     return np.column_stack([steps, np.ones(len(steps))]).astype(np.float32)
+
+
+LAG_S: Final = 0.04
+"""Time constant with which the arm follows its controller's reference."""
+_SPEED: Final = np.array([12.0, 30.0])
+"""Limits of translation, mm/s, and of each angle, deg/s."""
+_ACCELERATION: Final = np.array([120.0, 300.0])
+"""Limits of the same, mm/s² and deg/s²."""
+
+
+@dataclass(frozen=True)
+class ArmMotion:
+    """How the arm moves over a tick: its controller leads, its joints follow with a lag.
+
+    The reference goes from `reference` (6,) at `velocity` (6,), mm/s and deg/s. From `pose` (6,)
+    the arm follows it as dp/dt = (reference - p) / LAG_S: its velocity has no steps, and its
+    acceleration is at most the change of the reference's velocity over the lag. Angles are not
+    wrapped.
+    """
+
+    pose: NDArray[np.float64]
+    reference: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+
+    @classmethod
+    def resting(cls, pose: NDArray[np.float64]) -> "ArmMotion":
+        """The arm standing still."""
+        return cls(pose, pose, np.zeros(6))
+
+    def at(self, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Poses (time, 6) at times since the tick began: the response to a ramp, in closed form."""
+        time = np.asarray(seconds)[..., None]
+        behind = self.velocity * LAG_S
+        decay = np.exp(-time / LAG_S)
+        return (
+            self.reference
+            + time * self.velocity
+            - behind
+            + decay * (self.pose - self.reference + behind)
+        )
+
+    def towards(self, setpoint: NDArray[np.float64], tick_s: float) -> "ArmMotion":
+        """The motion of the next tick, towards `setpoint` (6,) within the limits of the arm."""
+        reference = self.reference + tick_s * self.velocity
+        wanted = _limited((setpoint - reference) / tick_s, _SPEED)
+        change = _limited(wanted - self.velocity, _ACCELERATION * tick_s)
+        return ArmMotion(self.at(np.array([tick_s]))[0], reference, self.velocity + change)
+
+
+def _limited(values: NDArray[np.float64], limits: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The same direction (6,), of translation and of rotation, at no more than these lengths."""
+    lengths = np.array([np.linalg.norm(values[:3]), np.abs(values[3:]).max()])
+    return values * np.repeat(np.minimum(1.0, limits / np.maximum(lengths, 1e-12)), 3)

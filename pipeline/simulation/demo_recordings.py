@@ -29,7 +29,7 @@ from pipeline.simulation.insertion_formats import (
 from pipeline.simulation.lerobot_format import write_lerobot
 from pipeline.simulation.recorder import SimulatedEpisode, simulate_episode
 
-DEMO_VERSION: Final = 1
+DEMO_VERSION: Final = 2
 """Goes up whenever the same seed gives other recordings."""
 MARKER: Final = "demo.json"
 DEMO: Final = OutputKind("what the demo wrote", lambda folder: (folder / MARKER).is_file())

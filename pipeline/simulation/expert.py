@@ -1,9 +1,9 @@
-"""The demonstrator: a hand that sees the target and the A-scan, and needs time to react.
+"""The demonstrator: a hand that sees the target and the A-scan.
 
-Align over the target at limited speed while descending to a standoff; once aligned, go down
-slowly, puncture, and stop at the target layer. It acts on where target and surface were
-`REACTION_TICKS` ago, as a person does: whoever looks at the images and the A-scan now knows
-what the hand will do next, whoever looks only at the hand does not.
+Align over the target at limited speed while descending to a standoff; go on down the slower, the
+farther from aligned; puncture, and stop at the target layer. Waiting is standing still, never a
+return upwards: who imitates a demonstrator that rises here and sinks there, and cannot tell the two
+apart, hovers. It acts on where the target was `REACTION_TICKS` ago, which the newest frames show.
 """
 
 from dataclasses import dataclass
@@ -12,11 +12,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-REACTION_TICKS: Final = 5
-ALIGNED_MM: Final = 0.6
+REACTION_TICKS: Final = 1
+ALIGNED_MM: Final = 0.3
+"""As near as this the needle goes down at full speed, and at `NOT_ALIGNED_MM` no more."""
+NOT_ALIGNED_MM: Final = 0.8
 STANDOFF_MM: Final = 1.4
 
-_LATERAL_GAIN_HZ, _VERTICAL_GAIN_HZ, _TURN_GAIN_HZ = 4.0, 3.0, 2.0
+_LATERAL_GAIN_HZ, _APPROACH_GAIN_HZ, _LAYER_GAIN_HZ, _TURN_GAIN_HZ = 4.0, 3.0, 4.0, 2.0
 _DESCENT_MM_S, _INSERTION_MM_S, _TURN_DEG_S = 3.5, 1.5, 9.0
 _TREMOR_MM, _TREMOR_DEG = 0.012, 0.012
 _SMOOTHING = 0.5
@@ -29,7 +31,7 @@ class Percept:
 
     `offset_mm` (2,) from needle to target; `distance_mm` from tip to surface and `layer_mm` from
     tip to target layer; `inside` the tissue; `turn_deg` (3,) rotation vector to the upright;
-    `velocity` (6,) its own last action, a tick.
+    `velocity` (6,) the arm's last motion, a tick.
     """
 
     offset_mm: NDArray[np.float64]
@@ -58,11 +60,12 @@ def expert_motion(
 
 def _vertical_mm_s(seen: Percept) -> float:
     if seen.inside:
-        return -float(np.clip(_VERTICAL_GAIN_HZ * seen.layer_mm, -_INSERTION_MM_S, _INSERTION_MM_S))
-    fall = _VERTICAL_GAIN_HZ * (seen.distance_mm - STANDOFF_MM)
-    if np.hypot(*seen.offset_mm) < ALIGNED_MM:
-        return -float(np.clip(fall, _INSERTION_MM_S, _DESCENT_MM_S))
-    return -float(np.clip(fall, -_DESCENT_MM_S, _DESCENT_MM_S))
+        limit = _INSERTION_MM_S
+        return -float(np.clip(_LAYER_GAIN_HZ * seen.layer_mm, -limit, limit))
+    approach = np.clip(_APPROACH_GAIN_HZ * (seen.distance_mm - STANDOFF_MM), 0, _DESCENT_MM_S)
+    miss = float(np.hypot(*seen.offset_mm))
+    aligned = np.clip((NOT_ALIGNED_MM - miss) / (NOT_ALIGNED_MM - ALIGNED_MM), 0, 1)
+    return -float(max(approach, aligned * _INSERTION_MM_S))
 
 
 def _limited(velocity: NDArray[np.float64], limit: float) -> NDArray[np.float64]:

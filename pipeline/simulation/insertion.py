@@ -7,17 +7,21 @@ a layer inside the phantom is where to stop. What is hidden where:
   nothing about the target. Where the target lies sideways shows only in the images.
 - The cameras see nothing of heights (`Scene` holds none). How far the tissue and the layer are
   shows only in the A-scan, and contact in the force.
-- The phantom is pushed aside and up or down at random times, as a patient moves, as long as the
-  needle is clear of it. So motion so far does not tell motion to come.
+- The phantom breathes. At level `moved` it is also pushed aside and up or down at random times, as
+  a patient moves, as long as the needle is clear of it: motion so far does not tell motion to come.
+
+An action adds to the setpoint that the arm is commanded to, not to where it is: the arm follows
+with a lag, at limited speed and acceleration (`arm.ArmMotion`).
 
 Mechanics along the needle (vertical; leans are small): tissue is a stiffening spring,
 f = k1·u + k2·u² for an indentation u, until it is punctured at a set force; the surface then
 springs back around the needle, and f = cutting + friction·depth, as in A. M. Okamura, C. Simone,
 M. D. O'Leary, "Force modeling for needle insertion into soft tissue", IEEE TBME 51(10), 2004.
-A needle inside holds the tissue: no more pushes, and bending is not modelled.
+A needle inside is held where it entered: pulled sideways it meets a spring, which also presses it
+against its channel and so adds friction along it. No more pushes then; bending is not modelled.
 
-Between ticks everything moves in straight lines. Units: mm, degrees, N, s. `bench` frame: the base
-frame moved sideways to the bench.
+Between ticks target and surface move in straight lines. Units: mm, degrees, N, s. `bench` frame:
+the base frame moved sideways to the bench.
 """
 
 from dataclasses import dataclass
@@ -26,8 +30,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.base.config import Level
 from pipeline.simulation.arm import (
     ActionRotation,
+    ArmMotion,
     angles_deg,
     moved,
     orientation,
@@ -36,7 +42,7 @@ from pipeline.simulation.arm import (
 )
 from pipeline.simulation.expert import REACTION_TICKS, Percept, expert_motion
 from pipeline.simulation.layout import InsertionLayout, draw_layout
-from pipeline.simulation.needle_sensor import READING_HZ, NeedleContact, sensor_readings
+from pipeline.simulation.needle_sensor import READING_HZ, NeedleContact, NeedleSensor
 
 TICK_HZ: Final = 10
 TICK_S: Final = 1 / TICK_HZ
@@ -44,12 +50,27 @@ READINGS_PER_TICK: Final = READING_HZ // TICK_HZ
 STATE_HZ: Final = 100
 HUB_MM: Final = 8.0
 """Height of the needle's hub above its tip."""
-MAX_TICKS: Final = 90
+ENCODER_NOISE: Final = 0.002
+"""Of every joint and pose reading, mm and degrees."""
+
+MISS_MM: Final = 1.0
+"""Success asks for a puncture as near to the target as this,"""
+AT_LAYER_MM: Final = 0.15
+"""for the tip to rest as near to the layer as this"""
+HOLD_TICKS: Final = 6
+"""for so many ticks,"""
+OVERSHOOT_MM: Final = 0.5
+"""for a tip that never goes farther beyond the layer,"""
+FORCE_LIMIT_N: Final = 2.5
+"""for never more force,"""
+MAX_TICKS: Final = 120
+"""and for all this in time: 12 s."""
 
 _PUSH_TICKS = 2
 _CLEAR_MM = 1.1
 """The phantom is pushed only while the tip is farther away than this."""
-_AT_LAYER_MM, _HOLD_TICKS = 0.08, 6
+_SIDEWAYS_N_MM, _SIDEWAYS_FRICTION = 0.8, 0.3
+"""Spring that holds a needle 1 mm or more inside, and friction along it from that force."""
 
 
 @dataclass(frozen=True)
@@ -81,15 +102,64 @@ class InsertionObservation:
 
 @dataclass(frozen=True)
 class Knot:
-    """Where everything is at the end of a tick; between knots it moves in straight lines.
+    """Where everything is at the end of a tick.
 
-    `pose` (6,) in the base frame, its angles not wrapped; `target_mm` (2,) in the bench frame;
-    `surface_mm` the height of the undisturbed surface in the base frame.
+    `motion` is how the arm came there; `pose` (6,) in the base frame, its angles not wrapped;
+    `target_mm` (2,) in the bench frame; `surface_mm` the height of the undisturbed surface in the
+    base frame; `layer_mm` from the tip to the layer and `force_n` the largest force of the tick.
     """
 
+    motion: ArmMotion
     pose: NDArray[np.float64]
     target_mm: NDArray[np.float64]
     surface_mm: float
+    layer_mm: float = np.nan
+    force_n: float = 0.0
+
+
+@dataclass
+class Progress:
+    """How an episode goes: what success and failure are told by."""
+
+    punctured_mm: float | None = None
+    """Sideways from tip to target when the surface was first punctured."""
+    overshoot_mm: float = 0.0
+    max_force_n: float = 0.0
+    held_ticks: int = 0
+
+    def outcome(self, ticks: int) -> str | None:
+        """Why it has ended after `ticks`, `INSERTED` for success; None where it goes on."""
+        if self.max_force_n > FORCE_LIMIT_N:
+            return "too much force"
+        if self.punctured_mm is not None and self.punctured_mm > MISS_MM:
+            return "punctured beside the target"
+        if self.overshoot_mm > OVERSHOOT_MM:
+            return "beyond the layer"
+        if self.held_ticks >= HOLD_TICKS:
+            return INSERTED
+        if ticks < MAX_TICKS:
+            return None
+        return TIME_IS_UP if self.punctured_mm is not None else f"{TIME_IS_UP} before a puncture"
+
+
+INSERTED: Final = "inserted"
+TIME_IS_UP: Final = "time is up"
+
+
+@dataclass(frozen=True)
+class EpisodeTrace:
+    """What happened, a row a tick.
+
+    `time_s` (tick,); `offset_mm` (tick, 2) from the target to the tip, sideways; `height_mm`
+    (tick,) of the tip above the surface at rest, negative inside; `layer_mm` (tick,) from the tip
+    to the target layer, negative beyond it; `force_n` (tick,) the largest within the tick.
+    """
+
+    time_s: NDArray[np.float64]
+    offset_mm: NDArray[np.float64]
+    height_mm: NDArray[np.float64]
+    layer_mm: NDArray[np.float64]
+    force_n: NDArray[np.float64]
 
 
 class NeedleInsertion:
@@ -101,21 +171,26 @@ class NeedleInsertion:
 
     layout: InsertionLayout
     knots: list[Knot]
+    progress: Progress
 
     def __init__(self, action_rotation: ActionRotation = "rotvec") -> None:
         self.action_rotation: ActionRotation = action_rotation
 
-    def reset(self, seed: int) -> InsertionObservation:
+    def reset(self, seed: int, level: Level = "moved") -> InsertionObservation:
         """The first observation of the episode that this seed draws."""
-        return self.start(draw_layout(seed))
+        return self.start(draw_layout(seed, level))
 
     def start(self, layout: InsertionLayout) -> InsertionObservation:
         """The first observation of this very episode: the arm has stood still for one tick."""
         self.layout = layout
         self._upright = orientation(layout.upright_deg)
-        self.inside = False
-        self.knots = [Knot(layout.start_pose, layout.targets_mm[0], float(layout.surfaces_mm[0]))]
-        self._place, self._pushing, self._due, self._held = 0, 0, 0, 0
+        self._sensor = NeedleSensor(layout.oct_gain, layout.seed)
+        self.inside, self.progress, self.setpoint = False, Progress(), layout.start_pose
+        surface = layout.surfaces_mm[0] + layout.breath_mm(0.0)
+        resting = ArmMotion.resting(layout.start_pose)
+        self.knots = [Knot(resting, layout.start_pose, layout.targets_mm[0], surface)]
+        self._place, self._pushing, self._due = 0, 0, 0
+        self._entry_mm = layout.start_pose[:2]
         return self.step(np.zeros(7))
 
     @property
@@ -124,54 +199,88 @@ class NeedleInsertion:
         return (len(self.knots) - 1) * TICK_S
 
     @property
+    def outcome(self) -> str | None:
+        """Why the episode has ended, `INSERTED` for success; None where it goes on."""
+        return self.progress.outcome(len(self.knots) - 1)
+
+    @property
     def finished(self) -> bool:
-        """Whether the tip has rested at the target layer, or time is up."""
-        return self._held >= _HOLD_TICKS or len(self.knots) > MAX_TICKS
+        """Whether the needle is inserted, a limit was passed, or time is up."""
+        return self.outcome is not None
 
     def step(self, action: NDArray[np.float64]) -> InsertionObservation:
-        """Carry out one tick: dx dy dz (mm, base frame), rotation (deg), gripper (ignored)."""
+        """Carry out one tick: dx dy dz (mm, base frame), rotation (deg), gripper (ignored).
+
+        It is added to the commanded setpoint, which the arm follows.
+        """
         now = self.knots[-1]
-        pose = moved(now.pose, np.asarray(action, np.float64), self.action_rotation)
+        self.setpoint = moved(self.setpoint, np.asarray(action, np.float64), self.action_rotation)
+        motion = now.motion.towards(self.setpoint, TICK_S)
         target, surface = self._pushed(now)
-        self.knots.append(Knot(pose, target, surface))
-        self.contact = self._meet(now, self.knots[-1])
-        resting = self.inside and abs(self.contact.layer_mm[-1]) < _AT_LAYER_MM
-        self._held = self._held + 1 if resting else 0
-        return self.observe()
+        self.contact, path = self._meet(now, motion, target, surface)
+        layer, force = float(self.contact.layer_mm[-1]), float(self._force_n.max())
+        self.knots.append(Knot(motion, path[-1], target, surface, layer, force))
+        progress = self.progress
+        resting = self.inside and abs(layer) < AT_LAYER_MM
+        progress.held_ticks = progress.held_ticks + 1 if resting else 0
+        progress.max_force_n = max(progress.max_force_n, force)
+        if self.contact.inside.any():
+            beyond = -self.contact.layer_mm[self.contact.inside].min()
+            progress.overshoot_mm = max(progress.overshoot_mm, float(beyond))
+        self._observed = self._observe()
+        return self._observed
 
     def observe(self) -> InsertionObservation:
-        """What the last tick showed; asking again changes nothing."""
+        """What the last tick showed."""
+        return self._observed
+
+    def _observe(self) -> InsertionObservation:
         tick = len(self.knots) - 1
-        before, now = self.knots[-2].pose, self.knots[-1].pose
-        part = np.arange(1, STATE_HZ // TICK_HZ + 1)[:, None] * (TICK_HZ / STATE_HZ)
         rng = np.random.default_rng([self.layout.seed, 101, tick])
+        times = np.arange(1, STATE_HZ // TICK_HZ + 1) / STATE_HZ
+        state = robot_state(self.knots[-1].motion.at(times))
+        noise = ENCODER_NOISE * rng.standard_normal(state.shape)
         return InsertionObservation(
             time_s=self.time_s,
             scene=self.scene(self.time_s),
-            state=robot_state(before + part * (now - before)),
-            sensor=sensor_readings(self.contact, self.time_s - TICK_S, self.layout.oct_gain, rng),
+            state=(state + noise).astype(np.float32),
+            sensor=self._sensor.read(self.contact, self.time_s - TICK_S, rng),
         )
 
     def poses(self, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Poses (time, 6) at any times of the episode so far, angles not wrapped."""
-        knots = np.stack([knot.pose for knot in self.knots])
-        at = np.clip(time_s * TICK_HZ, 0, len(knots) - 1)
-        first = np.minimum(at.astype(np.int64), len(knots) - 2)
-        part = (at - first)[:, None]
-        return knots[first] + part * (knots[first + 1] - knots[first])
+        """True poses (time, 6) at any times of the episode so far, angles not wrapped."""
+        motions = [knot.motion for knot in self.knots[1:]]
+        at = np.clip(time_s * TICK_HZ, 0, len(motions))
+        tick = np.minimum(at.astype(np.int64), len(motions) - 1)
+        path = ArmMotion(
+            *(np.stack([getattr(motion, name) for motion in motions])[tick] for name in _MOTION)
+        )
+        return path.at((at - tick) * TICK_S)
 
     def scene(self, time_s: float) -> Scene:
         """What the cameras see at a time of the episode so far."""
         at = min(max(time_s * TICK_HZ, 0.0), len(self.knots) - 1.0)
         first = min(int(at), len(self.knots) - 2)
         before, after = self.knots[first : first + 2]
-        pose = before.pose + (at - first) * (after.pose - before.pose)
+        pose = after.motion.at(np.array([(at - first) * TICK_S]))[0]
         upward = (orientation(pose[3:]) * self._upright.inv()).apply([0.0, 0.0, HUB_MM])
         return Scene(
             needle_mm=pose[:2] - self.layout.bench_mm,
             lean_mm=upward[:2],
             target_mm=before.target_mm + (at - first) * (after.target_mm - before.target_mm),
             brightness=self.layout.brightness,
+        )
+
+    def trace(self) -> EpisodeTrace:
+        """What happened so far."""
+        knots = self.knots[1:]
+        bench = self.layout.bench_mm
+        return EpisodeTrace(
+            time_s=np.arange(1.0, len(self.knots)) * TICK_S,
+            offset_mm=np.stack([knot.pose[:2] - bench - knot.target_mm for knot in knots]),
+            height_mm=np.array([knot.pose[2] - knot.surface_mm for knot in knots]),
+            layer_mm=np.array([knot.layer_mm for knot in knots]),
+            force_n=np.array([knot.force_n for knot in knots]),
         )
 
     def expert_action(self) -> NDArray[np.float64]:
@@ -181,8 +290,8 @@ class NeedleInsertion:
         spun = (orientation(now[3:]) * orientation(before[3:]).inv()).as_rotvec(degrees=True)
         percept = Percept(
             offset_mm=seen.target_mm - (now[:2] - self.layout.bench_mm),
-            distance_mm=float(now[2]) - seen.surface_mm,
-            layer_mm=float(self.contact.layer_mm[-1]),
+            distance_mm=float(now[2]) - self.knots[-1].surface_mm,
+            layer_mm=self.knots[-1].layer_mm,
             inside=self.inside,
             turn_deg=(self._upright * orientation(now[3:]).inv()).as_rotvec(degrees=True),
             velocity=np.concatenate([now[:3] - before[:3], spun]),
@@ -197,35 +306,54 @@ class NeedleInsertion:
 
     def _pushed(self, now: Knot) -> tuple[NDArray[np.float64], float]:
         """Where target and surface are a tick from now."""
-        layout = self.layout
+        layout, breath = self.layout, self.layout.breath_mm(self.time_s + TICK_S)
+        calm = now.surface_mm - layout.breath_mm(self.time_s)
         clear = not self.inside and now.pose[2] - now.surface_mm > _CLEAR_MM
         if self._due < len(layout.push_times_s) and self.time_s >= layout.push_times_s[self._due]:
             self._due += 1
             if clear and not self._pushing:
                 self._place, self._pushing = self._place + 1, _PUSH_TICKS
         if not self._pushing:
-            return now.target_mm, now.surface_mm
+            return now.target_mm, calm + breath
         share = 1 / self._pushing
         self._pushing -= 1
         target = now.target_mm + share * (layout.targets_mm[self._place] - now.target_mm)
-        surface = now.surface_mm + share * (layout.surfaces_mm[self._place] - now.surface_mm)
-        return target, float(surface)
+        return target, calm + share * float(layout.surfaces_mm[self._place] - calm) + breath
 
-    def _meet(self, before: Knot, now: Knot) -> NeedleContact:
-        """Needle and tissue over one tick; also settles whether the tip is now inside."""
+    def _meet(
+        self, before: Knot, motion: ArmMotion, target_mm: NDArray[np.float64], surface_mm: float
+    ) -> tuple[NeedleContact, NDArray[np.float64]]:
+        """Needle and tissue over one tick, and the poses at its readings.
+
+        Also settles whether the tip is now inside, where it entered, and all force on it.
+        """
         part = np.arange(1, READINGS_PER_TICK + 1) / READINGS_PER_TICK
-        tip = before.pose[2] + part * (now.pose[2] - before.pose[2])
-        surface = before.surface_mm + part * (now.surface_mm - before.surface_mm)
-        depth = surface - tip
+        path = motion.at(part * TICK_S)
+        depth = before.surface_mm + part * (surface_mm - before.surface_mm) - path[:, 2]
         tissue = self.layout.tissue
         spring = tissue.spring_n(np.maximum(depth, 0))
         inside = self.inside | np.logical_or.accumulate(spring >= tissue.puncture_n)
         inside &= depth > 0
+        if inside.any() and not self.inside:
+            entered = int(inside.argmax())
+            self._entry_mm = path[entered, :2]
+            if self.progress.punctured_mm is None:
+                target = before.target_mm + part[entered] * (target_mm - before.target_mm)
+                miss = self._entry_mm - self.layout.bench_mm - target
+                self.progress.punctured_mm = float(np.hypot(*miss))
         self.inside = bool(inside[-1])
-        return NeedleContact(
+        held = np.where(inside, np.clip(depth, 0, 1), 0) * _SIDEWAYS_N_MM
+        sideways = held * np.hypot(*(path[:, :2] - self._entry_mm).T)
+        drag = tissue.drag_n(depth) + _SIDEWAYS_FRICTION * sideways
+        contact = NeedleContact(
             distance_mm=np.maximum(-depth, 0),
             # A surface that gives way carries the layer along, until it is punctured.
             layer_mm=tissue.layer_depth_mm - np.where(inside, depth, np.minimum(depth, 0)),
             inside=inside,
-            force_n=np.where(inside, tissue.drag_n(depth), spring),
+            force_n=np.where(inside, drag, spring),
         )
+        self._force_n = np.hypot(contact.force_n, sideways)
+        return contact, path
+
+
+_MOTION: Final = ("pose", "reference", "velocity")

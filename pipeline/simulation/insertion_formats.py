@@ -18,13 +18,12 @@ from pipeline.simulation.arm import euler_actions
 from pipeline.simulation.insertion import STATE_HZ, TICK_HZ
 from pipeline.simulation.needle_sensor import READING_HZ
 from pipeline.simulation.recorder import SimulatedEpisode
-from pipeline.simulation.rendering import VIEWS
+from pipeline.simulation.rendering import JPEG_QUALITY, VIEWS
 
 INSTRUCTION: Final = "Insert the needle at the red point"
 ABUTTING, OVERLAPPING = (65, 65), (650, 130)
 """Readings in a window of the new format, and readings between windows."""
 
-_JPEG_QUALITY = 75
 _CAMERAS: Final = {
     "View1": "zed_41182735_left",
     "View2": "zed_49429257_left",
@@ -153,5 +152,5 @@ def _write_frames(
     folder.mkdir(parents=True)
     names = [f"{prefix}{time:.3f}.jpg" for time in clock]
     for name, frame in zip(names, episode.frames(view, clock), strict=True):
-        Image.fromarray(frame).save(folder / name, quality=_JPEG_QUALITY)
+        Image.fromarray(frame).save(folder / name, quality=JPEG_QUALITY)
     return names

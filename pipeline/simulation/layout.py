@@ -3,17 +3,20 @@
 Each concern draws from its own generator, so that changing one leaves the others as they were.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.base.config import Level
 from pipeline.simulation.arm import NOMINAL_POSE, angles_deg, orientation, wrapped_deg
 
 WORKSPACE_MM: Final = np.array([6.5, 4.0])
 """Needle and target begin within plus or minus this of the bench's middle, x and y."""
 
+_ABOVE_MM = 0.3
 _PUSHES = 3
 _PUSH_MM: Final = (3.0, 8.0)
 _PUSH_EVERY_S: Final = (0.7, 1.4)
@@ -55,29 +58,41 @@ class InsertionLayout:
     targets_mm: NDArray[np.float64]
     surfaces_mm: NDArray[np.float64]
     push_times_s: NDArray[np.float64]
+    breath: tuple[float, float, float]
+    """Height in mm, rate in Hz and phase of the surface's breathing."""
     tissue: Tissue
     speed_mm_s: float
     brightness: float
     oct_gain: float
 
+    def breath_mm(self, time_s: float) -> float:
+        """How far breathing lifts the surface at a time of the episode."""
+        height, rate_hz, phase = self.breath
+        return height * math.sin(2 * math.pi * rate_hz * time_s + phase)
 
-def draw_layout(seed: int, crosses_180: bool = False) -> InsertionLayout:
+
+def draw_layout(seed: int, level: Level = "moved", crosses_180: bool = False) -> InsertionLayout:
     """The episode of a seed; with `crosses_180` its angle r passes ±180° on the way upright."""
-    bench, lateral, depth, hand, look = (np.random.default_rng([seed, i]) for i in range(5))
+    bench, lateral, depth, hand, look, breath = (np.random.default_rng([seed, i]) for i in range(6))
     bench_mm = NOMINAL_POSE[:2] + bench.uniform(-15, 15, 2)
     surface = NOMINAL_POSE[2] + bench.uniform(-10, 10)
     rises = depth.uniform(0.5, 1.2, _PUSHES) * depth.choice([-1, 1], _PUSHES)
     start_xy = bench_mm + hand.uniform(-WORKSPACE_MM, WORKSPACE_MM)
     start_z = surface + depth.uniform(3.8, 5.0)
+    targets = _targets(lateral)
+    if level == "depth":
+        start_xy = bench_mm + targets[0] + hand.uniform(-_ABOVE_MM, _ABOVE_MM, 2)
+    pushes = _PUSHES if level == "moved" else 0
     upright, leaning = _orientations(hand.uniform(-8, 8, 2), crosses_180)
     return InsertionLayout(
         seed=seed,
         bench_mm=bench_mm,
         start_pose=np.concatenate([start_xy, [start_z], leaning]),
         upright_deg=upright,
-        targets_mm=_targets(lateral),
+        targets_mm=targets,
         surfaces_mm=surface + np.concatenate([[0.0], _bounded_walk(rises)]),
-        push_times_s=np.cumsum(lateral.uniform(*_PUSH_EVERY_S, _PUSHES)),
+        push_times_s=np.cumsum(lateral.uniform(*_PUSH_EVERY_S, pushes)),
+        breath=(breath.uniform(0.03, 0.1), breath.uniform(0.2, 0.35), breath.uniform(0, 2 * np.pi)),
         tissue=_tissue(depth),
         speed_mm_s=float(hand.uniform(6, 9)),
         brightness=float(look.uniform(0.94, 1.06)),

@@ -4,6 +4,11 @@ An A-scan is 1,025 bins of 5 µm, counted from the tip, in whole counts of an 8-
 Outside the tissue its surface is the strongest peak, at the tip-to-tissue distance, with light
 scattered behind it that decays exponentially; inside, the scatter begins at the tip. The target
 layer is a second, weaker peak. Beyond the last bin nothing is seen.
+
+Scattered light carries speckle, a grain that is fixed to the tissue and drawn anew for each episode
+(Schmitt, Xiang, Yung, "Speckle in optical coherence tomography", J. Biomed. Opt. 4(1), 1999). The
+gain drifts, the digitiser saturates, scans come late, and some are lost: the reader then repeats
+the last.
 """
 
 from dataclasses import dataclass
@@ -19,9 +24,15 @@ READINGS_PER_SCAN: Final = 5
 """The spectrometer is slower than the reader: each A-scan is read five times (130 Hz)."""
 BIN_MM: Final = 0.005
 A_SCAN_BINS: Final = ALINE_BINS
+SCANS_LATE: Final = 2
+"""Scans that are under way in the spectrometer: 15 ms."""
 
+_LOST_SCANS = 0.02
 _BACKGROUND, _NOISE = 20.0, 0.35
+_SPECKLE_CONTRAST, _SPECKLE_BINS = 0.3, 4
+_GAIN_DRIFT, _GAIN_DRIFT_HZ = 0.05, 0.11
 _FORCE_NOISE_N, _FORCE_DRIFT_N, _FORCE_DRIFT_HZ = 0.01, 0.02, 0.07
+_ORIGIN: Final = 2 * A_SCAN_BINS
 
 
 @dataclass(frozen=True)
@@ -38,43 +49,74 @@ class NeedleContact:
     force_n: NDArray[np.float64]
 
 
+class NeedleSensor:
+    """The sensor of one episode: its gain, its tissue's speckle, and the scans under way."""
+
+    def __init__(self, gain: float, seed: int) -> None:
+        rng = np.random.default_rng([seed, 103])
+        self._gain, self._phase = gain, rng.uniform(0, 2 * np.pi)
+        self._speckle = _speckle(rng)
+        self._under_way: NDArray[np.float32] | None = None
+
+    def read(
+        self, contact: NeedleContact, start_s: float, rng: np.random.Generator
+    ) -> NDArray[np.float32]:
+        """Readings (row, 1026) that follow those read before, at 650 Hz: force in N, then A-scan.
+
+        The number of rows is a multiple of `READINGS_PER_SCAN`. The force drifts slowly.
+        """
+        fresh = slice(None, None, READINGS_PER_SCAN)
+        seen = NeedleContact(*(values[fresh] for values in vars(contact).values()))
+        time = start_s + np.arange(len(contact.force_n)) / READING_HZ
+        taken = self.a_scans(seen, time[fresh], rng)
+        if self._under_way is None:  # before the episode the needle hung where it begins
+            self._under_way = np.repeat(taken[:1], SCANS_LATE + 1, axis=0)
+        # The first of those under way was read last, and is repeated should the next be lost.
+        scans = np.concatenate([self._under_way, taken])
+        arrived = np.where(rng.random(len(taken)) < _LOST_SCANS, 0, np.arange(1, len(taken) + 1))
+        shown = scans[np.maximum.accumulate(arrived)]
+        self._under_way = np.concatenate([shown[-1:], scans[-SCANS_LATE:]])
+        drift = _FORCE_DRIFT_N * np.sin(2 * np.pi * _FORCE_DRIFT_HZ * time)
+        force = contact.force_n + drift + _FORCE_NOISE_N * rng.standard_normal(len(time))
+        readings = np.empty((len(time), 1 + A_SCAN_BINS), np.float32)
+        # A force amplifier resolves 1 mN; the quantised values also compress.
+        readings[:, 0] = np.rint(force * 1000) / 1000
+        readings[:, 1:] = np.repeat(shown, READINGS_PER_SCAN, axis=0)
+        return readings
+
+    def a_scans(
+        self, contact: NeedleContact, time_s: NDArray[np.float64], rng: np.random.Generator
+    ) -> NDArray[np.float32]:
+        """A-scans (row, 1025) in counts, a whole number in 0..255, with digitiser noise."""
+        bins = np.arange(A_SCAN_BINS)
+        outside = ~contact.inside[:, None]
+        surface = np.where(contact.inside, 0, distance_bin(contact.distance_mm))
+        behind_surface = bins - surface[:, None] + _ORIGIN
+        behind_layer = bins - distance_bin(contact.layer_mm)[:, None] + _ORIGIN
+        scattered = (_SCATTER[behind_surface] + _LAYER[behind_layer]) * self._speckle[behind_layer]
+        gain = 1 + _GAIN_DRIFT * np.sin(2 * np.pi * _GAIN_DRIFT_HZ * time_s + self._phase)
+        signal = (
+            np.float32(self._gain)
+            * gain.astype(np.float32)[:, None]
+            * (scattered + outside * _SURFACE[behind_surface])
+        )
+        noise = rng.standard_normal(signal.shape, np.float32) * np.float32(_NOISE)
+        # Rounded apart, rows of a still needle differ in few bins and compress.
+        return np.clip(np.rint(_BACKGROUND + signal) + np.rint(noise), 0, 255, dtype=np.float32)
+
+
 def distance_bin(distance_mm: NDArray[np.float64]) -> NDArray[np.int64]:
     """The bin nearest to a distance, far distances held a scan's length beyond the last bin."""
     return np.clip(np.rint(distance_mm / BIN_MM), -A_SCAN_BINS, _ORIGIN).astype(np.int64)
 
 
-def a_scans(contact: NeedleContact, gain: float, rng: np.random.Generator) -> NDArray[np.float32]:
-    """A-scans (row, 1025) in counts, a whole number in 0..255, with digitiser noise."""
-    bins = np.arange(A_SCAN_BINS)
-    surface = np.where(contact.inside, 0, distance_bin(contact.distance_mm))
-    behind_surface = bins - surface[:, None] + _ORIGIN
-    behind_layer = bins - distance_bin(contact.layer_mm)[:, None] + _ORIGIN
-    tissue = np.where(contact.inside[:, None], _SCATTER[behind_surface], _SURFACE[behind_surface])
-    signal = gain * (tissue + _LAYER[behind_layer])
-    noise = rng.standard_normal(signal.shape, np.float32) * np.float32(_NOISE)
-    # Rounded apart, rows of a still needle differ in few bins and compress.
-    return np.clip(np.rint(_BACKGROUND + signal) + np.rint(noise), 0, 255, dtype=np.float32)
-
-
-def sensor_readings(
-    contact: NeedleContact, start_s: float, gain: float, rng: np.random.Generator
-) -> NDArray[np.float32]:
-    """Readings (row, 1026) that follow each other at 650 Hz: force in N, then the A-scan.
-
-    The number of rows is a multiple of `READINGS_PER_SCAN`. The force drifts slowly.
-    """
-    fresh = slice(None, None, READINGS_PER_SCAN)
-    seen = NeedleContact(*(values[fresh] for values in vars(contact).values()))
-    scans = np.repeat(a_scans(seen, gain, rng), READINGS_PER_SCAN, axis=0)
-    time = start_s + np.arange(len(scans)) / READING_HZ
-    drift = _FORCE_DRIFT_N * np.sin(2 * np.pi * _FORCE_DRIFT_HZ * time)
-    force = contact.force_n + drift + _FORCE_NOISE_N * rng.standard_normal(len(scans))
-    # A force amplifier resolves 1 mN; the quantised values also compress.
-    force = np.rint(force * 1000) / 1000
-    return np.concatenate([force[:, None].astype(np.float32), scans], axis=1)
-
-
-_ORIGIN: Final = 2 * A_SCAN_BINS
+def _speckle(rng: np.random.Generator) -> NDArray[np.float32]:
+    """A grain of mean 1 along the tissue: the amplitude of summed random phasors (Rayleigh)."""
+    size = (2, 2 * _ORIGIN + _SPECKLE_BINS)
+    phasors = np.cumsum(rng.standard_normal(size), axis=1)
+    amplitude = np.hypot(*(phasors[:, _SPECKLE_BINS:] - phasors[:, :-_SPECKLE_BINS]))
+    grain = 1 + _SPECKLE_CONTRAST * (amplitude / amplitude.mean() - 1) / 0.523
+    return np.maximum(grain, 0).astype(np.float32)
 
 
 def _peak(height: float, width_bins: float) -> NDArray[np.float32]:
@@ -83,13 +125,12 @@ def _peak(height: float, width_bins: float) -> NDArray[np.float32]:
 
 
 def _scatter(height: float, decay_bins: float) -> NDArray[np.float32]:
-    """Scattered light behind the surface, with the tissue's fixed grain."""
+    """Scattered light behind the surface."""
     offset = np.arange(-_ORIGIN, 2 * A_SCAN_BINS + 1)
-    grain = 1 + 0.15 * np.sin(0.19 * offset) * np.sin(0.043 * offset + 1)
-    decay = height * np.exp(-np.maximum(offset, 0) / decay_bins) * grain
+    decay = height * np.exp(-np.maximum(offset, 0) / decay_bins)
     return np.where(offset >= 0, decay, 0).astype(np.float32)
 
 
 _SCATTER: Final = _scatter(60.0, 180.0)
-_SURFACE: Final = _SCATTER + _peak(130.0, 14.0)
-_LAYER: Final = _peak(80.0, 18.0)
+_SURFACE: Final = _peak(165.0, 14.0)
+_LAYER: Final = _peak(90.0, 18.0)

@@ -5,7 +5,7 @@ encoders. Times are seconds since the epoch.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
 from typing import Final
@@ -14,18 +14,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.simulation.arm import robot_state
-from pipeline.simulation.insertion import STATE_HZ, NeedleInsertion
+from pipeline.simulation.insertion import ENCODER_NOISE, INSERTED, STATE_HZ, NeedleInsertion
 from pipeline.simulation.layout import draw_layout
 from pipeline.simulation.needle_sensor import READING_HZ
-from pipeline.simulation.rendering import render
+from pipeline.simulation.rendering import photograph
 
 CAMERA_HZ: Final = 10
 
 _LATE_S: Final = 0.08
-_ROBOT_JITTER_S, _SENSOR_JITTER_S, _CAMERA_JITTER_S = 4e-4, 8e-5, 3e-3
+_ROBOT_JITTER_S, _SENSOR_JITTER_S, CAMERA_JITTER_S = 4e-4, 8e-5, 3e-3
 _LOST_FRAMES = 0.01
-_ENCODER_NOISE = 0.002
-"""Of every joint and pose reading, mm and degrees."""
+_START_MM = (1.8, 5.0)
+"""Heights that demonstrations begin at: some lower than a rollout does."""
+_NOISE_MM, _NOISE_DEG = 0.02, 0.02
+"""Of every tick's motion, in every direction."""
+_NUDGE_SHARE, _NUDGE_TICKS, _NUDGE_MM, _NUDGE_ABOVE_MM = 0.05, 3, (0.2, 0.5), 0.8
+"""Share of ticks at which a nudge begins; its ticks, its length a tick, and how clear of the tissue
+the needle must be."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +71,7 @@ class SimulatedEpisode:
         """A 10 Hz clock in whole milliseconds that begins late and loses a frame now and then."""
         late = self.rng.uniform(0, _LATE_S) if late_s is None else late_s
         frames = np.arange((self.duration_s - late) * CAMERA_HZ)
-        times = _jittered(self.epoch_s + late + frames / CAMERA_HZ, _CAMERA_JITTER_S, self.rng)
+        times = _jittered(self.epoch_s + late + frames / CAMERA_HZ, CAMERA_JITTER_S, self.rng)
         kept = self.rng.random(len(times)) >= _LOST_FRAMES
         times[0], kept[0] = self.epoch_s + late, True
         return np.round(times[kept], 3)
@@ -74,7 +79,7 @@ class SimulatedEpisode:
     def states(self, time: NDArray[np.float64]) -> NDArray[np.float32]:
         """Joints and pose (time, 12), with the encoders' noise."""
         exact = robot_state(self.poses(time))
-        noise = self.rng.standard_normal(exact.shape) * _ENCODER_NOISE
+        noise = self.rng.standard_normal(exact.shape) * ENCODER_NOISE
         return (exact + noise).astype(np.float32)
 
     def poses(self, time: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -82,19 +87,50 @@ class SimulatedEpisode:
         return self.insertion.poses(time - self.epoch_s)
 
     def frames(self, view: str, time: NDArray[np.float64]) -> Iterator[NDArray[np.uint8]]:
-        """What a camera sees at each time, rendered one by one."""
+        """What a camera takes at each time, one by one."""
         for instant in time:
-            yield render(view, self.insertion.scene(float(instant) - self.epoch_s))
+            yield photograph(view, self.insertion, float(instant) - self.epoch_s)
 
 
 def simulate_episode(seed: int, epoch_s: float, crosses_180: bool = False) -> SimulatedEpisode:
-    """The demonstrator's whole episode of a seed; same arguments, same episode."""
+    """A demonstration that succeeds, of this seed or the next that does.
+
+    It is disturbed while the demonstrator corrects, so that recoveries are in the data, as in
+    Laskey et al. 2017, "DART: Noise Injection for Robust Imitation Learning": a little in every
+    tick, and now and then by a nudge. Same arguments, same episode.
+    """
     insertion = NeedleInsertion()
-    readings = [insertion.start(draw_layout(seed, crosses_180)).sensor]
+    layout, rng = draw_layout(seed, "moved", crosses_180), np.random.default_rng([seed, 202])
+    start = layout.start_pose.copy()
+    start[2] = layout.surfaces_mm[0] + rng.uniform(*_START_MM)
+    readings = [insertion.start(replace(layout, start_pose=start)).sensor]
+    disturbances = _disturbances(insertion, rng)
     while not insertion.finished:
-        readings.append(insertion.step(insertion.expert_action()).sensor)
+        action = insertion.expert_action()
+        action[:6] += next(disturbances)
+        readings.append(insertion.step(action).sensor)
+    if insertion.outcome != INSERTED:
+        return simulate_episode(seed + 1, epoch_s, crosses_180)
     rng = np.random.default_rng([seed, 201])
     return SimulatedEpisode(insertion, np.concatenate(readings), epoch_s, rng)
+
+
+def _disturbances(
+    insertion: NeedleInsertion, rng: np.random.Generator
+) -> Iterator[NDArray[np.float64]]:
+    """What is added to the motion (6,) of each tick; sideways only while the needle is outside."""
+    nudge, ticks = np.zeros(3), 0
+    while True:
+        clear = insertion.contact.distance_mm[-1] > _NUDGE_ABOVE_MM
+        if not ticks and clear and rng.random() < _NUDGE_SHARE:
+            nudge, ticks = rng.standard_normal(3) * [1.0, 1.0, 0.3], _NUDGE_TICKS
+            nudge *= rng.uniform(*_NUDGE_MM) / np.linalg.norm(nudge)
+        noise = rng.standard_normal(6) * np.repeat([_NOISE_MM, _NOISE_DEG], 3)
+        if ticks and clear:
+            noise[:3] += nudge
+        ticks = max(0, ticks - 1)
+        noise[:2] *= not insertion.inside
+        yield noise
 
 
 def _jittered(

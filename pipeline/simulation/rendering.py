@@ -10,18 +10,24 @@ The views look through telecentric lenses: distance changes neither size nor pla
 """
 
 from functools import cache
+from io import BytesIO
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from pipeline.simulation.insertion import HUB_MM, Scene
+from pipeline.simulation.insertion import HUB_MM, NeedleInsertion, Scene
 
 VIEWS: Final = ("View1", "View2", "View5")
 WIDTH: Final = 224
 HEIGHT: Final = 126
 
+JPEG_QUALITY: Final = 75
+"""Of the recorder, and so of what a policy sees."""
+
+_NOISE = 2.0
+"""Of every level of a pixel."""
 _OVERSAMPLING = 2
 _SIZE = np.array([WIDTH, HEIGHT]) * _OVERSAMPLING
 _MIDDLE = _SIZE / 2
@@ -52,6 +58,24 @@ def render(view: str, scene: Scene) -> NDArray[np.uint8]:
     image = Image.new("RGB", (int(_SIZE[0]), int(_SIZE[1])), _WALL if view == "View1" else _BENCH)
     _VIEWS[view](ImageDraw.Draw(image), scene)
     return _exposure(scene.brightness)[np.asarray(image.reduce(_OVERSAMPLING))]
+
+
+def photograph(view: str, insertion: NeedleInsertion, time_s: float) -> NDArray[np.uint8]:
+    """What a camera takes at a time of the episode so far: the image with the camera's noise.
+
+    The same episode, view and time give the same bits.
+    """
+    image = render(view, insertion.scene(time_s))
+    seed = [insertion.layout.seed, 104, VIEWS.index(view), round(time_s * 1e4)]
+    noise = np.random.default_rng(seed).standard_normal(image.shape, np.float32)
+    return np.clip(image + _NOISE * noise, 0, 255).astype(np.uint8)
+
+
+def through_jpeg(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The image as a recording of it gives it back."""
+    file = BytesIO()
+    Image.fromarray(image).save(file, "JPEG", quality=JPEG_QUALITY)
+    return np.asarray(Image.open(file))
 
 
 @cache

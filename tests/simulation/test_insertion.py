@@ -7,9 +7,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.simulation.arm import euler_actions, orientation
-from pipeline.simulation.expert import ALIGNED_MM, REACTION_TICKS
-from pipeline.simulation.insertion import MAX_TICKS, InsertionObservation, NeedleInsertion
+from pipeline.simulation.arm import LAG_S, ArmMotion, orientation
+from pipeline.simulation.expert import NOT_ALIGNED_MM, REACTION_TICKS, Percept, expert_motion
+from pipeline.simulation.insertion import (
+    AT_LAYER_MM,
+    FORCE_LIMIT_N,
+    INSERTED,
+    MAX_TICKS,
+    MISS_MM,
+    OVERSHOOT_MM,
+    TICK_S,
+    InsertionObservation,
+    NeedleInsertion,
+)
 from pipeline.simulation.layout import WORKSPACE_MM, InsertionLayout, draw_layout
 from pipeline.simulation.needle_sensor import BIN_MM
 from pipeline.simulation.rendering import VIEWS, render
@@ -34,8 +44,9 @@ def follow(insertion: NeedleInsertion) -> Iterator[InsertionObservation]:
 
 
 def peak_bin(observation: InsertionObservation) -> int:
-    """The brightest bin of the newest A-scan."""
-    return int(observation.sensor[-1, 1:].argmax())
+    """The middle of the brightest bins of the newest A-scan, several where it saturates."""
+    scan = observation.sensor[-1, 1:]
+    return round(np.flatnonzero(scan == scan.max()).mean())
 
 
 def test_same_seed_and_actions_give_the_same_bits() -> None:
@@ -61,10 +72,10 @@ def test_a_scan_peaks_at_the_tip_to_tissue_distance() -> None:
     insertion = NeedleInsertion()
     observation = insertion.start(calm())
     while insertion.contact.distance_mm[-1] > 0.3:
-        # Held still: an A-scan is up to four readings old.
-        observation = insertion.step(STILL)
+        for _ in range(2):  # held still: the arm lags, and an A-scan is up to 23 ms old
+            observation = insertion.step(STILL)
         distance = insertion.knots[-1].pose[2] - insertion.knots[-1].surface_mm
-        assert abs(peak_bin(observation) * BIN_MM - distance) <= 2 * BIN_MM
+        assert abs(peak_bin(observation) * BIN_MM - distance) <= 8 * BIN_MM
         insertion.step(down(0.17))
     assert peak_bin(observation) < 150
 
@@ -106,7 +117,8 @@ def test_force_rises_on_contact_drops_at_puncture_and_grows_with_depth() -> None
         now = insertion.knots[-1]
         before = insertion.knots[-2]
         part = np.arange(1, 66) / 65
-        depth.append(now.surface_mm - (before.pose[2] + part * (now.pose[2] - before.pose[2])))
+        surface = before.surface_mm + part * (now.surface_mm - before.surface_mm)
+        depth.append(surface - now.motion.at(part * TICK_S)[:, 2])
         inside.append(insertion.contact.inside.copy())
         # The gauge reads the true force but for noise and a slow drift of 20 mN.
         assert np.abs(observation.sensor[:, 0] - insertion.contact.force_n).max() < 0.08
@@ -201,13 +213,12 @@ def test_the_demonstrator_ends_at_the_layer_under_the_mark(seed: int) -> None:
     insertion.reset(seed)
     for _ in follow(insertion):
         pass
-    last = insertion.knots[-1]
-    offset = last.target_mm - (last.pose[:2] - insertion.layout.bench_mm)
-    if len(insertion.knots) <= MAX_TICKS:
-        assert insertion.inside and abs(insertion.contact.layer_mm[-1]) < 0.1
-        assert np.hypot(*offset) < 2 * ALIGNED_MM
-        upright = orientation(insertion.layout.upright_deg)
-        assert (orientation(last.pose[3:]) * upright.inv()).magnitude() < np.deg2rad(1.5)
+    assert insertion.outcome == INSERTED
+    last, progress = insertion.knots[-1], insertion.progress
+    assert insertion.inside and abs(last.layer_mm) < AT_LAYER_MM
+    assert progress.punctured_mm is not None and progress.punctured_mm < NOT_ALIGNED_MM
+    upright = orientation(insertion.layout.upright_deg)
+    assert (orientation(last.pose[3:]) * upright.inv()).magnitude() < np.deg2rad(1.5)
     places = np.stack([knot.target_mm for knot in insertion.knots])
     assert (np.abs(places) <= WORKSPACE_MM).all()
 
@@ -251,21 +262,157 @@ def test_both_rotation_conventions_lead_to_the_same_episode(seed: int) -> None:
     by_angles.reset(seed)
     for _ in range(15):
         by_vector.step(by_vector.expert_action())
-        action = by_angles.expert_action()
+        before, action = by_angles.setpoint, by_angles.expert_action()
         by_angles.step(action)
-        poses = np.stack([knot.pose for knot in by_angles.knots[-2:]])
-        np.testing.assert_allclose(euler_actions(poses)[0], action, atol=1e-6)
-    np.testing.assert_allclose(by_vector.knots[-1].pose, by_angles.knots[-1].pose, atol=1e-9)
+        np.testing.assert_allclose(by_angles.setpoint - before, action[:6], atol=1e-9)
+    # Angles are added to a setpoint that leads the pose that they were computed at.
+    np.testing.assert_allclose(by_vector.knots[-1].pose, by_angles.knots[-1].pose, atol=0.02)
 
 
-def test_positions_between_ticks_are_what_was_passed() -> None:
+def test_poses_between_ticks_are_what_the_arm_passed() -> None:
     insertion = NeedleInsertion()
     insertion.reset(5)
     for _ in follow(insertion):
         pass
-    times = np.array([0.3, 0.35, 0.4])
-    poses = insertion.poses(times)
-    np.testing.assert_allclose(poses[1], (poses[0] + poses[2]) / 2)
-    np.testing.assert_allclose(poses[2], insertion.knots[4].pose)
+    knots = insertion.knots
+    ends = insertion.poses(np.arange(len(knots)) * TICK_S)
+    np.testing.assert_allclose(ends, np.stack([knot.pose for knot in knots]), atol=1e-9)
+    fine = insertion.poses(np.arange(0, insertion.time_s, 0.001))
+    speed = np.linalg.norm(np.diff(fine[:, :3], axis=0), axis=1) / 0.001
+    assert speed.max() < 12.1
     scene = insertion.scene(0.35)
-    np.testing.assert_allclose(scene.needle_mm, poses[1, :2] - insertion.layout.bench_mm)
+    pose = insertion.poses(np.array([0.35]))[0]
+    np.testing.assert_allclose(scene.needle_mm, pose[:2] - insertion.layout.bench_mm)
+
+
+def test_an_action_adds_to_the_setpoint_and_the_arm_follows_with_its_lag() -> None:
+    insertion = NeedleInsertion()
+    insertion.start(calm())
+    start = insertion.layout.start_pose
+    insertion.step(down(0.5))
+    behind = insertion.knots[-1].pose[2] - insertion.setpoint[2]
+    assert insertion.setpoint[2] == pytest.approx(start[2] - 0.5)
+    # The reference ramps for a tick; what is left after it is the lag's share of a ramp.
+    assert behind == pytest.approx(0.5 * LAG_S / TICK_S * (1 - np.exp(-TICK_S / LAG_S)))
+    for _ in range(5):
+        insertion.step(STILL)
+    np.testing.assert_allclose(insertion.knots[-1].pose, insertion.setpoint, atol=1e-6)
+
+
+def test_a_leap_is_carried_out_at_the_arms_speed() -> None:
+    insertion = NeedleInsertion()
+    insertion.start(calm())
+    before = insertion.knots[-1].pose
+    insertion.step(np.array([20.0, 0, 0, 0, 0, 0, 1]))
+    assert 0 < insertion.knots[-1].pose[0] - before[0] <= 1.2
+    motion, jumps = ArmMotion.resting(np.zeros(6)), []
+    for target in (50.0, -50.0, 50.0):
+        after = motion.towards(np.array([target, 0, 0, 0, 0, 0]), TICK_S)
+        jumps.append(np.abs(after.velocity - motion.velocity).max())
+        motion = after
+    assert max(jumps) <= 12.0 + 1e-9
+
+
+def plunge(insertion: NeedleInsertion, *steps: tuple[int, NDArray[np.float64]]) -> str | None:
+    """How an episode ends when each action is repeated so many times, and nothing after."""
+    for times, action in steps:
+        for _ in range(times):
+            if not insertion.finished:
+                insertion.step(action)
+    while not insertion.finished:
+        insertion.step(STILL)
+    return insertion.outcome
+
+
+def over_the_target(offset_mm: float = 0.0) -> NeedleInsertion:
+    """An episode that begins above the target, or so far beside it."""
+    layout = calm()
+    start = layout.start_pose.copy()
+    start[:2] = layout.bench_mm + layout.targets_mm[0] + [offset_mm, 0]
+    insertion = NeedleInsertion()
+    insertion.start(replace(layout, start_pose=start))
+    return insertion
+
+
+def test_every_way_to_fail_ends_the_episode_with_its_reason() -> None:
+    assert plunge(over_the_target(), (0, STILL)) == "time is up before a puncture"
+    beside = plunge(over_the_target(1.2 * MISS_MM), (80, down(0.15)))
+    assert beside == "punctured beside the target"
+    assert plunge(over_the_target(0.8 * MISS_MM), (80, down(0.15))) == "beyond the layer"
+    inside = over_the_target()
+    while not inside.inside:
+        inside.step(down(0.15))
+    sideways = np.array([0.5, 0, 0, 0, 0, 0, 1.0])
+    assert plunge(inside, (1, down(1.0)), (12, sideways)) == "too much force"
+    assert inside.progress.max_force_n > FORCE_LIMIT_N
+    short = over_the_target()
+    while not short.inside:
+        short.step(down(0.15))
+    assert plunge(short, (0, STILL)) == "time is up"
+    assert len(short.knots) == MAX_TICKS + 1
+
+
+def test_a_needle_inside_is_held_sideways() -> None:
+    insertion = over_the_target()
+    while not insertion.inside:
+        insertion.step(down(0.15))
+    insertion.step(down(0.6))
+    calm_n = insertion.knots[-1].force_n
+    insertion.step(np.array([0.4, 0, 0, 0, 0, 0, 1.0]))
+    pulled = insertion.knots[-1].force_n
+    assert pulled > calm_n
+    # The gauge along the needle feels the friction of it.
+    assert insertion.contact.force_n[-1] > insertion.layout.tissue.cutting_n
+
+
+def test_a_layer_that_was_passed_is_no_success() -> None:
+    insertion = NeedleInsertion()
+    insertion.reset(3, "full")
+    for _ in follow(insertion):
+        pass
+    progress = insertion.progress
+    assert insertion.outcome == INSERTED
+    assert replace(progress, overshoot_mm=1.1 * OVERSHOOT_MM).outcome(50) == "beyond the layer"
+    assert replace(progress, punctured_mm=1.1).outcome(50) == "punctured beside the target"
+    assert replace(progress, max_force_n=2.6).outcome(50) == "too much force"
+
+
+def test_levels() -> None:
+    for seed in range(20):
+        depth, full, moved = (draw_layout(seed, level) for level in ("depth", "full", "moved"))
+        above = depth.start_pose[:2] - depth.bench_mm - depth.targets_mm[0]
+        assert np.abs(above).max() <= 0.3
+        assert not len(full.push_times_s) and not len(depth.push_times_s)
+        assert len(moved.push_times_s) == 3
+        np.testing.assert_array_equal(full.start_pose, moved.start_pose)
+
+
+def test_the_surface_breathes() -> None:
+    insertion = NeedleInsertion()
+    insertion.start(calm())
+    for _ in range(60):
+        insertion.step(STILL)
+    heights = np.array([knot.surface_mm for knot in insertion.knots])
+    assert 0.05 < np.ptp(heights) < 0.25
+
+
+def percept(miss_mm: float, distance_mm: float) -> Percept:
+    """A needle that hangs still beside the target."""
+    return Percept(
+        np.array([miss_mm, 0.0]), distance_mm, distance_mm + 2.5, False, np.zeros(3), np.zeros(6)
+    )
+
+
+@pytest.mark.parametrize("distance", [0.0, 0.2, 0.7, 1.3, 2.0, 4.0])
+def test_the_demonstrator_never_returns_upwards_and_waits_where_it_is(distance: float) -> None:
+    """Averages of what it does at two misses stand between them: nobody learns to hover."""
+
+    def falls(miss: float) -> float:
+        seeds = (np.random.default_rng(seed) for seed in range(200))
+        motions = [expert_motion(percept(miss, distance), 8.0, TICK_S, rng)[2] for rng in seeds]
+        return -float(np.mean(motions))
+
+    speeds = [falls(miss) for miss in np.linspace(0, 2, 21)]
+    assert min(speeds) > -0.003  # of tremor alone
+    assert (np.diff(speeds) < 1e-9).all()
+    assert max(-np.diff(speeds)) < 0.025  # no step of its gate

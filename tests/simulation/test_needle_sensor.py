@@ -8,10 +8,12 @@ from pipeline.simulation.needle_sensor import (
     A_SCAN_BINS,
     BIN_MM,
     READINGS_PER_SCAN,
+    SCANS_LATE,
     NeedleContact,
-    a_scans,
-    sensor_readings,
+    NeedleSensor,
 )
+
+NOW = np.zeros(1)
 
 
 def outside(distance_mm: float, layer_depth_mm: float, rows: int) -> NeedleContact:
@@ -24,27 +26,67 @@ def outside(distance_mm: float, layer_depth_mm: float, rows: int) -> NeedleConta
     )
 
 
-@given(st.floats(0, 5.0), st.floats(1.5, 4.0), st.floats(0.9, 1.1), st.integers(0, 99))
+@given(st.floats(0, 5.0), st.floats(1.5, 4.0), st.floats(0.92, 1.08), st.integers(0, 99))
 def test_the_surface_is_the_strongest_peak(
     distance: float, layer_depth: float, gain: float, seed: int
 ) -> None:
-    scan = a_scans(outside(distance, layer_depth, 1), gain, np.random.default_rng(seed))[0]
-    # The light scattered behind the surface pulls the peak a few bins inwards.
-    assert abs(scan.argmax() - distance / BIN_MM) <= 5
+    sensor = NeedleSensor(gain, seed)
+    scan = sensor.a_scans(outside(distance, layer_depth, 1), NOW, np.random.default_rng(seed))[0]
+    # Where it saturates the peak is flat, and the light behind it pulls it inwards.
+    top = np.flatnonzero(scan == scan.max())
+    assert abs(top.mean() - distance / BIN_MM) <= 12
     assert scan.min() >= 0 and scan.max() <= 255
     np.testing.assert_array_equal(scan, np.rint(scan))
 
 
 @given(st.floats(5.4, 100.0))
 def test_tissue_out_of_range_leaves_the_background(distance: float) -> None:
-    scans = a_scans(outside(distance, 2.0, 3), 1.0, np.random.default_rng(0))
+    sensor = NeedleSensor(1.0, 0)
+    scans = sensor.a_scans(outside(distance, 2.0, 3), np.zeros(3), np.random.default_rng(0))
     assert np.ptp(scans) <= 6
 
 
+def test_a_strong_signal_saturates() -> None:
+    scans = [
+        NeedleSensor(1.08, seed).a_scans(outside(0.5, 2.0, 1), NOW, np.random.default_rng(0))
+        for seed in range(20)
+    ]
+    assert max(scan.max() for scan in scans) == 255
+
+
+def test_speckle_belongs_to_the_tissue_and_to_the_episode() -> None:
+    """It moves with the tissue towards the tip, and another episode has another."""
+
+    def behind(sensor: NeedleSensor, distance: float) -> np.ndarray:
+        scan = sensor.a_scans(outside(distance, 3.0, 1), NOW, np.random.default_rng(1))[0]
+        # The light behind the surface, clear of both peaks.
+        first = round(distance / BIN_MM) + 80
+        return scan[first : first + 250]
+
+    one, other = NeedleSensor(1.0, 1), NeedleSensor(1.0, 2)
+    near, far, strange = behind(one, 0.5), behind(one, 1.0), behind(other, 1.0)
+    assert np.abs(near - far).mean() < 1.0 < np.abs(far - strange).mean()
+
+
 def test_each_scan_is_read_five_times_and_each_force_once() -> None:
-    rows = sensor_readings(outside(1.0, 2.0, 65), 0.0, 1.0, np.random.default_rng(0))
-    assert rows.shape == (65, 1 + A_SCAN_BINS) and rows.dtype == np.float32
+    rows = NeedleSensor(1.0, 0).read(outside(1.0, 2.0, 650), 0.0, np.random.default_rng(0))
+    assert rows.shape == (650, 1 + A_SCAN_BINS) and rows.dtype == np.float32
     held = rows[:, 1:].reshape(-1, READINGS_PER_SCAN, A_SCAN_BINS)
     assert (held == held[:, :1]).all()
-    assert (held[1:, 0] != held[:-1, 0]).any(axis=1).all()
+    repeated = (held[SCANS_LATE + 1 :, 0] == held[SCANS_LATE:-1, 0]).all(axis=1)
+    assert 0 < repeated.sum() < 12  # a lost scan is the last one again
     assert len(np.unique(rows[:, 0])) > 20
+
+
+def test_scans_come_late_and_go_on_where_the_last_tick_ended() -> None:
+    """A step of the distance shows two scans later, also across the end of a tick."""
+    before, after = outside(3.0, 2.0, 65), outside(1.0, 2.0, 65)
+    for seed in range(20):
+        sensor, rng = NeedleSensor(1.0, 0), np.random.default_rng(seed)
+        rows = np.concatenate([sensor.read(before, 0.0, rng), sensor.read(after, 0.1, rng)])
+        scans = rows[::READINGS_PER_SCAN, 1:]
+        near = np.abs(scans.argmax(axis=1) - 1.0 / BIN_MM) < 20
+        shown = int(near.argmax())
+        assert near[shown:].all() and shown >= 13 + SCANS_LATE
+        if seed == 0:
+            assert shown == 13 + SCANS_LATE

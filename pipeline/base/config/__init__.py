@@ -22,10 +22,13 @@ from pipeline.base.config.stage_one import (
     VLMParams,
 )
 from pipeline.base.config.stage_two import (
+    Chunking,
     EvaluateParams,
     FinetuneParams,
     FusionStrategy,
+    Level,
     ModelType,
+    RolloutParams,
     TrainHeadParams,
     TuningParams,
 )

@@ -20,6 +20,7 @@ from pipeline.base.config.stage_two import (
     CompareParams,
     EvaluateParams,
     FinetuneParams,
+    RolloutParams,
     TrainHeadParams,
 )
 from pipeline.base.config.stores import ArchiveParams, ProbeParams, StoresParams, VerifyParams
@@ -34,6 +35,7 @@ class Params(Section):
     extract: ExtractParams = ExtractParams()
     train_head: TrainHeadParams = TrainHeadParams()
     evaluate: EvaluateParams = EvaluateParams()
+    rollout: RolloutParams = RolloutParams()
     finetune: FinetuneParams = FinetuneParams()
     compare: CompareParams = CompareParams()
     verify: VerifyParams = VerifyParams()

@@ -17,6 +17,8 @@ from pipeline.base.config.section import Fraction, Section, Seed
 
 ModelType = Literal["regression", "diffusion", "flow_matching"]
 FusionStrategy = Literal["concat", "cross_attention", "gated", "none"]
+Level = Literal["depth", "full", "moved"]
+Chunking = Literal["none", "temporal", "rtc"]
 LoggerName = Literal["tensorboard", "wandb"]
 Weight = Annotated[float, Field(ge=0)]
 
@@ -165,6 +167,36 @@ class EvaluateParams(Section):
     check_store: bool = True
     """Read the store once before the evaluation, and refuse a chunk that does not give its
     checksum; false where that takes too long."""
+
+
+class RolloutParams(Section):
+    """How a policy runs closed loop in the simulation, and where the report goes."""
+
+    checkpoint: Path | None = None
+    """A training run's folder, or one checkpoint in it; `train_head.output` where null."""
+    environment: Literal["phantom"] = "phantom"
+    """The simulated needle insertion of the demo."""
+    level: Level = "full"
+    """depth: the needle begins above the target, so that the sensor suffices. full: it begins
+    anywhere. moved: besides, target and tissue are pushed meanwhile."""
+    episodes: int = Field(default=50, ge=1)
+    """Episodes of each controller."""
+    seed: Seed = 1_000_000
+    """Of the first episode; those that follow have the seeds that follow."""
+    execute: int = Field(default=1, ge=1)
+    """Steps of a chunk that are carried out before the head is asked for the next."""
+    chunking: Chunking = "none"
+    """none: the newest chunk. temporal: the weighted mean of all chunks that reach the tick
+    (temporal ensembling). rtc: each chunk is drawn to continue the last (real-time chunking), for
+    experts that sample."""
+    latency_ms: float = Field(default=0.0, ge=0)
+    """What a pass of the model takes, in simulated time: its features are so much older."""
+    ablations: bool = True
+    """Also run the policy without the sensor, and without features."""
+    device: str = "auto"
+    """auto, cpu, cuda or cuda:N."""
+    output: Path = Path("reports/rollout")
+    """Folder of metrics, table and page."""
 
 
 class CompareParams(Section):
