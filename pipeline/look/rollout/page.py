@@ -1,0 +1,170 @@
+"""The page of a policy's rollouts: how often it succeeds, and how it fails."""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from pipeline.base.table import Table
+from pipeline.evaluate.rollouts import RolloutEpisode, Rollouts, SuccessRate
+from pipeline.look.page.blocks import Block, Document, Picture, Report, Section, Text
+from pipeline.look.page.writing import sentence
+from pipeline.look.rollout import pictures as plots
+from pipeline.look.rollout.pictures import controller_name
+
+_SUCCESS = (
+    f"An episode succeeds where the needle punctures within {plots.LATERAL_MM:.1f} mm of the "
+    f"target, rests within {plots.REST_MM:g} mm of the layer for 6 ticks, never goes more than "
+    f"{plots.OVERSHOOT_MM:g} mm beyond it, never meets more than {plots.FORCE_N:g} N, and all of "
+    "this within 12 s. Anything else ends it, with its reason. The levels are `depth`, which "
+    "begins above the target and leaves the depth to judge, `full`, which begins beside it, and "
+    "`moved`, which pushes the phantom on the way."
+)
+_CONTROLLERS = (
+    "The demonstrator is the rule that made the training data, and sees what the simulation hides. "
+    "With a stream off, the same policy acts without it. All of them meet the same episodes."
+)
+
+
+def rollout_report(rollouts: Rollouts) -> Report:
+    """The page of these rollouts, those of `policy` in detail.
+
+    Says nothing of the clock and nothing of where it is written: the same rollouts give the same
+    page. Pictures ask the episodes for their frames when they are drawn.
+    """
+    rates, episodes = rollouts.rates(), rollouts.of("policy")
+    shares = "; ".join(f"{controller_name(name)} {_share(rate)}" for name, rate in rates.items())
+    return Report(
+        title=f"Rollouts of {rollouts.checkpoint}",
+        summary=(
+            "The policy acts in the simulated needle insertion and sees what its actions lead to. "
+            f"Episodes that succeed at level {rollouts.level}: {shares}."
+        ),
+        tiles=(
+            ("success of the policy", f"{100 * rates['policy'].rate:.0f} %"),
+            ("95 % interval [%]", _interval(rates["policy"])),
+            ("median sideways miss [mm]", f"{_median(episodes, 'lateral_mm'):.2f}"),
+            ("median time [s]", f"{_median(episodes, 'time_s'):.1f}"),
+        ),
+        sections=(
+            Section("Success", _success(rollouts)),
+            Section("How episodes ended", _endings(rollouts)),
+            Section("Where the needle went", _places(rollouts)),
+            Section("Episodes closely", (), tuple(_filmstrips(episodes))),
+            Section("How far each missed", _misses(rollouts)),
+            Section("What was run", [Document("Settings of the rollout", rollouts.settings)]),
+        ),
+    )
+
+
+def worst_and_median(
+    episodes: Sequence[RolloutEpisode],
+) -> tuple[RolloutEpisode, RolloutEpisode]:
+    """The worst episode, and that in the middle between it and the best.
+
+    Those without success are worse than those with; among equals, the farther the tip was from
+    the target and from the layer (mm, added), the worse.
+    """
+    ordered = sorted(
+        episodes, key=lambda episode: (episode.success, -episode.lateral_mm - abs(episode.depth_mm))
+    )
+    return ordered[0], ordered[len(ordered) // 2]
+
+
+def _share(rate: SuccessRate) -> str:
+    return f"{round(rate.rate * rate.episodes)} of {rate.episodes}"
+
+
+def _interval(rate: SuccessRate) -> str:
+    return f"{100 * rate.low:.0f} to {100 * rate.high:.0f}"
+
+
+def _median(episodes: Sequence[RolloutEpisode], field: str) -> float:
+    return float(np.median([getattr(episode, field) for episode in episodes]))
+
+
+def _success(rollouts: Rollouts) -> list[Block]:
+    """How often, as a picture and as a table with a row a controller and level."""
+    rows: list[tuple[object, ...]] = []
+    for level in dict.fromkeys(episode.level for episode in rollouts.episodes):
+        here = tuple(episode for episode in rollouts.episodes if episode.level == level)
+        met = replace(rollouts, episodes=here)
+        for name, rate in met.rates().items():
+            share, medians = round(100 * rate.rate, 1), ("lateral_mm", "time_s")
+            row = (controller_name(name), level, rate.episodes, share, _interval(rate))
+            rows.append((*row, *(_median(met.of(name), field) for field in medians)))
+    heads = ["controller", "level", "episodes", "success [%]", "95 % interval [%]"]
+    heads += ["median sideways miss [mm]", "median time [s]"]
+    caption = "The share of episodes that succeed, and its 95 % interval (Wilson), by controller."
+    return [
+        Text(_SUCCESS),
+        Text(_CONTROLLERS),
+        Picture("success", caption, partial(plots.success, rollouts)),
+        Table(heads, rows, "Success by controller, and medians over all of its episodes."),
+    ]
+
+
+def _endings(rollouts: Rollouts) -> list[Block]:
+    counts = {
+        name: Counter(episode.reason for episode in rollouts.of(name)) for name in rollouts.rates()
+    }
+    reasons = sum(counts.values(), Counter[str]()).most_common()
+    rows = [(reason, *(count[reason] for count in counts.values())) for reason, _ in reasons]
+    caption = "Every episode of each controller by how it ended; grey, those that succeeded."
+    return [
+        Picture("endings", caption, partial(plots.endings, rollouts)),
+        Table(["ending", *map(controller_name, counts)], rows, "Episodes by how they ended."),
+    ]
+
+
+def _places(rollouts: Rollouts) -> list[Block]:
+    episodes = rollouts.of("policy")
+    above = (
+        "The way of the needle's tip as seen from the target. Points are where it punctured, or "
+        "where it was in the end when it never did; in the circle, an insertion may succeed. Where "
+        "a push moves the target, a line jumps."
+    )
+    over_time = (
+        "A thin line is an episode. The tip is to be near the target before it goes below the "
+        "surface, and to come to rest in the green band. Force is the largest in each tick; it "
+        "falls when the needle punctures."
+    )
+    strong = {f"{kind}, seed {e.seed}": e for kind, e in _extremes(episodes).items()}
+    return [
+        Picture("paths", above, partial(plots.paths, rollouts)),
+        Picture("courses", over_time, partial(plots.courses, episodes, strong)),
+    ]
+
+
+def _extremes(episodes: Sequence[RolloutEpisode]) -> Mapping[str, RolloutEpisode]:
+    """The worst and the median; a single episode is only the worst."""
+    worst, median = worst_and_median(episodes)
+    return {"worst": worst} | ({} if median is worst else {"median": median})
+
+
+def _filmstrips(episodes: Sequence[RolloutEpisode]) -> Iterator[Section]:
+    caption = (
+        "What the cameras saw at moments from the beginning to the end, which dotted lines mark "
+        "below. While the needle presses and has not punctured, the layer gives way with it."
+    )
+    for kind, episode in _extremes(episodes).items():
+        side = "short of" if episode.depth_mm > 0 else "beyond"
+        words = (
+            f"{sentence(episode.reason)} {episode.lateral_mm:.2f} mm sideways from the target, "
+            f"{abs(episode.depth_mm):.2f} mm {side} the layer in the end, at most "
+            f"{episode.overshoot_mm:.2f} mm beyond it and {episode.max_force_n:.2f} N, "
+            f"{episode.time_s:.1f} s."
+        )
+        title = f"{kind.capitalize()}: seed {episode.seed}, level {episode.level}"
+        draw = partial(plots.filmstrip, episode, f"{title}, {episode.reason}")
+        yield Section(title, [Text(words), Picture(f"filmstrip_{kind}", caption, draw)])
+
+
+def _misses(rollouts: Rollouts) -> list[Block]:
+    caption = (
+        "A point is an episode, the upright stroke the median. What is farther than the axis "
+        "reaches lies at its right end."
+    )
+    return [Picture("misses", caption, partial(plots.misses, rollouts))]

@@ -1,0 +1,242 @@
+"""Rollouts -> pictures; the same rollouts give the same bytes."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from itertools import cycle
+from typing import Any, Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+
+from pipeline.evaluate.rollouts import RolloutEpisode, Rollouts
+from pipeline.look.page.style import GRID, INK, PALETTE, canvas, legend_below
+
+# What an episode must keep to succeed: sideways at the puncture, from the layer at rest, beyond it.
+LATERAL_MM: Final = 1.0
+REST_MM: Final = 0.15
+OVERSHOOT_MM: Final = 0.5
+FORCE_N: Final = 2.5
+
+_MOMENTS = 8
+_NEAR_MM = 3.0
+"""Around the target, what the nearer view of the paths shows."""
+_WIDTH = 9.0
+_OTHER = "#999999"
+"""Of an episode among many, and of a controller beside the policy."""
+_OUTCOMES = {True: ("inserted", PALETTE[0], "o"), False: ("not inserted", PALETTE[5], "X")}
+_MANY = 100
+"""Episodes from which on paths are pixels in the page, for thousands of lines are slow."""
+
+
+def controller_name(controller: str) -> str:
+    """What a page calls a controller."""
+    known = {"policy": "policy", "expert": "demonstrator"}
+    return known.get(controller, f"policy, {controller}")
+
+
+def success(rollouts: Rollouts) -> Figure:
+    """A bar a controller: the share of its episodes that succeed, with its 95 % interval."""
+    rates = rollouts.rates()
+    figure = canvas(_WIDTH, 0.55 * len(rates) + 1.3)
+    axis = figure.subplots()
+    for place, (controller, rate) in enumerate(rates.items()):
+        reach = 100 * np.array([[rate.rate - rate.low], [rate.high - rate.rate]])
+        colour = PALETTE[0] if controller == "policy" else _OTHER
+        style = {"ecolor": INK, "capsize": 4, "lw": 1.5}
+        axis.barh(place, 100 * rate.rate, 0.66, color=colour, xerr=reach, error_kw=style)
+        words = f"{round(rate.rate * rate.episodes)} of {rate.episodes}"
+        axis.text(1.01, place, words, transform=axis.get_yaxis_transform(), va="center")
+    _name_rows(axis, list(rates))
+    axis.set(xlim=(0, 100), xlabel="episodes that succeed [%] (lines: 95 % interval)")
+    figure.suptitle("How often the needle is inserted")
+    return figure
+
+
+def endings(rollouts: Rollouts) -> Figure:
+    """A bar a controller, as long as it has episodes, divided by why they ended.
+
+    Safe stops are of one kind, whatever their cause.
+    """
+    counts = {
+        name: Counter(episode.reason.partition(":")[0] for episode in rollouts.of(name))
+        for name in rollouts.rates()
+    }
+    failures = {reason for count in counts.values() for reason in count} - {"inserted"}
+    colours = {"inserted": GRID, **dict(zip(sorted(failures), cycle(PALETTE[1:]), strict=False))}
+    figure = canvas(_WIDTH, 0.55 * len(counts) + 1.3 + 0.25 * -(-len(colours) // 3))
+    axis = figure.subplots()
+    begins = np.zeros(len(counts))
+    for reason, colour in colours.items():
+        lengths = np.array([count[reason] for count in counts.values()])
+        bars = axis.barh(range(len(lengths)), lengths, 0.66, begins, color=colour, label=reason)
+        words = [f"{length}" if length else "" for length in lengths]
+        ink = INK if colour == GRID else "#111111"
+        axis.bar_label(bars, words, label_type="center", color=ink)
+        begins += lengths
+    _name_rows(axis, list(counts))
+    axis.set_xlabel("episodes")
+    axis.xaxis.set_major_locator(MaxNLocator(integer=True))
+    legend_below(figure, axis, 3)
+    figure.suptitle("How episodes ended")
+    return figure
+
+
+def paths(rollouts: Rollouts) -> Figure:
+    """The tip's ways seen from above, of policy and demonstrator; below, those near the target."""
+    shown = [name for name in ("policy", "expert") if rollouts.of(name)]
+    offsets = [episode.trace.offset_mm for name in shown for episode in rollouts.of(name)]
+    far = max(_NEAR_MM, 1.05 * float(np.abs(np.concatenate(offsets)).max()))
+    figure = canvas(_WIDTH * max(len(shown), 1.4) / 2, _WIDTH + 0.9)
+    axes = figure.subplots(2, len(shown), squeeze=False)
+    for column, name in zip(axes.T, shown, strict=True):
+        _draw_paths(column[0], rollouts.of(name), far)
+        _draw_paths(column[1], rollouts.of(name), _NEAR_MM)
+        column[0].set_title(f"{controller_name(name)}: whole paths")
+        column[1].set_title(f"{controller_name(name)}: the last {_NEAR_MM:g} mm")
+    legend_below(figure, axes[0, 0], 3)
+    figure.suptitle("Seen from above, the target in the middle")
+    return figure
+
+
+def entry_mm(episode: RolloutEpisode) -> NDArray[np.float64]:
+    """(2,) from the target to where `lateral_mm` was taken: the puncture, without one the end.
+
+    Of the places below the surface, and the end, that which lies so far from the target.
+    """
+    trace = episode.trace
+    gap = np.abs(np.hypot(*trace.offset_mm.T) - episode.lateral_mm)
+    gap[:-1][trace.height_mm[:-1] > 0] = np.inf
+    return trace.offset_mm[gap.argmin()]
+
+
+def courses(episodes: Sequence[RolloutEpisode], strong: Mapping[str, RolloutEpisode]) -> Figure:
+    """Place and force over time, a thin line an episode.
+
+    `strong` are those that stand out, by what the legend says of them.
+    """
+    figure = canvas(_WIDTH, 10.0)
+    axes = figure.subplots(4)
+    pixels = len(episodes) > _MANY
+    for episode in episodes:
+        _draw_course(axes, episode, color=_OTHER, lw=0.7, alpha=0.5, rasterized=pixels)
+    for (label, episode), colour in zip(strong.items(), (PALETTE[1], INK), strict=False):
+        _draw_course(axes, episode, color=colour, lw=2.4, label=label, zorder=5)
+    _mark_limits(axes)
+    figure.align_ylabels(axes)
+    legend_below(figure, axes[0], 2)
+    figure.suptitle(f"Place and force over time in {len(episodes)} episode(s) of the policy")
+    return figure
+
+
+def misses(rollouts: Rollouts) -> Figure:
+    """Every episode's sideways miss and overshoot as a point, a row a controller."""
+    controllers = list(rollouts.rates())
+    figure = canvas(_WIDTH, 0.7 * len(controllers) + 1.8)
+    sideways, beyond = axes = figure.subplots(1, 2, sharey=True)
+    for place, name in enumerate(controllers):
+        _draw_strip(sideways, place, rollouts.of(name), "lateral_mm", 4 * LATERAL_MM)
+        _draw_strip(beyond, place, rollouts.of(name), "overshoot_mm", 2 * OVERSHOOT_MM)
+    sideways.set_xlabel("sideways from the target [mm]")
+    beyond.set_xlabel("farthest beyond the layer [mm]")
+    for axis, limit in zip(axes, (LATERAL_MM, OVERSHOOT_MM), strict=True):
+        axis.axvline(limit, color=INK, ls="--", lw=1.2, label="limit of a success")
+        _name_rows(axis, controllers)
+    legend_below(figure, sideways, 3)
+    figure.suptitle("How far each episode missed (left is better)")
+    return figure
+
+
+def filmstrip(episode: RolloutEpisode, title: str) -> Figure:
+    """What every view showed at moments from begin to end; below, place and force over time."""
+    trace = episode.trace
+    ticks = np.unique(np.linspace(0, len(trace.time_s) - 1, _MOMENTS).round().astype(int))
+    moments = trace.time_s[ticks].tolist()
+    frames = [episode.frames(moment) for moment in moments]
+    shapes = {view: image.shape for view, image in frames[0].items()}
+    heights = [10 / _MOMENTS * shape[0] / shape[1] for shape in shapes.values()]
+    figure = canvas(10.4, sum(heights) + 8.5)
+    grid = figure.add_gridspec(len(shapes) + 4, _MOMENTS, height_ratios=[*heights, *[1.6] * 4])
+    for row, view in enumerate(shapes):
+        for column, shown in enumerate(frames):
+            axis = figure.add_subplot(grid[row, column])
+            # Matplotlib names an image by its content, which may come twice.
+            axis.imshow(shown[view], gid=f"frame-{row}-{column}")
+            axis.set(xticks=[], yticks=[], ylabel="" if column else view)
+            axis.set_title("" if row else f"{moments[column]:.1f} s")
+            axis.spines[:].set_visible(False)
+    axes = [figure.add_subplot(grid[row, :]) for row in range(-4, 0)]
+    _draw_course(axes, episode, color=PALETTE[0], lw=2)
+    _mark_limits(axes)
+    for axis in axes:
+        for moment in moments:
+            axis.axvline(moment, color=INK, lw=0.8, ls=":", zorder=1)
+    figure.align_ylabels(axes)
+    figure.suptitle(title)
+    return figure
+
+
+def _draw_paths(axis: Axes, episodes: Sequence[RolloutEpisode], reach_mm: float) -> None:
+    """Each from where it last comes within reach."""
+    for episode in episodes:
+        offset_mm = episode.trace.offset_mm
+        (outside,) = np.nonzero(np.abs(offset_mm).max(axis=1) > reach_mm)
+        style: dict[str, Any] = {"lw": 0.8, "alpha": 0.45, "rasterized": len(episodes) > _MANY}
+        shown = offset_mm[outside[-1] if len(outside) else 0 :]
+        axis.plot(*shown.T, color=_OUTCOMES[episode.success][1], **style)
+    around = LATERAL_MM * np.exp(2j * np.pi * np.arange(91) / 90)
+    label = f"{LATERAL_MM:g} mm from the target"
+    axis.plot(around.real, around.imag, color=INK, lw=1.6, zorder=6, label=label)
+    for outcome, (label, colour, marker) in _OUTCOMES.items():
+        ends = [entry_mm(episode) for episode in episodes if episode.success == outcome]
+        style = {"s": 34, "color": colour, "edgecolors": "white", "lw": 0.6, "zorder": 7}
+        axis.scatter(*np.reshape(ends, (-1, 2)).T, marker=marker, label=label, **style)
+    axis.set(xlim=(-reach_mm, reach_mm), ylim=(-reach_mm, reach_mm), aspect="equal")
+    axis.set(xlabel="x [mm]", ylabel="y [mm]")
+
+
+def _draw_course(axes: Sequence[Axes], episode: RolloutEpisode, **style: Any) -> None:
+    """From top to bottom: sideways from the target, height, distance to the layer, force."""
+    trace = episode.trace
+    shown = (np.hypot(*trace.offset_mm.T), trace.height_mm, trace.layer_mm, trace.force_n)
+    for axis, values in zip(axes, shown, strict=True):
+        axis.plot(trace.time_s, values, **style)
+
+
+def _mark_limits(axes: Sequence[Axes]) -> None:
+    """What `_draw_course` has drawn, and what an episode must keep to."""
+    sideways, height, layer, force = axes
+    for axis, limit in zip(axes, (LATERAL_MM, 0, -OVERSHOOT_MM, FORCE_N), strict=True):
+        axis.axhline(limit, color=INK, lw=1, ls="--")
+        axis.tick_params(labelbottom=axis is force)
+        axis.set_xlim(axes[0].get_xlim())
+    layer.axhspan(-REST_MM, REST_MM, color=PALETTE[2], alpha=0.35, lw=0)
+    words = f"tip to the layer [mm]; green: within {REST_MM:g}, dashed: {OVERSHOOT_MM:g} beyond it"
+    sideways.set(title=f"sideways from the target [mm]; dashed: {LATERAL_MM:g}", ylim=(0, None))
+    height.set_title("tip above the surface [mm]; dashed: the surface at rest")
+    layer.set_title(words)
+    force.set(title=f"force [N]; dashed: {FORCE_N:g}", xlabel="time [s]", ylim=(0, None))
+
+
+def _draw_strip(
+    axis: Axes, place: int, episodes: Sequence[RolloutEpisode], field: str, most: float
+) -> None:
+    """Points of one row, no farther than `most` and spread upright so that equal ones show."""
+    values = np.minimum([getattr(episode, field) for episode in episodes], most)
+    successes = np.array([episode.success for episode in episodes])
+    # Multiples of the golden ratio fill an interval evenly, however many there are.
+    rows = place + 0.5 * (np.arange(len(values)) * 0.618 % 1 - 0.5)
+    style: dict[str, Any] = {"s": 26, "linewidths": 0, "alpha": 0.75}
+    for outcome, (label, colour, marker) in _OUTCOMES.items():
+        here, label = successes == outcome, "" if place else label
+        axis.scatter(values[here], rows[here], c=colour, marker=marker, label=label, **style)
+    axis.plot([np.median(values)] * 2, [place - 0.36, place + 0.36], color=INK, lw=2.4)
+    axis.set_xlim(-0.03 * most, 1.03 * most)
+
+
+def _name_rows(axis: Axes, controllers: Sequence[str]) -> None:
+    axis.set_yticks(range(len(controllers)), [controller_name(name) for name in controllers])
+    axis.set_ylim(len(controllers) - 0.5, -0.5)
+    axis.grid(axis="y", visible=False)

@@ -1,0 +1,107 @@
+"""The pictures of rollouts show their numbers."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.evaluate.rollouts import RolloutEpisode, Rollouts
+from pipeline.look.rollout import pictures as plots
+
+MakeEpisode = Callable[..., RolloutEpisode]
+
+
+def test_bars_are_shares_with_their_intervals(rollouts: Rollouts) -> None:
+    (axis,) = plots.success(rollouts).axes
+    names = [label.get_text() for label in axis.get_yticklabels()]
+    assert names == ["policy", "demonstrator", "policy, features off"]
+    assert [bar.get_width() for bar in axis.patches] == pytest.approx([60.0, 100.0, 0.0])
+    (line,) = axis.collections[0].get_segments()
+    rate = rollouts.rates()["policy"]
+    assert line[:, 0] == pytest.approx([100 * rate.low, 100 * rate.high])
+    assert [text.get_text() for text in axis.texts] == ["3 of 5", "5 of 5", "0 of 5"]
+
+
+def test_every_episode_is_in_the_bar_of_endings_once(rollouts: Rollouts) -> None:
+    (axis,) = plots.endings(rollouts).axes
+    lengths = {str(bars.get_label()): [bar.get_width() for bar in bars] for bars in axis.containers}
+    assert lengths["inserted"] == [3, 5, 0]
+    # Without what is said of its cause.
+    assert "safe stop" in lengths and len(lengths) == 4
+    assert np.sum(list(lengths.values()), axis=0).tolist() == [5, 5, 5]
+
+
+def test_points_of_paths_are_coloured_by_success(rollouts: Rollouts) -> None:
+    figure = plots.paths(rollouts)
+    titles = [axis.get_title() for axis in figure.axes]
+    assert titles == [
+        "policy: whole paths",
+        "demonstrator: whole paths",
+        "policy: the last 3 mm",
+        "demonstrator: the last 3 mm",
+    ]
+    inserted, others = (len(points.get_offsets()) for points in figure.axes[0].collections)
+    assert (inserted, others) == (3, 2)
+    near, limit = figure.axes[2], plots.LATERAL_MM
+    circle = next(line for line in near.lines if "from the target" in str(line.get_label()))
+    assert np.hypot(*circle.get_xydata().T) == pytest.approx(np.full(91, limit))
+    # From above, a path begins where it last comes near.
+    begins = [np.abs(line.get_xydata()[1:]).max() for line in near.lines[:5]]
+    assert max(begins) <= 3.0
+    without = replace(rollouts, episodes=rollouts.of("policy"))
+    assert len(plots.paths(without).axes) == 2
+
+
+def test_the_entry_is_where_the_miss_was_measured(make_episode: MakeEpisode) -> None:
+    episode = make_episode(0, ticks=40)
+    miss = np.hypot(*episode.trace.offset_mm.T)
+    punctured = int(np.flatnonzero(episode.trace.height_mm <= 0)[2])
+    there = replace(episode, lateral_mm=float(miss[punctured]))
+    assert plots.entry_mm(there).tolist() == episode.trace.offset_mm[punctured].tolist()
+    # Never punctured, and above the surface in the end.
+    above = replace(episode.trace, height_mm=np.abs(episode.trace.height_mm))
+    ended = replace(episode, trace=above, lateral_mm=float(miss[-1]))
+    assert plots.entry_mm(ended).tolist() == above.offset_mm[-1].tolist()
+
+
+def test_misses_beyond_the_axis_lie_at_its_end(rollouts: Rollouts) -> None:
+    sideways, beyond = plots.misses(rollouts).axes
+    points = np.concatenate([np.asarray(c.get_offsets()) for c in sideways.collections])
+    assert len(points) == 15
+    assert points[:, 0].max() == 4 * plots.LATERAL_MM < sideways.get_xlim()[1]
+    rows, counts = np.unique(points[:, 1].round(), return_counts=True)
+    assert (rows.tolist(), counts.tolist()) == ([0, 1, 2], [5, 5, 5])
+    for axis, limit in ((sideways, plots.LATERAL_MM), (beyond, plots.OVERSHOOT_MM)):
+        (line,) = (line for line in axis.lines if line.get_label() == "limit of a success")
+        assert line.get_xdata()[0] == limit
+
+
+def test_a_filmstrip_asks_for_frames_at_its_moments(make_episode: MakeEpisode) -> None:
+    asked = list[float]()
+
+    def frames(time_s: float) -> dict[str, np.ndarray]:
+        asked.append(time_s)
+        return {"View1": np.zeros((126, 224, 3), np.uint8)}
+
+    episode = make_episode(ticks=60, frames=frames)
+    figure = plots.filmstrip(episode, "Worst")
+    assert len(asked) == 8
+    assert (asked[0], asked[-1]) == (episode.trace.time_s[0], episode.trace.time_s[-1])
+    assert [axis.get_title() for axis in figure.axes[:8]] == [f"{at:.1f} s" for at in asked]
+    for axis in figure.axes[8:]:
+        marked = [line.get_xdata()[0] for line in axis.lines if line.get_linestyle() == ":"]
+        assert marked == asked
+    force = figure.axes[-1]
+    assert force.lines[0].get_ydata().max() == 0.6
+    assert force.lines[1].get_ydata()[0] == plots.FORCE_N
+
+
+def test_worst_and_median_stand_out_among_all(make_episode: MakeEpisode) -> None:
+    episodes = [make_episode(seed) for seed in range(6)]
+    figure = plots.courses(episodes, {"worst, seed 2": episodes[2], "median, seed 4": episodes[4]})
+    assert len(figure.axes) == 4
+    for axis in figure.axes:
+        strong = [line for line in axis.lines if line.get_linewidth() == 2.4]
+        assert [line.get_label() for line in strong] == ["worst, seed 2", "median, seed 4"]
+        assert len(axis.lines) == 6 + 2 + 1
