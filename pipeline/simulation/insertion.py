@@ -121,8 +121,8 @@ class Knot:
 class Progress:
     """How an episode goes: what success and failure are told by."""
 
-    punctured_mm: float | None = None
-    """Sideways from tip to target when the surface was first punctured."""
+    puncture_mm: NDArray[np.float64] | None = None
+    """(2,) from the target to the tip, sideways, when the surface was first punctured."""
     overshoot_mm: float = 0.0
     max_force_n: float = 0.0
     held_ticks: int = 0
@@ -131,7 +131,7 @@ class Progress:
         """Why it has ended after `ticks`, `INSERTED` for success; None where it goes on."""
         if self.max_force_n > FORCE_LIMIT_N:
             return "too much force"
-        if self.punctured_mm is not None and self.punctured_mm > MISS_MM:
+        if self.puncture_mm is not None and np.hypot(*self.puncture_mm) > MISS_MM:
             return "punctured beside the target"
         if self.overshoot_mm > OVERSHOOT_MM:
             return "beyond the layer"
@@ -139,7 +139,7 @@ class Progress:
             return INSERTED
         if ticks < MAX_TICKS:
             return None
-        return TIME_IS_UP if self.punctured_mm is not None else f"{TIME_IS_UP} before a puncture"
+        return TIME_IS_UP if self.puncture_mm is not None else f"{TIME_IS_UP} before a puncture"
 
 
 INSERTED: Final = "inserted"
@@ -150,13 +150,15 @@ TIME_IS_UP: Final = "time is up"
 class EpisodeTrace:
     """What happened, a row a tick.
 
-    `time_s` (tick,); `offset_mm` (tick, 2) from the target to the tip, sideways; `height_mm`
+    `time_s` (tick,); `offset_mm` (tick, 2) from the target to the tip, sideways; `lateral_mm` (2,)
+    that at the puncture, without one at the end; `height_mm`
     (tick,) of the tip above the surface at rest, negative inside; `layer_mm` (tick,) from the tip
     to the target layer, negative beyond it; `force_n` (tick,) the largest within the tick.
     """
 
     time_s: NDArray[np.float64]
     offset_mm: NDArray[np.float64]
+    lateral_mm: NDArray[np.float64]
     height_mm: NDArray[np.float64]
     layer_mm: NDArray[np.float64]
     force_n: NDArray[np.float64]
@@ -274,10 +276,12 @@ class NeedleInsertion:
     def trace(self) -> EpisodeTrace:
         """What happened so far."""
         knots = self.knots[1:]
-        bench = self.layout.bench_mm
+        bench, puncture = self.layout.bench_mm, self.progress.puncture_mm
+        offsets = np.stack([knot.pose[:2] - bench - knot.target_mm for knot in knots])
         return EpisodeTrace(
             time_s=np.arange(1.0, len(self.knots)) * TICK_S,
-            offset_mm=np.stack([knot.pose[:2] - bench - knot.target_mm for knot in knots]),
+            offset_mm=offsets,
+            lateral_mm=offsets[-1] if puncture is None else puncture,
             height_mm=np.array([knot.pose[2] - knot.surface_mm for knot in knots]),
             layer_mm=np.array([knot.layer_mm for knot in knots]),
             force_n=np.array([knot.force_n for knot in knots]),
@@ -337,10 +341,9 @@ class NeedleInsertion:
         if inside.any() and not self.inside:
             entered = int(inside.argmax())
             self._entry_mm = path[entered, :2]
-            if self.progress.punctured_mm is None:
+            if self.progress.puncture_mm is None:
                 target = before.target_mm + part[entered] * (target_mm - before.target_mm)
-                miss = self._entry_mm - self.layout.bench_mm - target
-                self.progress.punctured_mm = float(np.hypot(*miss))
+                self.progress.puncture_mm = self._entry_mm - self.layout.bench_mm - target
         self.inside = bool(inside[-1])
         held = np.where(inside, np.clip(depth, 0, 1), 0) * _SIDEWAYS_N_MM
         sideways = held * np.hypot(*(path[:, :2] - self._entry_mm).T)

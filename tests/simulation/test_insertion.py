@@ -216,7 +216,8 @@ def test_the_demonstrator_ends_at_the_layer_under_the_mark(seed: int) -> None:
     assert insertion.outcome == INSERTED
     last, progress = insertion.knots[-1], insertion.progress
     assert insertion.inside and abs(last.layer_mm) < AT_LAYER_MM
-    assert progress.punctured_mm is not None and progress.punctured_mm < NOT_ALIGNED_MM
+    assert progress.puncture_mm is not None
+    assert np.hypot(*progress.puncture_mm) < NOT_ALIGNED_MM
     upright = orientation(insertion.layout.upright_deg)
     assert (orientation(last.pose[3:]) * upright.inv()).magnitude() < np.deg2rad(1.5)
     places = np.stack([knot.target_mm for knot in insertion.knots])
@@ -373,7 +374,8 @@ def test_a_layer_that_was_passed_is_no_success() -> None:
     progress = insertion.progress
     assert insertion.outcome == INSERTED
     assert replace(progress, overshoot_mm=1.1 * OVERSHOOT_MM).outcome(50) == "beyond the layer"
-    assert replace(progress, punctured_mm=1.1).outcome(50) == "punctured beside the target"
+    beside = replace(progress, puncture_mm=np.array([1.1, 0.0]))
+    assert beside.outcome(50) == "punctured beside the target"
     assert replace(progress, max_force_n=2.6).outcome(50) == "too much force"
 
 

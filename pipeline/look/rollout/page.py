@@ -13,14 +13,23 @@ from pipeline.look.page.blocks import Block, Document, Picture, Report, Section,
 from pipeline.look.page.writing import sentence
 from pipeline.look.rollout import pictures as plots
 from pipeline.look.rollout.pictures import controller_name
+from pipeline.simulation.insertion import (
+    AT_LAYER_MM,
+    FORCE_LIMIT_N,
+    HOLD_TICKS,
+    MAX_TICKS,
+    MISS_MM,
+    OVERSHOOT_MM,
+    TICK_S,
+)
 
 _SUCCESS = (
-    f"An episode succeeds where the needle punctures within {plots.LATERAL_MM:.1f} mm of the "
-    f"target, rests within {plots.REST_MM:g} mm of the layer for 6 ticks, never goes more than "
-    f"{plots.OVERSHOOT_MM:g} mm beyond it, never meets more than {plots.FORCE_N:g} N, and all of "
-    "this within 12 s. Anything else ends it, with its reason. The levels are `depth`, which "
-    "begins above the target and leaves the depth to judge, `full`, which begins beside it, and "
-    "`moved`, which pushes the phantom on the way."
+    f"An episode succeeds where the needle punctures within {MISS_MM:.1f} mm of the target, rests "
+    f"within {AT_LAYER_MM:g} mm of the layer for {HOLD_TICKS} ticks, never goes more than "
+    f"{OVERSHOOT_MM:g} mm beyond it, never meets more than {FORCE_LIMIT_N:g} N, and all of this "
+    f"within {MAX_TICKS * TICK_S:g} s. Anything else ends it, with its reason. The levels are "
+    "`depth`, which begins above the target, so that the sensor suffices, `full`, which begins "
+    "anywhere, and `moved`, in which target and tissue are also pushed on the way."
 )
 _CONTROLLERS = (
     "The demonstrator is the rule that made the training data, and sees what the simulation hides. "

@@ -3,22 +3,16 @@
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import cycle
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 
 from pipeline.evaluate.rollouts import RolloutEpisode, Rollouts
 from pipeline.look.page.style import GRID, INK, PALETTE, canvas, legend_below
-
-# What an episode must keep to succeed: sideways at the puncture, from the layer at rest, beyond it.
-LATERAL_MM: Final = 1.0
-REST_MM: Final = 0.15
-OVERSHOOT_MM: Final = 0.5
-FORCE_N: Final = 2.5
+from pipeline.simulation.insertion import AT_LAYER_MM, FORCE_LIMIT_N, MISS_MM, OVERSHOOT_MM
 
 _MOMENTS = 8
 _NEAR_MM = 3.0
@@ -101,17 +95,6 @@ def paths(rollouts: Rollouts) -> Figure:
     return figure
 
 
-def entry_mm(episode: RolloutEpisode) -> NDArray[np.float64]:
-    """(2,) from the target to where `lateral_mm` was taken: the puncture, without one the end.
-
-    Of the places below the surface, and the end, that which lies so far from the target.
-    """
-    trace = episode.trace
-    gap = np.abs(np.hypot(*trace.offset_mm.T) - episode.lateral_mm)
-    gap[:-1][trace.height_mm[:-1] > 0] = np.inf
-    return trace.offset_mm[gap.argmin()]
-
-
 def courses(episodes: Sequence[RolloutEpisode], strong: Mapping[str, RolloutEpisode]) -> Figure:
     """Place and force over time, a thin line an episode.
 
@@ -137,11 +120,11 @@ def misses(rollouts: Rollouts) -> Figure:
     figure = canvas(_WIDTH, 0.7 * len(controllers) + 1.8)
     sideways, beyond = axes = figure.subplots(1, 2, sharey=True)
     for place, name in enumerate(controllers):
-        _draw_strip(sideways, place, rollouts.of(name), "lateral_mm", 4 * LATERAL_MM)
+        _draw_strip(sideways, place, rollouts.of(name), "lateral_mm", 4 * MISS_MM)
         _draw_strip(beyond, place, rollouts.of(name), "overshoot_mm", 2 * OVERSHOOT_MM)
     sideways.set_xlabel("sideways from the target [mm]")
     beyond.set_xlabel("farthest beyond the layer [mm]")
-    for axis, limit in zip(axes, (LATERAL_MM, OVERSHOOT_MM), strict=True):
+    for axis, limit in zip(axes, (MISS_MM, OVERSHOOT_MM), strict=True):
         axis.axvline(limit, color=INK, ls="--", lw=1.2, label="limit of a success")
         _name_rows(axis, controllers)
     legend_below(figure, sideways, 3)
@@ -186,11 +169,11 @@ def _draw_paths(axis: Axes, episodes: Sequence[RolloutEpisode], reach_mm: float)
         style: dict[str, Any] = {"lw": 0.8, "alpha": 0.45, "rasterized": len(episodes) > _MANY}
         shown = offset_mm[outside[-1] if len(outside) else 0 :]
         axis.plot(*shown.T, color=_OUTCOMES[episode.success][1], **style)
-    around = LATERAL_MM * np.exp(2j * np.pi * np.arange(91) / 90)
-    label = f"{LATERAL_MM:g} mm from the target"
+    around = MISS_MM * np.exp(2j * np.pi * np.arange(91) / 90)
+    label = f"{MISS_MM:g} mm from the target"
     axis.plot(around.real, around.imag, color=INK, lw=1.6, zorder=6, label=label)
     for outcome, (label, colour, marker) in _OUTCOMES.items():
-        ends = [entry_mm(episode) for episode in episodes if episode.success == outcome]
+        ends = [episode.trace.lateral_mm for episode in episodes if episode.success == outcome]
         style = {"s": 34, "color": colour, "edgecolors": "white", "lw": 0.6, "zorder": 7}
         axis.scatter(*np.reshape(ends, (-1, 2)).T, marker=marker, label=label, **style)
     axis.set(xlim=(-reach_mm, reach_mm), ylim=(-reach_mm, reach_mm), aspect="equal")
@@ -208,16 +191,17 @@ def _draw_course(axes: Sequence[Axes], episode: RolloutEpisode, **style: Any) ->
 def _mark_limits(axes: Sequence[Axes]) -> None:
     """What `_draw_course` has drawn, and what an episode must keep to."""
     sideways, height, layer, force = axes
-    for axis, limit in zip(axes, (LATERAL_MM, 0, -OVERSHOOT_MM, FORCE_N), strict=True):
+    for axis, limit in zip(axes, (MISS_MM, 0, -OVERSHOOT_MM, FORCE_LIMIT_N), strict=True):
         axis.axhline(limit, color=INK, lw=1, ls="--")
         axis.tick_params(labelbottom=axis is force)
         axis.set_xlim(axes[0].get_xlim())
-    layer.axhspan(-REST_MM, REST_MM, color=PALETTE[2], alpha=0.35, lw=0)
-    words = f"tip to the layer [mm]; green: within {REST_MM:g}, dashed: {OVERSHOOT_MM:g} beyond it"
-    sideways.set(title=f"sideways from the target [mm]; dashed: {LATERAL_MM:g}", ylim=(0, None))
+    layer.axhspan(-AT_LAYER_MM, AT_LAYER_MM, color=PALETTE[2], alpha=0.35, lw=0)
+    rest = f"green: within {AT_LAYER_MM:g}, dashed: {OVERSHOOT_MM:g} beyond it"
+    words = f"tip to the layer [mm]; {rest}"
+    sideways.set(title=f"sideways from the target [mm]; dashed: {MISS_MM:g}", ylim=(0, None))
     height.set_title("tip above the surface [mm]; dashed: the surface at rest")
     layer.set_title(words)
-    force.set(title=f"force [N]; dashed: {FORCE_N:g}", xlabel="time [s]", ylim=(0, None))
+    force.set(title=f"force [N]; dashed: {FORCE_LIMIT_N:g}", xlabel="time [s]", ylim=(0, None))
 
 
 def _draw_strip(

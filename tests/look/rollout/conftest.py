@@ -26,6 +26,7 @@ def rollout_episode(seed: int = 0, ticks: int = 60, **changed: Any) -> RolloutEp
     trace = EpisodeTrace(
         time_s=0.1 * np.arange(1, ticks + 1),
         offset_mm=way,
+        lateral_mm=way[-1],
         height_mm=height,
         layer_mm=height + 2.5,
         force_n=np.where(height < 0, 0.6, 0.0),

@@ -8,6 +8,7 @@ import pytest
 
 from pipeline.evaluate.rollouts import RolloutEpisode, Rollouts
 from pipeline.look.rollout import pictures as plots
+from pipeline.simulation.insertion import FORCE_LIMIT_N, MISS_MM, OVERSHOOT_MM
 
 MakeEpisode = Callable[..., RolloutEpisode]
 
@@ -43,7 +44,7 @@ def test_points_of_paths_are_coloured_by_success(rollouts: Rollouts) -> None:
     ]
     inserted, others = (len(points.get_offsets()) for points in figure.axes[0].collections)
     assert (inserted, others) == (3, 2)
-    near, limit = figure.axes[2], plots.LATERAL_MM
+    near, limit = figure.axes[2], MISS_MM
     circle = next(line for line in near.lines if "from the target" in str(line.get_label()))
     assert np.hypot(*circle.get_xydata().T) == pytest.approx(np.full(91, limit))
     # From above, a path begins where it last comes near.
@@ -53,26 +54,14 @@ def test_points_of_paths_are_coloured_by_success(rollouts: Rollouts) -> None:
     assert len(plots.paths(without).axes) == 2
 
 
-def test_the_entry_is_where_the_miss_was_measured(make_episode: MakeEpisode) -> None:
-    episode = make_episode(0, ticks=40)
-    miss = np.hypot(*episode.trace.offset_mm.T)
-    punctured = int(np.flatnonzero(episode.trace.height_mm <= 0)[2])
-    there = replace(episode, lateral_mm=float(miss[punctured]))
-    assert plots.entry_mm(there).tolist() == episode.trace.offset_mm[punctured].tolist()
-    # Never punctured, and above the surface in the end.
-    above = replace(episode.trace, height_mm=np.abs(episode.trace.height_mm))
-    ended = replace(episode, trace=above, lateral_mm=float(miss[-1]))
-    assert plots.entry_mm(ended).tolist() == above.offset_mm[-1].tolist()
-
-
 def test_misses_beyond_the_axis_lie_at_its_end(rollouts: Rollouts) -> None:
     sideways, beyond = plots.misses(rollouts).axes
     points = np.concatenate([np.asarray(c.get_offsets()) for c in sideways.collections])
     assert len(points) == 15
-    assert points[:, 0].max() == 4 * plots.LATERAL_MM < sideways.get_xlim()[1]
+    assert points[:, 0].max() == 4 * MISS_MM < sideways.get_xlim()[1]
     rows, counts = np.unique(points[:, 1].round(), return_counts=True)
     assert (rows.tolist(), counts.tolist()) == ([0, 1, 2], [5, 5, 5])
-    for axis, limit in ((sideways, plots.LATERAL_MM), (beyond, plots.OVERSHOOT_MM)):
+    for axis, limit in ((sideways, MISS_MM), (beyond, OVERSHOOT_MM)):
         (line,) = (line for line in axis.lines if line.get_label() == "limit of a success")
         assert line.get_xdata()[0] == limit
 
@@ -94,7 +83,7 @@ def test_a_filmstrip_asks_for_frames_at_its_moments(make_episode: MakeEpisode) -
         assert marked == asked
     force = figure.axes[-1]
     assert force.lines[0].get_ydata().max() == 0.6
-    assert force.lines[1].get_ydata()[0] == plots.FORCE_N
+    assert force.lines[1].get_ydata()[0] == FORCE_LIMIT_N
 
 
 def test_worst_and_median_stand_out_among_all(make_episode: MakeEpisode) -> None:
