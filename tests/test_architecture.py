@@ -13,6 +13,7 @@ TIERS = (
     {"base"},
     {"data", "vlm", "store", "policy"},
     {"extract", "train", "simulation"},
+    {"robot"},
     {"evaluate"},
     {"compat"},
     {"models", "datasets", "look"},

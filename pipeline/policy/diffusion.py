@@ -10,6 +10,7 @@ from torch import Generator
 from pipeline.policy.attention import Projected
 from pipeline.policy.denoiser import Denoiser
 from pipeline.policy.expert import ActionExpert, standard_normal, uniform
+from pipeline.policy.guidance import Guide, gain, pull
 from pipeline.policy.noise_schedule import NoiseSchedule, Prediction, ScheduleKind
 from pipeline.policy.tensors import Chunk, Context, Losses, StepMask
 
@@ -68,13 +69,21 @@ class DiffusionActionExpert(ActionExpert):
         return self.grouped(predicted, target, valid)
 
     @torch.no_grad()
-    def act(self, context: Context, generator: Generator | None = None) -> Chunk:
-        """A chunk drawn by the sampler, float32; from noise, the context and the generator."""
+    def act(
+        self, context: Context, generator: Generator | None = None, guide: Guide | None = None
+    ) -> Chunk:
+        """A chunk drawn by the sampler, float32; from noise, the context and the generator.
+
+        With a guide every step is taken from the clean chunk that it asks for.
+        """
         shape = (len(context), self.horizon, self.action_dim)
         chunk = standard_normal(shape, context.device, generator)
         prepared = self.denoiser.prepare(context)
         for step, to in pairwise(self.steps):
-            sample = self.clean(chunk, step, prepared)
+            if guide is None:
+                sample = self.clean(chunk, step, prepared)
+            else:
+                sample = self.guided(chunk, step, prepared, guide)
             if self.sampler == "ddpm":
                 chunk, variance = self.schedule.posterior(sample, chunk, step)
             else:
@@ -86,7 +95,28 @@ class DiffusionActionExpert(ActionExpert):
 
     def clean(self, noisy: Chunk, step: int, context: Context | Sequence[Projected]) -> Chunk:
         """The clean chunk that the network sees in a noisy one at this step, clipped."""
+        return self._clipped(self._estimate(noisy, step, context))
+
+    def guided(
+        self, noisy: Chunk, step: int, context: Context | Sequence[Projected], guide: Guide
+    ) -> Chunk:
+        """The clean chunk at this step corrected by a guide, clipped.
+
+        As flow matching would at the time where as much of the chunk is left: signal / noise. The
+        clip has a slope of 1 here, so that what it holds can still be pulled.
+        """
+        with torch.enable_grad():
+            noisy = noisy.detach().requires_grad_()
+            estimate = self._estimate(noisy, step, context)
+            sample = estimate + (self._clipped(estimate) - estimate).detach()
+        signal, noise = (float(x[step]) for x in (self.schedule.signal, self.schedule.noise))
+        change = noise * gain(signal, noise) * pull(sample, noisy, guide)
+        return self._clipped(sample.detach() + change)
+
+    def _estimate(self, noisy: Chunk, step: int, context: Context | Sequence[Projected]) -> Chunk:
         time = noisy.new_full((len(noisy),), step / self.schedule.timesteps)
         predicted = self.denoiser(noisy, time, context)
-        sample = self.schedule.sample_of(self.prediction, predicted, noisy, step)
+        return self.schedule.sample_of(self.prediction, predicted, noisy, step)
+
+    def _clipped(self, sample: Chunk) -> Chunk:
         return sample if self.clip is None else sample.clamp(-self.clip, self.clip)

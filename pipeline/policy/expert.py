@@ -10,6 +10,7 @@ from torch import Generator, Tensor, nn
 from torch.nn import functional as F
 
 from pipeline.base.errors import ConfigError
+from pipeline.policy.guidance import Guide
 from pipeline.policy.tensors import Chunk, Context, Losses, StepMask
 
 ErrorKind = Literal["smooth_l1", "mse"]
@@ -47,8 +48,13 @@ class ActionExpert(nn.Module, ABC):
         """The scalar to minimise and its detached parts by name; masked steps count nothing."""
 
     @abstractmethod
-    def act(self, context: Context, generator: Generator | None = None) -> Chunk:
-        """A chunk; the same for the same context and generator state."""
+    def act(
+        self, context: Context, generator: Generator | None = None, guide: Guide | None = None
+    ) -> Chunk:
+        """A chunk; the same for the same context, generator state and guide.
+
+        Only a `stochastic` expert is given a guide: a chunk to continue, in normalised units.
+        """
 
 
 class GroupedLoss(nn.Module):

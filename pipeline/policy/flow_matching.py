@@ -9,6 +9,7 @@ from torch import Generator, Tensor, nn
 
 from pipeline.policy.denoiser import Denoiser
 from pipeline.policy.expert import ActionExpert, standard_normal, uniform
+from pipeline.policy.guidance import Guide, gain, pull
 from pipeline.policy.tensors import Chunk, Context, Losses, StepMask
 
 Solver = Literal["euler", "midpoint", "rk4"]
@@ -111,8 +112,10 @@ class FlowMatchingActionExpert(ActionExpert):
         return self.grouped(self.denoiser(noisy, time, context, valid), chunk - noise, valid)
 
     @torch.no_grad()
-    def act(self, context: Context, generator: Generator | None = None) -> Chunk:
-        """Where the flow takes a drawn noise, float32."""
+    def act(
+        self, context: Context, generator: Generator | None = None, guide: Guide | None = None
+    ) -> Chunk:
+        """Where the flow takes a drawn noise, float32; with a guide, the flow so corrected."""
         shape = (len(context), self.horizon, self.action_dim)
         noise = standard_normal(shape, context.device, generator)
         prepared = self.denoiser.prepare(context)
@@ -120,4 +123,13 @@ class FlowMatchingActionExpert(ActionExpert):
         def velocity(x: Tensor, time: float) -> Tensor:
             return self.denoiser(x, x.new_full((len(x),), time), prepared)
 
-        return integrate(velocity, noise, self.sampling_steps, self.solver)
+        def guided(x: Tensor, time: float) -> Tensor:
+            assert guide is not None
+            with torch.enable_grad():
+                x = x.detach().requires_grad_()
+                towards = velocity(x, time)
+                clean = x + (1 - time) * towards
+            return towards.detach() + gain(time, 1 - time) * pull(clean, x, guide)
+
+        followed = velocity if guide is None else guided
+        return integrate(followed, noise, self.sampling_steps, self.solver)

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from pipeline.base.observation import Observation
+from pipeline.policy.guidance import Guide
 from pipeline.policy.observation import LiveObservation, with_features
 from pipeline.policy.policy import Policy, Trainable
 from pipeline.policy.tensors import Chunk, Losses, StepMask
@@ -83,14 +84,18 @@ class LivePolicy(Trainable, Generic[Model]):
 
     @torch.no_grad()
     def sample(
-        self, observation: Observation, samples: int = 1, generator: torch.Generator | None = None
+        self,
+        observation: Observation,
+        samples: int = 1,
+        generator: torch.Generator | None = None,
+        guide: Guide | None = None,
     ) -> Float[Tensor, "sample batch horizon action"]:
         """As `Policy.sample`, but never with dropout, whatever the mode; the model runs once.
 
         Equal generators give equal samples. The mode of every part is afterwards what it was.
         """
         with self._evaluating():
-            return self.policy.sample(self._seen(observation), samples, generator)
+            return self.policy.sample(self._seen(observation), samples, generator, guide)
 
     @property
     def stochastic(self) -> bool:

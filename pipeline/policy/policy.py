@@ -16,6 +16,7 @@ from pipeline.policy.expert import ActionExpert, uniform
 from pipeline.policy.feature_encoder import FeatureEncoder
 from pipeline.policy.flow_matching import FlowMatchingActionExpert
 from pipeline.policy.fusion import build_fusion
+from pipeline.policy.guidance import Guide
 from pipeline.policy.normalization import ChannelStatistics, Normalization
 from pipeline.policy.observation import (
     VALIDITY,
@@ -61,13 +62,23 @@ class Trainable(nn.Module, ABC):
 
     @abstractmethod
     def sample(
-        self, observation: Observation, samples: int = 1, generator: Generator | None = None
+        self,
+        observation: Observation,
+        samples: int = 1,
+        generator: Generator | None = None,
+        guide: Guide | None = None,
     ) -> Float[Tensor, "sample batch horizon action"]:
-        """Action chunks in physical units, float32."""
+        """Action chunks in physical units, float32; with a guide, in physical units too, chunks
+        that continue its chunk: only a `stochastic` policy is given a guide."""
 
-    def act(self, observation: Observation, generator: Generator | None = None) -> Chunk:
+    def act(
+        self,
+        observation: Observation,
+        generator: Generator | None = None,
+        guide: Guide | None = None,
+    ) -> Chunk:
         """One sample: an action chunk in physical units, float32."""
-        return self.sample(observation, 1, generator)[0]
+        return self.sample(observation, 1, generator, guide)[0]
 
     @property
     @abstractmethod
@@ -174,17 +185,26 @@ class Policy(Trainable):
         context = self.context(observation, validity)
         return self.expert.loss(context, target, action_valid, generator)
 
+    @torch.inference_mode(False)  # in which guidance could not differentiate
     @torch.no_grad()
     def sample(
-        self, observation: Observation, samples: int = 1, generator: Generator | None = None
+        self,
+        observation: Observation,
+        samples: int = 1,
+        generator: Generator | None = None,
+        guide: Guide | None = None,
     ) -> Float[Tensor, "sample batch horizon action"]:
         """Action chunks in physical units, float32; call `eval()` first to silence dropout.
 
-        The context is computed once. Where the policy is not stochastic all samples are one.
+        The context is computed once. Where the policy is not stochastic all samples are one. A
+        guide is in physical units, and of the batch: all samples have the same.
         """
         context = self.context(observation)
         repeats = samples if self.stochastic else 1
-        chunks = self.expert.act(context.repeat(repeats, 1, 1), generator)
+        if guide is not None:
+            normalised = self.action_normalizer.normalize(guide.chunk)
+            guide = Guide(normalised, guide.weight).repeat(repeats)
+        chunks = self.expert.act(context.repeat(repeats, 1, 1), generator, guide)
         physical = self.action_normalizer.invert(chunks).unflatten(0, (repeats, len(context)))
         return physical.expand(samples, -1, -1, -1)
 

@@ -7,6 +7,7 @@ from torch import Generator, Tensor, nn
 
 from pipeline.policy.attention import TransformerLayer, learned
 from pipeline.policy.expert import ActionExpert
+from pipeline.policy.guidance import Guide
 from pipeline.policy.tensors import Chunk, Context, Losses, StepMask
 
 
@@ -67,6 +68,9 @@ class RegressionActionExpert(ActionExpert):
         """The grouped smooth-L1 of `predict(context)`; `generator` is not needed."""
         return self.grouped(self.predict(context), actions, valid)
 
-    def act(self, context: Context, generator: Generator | None = None) -> Chunk:
-        """`predict(context)`; `generator` is not needed."""
+    def act(
+        self, context: Context, generator: Generator | None = None, guide: Guide | None = None
+    ) -> Chunk:
+        """`predict(context)`; `generator` is not needed, and there is nothing to guide."""
+        assert guide is None, "an expert that draws nothing cannot be guided"
         return self.predict(context)

@@ -11,6 +11,7 @@ from pipeline.base.errors import ConfigError
 from pipeline.policy.diffusion import DiffusionActionExpert
 from pipeline.policy.expert import ActionExpert, GroupedLoss
 from pipeline.policy.flow_matching import FlowMatchingActionExpert
+from pipeline.policy.guidance import Guide
 from pipeline.policy.regression import RegressionActionExpert
 
 GROUPS = ("translation", "translation", "rotation", "gripper")
@@ -30,6 +31,10 @@ def seeded(seed: int = 3) -> torch.Generator:
 
 def everything() -> torch.Tensor:
     return torch.ones(3, 5, dtype=torch.bool)
+
+
+def guide_of(weight: float) -> Guide:
+    return Guide(torch.full((3, 5, 4), 0.5), torch.full((3, 5), weight))
 
 
 @pytest.fixture
@@ -131,7 +136,7 @@ class ActionExpertContract:
         assert not torch.allclose(chunk[2], other[2])
 
     def test_act_never_sees_the_target(self, expert: ActionExpert, context: torch.Tensor) -> None:
-        assert list(inspect.signature(expert.act).parameters) == ["context", "generator"]
+        assert list(inspect.signature(expert.act).parameters) == ["context", "generator", "guide"]
         before = expert.act(context, seeded())
         expert.loss(context, 100 * torch.randn(3, 5, 4), everything(), seeded())
         assert torch.equal(expert.act(context, seeded()), before)
@@ -192,6 +197,31 @@ class SamplingExpertContract(ActionExpertContract):
 
     def test_act_keeps_no_graph(self, expert: ActionExpert, context: torch.Tensor) -> None:
         assert not expert.act(context.requires_grad_()).requires_grad
+        assert not expert.act(context, guide=guide_of(1.0)).requires_grad
+        assert all(p.grad is None for p in expert.parameters())
+
+    def test_a_guide_without_weight_changes_nothing(
+        self, expert: ActionExpert, context: torch.Tensor
+    ) -> None:
+        """But how attention is computed where it can be differentiated."""
+        guided = expert.act(context, seeded(), guide_of(0.0))
+        torch.testing.assert_close(guided, expert.act(context, seeded()), rtol=0, atol=1e-6)
+
+    def test_a_guide_pulls_its_own_rows(self, expert: ActionExpert, context: torch.Tensor) -> None:
+        guide = guide_of(1.0)
+        guide.weight[1:] = 0
+        free, guided = expert.act(context, seeded()), expert.act(context, seeded(), guide)
+        torch.testing.assert_close(guided[1:], free[1:], rtol=0, atol=1e-6)
+        before, after = ((x[0] - guide.chunk[0]).square().mean() for x in (free, guided))
+        assert after < before
+
+    def test_a_guide_leaves_what_is_drawn(
+        self, expert: ActionExpert, context: torch.Tensor
+    ) -> None:
+        generator, apart = seeded(), seeded()
+        expert.act(context, generator, guide_of(1.0))
+        expert.act(context, apart)
+        assert torch.equal(generator.get_state(), apart.get_state())
 
 
 class TestDiffusion(SamplingExpertContract):

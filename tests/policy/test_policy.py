@@ -8,6 +8,7 @@ import torch
 from pipeline.base.config import SensorEncoderParams, TrainHeadParams
 from pipeline.base.errors import CheckpointMismatch, ConfigError
 from pipeline.policy.cost import describe_cost, flop_table
+from pipeline.policy.guidance import Guide
 from pipeline.policy.normalization import Normalization
 from pipeline.policy.observation import PolicyShape, action_groups
 from pipeline.policy.policy import Policy, Trainable, drop_streams
@@ -145,6 +146,62 @@ class TestEveryKind:
         lines = describe_cost(any_policy)
         assert f"{total:,}" in lines[0]
         assert f"{sum(count for _, count in flops) / 1e6:,.1f} MFLOP" in lines[1]
+
+
+class TestGuide:
+    """A chunk to continue, in physical units."""
+
+    @pytest.fixture(params=["diffusion", "flow_matching"])
+    def policy(self, request: pytest.FixtureRequest, build_policy: BuildPolicy) -> Policy:
+        return build_policy(model_type=request.param).eval()
+
+    @staticmethod
+    def continuing(policy: Policy, weight: float = 1.0) -> Guide:
+        chunk = policy.action_normalizer.invert(torch.full((4, 8, 7), 0.5))
+        return Guide(chunk, torch.full((4, 8), weight))
+
+    def test_the_expert_is_given_it_normalised_for_every_sample(
+        self, policy: Policy, observe: Observe, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        given = []
+        act = policy.expert.act
+        monkeypatch.setattr(policy.expert, "act", lambda *of: (given.append(of[2]), act(*of))[1])
+        guide = self.continuing(policy)
+        guide.weight[2] = 0.25
+        chunks = policy.sample(observe(), 3, seeded(), guide)
+        torch.testing.assert_close(given[0].chunk, torch.full((12, 8, 7), 0.5))
+        assert torch.equal(given[0].weight, guide.weight.repeat(3, 1))
+        assert chunks.shape == (3, 4, 8, 7)
+        assert not chunks.requires_grad
+
+    def test_chunks_come_nearer_to_it(self, policy: Policy, observe: Observe) -> None:
+        seen, guide = observe(), self.continuing(policy)
+        free, guided = policy.act(seen, seeded()), policy.act(seen, seeded(), guide)
+        scale = policy.action_normalizer.scale
+        before, after = (((x - guide.chunk) / scale).square().mean() for x in (free, guided))
+        assert after < 0.5 * before
+
+    def test_without_weight_it_changes_nothing(self, policy: Policy, observe: Observe) -> None:
+        seen, guide = observe(), self.continuing(policy, 0.0)
+        free, guided = policy.act(seen, seeded()), policy.act(seen, seeded(), guide)
+        torch.testing.assert_close(guided, free, rtol=0, atol=1e-5)
+
+    def test_it_works_where_nothing_is_to_be_differentiated(
+        self, policy: Policy, observe: Observe
+    ) -> None:
+        seen, guide = observe(), self.continuing(policy)
+        expected = policy.act(seen, seeded(), guide)
+        with torch.inference_mode():
+            made = replace(seen, features=seen.features + 0)
+            same = Guide(guide.chunk + 0, guide.weight + 0)
+            assert torch.equal(policy.act(made, seeded(), same), expected)
+
+    def test_a_policy_that_draws_nothing_takes_none(
+        self, build_policy: BuildPolicy, observe: Observe
+    ) -> None:
+        policy = build_policy()
+        with pytest.raises(AssertionError, match="cannot be guided"):
+            policy.act(observe(), guide=self.continuing(policy))
 
 
 def blank_some(seen: Any) -> None:

@@ -29,6 +29,7 @@ from pipeline.compat.unified import (
     no_normalization,
 )
 from pipeline.policy.checkpoint import PolicyCheckpoint
+from pipeline.policy.guidance import Guide
 from pipeline.policy.normalization import Normalization
 from pipeline.policy.observation import LiveObservation, PolicyShape
 from pipeline.policy.policy import Policy, Trainable
@@ -312,6 +313,9 @@ def test_it_is_trainable_and_gives_the_loss_where_actions_are_given(
     assert not build(model_type="regression").stochastic
     observation = model.observe(images, TEXT, **streams)
     assert model.sample(observation, 5).shape == (5, 4, 8, 7)
+    guide = Guide(torch.ones(4, 8, 7), torch.ones(4, 8))
+    free, guided = (model.act(observation, _generator(), given) for given in (None, guide))
+    assert (guided - 1).square().mean() < 0.5 * (free - 1).square().mean()
     actions = torch.randn(4, 8, 7)
     found = model(images, TEXT, **streams, actions=actions, generator=_generator())
     valid = torch.ones(4, 8, dtype=torch.bool)

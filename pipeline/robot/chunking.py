@@ -1,0 +1,145 @@
+"""Action chunks played one step a tick: what of a plan is due, averaged, or left to continue.
+
+Numpy only; `pipeline.robot.guides` makes tensors of guides.
+"""
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pipeline.base.errors import ConfigError
+
+Chunking = Literal["none", "temporal", "rtc"]
+Steps = NDArray[np.float32]
+
+ENSEMBLE_DECAY = 0.01
+"""m of temporal ensembling, as in Zhao et al. 2023: the smaller, the more a new chunk counts."""
+
+DELAYS = 10
+"""How many of the newest delays the next one is expected to stay within."""
+
+
+@dataclass(frozen=True)
+class PlanGuide:
+    """What is left of a robot's plan at the tick of an observation: step 0 is that tick's.
+
+    `chunk` (horizon, action) in physical units, zeros where the plan has ended; `weight` (horizon,)
+    in [0, 1], 0 there.
+    """
+
+    chunk: Steps
+    weight: Steps
+
+
+class Executor:
+    """Plays the action chunks of one robot, a step a call of `next_action`.
+
+    `none` plays the newest chunk, `temporal` averages all chunks that reach a tick (`ensemble`),
+    `rtc` plays the newest chunk and guides the next one by it (real-time chunking, Black et al.
+    2025). A chunk's first step belongs to the tick of its observation, which `begin` marks; the
+    steps played until `plan` hands it in are skipped, as counted. Raises `ConfigError` where
+    `execute`, the steps from one observation to the next, is not within the horizon.
+    """
+
+    def __init__(self, chunking: Chunking, execute: int, horizon: int) -> None:
+        if not 1 <= execute <= horizon:
+            raise ConfigError(
+                f"rollout.execute: expected 1 to {horizon}, the steps of a chunk "
+                f"(train_head.horizon), found {execute}"
+            )
+        self.chunking: Chunking = chunking
+        self.execute, self.horizon = execute, horizon
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all chunks and counts, for the next episode."""
+        self._tick = 0
+        self._begun: int | None = None
+        self._chunks: list[tuple[int, Steps]] = []
+        self._delays: deque[int] = deque(maxlen=DELAYS)
+
+    @property
+    def due(self) -> bool:
+        """Whether to observe for the next chunk before the next action.
+
+        So it is before the first chunk, `execute` steps after the newest chunk's observation, and
+        where that chunk is used up; never between `begin` and `plan`.
+        """
+        if self._begun is not None:
+            return False
+        return not self._chunks or self._tick - self._chunks[-1][0] >= self.execute
+
+    def begin(self) -> PlanGuide | None:
+        """Mark this tick as that of the next chunk's observation, also in place of an earlier mark.
+
+        Returns what a policy is to continue: None but for `rtc` with a plan that reaches further.
+        """
+        self._begun = self._tick
+        if self.chunking != "rtc" or not self._chunks:
+            return None
+        start, chunk = self._chunks[-1]
+        played = self._tick - start
+        left = chunk[played:]
+        overlap = self.horizon - max(played, self.execute)
+        if overlap <= 0:
+            return None
+        rest = np.zeros_like(chunk)
+        rest[: len(left)] = left
+        return PlanGuide(rest, soft_mask(self.horizon, max(self._delays), overlap))
+
+    def plan(self, chunk: ArrayLike) -> None:
+        """Take the chunk of the observation that `begin` marked, (horizon, action)."""
+        steps = np.array(chunk, np.float32)
+        assert self._begun is not None, "plan without begin: of which tick is this chunk?"
+        assert steps.ndim == 2, steps.shape
+        assert len(steps) == self.horizon, (len(steps), self.horizon)
+        self._delays.append(self._tick - self._begun)
+        self._chunks.append((self._begun, steps))
+        self._begun = None
+
+    def next_action(self) -> Steps:
+        """The action of this tick, (action,), which counts as played.
+
+        There must be a chunk that reaches it: `plan` comes in time, or the caller stops the robot.
+        """
+        self._chunks = [(s, c) for s, c in self._chunks if self._tick - s < self.horizon]
+        assert self._chunks, f"no action at tick {self._tick}: no chunk came in time"
+        predicted = np.stack([chunk[self._tick - start] for start, chunk in self._chunks])
+        self._tick += 1
+        return ensemble(predicted) if self.chunking == "temporal" else predicted[-1]
+
+
+def ensemble(predicted: Steps) -> Steps:
+    """The mean action (action,) of predictions (prediction, action) for a tick, oldest first.
+
+    Weights exp(-m i), i = 0 the oldest (Zhao et al. 2023, "Learning Fine-Grained Bimanual
+    Manipulation with Low-Cost Hardware", Algorithm 2).
+    """
+    weights = np.exp(-ENSEMBLE_DECAY * np.arange(len(predicted)))
+    return np.average(predicted, axis=0, weights=weights).astype(np.float32)
+
+
+def soft_mask(horizon: int, delay: int, overlap: int) -> Steps:
+    """How strongly each step of a chunk is to continue the plan under way, (horizon,).
+
+    1 for the `delay` steps that are played meanwhile, 0 from `overlap` on, where the plan has
+    ended, and falling between them (Black, Galliker and Levine 2025, "Real-Time Execution of
+    Action Chunking Flow Policies", eq. 5, with `overlap` = H - s).
+    """
+    delay, step = min(delay, overlap), np.arange(horizon)
+    share = (overlap - step) / (overlap - delay + 1)
+    falling = share * np.expm1(share) / np.expm1(1)
+    return np.where(step < delay, 1, np.where(step < overlap, falling, 0)).astype(np.float32)
+
+
+def check_chunking(chunking: Chunking, stochastic: bool) -> None:
+    """Raise `ConfigError` where a policy cannot be guided: one that draws nothing."""
+    if chunking == "rtc" and not stochastic:
+        raise ConfigError(
+            "rollout.chunking: expected none or temporal, as this policy draws nothing that could "
+            "be guided, found rtc. Choose one of them, or train with train_head.model_type "
+            "diffusion or flow_matching."
+        )

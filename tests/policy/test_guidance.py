@@ -1,0 +1,170 @@
+"""Chunks that continue others: with the best possible network, against closed forms."""
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from pipeline.policy.diffusion import DiffusionActionExpert
+from pipeline.policy.expert import ActionExpert
+from pipeline.policy.flow_matching import FlowMatchingActionExpert
+from pipeline.policy.guidance import MOST_GAIN, Guide, gain, pull
+
+HORIZON, KEPT, COUNT = 12, 5, 2000
+STEP = torch.arange(HORIZON, dtype=torch.float64)
+COVARIANCE = 0.8 ** (STEP[:, None] - STEP[None]).abs()
+"""Of chunks (horizon, 1) whose steps follow each other, of unit variance."""
+
+
+def expectations(noisy: Tensor, signal: float, noise: float) -> tuple[Tensor, Tensor]:
+    """What is left of sample and noise on average, given signal * sample + noise * epsilon."""
+    total = signal**2 * COVARIANCE + noise**2 * torch.eye(HORIZON, dtype=torch.float64)
+    white = torch.linalg.solve(total, noisy.double())
+    return signal * COVARIANCE @ white, noise * white
+
+
+class Velocity(nn.Module):
+    """The best network of flow matching."""
+
+    def prepare(self, context: Tensor) -> Tensor:
+        return context
+
+    def forward(self, noisy: Tensor, time: Tensor, context: Tensor) -> Tensor:
+        sample, noise = expectations(noisy, float(time[0]), 1 - float(time[0]))
+        return (sample - noise).float()
+
+
+class Prediction(nn.Module):
+    """The best network of diffusion."""
+
+    def __init__(self, expert: DiffusionActionExpert) -> None:
+        super().__init__()
+        self.schedule, self.kind = expert.schedule, expert.prediction
+
+    def prepare(self, context: Tensor) -> Tensor:
+        return context
+
+    def forward(self, noisy: Tensor, time: Tensor, context: Tensor) -> Tensor:
+        step = (time * self.schedule.timesteps).round().long()
+        signal, noise = float(self.schedule.signal[step[0]]), float(self.schedule.noise[step[0]])
+        sample, epsilon = expectations(noisy, signal, noise)
+        return self.schedule.target(self.kind, sample, epsilon, step).float()
+
+
+def optimal(kind: type[ActionExpert], **arguments: Any) -> ActionExpert:
+    """An expert whose network is the best."""
+    expert: Any = kind(horizon=HORIZON, action_dim=1, dim=8, layers=1, heads=1, **arguments)
+    expert.denoiser = Prediction(expert) if kind is DiffusionActionExpert else Velocity()
+    return expert
+
+
+VARIANTS = [
+    (FlowMatchingActionExpert, {}),
+    (FlowMatchingActionExpert, {"sampling_steps": 5}),
+    (FlowMatchingActionExpert, {"solver": "midpoint"}),
+    (FlowMatchingActionExpert, {"solver": "rk4"}),
+    (DiffusionActionExpert, {}),
+    (DiffusionActionExpert, {"prediction": "v", "clip": None}),
+    (DiffusionActionExpert, {"prediction": "sample", "sampling_steps": 50}),
+    (DiffusionActionExpert, {"eta": 1.0}),
+    (DiffusionActionExpert, {"sampler": "ddpm"}),
+]
+
+
+@pytest.fixture(params=VARIANTS, ids=lambda v: f"{v[0].__name__}-{v[1]}")
+def expert(request: pytest.FixtureRequest) -> ActionExpert:
+    kind, arguments = request.param
+    return optimal(kind, **arguments)
+
+
+def drawn(expert: ActionExpert, guide: Guide | None = None, count: int = COUNT) -> Tensor:
+    generator = torch.Generator().manual_seed(1)
+    return expert.act(torch.zeros(count, 1, 8), generator, guide).squeeze(-1).double()
+
+
+def prefix_guide(prefix: Tensor, count: int = COUNT) -> Guide:
+    """Weight 1 on the steps of a prefix, zeros without weight behind it."""
+    chunk, weight = torch.zeros(count, HORIZON, 1), torch.zeros(count, HORIZON)
+    chunk[:, : len(prefix), 0], weight[:, : len(prefix)] = prefix.float(), 1.0
+    return Guide(chunk, weight)
+
+
+class TestPrefix:
+    PREFIX = torch.tensor([1.4, 1.0, 1.7, 1.2, 1.5], dtype=torch.float64)
+
+    def test_the_chunk_begins_with_it(self, expert: ActionExpert) -> None:
+        guided, free = drawn(expert, prefix_guide(self.PREFIX)), drawn(expert)
+        error, before = ((x[:, :KEPT] - self.PREFIX).square().mean().sqrt() for x in (guided, free))
+        assert error < 0.13
+        assert before > 1.5
+
+    def test_the_rest_follows_from_it_and_stays_free(self, expert: ActionExpert) -> None:
+        """Near the mean and spread of a Gaussian of which the first steps are known."""
+        rest = drawn(expert, prefix_guide(self.PREFIX))[:, KEPT:]
+        known = COVARIANCE[:KEPT, :KEPT]
+        share = torch.linalg.solve(known, COVARIANCE[:KEPT, KEPT:]).T
+        spread = (COVARIANCE[KEPT:, KEPT:] - share @ COVARIANCE[:KEPT, KEPT:]).diagonal().sqrt()
+        torch.testing.assert_close(rest.mean(0), share @ self.PREFIX, rtol=0, atol=0.2)
+        ratio = rest.std(0) / spread
+        assert (ratio > 0.7).all()
+        assert (ratio < 1.1).all()
+
+    def test_less_weight_pulls_less(self, expert: ActionExpert) -> None:
+        whole = prefix_guide(self.PREFIX)
+        errors = []
+        for weight in (0.0, 0.1, 0.4, 1.0):
+            chunk = drawn(expert, Guide(whole.chunk, weight * whole.weight))
+            errors.append(float((chunk[:, :KEPT] - self.PREFIX).square().mean()))
+        assert errors == sorted(errors, reverse=True)
+        assert errors[0] > errors[1] > errors[2] > errors[3]
+
+    def test_what_has_no_weight_is_not_looked_at(self, expert: ActionExpert) -> None:
+        """As zeros behind the end of a plan, which are the mean action."""
+        guide = prefix_guide(self.PREFIX, 50)
+        other = guide.chunk.clone()
+        other[:, KEPT:] = 1000.0
+        expected = drawn(expert, guide, 50)
+        assert torch.equal(drawn(expert, Guide(other, guide.weight), 50), expected)
+
+
+def test_what_the_clip_holds_is_still_pulled() -> None:
+    """An epsilon is divided by what is left of the chunk: an unsure network's are all clipped."""
+    torch.manual_seed(0)
+    expert = DiffusionActionExpert(dim=32, layers=2, heads=2, prediction="epsilon").eval()
+    context, guide = torch.randn(16, 3, 32), Guide(torch.randn(16, 8, 7), torch.ones(16, 8))
+    free, guided = (expert.act(context, torch.Generator(), given) for given in (None, guide))
+    assert free.abs().median() == 5.0
+    assert (guided - guide.chunk).square().mean() < 1e-2
+
+
+def test_flow_and_diffusion_pull_alike() -> None:
+    """ddim's steps follow the flow of Euler's, so the same guide leads to the same chunks."""
+    guide = prefix_guide(TestPrefix.PREFIX, 50)
+    flow = drawn(optimal(FlowMatchingActionExpert, sampling_steps=200), guide, 50)
+    ddim = optimal(DiffusionActionExpert, timesteps=1000, sampling_steps=200, prediction="v")
+    torch.testing.assert_close(drawn(ddim, guide, 50), flow, rtol=0, atol=0.1)
+
+
+class TestGain:
+    @pytest.mark.parametrize("tau", [0.25, 0.5, 0.7])
+    def test_it_is_that_of_the_paper(self, tau: float) -> None:
+        r2 = (1 - tau) ** 2 / (tau**2 + (1 - tau) ** 2)
+        assert gain(tau, 1 - tau) == pytest.approx((1 - tau) / (tau * r2))
+
+    @pytest.mark.parametrize("tau", [0.0, 1e-9, 0.1, 0.95, 1.0])
+    def test_it_is_bounded_near_both_ends(self, tau: float) -> None:
+        assert gain(tau, 1 - tau) == MOST_GAIN == 5.0
+
+    def test_it_knows_no_scale(self) -> None:
+        assert gain(0.3, 0.4) == pytest.approx(gain(3, 4))
+
+
+def test_pull_is_the_vector_jacobian_product() -> None:
+    """Of a linear clean chunk, in closed form."""
+    matrix = torch.randn(4, 4)
+    noisy = torch.randn(2, 4, 1, requires_grad=True)
+    guide = Guide(torch.randn(2, 4, 1), torch.rand(2, 4))
+    clean = matrix @ noisy
+    error = guide.weight.unsqueeze(-1) * (guide.chunk - clean.detach())
+    torch.testing.assert_close(pull(clean, noisy, guide), matrix.T @ error)
