@@ -29,6 +29,7 @@ ONLY_IN = {
     "sklearn": {"evaluate"},
     "matplotlib": {"look"},
     "jinja2": {"look"},
+    "gymnasium": {"simulation"},
 }
 WITHOUT_TORCH = {"data"}
 STAGE_ONE = {"vlm", "data", "extract", "simulation"}

@@ -19,6 +19,7 @@ TINY = {
     "demo": {"episodes": 2},
     "vlm": {"image_resize_height": 56, "image_resize_width": 56, "pooling": ["mean"]},
     "train_head": {"max_steps": 6, "eval_every": 3, "checkpoint_every": 3, "warmup_steps": 1},
+    "rollout": {"episodes": 2},
 }
 
 
@@ -96,8 +97,12 @@ def test_a_second_run_does_nothing(project):
 
 def test_metrics_and_plots_are_declared(project):
     shown = json.loads(project.dvc("metrics", "show", "--json"))
-    (found,) = shown[""]["data"].values()
-    assert "policy" in found["data"]["overall"]
+    evaluated, rolled_out = (
+        shown[""]["data"][f"reports/{stage}/metrics.json"]["data"]
+        for stage in ("evaluate", "rollout")
+    )
+    assert "policy" in evaluated["overall"]
+    assert set(rolled_out["success"]["policy"]) == {"rate", "low", "high", "episodes"}
     assert (project.folder / "reports/evaluate/timeline.png").exists()
 
 
@@ -108,6 +113,7 @@ def test_metrics_and_plots_are_declared(project):
         ("vlm", {"prompt": "{images}{instruction}"}, "extract"),
         ("extract", {"dtype": "float16"}, "extract"),
         ("evaluate", {"batch_size": 3}, "evaluate"),
+        ("rollout", {"seed": 3}, "rollout"),
         ("extract", {"batch_size": 3, "decode_threads": 1}, None),
     ],
 )

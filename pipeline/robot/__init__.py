@@ -1,2 +1,7 @@
-"""What moves a robot by a policy: how its action chunks are played, one step a tick, and how the
-next chunk continues the one under way."""
+"""The control loop that a robot and a rollout run: the model at its own rate, the head every tick.
+
+chunking.py, guides.py   how action chunks are played, and how the next continues the one under way
+memory.py                the newest readings and features of one robot, as a policy takes them
+features.py              frames -> features, by the very model that the policy was trained on
+loop.py                  one robot's loop, on whichever clock its readings bring
+"""

@@ -5,14 +5,13 @@ Numpy only; `pipeline.robot.guides` makes tensors of guides.
 
 from collections import deque
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pipeline.base.config import Chunking
 from pipeline.base.errors import ConfigError
 
-Chunking = Literal["none", "temporal", "rtc"]
 Steps = NDArray[np.float32]
 
 ENSEMBLE_DECAY = 0.01

@@ -34,7 +34,8 @@ DEMO_VERSION: Final = 2
 MARKER: Final = "demo.json"
 DEMO: Final = OutputKind("what the demo wrote", lambda folder: (folder / MARKER).is_file())
 _SET: Final = OutputKind("a set of the demo's", lambda folder: DEMO.is_one(folder.parent))
-TASK: Final = "Red_point"
+TASK: Final = "Insert_the_needle_at_the_red_point"
+"""The recorder names its folders after the instruction, which is the same in every format."""
 
 _FIRST_EPOCH_S = datetime(2026, 1, 5, 9, tzinfo=UTC).timestamp()
 _BETWEEN_EPISODES_S, _BETWEEN_SETS_S = 45.0, 86_400.0

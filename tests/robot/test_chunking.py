@@ -10,9 +10,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.base.config import Chunking
 from pipeline.base.errors import ConfigError
 from pipeline.robot.chunking import (
-    Chunking,
     Executor,
     PlanGuide,
     check_chunking,

@@ -1,0 +1,113 @@
+"""The command runs a checkpoint in the phantom, or says why it cannot."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from pipeline.simulation.insertion_formats import write_raw
+from pipeline.simulation.recorder import simulate_episode
+from stages import extract, rollout, train_head
+from stages.command import run
+
+
+@pytest.fixture(scope="module")
+def trained(
+    tmp_path_factory: pytest.TempPathFactory,
+    demo_checkpoint: Path,
+    tiny_head: Callable[..., dict[str, Any]],
+) -> Path:
+    """A params.yaml whose head is trained on two recordings of the phantom."""
+    folder = tmp_path_factory.mktemp("rollout")
+    for seed in (5, 6):
+        write_raw(folder / "raw" / "task", simulate_episode(seed, 1.7e9 + 100 * seed))
+    document = {
+        "data": {"root": str(folder), "sources": [{"name": "raw", "path": "raw"}]},
+        "vlm": {
+            "checkpoint": str(demo_checkpoint),
+            "image_resize_height": 56,
+            "image_resize_width": 84,
+            "dtype": "float32",
+            "pooling": ["mean"],
+        },
+        "extract": {"store": str(folder / "store.zarr")},
+        "train_head": tiny_head(folder),
+        "rollout": {"episodes": 2, "output": str(folder / "rollout")},
+    }
+    path = folder / "params.yaml"
+    path.write_text(yaml.safe_dump(document))
+    for stage in (extract, train_head):
+        assert run("", stage.main, ["--params", str(path)]) == 0
+    return path
+
+
+def arguments(trained: Path, **changed: Any) -> list[str]:
+    told = [f"rollout.{name}={value}" for name, value in changed.items()]
+    return ["--params", str(trained), *(part for line in told for part in ("--set", line))]
+
+
+def test_it_writes_metrics_table_and_page_the_same_every_time(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for output in ("first", "second"):
+        assert run("", rollout.main, arguments(trained, output=tmp_path / output)) == 0
+        said = capsys.readouterr().out
+        assert "expert" in said and "100%" in said
+    for name in ("metrics.json", "episodes.csv", "report.html"):
+        assert (tmp_path / "first" / name).read_bytes() == (tmp_path / "second" / name).read_bytes()
+    success = json.loads((tmp_path / "first" / "metrics.json").read_text())["success"]
+    assert success["expert"] | {"rate": 1.0, "episodes": 2} == success["expert"]
+    assert set(success) == {"policy", "sensor off", "features off", "expert"}
+    assert len((tmp_path / "first" / "episodes.csv").read_text().splitlines()) == 9
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"checkpoint": "nowhere"}, "expected a checkpoint"),
+        ({"execute": 99}, "rollout.execute"),
+        ({"chunking": "rtc"}, "rollout.chunking"),
+        ({"level": "hard"}, "rollout.level"),
+        ({"episodes": 0}, "rollout.episodes"),
+        ({"latency_ms": -1}, "rollout.latency_ms"),
+    ],
+)
+def test_what_cannot_be_run_is_refused_by_name(
+    trained: Path, capsys: pytest.CaptureFixture[str], changed: dict[str, Any], said: str
+) -> None:
+    assert run("", rollout.main, arguments(trained, **changed)) == 2
+    error = capsys.readouterr().err
+    assert said in error and "Traceback" not in error
+    assert not (trained.parent / "rollout").exists()
+
+
+def test_another_model_than_the_policy_was_trained_on_is_refused(
+    trained: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = ["--set", "vlm.image_resize_width=112"]
+    assert run("", rollout.main, [*arguments(trained), *other]) == 2
+    assert "the policy was trained on other features" in capsys.readouterr().err
+
+
+def test_a_policy_of_another_robot_is_refused(
+    quick_params: Callable[[Path], dict[str, Any]],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = tmp_path / "params.yaml"
+    path.write_text(yaml.safe_dump(quick_params(tmp_path)))
+    assert run("", train_head.main, ["--params", str(path)]) == 0
+    assert run("", rollout.main, ["--params", str(path)]) == 2
+    assert "trained on another robot than the phantom" in capsys.readouterr().err
+
+
+def test_a_folder_of_somebody_else_is_left_alone(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "thesis.txt").write_text("all of it")
+    assert run("", rollout.main, arguments(trained, output=tmp_path)) == 2
+    assert "thesis.txt" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
