@@ -83,6 +83,9 @@ class SuccessRate:
         rate = successes / len(episodes)
         return cls(rate, float(interval.low), float(interval.high), len(episodes))
 
+    def __str__(self) -> str:
+        return f"{self.rate:.0%} ({self.low:.0%} to {self.high:.0%})"
+
 
 @dataclass(frozen=True)
 class Rollouts:
@@ -115,9 +118,8 @@ class Rollouts:
             time = float(np.median([episode.time_s for episode in episodes]))
             failed = Counter(e.reason for e in episodes if not e.success).most_common()
             reasons = ", ".join(f"{count} {reason}" for reason, count in failed)
-            interval = f"{rate.low:.0%} to {rate.high:.0%}"
-            rows.append((name, f"{rate.rate:.0%}", interval, len(episodes), lateral, time, reasons))
-        heads = ("controller", "success", "95 % interval", "episodes", "median lateral miss [mm]",
+            rows.append((name, str(rate), len(episodes), lateral, time, reasons))
+        heads = ("controller", "success (95 % interval)", "episodes", "median lateral miss [mm]",
                  "median time [s]", "failed by")  # fmt: skip
         return Table(heads, rows, f"Success at level {self.level}")
 

@@ -238,6 +238,20 @@ class TestGuide:
             executor.plan(chunk_of(0))
         assert held == [0, *[2] * 10, 1, 0]
 
+    def test_a_warm_up_does_not_poison_the_estimate(self) -> None:
+        """The first chunk takes long, while the robot stands still: nothing is to be held for it.
+
+        A clock would count the seconds of the warm-up, and hold ten chunks for them.
+        """
+        executor = Executor("rtc", 1, HORIZON)
+        executor.begin()  # however long until the plan: no step is played
+        executor.plan(chunk_of(0) + 1)
+        for tick in range(1, 12):
+            play(executor, 1)
+            guide = executor.begin()
+            assert guide is not None and (guide.weight < 1).all()
+            executor.plan(chunk_of(tick) + 1)
+
     @pytest.mark.parametrize("chunking", ["none", "temporal"])
     def test_other_modes_guide_nothing(self, chunking: Chunking) -> None:
         executor = Executor(chunking, 1, HORIZON)

@@ -1,14 +1,11 @@
 """The page of a policy's rollouts: how often it succeeds, and how it fails."""
 
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
-from pipeline.base.table import Table
-from pipeline.evaluate.rollouts import RolloutEpisode, Rollouts, SuccessRate
+from pipeline.evaluate.rollouts import RolloutEpisode, Rollouts
 from pipeline.look.page.blocks import Block, Document, Picture, Report, Section, Text
 from pipeline.look.page.writing import sentence
 from pipeline.look.rollout import pictures as plots
@@ -35,6 +32,7 @@ _CONTROLLERS = (
     "The demonstrator is the rule that made the training data, and sees what the simulation hides. "
     "With a stream off, the same policy acts without it. All of them meet the same episodes."
 )
+_ENDINGS = "Every episode of each controller by how it ended; grey, those that succeeded."
 
 
 def rollout_report(rollouts: Rollouts) -> Report:
@@ -44,7 +42,7 @@ def rollout_report(rollouts: Rollouts) -> Report:
     page. Pictures ask the episodes for their frames when they are drawn.
     """
     rates, episodes = rollouts.rates(), rollouts.of("policy")
-    shares = "; ".join(f"{controller_name(name)} {_share(rate)}" for name, rate in rates.items())
+    shares = "; ".join(f"{controller_name(name)} {rate}" for name, rate in rates.items())
     return Report(
         title=f"Rollouts of {rollouts.checkpoint}",
         summary=(
@@ -52,17 +50,14 @@ def rollout_report(rollouts: Rollouts) -> Report:
             f"Episodes that succeed at level {rollouts.level}: {shares}."
         ),
         tiles=(
-            ("success of the policy", f"{100 * rates['policy'].rate:.0f} %"),
-            ("95 % interval [%]", _interval(rates["policy"])),
+            ("success of the policy", str(rates["policy"])),
             ("median sideways miss [mm]", f"{_median(episodes, 'lateral_mm'):.2f}"),
             ("median time [s]", f"{_median(episodes, 'time_s'):.1f}"),
         ),
         sections=(
             Section("Success", _success(rollouts)),
-            Section("How episodes ended", _endings(rollouts)),
             Section("Where the needle went", _places(rollouts)),
             Section("Episodes closely", (), tuple(_filmstrips(episodes))),
-            Section("How far each missed", _misses(rollouts)),
             Section("What was run", [Document("Settings of the rollout", rollouts.settings)]),
         ),
     )
@@ -82,49 +77,19 @@ def worst_and_median(
     return ordered[0], ordered[len(ordered) // 2]
 
 
-def _share(rate: SuccessRate) -> str:
-    return f"{round(rate.rate * rate.episodes)} of {rate.episodes}"
-
-
-def _interval(rate: SuccessRate) -> str:
-    return f"{100 * rate.low:.0f} to {100 * rate.high:.0f}"
-
-
 def _median(episodes: Sequence[RolloutEpisode], field: str) -> float:
     return float(np.median([getattr(episode, field) for episode in episodes]))
 
 
 def _success(rollouts: Rollouts) -> list[Block]:
-    """How often, as a picture and as a table with a row a controller and level."""
-    rows: list[tuple[object, ...]] = []
-    for level in dict.fromkeys(episode.level for episode in rollouts.episodes):
-        here = tuple(episode for episode in rollouts.episodes if episode.level == level)
-        met = replace(rollouts, episodes=here)
-        for name, rate in met.rates().items():
-            share, medians = round(100 * rate.rate, 1), ("lateral_mm", "time_s")
-            row = (controller_name(name), level, rate.episodes, share, _interval(rate))
-            rows.append((*row, *(_median(met.of(name), field) for field in medians)))
-    heads = ["controller", "level", "episodes", "success [%]", "95 % interval [%]"]
-    heads += ["median sideways miss [mm]", "median time [s]"]
+    """How often, as a picture and as a table."""
     caption = "The share of episodes that succeed, and its 95 % interval (Wilson), by controller."
     return [
         Text(_SUCCESS),
         Text(_CONTROLLERS),
         Picture("success", caption, partial(plots.success, rollouts)),
-        Table(heads, rows, "Success by controller, and medians over all of its episodes."),
-    ]
-
-
-def _endings(rollouts: Rollouts) -> list[Block]:
-    counts = {
-        name: Counter(episode.reason for episode in rollouts.of(name)) for name in rollouts.rates()
-    }
-    reasons = sum(counts.values(), Counter[str]()).most_common()
-    rows = [(reason, *(count[reason] for count in counts.values())) for reason, _ in reasons]
-    caption = "Every episode of each controller by how it ended; grey, those that succeeded."
-    return [
-        Picture("endings", caption, partial(plots.endings, rollouts)),
-        Table(["ending", *map(controller_name, counts)], rows, "Episodes by how they ended."),
+        rollouts.summary(),
+        Picture("endings", _ENDINGS, partial(plots.endings, rollouts)),
     ]
 
 
@@ -169,11 +134,3 @@ def _filmstrips(episodes: Sequence[RolloutEpisode]) -> Iterator[Section]:
         title = f"{kind.capitalize()}: seed {episode.seed}, level {episode.level}"
         draw = partial(plots.filmstrip, episode, f"{title}, {episode.reason}")
         yield Section(title, [Text(words), Picture(f"filmstrip_{kind}", caption, draw)])
-
-
-def _misses(rollouts: Rollouts) -> list[Block]:
-    caption = (
-        "A point is an episode, the upright stroke the median. What is farther than the axis "
-        "reaches lies at its right end."
-    )
-    return [Picture("misses", caption, partial(plots.misses, rollouts))]

@@ -114,24 +114,6 @@ def courses(episodes: Sequence[RolloutEpisode], strong: Mapping[str, RolloutEpis
     return figure
 
 
-def misses(rollouts: Rollouts) -> Figure:
-    """Every episode's sideways miss and overshoot as a point, a row a controller."""
-    controllers = list(rollouts.rates())
-    figure = canvas(_WIDTH, 0.7 * len(controllers) + 1.8)
-    sideways, beyond = axes = figure.subplots(1, 2, sharey=True)
-    for place, name in enumerate(controllers):
-        _draw_strip(sideways, place, rollouts.of(name), "lateral_mm", 4 * MISS_MM)
-        _draw_strip(beyond, place, rollouts.of(name), "overshoot_mm", 2 * OVERSHOOT_MM)
-    sideways.set_xlabel("sideways from the target [mm]")
-    beyond.set_xlabel("farthest beyond the layer [mm]")
-    for axis, limit in zip(axes, (MISS_MM, OVERSHOOT_MM), strict=True):
-        axis.axvline(limit, color=INK, ls="--", lw=1.2, label="limit of a success")
-        _name_rows(axis, controllers)
-    legend_below(figure, sideways, 3)
-    figure.suptitle("How far each episode missed (left is better)")
-    return figure
-
-
 def filmstrip(episode: RolloutEpisode, title: str) -> Figure:
     """What every view showed at moments from begin to end; below, place and force over time."""
     trace = episode.trace
@@ -202,22 +184,6 @@ def _mark_limits(axes: Sequence[Axes]) -> None:
     height.set_title("tip above the surface [mm]; dashed: the surface at rest")
     layer.set_title(words)
     force.set(title=f"force [N]; dashed: {FORCE_LIMIT_N:g}", xlabel="time [s]", ylim=(0, None))
-
-
-def _draw_strip(
-    axis: Axes, place: int, episodes: Sequence[RolloutEpisode], field: str, most: float
-) -> None:
-    """Points of one row, no farther than `most` and spread upright so that equal ones show."""
-    values = np.minimum([getattr(episode, field) for episode in episodes], most)
-    successes = np.array([episode.success for episode in episodes])
-    # Multiples of the golden ratio fill an interval evenly, however many there are.
-    rows = place + 0.5 * (np.arange(len(values)) * 0.618 % 1 - 0.5)
-    style: dict[str, Any] = {"s": 26, "linewidths": 0, "alpha": 0.75}
-    for outcome, (label, colour, marker) in _OUTCOMES.items():
-        here, label = successes == outcome, "" if place else label
-        axis.scatter(values[here], rows[here], c=colour, marker=marker, label=label, **style)
-    axis.plot([np.median(values)] * 2, [place - 0.36, place + 0.36], color=INK, lw=2.4)
-    axis.set_xlim(-0.03 * most, 1.03 * most)
 
 
 def _name_rows(axis: Axes, controllers: Sequence[str]) -> None:

@@ -15,7 +15,7 @@ from pipeline.look.rollout.page import rollout_report, worst_and_median
 Sound = Callable[[Path], None]
 MakeEpisode = Callable[..., RolloutEpisode]
 MakeRollouts = Callable[..., Rollouts]
-ALWAYS = {"success", "endings", "paths", "courses", "filmstrip_worst", "misses"}
+ALWAYS = {"success", "endings", "paths", "courses", "filmstrip_worst"}
 
 
 def failure(make_episode: MakeEpisode, seed: int = 0, **changed: object) -> RolloutEpisode:
@@ -33,10 +33,8 @@ def test_every_section_is_there_and_the_page_is_sound(
     report = rollout_report(rollouts)
     assert [section.title for section in report.sections] == [
         "Success",
-        "How episodes ended",
         "Where the needle went",
         "Episodes closely",
-        "How far each missed",
         "What was run",
     ]
     files = write_report(tmp_path, report)
@@ -48,31 +46,18 @@ def test_every_section_is_there_and_the_page_is_sound(
 
 def test_figures_are_those_of_the_rollouts(rollouts: Rollouts) -> None:
     report = rollout_report(rollouts)
-    success, endings = report.blocks(Table)
-    assert [row[:4] for row in success.rows] == [
-        ("policy", "full", 5, 60.0),
-        ("demonstrator", "full", 5, 100.0),
-        ("policy, features off", "full", 5, 0.0),
+    (success,) = report.blocks(Table)
+    policy = "60% (23% to 88%)"
+    assert [row[:3] for row in success.rows] == [
+        ("policy", policy, 5),
+        ("expert", "100% (57% to 100%)", 5),
+        ("features off", "0% (0% to 43%)", 5),
     ]
-    assert [row[5] for row in success.rows] == pytest.approx([0.4, 0.4, 40.0])
-    assert success.rows[0][4] == "23 to 88"
-    heads = ["ending", "policy", "demonstrator", "policy, features off"]
-    assert list(endings.columns) == heads
-    assert endings.rows[0] == ("inserted", 3, 5, 0)
-    assert sum(sum(row[1:]) for row in endings.rows) == 15
-    assert "policy 3 of 5; demonstrator 5 of 5; policy, features off 0 of 5." in report.summary
-    tiles = dict(report.tiles)
-    assert (tiles["success of the policy"], tiles["95 % interval [%]"]) == ("60 %", "23 to 88")
-
-
-def test_levels_stand_apart(make_episode: MakeEpisode, make_rollouts: MakeRollouts) -> None:
-    levels = [("depth", True), ("depth", True), ("full", False), ("full", True)]
-    episodes = [
-        make_episode(seed, level=level, success=success, reason="inserted" if success else "late")
-        for seed, (level, success) in enumerate(levels)
-    ]
-    success, _ = rollout_report(make_rollouts(*episodes)).blocks(Table)
-    assert [row[1:4] for row in success.rows] == [("depth", 2, 100.0), ("full", 2, 50.0)]
+    assert [row[3] for row in success.rows] == pytest.approx([0.4, 0.4, 40.0])
+    failed = [row[5] for row in success.rows]
+    assert failed[1] == "" and failed[0].startswith("1 ") and failed[2].startswith("2 time is up")
+    assert f"policy {policy}; demonstrator 100% (57% to 100%);" in report.summary
+    assert dict(report.tiles)["success of the policy"] == policy
 
 
 def test_the_worst_fails_and_the_median_lies_in_the_middle(make_episode: MakeEpisode) -> None:
@@ -92,10 +77,11 @@ def test_without_any_success(
 ) -> None:
     episodes = [failure(make_episode, seed, lateral_mm=seed) for seed in range(4)]
     report = rollout_report(make_rollouts(*episodes))
-    assert dict(report.tiles)["success of the policy"] == "0 %"
-    assert [row[0] for row in list(report.blocks(Table))[1].rows] == ["time is up"]
+    assert dict(report.tiles)["success of the policy"] == "0% (0% to 49%)"
+    (success,) = report.blocks(Table)
+    assert [row[5] for row in success.rows] == ["4 time is up"]
     assert {file.stem for file in write_report(tmp_path, report)} >= ALWAYS
-    worst = next(part for part in report.sections[3].parts if part.title.startswith("Worst"))
+    worst = next(part for part in report.sections[2].parts if part.title.startswith("Worst"))
     (words,) = (block.words for block in worst.blocks if isinstance(block, Text))
     assert words.startswith("Time is up. 3.00 mm sideways from the target, 1.50 mm short of ")
 

@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.evaluate.rollouts import RolloutEpisode, Rollouts
 from pipeline.look.rollout import pictures as plots
-from pipeline.simulation.insertion import FORCE_LIMIT_N, MISS_MM, OVERSHOOT_MM
+from pipeline.simulation.insertion import FORCE_LIMIT_N, MISS_MM
 
 MakeEpisode = Callable[..., RolloutEpisode]
 
@@ -52,18 +52,6 @@ def test_points_of_paths_are_coloured_by_success(rollouts: Rollouts) -> None:
     assert max(begins) <= 3.0
     without = replace(rollouts, episodes=rollouts.of("policy"))
     assert len(plots.paths(without).axes) == 2
-
-
-def test_misses_beyond_the_axis_lie_at_its_end(rollouts: Rollouts) -> None:
-    sideways, beyond = plots.misses(rollouts).axes
-    points = np.concatenate([np.asarray(c.get_offsets()) for c in sideways.collections])
-    assert len(points) == 15
-    assert points[:, 0].max() == 4 * MISS_MM < sideways.get_xlim()[1]
-    rows, counts = np.unique(points[:, 1].round(), return_counts=True)
-    assert (rows.tolist(), counts.tolist()) == ([0, 1, 2], [5, 5, 5])
-    for axis, limit in ((sideways, MISS_MM), (beyond, OVERSHOOT_MM)):
-        (line,) = (line for line in axis.lines if line.get_label() == "limit of a success")
-        assert line.get_xdata()[0] == limit
 
 
 def test_a_filmstrip_asks_for_frames_at_its_moments(make_episode: MakeEpisode) -> None:
