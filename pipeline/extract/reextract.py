@@ -22,7 +22,7 @@ from pipeline.extract.rows import ReadyRow, RowPreparation
 from pipeline.extract.survey import survey
 from pipeline.store import FEATURES, Episode, FeatureStore
 from pipeline.store.environments import environment_runs
-from pipeline.store.integrity.verification import capped
+from pipeline.store.verification import capped
 from pipeline.vlm.feature_spec import FeatureSpec
 from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.qwen import FrozenVLM

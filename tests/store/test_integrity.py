@@ -19,9 +19,8 @@ from pipeline.base.errors import StoreIncomplete, StoreMismatch
 from pipeline.base.format import size
 from pipeline.store import FeatureStore, check_trailers
 from pipeline.store.archive import archive
-from pipeline.store.integrity import Verification, verify
-from pipeline.store.integrity.verification import MOST_LINES
 from pipeline.store.schema import chunk_paths, read_spec
+from pipeline.store.verification import MOST_LINES, Verification, verify
 
 TICKS, REUSE = 30, 3
 ROWS = TICKS // REUSE
@@ -371,7 +370,7 @@ class TestOtherThings:
         def elsewhere(checks, workers):
             yield from (replace(check(), bytes=0, damage="no file") for check in checks)
 
-        monkeypatch.setattr("pipeline.store.integrity.verification._run_on_cluster", elsewhere)
+        monkeypatch.setattr("pipeline.store.verification._run_on_cluster", elsewhere)
         with pytest.raises(StoreIncomplete, match="a file system that they share"):
             verify(store, threads=1, workers="tcp://elsewhere:8786")
 
@@ -386,6 +385,6 @@ class TestOtherThings:
             shutil.copytree(store.with_name("before.zarr"), store)
             return []
 
-        monkeypatch.setattr("pipeline.store.integrity.verification.strange_files", replaced)
+        monkeypatch.setattr("pipeline.store.verification.strange_files", replaced)
         with pytest.raises(StoreMismatch, match="another store took its place"):
             verify(store, threads=1)
