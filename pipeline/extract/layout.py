@@ -1,5 +1,6 @@
 """Write everything of a store that needs no model: streams, ticks, episodes."""
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from itertools import takewhile
 from typing import Any
@@ -17,7 +18,7 @@ from pipeline.data.timeline import Timeline
 from pipeline.extract.plan import store_bytes
 from pipeline.extract.survey import CheckedEpisode, Survey, embodiment_of
 from pipeline.store import SCHEMA, RowSource, Sizes, StoreBuild, arrays
-from pipeline.store.episodes import episode_arrays, episode_edges
+from pipeline.store.episodes import episode_arrays
 from pipeline.store.schema import ArraySpec
 from pipeline.vlm.feature_spec import FeatureSpec
 
@@ -67,15 +68,16 @@ def lay_out(
 def build_arrays(checked: Sequence[CheckedEpisode], survey: Survey) -> dict[str, ArraySpec]:
     """The arrays that these episodes need."""
     embodiment, extract = embodiment_of(checked), survey.params.extract
-    edges = episode_edges([episode.rows for episode in checked])
-    ends = {kind: int(edge[-1]) for kind, edge in edges.items()}
+    count = Counter[str]()
+    for episode in checked:
+        count.update(episode.rows.counts)
     sizes = Sizes(
         episodes=len(checked),
-        ticks=ends["tick"],
-        vl_rows=ends["vl"],
-        readings=ends["sensor"],
-        states=ends["state"],
-        text_bytes=ends["text"],
+        ticks=count["tick"],
+        vl_rows=count["vl"],
+        readings=count["sensor"],
+        states=count["state"],
+        text_bytes=count["text"],
         slots=len(survey.spec.slots) * survey.spec.variants,
         dim=survey.spec.dim,
         views=len(survey.spec.views),

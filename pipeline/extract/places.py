@@ -1,7 +1,8 @@
 """What lies at the place of a store and beside it, and what of that an extraction may use."""
 
-from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from functools import cached_property
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -58,13 +59,14 @@ class StorePlaces:
     def stands(self, surveyed: Survey) -> bool:
         """Whether a store or a build of this very plan is there; a build, as it was laid out."""
         if self.begun == surveyed.plan:
-            return self.layout_damage() is None
+            return self.layout_damage is None
         return self.finished == surveyed.plan
 
     def begun_build(self) -> StoreBuild:
         """The unfinished build."""
         return StoreBuild(self.target, read_specs(self.part), self.begun or "")
 
+    @cached_property
     def layout_damage(self) -> str | None:
         """What is wrong with all but the feature rows of the unfinished build."""
         with closing(self.begun_build()) as build:
@@ -74,9 +76,8 @@ class StorePlaces:
         """Set an unfinished build aside; of another feature spec, it is of no use."""
         if self.begun is None:
             return
-        with closing(RowSource(self.part)) as abandoned:
-            before, spec_digest = abandoned.attrs["feature_spec"], abandoned.spec_digest
-        if spec_digest != surveyed.spec.digest:
+        before = RowSource(self.part).attrs["feature_spec"]
+        if before["digest"] != surveyed.spec.digest:
             for line in spec_differences(before, surveyed.spec.attrs()):
                 say(f"the unfinished build {self.part} is given up: {line}")
             return
@@ -137,14 +138,12 @@ class StorePlaces:
         """
         for place, plan in ((self.target, self.finished), (self.part, self.begun)):
             if plan is not None:
-                with closing(RowSource(place)) as source:
-                    _refuse_another(source, surveyed, embodiment)
+                _refuse_another(RowSource(place), surveyed, embodiment)
         under_repair = self.finished is not None and self.finished == self.begun
         if not under_repair and not (self.finished or "").startswith(MERGED):
             return
-        with closing(RowSource(self.part if under_repair else self.target)) as source:
-            lost = set(source.episode_contents) - surveyed.contents
-        if lost:
+        source = RowSource(self.part if under_repair else self.target)
+        if lost := set(source.episode_contents) - surveyed.contents:
             what = "is under repair" if under_repair else "was merged of others"
             raise StoreMismatch(
                 f"{self.target}: {what} and holds {len(lost)} episode(s) that the params do not "
@@ -153,14 +152,10 @@ class StorePlaces:
             )
 
 
-@contextmanager
-def row_sources(places: Sequence[Path], surveyed: Survey) -> Generator[list[RowSource]]:
+def row_sources(places: Sequence[Path], surveyed: Survey) -> list[RowSource]:
     """The stores and laid-out builds of the same feature spec among these."""
-    with ExitStack() as stack:
-        sources = [RowSource(place) for place in places]
-        for source in sources:
-            stack.enter_context(closing(source))
-        yield [source for source in sources if source.spec_digest == surveyed.spec.digest]
+    sources = map(RowSource, places)
+    return [source for source in sources if source.spec_digest == surveyed.spec.digest]
 
 
 def _refuse_another(source: RowSource, surveyed: Survey, embodiment: Embodiment) -> None:
@@ -192,11 +187,10 @@ def _channels(stream: Mapping[str, Any]) -> str:
 
 def _contents(store: Path) -> list[str] | None:
     """The content digest of each episode; None where they can no longer be read."""
-    with closing(RowSource(store)) as source:
-        try:
-            return source.episode_contents
-        except StoreIncomplete:
-            return None
+    try:
+        return RowSource(store).episode_contents
+    except StoreIncomplete:
+        return None
 
 
 def spec_differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:

@@ -1,7 +1,7 @@
 """What an extraction would do, and why; said before anything is done."""
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 from pipeline.base.digests import ContentDigests, joint_digest
 from pipeline.base.durable import free_bytes
@@ -18,15 +18,27 @@ def plan_lines(
     build: StoreBuild,
     surveyed: Survey,
     digests: ContentDigests,
+    places: StorePlaces,
+    sources: Sequence[RowSource],
     known: int,
-    reasons: Iterable[str],
-    before: RowSource | None = None,
-    unchanged: int | None = None,
 ) -> list[str]:
-    """What there is to do, for people, where so many rows are known and episodes unchanged (all).
+    """What there is to do, for people, where so many rows are known.
 
-    `before` is the store, or the begun build, that the new one takes the place of.
+    `sources` are stores and builds of the same feature spec.
     """
+    there = {digest for source in sources for digest in source.episode_digests}
+    unchanged = sum(episode.digest in there for episode in surveyed.episodes)
+    resumes = places.begun == surveyed.plan
+    place = places.part if resumes or places.repaired else places.target
+    before = None if read_plan(place) is None else RowSource(place)
+    if resumes and places.layout_damage:
+        reasons = [f"{places.layout_damage}; streams are laid out again, the feature rows are kept"]
+    elif resumes:
+        repairs = places.finished == surveyed.plan
+        doing = "completing the repair" if repairs else "continuing the interrupted build"
+        reasons = [f"{doing} {places.part}"]
+    else:
+        reasons = _reasons(surveyed, before, build.specs)
     rows, variants = build.specs[FEATURES].shape[0], surveyed.spec.variants
     left, rows_per_s = rows - known, digests.rate(rate_name(surveyed))
     if not left:
@@ -36,36 +48,16 @@ def plan_lines(
     else:
         time = f"about {duration(left / rows_per_s)} at {rows_per_s:.1f} rows/s, as last measured"
     needed, free = size(store_bytes(build.specs)), size(free_bytes(build.part))
-    episodes = len(surveyed.episodes)
     return [
         *(f"WARNING: {warning}" for warning in _warnings(surveyed, before, left)),
         *(f"why: {reason}" for reason in reasons),
-        f"episodes: {episodes}, {episodes if unchanged is None else unchanged} of them unchanged",
+        f"episodes: {len(surveyed.episodes)}, {unchanged} of them unchanged",
         f"rows: {rows}, {known} known, {left} to compute"
         + (f" in {variants} variants each" if left and variants > 1 else "")
         + (" (fewer where a key turns out to be known)" if left and known else ""),
         f"disk: {needed} for the whole store, {free} free",
         f"time: {time}",
     ]
-
-
-def new_plan_lines(
-    build: StoreBuild,
-    surveyed: Survey,
-    digests: ContentDigests,
-    places: StorePlaces,
-    sources: Sequence[RowSource],
-    known: int,
-) -> list[str]:
-    """`plan_lines` of a new build; `sources` are stores and builds of the same feature spec."""
-    there = {digest for source in sources for digest in source.episode_digests}
-    unchanged = sum(episode.digest in there for episode in surveyed.episodes)
-    place = places.part if places.repaired else places.target
-    before = None if read_plan(place) is None else RowSource(place)
-    reasons = list(_reasons(surveyed, before, build.specs))
-    if places.begun == surveyed.plan and (damage := places.layout_damage()):
-        reasons = [f"{damage}; streams are laid out again, the feature rows are kept"]
-    return plan_lines(build, surveyed, digests, known, reasons, before, unchanged)
 
 
 def rate_name(surveyed: Survey) -> str:

@@ -83,8 +83,7 @@ class ExtractionPlugin(WorkerPlugin):
             self._closed = True
             if self._engine is not None:
                 self._engine = None
-                for opened in (self._build, *self._known):
-                    opened.close()
+                self._build.close()
 
     def compute(self, rows: NDArray[np.int64]) -> list[WrittenRows]:
         """Write the features of these rows; equal ones among them are computed once."""
@@ -104,12 +103,12 @@ class ExtractionPlugin(WorkerPlugin):
         with self._opening:
             if self._engine is None:
                 check_place(self.job)
-                self._known = [RowSource(path) for path in self.job.known]
+                known = [RowSource(path) for path in self.job.known]
                 specs = read_specs(part_path(surveyed.target))
                 self._build = StoreBuild(surveyed.target, specs, surveyed.plan)
                 frames = row_frames(self._build, surveyed)
                 device = device_of(self.job, self._number)
-                self._engine = RowEngine(surveyed, frames, self._known, device)
+                self._engine = RowEngine(surveyed, frames, known, device)
             return self._engine
 
 

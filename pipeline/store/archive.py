@@ -283,17 +283,11 @@ def _create_array(root: Path, spec: ArraySpec, level: int) -> "zarr.Array[Any]":
     widths = tuple(max(1, size) for size in spec.shape[1:])
     inner = inner_rows(spec)
     codec = codec_for(spec.dtype, inner * spec.row_bytes, level)
-    return zarr.create_array(
-        store=root,
-        name=spec.name,
-        shape=spec.shape,
+    return spec.create(
+        root,
         shards=(_chunks_a_shard(spec) * spec.chunk_rows, *widths),
         chunks=(inner, *widths),
-        dtype=spec.dtype,
         compressors=[codec, Crc32cCodec()],
-        fill_value=0,
-        dimension_names=spec.dimensions,
-        attributes=dict(spec.attributes),
     )
 
 

@@ -86,10 +86,6 @@ class RowSource:
         """With which software and hardware a known row was computed; empty where not noted."""
         return environment_at(self._environments, self.rows[key])
 
-    def close(self) -> None:
-        """Forget what was read."""
-        self._arrays.clear()
-
     @cached_property
     def _episodes_by_text(self) -> dict[tuple[str, str], list[int]]:
         episodes = defaultdict[tuple[str, str], list[int]](list)

@@ -100,20 +100,23 @@ class ArraySpec:
         start = chunk * self.chunk_rows
         return range(start, min(start + self.chunk_rows, self.shape[0]))
 
-    def create(self, root: Path | dict[str, Any]) -> "zarr.Array[Any]":
-        """Write the array's zarr metadata below `root`."""
+    def create(self, root: Path | dict[str, Any], **otherwise: Any) -> "zarr.Array[Any]":
+        """Write the array's zarr metadata below `root`; an archive cuts and packs it otherwise."""
+        as_in_a_store = {
+            "chunks": (self.chunk_rows, *(max(1, size) for size in self.shape[1:])),
+            "compressors": [Crc32cCodec()],
+        }
         return zarr.create_array(
             store=root,
             name=self.name,
             shape=self.shape,
-            chunks=(self.chunk_rows, *(max(1, size) for size in self.shape[1:])),
             dtype=self.dtype,
             serializer=BytesCodec() if self.dtype.itemsize > 1 else BytesCodec(endian=None),
-            compressors=[Crc32cCodec()],
             filters=None,
             fill_value=0,
             dimension_names=self.dimensions,
             attributes=dict(self.attributes),
+            **(as_in_a_store | otherwise),
         )
 
 

@@ -361,7 +361,6 @@ class TestDeaths:
         build = RowSource(part_path(store))
         starts = build.episode_edges("vl")
         said = [Path(one["id"]).name for one in build._texts]
-        build.close()
         spans = [range(*edges) for edges in pairwise(starts.tolist())]
         return dict(zip(said, spans, strict=True))
 
