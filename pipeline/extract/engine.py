@@ -222,7 +222,12 @@ def fill(
     done = total - len(missing)
     with tqdm(None, "extract", total, initial=done, unit="row", disable=None) as bar:
         marks = RowMarks(build, bar)
-        missing = _take_over(surveyed, known, frames, missing, marks)
+        taken: list[int] = []
+        rows_known = _known_rows(surveyed, known, frames, missing)
+        while rows := list(islice(rows_known, _TOGETHER)):
+            marks.mark(block.write(build) for block in _known_blocks(rows))
+            taken += [row.row for row in rows]
+        missing = np.setdiff1d(missing, taken)
         rate = model_share = waited_share = None
         if len(missing) and extract.workers != 0:
             from pipeline.extract.cluster import compute_on_cluster  # dask: a second to import
@@ -243,28 +248,10 @@ def fill(
     return ExtractionReport(build.target, total, *counts, seconds, model_share, waited_share)
 
 
-def _take_over(
-    surveyed: Survey,
-    known: Sequence[RowSource],
-    frames: RowFrames,
-    missing: NDArray[np.int64],
-    marks: RowMarks,
-) -> NDArray[np.int64]:
-    """Mark the missing rows that are known by content, instruction and frame times.
-
-    No frame is decoded. Returns the rows that are left.
-    """
-    taken: list[int] = []
-    rows_known = _known_rows(surveyed, known, frames, missing)
-    while rows := list(islice(rows_known, _TOGETHER)):
-        marks.mark(block.write(marks.build) for block in _known_blocks(rows))
-        taken += [row.row for row in rows]
-    return np.setdiff1d(missing, taken)
-
-
 def _known_rows(
     surveyed: Survey, known: Sequence[RowSource], frames: RowFrames, missing: NDArray[np.int64]
 ) -> Iterator[KnownRow]:
+    """The missing rows that are known by content, instruction and frame times; decodes none."""
     for index, rows in by_episode(missing, frames.vl_start):
         episode = surveyed.episodes[index]
         of = episode.content, episode.recording.instruction

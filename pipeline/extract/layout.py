@@ -72,17 +72,17 @@ def build_arrays(checked: Sequence[CheckedEpisode], survey: Survey) -> dict[str,
     for episode in checked:
         count.update(episode.rows.counts)
     sizes = Sizes(
-        episodes=len(checked),
-        ticks=count["tick"],
-        vl_rows=count["vl"],
-        readings=count["sensor"],
-        states=count["state"],
-        text_bytes=count["text"],
-        slots=len(survey.spec.slots) * survey.spec.variants,
+        episode=len(checked),
+        tick=count["tick"],
+        vl_row=count["vl"],
+        sensor_reading=count["sensor"],
+        state_reading=count["state"],
+        byte=count["text"],
+        slot=len(survey.spec.slots) * survey.spec.variants,
         dim=survey.spec.dim,
-        views=len(survey.spec.views),
+        view=len(survey.spec.views),
         action_dim=len(embodiment.action.names),
-        sensor_channels=len(embodiment.sensor.names),
+        channel=len(embodiment.sensor.names),
         state_dim=len(embodiment.state.names),
     )
     return arrays(sizes, extract.dtype, extract.sensor_dtype)

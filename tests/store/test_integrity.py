@@ -6,6 +6,7 @@ import os
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from io import FileIO
 from pathlib import Path
 
 import distributed
@@ -211,14 +212,18 @@ class TestFeatureRows:
 
     def test_rows_on_a_disk_that_fails(self, store, monkeypatch):
         monkeypatch.setattr("pipeline.store.chunks.BLOCK_BYTES", 10 * 3 * 8 * 4)
-        read, inode = os.preadv, chunk_file(store, "vl/features").stat().st_ino
+        path, opened = chunk_file(store, "vl/features"), Path.open
 
-        def failing(descriptor, buffers, offset):
-            if os.fstat(descriptor).st_ino == inode and offset >= 50 * 3 * 8 * 4:
-                raise OSError(errno.EIO, "Input/output error")
-            return read(descriptor, buffers, offset)
+        class Failing(FileIO):
+            def readinto(self, buffer):
+                if self.tell() >= 50 * 3 * 8 * 4:
+                    raise OSError(errno.EIO, "Input/output error")
+                return super().readinto(buffer)
 
-        monkeypatch.setattr(os, "preadv", failing)
+        def failing(self, *args, **kwargs):
+            return Failing(self) if self == path else opened(self, *args, **kwargs)
+
+        monkeypatch.setattr(Path, "open", failing)
         verification = verify(store, threads=1)
         assert verification.bad_rows.tolist() == list(range(50, 60))
         assert "cannot be read at byte 4800: Input/output error" in verification.lines()[0]
