@@ -18,11 +18,11 @@ from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.base.errors import StoreMismatch
 from pipeline.data.row_range import RowFrames
 from pipeline.extract.encoder import Encoder
-from pipeline.extract.rows import ReadyRow, RowPreparation
+from pipeline.extract.engine import ReadyRow, RowPreparation
 from pipeline.extract.survey import survey
 from pipeline.store import FEATURES, Episode, FeatureStore
-from pipeline.store.environments import environment_runs
 from pipeline.store.verification import capped
+from pipeline.store.writer import environment_runs
 from pipeline.vlm.feature_spec import FeatureSpec
 from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.qwen import FrozenVLM

@@ -23,12 +23,11 @@ from pipeline.extract.layout import build_arrays, check_space, lay_out
 from pipeline.extract.survey import sound_episodes, survey
 from pipeline.store import FEATURES, StoreBuild, build_lock, part_path, read_plan, recover
 from pipeline.store.chunks import ChunkFiles, read_rows, row_checksums
-from pipeline.store.environments import environment_runs
 from pipeline.store.paths import MERGED, STORE, read_attributes, refuse_replaced
 from pipeline.store.repair_hints import extract_command, gc_command
 from pipeline.store.schema import CHECKSUMS, INCREMENTAL, KEYS, chunk_paths, read_specs
 from pipeline.store.verification import Verification, read_arrays
-from pipeline.store.writer import sync_folders
+from pipeline.store.writer import environment_runs, sync_folders
 
 Say = Callable[[str], None]
 _BLOCK_BYTES = 2**26

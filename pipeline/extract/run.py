@@ -12,8 +12,7 @@ from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.data.timeline import rate_notes
 from pipeline.extract.engine import ExtractionReport, fill
 from pipeline.extract.layout import build_arrays, check_space, lay_out
-from pipeline.extract.places import Say, StorePlaces, row_sources
-from pipeline.extract.plan import count_known, plan_lines
+from pipeline.extract.plan import Say, StorePlaces, count_known, plan_lines, row_sources
 from pipeline.extract.survey import (
     CheckedEpisode,
     Survey,

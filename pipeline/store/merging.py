@@ -23,7 +23,6 @@ from tqdm import tqdm
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import ConfigError, StoreMismatch
 from pipeline.store.chunks import check_row_checksums, check_trailers, read_rows
-from pipeline.store.environments import environment_runs
 from pipeline.store.episodes import Episode, index_arrays
 from pipeline.store.lock import build_lock
 from pipeline.store.metadata import ATTRIBUTE as METADATA_DIGEST
@@ -49,7 +48,7 @@ from pipeline.store.schema import (
     ArraySpec,
     read_spec,
 )
-from pipeline.store.writer import StoreBuild
+from pipeline.store.writer import StoreBuild, environment_runs
 
 _COPIED = [
     name for name in ARRAY_NAMES if name.split("/")[0] in STREAMS and name not in INCREMENTAL

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from pipeline.base.errors import StoreIncomplete
 from pipeline.store.chunks import check_chunks, find_damage, read_rows, row_checksums
-from pipeline.store.environments import EnvironmentLog, environment_at
 from pipeline.store.episodes import read_texts
 from pipeline.store.schema import CHECKSUMS, FEATURES, KEYS, ArraySpec, read_specs
+from pipeline.store.writer import EnvironmentLog, environment_at
 
 
 class RowSource:
