@@ -122,7 +122,10 @@ def measure(
     count = sizes["rows"]
     amount = {
         "rows": count,
-        "GB": count * store.tensor("features").nbytes / len(store.tensor("features")) / 1e9,
+        "GB": count
+        * store.gatherer.tensor("features").nbytes
+        / len(store.gatherer.tensor("features"))
+        / 1e9,
     }
     for written in (folder / "rows").glob("rows.*"):
         written.unlink()
@@ -182,7 +185,7 @@ class Fresh:
             if self._available is not None:
                 gathering.available_bytes = lambda: self._available
             self.store = FeatureStore.open(self._path)
-            self.store.empty_batch(1, 1, 1, 1)  # here it decides how to page
+            self.store.gatherer.empty_batch(1, 1, 1, 1)  # here it decides how to page
         finally:
             gathering.available_bytes = real
 

@@ -1,6 +1,7 @@
 """The one engine: rows are prepared, encoded and written in any process, and marked in one.
 
-Row ranges become rows ready for the model, decoded and prepared in the background. has the model of a process: that of the coordinator, or each dask worker's. What was written counts
+Row ranges become rows ready for the model, decoded and prepared in the background. A `RowEngine`
+has the model of a process: that of the coordinator, or each dask worker's. What was written counts
 once the coordinator has marked it. `fill` is the coordinator's side.
 """
 

@@ -147,7 +147,7 @@ class TestVariants:
         assert varied.variants == 3
         assert varied.feature_shape == (2, 8)
         assert varied.array("vl/features").shape[1:] == (6, 8)
-        assert varied.empty_batch(4, 8, 65, 100).features.shape == (4, 2, 8)
+        assert varied.gatherer.empty_batch(4, 8, 65, 100).features.shape == (4, 2, 8)
 
     @settings(max_examples=60, deadline=None)
     @given(data=st.data())
