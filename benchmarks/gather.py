@@ -120,12 +120,10 @@ def measure(
 
     rows, slow_rows = row_race(store, folder / "rows", sizes, rounds, slow)
     count = sizes["rows"]
+    features = store.gatherer.tensor("features")
     amount = {
         "rows": count,
-        "GB": count
-        * store.gatherer.tensor("features").nbytes
-        / len(store.gatherer.tensor("features"))
-        / 1e9,
+        "GB": count * features.nbytes / len(features) / 1e9,
     }
     for written in (folder / "rows").glob("rows.*"):
         written.unlink()

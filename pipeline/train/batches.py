@@ -144,9 +144,8 @@ def choose_feed(
     if free is None:
         on_gpu = device.type == "cuda"
         free = torch.cuda.mem_get_info(device)[0] if on_gpu else available_bytes()
-    wide = {
-        name: store.gatherer.tensor(name) for name in WIDE if store.gatherer.tensor(name).nbytes
-    }
+    maps = {name: store.gatherer.tensor(name) for name in WIDE}
+    wide = {name: tensor for name, tensor in maps.items() if tensor.nbytes}
     fields = fitting(wide, free, _DEVICE_SHARE)
     room = (
         f"{_DEVICE_SHARE:.0%} of the {size(free)} free on {device} hold "
