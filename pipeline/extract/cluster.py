@@ -199,9 +199,8 @@ def check_place(job: ExtractionJob) -> None:
     here, host = Path.cwd(), socket.gethostname()
     if not job.folder.is_dir() or not here.samefile(job.folder):
         raise ConfigError(
-            f"the worker on {host} runs in {here}, the coordinator in {job.folder}: relative paths "
-            f"would not be the same. Start every worker with `cd {job.folder}`, on a file system "
-            "that all hosts share."
+            f"the worker on {host} runs in {here}, the coordinator in {job.folder}. Start every "
+            f"worker with `cd {job.folder}`, on a file system that all hosts share."
         )
     surveyed, part = job.surveyed, part_path(job.surveyed.target)
     if read_plan(part) != surveyed.plan:
@@ -317,15 +316,13 @@ class ClusterTasks:
         """Raise what the recordings of a range cannot be to blame for."""
         if isinstance(error, CancelledError):
             raise PipelineError(
-                f"the connection to the dask scheduler was lost ({error}). The rows that were "
-                "written are kept: start the scheduler and its workers again, and run the same "
-                "command."
+                f"the connection to the dask scheduler was lost ({error}). What was written is "
+                "kept: start scheduler and workers again, and run the same command."
             )
         if isinstance(error, NoWorkerError):
             raise PipelineError(
                 "no worker has been there for two minutes: they were killed, or ran out of memory. "
-                "The rows that were written are kept. Run the same command again, with fewer "
-                "extract.workers where memory is short."
+                "What was written is kept: run the same command again, with fewer extract.workers."
             )
         if not isinstance(error, KilledWorker | RecordingError | NumericsError):
             raise error
@@ -447,9 +444,8 @@ def _local_cluster(workers: int, extract: ExtractParams) -> Generator[LocalClust
             except (RuntimeError, OSError) as error:
                 raise PipelineError(
                     f"extract.workers: {workers} worker processes could not be started "
-                    f"({error.__cause__ or error}). One was killed, or ran out of memory as it "
-                    "began: run the same command again, with fewer extract.workers where memory "
-                    "is short, or with extract.workers=0."
+                    f"({error.__cause__ or error}): one was killed, or ran out of memory. Run the "
+                    "same command again, with fewer extract.workers, or with extract.workers=0."
                 ) from None
             yield cluster
         finally:

@@ -36,9 +36,8 @@ def check_space(
     if needed > free:
         raise DiskFull(
             f"{build.target}: the store needs {size(needed)}, {build.part.parent} has "
-            f"{size(free)} free. Make room, or set extract.store to another disk, "
-            "extract.dtype or extract.sensor_dtype to float16, or fewer vlm.pooling slots or "
-            "vlm.variants."
+            f"{size(free)} free. Make room, or set another extract.store, extract.dtype or "
+            "extract.sensor_dtype float16, or fewer vlm.pooling slots or vlm.variants."
         )
 
 
@@ -96,16 +95,13 @@ def _linkable(
     Those of the leading episodes of unchanged content; only whole chunks of them can be linked.
     """
     for source in known:
-        if source.path != build.target:
-            continue
-        contents = [episode.surveyed.content for episode in checked]
-        pairs = zip(source.episode_contents, contents, strict=False)
-        same = len(list(takewhile(lambda pair: pair[0] == pair[1], pairs)))
-        readings = sum(episode.rows.readings for episode in checked[:same])
-        states = sum(episode.rows.states for episode in checked[:same])
-        for stream, rows in (("sensor", readings), ("state", states)):
-            for part in ("values", "time"):
-                yield source, f"{stream}/{part}", rows
+        if source.path == build.target:
+            pairs = zip(source.episode_contents, checked, strict=False)
+            same = [*takewhile(lambda pair: pair[0] == pair[1].surveyed.content, pairs)]
+            for stream in ("sensor", "state"):
+                rows = sum(episode.rows.counts[stream] for _, episode in same)
+                yield source, f"{stream}/values", rows
+                yield source, f"{stream}/time", rows
 
 
 def _slot_valid(line: Timeline, spec: FeatureSpec) -> NDArray[np.uint8]:

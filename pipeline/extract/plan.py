@@ -155,8 +155,8 @@ class StorePlaces:
             what = "is under repair" if under_repair else "was merged of others"
             raise StoreMismatch(
                 f"{self.target}: {what} and holds {len(lost)} episode(s) that the params do not "
-                "name; extraction would replace it. Give the --params it was made with (or run its "
-                "merge again), name another extract.store, or move it away."
+                "name. Give the --params it was made with (or run its merge again), name another "
+                "extract.store, or move it away."
             )
 
 
@@ -173,24 +173,18 @@ def _refuse_another(source: RowSource, surveyed: Survey, embodiment: Embodiment)
     there, here = source.attrs["sources"], sorted({r.source for r in surveyed.recordings})
     before, now = source.attrs["streams"], embodiment.document()
     differing = [
-        f"; {stream}: {_channels(before[stream])} there, {_channels(now[stream])} here"
-        for stream in ("action", "sensor", "state")
-        if before[stream]["names"] and now[stream]["names"]
-        if any(before[stream][key] != now[stream][key] for key in ("names", "units"))
+        f"; {name}: {len(before[name]['names'])} channels there, {len(now[name]['names'])} here"
+        for name in now
+        if before[name]["names"] and now[name]["names"]
+        if any(before[name][key] != now[name][key] for key in ("names", "units"))
     ]
     if differing or not set(there) & set(here):
         raise StoreMismatch(
-            f"{source.path}: holds the feature rows of {len(known)} episode(s), none "
-            "of which is in data.sources, and extraction would throw them away (sources: "
+            f"{source.path}: holds the feature rows of {len(known)} episode(s), none of which is "
+            "in data.sources, and extraction would throw them away (sources: "
             f"{', '.join(there)} there, {', '.join(here)} here{''.join(differing)}).\n"
-            "Name another store for these recordings, with --set extract.store=…, give the "
-            "--params it was made with, or move it away."
+            "Name another extract.store, give the --params it was made with, or move it away."
         )
-
-
-def _channels(stream: Mapping[str, Any]) -> str:
-    names, units = stream["names"], ", ".join(sorted(set(stream["units"])))
-    return f"{len(names)} channels [{names[0]} … {names[-1]}] ({units})"
 
 
 def _contents(store: Path) -> list[str] | None:
@@ -325,10 +319,9 @@ def _warnings(surveyed: Survey, before: RowSource | None, missing: int) -> Itera
     if params.data.action_rotation == "auto" and 0 < len(without) < len(recordings):
         yield (
             f"{len(without)} of {len(recordings)} episode(s), of source(s) "
-            f"{', '.join(dict.fromkeys(without))}, have no poses, so that the actions of all "
-            "episodes are differences of Euler angles (euler_delta) in place of rotation vectors "
-            "(rotvec). To keep rotation vectors: leave these out of data.sources, or give them a "
-            "store of their own. To say that it is meant: --set data.action_rotation=euler_delta"
+            f"{', '.join(dict.fromkeys(without))}, have no poses, so that the actions of all are "
+            "euler_delta in place of rotvec. To keep rotvec: give these a store of their own. To "
+            "say that it is meant: --set data.action_rotation=euler_delta"
         )
     # What the workers of a dask scheduler have is not known.
     if missing and params.vlm.dtype != "float32" and isinstance(params.extract.workers, int):

@@ -158,9 +158,8 @@ def _lay_out_anew(store: Path, plan: str, params: Params) -> StoreBuild:
     if surveyed.plan != plan:
         raise StoreMismatch(
             f"{store}: metadata, streams, ticks or episodes are damaged, and the params describe "
-            "another store than this one (recordings, data, vlm or dtypes changed). Restore the "
-            f"recordings and params, or run {_completed_by(store, plan)}, which takes over every "
-            "row whose frames it knows."
+            "another store than this one. Restore its recordings and params, or run "
+            f"{_completed_by(store, plan)}, which takes over every row whose frames it knows."
         )
     build = StoreBuild(_repaired(store), build_arrays(checked, surveyed), plan)
     check_space(build, checked, ())

@@ -361,8 +361,7 @@ def _refuse_build(target: Path) -> None:
     if read_plan(part) is not None:
         raise StoreMismatch(
             f"{part}: expected nothing there, found an unfinished build. Finish it with "
-            f"{extract_command(target)}, remove it with {gc_command(part)}, or restore to another "
-            "place with archive.store."
+            f"{extract_command(target)}, remove it with {gc_command(part)}, or set archive.store."
         )
 
 

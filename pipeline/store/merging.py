@@ -187,7 +187,7 @@ def _check_paths(inputs: Sequence[Path], output: Path) -> None:
     places = [path.resolve() for path in inputs]
     if len(places) < 2 or len(set(places)) < len(places):
         raise ConfigError(
-            "stores.inputs: expected two or more stores to merge, each named once, found "
+            "stores.inputs: expected two or more stores, each named once, found "
             f"{', '.join(map(str, inputs)) or 'none'}. "
             "Name them: python -m stages.store merge A.zarr B.zarr --into C.zarr"
         )
