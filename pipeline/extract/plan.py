@@ -162,8 +162,8 @@ class StorePlaces:
 
 def row_sources(places: Sequence[Path], surveyed: Survey) -> list[RowSource]:
     """The stores and laid-out builds of the same feature spec among these."""
-    sources = map(RowSource, places)
-    return [source for source in sources if source.spec_digest == surveyed.spec.digest]
+    digest, sources = surveyed.spec.digest, map(RowSource, places)
+    return [source for source in sources if source.attrs["feature_spec"]["digest"] == digest]
 
 
 def _refuse_another(source: RowSource, surveyed: Survey, embodiment: Embodiment) -> None:

@@ -331,10 +331,8 @@ def _shards(root: Path, spec: ArraySpec, array: "zarr.Array[Any]") -> list[tuple
 def _open_array(archive: Path, name: str, record: ArchivedArray) -> "zarr.Array[Any]":
     """An array of an archive; raises `StoreIncomplete` where its metadata are not as written."""
     metadata = archive / name / _ZARR_JSON
-    if not metadata.exists():
-        raise _damaged(metadata, f"the file is missing, and with it {name}")
-    if file_digest(metadata) != record.metadata:
-        raise _damaged(metadata, f"the metadata of {name} are not those that were written")
+    if not metadata.exists() or file_digest(metadata) != record.metadata:
+        raise _damaged(metadata, f"the metadata of {name} are missing or not as written")
     return zarr.open_array(archive, path=name, mode="r")
 
 

@@ -29,11 +29,6 @@ class RowSource:
         self.attrs: dict[str, Any] = zarr.open_group(path, mode="r").attrs.asdict()
         self._arrays: dict[str, NDArray[Any]] = {}
 
-    @property
-    def spec_digest(self) -> str:
-        """Digest of the feature spec its rows were computed under."""
-        return str(self.attrs["feature_spec"]["digest"])
-
     @cached_property
     def episode_digests(self) -> list[str]:
         """The digest of each episode, in order: equal digest, equal rows."""
@@ -43,10 +38,6 @@ class RowSource:
     def episode_contents(self) -> list[str]:
         """The content digest of each episode, in order: equal content, equal streams."""
         return [text["content"] for text in self._texts]
-
-    def episode_edges(self, stream: str) -> NDArray[np.int64]:
-        """(episode + 1,) where the rows of a stream begin."""
-        return self._read(f"episode/{stream}_start")
 
     @cached_property
     def rows(self) -> dict[bytes, int]:
@@ -63,11 +54,12 @@ class RowSource:
         episodes = self._episodes_by_text.get((content, instruction), [])
         if not episodes:
             return {}
-        frame_time, keys, checksums = map(self._read, ("vl/frame_time", KEYS, CHECKSUMS))
+        names = ("episode/vl_start", "vl/frame_time", KEYS, CHECKSUMS)
+        vl_start, frame_time, keys, checksums = map(self._read, names)
         return {
             frame_time[row].tobytes(): keys[row].tobytes()
             for episode in episodes
-            for row in range(*self.episode_edges("vl")[episode : episode + 2])
+            for row in range(vl_start[episode], vl_start[episode + 1])
             if checksums[row]
         }
 

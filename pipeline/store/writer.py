@@ -39,20 +39,15 @@ def environment_at(ranges: Sequence[Mapping[str, Any]], row: int) -> dict[str, A
     return {name: value for name, value in noted.items() if name != "rows"}
 
 
-def runs_of(rows: NDArray[np.int64]) -> list[range]:
-    """Consecutive rows among these, which ascend."""
-    runs = np.split(rows, np.flatnonzero(np.diff(rows) != 1) + 1)
-    return [range(int(run[0]), int(run[-1]) + 1) for run in runs if len(run)]
-
-
 def environment_runs(
     ranges: Sequence[Mapping[str, Any]], rows: NDArray[np.int64]
 ) -> Iterator[tuple[dict[str, Any], range]]:
     """Consecutive rows among these, which ascend, that were computed in one environment."""
-    edges = [edge for noted in ranges for edge in noted["rows"]]
-    for part in np.split(rows, np.searchsorted(rows, np.unique(edges))):
-        for run in runs_of(part):
-            yield environment_at(ranges, run.start), run
+    edges = np.searchsorted(rows, [edge for noted in ranges for edge in noted["rows"]])
+    gaps = np.flatnonzero(np.diff(rows) != 1) + 1
+    for run in np.split(rows, np.union1d(edges, gaps).astype(np.int64)):
+        if len(run):
+            yield environment_at(ranges, int(run[0])), range(int(run[0]), int(run[-1]) + 1)
 
 
 class EnvironmentLog:
