@@ -233,12 +233,9 @@ class RowEngine:
         self.loaded_at = self.waited_s = 0.0
         self._spec, self.variants = surveyed.spec, surveyed.spec.variants
         self._device = device
-        self._preparation = RowPreparation(Preparer(self._vlm, self._spec), self._spec, known)
+        preparation = RowPreparation(Preparer(self._vlm, self._spec), self._spec, known)
+        self.prepare = preparation.prepare
         self._environment: Mapping[str, Any] = {}
-
-    def prepare(self, rows: RowRange, firsts: dict[bytes, int] | None) -> list[Row]:
-        """`RowPreparation.prepare`; may be called from several threads."""
-        return self._preparation.prepare(rows, firsts)
 
     def encode(self, prepared: Iterator[list[Row]], put: Callable[[FeatureBlock], object]) -> None:
         """Hand over the features of all these rows, a repeated row's after those of its first."""

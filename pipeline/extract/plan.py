@@ -115,12 +115,12 @@ class StorePlaces:
 
     def put_in_place(self, build: StoreBuild, surveyed: Survey, say: Say) -> None:
         """Seal a build, keep the store before it where episodes would be lost, and tidy up."""
-        build.keeps_replaced = self._lost(surveyed) is not None
+        keep = self._lost(surveyed) is not None
         with closing(build):
-            build.seal()
+            build.seal(keep=keep)
         for folder in self.aside:
             remove_folder(folder, STORE)
-        if build.keeps_replaced:
+        if keep:
             say(f"{self.previous}: the store of before, kept until the next successful run")
         else:
             for place in self.kept:
@@ -251,6 +251,7 @@ def plan_lines(
         + (" (fewer where a key turns out to be known)" if left and known else ""),
         f"disk: {needed} for the whole store, {free} free",
         f"time: {time}",
+        *places.keeping_note(surveyed),
     ]
 
 

@@ -6,7 +6,6 @@ rename at the end. So a kill leaves the damaged store as it was and nothing half
 """
 
 import shutil
-from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
@@ -20,6 +19,7 @@ from pipeline.base.durable import put_in_place as replace_folder
 from pipeline.base.errors import StoreMismatch
 from pipeline.base.ownership import begin_folder, remove_folder
 from pipeline.extract.layout import build_arrays, check_space, lay_out
+from pipeline.extract.plan import Say
 from pipeline.extract.survey import sound_episodes, survey
 from pipeline.store import FEATURES, StoreBuild, build_lock, part_path, read_plan, recover
 from pipeline.store.chunks import ChunkFiles, read_rows, row_checksums
@@ -29,7 +29,6 @@ from pipeline.store.schema import CHECKSUMS, INCREMENTAL, KEYS, chunk_paths, rea
 from pipeline.store.verification import Verification, read_arrays
 from pipeline.store.writer import environment_runs, sync_folders
 
-Say = Callable[[str], None]
 _BLOCK_BYTES = 2**26
 
 

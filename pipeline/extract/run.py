@@ -75,8 +75,8 @@ def _resume(
     with closing(build):
         missing = build.missing()
         done = build.specs[FEATURES].shape[0] - len(missing)
-        plan = plan_lines(build, surveyed, digests, places, [RowSource(places.part)], done)
-        for line in [*plan, *places.keeping_note(surveyed)]:
+        known = [RowSource(places.part)]
+        for line in plan_lines(build, surveyed, digests, places, known, done):
             say(line)
         if surveyed.params.extract.plan:
             return None
@@ -95,7 +95,6 @@ def _begin(
     """Begin a new build; what stood in its place is set aside only when nothing can refuse it."""
     extract = surveyed.params.extract
     places.refuse_to_lose(surveyed, embodiment_of(checked))
-    keeping = places.keeping_note(surveyed)
     for line in _timeline_lines(surveyed, checked):
         say(line)
     build = StoreBuild(places.target, build_arrays(checked, surveyed), surveyed.plan)
@@ -103,8 +102,7 @@ def _begin(
         begun = [] if places.begun is None else [places.part]
         known = row_sources([*begun, *places.known], surveyed)
         taken = count_known(checked, surveyed, known)
-        plan = plan_lines(build, surveyed, digests, places, known, taken)
-        for line in [*plan, *keeping]:
+        for line in plan_lines(build, surveyed, digests, places, known, taken):
             say(line)
         if extract.plan:
             return None

@@ -332,7 +332,7 @@ def _open_array(archive: Path, name: str, record: ArchivedArray) -> "zarr.Array[
     """An array of an archive; raises `StoreIncomplete` where its metadata are not as written."""
     metadata = archive / name / _ZARR_JSON
     if not metadata.exists() or file_digest(metadata) != record.metadata:
-        raise _damaged(metadata, f"the metadata of {name} are missing or not as written")
+        raise _damaged(metadata, f"missing, or not the metadata that were written of {name}")
     return zarr.open_array(archive, path=name, mode="r")
 
 

@@ -111,8 +111,6 @@ class StoreBuild:
         self.part = part_path(target)
         self.specs = dict(specs)
         self.plan = plan
-        self.keeps_replaced = False
-        """Whether the store whose place it takes is kept as `<name>.zarr.previous`."""
         self._files: dict[str, ChunkFiles] = {}
         self._environments = EnvironmentLog(self.part)
 
@@ -228,14 +226,15 @@ class StoreBuild:
         for run in runs:
             self.files(CHECKSUMS).write(int(rows[run[0]]), checksums[run])
 
-    def seal(self) -> None:
+    def seal(self, *, keep: bool = False) -> None:
         """Check every row, write the trailers and put the store in its place.
 
+        To `keep` is to have what was there as `<name>.zarr.previous`.
         Idempotent: a kill in the middle is mended by running it again. Raises `StoreIncomplete`
         when rows are missing, or a file is not as it was written.
         """
         self.finish()
-        self.put_in_place()
+        self.put_in_place(keep)
 
     def finish(self) -> None:
         """The first half of `seal`: all of the store is on the disk, still beside its place."""
@@ -266,9 +265,9 @@ class StoreBuild:
         self.close()
         sync_folders(self.part)
 
-    def put_in_place(self) -> None:
+    def put_in_place(self, keep: bool = False) -> None:
         """The second half of `seal`: an instant."""
-        put_in_place(self.part, self.target, STORE, keep=self.keeps_replaced)
+        put_in_place(self.part, self.target, STORE, keep=keep)
 
     def close(self) -> None:
         """Close every file."""
