@@ -109,8 +109,8 @@ class RowPreparation:
         key = row_key(self._spec, prompt, frames)
         with self._lock:
             for source in self._known:
-                if (features := source.take(key)) is not None:
-                    return KnownRow(row, key, features, source.environment_of(key))
+                if (taken := source.take(key)) is not None:
+                    return KnownRow(row, key, *taken)
             first = row if firsts is None else firsts.setdefault(key, row)
         if first != row:
             return RepeatedRow(row, key, first)
@@ -233,9 +233,12 @@ class RowEngine:
         self.loaded_at = self.waited_s = 0.0
         self._spec, self.variants = surveyed.spec, surveyed.spec.variants
         self._device = device
-        preparation = RowPreparation(Preparer(self._vlm, self._spec), self._spec, known)
-        self.prepare = preparation.prepare
+        self._preparation = RowPreparation(Preparer(self._vlm, self._spec), self._spec, known)
         self._environment: Mapping[str, Any] = {}
+
+    def prepare(self, rows: RowRange, firsts: dict[bytes, int] | None) -> list[Row]:
+        """`RowPreparation.prepare`; may be called from several threads."""
+        return self._preparation.prepare(rows, firsts)
 
     def encode(self, prepared: Iterator[list[Row]], put: Callable[[FeatureBlock], object]) -> None:
         """Hand over the features of all these rows, a repeated row's after those of its first."""
@@ -353,8 +356,8 @@ def _known_rows(
         for row in rows.tolist():
             for source, by_frames in keys:
                 key = by_frames.get(frames.frame_time[row].tobytes())
-                if key is not None and (features := source.take(key)) is not None:
-                    yield KnownRow(row, key, features, source.environment_of(key))
+                if key is not None and (taken := source.take(key)) is not None:
+                    yield KnownRow(row, key, *taken)
                     break
 
 

@@ -317,28 +317,29 @@ def _details(inventory: Inventory, entry: StoreEntry) -> Iterator[str]:
 def _embodiment(held: StoreContents) -> str:
     attrs, streams = held.attrs, ("tick/action", "sensor/values", "state/values")
     action, sensor, state = (held.specs[name].shape[1] for name in streams)
+    kind = attrs["streams"]["action"].get("kind", "")
     rate = "recorded rows" if attrs["action_hz"] is None else f"{attrs['action_hz']:g} Hz"
     return (
-        f"action {action}, sensor {sensor}, state {state}; {rate}, an answer every "
+        f"{kind} action {action}, sensor {sensor}, state {state}; {rate}, an answer every "
         f"{attrs['vlm_reuse_count']} ticks; sources {', '.join(attrs['sources'])}"
-    )
+    ).strip()
 
 
 def _spec(held: StoreContents) -> str:
     """The main entries of a feature spec: what tells two specs apart at a glance."""
     spec, features = held.attrs["feature_spec"], held.specs[FEATURES]
     slots = [f"{slot['pooling']} of layer {slot['layer']}" for slot in spec.get("slots", ())]
-    entries = {
-        "pooling": " + ".join(dict.fromkeys(slots)),
-        "pixels": spec.get("processor", {}).get("image_size"),
-        **{name: spec.get(name) for name in _SHOWN},
-    }
+    named = [
+        ("pooling", " + ".join(dict.fromkeys(slots))),
+        ("pixels", spec.get("processor", {}).get("image_size")),
+        *((name, spec.get(name)) for name in _SHOWN),
+    ]
     _, count, dim = features.shape
     return ", ".join(
         [
             f"{count} slots x {dim} in {features.attributes.get('dtype', features.dtype.name)}",
             f"sensor in {held.specs['sensor/values'].dtype.name}",
-            *(f"{name} {shorten(str(it), 60)}" for name, it in entries.items() if it),
+            *(f"{name} {shorten(str(it), 60, placeholder='…')}" for name, it in named if it),
         ]
     )
 

@@ -63,8 +63,9 @@ class RowSource:
             if checksums[row]
         }
 
-    def take(self, key: bytes) -> NDArray[Any] | None:
-        """The feature row (slot, dim) of a key; None where it is unknown or damaged."""
+    def take(self, key: bytes) -> tuple[NDArray[Any], dict[str, Any]] | None:
+        """The feature row (slot, dim) of a key, and with which software and hardware it was
+        computed, empty where that is not noted; None where it is unknown or damaged."""
         row = self.rows.get(key)
         if row is None:
             return None
@@ -72,11 +73,9 @@ class RowSource:
             values = read_rows(self.path, self.specs[FEATURES], row, row + 1)
         except StoreIncomplete:  # its file is cut short or gone: the row is computed again
             return None
-        return values[0] if row_checksums(values)[0] == self._read(CHECKSUMS)[row] else None
-
-    def environment_of(self, key: bytes) -> dict[str, Any]:
-        """With which software and hardware a known row was computed; empty where not noted."""
-        return environment_at(self._environments, self.rows[key])
+        if row_checksums(values)[0] != self._read(CHECKSUMS)[row]:
+            return None
+        return values[0], environment_at(self._environments, row)
 
     @cached_property
     def _episodes_by_text(self) -> dict[tuple[str, str], list[int]]:
