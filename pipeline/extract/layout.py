@@ -53,10 +53,10 @@ def lay_out(
         build.link_unchanged(name, source.path, source.specs[name], rows)
     build.allocate()
     attributes = _attributes(checked, survey)
-    rows, views = [episode.rows for episode in checked], survey.spec.views
-    for name, values in episode_arrays(rows, attributes["sources"], views).items():
+    sources, views = attributes["sources"], survey.spec.views
+    for name, values in episode_arrays(checked, sources, views).items():
         build.write(name, 0, values)
-    valid = [_slot_valid(episode.timeline, survey.spec) for episode in checked]
+    valid = [_slot_valid(episode.ticks, survey.spec) for episode in checked]
     build.write("vl/slot_valid", 0, np.concatenate(valid))
     starts = {"sensor": 0, "state": 0}
     for episode in tqdm(checked, "streams", unit="episode", disable=None, leave=False):
@@ -69,7 +69,7 @@ def build_arrays(checked: Sequence[CheckedEpisode], survey: Survey) -> dict[str,
     embodiment, extract = embodiment_of(checked), survey.params.extract
     count = Counter[str]()
     for episode in checked:
-        count.update(episode.rows.counts)
+        count.update(episode.counts)
     sizes = Sizes(
         episode=len(checked),
         tick=count["tick"],
@@ -97,9 +97,9 @@ def _linkable(
     for source in known:
         if source.path == build.target:
             pairs = zip(source.episode_contents, checked, strict=False)
-            same = [*takewhile(lambda pair: pair[0] == pair[1].surveyed.content, pairs)]
+            same = [*takewhile(lambda pair: pair[0] == pair[1].said["content"], pairs)]
             for stream in ("sensor", "state"):
-                rows = sum(episode.rows.counts[stream] for _, episode in same)
+                rows = sum(episode.counts[stream] for _, episode in same)
                 yield source, f"{stream}/values", rows
                 yield source, f"{stream}/time", rows
 
@@ -117,7 +117,7 @@ def _slot_valid(line: Timeline, spec: FeatureSpec) -> NDArray[np.uint8]:
 
 def _write_streams(build: StoreBuild, episode: CheckedEpisode, starts: dict[str, int]) -> None:
     """Write an episode's readings at `starts`, and move these behind them."""
-    recording = episode.surveyed.recording
+    recording = episode.recording
     for kind, stream in (("sensor", recording.sensor()), ("state", recording.state())):
         if stream is not None:
             values = _stored(stream, build.specs[f"{kind}/values"])

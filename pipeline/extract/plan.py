@@ -342,8 +342,8 @@ def count_known(
     """How many rows of these episodes are in `sources`, as far as can be told without a frame."""
     count = 0
     for episode in checked:
-        of = episode.surveyed.content, episode.surveyed.recording.instruction
+        of = episode.said["content"], episode.said["instruction"]
         times = set().union(*(source.keys_of(*of) for source in sources))
-        rows = episode.timeline.frame_times(surveyed.spec.views)
+        rows = episode.ticks.frame_times(surveyed.spec.views)
         count += sum(row.tobytes() in times for row in rows)
     return count

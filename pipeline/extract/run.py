@@ -138,9 +138,6 @@ def _survey_lines(surveyed: Survey) -> Iterator[str]:
 def _timeline_lines(surveyed: Survey, checked: Sequence[CheckedEpisode]) -> Iterator[str]:
     if any(recording.has_poses for recording in surveyed.recordings):
         yield f"actions: rotations as {surveyed.action_rotation}"
-    rates = [
-        (one.surveyed.recording.source, one.timeline.recorded_hz, one.timeline.fastest_hz)
-        for one in checked
-    ]
+    rates = [(one.source, one.ticks.recorded_hz, one.ticks.fastest_hz) for one in checked]
     for source, note in rate_notes(rates, surveyed.params.data.action_hz).items():
         yield f"source {source!r}: {note}"
