@@ -136,17 +136,17 @@ def store_arrays(
     """The arrays of a store of this many ticks."""
     episodes = ticks // EPISODE_TICKS
     sizes = Sizes(
-        episodes=episodes,
-        ticks=ticks,
-        vl_rows=-(-ticks // REUSE),
-        readings=ticks * SENSOR_HZ // ACTION_HZ,
-        states=ticks * STATE_HZ // ACTION_HZ,
-        text_bytes=episodes * EPISODE_TEXT_BYTES,
-        slots=slots,
+        episode=episodes,
+        tick=ticks,
+        vl_row=-(-ticks // REUSE),
+        sensor_reading=ticks * SENSOR_HZ // ACTION_HZ,
+        state_reading=ticks * STATE_HZ // ACTION_HZ,
+        byte=episodes * EPISODE_TEXT_BYTES,
+        slot=slots,
         dim=DIM,
-        views=views,
+        view=views,
         action_dim=ACTION_DIM,
-        sensor_channels=SENSOR_CHANNELS,
+        channel=SENSOR_CHANNELS,
         state_dim=STATE_DIM,
     )
     return arrays(sizes, features_dtype, sensor_dtype)

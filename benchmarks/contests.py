@@ -26,15 +26,15 @@ def row_race(
 ) -> tuple[Race, Race]:
     """256 random VL rows: the fast ways, then the slow ones beside the store again."""
     folder.mkdir()
-    count, mapped = sizes["rows"], store.tensor("features")
+    count, mapped = sizes["rows"], store.gatherer.tensor("features")
     ram = mapped.clone()
     drawn = draws(sizes["draws"], count, 0, len(mapped))
     out = torch.zeros((count, *mapped.shape[1:]), dtype=mapped.dtype)
-    batch = store.empty_batch(count, 1, 1, 1).touch()
+    batch = store.gatherer.empty_batch(count, 1, 1, 1).touch()
     but = WIDE.keys() - {"features"}
 
     def ours(rows: Index) -> None:
-        store.copy(Selection({"features": rows}, {}), batch, but)
+        store.gatherer.copy(Selection({"features": rows}, {}), batch, but)
 
     fast: dict[str, Work] = {
         "memcpy": each(drawn, lambda rows: out.copy_(ram[rows[0] % (len(ram) - count) :][:count])),
@@ -66,17 +66,17 @@ def window_race(
 ) -> tuple[Race, Race]:
     """64 random windows: the fast ways, then the slow ones beside the store again."""
     folder.mkdir(exist_ok=True)
-    count, mapped = sizes["windows"], store.tensor("sensor")
+    count, mapped = sizes["windows"], store.gatherer.tensor("sensor")
     ram = mapped.clone()
     drawn = draws(window_draws(sizes, count, length), count, length, len(mapped))
-    batch = store.empty_batch(count, 1, length, 1).touch()
+    batch = store.gatherer.empty_batch(count, 1, length, 1).touch()
     out, full = torch.zeros_like(batch.sensor), np.full(count, length)
     flat, place = out.view(-1, mapped.shape[1]), np.arange(-length, 0)
     by_row = [(ends[:, None] + place).ravel() for ends in drawn]
     other = torch.ones_like(out)
 
     def ours(ends: Index) -> None:
-        store.copy(Selection({}, {"sensor": Window(ends, full)}), batch)
+        store.gatherer.copy(Selection({}, {"sensor": Window(ends, full)}), batch)
 
     fast: dict[str, Work] = {
         "memcpy": lambda: out.copy_(other),
@@ -105,8 +105,8 @@ def batch_race(
     """A whole `Batch` from its ticks, against its wide fields' rows gathered from RAM."""
     wanted = (8, length, 100)
     drawn = draws(window_draws(sizes, count, length), count, store.ticks // 8, store.ticks)
-    out = store.empty_batch(count, *wanted).touch()
-    ram = {name: store.tensor(name).clone() for name in WIDE}
+    out = store.gatherer.empty_batch(count, *wanted).touch()
+    ram = {name: store.gatherer.tensor(name).clone() for name in WIDE}
     warm(store)
     bare = {name: torch.zeros_like(getattr(out, name)) for name in ram}
     rows = [wide_rows(store, ticks, wanted) for ticks in drawn]

@@ -120,9 +120,10 @@ def measure(
 
     rows, slow_rows = row_race(store, folder / "rows", sizes, rounds, slow)
     count = sizes["rows"]
+    features = store.gatherer.tensor("features")
     amount = {
         "rows": count,
-        "GB": count * store.tensor("features").nbytes / len(store.tensor("features")) / 1e9,
+        "GB": count * features.nbytes / len(features) / 1e9,
     }
     for written in (folder / "rows").glob("rows.*"):
         written.unlink()
@@ -182,7 +183,7 @@ class Fresh:
             if self._available is not None:
                 gathering.available_bytes = lambda: self._available
             self.store = FeatureStore.open(self._path)
-            self.store.empty_batch(1, 1, 1, 1)  # here it decides how to page
+            self.store.gatherer.empty_batch(1, 1, 1, 1)  # here it decides how to page
         finally:
             gathering.available_bytes = real
 

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from benchmarks.workload import Workload
 from pipeline.data.row_range import RowRange
 from pipeline.extract.encoder import Encoder
-from pipeline.extract.engine import RowEngine, fill
-from pipeline.extract.rows import ReadyRow, Row, RowPreparation, in_background
+from pipeline.extract.engine import ReadyRow, Row, RowEngine, RowPreparation, fill, in_background
 from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.qwen import FrozenVLM
 

@@ -32,17 +32,17 @@ def write_store(
     rows = -(-ticks // reuse)
     said = [json.dumps(_said(index)).encode() for index in range(episodes)]
     sizes = Sizes(
-        episodes=episodes,
-        ticks=episodes * ticks,
-        vl_rows=episodes * rows,
-        readings=episodes * readings,
-        states=episodes * states,
-        text_bytes=sum(map(len, said)),
-        slots=slots,
+        episode=episodes,
+        tick=episodes * ticks,
+        vl_row=episodes * rows,
+        sensor_reading=episodes * readings,
+        state_reading=episodes * states,
+        byte=sum(map(len, said)),
+        slot=slots,
         dim=dim,
-        views=1,
+        view=1,
         action_dim=ACTION_DIM,
-        sensor_channels=channels,
+        channel=channels,
         state_dim=state_dim,
     )
     build = StoreBuild(target, arrays(sizes, dtype, "float32"), plan=target.name)
@@ -52,7 +52,7 @@ def write_store(
         build.write(name, 0, values)
     build.write("episode/text_start", 0, np.cumsum([0, *map(len, said)]))
     build.write("episode/text", 0, np.frombuffer(b"".join(said), np.uint8))
-    build.write("vl/slot_valid", 0, np.ones((sizes.vl_rows, slots), np.uint8))
+    build.write("vl/slot_valid", 0, np.ones((sizes.vl_row, slots), np.uint8))
     for name in ("tick/action", "state/values", "sensor/values"):
         _write_random(build, name)
     build.finish_layout(_attributes(channels, state_dim, reuse), {"slots": [{}] * slots})

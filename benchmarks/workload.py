@@ -15,8 +15,8 @@ from tqdm import tqdm
 from pipeline.base.config import Params
 from pipeline.base.digests import ContentDigests
 from pipeline.data.row_range import RowFrames, RowRange
+from pipeline.extract.engine import RANGE_ROWS
 from pipeline.extract.layout import build_arrays, lay_out
-from pipeline.extract.rows import RANGE_ROWS
 from pipeline.extract.survey import CheckedEpisode, Survey, check_episodes, survey
 from pipeline.simulation.demo_recordings import TASK
 from pipeline.simulation.insertion_formats import write_raw

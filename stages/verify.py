@@ -27,7 +27,7 @@ from pipeline.base.config import Params
 from pipeline.base.errors import NumericsError, StoreIncomplete
 from pipeline.extract.reextract import reextract
 from pipeline.extract.repair import repair
-from pipeline.store.integrity import verify
+from pipeline.store.verification import verify
 
 
 def main(params: Params) -> None:

@@ -253,17 +253,17 @@ def write_tiny_store(
     }
     count = episodes
     sizes = Sizes(
-        episodes=count,
-        ticks=count * ticks,
-        vl_rows=count * rows,
-        readings=count * readings,
-        states=count * states,
-        text_bytes=sum(map(len, said)),
-        slots=slots,
+        episode=count,
+        tick=count * ticks,
+        vl_row=count * rows,
+        sensor_reading=count * readings,
+        state_reading=count * states,
+        byte=sum(map(len, said)),
+        slot=slots,
         dim=dim,
-        views=1,
+        view=1,
         action_dim=len(action_names),
-        sensor_channels=sensor_channels,
+        channel=sensor_channels,
         state_dim=state_dim,
     )
     target = folder / f"{name}.zarr"

@@ -1,9 +1,11 @@
 """The one engine: rows are prepared, encoded and written in any process, and marked in one.
 
-A `RowEngine` has the model of a process: that of the coordinator, or each dask worker's. What was
-written counts once the coordinator has marked it. `fill` is the coordinator's side.
+Row ranges become rows ready for the model, decoded and prepared in the background. A `RowEngine`
+has the model of a process: that of the coordinator, or each dask worker's. What was written counts
+once the coordinator has marked it. `fill` is the coordinator's side.
 """
 
+import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
@@ -14,36 +16,131 @@ from functools import partial
 from itertools import chain, groupby, islice
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
 from pipeline.base.digests import ContentDigests
-from pipeline.data.row_range import RowFrames, RowRange, by_episode
+from pipeline.data.row_range import Frames, RowFrames, RowRange, by_episode
 from pipeline.extract.plan import rate_name
-from pipeline.extract.rows import (
-    RANGE_ROWS,
-    KnownRow,
-    ReadyRow,
-    RepeatedRow,
-    Row,
-    RowPreparation,
-    in_background,
-)
 from pipeline.extract.survey import Survey
 from pipeline.store import FEATURES, RowSource, StoreBuild
-from pipeline.vlm.preparation import Preparer
+from pipeline.vlm.feature_spec import FeatureSpec, row_key
+from pipeline.vlm.preparation import PreparedRow, Preparer
 
 if TYPE_CHECKING:
     from pipeline.extract.encoder import Encoder
+
+
+Work = TypeVar("Work")
+Made = TypeVar("Made")
+
+# Rows that one thread decodes in one go: long enough for video, short enough for memory.
+#
+# Variants count as rows of their own here: they wait in memory alike.
+RANGE_ROWS = 16
 
 # Blocks that are written or wait for it; the model waits when there are more: a kill loses few.
 _WAITING = 2
 
 # Known or repeated rows that are written in one go: each time waits for the disk.
 _TOGETHER = 64
+
+
+@dataclass(frozen=True)
+class KnownRow:
+    """A row that an older store or build has."""
+
+    row: int
+    key: bytes
+    features: NDArray[Any]
+    environment: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class ReadyRow:
+    """A row ready for the model: its frames as they are, then augmented; all of one shape.
+
+    `where` is recording and row, for messages.
+    """
+
+    row: int
+    key: bytes
+    variants: tuple[PreparedRow, ...]
+    where: str
+
+
+@dataclass(frozen=True)
+class RepeatedRow:
+    """A row that shows and says what another, `first`, does: that one the model is given."""
+
+    row: int
+    key: bytes
+    first: int
+
+
+Row = KnownRow | ReadyRow | RepeatedRow
+
+
+class RowPreparation:
+    """Turns row ranges into rows; used from several threads."""
+
+    def __init__(self, preparer: Preparer, spec: FeatureSpec, known: Sequence[RowSource]) -> None:
+        """A row of a key that one of `known` has is taken from there."""
+        self._preparer = preparer
+        self._spec = spec
+        self._known = known
+        self._lock = threading.Lock()
+
+    def prepare(self, rows: RowRange, firsts: dict[bytes, int] | None = None) -> list[Row]:
+        """The rows of a range, each decoded frame held only while its row is made.
+
+        Of all rows of equal key only the one that `firsts` notes is made ready; where that is None,
+        all are. Raises what the recording raises.
+        """
+        prompt = self._preparer.render(rows.recording.instruction, list(rows.frames))
+        return [self._row(rows, row, frames, prompt, firsts) for row, frames in rows.read()]
+
+    def _row(
+        self, rows: RowRange, row: int, frames: Frames, prompt: str, firsts: dict[bytes, int] | None
+    ) -> Row:
+        key = row_key(self._spec, prompt, frames)
+        with self._lock:
+            for source in self._known:
+                if (taken := source.take(key)) is not None:
+                    return KnownRow(row, key, *taken)
+            first = row if firsts is None else firsts.setdefault(key, row)
+        if first != row:
+            return RepeatedRow(row, key, first)
+        recording = rows.recording
+        variants = self._preparer.prepare_variants(recording.instruction, frames, key)
+        return ReadyRow(row, key, variants, f"{recording.path}, VL row {row}")
+
+
+def in_background(
+    work: Iterable[Work],
+    make: Callable[[Work], Made],
+    threads: int,
+    ahead: Callable[[], int] = lambda: 0,
+) -> Generator[Made]:
+    """`make` of each piece of work, in order, as many pieces before the reader as `ahead` says.
+
+    At least `threads + 1`, so that no thread waits for the reader.
+    """
+    with ThreadPoolExecutor(threads, thread_name_prefix="decode") as pool:
+        pieces: Iterator[Work] = iter(work)
+        made: deque[Future[Made]] = deque()
+        try:
+            while True:
+                lacking = max(threads + 1, ahead()) - len(made)  # below 0 once `ahead` has shrunk
+                made.extend(pool.submit(make, piece) for piece in islice(pieces, max(0, lacking)))
+                if not made:
+                    return
+                yield made.popleft().result()
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
 @dataclass(frozen=True)
@@ -222,7 +319,12 @@ def fill(
     done = total - len(missing)
     with tqdm(None, "extract", total, initial=done, unit="row", disable=None) as bar:
         marks = RowMarks(build, bar)
-        missing = _take_over(surveyed, known, frames, missing, marks)
+        taken: list[int] = []
+        rows_known = _known_rows(surveyed, known, frames, missing)
+        while rows := list(islice(rows_known, _TOGETHER)):
+            marks.mark(block.write(build) for block in _known_blocks(rows))
+            taken += [row.row for row in rows]
+        missing = np.setdiff1d(missing, taken)
         rate = model_share = waited_share = None
         if len(missing) and extract.workers != 0:
             from pipeline.extract.cluster import compute_on_cluster  # dask: a second to import
@@ -243,28 +345,10 @@ def fill(
     return ExtractionReport(build.target, total, *counts, seconds, model_share, waited_share)
 
 
-def _take_over(
-    surveyed: Survey,
-    known: Sequence[RowSource],
-    frames: RowFrames,
-    missing: NDArray[np.int64],
-    marks: RowMarks,
-) -> NDArray[np.int64]:
-    """Mark the missing rows that are known by content, instruction and frame times.
-
-    No frame is decoded. Returns the rows that are left.
-    """
-    taken: list[int] = []
-    rows_known = _known_rows(surveyed, known, frames, missing)
-    while rows := list(islice(rows_known, _TOGETHER)):
-        marks.mark(block.write(marks.build) for block in _known_blocks(rows))
-        taken += [row.row for row in rows]
-    return np.setdiff1d(missing, taken)
-
-
 def _known_rows(
     surveyed: Survey, known: Sequence[RowSource], frames: RowFrames, missing: NDArray[np.int64]
 ) -> Iterator[KnownRow]:
+    """The missing rows that are known by content, instruction and frame times; decodes none."""
     for index, rows in by_episode(missing, frames.vl_start):
         episode = surveyed.episodes[index]
         of = episode.content, episode.recording.instruction
@@ -272,8 +356,8 @@ def _known_rows(
         for row in rows.tolist():
             for source, by_frames in keys:
                 key = by_frames.get(frames.frame_time[row].tobytes())
-                if key is not None and (features := source.take(key)) is not None:
-                    yield KnownRow(row, key, features, source.environment_of(key))
+                if key is not None and (taken := source.take(key)) is not None:
+                    yield KnownRow(row, key, *taken)
                     break
 
 

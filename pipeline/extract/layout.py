@@ -1,5 +1,6 @@
 """Write everything of a store that needs no model: streams, ticks, episodes."""
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from itertools import takewhile
 from typing import Any
@@ -17,7 +18,7 @@ from pipeline.data.timeline import Timeline
 from pipeline.extract.plan import store_bytes
 from pipeline.extract.survey import CheckedEpisode, Survey, embodiment_of
 from pipeline.store import SCHEMA, RowSource, Sizes, StoreBuild, arrays
-from pipeline.store.episodes import episode_arrays, episode_edges
+from pipeline.store.episodes import episode_arrays
 from pipeline.store.schema import ArraySpec
 from pipeline.vlm.feature_spec import FeatureSpec
 
@@ -35,9 +36,8 @@ def check_space(
     if needed > free:
         raise DiskFull(
             f"{build.target}: the store needs {size(needed)}, {build.part.parent} has "
-            f"{size(free)} free. Make room, or set extract.store to another disk, "
-            "extract.dtype or extract.sensor_dtype to float16, or fewer vlm.pooling slots or "
-            "vlm.variants."
+            f"{size(free)} free. Make room, or set another extract.store, extract.dtype or "
+            "extract.sensor_dtype float16, or fewer vlm.pooling slots or vlm.variants."
         )
 
 
@@ -53,10 +53,10 @@ def lay_out(
         build.link_unchanged(name, source.path, source.specs[name], rows)
     build.allocate()
     attributes = _attributes(checked, survey)
-    rows, views = [episode.rows for episode in checked], survey.spec.views
-    for name, values in episode_arrays(rows, attributes["sources"], views).items():
+    sources, views = attributes["sources"], survey.spec.views
+    for name, values in episode_arrays(checked, sources, views).items():
         build.write(name, 0, values)
-    valid = [_slot_valid(episode.timeline, survey.spec) for episode in checked]
+    valid = [_slot_valid(episode.ticks, survey.spec) for episode in checked]
     build.write("vl/slot_valid", 0, np.concatenate(valid))
     starts = {"sensor": 0, "state": 0}
     for episode in tqdm(checked, "streams", unit="episode", disable=None, leave=False):
@@ -67,20 +67,21 @@ def lay_out(
 def build_arrays(checked: Sequence[CheckedEpisode], survey: Survey) -> dict[str, ArraySpec]:
     """The arrays that these episodes need."""
     embodiment, extract = embodiment_of(checked), survey.params.extract
-    edges = episode_edges([episode.rows for episode in checked])
-    ends = {kind: int(edge[-1]) for kind, edge in edges.items()}
+    count = Counter[str]()
+    for episode in checked:
+        count.update(episode.counts)
     sizes = Sizes(
-        episodes=len(checked),
-        ticks=ends["tick"],
-        vl_rows=ends["vl"],
-        readings=ends["sensor"],
-        states=ends["state"],
-        text_bytes=ends["text"],
-        slots=len(survey.spec.slots) * survey.spec.variants,
+        episode=len(checked),
+        tick=count["tick"],
+        vl_row=count["vl"],
+        sensor_reading=count["sensor"],
+        state_reading=count["state"],
+        byte=count["text"],
+        slot=len(survey.spec.slots) * survey.spec.variants,
         dim=survey.spec.dim,
-        views=len(survey.spec.views),
+        view=len(survey.spec.views),
         action_dim=len(embodiment.action.names),
-        sensor_channels=len(embodiment.sensor.names),
+        channel=len(embodiment.sensor.names),
         state_dim=len(embodiment.state.names),
     )
     return arrays(sizes, extract.dtype, extract.sensor_dtype)
@@ -94,16 +95,13 @@ def _linkable(
     Those of the leading episodes of unchanged content; only whole chunks of them can be linked.
     """
     for source in known:
-        if source.path != build.target:
-            continue
-        contents = [episode.surveyed.content for episode in checked]
-        pairs = zip(source.episode_contents, contents, strict=False)
-        same = len(list(takewhile(lambda pair: pair[0] == pair[1], pairs)))
-        readings = sum(episode.rows.readings for episode in checked[:same])
-        states = sum(episode.rows.states for episode in checked[:same])
-        for stream, rows in (("sensor", readings), ("state", states)):
-            for part in ("values", "time"):
-                yield source, f"{stream}/{part}", rows
+        if source.path == build.target:
+            pairs = zip(source.episode_contents, checked, strict=False)
+            same = [*takewhile(lambda pair: pair[0] == pair[1].said["content"], pairs)]
+            for stream in ("sensor", "state"):
+                rows = sum(episode.counts[stream] for _, episode in same)
+                yield source, f"{stream}/values", rows
+                yield source, f"{stream}/time", rows
 
 
 def _slot_valid(line: Timeline, spec: FeatureSpec) -> NDArray[np.uint8]:
@@ -119,7 +117,7 @@ def _slot_valid(line: Timeline, spec: FeatureSpec) -> NDArray[np.uint8]:
 
 def _write_streams(build: StoreBuild, episode: CheckedEpisode, starts: dict[str, int]) -> None:
     """Write an episode's readings at `starts`, and move these behind them."""
-    recording = episode.surveyed.recording
+    recording = episode.recording
     for kind, stream in (("sensor", recording.sensor()), ("state", recording.state())):
         if stream is not None:
             values = _stored(stream, build.specs[f"{kind}/values"])

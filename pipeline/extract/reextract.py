@@ -1,6 +1,6 @@
 """Compute stored rows again with today's software and hardware, and compare."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -18,12 +18,11 @@ from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.base.errors import StoreMismatch
 from pipeline.data.row_range import RowFrames
 from pipeline.extract.encoder import Encoder
-from pipeline.extract.rows import ReadyRow, RowPreparation
+from pipeline.extract.engine import ReadyRow, RowPreparation
 from pipeline.extract.survey import survey
-from pipeline.store import FEATURES, Episode, FeatureStore
-from pipeline.store.environments import environment_runs
-from pipeline.store.integrity.verification import capped
-from pipeline.vlm.feature_spec import FeatureSpec
+from pipeline.store import FEATURES, FeatureStore
+from pipeline.store.verification import capped
+from pipeline.store.writer import environment_runs
 from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.qwen import FrozenVLM
 
@@ -114,13 +113,21 @@ def reextract(path: Path, params: Params, say: Callable[[str], None]) -> Reextra
     with closing(ContentDigests(ledger_path(path))) as digests:
         surveyed = survey(params, digests)
     spec = surveyed.spec
-    _refuse_other_spec(store, spec)
+    if other := differences(store.spec, spec.attrs()):
+        raise StoreMismatch(
+            f"{path}: the params describe other features than the store holds, which cannot be "
+            "compared (store -> params):\n  "
+            + "\n  ".join(describe(other))
+            + "\nRun with the params that it was extracted with, or extract it anew."
+        )
     today = {episode.digest: episode.recording for episode in surveyed.episodes}
     known = [episode for episode in store.episodes if episode.digest in today]
     unchecked = tuple(episode.id for episode in store.episodes if episode.digest not in today)
     dtypes = (store.spec["compute_dtype"], store.spec["storage_dtype"])
     tolerance = options.tolerance or max(TOLERANCES[dtype] for dtype in dtypes)
-    rows = _draw_rows(known, options.reextract, options.seed)
+    stored = np.array([row for episode in known for row in episode.vl_rows], np.int64)
+    drawn = np.random.default_rng(options.seed)
+    rows = np.sort(drawn.choice(stored, min(options.reextract, len(stored)), replace=False))
     if not len(rows):
         return Reextraction((), tolerance, unchecked, ())
     say(f"computing {len(rows)} rows again")
@@ -145,25 +152,6 @@ def reextract(path: Path, params: Params, say: Callable[[str], None]) -> Reextra
         unchecked,
         tuple(sorted({line for lines in differing for line in lines})),
     )
-
-
-def _refuse_other_spec(store: FeatureStore, spec: FeatureSpec) -> None:
-    if store.spec["digest"] == spec.digest:
-        return
-    lines = describe(differences(store.spec, spec.attrs()))
-    raise StoreMismatch(
-        f"{store.path}: the params describe other features than the store holds, which cannot be "
-        "compared (store -> params):\n"
-        + "\n".join(f"  {line}" for line in lines)
-        + "\nRun with the params that it was extracted with, or extract it anew."
-    )
-
-
-def _draw_rows(episodes: Sequence[Episode], count: int, seed: int) -> NDArray[np.int64]:
-    """That many different rows of these episodes, ascending."""
-    rows = np.array([row for episode in episodes for row in episode.vl_rows], np.int64)
-    drawn = np.random.default_rng(seed).choice(rows, min(count, len(rows)), replace=False)
-    return np.sort(drawn)
 
 
 def _compare(store: FeatureStore, row: ReadyRow, features: NDArray[Any]) -> Deviation:

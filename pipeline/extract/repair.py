@@ -1,31 +1,35 @@
-"""Begin the repair of a damaged store: take over what is sound, lay out anew what is not."""
+"""Begin the repair of a damaged store: take over what is sound, lay out anew what is not.
 
-from collections.abc import Callable
+Everything is put together in `<name>.zarr.repair.part`, which becomes `<name>.zarr.part` by one
+rename at the end. So a kill leaves the damaged store as it was and nothing half begun, and what
+`stages.extract` then completes is a build like any other. The store itself is only read from.
+"""
+
+import shutil
 from contextlib import closing
 from pathlib import Path
 
+import numpy as np
+from tqdm import tqdm
+
 from pipeline.base.config import Params
 from pipeline.base.digests import ContentDigests, ledger_path
-from pipeline.base.durable import disk_full_named
+from pipeline.base.durable import disk_full_named, sync
+from pipeline.base.durable import put_in_place as replace_folder
 from pipeline.base.errors import StoreMismatch
-from pipeline.base.ownership import remove_folder
+from pipeline.base.ownership import begin_folder, remove_folder
 from pipeline.extract.layout import build_arrays, check_space, lay_out
+from pipeline.extract.plan import Say
 from pipeline.extract.survey import sound_episodes, survey
 from pipeline.store import FEATURES, StoreBuild, build_lock, part_path, read_plan, recover
-from pipeline.store.integrity import Verification
-from pipeline.store.integrity.repair import (
-    carry_rows,
-    copy_layout,
-    layout_is_sound,
-    put_in_place,
-    repair_build,
-)
-from pipeline.store.integrity.verification import read_arrays
-from pipeline.store.paths import MERGED, STORE
+from pipeline.store.chunks import ChunkFiles, read_rows, row_checksums
+from pipeline.store.paths import MERGED, STORE, read_attributes, refuse_replaced
 from pipeline.store.repair_hints import extract_command, gc_command
-from pipeline.store.schema import INCREMENTAL
+from pipeline.store.schema import CHECKSUMS, INCREMENTAL, KEYS, chunk_paths, read_specs
+from pipeline.store.verification import Verification, read_arrays
+from pipeline.store.writer import environment_runs, sync_folders
 
-Say = Callable[[str], None]
+_BLOCK_BYTES = 2**26
 
 
 def repair(verification: Verification, params: Params, say: Say) -> None:
@@ -42,8 +46,7 @@ def repair(verification: Verification, params: Params, say: Say) -> None:
         plan = read_plan(store) or ""
         part = part_path(store)
         if (unfinished := read_plan(part)) is not None:
-            repairs = unfinished == plan
-            what = "a repair of it has begun" if repairs else "another build is unfinished"
+            what = "a repair of it has begun" if unfinished == plan else "a build is unfinished"
             raise StoreMismatch(
                 f"{part}: {what}. Run {_completed_by(store, unfinished)}, which completes it, or "
                 f"remove it: {gc_command(part)}"
@@ -52,8 +55,80 @@ def repair(verification: Verification, params: Params, say: Say) -> None:
             with disk_full_named(store):
                 _begin(verification, plan, params, say)
         except BaseException:
-            remove_folder(part_path(repair_build(store)), STORE)
+            remove_folder(part_path(_repaired(store)), STORE)
             raise
+
+
+def layout_is_sound(verification: Verification) -> bool:
+    """Whether all that needs no model can be taken over as it is: streams, ticks, episodes."""
+    return all(
+        issue.stream in INCREMENTAL and issue.chunk is not None for issue in verification.damaged
+    )
+
+
+def copy_layout(store: Path) -> StoreBuild:
+    """A build with the metadata of a store, and its chunk files but those written row by row."""
+    specs = read_specs(store)
+    build = StoreBuild(_repaired(store), specs, read_plan(store) or "")
+    with disk_full_named(build.part):
+        begin_folder(build.part, STORE)
+        for metadata in store.glob("**/zarr.json"):
+            _copy(metadata, build.part / metadata.relative_to(store))
+        others = sorted(set(specs) - set(INCREMENTAL))
+        for name in tqdm(others, "take over", unit="array", disable=None, leave=False):
+            files = build.files(name)
+            for chunk, path in enumerate(chunk_paths(store, specs[name])):
+                if not files.link(chunk, path):
+                    _copy(path, files.paths[chunk])
+    return build
+
+
+def carry_rows(store: Path, build: StoreBuild, verification: Verification) -> int:
+    """Take the sound feature rows over, each to its place, and mark them; returns how many.
+
+    Not those whose key lies in a damaged chunk of keys, for a key has no checksum of its own. The
+    rows that are not marked are for `stages.extract` to compute. Raises `StoreMismatch` where
+    another store took the place of the one that was checked.
+    """
+    refuse_replaced(store, verification.inode)
+    sound = np.ones(build.specs[FEATURES].shape[0], np.bool_)
+    sound[verification.bad_rows] = False
+    for chunk in verification.damaged_chunks(KEYS):
+        rows = build.specs[KEYS].chunk_rows_of(chunk)
+        sound[rows.start : rows.stop] = False
+    for name in INCREMENTAL:
+        build.files(name).close()
+        for path in build.files(name).paths:  # of zeros, where it was laid out anew
+            path.unlink(missing_ok=True)
+    # Chunk files in which everything is sound are linked; of the others, sound rows are copied.
+    spec, damaged = build.specs[FEATURES], verification.damaged_chunks(FEATURES)
+    environments = read_attributes(store).get("environment", [])
+    step = max(1, _BLOCK_BYTES // max(1, spec.row_bytes))
+    with closing(ChunkFiles(build.part, spec)) as files:  # which leaves linked chunks as they are
+        for chunk, path in enumerate(chunk_paths(store, spec)):
+            rows = spec.chunk_rows_of(chunk)
+            if chunk not in damaged and sound[rows.start : rows.stop].all():
+                files.link(chunk, path)
+        for name in INCREMENTAL:
+            build.files(name).allocate()
+        for environment, run in environment_runs(environments, np.flatnonzero(sound)):
+            number = build.environment_index(environment)
+            for start in range(run.start, run.stop, step):
+                rows = run[start - run.start :][:step]
+                values = read_rows(store, spec, start, rows.stop)
+                files.write(start, values)
+                keys = read_rows(store, build.specs[KEYS], start, rows.stop)
+                build.mark(rows, [*map(bytes, keys)], row_checksums(values), number)
+        files.sync()
+    build.files(CHECKSUMS).sync()
+    return int(sound.sum())
+
+
+def put_in_place(build: StoreBuild, store: Path) -> None:
+    """Make it the build of the store that `stages.extract` goes on with."""
+    build.close()
+    sync_folders(build.part)
+    replace_folder(build.part, part_path(store), STORE)
 
 
 def _begin(verification: Verification, plan: str, params: Params, say: Say) -> None:
@@ -68,18 +143,11 @@ def _begin(verification: Verification, plan: str, params: Params, say: Say) -> N
         )
         carried = carry_rows(store, build, verification) if readable else 0
         put_in_place(build, store)
-    layout = "taken over as they are" if sound else "written again from the recordings"
     say(
-        f"{part_path(store)}: a new build, streams, ticks and episodes {layout}, {carried} of "
-        f"{rows} feature rows taken over, {rows - carried} to compute"
+        f"{part_path(store)}: a new build, {carried} of {rows} feature rows taken over, "
+        f"{rows - carried} to compute"
     )
     say(f"run next: {_completed_by(store, plan)}, which completes it and then replaces the store")
-
-
-def _completed_by(store: Path, plan: str) -> str:
-    if plan.startswith(MERGED):
-        return f"the same python -m stages.store merge --into {store} that made it"
-    return extract_command(store)
 
 
 def _lay_out_anew(store: Path, plan: str, params: Params) -> StoreBuild:
@@ -89,11 +157,27 @@ def _lay_out_anew(store: Path, plan: str, params: Params) -> StoreBuild:
     if surveyed.plan != plan:
         raise StoreMismatch(
             f"{store}: metadata, streams, ticks or episodes are damaged, and the params describe "
-            "another store than this one (recordings, data, vlm or dtypes changed). Restore the "
-            f"recordings and params, or run {_completed_by(store, plan)}, which takes over every "
-            "row whose frames it knows."
+            "another store than this one. Restore its recordings and params, or run "
+            f"{_completed_by(store, plan)}, which takes over every row whose frames it knows."
         )
-    build = StoreBuild(repair_build(store), build_arrays(checked, surveyed), plan)
+    build = StoreBuild(_repaired(store), build_arrays(checked, surveyed), plan)
     check_space(build, checked, ())
     lay_out(build, checked, surveyed, ())
     return build
+
+
+def _repaired(store: Path) -> Path:
+    """The target under which a build for the repair of this store is put together."""
+    return store.with_name(store.name + ".repair")
+
+
+def _completed_by(store: Path, plan: str) -> str:
+    if plan.startswith(MERGED):
+        return f"the same python -m stages.store merge --into {store} that made it"
+    return extract_command(store)
+
+
+def _copy(path: Path, to: Path) -> None:
+    to.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(path, to)
+    sync(to)

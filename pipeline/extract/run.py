@@ -12,8 +12,7 @@ from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.data.timeline import rate_notes
 from pipeline.extract.engine import ExtractionReport, fill
 from pipeline.extract.layout import build_arrays, check_space, lay_out
-from pipeline.extract.places import Say, StorePlaces, row_sources
-from pipeline.extract.plan import count_known, new_plan_lines, plan_lines
+from pipeline.extract.plan import Say, StorePlaces, count_known, plan_lines, row_sources
 from pipeline.extract.survey import (
     CheckedEpisode,
     Survey,
@@ -22,7 +21,7 @@ from pipeline.extract.survey import (
     sound_episodes,
     survey,
 )
-from pipeline.store import FEATURES, FeatureStore, StoreBuild, build_lock, recover
+from pipeline.store import FEATURES, FeatureStore, RowSource, StoreBuild, build_lock, recover
 from pipeline.store.metadata import check_metadata
 from pipeline.store.paths import refuse_foreign_store
 
@@ -73,17 +72,15 @@ def _resume(
     """Go on with the build of this very plan; beside a finished store of it, that is its repair."""
     resolve_device(surveyed.params.extract.device)
     build = places.begun_build()
-    with closing(build), row_sources(places.known, surveyed) as known:
+    with closing(build):
         missing = build.missing()
         done = build.specs[FEATURES].shape[0] - len(missing)
-        repairs = places.finished == surveyed.plan
-        doing = "completing the repair" if repairs else "continuing the interrupted build"
-        plan = plan_lines(build, surveyed, digests, done, [f"{doing} {build.part}"])
-        for line in [*plan, *places.keeping_note(surveyed)]:
+        known = [RowSource(places.part)]
+        for line in plan_lines(build, surveyed, digests, places, known, done):
             say(line)
         if surveyed.params.extract.plan:
             return None
-        report = fill(build, surveyed, known, digests, missing)
+        report = fill(build, surveyed, row_sources(places.known, surveyed), digests, missing)
     places.put_in_place(build, surveyed, say)
     return report
 
@@ -98,20 +95,18 @@ def _begin(
     """Begin a new build; what stood in its place is set aside only when nothing can refuse it."""
     extract = surveyed.params.extract
     places.refuse_to_lose(surveyed, embodiment_of(checked))
-    keeping = places.keeping_note(surveyed)
     for line in _timeline_lines(surveyed, checked):
         say(line)
     build = StoreBuild(places.target, build_arrays(checked, surveyed), surveyed.plan)
     with closing(build):
         begun = [] if places.begun is None else [places.part]
-        with row_sources([*begun, *places.known], surveyed) as known:
-            taken = count_known(checked, surveyed, known)
-            plan = new_plan_lines(build, surveyed, digests, places, known, taken)
-            for line in [*plan, *keeping]:
-                say(line)
-            if extract.plan:
-                return None
-            check_space(build, checked, known)
+        known = row_sources([*begun, *places.known], surveyed)
+        taken = count_known(checked, surveyed, known)
+        for line in plan_lines(build, surveyed, digests, places, known, taken):
+            say(line)
+        if extract.plan:
+            return None
+        check_space(build, checked, known)
         rows = np.arange(build.specs[FEATURES].shape[0])
         if isinstance(extract.workers, str) and taken < len(rows):
             from pipeline.extract.cluster import check_scheduler  # dask: a second to import
@@ -119,9 +114,9 @@ def _begin(
             check_scheduler(extract.workers)
         places.make_room(surveyed, say)
         places = StorePlaces(places.target)
-        with row_sources(places.known, surveyed) as known:
-            lay_out(build, checked, surveyed, known)
-            report = fill(build, surveyed, known, digests, rows)
+        known = row_sources(places.known, surveyed)
+        lay_out(build, checked, surveyed, known)
+        report = fill(build, surveyed, known, digests, rows)
     places.put_in_place(build, surveyed, say)
     return report
 
@@ -143,9 +138,6 @@ def _survey_lines(surveyed: Survey) -> Iterator[str]:
 def _timeline_lines(surveyed: Survey, checked: Sequence[CheckedEpisode]) -> Iterator[str]:
     if any(recording.has_poses for recording in surveyed.recordings):
         yield f"actions: rotations as {surveyed.action_rotation}"
-    rates = [
-        (one.surveyed.recording.source, one.timeline.recorded_hz, one.timeline.fastest_hz)
-        for one in checked
-    ]
+    rates = [(one.source, one.ticks.recorded_hz, one.ticks.fastest_hz) for one in checked]
     for source, note in rate_notes(rates, surveyed.params.data.action_hz).items():
         yield f"source {source!r}: {note}"

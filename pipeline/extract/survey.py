@@ -21,7 +21,7 @@ from pipeline.base.errors import RecordingError, VLMError
 from pipeline.data import BadEpisode, Recording, content_digest, open_recordings
 from pipeline.data.embodiment import Embodiment, common_embodiment
 from pipeline.data.episode import read_episode
-from pipeline.data.timeline import ActionRotation, Timeline, choose_action_rotation
+from pipeline.data.timeline import ActionRotation, choose_action_rotation
 from pipeline.store.episodes import EpisodeRows
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 from pipeline.vlm.preparation import Preparer
@@ -78,16 +78,11 @@ class Survey:
 
 
 @dataclass(frozen=True)
-class CheckedEpisode:
-    """An episode that was read whole and found sound; its streams are let go again.
+class CheckedEpisode(EpisodeRows):
+    """An episode that was read whole and found sound; its streams are let go again."""
 
-    `rows` is what a store lists of it.
-    """
-
-    surveyed: SurveyedEpisode
-    timeline: Timeline
+    recording: Recording
     embodiment: Embodiment
-    rows: EpisodeRows
 
 
 def survey(params: Params, digests: ContentDigests) -> Survey:
@@ -139,7 +134,7 @@ def sound_episodes(
     again = survey(surveyed.params, digests)
     if again.action_rotation == surveyed.action_rotation:
         kept = {episode.digest for episode in again.episodes}
-        return again, [episode for episode in checked if episode.surveyed.digest in kept]
+        return again, [episode for episode in checked if episode.said["digest"] in kept]
     return sound_episodes(again, digests)
 
 
@@ -173,7 +168,7 @@ def check_episodes(
 def embodiment_of(checked: Sequence[CheckedEpisode]) -> Embodiment:
     """What all these episodes have in common; `StoreMismatch` where two sources differ."""
     return common_embodiment(
-        [(episode.surveyed.recording, episode.embodiment) for episode in checked],
+        [(episode.recording, episode.embodiment) for episode in checked],
         "store",
         "Extract them into two stores: one params file each, with its own data.sources and "
         "extract.store.",
@@ -190,9 +185,8 @@ def _checked(episode: SurveyedEpisode, surveyed: Survey, preparer: Preparer) -> 
         raise RecordingError(f"{recording.path}: {error}") from None
     for view, camera in cameras.items():
         camera.check(np.unique(read.timeline.frames[view]).tolist())
-    source = recording.source
-    rows = EpisodeRows(read.timeline, read.readings, read.states, source, episode.text)
-    return CheckedEpisode(episode, read.timeline, read.embodiment, rows)
+    rows = (read.timeline, read.readings, read.states)
+    return CheckedEpisode(*rows, recording.source, episode.text, recording, read.embodiment)
 
 
 def _refuse_bad(bad: Sequence[BadEpisode], of: int) -> None:

@@ -59,6 +59,8 @@ _UNNEEDED = {
     "lock": "held by no process",
 }
 """Why something of a kind may go, where it is no work and nothing holds it."""
+_SHOWN = ("weights", "adapter", "compute_dtype", "variants", "prompt")
+"""Entries of a feature spec that are listed."""
 
 
 @dataclass(frozen=True)
@@ -313,33 +315,33 @@ def _details(inventory: Inventory, entry: StoreEntry) -> Iterator[str]:
 
 
 def _embodiment(held: StoreContents) -> str:
-    attrs, names = held.attrs, ("tick/action", "sensor/values", "state/values")
-    action, sensor, state = (held.specs[name].shape[1] for name in names)
+    attrs, streams = held.attrs, ("tick/action", "sensor/values", "state/values")
+    action, sensor, state = (held.specs[name].shape[1] for name in streams)
+    kind = attrs["streams"]["action"].get("kind", "")
     rate = "recorded rows" if attrs["action_hz"] is None else f"{attrs['action_hz']:g} Hz"
     return (
-        f"{attrs['streams']['action'].get('kind', '')} action {action}, sensor {sensor}, state "
-        f"{state}; {rate}, an answer every {attrs['vlm_reuse_count']} ticks; "
-        f"sources {', '.join(attrs['sources'])}"
+        f"{kind} action {action}, sensor {sensor}, state {state}; {rate}, an answer every "
+        f"{attrs['vlm_reuse_count']} ticks; sources {', '.join(attrs['sources'])}"
     ).strip()
 
 
 def _spec(held: StoreContents) -> str:
     """The main entries of a feature spec: what tells two specs apart at a glance."""
     spec, features = held.attrs["feature_spec"], held.specs[FEATURES]
-    _, slots, dim = features.shape
-    pooled = [slot for slot in spec.get("slots", ()) if isinstance(slot, Mapping)]
-    kinds = dict.fromkeys(f"{slot.get('pooling')} of layer {slot.get('layer')}" for slot in pooled)
-    pixels = " x ".join(map(str, spec.get("processor", {}).get("image_size", ())))
-    entries = {**spec, "pixels": pixels, "pooling": " + ".join(kinds)}
-    names = ("pooling", "weights", "adapter", "pixels", "compute_dtype", "variants", "prompt")
-    words = [
-        f"{name.replace('_', ' ')} {shorten(str(entries[name]), 60, placeholder='…')}"
-        for name in names
-        if entries.get(name)
+    slots = [f"{slot['pooling']} of layer {slot['layer']}" for slot in spec.get("slots", ())]
+    named = [
+        ("pooling", " + ".join(dict.fromkeys(slots))),
+        ("pixels", spec.get("processor", {}).get("image_size")),
+        *((name, spec.get(name)) for name in _SHOWN),
     ]
-    sensor = held.specs["sensor/values"].dtype.name
-    stored = f"{slots} slots x {dim} in {features.attributes.get('dtype', features.dtype.name)}"
-    return ", ".join([stored, f"sensor in {sensor}", *words])
+    _, count, dim = features.shape
+    return ", ".join(
+        [
+            f"{count} slots x {dim} in {features.attributes.get('dtype', features.dtype.name)}",
+            f"sensor in {held.specs['sensor/values'].dtype.name}",
+            *(f"{name} {shorten(str(it), 60, placeholder='…')}" for name, it in named if it),
+        ]
+    )
 
 
 def _clause(damage: str) -> str:
@@ -360,12 +362,15 @@ def _fate(inventory: Inventory, entry: StoreEntry) -> tuple[Fate, str]:
         return "in place", f"a finished {entry.kind}, which is never removed here"
     if entry.path.is_symlink():
         return "kept", "a symbolic link, left alone"
-    if _is_foreign(entry):
+    is_file = entry.path.name.endswith(LEDGER_SUFFIX)
+    if not (is_ledger(entry.path) if is_file else entry.path.is_file() or _owner(entry.path)):
         return "kept", "this project did not write it, left alone"
     if holder := inventory.holders.get(entry.base):
         return "kept", f"in use by {holder}"
-    if work := _work(entry):
-        return "work", work
+    if entry.kind == "previous":
+        return "work", "the store of before, kept until the next successful stages.extract"
+    if entry.kind in ("build", "set aside") and (work := _work(entry)):
+        return "work", f"unfinished build{work}"
     beside = [other for other in inventory.entries if other.base == entry.base]
     sound = {other.kind for other in beside if other.damage is None}
     if entry.kind == "replaced" and not sound & {"store", "archive"}:
@@ -380,24 +385,14 @@ def _fate(inventory: Inventory, entry: StoreEntry) -> tuple[Fate, str]:
 
 def _work(entry: StoreEntry) -> str | None:
     """What would be lost with an unfinished build; None where that holds no row."""
-    if entry.kind == "previous":
-        return "the store of before, kept for its rows until the next successful stages.extract"
-    if entry.kind not in ("build", "set aside"):
-        return None
     if entry.damage is not None:
-        return f"unfinished build that cannot be read: {_clause(entry.damage)}"
+        return f" that cannot be read: {_clause(entry.damage)}"
     held = entry.contents
     if held is None or not held.done:
         return None
-    merged = held.plan is not None and held.plan.startswith(MERGED)
+    merged = (held.plan or "").startswith(MERGED)
     command = "the same stages.store merge" if merged else "stages.extract"
-    return f"unfinished build, {held.done} of {held.rows} rows done; {command} takes them over"
-
-
-def _is_foreign(entry: StoreEntry) -> bool:
-    if entry.path.name.endswith(LEDGER_SUFFIX):
-        return not is_ledger(entry.path)
-    return entry.path.is_dir() and _owner(entry.path) is None
+    return f", {held.done} of {held.rows} rows done; {command} takes them over"
 
 
 def _owner(path: Path) -> OutputKind | None:

@@ -283,17 +283,11 @@ def _create_array(root: Path, spec: ArraySpec, level: int) -> "zarr.Array[Any]":
     widths = tuple(max(1, size) for size in spec.shape[1:])
     inner = inner_rows(spec)
     codec = codec_for(spec.dtype, inner * spec.row_bytes, level)
-    return zarr.create_array(
-        store=root,
-        name=spec.name,
-        shape=spec.shape,
+    return spec.create(
+        root,
         shards=(_chunks_a_shard(spec) * spec.chunk_rows, *widths),
         chunks=(inner, *widths),
-        dtype=spec.dtype,
         compressors=[codec, Crc32cCodec()],
-        fill_value=0,
-        dimension_names=spec.dimensions,
-        attributes=dict(spec.attributes),
     )
 
 
@@ -337,10 +331,8 @@ def _shards(root: Path, spec: ArraySpec, array: "zarr.Array[Any]") -> list[tuple
 def _open_array(archive: Path, name: str, record: ArchivedArray) -> "zarr.Array[Any]":
     """An array of an archive; raises `StoreIncomplete` where its metadata are not as written."""
     metadata = archive / name / _ZARR_JSON
-    if not metadata.exists():
-        raise _damaged(metadata, f"the file is missing, and with it {name}")
-    if file_digest(metadata) != record.metadata:
-        raise _damaged(metadata, f"the metadata of {name} are not those that were written")
+    if not metadata.exists() or file_digest(metadata) != record.metadata:
+        raise _damaged(metadata, f"missing, or not the metadata that were written of {name}")
     return zarr.open_array(archive, path=name, mode="r")
 
 
@@ -367,8 +359,7 @@ def _refuse_build(target: Path) -> None:
     if read_plan(part) is not None:
         raise StoreMismatch(
             f"{part}: expected nothing there, found an unfinished build. Finish it with "
-            f"{extract_command(target)}, remove it with {gc_command(part)}, or restore to another "
-            "place with archive.store."
+            f"{extract_command(target)}, remove it with {gc_command(part)}, or set archive.store."
         )
 
 

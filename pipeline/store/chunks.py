@@ -87,8 +87,9 @@ def read_rows(root: Path, spec: ArraySpec, start: int = 0, stop: int | None = No
     for chunk, offset, data in _parts(spec, start, rows):
         path, what = chunk_path(root, spec, chunk), "the file ends early"
         try:
-            with path.open("rb", buffering=0) as file:
-                if _read_into(file.fileno(), data, offset) == len(data):
+            with path.open("rb") as file:
+                file.seek(offset)
+                if file.readinto(data.data) == len(data):
                     continue
         except FileNotFoundError:
             what = "no such file"
@@ -123,16 +124,16 @@ def read_chunk(
     trailer = np.zeros(1, "<u4")
     done = crc = 0
     try:
-        with path.open("rb", buffering=0) as file:
+        with path.open("rb") as file:
             for first in range(0, spec.chunk_rows, together):
                 block = buffer[: min(together, spec.chunk_rows - first) * spec.row_bytes]
-                got = _read_into(file.fileno(), block, done)
+                got = file.readinto(block.data)
                 done, crc = done + got, google_crc32c.extend(crc, block[:got])
                 rows = block[: got // spec.row_bytes * spec.row_bytes].view(spec.dtype)
                 visit(first, rows.reshape(-1, *spec.shape[1:]))
                 if got < len(block):
                     break
-            done += _read_into(file.fileno(), trailer.view(np.uint8), done)
+            done += file.readinto(trailer.data)
             size = os.fstat(file.fileno()).st_size
     except OSError as error:
         return ChunkState(done, crc, f"cannot be read at byte {done}: {error.strerror}")
@@ -305,14 +306,6 @@ def _parts(
         taken = min(len(raw) - done, spec.chunk_rows - inside)
         yield chunk, inside * spec.row_bytes, raw[done : done + taken].reshape(-1)
         done += taken
-
-
-def _read_into(descriptor: int, into: NDArray[np.uint8], offset: int) -> int:
-    """Bytes read, fewer where the file ends."""
-    done = 0
-    while done < len(into) and (got := os.preadv(descriptor, [into[done:].data], offset + done)):
-        done += got
-    return done
 
 
 def _write_all(descriptor: int, block: memoryview, offset: int) -> None:

@@ -37,6 +37,21 @@ class Episode:
     readings: range
     states: range
 
+    @property
+    def text(self) -> bytes:
+        """What `episode/text` says of it."""
+        return _text({name: getattr(self, name) for name in SAID})
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Rows by stream, and bytes of `text`."""
+        rows = {name: len(getattr(self, stream.rows)) for name, stream in STREAMS.items()}
+        return {**rows, "text": len(self.text)}
+
+
+def _text(said: Mapping[str, str]) -> bytes:
+    return json.dumps(said, ensure_ascii=False).encode()
+
 
 def read_texts(arrays: Mapping[str, NDArray[Any]]) -> list[dict[str, Any]]:
     """What `episode/text` says of each episode: the fields named in `SAID`."""
@@ -81,7 +96,7 @@ class EpisodeRows:
     @property
     def text(self) -> bytes:
         """What is said, as JSON."""
-        return json.dumps(self.said, ensure_ascii=False).encode()
+        return _text(self.said)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -90,12 +105,18 @@ class EpisodeRows:
         return {**dict(zip(STREAMS, rows, strict=True)), "text": len(self.text)}
 
 
-def episode_edges(episodes: Sequence[EpisodeRows]) -> dict[str, NDArray[np.int64]]:
-    """(episode + 1,) where the rows of each stream, and the text, of each episode begin."""
+def index_arrays(
+    episodes: Sequence[Episode | EpisodeRows], sources: Sequence[str]
+) -> dict[str, NDArray[Any]]:
+    """Everything under `episode/`; the rows of these episodes stand one behind the other."""
     counts = [episode.counts for episode in episodes]
-    return {
-        stream: np.cumsum([0, *(count[stream] for count in counts)], dtype=np.int64)
+    arrays: dict[str, NDArray[Any]] = {
+        f"episode/{stream}_start": np.cumsum([0, *(count[stream] for count in counts)])
         for stream in (*STREAMS, "text")
+    }
+    return arrays | {
+        "episode/source": np.array([sources.index(episode.source) for episode in episodes], "i4"),
+        "episode/text": np.frombuffer(b"".join(episode.text for episode in episodes), np.uint8),
     }
 
 
@@ -103,23 +124,19 @@ def episode_arrays(
     episodes: Sequence[EpisodeRows], sources: Sequence[str], views: Sequence[str]
 ) -> dict[str, NDArray[Any]]:
     """Everything under `tick/` and `episode/`, and the times under `vl/`; indices store-global."""
-    edges = episode_edges(episodes)
+    arrays = index_arrays(episodes, sources)
     ticks = [episode.ticks for episode in episodes]
-    of_episodes = [episode.source for episode in episodes]
-    arrays = {
+    for stream, stored in STREAMS.items():
+        if name := stored.counted_by:
+            own = [getattr(tick, name.removeprefix("tick/")) for tick in ticks]
+            pairs = zip(own, arrays[f"episode/{stream}_start"][:-1], strict=True)
+            arrays[name] = np.concatenate([positions + start for positions, start in pairs])
+    return arrays | {
         "tick/time": np.concatenate([tick.time for tick in ticks]),
         "tick/action": np.concatenate([tick.action for tick in ticks]),
         "vl/time": np.concatenate([tick.vl_time for tick in ticks]),
         "vl/frame_time": np.concatenate([tick.frame_times(views) for tick in ticks]),
-        "episode/source": np.array([*map(sources.index, of_episodes)], np.int32),
-        "episode/text": np.frombuffer(b"".join(episode.text for episode in episodes), np.uint8),
     }
-    for stream, stored in STREAMS.items():
-        if name := stored.counted_by:
-            own = [getattr(tick, name.removeprefix("tick/")) for tick in ticks]
-            pairs = zip(own, edges[stream][:-1], strict=True)
-            arrays[name] = np.concatenate([positions + start for positions, start in pairs])
-    return arrays | {f"episode/{stream}_start": edge for stream, edge in edges.items()}
 
 
 def episode_of(arrays: Mapping[str, NDArray[Any]], ticks: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -18,14 +18,12 @@ from typing import Any
 
 import numpy as np
 import zarr
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import ConfigError, StoreMismatch
 from pipeline.store.chunks import check_row_checksums, check_trailers, read_rows
-from pipeline.store.environments import environment_runs
-from pipeline.store.episodes import SAID, Episode
+from pipeline.store.episodes import Episode, index_arrays
 from pipeline.store.lock import build_lock
 from pipeline.store.metadata import ATTRIBUTE as METADATA_DIGEST
 from pipeline.store.metadata import check_metadata
@@ -50,7 +48,7 @@ from pipeline.store.schema import (
     ArraySpec,
     read_spec,
 )
-from pipeline.store.writer import StoreBuild
+from pipeline.store.writer import StoreBuild, environment_runs
 
 _COPIED = [
     name for name in ARRAY_NAMES if name.split("/")[0] in STREAMS and name not in INCREMENTAL
@@ -109,24 +107,8 @@ class MergedEpisodes:
             self.episodes.append(replace(episode, id=name))
         self.twice = sum(len(store.episodes) for store in stores) - len(self.episodes)
         """Episodes that an earlier input holds just so."""
-        self.arrays = self._episode_arrays()
-
-    def _episode_arrays(self) -> dict[str, NDArray[Any]]:
-        """The arrays under `episode/`."""
-        said = ({name: getattr(episode, name) for name in SAID} for episode in self.episodes)
-        texts = [json.dumps(text, ensure_ascii=False).encode() for text in said]
-        counts = {
-            stream: [len(getattr(episode, stored.rows)) for episode in self.episodes]
-            for stream, stored in STREAMS.items()
-        } | {"text": [*map(len, texts)]}
-        sources = [self.sources.index(episode.source) for episode in self.episodes]
-        return {
-            "episode/source": np.array(sources, np.int32),
-            "episode/text": np.frombuffer(b"".join(texts), np.uint8),
-        } | {
-            f"episode/{name}_start": np.cumsum([0, *count], dtype=np.int64)
-            for name, count in counts.items()
-        }
+        self.arrays = index_arrays(self.episodes, self.sources)
+        """Those under `episode/`."""
 
     @property
     def plan(self) -> str:
@@ -205,7 +187,7 @@ def _check_paths(inputs: Sequence[Path], output: Path) -> None:
     places = [path.resolve() for path in inputs]
     if len(places) < 2 or len(set(places)) < len(places):
         raise ConfigError(
-            "stores.inputs: expected two or more stores to merge, each named once, found "
+            "stores.inputs: expected two or more stores, each named once, found "
             f"{', '.join(map(str, inputs)) or 'none'}. "
             "Name them: python -m stages.store merge A.zarr B.zarr --into C.zarr"
         )

@@ -73,18 +73,14 @@ def read_attributes(root: Path) -> dict[str, Any]:
             f"{restore_command(root)}"
         )
     if "schema" not in attributes:
-        part, found = root if build else part_path(root), "nothing there"
+        part = root if build else part_path(root)
+        target = root.with_name(root.name.removesuffix(".part").removesuffix(".repair"))
+        found, then = "nothing there", f"Run {extract_command(target)}."
         if part.exists():
             found = f"only the unfinished build {part}"
         elif there(root):
-            raise StoreIncomplete(
-                f"{root}: no finished store, found {described(root)}. It was left as it is: name "
-                "another place."
-            )
-        target = root.with_name(root.name.removesuffix(".part").removesuffix(".repair"))
-        raise StoreIncomplete(
-            f"{root}: no finished store ({found}). Run {extract_command(target)}."
-        )
+            found, then = described(root), "It was left as it is: name another place."
+        raise StoreIncomplete(f"{root}: no finished store, found {found}. {then}")
     if attributes["schema"] != SCHEMA:
         raise StoreMismatch(
             f"{root}: expected store schema {SCHEMA}, found {attributes['schema']!r}. "

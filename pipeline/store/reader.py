@@ -22,8 +22,6 @@ from pipeline.store.repair_hints import mend
 from pipeline.store.schema import STREAMS, TRAILER_BYTES, ArraySpec, chunk_paths, read_specs
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from pipeline.store.batch import Batch
     from pipeline.store.gather import Gatherer, Selection
 
@@ -139,10 +137,6 @@ class FeatureStore:
         steps = steps[np.diff(self.episode_of(np.arange(self.ticks))) == 0]
         return float(np.median(steps)) if len(steps) else float("nan")
 
-    def feature_age(self, ticks: NDArray[np.int64]) -> NDArray[np.float64]:
-        """(tick,) s since the newest frame that the features of these ticks have seen."""
-        return self._gatherer.feature_age(ticks, self._arrays["tick/vl_row"][ticks])
-
     def gather(
         self,
         ticks: Sequence[int] | NDArray[np.int64],
@@ -169,7 +163,7 @@ class FeatureStore:
         batch, selection = self.select(
             ticks, (horizon, sensor_window, state_window), lags, out, variants
         )
-        self.copy(selection, batch)
+        self.gatherer.copy(selection, batch)
         return batch
 
     def select(
@@ -195,28 +189,13 @@ class FeatureStore:
                 f"{len(tick)} ticks, asked for {variants}. A store holds `vlm.variants` of them."
             )
         sizes = (len(tick), *windows)
-        batch = self.empty_batch(*sizes) if out is None else out
+        batch = self.gatherer.empty_batch(*sizes) if out is None else out
         if batch.sizes != sizes:
             raise ValueError(
                 "`out` has (batch, horizon, sensor_window, state_window) "
                 f"{batch.sizes}, asked for {sizes}"
             )
-        return batch, self._gatherer.select(batch, tick, *lags, variants)
-
-    def copy(self, selection: "Selection", batch: "Batch", but: Collection[str] = ()) -> None:
-        """The second half of `gather`: the wide fields of `batch`, without those named in `but`."""
-        self._gatherer.copy(selection, batch, but)
-
-    def empty_batch(self, *sizes: int, but: Collection[str] = ()) -> "Batch":
-        """Buffers for `gather(..., out=)`: batch, horizon, sensor_window and state_window.
-
-        Those named in `but` have a shape, but no memory.
-        """
-        return self._gatherer.empty_batch(*sizes, but=but)
-
-    def tensor(self, field: str) -> "Tensor":
-        """The map that a wide field of a batch (`WIDE`) is gathered from, row by row."""
-        return self._gatherer.tensor(field)
+        return batch, self.gatherer.select(batch, tick, *lags, variants)
 
     def warm(self, but: Collection[str] = ()) -> None:
         """Begin to read what memory has room for, once, in the background; no field of `but`.
@@ -226,11 +205,12 @@ class FeatureStore:
         """
         if not self._warmed:
             self._warmed = True
-            read = self._gatherer.populate
+            read = self.gatherer.populate
             threading.Thread(target=read, args=(but,), name="warm", daemon=True).start()
 
     @cached_property
-    def _gatherer(self) -> "Gatherer":
+    def gatherer(self) -> "Gatherer":
+        """What fills batches: their buffers, the maps behind them, the second half of `gather`."""
         from pipeline.store.gather import Gatherer
 
         return Gatherer(self._arrays, self.variants)

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from pipeline.base.errors import StoreIncomplete
 from pipeline.store.chunks import check_chunks, find_damage, read_rows, row_checksums
-from pipeline.store.environments import EnvironmentLog, environment_at
 from pipeline.store.episodes import read_texts
 from pipeline.store.schema import CHECKSUMS, FEATURES, KEYS, ArraySpec, read_specs
+from pipeline.store.writer import EnvironmentLog, environment_at
 
 
 class RowSource:
@@ -29,11 +29,6 @@ class RowSource:
         self.attrs: dict[str, Any] = zarr.open_group(path, mode="r").attrs.asdict()
         self._arrays: dict[str, NDArray[Any]] = {}
 
-    @property
-    def spec_digest(self) -> str:
-        """Digest of the feature spec its rows were computed under."""
-        return str(self.attrs["feature_spec"]["digest"])
-
     @cached_property
     def episode_digests(self) -> list[str]:
         """The digest of each episode, in order: equal digest, equal rows."""
@@ -43,10 +38,6 @@ class RowSource:
     def episode_contents(self) -> list[str]:
         """The content digest of each episode, in order: equal content, equal streams."""
         return [text["content"] for text in self._texts]
-
-    def episode_edges(self, stream: str) -> NDArray[np.int64]:
-        """(episode + 1,) where the rows of a stream begin."""
-        return self._read(f"episode/{stream}_start")
 
     @cached_property
     def rows(self) -> dict[bytes, int]:
@@ -63,16 +54,18 @@ class RowSource:
         episodes = self._episodes_by_text.get((content, instruction), [])
         if not episodes:
             return {}
-        frame_time, keys, checksums = map(self._read, ("vl/frame_time", KEYS, CHECKSUMS))
+        names = ("episode/vl_start", "vl/frame_time", KEYS, CHECKSUMS)
+        vl_start, frame_time, keys, checksums = map(self._read, names)
         return {
             frame_time[row].tobytes(): keys[row].tobytes()
             for episode in episodes
-            for row in range(*self.episode_edges("vl")[episode : episode + 2])
+            for row in range(vl_start[episode], vl_start[episode + 1])
             if checksums[row]
         }
 
-    def take(self, key: bytes) -> NDArray[Any] | None:
-        """The feature row (slot, dim) of a key; None where it is unknown or damaged."""
+    def take(self, key: bytes) -> tuple[NDArray[Any], dict[str, Any]] | None:
+        """The feature row (slot, dim) of a key, and with which software and hardware it was
+        computed, empty where that is not noted; None where it is unknown or damaged."""
         row = self.rows.get(key)
         if row is None:
             return None
@@ -80,15 +73,9 @@ class RowSource:
             values = read_rows(self.path, self.specs[FEATURES], row, row + 1)
         except StoreIncomplete:  # its file is cut short or gone: the row is computed again
             return None
-        return values[0] if row_checksums(values)[0] == self._read(CHECKSUMS)[row] else None
-
-    def environment_of(self, key: bytes) -> dict[str, Any]:
-        """With which software and hardware a known row was computed; empty where not noted."""
-        return environment_at(self._environments, self.rows[key])
-
-    def close(self) -> None:
-        """Forget what was read."""
-        self._arrays.clear()
+        if row_checksums(values)[0] != self._read(CHECKSUMS)[row]:
+            return None
+        return values[0], environment_at(self._environments, row)
 
     @cached_property
     def _episodes_by_text(self) -> dict[tuple[str, str], list[int]]:

@@ -37,10 +37,8 @@ class StoredStream:
     `episode/<stream>_start` says where the range of each episode begins.
     """
 
-    axis: str
-    """The first axis of its arrays, as zarr's metadata name it."""
     rows: str
-    """What `Sizes` calls their number, and `Episode` the range of an episode."""
+    """What `Episode` calls the range of an episode."""
     row: str
     """How messages call one of them."""
     counted_by: str = ""
@@ -48,10 +46,10 @@ class StoredStream:
 
 
 STREAMS = {
-    "tick": StoredStream("tick", "ticks", "tick"),
-    "vl": StoredStream("vl_row", "vl_rows", "VL row", "tick/vl_row"),
-    "sensor": StoredStream("sensor_reading", "readings", "sensor reading", "tick/sensor_end"),
-    "state": StoredStream("state_reading", "states", "state reading", "tick/state_end"),
+    "tick": StoredStream("ticks", "tick"),
+    "vl": StoredStream("vl_rows", "VL row", "tick/vl_row"),
+    "sensor": StoredStream("readings", "sensor reading", "tick/sensor_end"),
+    "state": StoredStream("states", "state reading", "tick/state_end"),
 }
 
 
@@ -100,20 +98,23 @@ class ArraySpec:
         start = chunk * self.chunk_rows
         return range(start, min(start + self.chunk_rows, self.shape[0]))
 
-    def create(self, root: Path | dict[str, Any]) -> "zarr.Array[Any]":
-        """Write the array's zarr metadata below `root`."""
+    def create(self, root: Path | dict[str, Any], **otherwise: Any) -> "zarr.Array[Any]":
+        """Write the array's zarr metadata below `root`; an archive cuts and packs it otherwise."""
+        as_in_a_store: dict[str, Any] = {
+            "chunks": (self.chunk_rows, *(max(1, size) for size in self.shape[1:])),
+            "compressors": [Crc32cCodec()],
+        }
         return zarr.create_array(
             store=root,
             name=self.name,
             shape=self.shape,
-            chunks=(self.chunk_rows, *(max(1, size) for size in self.shape[1:])),
             dtype=self.dtype,
             serializer=BytesCodec() if self.dtype.itemsize > 1 else BytesCodec(endian=None),
-            compressors=[Crc32cCodec()],
             filters=None,
             fill_value=0,
             dimension_names=self.dimensions,
             attributes=dict(self.attributes),
+            **(as_in_a_store | otherwise),
         )
 
 
@@ -129,20 +130,22 @@ def chunk_path(root: Path, spec: ArraySpec, chunk: int) -> Path:
 
 @dataclass(frozen=True)
 class Sizes:
-    """How many of each thing a store holds; a width of 0 is an absent stream."""
+    """How long each axis of a store's arrays is; a width of 0 is an absent stream."""
 
-    episodes: int
-    ticks: int
-    vl_rows: int
-    readings: int
-    states: int
-    text_bytes: int
-    slots: int
+    episode: int
+    tick: int
+    vl_row: int
+    sensor_reading: int
+    state_reading: int
+    byte: int
+    """Of the texts of all episodes."""
+    slot: int
     """Of a VL row: those of all its variants, one variant after the other."""
     dim: int
-    views: int
+    view: int
     action_dim: int
-    sensor_channels: int
+    channel: int
+    """Of the sensor."""
     state_dim: int
 
 
@@ -174,19 +177,7 @@ GROUPS = tuple(sorted({name.partition("/")[0] for name in ARRAY_NAMES}))
 
 def arrays(sizes: Sizes, features_dtype: str, sensor_dtype: str) -> dict[str, ArraySpec]:
     """Every array of a store, by name, in the order of the contract."""
-    lengths = {stream.axis: getattr(sizes, stream.rows) for stream in STREAMS.values()}
-    lengths |= {
-        "slot": sizes.slots,
-        "dim": sizes.dim,
-        "view": sizes.views,
-        "action_dim": sizes.action_dim,
-        "channel": sizes.sensor_channels,
-        "state_dim": sizes.state_dim,
-        "episode": sizes.episodes,
-        "episode_edge": sizes.episodes + 1,
-        "key_byte": KEY_BYTES,
-        "byte": sizes.text_bytes,
-    }
+    lengths = {**vars(sizes), "episode_edge": sizes.episode + 1, "key_byte": KEY_BYTES}
     chosen = {FEATURES: features_dtype, "sensor/values": sensor_dtype}
     return {
         name: array_spec(name, tuple(lengths[axis] for axis in axes), chosen.get(name))

@@ -5,10 +5,15 @@ first, with its checksums; then feature rows with `pwrite` and `fdatasync`, and 
 and checksums. A row counts as done when its checksum is not 0. Sealing compares the streams with
 their trailers, writes those of the feature rows, which make plain zarr accept the chunks, and one
 rename puts the build in its place.
+
+With which software and hardware each feature row was computed is recorded, not part of its
+identity: while a store is built, as a number a row in a file of its own, which sealing folds into
+ranges of rows in the store's attributes.
 """
 
+import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +25,79 @@ from pipeline.base.durable import disk_full_named, put_in_place, sync
 from pipeline.base.errors import StoreIncomplete
 from pipeline.base.ownership import begin_folder
 from pipeline.store.chunks import ChunkFiles, find_damage, read_chunk, read_rows, row_checksums
-from pipeline.store.environments import EnvironmentLog
 from pipeline.store.metadata import metadata_damage, note_metadata
 from pipeline.store.paths import STORE, part_path
 from pipeline.store.schema import CHECKSUMS, FEATURES, INCREMENTAL, KEYS, ArraySpec, chunk_path
 
 Rows = Sequence[int] | NDArray[np.int64]
 """Store-global VL rows, in any order."""
+
+
+def environment_at(ranges: Sequence[Mapping[str, Any]], row: int) -> dict[str, Any]:
+    """What a row was computed with, by the ranges of a store; empty where it is not noted."""
+    noted = next((noted for noted in ranges if row in range(*noted["rows"])), {})
+    return {name: value for name, value in noted.items() if name != "rows"}
+
+
+def environment_runs(
+    ranges: Sequence[Mapping[str, Any]], rows: NDArray[np.int64]
+) -> Iterator[tuple[dict[str, Any], range]]:
+    """Consecutive rows among these, which ascend, that were computed in one environment."""
+    edges = np.searchsorted(rows, [edge for noted in ranges for edge in noted["rows"]])
+    gaps = np.flatnonzero(np.diff(rows) != 1) + 1
+    for run in np.split(rows, np.union1d(edges, gaps).astype(np.int64)):
+        if len(run):
+            yield environment_at(ranges, int(run[0])), range(int(run[0]), int(run[-1]) + 1)
+
+
+class EnvironmentLog:
+    """The environments of a build's rows, kept beside its arrays until it is sealed."""
+
+    def __init__(self, part: Path) -> None:
+        self._listed = part / ".environments.json"
+        self._of_row = part / ".environment_of_row"
+        self._temporary = part / ".environments.json.tmp"
+
+    @property
+    def noted(self) -> bool:
+        """Whether there is anything to fold."""
+        return self._listed.exists()
+
+    def index(self, environment: Mapping[str, Any]) -> int:
+        """The number of an environment, a new one if it is new."""
+        known = self._known()
+        if environment not in known:
+            known.append(dict(environment))
+            self._temporary.write_text(json.dumps(known))
+            sync(self._temporary)
+            self._temporary.replace(self._listed)
+        return known.index(dict(environment))
+
+    def note(self, start: int, count: int, number: int) -> None:
+        """Say with which environment a run of rows was computed."""
+        descriptor = os.open(self._of_row, os.O_WRONLY | os.O_CREAT, 0o644)
+        try:
+            os.pwrite(descriptor, np.full(count, number, "<u2").tobytes(), start * 2)
+        finally:
+            os.close(descriptor)
+
+    def ranges(self) -> list[dict[str, Any]]:
+        """`[{"rows": [start, stop], **environment}, ...]`, in order."""
+        known, ranges, start = self._known(), [], 0
+        numbers = np.fromfile(self._of_row, "<u2") if self._of_row.exists() else np.zeros(0, "<u2")
+        for run in np.split(numbers, np.flatnonzero(np.diff(numbers)) + 1):
+            if len(run):
+                ranges.append({"rows": [start, start + len(run)], **known[run[0]]})
+                start += len(run)
+        return ranges
+
+    def remove(self) -> None:
+        """Forget it; a kill between the two leaves nothing that would be folded again."""
+        for path in (self._listed, self._of_row, self._temporary):
+            path.unlink(missing_ok=True)
+
+    def _known(self) -> list[dict[str, Any]]:
+        return json.loads(self._listed.read_text()) if self._listed.exists() else []
 
 
 class StoreBuild:
@@ -40,8 +111,6 @@ class StoreBuild:
         self.part = part_path(target)
         self.specs = dict(specs)
         self.plan = plan
-        self.keeps_replaced = False
-        """Whether the store whose place it takes is kept as `<name>.zarr.previous`."""
         self._files: dict[str, ChunkFiles] = {}
         self._environments = EnvironmentLog(self.part)
 
@@ -157,14 +226,15 @@ class StoreBuild:
         for run in runs:
             self.files(CHECKSUMS).write(int(rows[run[0]]), checksums[run])
 
-    def seal(self) -> None:
+    def seal(self, *, keep: bool = False) -> None:
         """Check every row, write the trailers and put the store in its place.
 
+        To `keep` is to have what was there as `<name>.zarr.previous`.
         Idempotent: a kill in the middle is mended by running it again. Raises `StoreIncomplete`
         when rows are missing, or a file is not as it was written.
         """
         self.finish()
-        self.put_in_place()
+        self.put_in_place(keep)
 
     def finish(self) -> None:
         """The first half of `seal`: all of the store is on the disk, still beside its place."""
@@ -195,9 +265,9 @@ class StoreBuild:
         self.close()
         sync_folders(self.part)
 
-    def put_in_place(self) -> None:
+    def put_in_place(self, keep: bool = False) -> None:
         """The second half of `seal`: an instant."""
-        put_in_place(self.part, self.target, STORE, keep=self.keeps_replaced)
+        put_in_place(self.part, self.target, STORE, keep=keep)
 
     def close(self) -> None:
         """Close every file."""

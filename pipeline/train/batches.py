@@ -86,7 +86,7 @@ class DeviceStore:
     """
 
     def __init__(self, store: FeatureStore, fields: Collection[str], device: torch.device) -> None:
-        sources = {name: store.tensor(name) for name in sorted(fields)}
+        sources = {name: store.gatherer.tensor(name) for name in sorted(fields)}
         sources = {name: source for name, source in sources.items() if source.nbytes}
         self.fields = frozenset(sources)
         """What lives there; of a stream that the store lacks there is nothing to hold."""
@@ -144,7 +144,8 @@ def choose_feed(
     if free is None:
         on_gpu = device.type == "cuda"
         free = torch.cuda.mem_get_info(device)[0] if on_gpu else available_bytes()
-    wide = {name: store.tensor(name) for name in WIDE if store.tensor(name).nbytes}
+    maps = {name: store.gatherer.tensor(name) for name in WIDE}
+    wide = {name: tensor for name, tensor in maps.items() if tensor.nbytes}
     fields = fitting(wide, free, _DEVICE_SHARE)
     room = (
         f"{_DEVICE_SHARE:.0%} of the {size(free)} free on {device} hold "
@@ -254,12 +255,12 @@ class Prefetch(Iterator[tuple[BatchIndices, Batch]]):
             buffer.copied.synchronize()
         count = len(indices.ticks)
         if buffer.batch is None or len(buffer.batch) != count:
-            empty = self._store.empty_batch(count, *self._windows, but=self._on_device)
+            empty = self._store.gatherer.empty_batch(count, *self._windows, but=self._on_device)
             buffer.batch = empty.pin() if self._device.type == "cuda" else empty.touch()
         batch, selection = self._store.select(
             indices.ticks, self._windows, self._lags, buffer.batch, indices.variants
         )
-        self._store.copy(selection, batch, but=self._on_device)
+        self._store.gatherer.copy(selection, batch, but=self._on_device)
         if self._device.type != "cuda":
             batch = self._complete(batch, selection)
         return indices, batch, selection

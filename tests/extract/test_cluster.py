@@ -36,10 +36,15 @@ from pipeline.base.errors import (
     VLMError,
 )
 from pipeline.extract import extract
-from pipeline.extract.cluster import check_scheduler, connected
+from pipeline.extract.cluster import (
+    ExtractionJob,
+    check_place,
+    check_scheduler,
+    connected,
+    device_of,
+)
 from pipeline.extract.plan import rate_name
 from pipeline.extract.survey import Survey, survey
-from pipeline.extract.worker import ExtractionJob, check_place, device_of
 from pipeline.store import FeatureStore, RowSource, StoreBuild, part_path, read_plan
 from pipeline.store.schema import ARRAY_NAMES, read_specs
 from pipeline.vlm.feature_spec import feature_spec
@@ -55,7 +60,7 @@ from pathlib import Path
 from pipeline.base.errors import NumericsError
 from pipeline.extract.encoder import Encoder
 from pipeline.extract.engine import RowEngine
-from pipeline.extract.worker import ExtractionPlugin
+from pipeline.extract.cluster import ExtractionPlugin
 
 control = Path({control!r})
 prepare, encode, begin = RowEngine.prepare, Encoder.encoded, ExtractionPlugin.setup
@@ -359,9 +364,8 @@ class TestDeaths:
 
     def edges(self, store: Path) -> dict[str, range]:
         build = RowSource(part_path(store))
-        starts = build.episode_edges("vl")
+        starts = build._read("episode/vl_start")
         said = [Path(one["id"]).name for one in build._texts]
-        build.close()
         spans = [range(*edges) for edges in pairwise(starts.tolist())]
         return dict(zip(said, spans, strict=True))
 
@@ -394,7 +398,7 @@ class TestRefusals:
         job = ExtractionJob(surveyed, (), Path.cwd())
         with pytest.raises(StoreIncomplete, match=r"does not see the build .*made\.zarr\.part"):
             check_place(job)
-        monkeypatch.setattr("pipeline.extract.worker.read_plan", lambda part: "plan")
+        monkeypatch.setattr("pipeline.extract.cluster.read_plan", lambda part: "plan")
         check_place(job)
         other = replace(
             job,

@@ -432,7 +432,7 @@ class TestWhatWouldBeLost:
         monkeypatch.setattr(WindowedRecording, "sensor", narrower)
         no_model_later(images=False)
         other = {"sources": [{"name": "made", "path": str(tmp_path / "other")}]}
-        with pytest.raises(StoreMismatch, match=r"sensor: 1026 channels .* there, 7 channels"):
+        with pytest.raises(StoreMismatch, match=r"sensor: 1026 channels there, 7 here"):
             run(changed(data=other))
 
     @pytest.mark.usefixtures("extracted")

@@ -7,8 +7,7 @@ import pytest
 
 from pipeline.base.errors import DiskFull
 from pipeline.extract import extract
-from pipeline.extract.engine import RowEngine
-from pipeline.extract.rows import in_background
+from pipeline.extract.engine import RowEngine, in_background
 from pipeline.store import FeatureStore, StoreBuild
 from pipeline.vlm.qwen import FrozenVLM
 

@@ -17,8 +17,8 @@ from pipeline.base.errors import DiskFull, StoreIncomplete, StoreLocked, StoreMi
 from pipeline.extract import ExtractionReport, extract
 from pipeline.extract.repair import repair
 from pipeline.store import FeatureStore, build_lock, part_path
-from pipeline.store.integrity import Verification, verify
 from pipeline.store.schema import chunk_paths, read_spec
+from pipeline.store.verification import Verification, verify
 
 
 def quiet(line: str) -> None:
@@ -134,7 +134,7 @@ def test_damage_is_found_and_mended_to_the_byte(case, harm, computed, anew):
     lines = case.verified().lines()
     assert any(str(place) in line for line in lines), lines
     said, report = case.mended()
-    assert ("written again from the recordings" in said) is anew
+    assert ("again from the recordings" in said) is anew
     assert f"{report.rows - computed} of {report.rows} feature rows taken over" in said
     assert (report.computed, report.taken) == (computed, 0)
     assert contents(case.store) == contents(case.original)

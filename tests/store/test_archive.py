@@ -24,25 +24,25 @@ from pipeline.store.schema import INCREMENTAL, read_specs
 
 DEMO = Path(__file__).resolve().parents[2] / "cache_store/demo.zarr"
 SIZES = Sizes(
-    episodes=2,
-    ticks=500,
-    vl_rows=10_000,
-    readings=21_000,
-    states=9_000,
-    text_bytes=4,
-    slots=2,
+    episode=2,
+    tick=500,
+    vl_row=10_000,
+    sensor_reading=21_000,
+    state_reading=9_000,
+    byte=4,
+    slot=2,
     dim=6,
-    views=2,
+    view=2,
     action_dim=3,
-    sensor_channels=7,
+    channel=7,
     state_dim=5,
 )
 SHAPES = {
     "all streams": {},
-    "no sensor": {"readings": 0, "sensor_channels": 0},
-    "a sensor without readings": {"readings": 0},
-    "no state": {"states": 0, "state_dim": 0},
-    "variants": {"slots": 6},
+    "no sensor": {"sensor_reading": 0, "channel": 0},
+    "a sensor without readings": {"sensor_reading": 0},
+    "no state": {"state_reading": 0, "state_dim": 0},
+    "variants": {"slot": 6},
 }
 
 
@@ -204,7 +204,7 @@ class TestArchive:
     def test_another_archive_is_not_written_over(self, archived, tmp_path):
         _, output = archived
         (tmp_path / "other").mkdir()
-        other = write_store(tmp_path / "other", slots=1)
+        other = write_store(tmp_path / "other", slot=1)
         before = content(output)
         with pytest.raises(StoreMismatch, match=r"not an archive of .*other.*archive.output"):
             archive(other, output, level=1, threads=1)

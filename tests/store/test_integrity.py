@@ -6,6 +6,7 @@ import os
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from io import FileIO
 from pathlib import Path
 
 import distributed
@@ -19,9 +20,8 @@ from pipeline.base.errors import StoreIncomplete, StoreMismatch
 from pipeline.base.format import size
 from pipeline.store import FeatureStore, check_trailers
 from pipeline.store.archive import archive
-from pipeline.store.integrity import Verification, verify
-from pipeline.store.integrity.verification import MOST_LINES
 from pipeline.store.schema import chunk_paths, read_spec
+from pipeline.store.verification import MOST_LINES, Verification, verify
 
 TICKS, REUSE = 30, 3
 ROWS = TICKS // REUSE
@@ -212,14 +212,18 @@ class TestFeatureRows:
 
     def test_rows_on_a_disk_that_fails(self, store, monkeypatch):
         monkeypatch.setattr("pipeline.store.chunks.BLOCK_BYTES", 10 * 3 * 8 * 4)
-        read, inode = os.preadv, chunk_file(store, "vl/features").stat().st_ino
+        path, opened = chunk_file(store, "vl/features"), Path.open
 
-        def failing(descriptor, buffers, offset):
-            if os.fstat(descriptor).st_ino == inode and offset >= 50 * 3 * 8 * 4:
-                raise OSError(errno.EIO, "Input/output error")
-            return read(descriptor, buffers, offset)
+        class Failing(FileIO):
+            def readinto(self, buffer):
+                if self.tell() >= 50 * 3 * 8 * 4:
+                    raise OSError(errno.EIO, "Input/output error")
+                return super().readinto(buffer)
 
-        monkeypatch.setattr(os, "preadv", failing)
+        def failing(self, *args, **kwargs):
+            return Failing(self) if self == path else opened(self, *args, **kwargs)
+
+        monkeypatch.setattr(Path, "open", failing)
         verification = verify(store, threads=1)
         assert verification.bad_rows.tolist() == list(range(50, 60))
         assert "cannot be read at byte 4800: Input/output error" in verification.lines()[0]
@@ -371,7 +375,7 @@ class TestOtherThings:
         def elsewhere(checks, workers):
             yield from (replace(check(), bytes=0, damage="no file") for check in checks)
 
-        monkeypatch.setattr("pipeline.store.integrity.verification._run_on_cluster", elsewhere)
+        monkeypatch.setattr("pipeline.store.verification._run_on_cluster", elsewhere)
         with pytest.raises(StoreIncomplete, match="a file system that they share"):
             verify(store, threads=1, workers="tcp://elsewhere:8786")
 
@@ -386,6 +390,6 @@ class TestOtherThings:
             shutil.copytree(store.with_name("before.zarr"), store)
             return []
 
-        monkeypatch.setattr("pipeline.store.integrity.verification.strange_files", replaced)
+        monkeypatch.setattr("pipeline.store.verification.strange_files", replaced)
         with pytest.raises(StoreMismatch, match="another store took its place"):
             verify(store, threads=1)

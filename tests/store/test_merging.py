@@ -13,12 +13,12 @@ import pytest
 import zarr
 
 from pipeline.base.errors import ConfigError, StoreIncomplete, StoreLocked, StoreMismatch
+from pipeline.extract.repair import carry_rows, copy_layout, put_in_place
 from pipeline.store import FeatureStore, StoreBuild, build_lock, check_trailers
-from pipeline.store.integrity import verify
-from pipeline.store.integrity.repair import carry_rows, copy_layout, put_in_place
 from pipeline.store.merging import merge
 from pipeline.store.metadata import note_metadata
 from pipeline.store.schema import ARRAY_NAMES
+from pipeline.store.verification import verify
 
 Make = Callable[..., Path]
 WINDOWS = {"horizon": 3, "sensor_window": 6, "state_window": 5}

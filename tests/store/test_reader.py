@@ -106,11 +106,6 @@ class TestGather:
                 found = getattr(batch, name)[index].numpy()
                 assert np.allclose(found, value, atol=1e-6), (name, tick)
 
-    def test_the_age_of_a_feature_is_known_without_a_batch(self, store):
-        ticks = np.array([0, 2, 31, 179])
-        wanted = [reference(store, int(tick), 1, 1, 0, 0.0)["feature_age"] for tick in ticks]
-        assert store.feature_age(ticks).tolist() == wanted
-
     def test_fills_the_buffers_it_is_given_and_leaves_nothing_of_before(self, store):
         out = store.gather([100, 170], 8, 65, 20)
         pointers = out.sensor.data_ptr(), out.features.data_ptr()
@@ -152,7 +147,7 @@ class TestVariants:
         assert varied.variants == 3
         assert varied.feature_shape == (2, 8)
         assert varied.array("vl/features").shape[1:] == (6, 8)
-        assert varied.empty_batch(4, 8, 65, 100).features.shape == (4, 2, 8)
+        assert varied.gatherer.empty_batch(4, 8, 65, 100).features.shape == (4, 2, 8)
 
     @settings(max_examples=60, deadline=None)
     @given(data=st.data())

@@ -102,7 +102,7 @@ def test_auto_takes_a_gpu_that_has_room_for_all(store: FeatureStore) -> None:
 
 
 def test_device_takes_what_fits_the_smallest_first(store: FeatureStore) -> None:
-    sizes = {name: store.tensor(name).nbytes for name in ALL}
+    sizes = {name: store.gatherer.tensor(name).nbytes for name in ALL}
     largest = max(sizes, key=lambda name: sizes[name])
     free = int((sum(sizes.values()) - 1) / 0.6)
     assert choose_feed("device", store, CPU, free)[0] == ALL - {largest}

@@ -109,17 +109,17 @@ def estimated_bytes(read: Sequence[ReadEpisode], episodes: int, params: Params) 
     # A digest decides nothing of a size, and reading every weight for it takes long.
     spec = feature_spec(params.vlm, params.extract.dtype, sorted(views), lambda path: "")
     sizes = Sizes(
-        episodes=len(read),
-        ticks=sum(len(line.time) for line in lines),
-        vl_rows=sum(len(line.vl_time) for line in lines),
-        readings=sum(episode.readings for episode in read),
-        states=sum(episode.states for episode in read),
-        text_bytes=_TEXT_BYTES * len(read),
-        slots=len(spec.slots) * spec.variants,
+        episode=len(read),
+        tick=sum(len(line.time) for line in lines),
+        vl_row=sum(len(line.vl_time) for line in lines),
+        sensor_reading=sum(episode.readings for episode in read),
+        state_reading=sum(episode.states for episode in read),
+        byte=_TEXT_BYTES * len(read),
+        slot=len(spec.slots) * spec.variants,
         dim=spec.dim,
-        views=len(views),
+        view=len(views),
         action_dim=len(embodiments[0].action.names),
-        sensor_channels=max(len(embodiment.sensor.names) for embodiment in embodiments),
+        channel=max(len(embodiment.sensor.names) for embodiment in embodiments),
         state_dim=max(len(embodiment.state.names) for embodiment in embodiments),
     )
     specs = arrays(sizes, params.extract.dtype, params.extract.sensor_dtype).values()

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from pipeline.base.errors import StoreMismatch
+from pipeline.extract.repair import carry_rows, copy_layout, layout_is_sound, put_in_place
 from pipeline.store import FeatureStore, StoreBuild, part_path, read_plan
-from pipeline.store.integrity import verify
-from pipeline.store.integrity.repair import carry_rows, copy_layout, layout_is_sound, put_in_place
 from pipeline.store.schema import chunk_paths, read_spec, read_specs
+from pipeline.store.verification import verify
 
 ROW_BYTES = 3 * 8 * 4
 
