@@ -3,7 +3,8 @@
 Takes what stages.train_head wrote to train_head.output, or rollout.checkpoint if it is given, and
 the model of vlm.checkpoint, which must give the features that the policy was trained on. Beside the
 policy: the demonstrator, and the policy without sensor and without features. Writes metrics.json
-(success with its 95 % interval), episodes.csv and a page (report.html) into `rollout.output`.
+(success with its 95 % interval), episodes.csv, beside.csv (those of the others) and a page
+(report.html) into `rollout.output`.
 
   python -m stages.rollout                                     50 episodes at level full
   python -m stages.rollout --set rollout.level=moved           the target is pushed meanwhile
@@ -15,13 +16,14 @@ from stages.command import run
 if __name__ == "__main__":  # here, for --help waits for no import below
     raise SystemExit(run(__doc__ or "", "stages.rollout", sections=("rollout",)))
 
+from functools import partial
 from pathlib import Path
 
 from pipeline.base.config import Params
 from pipeline.base.device import resolve_device
 from pipeline.base.durable import write_document
 from pipeline.base.ownership import REPORT, claim, refuse_foreign
-from pipeline.evaluate.rollouts import LivePart, Rollouts, refuse_other_robot, roll_out
+from pipeline.evaluate.rollouts import Rollouts, roll_out
 from pipeline.look.page.writing import write_report
 from pipeline.look.rollout.page import rollout_report
 from pipeline.policy.checkpoint import find_policy, load_policy
@@ -34,17 +36,11 @@ def main(params: Params) -> None:
     refuse_foreign(wanted.output, REPORT)
     folder = wanted.checkpoint or params.train_head.output
     checkpoint = load_policy(find_policy(folder))
-    refuse_other_robot(checkpoint)
     device = resolve_device(wanted.device)
-    policy = checkpoint.policy(device)
-    features = None
-    if "features" in policy.encoders:
-        features = LiveFeatures(params.vlm, checkpoint.source["feature_spec"], str(device))
-    live = LivePart(
-        policy, features, checkpoint.source["vlm_reuse_count"], checkpoint.normalization
-    )
+    load = partial(LiveFeatures, params.vlm, checkpoint.source["feature_spec"], str(device))
     print(f"{folder} (step {checkpoint.step}), level {wanted.level}, device {device}", flush=True)
-    rollouts = roll_out(checkpoint, str(folder), live, wanted, progress=True)
+    policy = checkpoint.policy(device)
+    rollouts = roll_out(checkpoint, str(folder), policy, load, wanted, progress=True)
     files = _write(wanted.output, rollouts)
     for line in rollouts.summary().text():
         print(line)
@@ -55,5 +51,8 @@ def _write(folder: Path, rollouts: Rollouts) -> list[Path]:
     """Metrics, the table of episodes and the page; returns their paths."""
     claim(folder, REPORT)
     write_document(folder / "metrics.json", rollouts.document())
-    table = rollouts.table().write_csv(folder / "episodes.csv")
-    return [folder / "metrics.json", table, *write_report(folder, rollout_report(rollouts))]
+    tables = [
+        rollouts.table(policy=True).write_csv(folder / "episodes.csv"),
+        rollouts.table(policy=False).write_csv(folder / "beside.csv"),
+    ]
+    return [folder / "metrics.json", *tables, *write_report(folder, rollout_report(rollouts))]

@@ -16,17 +16,15 @@ from scipy.stats import binomtest
 from tqdm import tqdm
 
 from pipeline.base.config import RolloutParams
-from pipeline.base.errors import CheckpointMismatch
+from pipeline.base.errors import CheckpointMismatch, ConfigError
 from pipeline.base.table import Table
 from pipeline.policy.checkpoint import PolicyCheckpoint
-from pipeline.policy.normalization import Normalization
 from pipeline.policy.policy import Policy
-from pipeline.robot.chunking import check_chunking
+from pipeline.robot.chunking import Executor, check_chunking
 from pipeline.robot.features import LiveFeatures
 from pipeline.robot.guides import stack_guides
 from pipeline.robot.loop import ControlLoop, LoopTiming, SafeStop
 from pipeline.robot.memory import SeenFeatures
-from pipeline.simulation.arm import ActionRotation
 from pipeline.simulation.environment import InsertionEnvironment
 from pipeline.simulation.insertion import INSERTED, TICK_HZ, EpisodeTrace, NeedleInsertion
 from pipeline.simulation.insertion_formats import INSTRUCTION
@@ -35,9 +33,7 @@ from pipeline.simulation.rendering import VIEWS, photograph
 POLICY: Final = "policy"
 EXPERT: Final = "expert"
 SIDE_BY_SIDE: Final = 50
-"""Environments that share a pass of the model."""
-_USUAL_AGE_S = 0.15
-"""Of features, where there are none."""
+"""Environments that are stepped together, and share passes of the model."""
 
 
 @dataclass(frozen=True)
@@ -92,9 +88,13 @@ class Rollouts:
     """All episodes of a rollout, and how it was run."""
 
     checkpoint: str
-    level: str
     settings: Mapping[str, Any]
     episodes: tuple[RolloutEpisode, ...]
+
+    @property
+    def level(self) -> str:
+        """That of all episodes."""
+        return self.episodes[0].level
 
     @property
     def controllers(self) -> tuple[str, ...]:
@@ -133,12 +133,11 @@ class Rollouts:
             "settings": dict(self.settings),
         }
 
-    def table(self) -> Table:
-        """The content of episodes.csv."""
-        return Table(
-            ("controller", *_COLUMNS),
-            [(e.controller, *(getattr(e, name) for name in _COLUMNS)) for e in self.episodes],
-        )
+    def table(self, policy: bool) -> Table:
+        """A row an episode: those of the policy, or those beside it with who controlled them."""
+        heads = _COLUMNS if policy else ("controller", *_COLUMNS)
+        episodes = [e for e in self.episodes if (e.controller == POLICY) == policy]
+        return Table(heads, [tuple(getattr(e, name) for name in heads) for e in episodes])
 
 
 _COLUMNS: Final = (
@@ -147,80 +146,72 @@ _COLUMNS: Final = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class LivePart:
-    """What a rollout runs: the policy, its model where it uses features, and how it was trained."""
-
-    policy: Policy
-    features: LiveFeatures | None
-    reuse: int
-    normalization: Normalization
-
-
 def roll_out(
     checkpoint: PolicyCheckpoint,
     name: str,
-    live: LivePart,
+    policy: Policy,
+    load_features: Callable[[], LiveFeatures],
     wanted: RolloutParams,
     progress: bool = False,
 ) -> Rollouts:
-    """Episodes of the policy, the demonstrator and the policy with each stream off.
+    """Episodes of the policy, of it with a stream off, and of the demonstrator.
 
-    Raises `CheckpointMismatch` where the phantom has not what the policy was trained on, and
-    `ConfigError` for chunking that its expert cannot do.
+    `load_features` is called where the policy looks at features, once all that can be refused
+    without it is known to be good. Raises `CheckpointMismatch` where the phantom has not what the
+    policy was trained on, `ConfigError` for an instruction that it was not, for chunking that its
+    expert cannot do and for more steps than a chunk has.
     """
     refuse_other_robot(checkpoint)
-    check_chunking(wanted.chunking, live.policy.stochastic)
-    encoders = tuple(live.policy.encoders)
-    off = [stream for stream in ("sensor", "features") if stream in encoders and len(encoders) > 1]
-    switched = off if wanted.ablations else []
+    check_chunking(wanted.chunking, policy.stochastic)
+    Executor(wanted.chunking, wanted.execute, policy.params.horizon)
+    driver = _Driver(
+        checkpoint,
+        policy,
+        load_features() if "features" in policy.encoders else None,
+        wanted,
+        instruction_of(checkpoint),
+    )
+    off = [stream for stream in ("sensor", "features") if stream in policy.encoders]
+    streams = (None, *(off if wanted.ablations and len(policy.encoders) > 1 else ()))
     seeds = range(wanted.seed, wanted.seed + wanted.episodes)
     groups = [seeds[at : at + SIDE_BY_SIDE] for at in range(0, len(seeds), SIDE_BY_SIDE)]
-    rotation = action_rotation(checkpoint)
     episodes: list[RolloutEpisode] = []
-    with tqdm(
-        total=(2 + len(switched)) * len(seeds), unit="episode", disable=None if progress else True
-    ) as bar:
-        for stream in (None, *switched):
-            label = f"{stream} off" if stream else POLICY
-            bar.set_description(label)
+    total = (1 + len(streams)) * len(seeds)
+    with tqdm(total=total, unit="episode", disable=None if progress else True) as bar:
+        for stream in streams:
+            controller = f"{stream} off" if stream else POLICY
+            bar.set_description(controller)
             for group in groups:
-                robots = [_begin(wanted, rotation, seed) for seed in group]
-                reasons = _drive(robots, live, wanted, group[0], stream, bar.update)
+                robots = [driver.begin(seed) for seed in group]
+                stops = driver.drive(robots, group, stream, bar.update)
                 episodes += [
-                    _episode(label, wanted.level, seed, robot.insertion, reason)
-                    for seed, robot, reason in zip(group, robots, reasons, strict=True)
+                    _episode(controller, wanted.level, seed, robot.insertion, stop)
+                    for seed, robot, stop in zip(group, robots, stops, strict=True)
                 ]
         bar.set_description(EXPERT)
         for seed in seeds:
-            insertion = _begin(wanted, rotation, seed).insertion
+            insertion = driver.begin(seed).insertion
             while not insertion.finished:
                 insertion.step(insertion.expert_action())
             episodes.append(_episode(EXPERT, wanted.level, seed, insertion, None))
             bar.update()
     settings = wanted.model_dump(mode="json", exclude={"checkpoint", "output", "device"})
-    return Rollouts(name, wanted.level, settings, tuple(episodes))
+    return Rollouts(name, settings | {"instruction": driver.instruction}, tuple(episodes))
 
 
 def refuse_other_robot(checkpoint: PolicyCheckpoint) -> None:
     """Raise `CheckpointMismatch` where the phantom has not what a policy was trained on."""
-    streams, shape = checkpoint.source["streams"], checkpoint.shape
-    views = streams["views"]
-    has = {
-        "views": (set(views) <= set(VIEWS), views, VIEWS),
-        "action kind": (streams["action"]["kind"] == "delta", streams["action"]["kind"], "delta"),
-        "action channels": (shape.action_dim == 7, shape.action_dim, 7),
-        "state channels": (shape.state_dim in (0, 12), shape.state_dim, 12),
-        "sensor channels": (shape.sensor_channels in (0, 1026), shape.sensor_channels, 1026),
-        "action_hz": (
-            checkpoint.source["action_hz"] == TICK_HZ,
-            checkpoint.source["action_hz"],
-            TICK_HZ,
-        ),
+    source, shape = checkpoint.source, checkpoint.shape
+    checked = {
+        "views": (tuple(sorted({*source["streams"]["views"], *VIEWS})), (VIEWS,)),
+        "action kind": (source["streams"]["action"]["kind"], ("delta",)),
+        "action channels": (shape.action_dim, (7,)),
+        "state channels": (shape.state_dim, (0, 12)),
+        "sensor channels": (shape.sensor_channels, (0, 1026)),
+        "action_hz": (source["action_hz"], (TICK_HZ,)),
     }
-    if differs := [
-        f"{name} {got} (phantom: {own})" for name, (same, got, own) in has.items() if not same
-    ]:
+    differs = [f"{name} {got}" for name, (got, allowed) in checked.items() if got not in allowed]
+    if differs:
         raise CheckpointMismatch(
             "rollout.environment: the policy was trained on another robot than the phantom: "
             f"{'; '.join(differs)}. Roll out a policy of recordings of the phantom "
@@ -228,101 +219,107 @@ def refuse_other_robot(checkpoint: PolicyCheckpoint) -> None:
         )
 
 
-def action_rotation(checkpoint: PolicyCheckpoint) -> ActionRotation:
-    """The convention of the policy's rotation channels, by their names."""
-    names = checkpoint.source["streams"]["action"]["names"]
-    return "rotvec" if "rx" in names else "euler_delta"
+def instruction_of(checkpoint: PolicyCheckpoint) -> str:
+    """What the robot is told: the phantom's task, or else the only words the policy was trained on.
 
-
-def _begin(wanted: RolloutParams, rotation: ActionRotation, seed: int) -> InsertionEnvironment:
-    robot = InsertionEnvironment(wanted.level, rotation, cameras=False)
-    robot.reset(seed=seed)
-    return robot
-
-
-def _drive(
-    robots: Sequence[InsertionEnvironment],
-    live: LivePart,
-    wanted: RolloutParams,
-    seed: int,
-    off: str | None,
-    ended: Callable[[], Any],
-) -> list[str | None]:
-    """Run the policy on all robots at once to their ends; a safe stop's reason for each, or None.
-
-    `off` names a stream that tells the policy nothing. `ended` is called for each that ends.
+    Raises `ConfigError` where it was trained on several others.
     """
-    policy, needs = live.policy, "features" in live.policy.encoders and off != "features"
-    timing = LoopTiming(live.reuse, wanted.latency_ms / 1000, wanted.execute, wanted.chunking)
-    loops = [ControlLoop(policy.params, policy.shape, timing, needs) for _ in robots]
-    generator = torch.Generator().manual_seed(seed)
-    stops: list[str | None] = [None] * len(robots)
-    for loop, robot in zip(loops, robots, strict=True):
-        loop.sense(robot.readings())
-    active = list(range(len(robots)))
-    while active:
-        _look([(robots[i], loops[i]) for i in active if loops[i].frames_due], live.features)
-        due = [i for i in active if loops[i].chunk_due]
-        chunks = _chunks(live, [loops[i] for i in due], off, generator)
-        for i, chunk in zip(due, chunks, strict=True):
-            try:
-                loops[i].plan(chunk)
-            except SafeStop as stop:
-                stops[i] = f"safe stop: {stop}"
-        for i in active:
-            if stops[i] is None:
-                loops[i].sense(robots[i].step(loops[i].action())[0])
-        going = [i for i in active if stops[i] is None and not robots[i].insertion.finished]
-        for _ in range(len(active) - len(going)):
-            ended()
-        active = going
-    return stops
-
-
-def _look(
-    due: Sequence[tuple[InsertionEnvironment, ControlLoop]], features: LiveFeatures | None
-) -> None:
-    """One pass of the model for all whose frames are due."""
-    if not due or features is None:
-        return
-    taken = [robot.frames() for robot, _ in due]
-    seen, valid = features(
-        [{view: frame for view, (_, frame) in views.items()} for views in taken], INSTRUCTION
+    trained = checkpoint.instructions
+    if not trained or INSTRUCTION in trained:
+        return INSTRUCTION
+    if len(trained) == 1:
+        return trained[0]
+    raise ConfigError(
+        f"rollout: the policy was trained on other instructions than {INSTRUCTION!r}: "
+        f"{', '.join(map(repr, trained))}. Train it on the phantom's, or on one: "
+        "data.sources[].instruction"
     )
-    for (_, loop), views, row, slots in zip(due, taken, seen.numpy(), valid.numpy(), strict=True):
-        newest = max(time for time, _ in views.values())
-        loop.see(SeenFeatures(row, slots, newest))
 
 
-def _chunks(
-    live: LivePart, loops: Sequence[ControlLoop], off: str | None, generator: torch.Generator
-) -> NDArray[np.float32]:
-    """The head's chunks (loop, horizon, action) for robots that ask for one."""
-    if not loops:
-        return np.zeros((0, 0, 0), np.float32)
-    guides = [loop.executor.begin() for loop in loops]
-    fields = [loop.memory.observation() for loop in loops]
-    streams = {name: np.stack([each[name] for each in fields]) for name in fields[0]}
-    if off is not None:
-        streams |= _at_mean(live, off, len(loops))
-    observation = live.policy.observe(streams)
-    guide = stack_guides(guides, observation.features.device)
-    return live.policy.act(observation, generator, guide).cpu().numpy()
+@dataclass(frozen=True)
+class _Driver:
+    """Drives a policy's robots; `features` is the model that it asks, None where it asks none."""
 
+    checkpoint: PolicyCheckpoint
+    policy: Policy
+    features: LiveFeatures | None
+    wanted: RolloutParams
+    instruction: str
 
-def _at_mean(live: LivePart, stream: str, batch: int) -> dict[str, NDArray[Any]]:
-    """A stream that says nothing: every value at its training mean, as in an evaluation."""
-    statistics = getattr(live.normalization, stream)
-    assert statistics is not None, stream
-    mean = statistics.mean.astype(np.float32)
-    if stream == "features":
-        real: NDArray[Any] = np.ones((batch, len(mean)), np.bool_)
-        age = np.full(batch, _USUAL_AGE_S, np.float32)
-        values = np.broadcast_to(mean, (batch, *mean.shape))
-        return {"features": values.copy(), "slot_valid": real, "feature_age": age}
-    window = live.policy.params.sensor_window
-    values = np.broadcast_to(mean, (batch, window, *mean.shape))
-    return {stream: values.copy(), f"{stream}_valid": np.full(batch, window)}
+    def begin(self, seed: int) -> InsertionEnvironment:
+        """The phantom at the beginning of an episode."""
+        names = self.checkpoint.source["streams"]["action"]["names"]
+        rotation = "rotvec" if "rx" in names else "euler_delta"
+        robot = InsertionEnvironment(self.wanted.level, rotation, cameras=False)
+        robot.reset(seed=seed)
+        return robot
+
+    def drive(
+        self,
+        robots: Sequence[InsertionEnvironment],
+        seeds: Sequence[int],
+        off: str | None,
+        ended: Callable[[], Any],
+    ) -> list[str | None]:
+        """Run the policy on all robots at once to their ends; why each stopped safely, or None.
+
+        `off` names a stream that tells the policy nothing. `ended` is called for each that ends.
+        A robot draws from a generator of its own seed, so that it does as it would alone.
+        """
+        wanted, policy = self.wanted, self.policy
+        reuse = self.checkpoint.source["vlm_reuse_count"]
+        timing = LoopTiming(reuse, wanted.latency_ms / 1000, wanted.execute, wanted.chunking)
+        asks = self.features is not None
+        loops = [ControlLoop(policy.params, policy.shape, timing, asks) for _ in robots]
+        generators = [torch.Generator().manual_seed(seed) for seed in seeds]
+        stops: list[str | None] = [None] * len(robots)
+        for loop, robot in zip(loops, robots, strict=True):
+            loop.sense(robot.readings())
+        active = list(range(len(robots)))
+        while active:
+            self._look([(robots[i], loops[i]) for i in active if loops[i].frames_due])
+            due = [i for i in active if loops[i].chunk_due]
+            chunks = self._chunks([loops[i] for i in due], [generators[i] for i in due], off)
+            for i, chunk in zip(due, chunks, strict=True):
+                try:
+                    loops[i].plan(chunk)
+                except SafeStop as stop:
+                    stops[i] = f"safe stop: {stop}"
+            for i in active:
+                if stops[i] is None:
+                    loops[i].sense(robots[i].step(loops[i].action())[0])
+            going = [i for i in active if stops[i] is None and not robots[i].insertion.finished]
+            for _ in range(len(active) - len(going)):
+                ended()
+            active = going
+        return stops
+
+    def _look(self, due: Sequence[tuple[InsertionEnvironment, ControlLoop]]) -> None:
+        """Begin a pass of the model for all whose frames are due."""
+        if not due or self.features is None:
+            return
+        taken = [robot.frames() for robot, _ in due]
+        frames = [{view: frame for view, (_, frame) in views.items()} for views in taken]
+        features, valid = self.features(frames, self.instruction)
+        rows = zip(features.numpy(), valid.numpy(), strict=True)
+        for (_, loop), views, (row, real) in zip(due, taken, rows, strict=True):
+            loop.see(SeenFeatures(row, real, max(time for time, _ in views.values())))
+
+    def _chunks(
+        self, loops: Sequence[ControlLoop], generators: Sequence[torch.Generator], off: str | None
+    ) -> NDArray[np.float32]:
+        """The head's chunks (loop, horizon, action) for robots that ask for one."""
+        if not loops:
+            return np.zeros((0, 0, 0), np.float32)
+        guides = [loop.executor.begin() for loop in loops]
+        fields = [loop.memory.observation() for loop in loops]
+        streams = {name: np.stack([own[name] for own in fields]) for name in fields[0]}
+        if off is not None:  # every value at its training mean, as in an evaluation
+            mean = getattr(self.checkpoint.normalization, off).mean.astype(np.float32)
+            streams[off] = np.broadcast_to(mean, streams[off].shape).copy()
+        observation = self.policy.observe(streams)
+        guide = stack_guides(guides, observation.features.device)
+        return self.policy.act(observation, generators, guide).cpu().numpy()
 
 
 def _episode(

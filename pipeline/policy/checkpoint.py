@@ -60,6 +60,8 @@ class PolicyCheckpoint:
     step: int
     weights: Mapping[str, "Tensor"]
     metrics: Mapping[str, float] = field(default_factory=dict)
+    instructions: tuple[str, ...] = ()
+    """What the store's episodes were told; empty where an earlier version wrote the checkpoint."""
 
     def policy(self, device: "torch.device | str" = "cpu") -> "Policy":
         """The policy with these weights, in evaluation mode; it knows its feature spec."""
@@ -85,6 +87,7 @@ class PolicyCheckpoint:
             "params": {"train_head": self.params.model_dump(mode="json")},
             "shape": asdict(self.shape),
             **self.source,
+            "instructions": list(self.instructions),
             "held_out_episodes": list(self.held_out_ticks),
             "held_out_ticks": {name: list(ticks) for name, ticks in self.held_out_ticks.items()},
             "held_out_content": dict(self.held_out_content),
@@ -157,6 +160,7 @@ def load_policy(folder: Path) -> PolicyCheckpoint:
             held_out_content=dict(document["held_out_content"]),
             step=document["step"],
             metrics=document["metrics"],
+            instructions=tuple(document.get("instructions", ())),
             weights=read_tensors(folder / WEIGHTS, document["weights_sha256"]),
         )
 

@@ -12,7 +12,7 @@ from pipeline.policy.denoiser import Denoiser
 from pipeline.policy.expert import ActionExpert, standard_normal, uniform
 from pipeline.policy.guidance import Guide, gain, pull
 from pipeline.policy.noise_schedule import NoiseSchedule, Prediction, ScheduleKind
-from pipeline.policy.tensors import Chunk, Context, Losses, StepMask
+from pipeline.policy.tensors import Chunk, Context, Generators, Losses, StepMask
 
 
 class DiffusionActionExpert(ActionExpert):
@@ -70,7 +70,7 @@ class DiffusionActionExpert(ActionExpert):
 
     @torch.no_grad()
     def act(
-        self, context: Context, generator: Generator | None = None, guide: Guide | None = None
+        self, context: Context, generator: Generators = None, guide: Guide | None = None
     ) -> Chunk:
         """A chunk drawn by the sampler, float32; from noise, the context and the generator.
 

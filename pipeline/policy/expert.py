@@ -11,7 +11,7 @@ from torch.nn import functional as F
 
 from pipeline.base.errors import ConfigError
 from pipeline.policy.guidance import Guide
-from pipeline.policy.tensors import Chunk, Context, Losses, StepMask
+from pipeline.policy.tensors import Chunk, Context, Generators, Losses, StepMask
 
 ErrorKind = Literal["smooth_l1", "mse"]
 
@@ -49,7 +49,7 @@ class ActionExpert(nn.Module, ABC):
 
     @abstractmethod
     def act(
-        self, context: Context, generator: Generator | None = None, guide: Guide | None = None
+        self, context: Context, generator: Generators = None, guide: Guide | None = None
     ) -> Chunk:
         """A chunk; the same for the same context, generator state and guide.
 
@@ -100,9 +100,12 @@ class GroupedLoss(nn.Module):
 
 
 def standard_normal(
-    shape: Sequence[int], device: torch.device, generator: Generator | None
+    shape: Sequence[int], device: torch.device, generator: Generators
 ) -> Float[Tensor, "..."]:
-    """Float32 noise on `device`, drawn where the generator is."""
+    """Float32 noise on `device`, drawn where the generator is; with several, a row of each."""
+    if isinstance(generator, Sequence):
+        rows = [standard_normal(shape[1:], device, own) for own in generator]
+        return torch.stack(rows).view(*shape)
     drawn_on = device if generator is None else generator.device
     return torch.randn(*shape, generator=generator, device=drawn_on).to(device)
 

@@ -10,7 +10,7 @@ from torch import Generator, Tensor, nn
 from pipeline.policy.denoiser import Denoiser
 from pipeline.policy.expert import ActionExpert, standard_normal, uniform
 from pipeline.policy.guidance import Guide, gain, pull
-from pipeline.policy.tensors import Chunk, Context, Losses, StepMask
+from pipeline.policy.tensors import Chunk, Context, Generators, Losses, StepMask
 
 Solver = Literal["euler", "midpoint", "rk4"]
 Velocity = Callable[[Tensor, float], Tensor]
@@ -113,7 +113,7 @@ class FlowMatchingActionExpert(ActionExpert):
 
     @torch.no_grad()
     def act(
-        self, context: Context, generator: Generator | None = None, guide: Guide | None = None
+        self, context: Context, generator: Generators = None, guide: Guide | None = None
     ) -> Chunk:
         """Where the flow takes a drawn noise, float32; with a guide, the flow so corrected."""
         shape = (len(context), self.horizon, self.action_dim)

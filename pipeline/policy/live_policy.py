@@ -12,7 +12,7 @@ from pipeline.base.observation import Observation
 from pipeline.policy.guidance import Guide
 from pipeline.policy.observation import LiveObservation, with_features
 from pipeline.policy.policy import Policy, Trainable
-from pipeline.policy.tensors import Chunk, Losses, StepMask
+from pipeline.policy.tensors import Chunk, Generators, Losses, StepMask
 
 Model = TypeVar("Model", bound=nn.Module)
 
@@ -87,7 +87,7 @@ class LivePolicy(Trainable, Generic[Model]):
         self,
         observation: Observation,
         samples: int = 1,
-        generator: torch.Generator | None = None,
+        generator: Generators = None,
         guide: Guide | None = None,
     ) -> Float[Tensor, "sample batch horizon action"]:
         """As `Policy.sample`, but never with dropout, whatever the mode; the model runs once.

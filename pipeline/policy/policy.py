@@ -26,7 +26,7 @@ from pipeline.policy.observation import (
     stream_of,
 )
 from pipeline.policy.regression import RegressionActionExpert
-from pipeline.policy.tensors import Chunk, Context, Losses, StepMask
+from pipeline.policy.tensors import Chunk, Context, Generators, Losses, StepMask
 from pipeline.policy.window_encoders import (
     ForceAwareSensorEncoder,
     RobotStateEncoder,
@@ -65,7 +65,7 @@ class Trainable(nn.Module, ABC):
         self,
         observation: Observation,
         samples: int = 1,
-        generator: Generator | None = None,
+        generator: Generators = None,
         guide: Guide | None = None,
     ) -> Float[Tensor, "sample batch horizon action"]:
         """Action chunks in physical units, float32; with a guide, in physical units too, chunks
@@ -74,7 +74,7 @@ class Trainable(nn.Module, ABC):
     def act(
         self,
         observation: Observation,
-        generator: Generator | None = None,
+        generator: Generators = None,
         guide: Guide | None = None,
     ) -> Chunk:
         """One sample: an action chunk in physical units, float32."""
@@ -191,7 +191,7 @@ class Policy(Trainable):
         self,
         observation: Observation,
         samples: int = 1,
-        generator: Generator | None = None,
+        generator: Generators = None,
         guide: Guide | None = None,
     ) -> Float[Tensor, "sample batch horizon action"]:
         """Action chunks in physical units, float32; call `eval()` first to silence dropout.

@@ -8,7 +8,7 @@ from torch import Generator, Tensor, nn
 from pipeline.policy.attention import TransformerLayer, learned
 from pipeline.policy.expert import ActionExpert
 from pipeline.policy.guidance import Guide
-from pipeline.policy.tensors import Chunk, Context, Losses, StepMask
+from pipeline.policy.tensors import Chunk, Context, Generators, Losses, StepMask
 
 
 class RegressionActionExpert(ActionExpert):
@@ -69,7 +69,7 @@ class RegressionActionExpert(ActionExpert):
         return self.grouped(self.predict(context), actions, valid)
 
     def act(
-        self, context: Context, generator: Generator | None = None, guide: Guide | None = None
+        self, context: Context, generator: Generators = None, guide: Guide | None = None
     ) -> Chunk:
         """`predict(context)`; `generator` is not needed, and there is nothing to guide."""
         assert guide is None, "an expert that draws nothing cannot be guided"

@@ -1,7 +1,9 @@
 """The tensors that the parts of a policy hand on, by name."""
 
+from collections.abc import Sequence
+
 from jaxtyping import Bool, Float
-from torch import Tensor
+from torch import Generator, Tensor
 
 Context = Float[Tensor, "batch token dim"]
 """What an action expert attends to."""
@@ -17,3 +19,6 @@ StepMask = Bool[Tensor, "batch horizon"]
 
 Losses = tuple[Float[Tensor, ""], dict[str, Tensor]]
 """The scalar to minimise, and its detached parts by name."""
+
+Generators = Generator | Sequence[Generator] | None
+"""What draws a batch: one generator for all of it, one a sample, or the device's own."""

@@ -38,8 +38,9 @@ class RobotMemory:
     """What a policy with windows of these sizes remembers of one robot."""
 
     def __init__(self, sensor: tuple[int, int], state: tuple[int, int]) -> None:
-        """`sensor` and `state` are (readings, channels) of the windows."""
-        self._windows = {"sensor": ReadingWindow(*sensor), "state": ReadingWindow(*state)}
+        """`sensor` and `state` are (readings, channels) of the windows; without channels none."""
+        sizes = {"sensor": sensor, "state": state}
+        self._windows = {name: ReadingWindow(*size) for name, size in sizes.items() if size[1]}
         self.features: SeenFeatures | None = None
         self.time_s = 0.0
 

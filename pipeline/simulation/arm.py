@@ -89,9 +89,9 @@ def euler_actions(poses: NDArray[np.float64]) -> NDArray[np.float32]:
 LAG_S: Final = 0.04
 """Time constant with which the arm follows its controller's reference."""
 _SPEED: Final = np.array([12.0, 30.0])
-"""Limits of translation, mm/s, and of each angle, deg/s."""
+"""Limits of the reference's translation, mm/s, and of each angle, deg/s."""
 _ACCELERATION: Final = np.array([120.0, 300.0])
-"""Limits of the same, mm/s² and deg/s²."""
+"""Limits of how its velocity changes from tick to tick, mm/s² and deg/s²."""
 
 
 @dataclass(frozen=True)

@@ -18,10 +18,11 @@ from pipeline.simulation.insertion import (
     STATE_HZ,
     TICK_HZ,
     TICK_S,
+    TIME_IS_UP,
     NeedleInsertion,
 )
 from pipeline.simulation.needle_sensor import READING_HZ
-from pipeline.simulation.recorder import CAMERA_HZ, CAMERA_JITTER_S
+from pipeline.simulation.recorder import CAMERA_HZ, CAMERA_JITTER_S, LOST_FRAMES
 from pipeline.simulation.rendering import HEIGHT, VIEWS, WIDTH, photograph, through_jpeg
 
 _LARGEST_ACTION: Final = 5.0
@@ -80,6 +81,7 @@ class InsertionEnvironment(gymnasium.Env[Any, NDArray[np.floating[Any]]]):
         begun = clock.uniform(-TICK_S, 0, (len(VIEWS), 1))
         jitter = CAMERA_JITTER_S * clock.standard_normal(shape)
         self._shots = np.maximum(begun + np.arange(shape[1]) / CAMERA_HZ + jitter, 0.0)
+        self._shots[:, 2:][clock.random((len(VIEWS), MAX_TICKS)) < LOST_FRAMES] = np.inf
         return self.readings(), self._info()
 
     def step(
@@ -88,7 +90,7 @@ class InsertionEnvironment(gymnasium.Env[Any, NDArray[np.floating[Any]]]):
         """Carry out one tick of 0.1 s."""
         self.insertion.step(action.astype(np.float64))
         info, ended = self._info(), self.insertion.finished
-        late = ended and len(self.insertion.knots) > MAX_TICKS
+        late = ended and str(self.insertion.outcome).startswith(TIME_IS_UP)
         return self.readings(), float(info["success"]), ended and not late, late, info
 
     def readings(self) -> Readings:
@@ -119,7 +121,7 @@ class InsertionEnvironment(gymnasium.Env[Any, NDArray[np.floating[Any]]]):
 
     def _frame_times(self) -> Mapping[str, float]:
         now = self.insertion.time_s + 1e-9
-        newest = [shots[shots <= now][-1] for shots in self._shots]
+        newest = [shots[shots <= now].max() for shots in self._shots]
         return dict(zip(VIEWS, map(float, newest), strict=True))
 
     def _info(self) -> dict[str, Any]:

@@ -18,7 +18,8 @@ f = k1·u + k2·u² for an indentation u, until it is punctured at a set force; 
 springs back around the needle, and f = cutting + friction·depth, as in A. M. Okamura, C. Simone,
 M. D. O'Leary, "Force modeling for needle insertion into soft tissue", IEEE TBME 51(10), 2004.
 A needle inside is held where it entered: pulled sideways it meets a spring, which also presses it
-against its channel and so adds friction along it. No more pushes then; bending is not modelled.
+against its channel and so adds friction along it. Pushes that are due while the needle is near or
+inside do not happen; bending is not modelled.
 
 Between ticks target and surface move in straight lines. Units: mm, degrees, N, s. `bench` frame:
 the base frame moved sideways to the bench.
@@ -91,11 +92,10 @@ class InsertionObservation:
     """What a policy may see at the end of a tick.
 
     `state` (10, 12) and `sensor` (65, 1026) are the readings of the tick that ends at `time_s`;
-    `scene` is for `rendering.render`.
+    `rendering.photograph` gives what cameras see.
     """
 
     time_s: float
-    scene: Scene
     state: NDArray[np.float32]
     sensor: NDArray[np.float32]
 
@@ -122,7 +122,7 @@ class Progress:
     """How an episode goes: what success and failure are told by."""
 
     puncture_mm: NDArray[np.float64] | None = None
-    """(2,) from the target to the tip, sideways, when the surface was first punctured."""
+    """(2,) from the target to the tip, sideways, when the surface was last punctured."""
     overshoot_mm: float = 0.0
     max_force_n: float = 0.0
     held_ticks: int = 0
@@ -178,7 +178,7 @@ class NeedleInsertion:
     def __init__(self, action_rotation: ActionRotation = "rotvec") -> None:
         self.action_rotation: ActionRotation = action_rotation
 
-    def reset(self, seed: int, level: Level = "moved") -> InsertionObservation:
+    def reset(self, seed: int, level: Level = "full") -> InsertionObservation:
         """The first observation of the episode that this seed draws."""
         return self.start(draw_layout(seed, level))
 
@@ -213,8 +213,11 @@ class NeedleInsertion:
     def step(self, action: NDArray[np.float64]) -> InsertionObservation:
         """Carry out one tick: dx dy dz (mm, base frame), rotation (deg), gripper (ignored).
 
-        It is added to the commanded setpoint, which the arm follows.
+        It is added to the commanded setpoint, which the arm follows. Raises `ValueError` for an
+        action that is not seven finite numbers.
         """
+        if np.shape(action) != (7,) or not np.isfinite(action).all():
+            raise ValueError(f"action: expected 7 finite numbers, found {action}")
         now = self.knots[-1]
         self.setpoint = moved(self.setpoint, np.asarray(action, np.float64), self.action_rotation)
         motion = now.motion.towards(self.setpoint, TICK_S)
@@ -244,7 +247,6 @@ class NeedleInsertion:
         noise = ENCODER_NOISE * rng.standard_normal(state.shape)
         return InsertionObservation(
             time_s=self.time_s,
-            scene=self.scene(self.time_s),
             state=(state + noise).astype(np.float32),
             sensor=self._sensor.read(self.contact, self.time_s - TICK_S, rng),
         )
@@ -254,10 +256,8 @@ class NeedleInsertion:
         motions = [knot.motion for knot in self.knots[1:]]
         at = np.clip(time_s * TICK_HZ, 0, len(motions))
         tick = np.minimum(at.astype(np.int64), len(motions) - 1)
-        path = ArmMotion(
-            *(np.stack([getattr(motion, name) for motion in motions])[tick] for name in _MOTION)
-        )
-        return path.at((at - tick) * TICK_S)
+        fields = [[motion.pose, motion.reference, motion.velocity] for motion in motions]
+        return ArmMotion(*np.stack(fields, axis=1)[:, tick]).at((at - tick) * TICK_S)
 
     def scene(self, time_s: float) -> Scene:
         """What the cameras see at a time of the episode so far."""
@@ -341,9 +341,8 @@ class NeedleInsertion:
         if inside.any() and not self.inside:
             entered = int(inside.argmax())
             self._entry_mm = path[entered, :2]
-            if self.progress.puncture_mm is None:
-                target = before.target_mm + part[entered] * (target_mm - before.target_mm)
-                self.progress.puncture_mm = self._entry_mm - self.layout.bench_mm - target
+            target = before.target_mm + part[entered] * (target_mm - before.target_mm)
+            self.progress.puncture_mm = self._entry_mm - self.layout.bench_mm - target
         self.inside = bool(inside[-1])
         held = np.where(inside, np.clip(depth, 0, 1), 0) * _SIDEWAYS_N_MM
         sideways = held * np.hypot(*(path[:, :2] - self._entry_mm).T)
@@ -357,6 +356,3 @@ class NeedleInsertion:
         )
         self._force_n = np.hypot(contact.force_n, sideways)
         return contact, path
-
-
-_MOTION: Final = ("pose", "reference", "velocity")

@@ -71,7 +71,7 @@ class InsertionLayout:
         return height * math.sin(2 * math.pi * rate_hz * time_s + phase)
 
 
-def draw_layout(seed: int, level: Level = "moved", crosses_180: bool = False) -> InsertionLayout:
+def draw_layout(seed: int, level: Level = "full", crosses_180: bool = False) -> InsertionLayout:
     """The episode of a seed; with `crosses_180` its angle r passes ±180° on the way upright."""
     bench, lateral, depth, hand, look, breath = (np.random.default_rng([seed, i]) for i in range(6))
     bench_mm = NOMINAL_POSE[:2] + bench.uniform(-15, 15, 2)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pipeline.simulation.arm import robot_state
 from pipeline.simulation.insertion import ENCODER_NOISE, INSERTED, STATE_HZ, NeedleInsertion
-from pipeline.simulation.layout import draw_layout
+from pipeline.simulation.layout import WORKSPACE_MM, InsertionLayout, draw_layout
 from pipeline.simulation.needle_sensor import READING_HZ
 from pipeline.simulation.rendering import photograph
 
@@ -23,14 +23,13 @@ CAMERA_HZ: Final = 10
 
 _LATE_S: Final = 0.08
 _ROBOT_JITTER_S, _SENSOR_JITTER_S, CAMERA_JITTER_S = 4e-4, 8e-5, 3e-3
-_LOST_FRAMES = 0.01
+LOST_FRAMES = 0.01
 _START_MM = (1.8, 5.0)
 """Heights that demonstrations begin at: some lower than a rollout does."""
 _NOISE_MM, _NOISE_DEG = 0.02, 0.02
 """Of every tick's motion, in every direction."""
-_NUDGE_SHARE, _NUDGE_TICKS, _NUDGE_MM, _NUDGE_ABOVE_MM = 0.05, 3, (0.2, 0.5), 0.8
-"""Share of ticks at which a nudge begins; its ticks, its length a tick, and how clear of the tissue
-the needle must be."""
+_NUDGES, _NUDGE_MM = 4, (0.3, 1.2)
+"""Of the phantom in a demonstration, beside its pushes, and how far each moves the target."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +71,7 @@ class SimulatedEpisode:
         late = self.rng.uniform(0, _LATE_S) if late_s is None else late_s
         frames = np.arange((self.duration_s - late) * CAMERA_HZ)
         times = _jittered(self.epoch_s + late + frames / CAMERA_HZ, CAMERA_JITTER_S, self.rng)
-        kept = self.rng.random(len(times)) >= _LOST_FRAMES
+        kept = self.rng.random(len(times)) >= LOST_FRAMES
         times[0], kept[0] = self.epoch_s + late, True
         return np.round(times[kept], 3)
 
@@ -95,19 +94,20 @@ class SimulatedEpisode:
 def simulate_episode(seed: int, epoch_s: float, crosses_180: bool = False) -> SimulatedEpisode:
     """A demonstration that succeeds, of this seed or the next that does.
 
-    It is disturbed while the demonstrator corrects, so that recoveries are in the data, as in
-    Laskey et al. 2017, "DART: Noise Injection for Robust Imitation Learning": a little in every
-    tick, and now and then by a nudge. Same arguments, same episode.
+    The demonstrator is disturbed while it corrects, so that recoveries are in the data, as in
+    Laskey et al. 2017, "DART: Noise Injection for Robust Imitation Learning". Actions come from
+    poses, so what disturbs the arm is in the labels: a little noise in every tick, of mean 0.
+    Larger misses come from nudges of the phantom, which leave the labels clean. Same arguments,
+    same episode.
     """
-    insertion = NeedleInsertion()
-    layout, rng = draw_layout(seed, "moved", crosses_180), np.random.default_rng([seed, 202])
-    start = layout.start_pose.copy()
-    start[2] = layout.surfaces_mm[0] + rng.uniform(*_START_MM)
-    readings = [insertion.start(replace(layout, start_pose=start)).sensor]
-    disturbances = _disturbances(insertion, rng)
+    insertion, rng = NeedleInsertion(), np.random.default_rng([seed, 202])
+    layout = _nudged(draw_layout(seed, "moved", crosses_180), rng)
+    readings = [insertion.start(layout).sensor]
     while not insertion.finished:
         action = insertion.expert_action()
-        action[:6] += next(disturbances)
+        noise = rng.standard_normal(6) * np.repeat([_NOISE_MM, _NOISE_DEG], 3)
+        noise[:2] *= not insertion.inside
+        action[:6] += noise
         readings.append(insertion.step(action).sensor)
     if insertion.outcome != INSERTED:
         return simulate_episode(seed + 1, epoch_s, crosses_180)
@@ -115,22 +115,27 @@ def simulate_episode(seed: int, epoch_s: float, crosses_180: bool = False) -> Si
     return SimulatedEpisode(insertion, np.concatenate(readings), epoch_s, rng)
 
 
-def _disturbances(
-    insertion: NeedleInsertion, rng: np.random.Generator
-) -> Iterator[NDArray[np.float64]]:
-    """What is added to the motion (6,) of each tick; sideways only while the needle is outside."""
-    nudge, ticks = np.zeros(3), 0
-    while True:
-        clear = insertion.contact.distance_mm[-1] > _NUDGE_ABOVE_MM
-        if not ticks and clear and rng.random() < _NUDGE_SHARE:
-            nudge, ticks = rng.standard_normal(3) * [1.0, 1.0, 0.3], _NUDGE_TICKS
-            nudge *= rng.uniform(*_NUDGE_MM) / np.linalg.norm(nudge)
-        noise = rng.standard_normal(6) * np.repeat([_NOISE_MM, _NOISE_DEG], 3)
-        if ticks and clear:
-            noise[:3] += nudge
-        ticks = max(0, ticks - 1)
-        noise[:2] *= not insertion.inside
-        yield noise
+def _nudged(layout: InsertionLayout, rng: np.random.Generator) -> InsertionLayout:
+    """The layout with nudges among its pushes, and with another height to begin at."""
+    start = layout.start_pose.copy()
+    start[2] = layout.surfaces_mm[0] + rng.uniform(*_START_MM)
+    pushes = layout.push_times_s.tolist()
+    times = sorted([*pushes, *rng.uniform(0.4, 5.0, _NUDGES)])
+    targets, surfaces, place = [layout.targets_mm[0]], [layout.surfaces_mm[0]], 0
+    for time in times:
+        place += time in pushes
+        angle, far = rng.uniform(0, 2 * np.pi), rng.uniform(*_NUDGE_MM)
+        nudged = targets[-1] + far * np.array([np.cos(angle), np.sin(angle)])
+        nudged = np.clip(nudged, -WORKSPACE_MM, WORKSPACE_MM)
+        targets.append(layout.targets_mm[place] if time in pushes else nudged)
+        surfaces.append(layout.surfaces_mm[place])
+    return replace(
+        layout,
+        start_pose=start,
+        targets_mm=np.stack(targets),
+        surfaces_mm=np.array(surfaces),
+        push_times_s=np.array(times),
+    )
 
 
 def _jittered(

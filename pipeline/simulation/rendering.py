@@ -66,9 +66,10 @@ def photograph(view: str, insertion: NeedleInsertion, time_s: float) -> NDArray[
     The same episode, view and time give the same bits.
     """
     image = render(view, insertion.scene(time_s))
-    seed = [insertion.layout.seed, 104, VIEWS.index(view), round(time_s * 1e4)]
+    # A recording's clock in whole milliseconds may begin a little before the episode.
+    seed = [insertion.layout.seed, 104, VIEWS.index(view), max(0, round(time_s * 1e4))]
     noise = np.random.default_rng(seed).standard_normal(image.shape, np.float32)
-    return np.clip(image + _NOISE * noise, 0, 255).astype(np.uint8)
+    return np.clip(np.rint(image + _NOISE * noise), 0, 255).astype(np.uint8)
 
 
 def through_jpeg(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

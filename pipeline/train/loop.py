@@ -339,6 +339,7 @@ class Trainer:
             shape=self.shape,
             normalization=self.normalization,
             source=source_of(self.store),
+            instructions=tuple(sorted({episode.instruction for episode in self.store.episodes})),
             held_out_ticks=ranges,
             held_out_content=held_out_contents(self.store, ranges),
             step=self.step,

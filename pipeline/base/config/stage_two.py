@@ -181,7 +181,7 @@ class RolloutParams(Section):
     anywhere. moved: besides, target and tissue are pushed meanwhile."""
     episodes: int = Field(default=50, ge=1)
     """Episodes of each controller."""
-    seed: Seed = 1_000_000
+    seed: int = Field(default=1_000_000, ge=0, lt=2**53)
     """Of the first episode; those that follow have the seeds that follow."""
     execute: int = Field(default=1, ge=1)
     """Steps of a chunk that are carried out before the head is asked for the next."""
@@ -190,7 +190,8 @@ class RolloutParams(Section):
     (temporal ensembling). rtc: each chunk is drawn to continue the last (real-time chunking), for
     experts that sample."""
     latency_ms: float = Field(default=0.0, ge=0)
-    """What a pass of the model takes, in simulated time: its features are so much older."""
+    """What a pass of the model takes, in simulated time: its features are so much older. The head
+    answers at once."""
     ablations: bool = True
     """Also run the policy without the sensor, and without features."""
     device: str = "auto"
