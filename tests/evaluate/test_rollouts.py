@@ -10,12 +10,14 @@ import torch
 from pipeline.base.config import RolloutParams, TrainHeadParams
 from pipeline.base.errors import CheckpointMismatch, ConfigError
 from pipeline.compat.unified import no_normalization
-from pipeline.evaluate.rollouts import LivePart, RolloutEpisode, Rollouts, SuccessRate, roll_out
+from pipeline.evaluate.rollouts import RolloutEpisode, Rollouts, SuccessRate, roll_out
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.observation import PolicyShape
 from pipeline.policy.policy import Policy
+from pipeline.simulation.environment import InsertionEnvironment
 from pipeline.simulation.insertion import MAX_TICKS, NeedleInsertion
-from pipeline.simulation.rendering import VIEWS
+from pipeline.simulation.insertion_formats import INSTRUCTION
+from pipeline.simulation.rendering import VIEWS, photograph
 
 SLOTS, DIM = 2, 4
 ACTION = {
@@ -32,13 +34,15 @@ SOURCE = {
 
 
 class Glance:
-    """Stands for the model: features that are the means of the frames; counts its passes."""
+    """Stands for the model: features that are the means of the frames; remembers its passes."""
 
     def __init__(self) -> None:
-        self.passes: list[int] = []
+        self.passes: list[list[dict[str, Any]]] = []
+        self.instructions: set[str] = set()
 
     def __call__(self, frames: list[dict[str, Any]], instruction: str) -> Any:
-        self.passes.append(len(frames))
+        self.passes.append(frames)
+        self.instructions.add(instruction)
         means = [[frame[..., channel].mean() / 255 for channel in range(3)] for views in frames
                  for frame in list(views.values())[:SLOTS]]  # fmt: skip
         features = torch.zeros(len(frames), SLOTS, DIM)
@@ -46,8 +50,8 @@ class Glance:
         return features, torch.ones(len(frames), SLOTS, dtype=torch.bool)
 
 
-def made(model_type: str = "regression", **changed: Any) -> tuple[PolicyCheckpoint, LivePart]:
-    """A policy of few random weights, and what a rollout runs of it."""
+def made(model_type: str = "regression", **changed: Any) -> tuple[PolicyCheckpoint, Policy, Glance]:
+    """A policy of few random weights, its checkpoint, and what stands for its model."""
     params = TrainHeadParams.model_validate(
         {
             "model_type": model_type,
@@ -71,25 +75,26 @@ def made(model_type: str = "regression", **changed: Any) -> tuple[PolicyCheckpoi
     policy = Policy(params, shape, normal).eval()
     held = {"held_out_ticks": {}, "held_out_content": {}, "step": 1, "weights": {}}
     checkpoint = PolicyCheckpoint(params, shape, normal, SOURCE, **held)
-    features: Any = Glance()
-    return checkpoint, LivePart(policy, features, 3, normal)
+    return checkpoint, policy, Glance()
 
 
 def wanted(**changed: Any) -> RolloutParams:
     return RolloutParams.model_validate({"episodes": 3, "seed": 77} | changed)
 
 
+def rolled(parts: tuple[PolicyCheckpoint, Policy, Glance], **changed: Any) -> Rollouts:
+    checkpoint, policy, glance = parts
+    load: Any = lambda: glance  # noqa: E731
+    return roll_out(checkpoint, "models/head", policy, load, wanted(**changed))
+
+
 def figures(rollouts: Rollouts) -> list[Any]:
-    return [rollouts.document(), rollouts.table().csv()]
+    return [rollouts.document()["success"], *(rollouts.table(kind).csv() for kind in (True, False))]
 
 
 @pytest.fixture(scope="module")
 def rollouts() -> Rollouts:
-    return roll_out(*parts(made()), wanted())
-
-
-def parts(pair: tuple[PolicyCheckpoint, LivePart]) -> tuple[PolicyCheckpoint, str, LivePart]:
-    return pair[0], "models/head", pair[1]
+    return rolled(made())
 
 
 def test_every_controller_meets_the_same_episodes(rollouts: Rollouts) -> None:
@@ -110,30 +115,106 @@ def test_every_controller_meets_the_same_episodes(rollouts: Rollouts) -> None:
 @pytest.mark.parametrize("model_type", ["regression", "flow_matching", "diffusion"])
 @pytest.mark.parametrize("chunking", ["none", "temporal", "rtc"])
 def test_same_seeds_same_figures(model_type: str, chunking: str) -> None:
-    settings = wanted(chunking=chunking, execute=2, ablations=False, episodes=2)
+    settings = {"chunking": chunking, "execute": 2, "ablations": False, "episodes": 2}
     if chunking == "rtc" and model_type == "regression":
         with pytest.raises(ConfigError, match=r"rollout\.chunking"):
-            roll_out(*parts(made(model_type)), settings)
+            rolled(made(model_type), **settings)
         return
-    first, again = (roll_out(*parts(made(model_type)), settings) for _ in range(2))
+    first, again = (rolled(made(model_type), **settings) for _ in range(2))
     assert figures(first) == figures(again)
-    elsewhere = roll_out(*parts(made(model_type)), wanted(seed=500, episodes=2, ablations=False))
-    assert figures(first)[1] != figures(elsewhere)[1]
+    assert figures(first)[1] != figures(rolled(made(model_type), **settings, seed=500))[1]
 
 
-def test_robots_share_a_pass_of_the_model_and_old_features_change_what_is_done() -> None:
-    checkpoint, live = made()
-    fresh = roll_out(checkpoint, "x", live, wanted(ablations=False))
-    assert isinstance(live.features, Glance) and live.features.passes[0] == 3
+@pytest.mark.parametrize("chunking", ["none", "rtc"])
+def test_an_episode_is_the_same_alone_as_among_others(chunking: str) -> None:
+    """So that one that failed can be looked at again by its seed."""
+    settings = {"chunking": chunking, "execute": 2, "ablations": False}
+    among = rolled(made("flow_matching"), **settings, episodes=3)
+    alone = rolled(made("flow_matching"), **settings, episodes=1, seed=78)
+    there, here = among.of("policy")[1], alone.of("policy")[0]
+    assert (there.seed, there.ticks, there.reason) == (here.seed, here.ticks, here.reason)
+    np.testing.assert_allclose(there.trace.offset_mm, here.trace.offset_mm, atol=1e-3)
+
+
+def test_real_time_chunking_gives_the_policy_what_is_left_of_its_plan(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    parts = made("flow_matching")
+    act, guides, chunks = parts[1].act, [], []
+
+    def watched(observation: Any, generators: Any, guide: Any) -> torch.Tensor:
+        guides.append(guide)
+        chunks.append(act(observation, generators, guide))
+        return chunks[-1]
+
+    monkeypatch.setattr(parts[1], "act", watched)
+    rolled(parts, chunking="rtc", execute=2, ablations=False, episodes=1)
+    assert guides[0] is None and len(guides) > 3
+    for guide, before in zip(guides[1:], chunks, strict=False):
+        torch.testing.assert_close(guide.chunk[:, :2], before[:, 2:])
+        assert (guide.weight[:, :2] > 0).all() and not guide.weight[:, 2:].any()
+
+
+def test_robots_share_a_pass_of_the_model_and_are_told_the_task() -> None:
+    parts = made()
+    fresh = rolled(parts, ablations=False)
+    glance = parts[2]
+    assert len(glance.passes[0]) == 3
     longest = max(episode.ticks for episode in fresh.of("policy"))
-    assert len(live.features.passes) == -(-(longest - 1) // 3)
-    late = roll_out(*parts(made()), wanted(ablations=False, latency_ms=400))
-    assert figures(fresh)[1] != figures(late)[1]
+    assert len(glance.passes) == -(-(longest - 1) // 3)
+    assert glance.instructions == {INSTRUCTION}
+    # What the model sees has been through the recorder's JPEG.
+    robot = InsertionEnvironment("full", cameras=False)
+    robot.reset(seed=77)
+    for view, (time, frame) in robot.frames().items():
+        np.testing.assert_array_equal(glance.passes[0][0][view], frame)
+        assert not np.array_equal(frame, photograph(view, robot.insertion, time))
+
+
+def test_what_the_policy_sees_is_as_old_as_it_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    for latency in (0, 400):
+        parts = made()
+        ages, observe = [], parts[1].observe
+
+        def watched(streams: Any, observe: Any = observe, ages: Any = ages) -> Any:
+            ages.append(float(streams["feature_age"][0]))
+            return observe(streams)
+
+        monkeypatch.setattr(parts[1], "observe", watched)
+        rolled(parts, ablations=False, episodes=1, latency_ms=latency)
+        # Cameras run at 10 Hz, passes begin every third tick or when the model is free.
+        assert latency / 1000 < min(ages) and max(ages) < latency / 1000 + 0.33 + latency / 1000
+        assert np.ptp(ages) > 0.15
+
+
+@pytest.mark.parametrize("stream", ["sensor", "features"])
+def test_a_stream_that_is_off_says_nothing(stream: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    checkpoint, policy, glance = made()
+    normal = checkpoint.normalization
+    spread = {
+        name: replace(getattr(normal, name), mean=np.full(shape, 0.25))
+        for name, shape in policy.shape.channels.items()
+        if name in ("sensor", "features")
+    }
+    checkpoint = replace(checkpoint, normalization=replace(normal, **spread))
+    given, observe = [], policy.observe
+
+    def watched(streams: Any) -> Any:
+        given.append({name: np.array(value) for name, value in streams.items()})
+        return observe(streams)
+
+    monkeypatch.setattr(policy, "observe", watched)
+    rolled((checkpoint, policy, glance), episodes=1)
+    other = {"sensor": "features", "features": "sensor"}[stream]
+    silent = [seen for seen in given if (seen[stream] == 0.25).all()]
+    assert len(silent) > 5
+    assert not any((seen[other] == 0.25).all() for seen in silent)
+    assert len({tuple(seen["feature_age"]) for seen in silent}) > 3
 
 
 def test_an_action_that_is_no_number_stops_its_robot_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    checkpoint, live = made()
-    act, calls = live.policy.act, []
+    parts = made()
+    act, calls = parts[1].act, []
 
     def broken(*arguments: Any) -> torch.Tensor:
         chunks = act(*arguments).clone()
@@ -142,13 +223,35 @@ def test_an_action_that_is_no_number_stops_its_robot_alone(monkeypatch: pytest.M
             chunks[1, 0, 0] = np.nan
         return chunks
 
-    monkeypatch.setattr(live.policy, "act", broken)
-    rollouts = roll_out(checkpoint, "x", live, wanted(ablations=False))
+    monkeypatch.setattr(parts[1], "act", broken)
+    rollouts = rolled(parts, ablations=False)
     reasons = [episode.reason for episode in rollouts.of("policy")]
     assert reasons[1] == "safe stop: the policy's action is not a number"
     assert not any(reason.startswith("safe stop") for reason in (reasons[0], reasons[2]))
     assert [episode.ticks for episode in rollouts.of("policy")][1] == 4
     assert calls[3:5] == [3, 2]
+
+
+@pytest.mark.parametrize("lacking", ["sensor", "state"])
+def test_a_policy_without_a_stream_runs(lacking: str) -> None:
+    """One whose store lacks it, so that it has no channels."""
+    checkpoint, _, glance = made()
+    field = {"sensor": "sensor_channels", "state": "state_dim"}[lacking]
+    shape = replace(checkpoint.shape, **{field: 0})
+    normal = replace(checkpoint.normalization, **{lacking: None})
+    policy = Policy(checkpoint.params, shape, normal).eval()
+    without = replace(checkpoint, shape=shape, normalization=normal)
+    assert len(rolled((without, policy, glance), episodes=1).of("policy")) == 1
+
+
+def test_instructions_are_those_that_the_policy_was_trained_on() -> None:
+    checkpoint, policy, glance = made()
+    told = replace(checkpoint, instructions=("Go there",))
+    rollouts = rolled((told, policy, glance), episodes=1, ablations=False)
+    assert glance.instructions == {"Go there"} == {rollouts.settings["instruction"]}
+    several = replace(checkpoint, instructions=("Go there", "Stay"))
+    with pytest.raises(ConfigError, match="'Go there', 'Stay'"):
+        rolled((several, policy, glance), episodes=1)
 
 
 @pytest.mark.parametrize(
@@ -160,10 +263,11 @@ def test_an_action_that_is_no_number_stops_its_robot_alone(monkeypatch: pytest.M
     ],
 )
 def test_a_policy_of_another_robot_is_refused(source: dict[str, Any], said: str) -> None:
-    checkpoint, live = made()
+    checkpoint, policy, glance = made()
     other = replace(checkpoint, source=SOURCE | source)
     with pytest.raises(CheckpointMismatch, match=said):
-        roll_out(other, "x", live, wanted())
+        rolled((other, policy, glance))
+    assert not glance.passes
 
 
 def test_intervals_are_wilsons(rollouts: Rollouts) -> None:
@@ -184,9 +288,11 @@ def test_intervals_are_wilsons(rollouts: Rollouts) -> None:
 
 
 def test_metrics_and_table_say_the_same(rollouts: Rollouts) -> None:
-    document, lines = rollouts.document(), rollouts.table().csv().splitlines()
+    document = rollouts.document()
     assert document["success"] == document["levels"]["full"]
     assert document["success"]["expert"]["rate"] == 1.0
-    assert len(lines) == 1 + 4 * 3
-    assert lines[0].startswith("controller,seed,level,success,reason,lateral_mm,depth_mm,")
-    assert lines[0].endswith(",overshoot_mm,max_force_n,time_s,ticks")
+    lines = rollouts.table(policy=True).csv().splitlines()
+    assert lines[0].startswith("seed,level,success,reason,lateral_mm,depth_mm,overshoot_mm,")
+    assert lines[0].endswith(",max_force_n,time_s,ticks") and len(lines) == 1 + 3
+    beside = rollouts.table(policy=False).csv().splitlines()
+    assert beside[0] == f"controller,{lines[0]}" and len(beside) == 1 + 3 * 3

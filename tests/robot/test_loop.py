@@ -21,9 +21,14 @@ def seen(time_s: float) -> SeenFeatures:
     return SeenFeatures(np.full((1, 3), time_s, np.float32), np.ones(1, np.bool_), time_s)
 
 
+def chunk_of(tick: int) -> np.ndarray:
+    """A chunk whose steps say the tick that they are for."""
+    return np.repeat(tick + np.arange(HORIZON, dtype=np.float32)[:, None], ACTION, axis=1)
+
+
 def run(loop: ControlLoop, ticks: int) -> list[tuple[bool, bool, float | None, float]]:
     """Of every tick: whether a pass began, whether a chunk was asked for, the features' age, the
-    first channel of the action, which says the tick that it was planned at."""
+    first channel of the action, which says the tick that it is meant for."""
     log = []
     for tick in range(ticks):
         now = 0.1 * (tick + 1)
@@ -32,7 +37,7 @@ def run(loop: ControlLoop, ticks: int) -> list[tuple[bool, bool, float | None, f
             loop.see(seen(now - 0.02))
         if asked := loop.chunk_due:
             loop.executor.begin()
-            loop.plan(np.full((HORIZON, ACTION), tick + 1, np.float32))
+            loop.plan(chunk_of(tick + 1))
         age = loop.memory.observation().get("feature_age")
         log.append((began, asked, None if age is None else float(age), float(loop.action()[0])))
     return log
@@ -49,7 +54,7 @@ def test_the_model_is_asked_every_third_tick_and_the_head_every_tick() -> None:
 def test_a_chunk_is_played_for_as_many_steps_as_are_executed() -> None:
     log = run(make_loop(execute=3), 7)
     assert [asked for _, asked, *_ in log] == [True, False, False] * 2 + [True]
-    assert [action for *_, action in log] == [1, 1, 1, 4, 4, 4, 7]
+    assert [action for *_, action in log] == [1, 2, 3, 4, 5, 6, 7]
 
 
 def test_a_slow_model_is_asked_again_when_it_is_free_and_its_features_are_as_old_as_they_are() -> (
@@ -70,6 +75,26 @@ def test_a_robot_stands_still_until_the_first_features_are_there() -> None:
     assert [action for *_, action in log] == [0, 0, 0, 4, 5, 6]
     blind = run(make_loop(latency_s=0.25, uses_features=False), 2)
     assert blind == [(False, True, None, 1.0), (False, True, None, 2.0)]
+
+
+def test_steps_played_while_a_chunk_is_computed_are_skipped_and_no_others() -> None:
+    """A head that takes two ticks, after a first chunk that took as long and played nothing."""
+    loop = make_loop(execute=2, uses_features=False)
+    loop.sense({"time": np.array([0.1])})
+    loop.executor.begin()
+    loop.sense({"time": np.array([0.3])})  # the warm-up: time goes by, no step is played
+    loop.plan(chunk_of(1))
+    played, asked = [], None
+    for tick in range(1, 12):
+        loop.sense({"time": np.array([0.1 * tick + 0.3])})
+        if asked is not None and tick - asked == 2:
+            loop.plan(chunk_of(asked))
+            asked = None
+        if asked is None and loop.chunk_due:
+            loop.executor.begin()
+            asked = tick
+        played.append(float(loop.action()[0]))
+    assert played == list(range(1, 12))
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])

@@ -22,6 +22,13 @@ def test_a_window_holds_the_newest_readings_at_its_end(size: int, counts: list[i
         buffer = window.values
 
 
+def test_a_stream_that_the_policy_has_not_is_passed_over() -> None:
+    memory = RobotMemory((3, 0), (2, 1))
+    readings = {"sensor": np.ones((2, 1026), np.float32), "state": np.ones((2, 1), np.float32)}
+    memory.sense({"time": np.array([0.1]), **readings})
+    assert memory.observation().keys() == {"state", "state_valid"}
+
+
 def test_an_observation_is_a_copy_with_the_true_age() -> None:
     memory = RobotMemory((3, 2), (2, 1))
     memory.sense({"time": np.array([0.1]), "sensor": np.ones((2, 2), np.float32)})

@@ -56,12 +56,12 @@ def test_it_writes_metrics_table_and_page_the_same_every_time(
         assert run("", rollout.main, arguments(trained, output=tmp_path / output)) == 0
         said = capsys.readouterr().out
         assert "expert" in said and "100%" in said
-    for name in ("metrics.json", "episodes.csv", "report.html"):
+    for name in ("metrics.json", "episodes.csv", "beside.csv", "report.html"):
         assert (tmp_path / "first" / name).read_bytes() == (tmp_path / "second" / name).read_bytes()
     success = json.loads((tmp_path / "first" / "metrics.json").read_text())["success"]
     assert success["expert"] | {"rate": 1.0, "episodes": 2} == success["expert"]
     assert set(success) == {"policy", "sensor off", "features off", "expert"}
-    assert len((tmp_path / "first" / "episodes.csv").read_text().splitlines()) == 9
+    assert len((tmp_path / "first" / "episodes.csv").read_text().splitlines()) == 3
 
 
 @pytest.mark.parametrize(

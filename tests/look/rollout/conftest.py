@@ -48,7 +48,7 @@ def failed(seed: int = 0, **changed: Any) -> RolloutEpisode:
 
 def rollouts_of(*episodes: RolloutEpisode) -> Rollouts:
     settings = {"execute": 1, "chunking": "none", "latency_ms": 0, "seed": 1000000}
-    return Rollouts("models/head", "full", settings, episodes)
+    return Rollouts("models/head", settings, episodes)
 
 
 @pytest.fixture(scope="session")
