@@ -5,6 +5,8 @@ import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import torch
+
 from pipeline.base.config import Params, VLMParams
 from pipeline.base.errors import VLMError
 from pipeline.base.format import size
@@ -15,7 +17,6 @@ from pipeline.look.doctor.issues import missing, note, ok
 from pipeline.simulation.demo_recordings import MARKER
 from pipeline.vlm import checkpoint_folder
 
-_BYTES = {"float32": 4, "float16": 2, "bfloat16": 2}
 _EXAMPLE = "set vlm.checkpoint to a folder or a hub id, such as Qwen/Qwen2.5-VL-3B-Instruct"
 _BESIDE = 2 * 2**30
 """Roughly what else a GPU holds while the model works: CUDA itself and a batch's activations."""
@@ -95,7 +96,7 @@ def check_adapter(adapter: str) -> Issue:
 
 def check_fit(count: int, vlm: VLMParams, gpus: Sequence[GPU], available: int) -> Issue:
     """Whether the weights fit: on the smallest GPU, else into the memory that is free."""
-    weights = count * _BYTES[vlm.dtype]
+    weights = count * getattr(torch, vlm.dtype).itemsize
     where, room, needed = "memory", available, weights
     if gpus:
         smallest = min(gpus, key=lambda gpu: gpu.memory)
