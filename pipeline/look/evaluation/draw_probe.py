@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.evaluate.probe.inputs import SlotName
 from pipeline.evaluate.probe.study import ProbeResult, ProbeStudy, ranked
-from pipeline.look.page.style import RECORDED, canvas, draw_map, legend_below, write
+from pipeline.look.page.style import RECORDED, canvas, draw_map, legend_below, panels, write
 
 _BARS = 20
 """Choices that a picture still shows legibly."""
@@ -54,15 +54,15 @@ def heat_map(study: ProbeStudy) -> Figure:
     width = max(8.5, 2.0 + 1.25 * len(kinds), 1.5 + 2.3 * columns)
     figure = canvas(width, 1.8 + 0.5 * len(rows) + 2.2 * lines)
     ratios = [0.6 + 0.5 * len(rows)] + [2.2] * lines
-    panels = figure.add_gridspec(1 + lines, columns, height_ratios=ratios)
-    overview = figure.add_subplot(panels[0, :])
+    places = figure.add_gridspec(1 + lines, columns, height_ratios=ratios)
+    overview = figure.add_subplot(places[0, :])
     # A group of one slot is that slot.
-    places = [(rows.index(_row(r.name)), kinds.index(_column(r.name))) for r in named]
-    image = draw_map(overview, _grid(places, named), limits)
+    cells = [(rows.index(_row(r.name)), kinds.index(_column(r.name))) for r in named]
+    image = draw_map(overview, _grid(cells, named), limits)
     overview.set_xticks(range(len(kinds)), kinds)
     overview.set_yticks(range(len(rows)), rows)
     for index, title in enumerate(shown):
-        axis = figure.add_subplot(panels[1 + index // _MAPS_A_ROW, index % _MAPS_A_ROW])
+        axis = figure.add_subplot(places[1 + index // _MAPS_A_ROW, index % _MAPS_A_ROW])
         cells = [result.name.cell or (0, 0) for result in maps[title]]
         draw_map(axis, _grid(cells, maps[title]), limits)
         axis.set(xticks=[], yticks=[])
@@ -90,8 +90,7 @@ def bars(study: ProbeStudy) -> Figure:
     A bar that would end left of the axis ends at an arrow and its number.
     """
     shown = ranked(study.groups)[:_BARS][::-1]
-    figure = canvas(8.5, 2.4 + 0.55 * len(shown))
-    axis = figure.subplots()
+    figure, axis = panels(8.5, 2.4 + 0.55 * len(shown))
     kinds = [("alone", _ALONE, [result.alone for result in shown])]
     if study.streams is not None:
         kinds.append(("beside state + sensor", _BESIDE, [result.best for result in shown]))

@@ -132,6 +132,20 @@ def canvas(width: float, height: float) -> Figure:
     return figure
 
 
+def panels(width: float, height: float, *grid: int, **options: Any) -> tuple[Figure, Any]:
+    """An empty picture of this size in inches and its panels, as `Figure.subplots` gives them."""
+    figure = canvas(width, height)
+    return figure, figure.subplots(*grid, **options)
+
+
+def draw_frame(axis: Axes, frame: NDArray[np.uint8]) -> None:
+    """A frame (height, width, 3) RGB without ticks and grid."""
+    axis.imshow(frame)
+    axis.set(xticks=[], yticks=[])
+    axis.grid(visible=False)
+    axis.spines[:].set_visible(False)
+
+
 def draw_map(
     axis: Axes,
     grid: NDArray[Any],

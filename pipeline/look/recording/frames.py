@@ -21,7 +21,6 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -30,7 +29,7 @@ from pipeline.base.issue import Issue
 from pipeline.data import CameraStream
 from pipeline.data.timeline import last_at
 from pipeline.look.page.blocks import Block, Text
-from pipeline.look.page.style import canvas
+from pipeline.look.page.style import draw_frame, panels
 from pipeline.look.recording.episode import BROKEN, Draw, EpisodeView, runs
 
 MOST_FRAMES, RUNS = 120, 12
@@ -98,8 +97,8 @@ def draw_views(view: EpisodeView, ticks: Sequence[int]) -> Figure:
     frames, _ = read_frames(view, ticks)
     time = view.timeline.time[list(ticks)]
     heights = [_COLUMN_IN * row[0].shape[0] / row[0].shape[1] + 0.25 for row in frames.values()]
-    figure = canvas(_COLUMN_IN * max(len(ticks), 2) + 0.4, sum(heights) + 0.6)
-    axes = figure.subplots(len(frames), len(ticks), squeeze=False, height_ratios=heights)
+    size = _COLUMN_IN * max(len(ticks), 2) + 0.4, sum(heights) + 0.6
+    figure, axes = panels(*size, len(frames), len(ticks), squeeze=False, height_ratios=heights)
     for line, (name, row) in zip(axes, frames.items(), strict=True):
         ages = time - view.cameras[name].time[_shown_at(view, name, ticks)]
         for axis, frame, age in zip(line, row, ages, strict=True):
@@ -109,14 +108,6 @@ def draw_views(view: EpisodeView, ticks: Sequence[int]) -> Figure:
     for axis, tick, at in zip(axes[0], ticks, time - view.zero, strict=True):
         axis.set_title(f"tick {tick}, {at:.2f} s", fontsize=10)
     return figure
-
-
-def draw_frame(axis: Axes, frame: NDArray[np.uint8]) -> None:
-    """A frame (height, width, 3) RGB without ticks and grid."""
-    axis.imshow(frame)
-    axis.set(xticks=[], yticks=[])
-    axis.grid(visible=False)
-    axis.spines[:].set_visible(False)
 
 
 @dataclass(frozen=True)
