@@ -259,8 +259,8 @@ def statistics_table(statistics: Sequence[ChannelStatistics]) -> Table:
         group = [astuple(channel) for channel in like]
         rows += group if len(group) < PROFILE_CHANNELS else [_joint_row(group)]
     caption = (
-        "Over the whole episode, before any normalisation. A row of many channels shows the lowest "
-        "minimum, the highest maximum, and of the rest the median over the channels."
+        "Before any normalisation. A row of many channels shows the lowest minimum, the highest "
+        "maximum, and of the rest the median over the channels."
     )
     return Table(_HEADS, rows, caption)
 

@@ -13,7 +13,7 @@ from pipeline.base.issue import Issue
 from pipeline.base.table import Table
 from pipeline.data.timeline import COARSEST_S
 from pipeline.look.page.blocks import Block, Picture, Text
-from pipeline.look.page.style import INK, PALETTE, canvas
+from pipeline.look.page.style import INK, PALETTE, panels
 from pipeline.look.store.episodes import EpisodeCoverage
 from pipeline.store import FeatureStore
 
@@ -52,9 +52,8 @@ def show_ages(ages: Ages) -> list[Block]:
     ]
     return [
         Text(
-            "Ticks between two VL rows reuse the last, so what the model saw grows older until the "
-            "next; a camera slower than the ticks adds to it. The policy is given the age of the "
-            "newest frame as `feature_age`."
+            "What the model saw grows older until the next VL row. The policy is given the age of "
+            "the newest frame as `feature_age`."
         ),
         Picture(
             "ages",
@@ -68,8 +67,7 @@ def show_ages(ages: Ages) -> list[Block]:
 
 def draw_ages(ages: Ages) -> Figure:
     """How many ticks see features how old: since the newest frame, and since that of each view."""
-    figure = canvas(8.5, 3.6)
-    axis = figure.subplots()
+    figure, axis = panels(8.5, 3.6)
     age_of = {"newest frame (feature_age)": ages.newest, **ages.by_view}
     finite = {name: age[np.isfinite(age)] for name, age in age_of.items()}
     low = min(0.0, *(float(age.min()) for age in finite.values() if len(age)))
@@ -97,10 +95,11 @@ def find_age_issues(
         ahead, old = np.flatnonzero(age < -COARSEST_S), np.flatnonzero(age > limit)
         if len(ahead):
             text = f"{len(ahead)} ticks see a frame taken after them, by up to {-age.min():.3f} s"
-            times = time[ahead[[0, -1]]] - time[0]
-            yield episode.issue("frames from the future", "vl/frame_time", text, times, error=True)
+            span = time[ahead[[0, -1]]] - time[0]
+            kind = "frames from the future"
+            yield episode.issue(kind, "vl/frame_time", text, *span, severity="error")
         if len(old):
             text = f"{len(old)} of {len(age)} ticks see features up to {age.max():.2f} s old; "
             text += f"expected less than {limit:.2f} s, the time of {_STALE_PERIODS} VL rows"
-            times = time[old[[0, -1]]] - time[0]
-            yield episode.issue("old frames", "vl/frame_time", text, times)
+            span = time[old[[0, -1]]] - time[0]
+            yield episode.issue("old frames", "vl/frame_time", text, *span)

@@ -68,22 +68,18 @@ def find_duplicates(store: FeatureStore) -> Duplicates:
 
 def show_duplicates(duplicates: Duplicates, episodes: Sequence[EpisodeCoverage]) -> list[Block]:
     """How many rows there are twice, and in which episodes."""
+    pairs = duplicates.pairs
     text = Text(
         f"By their keys, {duplicates.rows:,} of {duplicates.total:,} VL rows have exactly the "
-        "frames and prompt of another row; pairs of episodes with such rows: "
-        f"{len(duplicates.pairs):,}."
+        f"frames and prompt of another row; pairs of episodes with such rows: {len(pairs):,}."
     )
-    if not duplicates.pairs:
-        return [text]
     rows: list[tuple[object, ...]] = []
-    for pair in duplicates.pairs[:_LISTED]:
+    for pair in pairs[:_LISTED]:
         first, second = (episodes[index].name for index in (pair.first, pair.second))
         rows.append((first, pair.rows[0], pair.time_s[0], second, pair.rows[1], pair.time_s[1]))
     heads = ("episode", "rows", "at [s]", "other episode", "rows ", "at [s] ")
-    return [
-        text,
-        Table(heads, rows, f"Rows with equal keys, by pairs of episodes, {_LISTED} at most."),
-    ]
+    table = Table(heads, rows, f"Rows with equal keys, {_LISTED} pairs of episodes at most.")
+    return [text, table] if pairs else [text]
 
 
 def find_duplicate_issues(

@@ -22,7 +22,7 @@ from pipeline.base.errors import StoreIncomplete
 from pipeline.base.finite import non_finite
 from pipeline.base.issue import Issue
 from pipeline.look.page.blocks import Block, Picture, Text
-from pipeline.look.page.style import GRID, PALETTE, canvas, draw_map
+from pipeline.look.page.style import GRID, PALETTE, draw_map, panels
 from pipeline.look.store.channels import evenly
 from pipeline.look.store.episodes import EpisodeCoverage, mark_sources
 from pipeline.store import FEATURES, FeatureStore, place
@@ -95,9 +95,8 @@ def check_rows(store: FeatureStore, rows: NDArray[np.int64]) -> None:
         bad = block[row_checksums(features[block]) != checksums[block]]
         if len(bad):
             raise StoreIncomplete(
-                f"{store.path}: expected features that give their checksum, found {len(bad)} VL "
-                f"row(s) that do not, the first {place(store, 'vl', int(bad[0]))}: the store is "
-                f"damaged. {mend(store.path)}"
+                f"{store.path}: {len(bad)} VL row(s) do not give their checksum, the first "
+                f"{place(store, 'vl', int(bad[0]))}: the store is damaged. {mend(store.path)}"
             )
 
 
@@ -151,11 +150,10 @@ def _variation(values: NDArray[np.float32]) -> float:
 
 def show_features(norms: FeatureNorms, episodes: Sequence[EpisodeCoverage]) -> list[Block]:
     """How many rows were looked at, and how long their features are."""
-    sampled = norms.sampled
+    looked_at, total = len(norms.sampled.rows), norms.sampled.total
     words = "Looked at: all VL rows"
-    if len(sampled.rows) < sampled.total:
-        words = f"Looked at: {len(sampled.rows):,} of {sampled.total:,} VL rows, the same moments "
-        words += "of each episode (`inspect.points`)"
+    if looked_at < total:
+        words = f"Looked at: {looked_at:,} of {total:,} VL rows (`inspect.points`)"
     if broken := int(norms.broken.any(axis=1).sum()):
         words += f", but for what is not finite in {broken:,} of them"
     if not np.isfinite(norms.norm).any():
@@ -174,8 +172,8 @@ def show_features(norms: FeatureNorms, episodes: Sequence[EpisodeCoverage]) -> l
 def draw_norms(norms: FeatureNorms, episodes: Sequence[EpisodeCoverage]) -> Figure:
     """Length of the features: by slot on the left, by slot and episode on the right."""
     slots = len(norms.names)
-    figure = canvas(9.5, 3.0 + min(5.0, 0.3 * slots))
-    left, right = figure.subplots(1, 2, sharey=True, gridspec_kw={"width_ratios": (1, 1.7)})
+    size = 9.5, 3.0 + min(5.0, 0.3 * slots)
+    figure, (left, right) = panels(*size, 1, 2, sharey=True, width_ratios=(1, 1.7))
     at = np.arange(slots)
     low, middle, high = _quantiles(norms.norm, (0.01, 0.5, 0.99))
     left.hlines(at, low, high, color=PALETTE[4], lw=min(5.0, 160 / slots), label="1 to 99 %")
@@ -235,9 +233,10 @@ def find_feature_issues(
     """Dead slots, odd lengths and what is no number; times are s since the episode's first tick."""
     dead = np.flatnonzero(norms.variation < DEAD).tolist()
     if dead:
-        text = f"{named(norms.names, dead)}: the same in all {len(norms.sampled.rows)} VL rows "
-        text += "looked at; expected features that follow the scene (is a camera dead, or its view "
-        text += "black?)"
+        rows = f"all {len(norms.sampled.rows)} VL rows looked at"
+        text = (
+            f"{named(norms.names, dead)}: the same in {rows}; is a camera dead, or its view black?"
+        )
         yield Issue(severity="warning", kind="dead slot", message=text, stream=FEATURES)
     far = find_outliers(norms)
     still = (norms.within < DEAD) & (norms.variation >= DEAD)
@@ -245,20 +244,20 @@ def find_feature_issues(
         own = np.flatnonzero(norms.sampled.episode == index)
         time = norms.sampled.time[own]
         if len(row := np.nonzero(norms.broken[own])[0]):
-            text = f"{len(np.unique(row))} VL row(s) with features that are NaN or infinite, the "
-            text += f"first in slot {norms.names[norms.broken[own[row[0]]].argmax()]} at "
-            text += f"{time[row[0]]:.2f} s; left out of all that is shown of features. Training "
-            text += "refuses them: extract these rows anew"
-            yield episode.issue("not finite", FEATURES, text, time[row[[0, -1]]], error=True)
+            text = f"{len(np.unique(row))} VL row(s) are NaN or infinite, the first in slot "
+            text += f"{norms.names[norms.broken[own[row[0]]].argmax()]}; they are left out here, "
+            text += "and training refuses them: extract them anew"
+            span = time[row[[0, -1]]]
+            yield episode.issue("not finite", FEATURES, text, *span, severity="error")
         if len(own) >= _STILL_ROWS and still[index].any():
-            text = f"{named(norms.names, np.flatnonzero(still[index]).tolist())}: the same in all "
-            text += f"{len(own)} VL rows looked at of this episode; expected them to follow the "
-            text += "scene"
+            slots = named(norms.names, np.flatnonzero(still[index]).tolist())
+            text = f"{slots}: the same in all {len(own)} VL rows looked at of this episode"
             yield episode.issue("still features", FEATURES, text)
         if len(row := np.nonzero(far[own])[0]):
             worst, slot = np.unravel_index(far[own].argmax(), far[own].shape)
             column = norms.norm[:, slot]
-            text = f"{len(row)} feature norm(s) far from the rest, the furthest "
-            text += f"{column[own[worst]]:.4g} in slot {norms.names[slot]}, of which the median is "
-            text += f"{np.nanmedian(column):.4g}"
-            yield episode.issue("feature norm", FEATURES, text, time[row[[0, -1]]])
+            text = (
+                f"{len(row)} feature norm(s) far from the rest: {column[own[worst]]:.4g} in slot "
+            )
+            text += f"{norms.names[slot]}, of which the median is {np.nanmedian(column):.4g}"
+            yield episode.issue("feature norm", FEATURES, text, *time[row[[0, -1]]])

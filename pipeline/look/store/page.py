@@ -23,10 +23,7 @@ from pipeline.store.repair_hints import extract_command
 from pipeline.store.schema import read_specs
 
 METADATA = "metadata"
-_NOTHING = (
-    "Nothing: clocks have no gaps, every stream is where others of its kind are, channels move, "
-    "features follow the scene, and no recording is there twice."
-)
+_NOTHING = "Nothing looks wrong: every check passed."
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +80,7 @@ def store_report(view: StoreView) -> Report:
     store = view.store
     rate = "as recorded" if store.action_hz is None else f"at {store.action_hz:g} Hz"
     reuse = store.vlm_reuse_count
+    rows = "each of them" if reuse == 1 else f"one in {reuse}"
     documents = (
         Document("Feature spec", store.spec),
         Document("Streams", store.streams),
@@ -91,8 +89,7 @@ def store_report(view: StoreView) -> Report:
     return Report(
         title=f"Store: {store.path.name}",
         summary=(
-            f"Ticks {rate}, features of the model (a VL row) at "
-            f"{'each of them' if reuse == 1 else f'one in {reuse}'}; feature spec "
+            f"Ticks {rate}, features of the model (a VL row) at {rows}; feature spec "
             f"`{store.spec['digest']}`. Times count from the first tick of their episode."
         ),
         tiles=_tiles(view),
