@@ -22,7 +22,7 @@ from pipeline.base.table import Table
 from pipeline.data.recording import Nominal
 from pipeline.data.timeline import Timeline
 from pipeline.look.page.blocks import Block
-from pipeline.look.page.style import GRID, INK, PALETTE, canvas
+from pipeline.look.page.style import GRID, INK, PALETTE, panels
 from pipeline.look.recording.episode import Draw, EpisodeView
 
 # Usual steps from which a step is a gap.
@@ -52,7 +52,7 @@ _TICK_S = 0.1
 _FEWEST = 20
 
 
-class Gap(NamedTuple):
+class Span(NamedTuple):
     """Where a clock skipped: from the last entry before to the first after, in seconds."""
 
     start_s: float
@@ -90,10 +90,10 @@ class Clock:
         return GAP_FACTOR * longest if len(self.time) > 2 and longest > 0 else float("inf")
 
     @cached_property
-    def gaps(self) -> tuple[Gap, ...]:
+    def gaps(self) -> tuple[Span, ...]:
         """Where it skips, in order."""
         places = np.flatnonzero(np.diff(self.time) >= self.shortest_gap_s)
-        return tuple(Gap(float(self.time[at]), float(self.time[at + 1])) for at in places)
+        return tuple(Span(float(self.time[at]), float(self.time[at + 1])) for at in places)
 
     @property
     def rate_hz(self) -> float:
@@ -182,17 +182,16 @@ def _usual(time: NDArray[np.float64]) -> tuple[float, float]:
     return (mean, float(kept[-1])) if median < _BURSTS * mean else (median, median)
 
 
-def _gaps(view: EpisodeView, clock: Clock, jumps: Mapping[Gap, str]) -> Iterator[Issue]:
+def _gaps(view: EpisodeView, clock: Clock, jumps: Mapping[Span, str]) -> Iterator[Issue]:
     line, camera = view.timeline, clock.name.split(", ")[0].removeprefix("view ")
     for gap in clock.gaps:
         if gap.length_s <= _tick_s(view):
             continue
-        kind, since = "gap", f"{gap.start_s - view.zero:.2f} s"
-        message = f"no entry for {gap.length_s:.2f} s from {since}, expected one every "
-        message += f"{clock.step_s:.3g} s"
+        kind, step = "gap", clock.step_s
+        message = f"no entry for {gap.length_s:.2f} s, expected one every {step:.3g} s"
         if gap in jumps:
-            kind, moved = "clock jump", gap.length_s - clock.step_s
-            message = f"the clock jumps by {moved:.2f} s at {since}: {jumps[gap]}"
+            kind, since = "clock jump", f"{gap.start_s - view.zero:.2f} s"
+            message = f"the clock jumps by {gap.length_s - step:.2f} s at {since}: {jumps[gap]}"
         if line is not None and camera in view.cameras:
             newest = line.frame_time[camera][line.vl_row]
             ages = (line.time - newest)[newest == gap.start_s]
@@ -201,13 +200,13 @@ def _gaps(view: EpisodeView, clock: Clock, jumps: Mapping[Gap, str]) -> Iterator
         yield view.issue(kind, clock.name, message, *gap)
 
 
-def _find_jumps(clock: Clock, recorded: Sequence[Clock]) -> dict[Gap, str]:
+def _find_jumps(clock: Clock, recorded: Sequence[Clock]) -> dict[Span, str]:
     """Where a clock was set, the longest jump first, rather than lacks entries; and what shows it.
 
     A clock that was set ends apart from those without such a step, and near them less the step; one
     that lacks entries ends with them.
     """
-    jumps: dict[Gap, str] = {}
+    jumps: dict[Span, str] = {}
     end = float(clock.time[-1])
     for gap in sorted(clock.gaps, key=lambda gap: -gap.length_s):
         ends = np.array(
@@ -355,9 +354,8 @@ def clock_table(view: EpisodeView, clocks: Sequence[Clock]) -> Table:
         for clock in clocks
     ]
     caption = (
-        "The usual rate is one over the usual step; on average are the steps over their time, lost "
-        f"entries and gaps included. A gap is a step of at least {GAP_FACTOR:g} usual ones. Jitter "
-        "is the standard deviation of the steps that are no gaps."
+        f"On average includes lost entries and gaps, which are steps of at least {GAP_FACTOR:g} "
+        "usual ones. Jitter is the standard deviation of the steps that are no gaps."
     )
     return Table(heads, rows, caption)
 
@@ -374,8 +372,7 @@ def draw_lanes(view: EpisodeView) -> Figure:
     near = _choose_near(view, clocks, start, stop)
     room = 0.01 * max(stop - start, 1e-3)
     heights = [0.34 * len(clocks) + 0.3, 0.46 * len(clocks) + 0.5]
-    figure = canvas(11.0, sum(heights) + 1.6)
-    whole, detail = figure.subplots(2, 1, height_ratios=heights)
+    figure, (whole, detail) = panels(11.0, sum(heights) + 1.6, 2, 1, height_ratios=heights)
     for axis, span in ((whole, (start - room, stop + room)), (detail, near)):
         axis.set_xlim(span[0] - view.zero, span[1] - view.zero)
         for lane, clock in enumerate(clocks):
@@ -417,15 +414,8 @@ def _choose_near(
     step = float("nan") if line is None else usual_step(line.vl_time)
     width = min(_ROWS_NEAR * step if step > 0 else _NEAR_S, max(stop - start, 1e-3))
     by_kind = sorted(clocks, key=lambda clock: clock.kind != "camera")
-    gap = next((gap for clock in by_kind for gap in clock.gaps), None)
-    # Of a gap longer than the stretch, where it begins.
-    around = (start + stop) / 2 if gap is None else min(sum(gap) / 2, gap.start_s + width / 4)
-    begin = around - width / 2
-    if line is not None:
-        # From just before a row, so that it is seen with all of its ticks.
-        row = max(int(np.searchsorted(line.vl_time, begin + width / 10, side="right")) - 1, 0)
-        begin = float(line.vl_time[row]) - width / 10
-    begin = max(min(begin, stop - width), start)
+    gaps = [gap.start_s - width / 4 for clock in by_kind for gap in clock.gaps]
+    begin = max(min([*gaps, (start + stop - width) / 2][0], stop - width), start)
     return begin, begin + width
 
 
@@ -437,11 +427,7 @@ def _draw_lane(axis: Axes, clock: Clock, lane: int, zero: float) -> None:
     time = time[np.unique(places, return_index=True)[1]]
     width = 1.6 if len(time) < _STROKES / 6 else 1.0
     axis.vlines(time, lane - _HALF, lane + _HALF, colors=_KINDS[clock.kind][0], lw=width)
-    spans = [
-        (gap.start_s - zero, gap.length_s)
-        for gap in clock.gaps
-        if gap.stop_s - zero >= low and gap.start_s - zero <= high
-    ]
+    spans = [(gap.start_s - zero, gap.length_s) for gap in clock.gaps]
     # One artist for all: thousands of gaps as patches take many seconds.
     axis.broken_barh(
         spans, (lane - _HALF, 2 * _HALF), facecolor="none", hatch="////", lw=1.4,

@@ -64,8 +64,7 @@ def sample_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
     lengths = window_lengths(params)
     caption = (
         f"{len(samples)} training samples side by side: the frames, the sensor and state windows "
-        f"that end at the tick, and the chunk of {lengths['action']} actions that begins at it. "
-        "The first is the episode's first tick, the last its last."
+        f"that end at the tick, and the chunk of {lengths['action']} actions that begins at it."
     )
     picture = draw("samples", caption, lambda view: draw_samples(view, samples, lengths))
     return [picture, batch_table(samples, lengths)]
@@ -156,8 +155,7 @@ def batch_table(samples: Sequence[Sample], lengths: Mapping[str, int]) -> Table:
     ]
     caption = (
         "The same samples as one batch: how many readings and steps are real. Windows are padded "
-        "with zeros on the left before the episode's start; chunks are masked past its end and "
-        "count for no loss there."
+        "with zeros before the episode's start, chunks are masked past its end."
     )
     heads = [f"{name} {'steps' if name == 'action' else 'readings'}" for name in streams]
     return Table(["tick", *heads], rows, caption)
@@ -215,21 +213,13 @@ def _sample_title(view: EpisodeView, tick: int) -> str:
 
 def prompt_blocks(view: EpisodeView, params: Params, views: Sequence[str]) -> list[Block]:
     """The prompt of the episode's first VL row, and the spec of the features of these views."""
+    spec: list[Block] = []
     try:
-        spec = remembered_spec(params, views)
+        found = remembered_spec(params, views)
+        spec = [Document("Feature spec: what decides what a feature is", found.attrs())]
+        return [*show_prompt(view, params.vlm, found), *spec]
     except PipelineError as error:
-        return [
-            Text(
-                f"Neither the prompt nor the feature spec can be shown: {str(error).rstrip('.')}. "
-                "Name a checkpoint that is here with `--set vlm.checkpoint=FOLDER`; the demo's is "
-                "written by `python -m stages.demo`."
-            )
-        ]
-    try:
-        blocks = show_prompt(view, params.vlm, spec)
-    except PipelineError as error:
-        blocks = [Text(f"The prompt cannot be shown: {error}")]
-    return [*blocks, Document("Feature spec: what decides what a feature is", spec.attrs())]
+        return [Text(f"The prompt cannot be shown: {error}"), *spec]
 
 
 def show_prompt(view: EpisodeView, vlm: VLMParams, spec: FeatureSpec) -> list[Block]:
@@ -257,8 +247,7 @@ def show_prompt(view: EpisodeView, vlm: VLMParams, spec: FeatureSpec) -> list[Bl
     return [
         Text(
             f"{len(tokens):,} tokens: {len(views):,} of images, {len(tokens) - len(views):,} "
-            f"others. Each image is {pixels[0]} × {pixels[1]} pixels for the model. Attention is "
-            "causal: a token sees only what stands before it."
+            "others. Attention is causal: a token sees only what stands before it."
         ),
         Tokens(fold_tokens(tokens)),
         Table(
@@ -269,8 +258,7 @@ def show_prompt(view: EpisodeView, vlm: VLMParams, spec: FeatureSpec) -> list[Bl
                 for high, wide in [frames[name][0].shape[:2]]
                 for stretch in [describe_stretch((high, wide), pixels)]
             ],
-            "Image tokens by view; sizes are height × width, the model's those of "
-            "`vlm.image_resize_height` and `vlm.image_resize_width`",
+            "Image tokens by view; sizes are height × width",
         ),
         Table(["token", "times"], list(special.items()), "Special tokens by name"),
     ]

@@ -30,8 +30,8 @@ from pipeline.base.config import Params
 from pipeline.data import Channels, Stream
 from pipeline.data.timeline import last_at
 from pipeline.look.page.blocks import Block
-from pipeline.look.page.style import PALETTE, canvas
-from pipeline.look.recording.clocks import Clock, usual_step
+from pipeline.look.page.style import PALETTE, panels
+from pipeline.look.recording.clocks import Clock, Span, usual_step
 from pipeline.look.recording.episode import Draw, EpisodeView, runs
 
 CONTACT_COLOUR = "#E69F00"
@@ -201,11 +201,11 @@ def _panels(groups: Sequence[Group]) -> tuple[Figure, list[Axes]]:
         _IMAGE_IN if group.profile else _PANEL_IN if group.names[1:] else _SMALL_IN
         for group in groups
     ]
-    figure = canvas(_WIDTH_IN, sum(heights) + 0.5)
-    axes = figure.subplots(len(groups), squeeze=False, sharex=True, height_ratios=heights)[:, 0]
-    axes[-1].set_xlabel("time since the recording began [s]")
+    shape = {"squeeze": False, "sharex": True, "height_ratios": heights}
+    figure, axes = panels(_WIDTH_IN, sum(heights) + 0.5, len(groups), **shape)
+    axes[-1, 0].set_xlabel("time since the recording began [s]")
     figure.align_ylabels(axes)
-    return figure, list(axes)
+    return figure, list(axes[:, 0])
 
 
 def _draw_curves(
@@ -246,15 +246,8 @@ def _draw_profile(axis: Axes, stream: Stream, group: Group, zero: float) -> None
     axis.figure.colorbar(drawn, cax=bar, label=f"{group.profile} {unit}", extend="both")
 
 
-class Contact(NamedTuple):
-    """A span in which the needle touches something, by the force alone."""
-
-    start_s: float
-    stop_s: float
-
-
-def contacts(view: EpisodeView) -> tuple[Contact, ...]:
-    """Spans of contact, in order; none where there is no sensor or it has no force channel.
+def contacts(view: EpisodeView) -> tuple[Span, ...]:
+    """Spans in which the needle touches something, by the force alone; none without a force.
 
     Several force channels (a wrench) count by the length of their departure from rest.
     """
@@ -275,7 +268,7 @@ def contacts(view: EpisodeView) -> tuple[Contact, ...]:
     least = _LEAST_N if {view.sensor.channels.units[column] for column in columns} == {"N"} else 0.0
     departure = np.linalg.norm(smooth - rest, axis=1)
     enter = max(_ENTER * float(np.linalg.norm(noise)), least)
-    spans: list[Contact] = []
+    spans: list[Span] = []
     for start, stop in runs((departure > enter * _LEAVE / _ENTER) & (departure > 0)):
         reached = np.flatnonzero(departure[start:stop] >= enter)
         if len(reached):
@@ -283,8 +276,8 @@ def contacts(view: EpisodeView) -> tuple[Contact, ...]:
             begin, end = time[start + reached[0]], time[min(stop, len(time) - 1)]
             if spans and begin - spans[-1].stop_s < _APART_S:
                 begin = spans.pop().start_s
-            spans.append(Contact(float(begin), float(end)))
-    return tuple(span for span in spans if span.stop_s - span.start_s >= _SHORTEST_S)
+            spans.append(Span(float(begin), float(end)))
+    return tuple(span for span in spans if span.length_s >= _SHORTEST_S)
 
 
 def force_columns(sensor: Stream) -> list[int]:
