@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.evaluate.probe.inputs import SlotName
 from pipeline.evaluate.probe.study import ProbeResult, ProbeStudy, ranked
-from pipeline.look.page.style import RECORDED, canvas, draw_map, legend_below, panels, write
+from pipeline.look.page.style import INK, canvas, draw_map, legend_below, panels, write
 
 _BARS = 20
 """Choices that a picture still shows legibly."""
@@ -98,7 +98,7 @@ def bars(study: ProbeStudy) -> Figure:
     for number, (label, colour, scores) in enumerate(kinds):
         where = np.arange(len(shown)) + height * ((len(kinds) - 1) / 2 - number)
         means, errors = [score.mean for score in scores], [score.error for score in scores]
-        style = {"ecolor": RECORDED, "capsize": 3, "lw": 1}
+        style = {"ecolor": INK, "capsize": 3, "lw": 1}
         axis.barh(where, means, height, xerr=errors, color=colour, label=label, error_kw=style)
         for place, mean in zip(where, means, strict=True):
             if mean < _LEAST:
@@ -107,7 +107,7 @@ def bars(study: ProbeStudy) -> Figure:
                 )
     if study.streams is not None:
         _mark_streams(axis, study.streams.mean)
-    axis.axvline(0, color=RECORDED, lw=1)
+    axis.axvline(0, color=INK, lw=1)
     low, high = axis.get_xlim()
     axis.set_xlim(max(low, _LEAST), min(max(high, 0.1), 1.0))
     axis.set_yticks(range(len(shown)), [_bar_name(result) for result in shown])
@@ -122,7 +122,7 @@ def _mark_streams(axis: Axes, mean: float) -> None:
     """Where state + sensor are by themselves, if only in the legend."""
     beyond = f" ({mean:.2f}, left of the axis)" if mean < _LEAST else ""
     label = f"state + sensor alone{beyond}"
-    axis.axvline(max(mean, _LEAST), color=RECORDED, ls="--", lw=1.8, label=label)
+    axis.axvline(max(mean, _LEAST), color=INK, ls="--", lw=1.8, label=label)
 
 
 def _grid(places: Sequence[tuple[int, int]], results: Sequence[ProbeResult]) -> NDArray[np.float64]:

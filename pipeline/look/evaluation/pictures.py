@@ -22,7 +22,6 @@ from pipeline.look.page.style import (
     INK,
     LABELS,
     PALETTE,
-    RECORDED,
     STYLES,
     canvas,
     draw_frame,
@@ -68,7 +67,7 @@ def dimensions(comparison: Comparison) -> Figure:
     figure, axis = panels(9.0, 0.42 * len(shown) + 2.0)
     for method in METHODS:
         errors = comparison.in_training_std(comparison.scores[method].mae)
-        axis.plot(errors, range(len(shown)), **_marked(method, linestyle=""))
+        axis.plot(errors, range(len(shown)), **_marked(method, ls=""))
     axis.set_yticks(range(len(shown)), _dimension_names(comparison))
     axis.set_ylim(len(shown) - 0.5, -0.5)
     axis.set_xlim(left=0)
@@ -124,7 +123,7 @@ def episodes(comparison: Comparison, store: FeatureStore) -> Figure:
     for axis, group in zip(axes, groups, strict=True):
         for method in METHODS:
             errors = group.mean(comparison.scores[method].mae_episode)[order]
-            axis.plot(errors, lines, **_marked(method, linestyle=""))
+            axis.plot(errors, lines, **_marked(method, ls=""))
         label = with_unit("mean absolute error", group.unit)
         axis.set(title=_group_title(comparison, group), xlabel=label)
         axis.set_xlim(left=0)
@@ -151,7 +150,7 @@ def scatter(comparison: Comparison, predictions: Predictions) -> Figure:
         low, high = float(both.min()), float(both.max())
         margin = max(0.05 * (high - low), 0.02 * max(abs(low), abs(high)), 1e-6)
         low, high = low - margin, high + margin
-        axis.plot([low, high], [low, high], color=RECORDED, lw=1, zorder=1)
+        axis.plot([low, high], [low, high], color=INK, lw=1, zorder=1)
         axis.scatter(recorded, predicted, s=9, alpha=0.35, linewidths=0, color=_POLICY)
         axis.set(xlim=(low, high), ylim=(low, high), aspect="equal")
         axis.locator_params(nbins=4)
@@ -246,7 +245,7 @@ def _plot_next_actions(
     here = predictions.episodes == episode.index
     at = time_s[predictions.ticks[here] - episode.ticks.start]
     recorded, predicted = predictions.recorded[here, 0], predictions.predicted[here, 0]
-    axis.plot(at, recorded[:, dimension], color=RECORDED, lw=2.2, label="recorded")
+    axis.plot(at, recorded[:, dimension], color=INK, lw=2.2, label="recorded")
     axis.plot(at, predicted[:, dimension], color=_POLICY, lw=1.6, label="policy, next action")
 
 
@@ -319,7 +318,7 @@ def comparison_of_experiments(experiments: Sequence[Experiment]) -> Figure:
         number = f"{experiment.error:.3f}"
         axis.text(1.01, place, number, transform=axis.get_yaxis_transform(), va="center")
     for method in BASELINES:
-        style = {key: STYLES[method][key] for key in ("color", "linestyle")}
+        style = {key: STYLES[method][key] for key in ("color", "ls")}
         axis.axvline(experiments[0].overall[method], lw=2, label=LABELS[method], **style)
     axis.set_yticks(range(len(experiments)), [experiment.name for experiment in experiments])
     axis.invert_yaxis()
@@ -332,11 +331,7 @@ def comparison_of_experiments(experiments: Sequence[Experiment]) -> Figure:
 
 def _marked(method: str, **changed: Any) -> dict[str, Any]:
     """How a way of acting is drawn where its points are marked."""
-    # An open, larger square stays visible where the mean action is next to no motion.
-    size = {"policy": 6.5, "zero_action": 8.5}.get(method, 5)
-    width = 2.4 if method == "policy" else 1.5
-    style = {"linewidth": width, "markersize": size, "label": LABELS[method]}
-    return STYLES[method] | style | changed
+    return {"lw": 1.5, "ms": 5, "label": LABELS[method]} | STYLES[method] | changed
 
 
 def _dimension_names(comparison: Comparison) -> list[str]:

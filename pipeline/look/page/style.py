@@ -32,16 +32,16 @@ LABELS = {
     "repeat_last": "baseline: repeat the last action",
 }
 STYLES: dict[str, dict[str, Any]] = {
-    "policy": {"color": "#0072B2", "marker": "o", "linestyle": "-", "zorder": 5},
-    "zero_action": {"color": "#E69F00", "marker": "s", "linestyle": "--", "fillstyle": "none"},
-    "mean_action": {"color": "#009E73", "marker": "^", "linestyle": "-."},
-    "repeat_last": {"color": "#CC79A7", "marker": "D", "linestyle": ":"},
+    "policy": {"color": "#0072B2", "marker": "o", "ls": "-", "zorder": 5, "lw": 2.4, "ms": 6.5},
+    # An open, larger square stays visible where the mean action is next to no motion.
+    "zero_action": {"color": "#E69F00", "marker": "s", "ls": "--", "fillstyle": "none", "ms": 8.5},
+    "mean_action": {"color": "#009E73", "marker": "^", "ls": "-."},
+    "repeat_last": {"color": "#CC79A7", "marker": "D", "ls": ":"},
 }
 INK = "#333333"
 """Text, axes, and whatever else is black on white paper."""
 GRID = "#dddddd"
 """Grid lines, and areas behind data."""
-RECORDED = INK
 PALETTE = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
 """Of what has no colour of its own; Okabe and Ito's, less what is lost on white or on black."""
 _CJK = (
@@ -51,9 +51,8 @@ _CJK = (
 )
 """Fonts of Debian, Windows and macOS with what Chinese, Japanese and Korean names are made of."""
 NO_FONT = (
-    "A name has letters that no font of this machine has: PNG files show boxes in their place. "
-    "Install a font that has them; fonts-noto-cjk of Debian and Ubuntu has Chinese, Japanese and "
-    "Korean."
+    "PNG files show boxes for letters that no font of this machine has. Install one that has them, "
+    "as fonts-noto-cjk of Debian and Ubuntu has Chinese, Japanese and Korean."
 )
 _NO_GLYPH = re.compile(rf"Glyph \d+ |{re.escape(NO_FONT)}")
 

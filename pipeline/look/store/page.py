@@ -11,12 +11,11 @@ from pipeline.base.format import duration, size
 from pipeline.base.issue import Issue
 from pipeline.base.table import Table
 from pipeline.look.page.blocks import Document, Issues, Report, Section, Text
-from pipeline.look.store import ages, channels, duplicates, episodes, features
-from pipeline.look.store.ages import Ages
+from pipeline.look.store import channels, episodes, features, rows
 from pipeline.look.store.channels import StreamSummary
-from pipeline.look.store.duplicates import Duplicates
 from pipeline.look.store.episodes import EpisodeCoverage
 from pipeline.look.store.features import FeatureNorms
+from pipeline.look.store.rows import Ages, Duplicates
 from pipeline.store import FeatureStore, check_trailers
 from pipeline.store.gather import WIDE
 from pipeline.store.repair_hints import extract_command
@@ -62,14 +61,14 @@ def inspect_store(path: str | Path, params: InspectParams) -> StoreView:
     sampled = features.sample_rows(store, params.points)
     features.check_rows(store, sampled.rows)
     coverage = tuple(episodes.read_coverage(store, episode) for episode in store.episodes)
-    age, statistics = ages.read_ages(store), channels.summarize_streams(store)
-    norms, same = features.look_at_features(store, sampled), duplicates.find_duplicates(store)
+    age, statistics = rows.read_ages(store), channels.summarize_streams(store)
+    norms, same = features.look_at_features(store, sampled), rows.find_duplicates(store)
     issues = (
         *episodes.find_episode_issues(store, coverage),
-        *ages.find_age_issues(store, coverage, age),
+        *rows.find_age_issues(store, coverage, age),
         *channels.find_channel_issues(statistics),
         *features.find_feature_issues(norms, coverage),
-        *duplicates.find_duplicate_issues(same, coverage),
+        *rows.find_duplicate_issues(same, coverage),
     )
     sizes = read_sizes(store.path)
     return StoreView(store, coverage, age, sizes, norms, same, statistics, issues)
@@ -80,7 +79,7 @@ def store_report(view: StoreView) -> Report:
     store = view.store
     rate = "as recorded" if store.action_hz is None else f"at {store.action_hz:g} Hz"
     reuse = store.vlm_reuse_count
-    rows = "each of them" if reuse == 1 else f"one in {reuse}"
+    often = "each of them" if reuse == 1 else f"one in {reuse}"
     documents = (
         Document("Feature spec", store.spec),
         Document("Streams", store.streams),
@@ -89,17 +88,17 @@ def store_report(view: StoreView) -> Report:
     return Report(
         title=f"Store: {store.path.name}",
         summary=(
-            f"Ticks {rate}, features of the model (a VL row) at {rows}; feature spec "
+            f"Ticks {rate}, features of the model (a VL row) at {often}; feature spec "
             f"`{store.spec['digest']}`. Times count from the first tick of their episode."
         ),
         tiles=_tiles(view),
         sections=(
             Section("What looks wrong", [Issues(view.issues, _NOTHING), _checked(view)]),
             Section("Coverage", episodes.show_coverage(view.episodes)),
-            Section("Age of the features", ages.show_ages(view.ages)),
+            Section("Age of the features", rows.show_ages(view.ages)),
             Section("Size", [tabulate_sizes(store.path, view.sizes)]),
             Section("Features", features.show_features(view.features, view.episodes)),
-            Section("Duplicates", duplicates.show_duplicates(view.duplicates, view.episodes)),
+            Section("Duplicates", rows.show_duplicates(view.duplicates, view.episodes)),
             Section("Channels", channels.show_channels(view.statistics)),
             Section("What it was made of", documents),
         ),
@@ -119,10 +118,10 @@ def _tiles(view: StoreView) -> list[tuple[str, str]]:
 
 def _checked(view: StoreView) -> Text:
     looked_at, total = len(view.features.sampled.rows), view.features.sampled.total
-    rows = f"all {total:,}" if looked_at == total else f"{looked_at:,} of {total:,}"
+    which = f"all {total:,}" if looked_at == total else f"{looked_at:,} of {total:,}"
     command = f"python -m stages.verify --set verify.store={view.store.path}"
     return Text(
-        f"Metadata, clocks, offsets and the features of {rows} VL rows give the checksums that "
+        f"Metadata, clocks, offsets and the features of {which} VL rows give the checksums that "
         f"were written with them; the rest was not read: `{command}` reads every byte."
     )
 
@@ -145,13 +144,12 @@ def read_sizes(path: Path) -> dict[str, int]:
 def tabulate_sizes(path: Path, sizes: Mapping[str, int]) -> Table:
     """A row an array of the store at `path`."""
     specs, total = read_specs(path), sum(sizes.values())
-    rows: list[tuple[object, ...]] = []
+    lines: list[tuple[object, ...]] = []
     for name, taken in sizes.items():
-        shape, dtype, chunks = "", "", 0
-        if name in specs:
-            spec = specs[name]
+        spec, held = specs.get(name), ("", "", 0)
+        if spec is not None:
             shape = " × ".join(f"{count:,}" for count in spec.shape)
-            dtype, chunks = spec.attributes.get("dtype", spec.dtype.name), spec.chunk_count
-        rows.append((name, shape, dtype, chunks, taken / 2**20, 100 * taken / total))
+            held = shape, spec.attributes.get("dtype", spec.dtype.name), spec.chunk_count
+        lines.append((name, *held, taken / 2**20, 100 * taken / total))
     heads = ("array", "shape", "dtype", "chunks", "on the disk [MiB]", "share [%]")
-    return Table(heads, rows, "Bytes on the disk by array.")
+    return Table(heads, lines, "Bytes on the disk by array.")
