@@ -74,9 +74,7 @@ def describe_still(channels: Channels, values: NDArray[np.floating]) -> str:
     largest = max(usual, key=lambda column: std[column] / usual[column])
     return (
         f"{named(names, [*usual])} hardly move{'s' * (len(usual) == 1)}: a standard deviation of "
-        f"{std[largest]:.2g} at most, where {usual[largest]:.2g} is usual for such channels; "
-        "training scales every channel to unit spread, so that their noise would count like a "
-        "motion"
+        f"{std[largest]:.2g} at most, where {usual[largest]:.2g} is usual for such channels"
     )
 
 

@@ -35,8 +35,7 @@ def test_a_path_that_is_not_there_names_what_is(tmp_path: Path) -> None:
     (tmp_path / "monday").mkdir()
     said = refused(tmp_path / "mondey" / "run")
     assert f"{tmp_path / 'mondey/run'} is not there" in said
-    assert said.endswith(f"Did you mean {tmp_path / 'monday'}?")
-    assert f"In {tmp_path} there is monday" in refused(tmp_path / "tuesday")
+    assert said.endswith(f"In {tmp_path} there is monday")
 
 
 def test_a_path_below_the_data_root_is_found_there(tmp_path: Path) -> None:
