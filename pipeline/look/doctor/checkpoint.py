@@ -40,9 +40,7 @@ def check(params: Params) -> Iterator[Issue]:
         yield missing("vlm.checkpoint", str(error), remedy)
         return
     count = sum(math.prod(shape) for header in headers for _, shape in header.values())
-    here = f"{vlm.checkpoint}, whole, {count:,} parameters"
-    if str(folder) != vlm.checkpoint:
-        here += " (in the hub's cache)"
+    here = f"{folder}, whole, {count:,} parameters"
     if (folder / MARKER).exists():
         here += "; the demo's random weights: to look at the machinery, not to learn from"
         yield note("vlm.checkpoint", here, f"{_EXAMPLE}; docs/real-model.md")

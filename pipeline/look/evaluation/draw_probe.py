@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -44,7 +43,7 @@ def heat_map(study: ProbeStudy) -> Figure:
         if result.name.cell is not None:
             maps[f"{_row(result.name)}, {result.name.view}"].append(result)
     best = {title: max(result.best.mean for result in cells) for title, cells in maps.items()}
-    shown = sorted(maps, key=lambda title: best[title], reverse=True)[:_MAPS]
+    shown = sorted(maps, key=best.__getitem__, reverse=True)[:_MAPS]
     seen = [*named, *(result for title in shown for result in maps[title])]
     values = [result.best.mean for result in seen]
     limits = _limits(values if study.streams is None else [*values, study.streams.mean])
@@ -73,9 +72,8 @@ def heat_map(study: ProbeStudy) -> Figure:
     if study.streams is not None:
         alone = study.streams.mean
         overview.set_title(f"state + sensor alone: {alone:.2f}", fontsize=9)
-        bar.set_label(
-            f"held-out R², beside state + sensor\n(line: state + sensor alone, {alone:.2f})"
-        )
+        words = f"held-out R², beside state + sensor\n(line: state + sensor alone, {alone:.2f})"
+        bar.set_label(words)
         bar.ax.axhline(max(alone, limits[0]), color="#D55E00", lw=2.5)
     words = "Where a linear reader finds the action"
     if len(shown) < len(maps):
@@ -100,13 +98,14 @@ def bars(study: ProbeStudy) -> Figure:
         means, errors = [score.mean for score in scores], [score.error for score in scores]
         style = {"ecolor": INK, "capsize": 3, "lw": 1}
         axis.barh(where, means, height, xerr=errors, color=colour, label=label, error_kw=style)
+        style = {"va": "center", "color": "white", "size": 8}
         for place, mean in zip(where, means, strict=True):
             if mean < _LEAST:
-                axis.text(
-                    _LEAST + 0.005, place, f"◀ {mean:.2f}", va="center", color="white", size=8
-                )
+                axis.text(_LEAST + 0.005, place, f"◀ {mean:.2f}", **style)
     if study.streams is not None:
-        _mark_streams(axis, study.streams.mean)
+        mean, label = study.streams.mean, "state + sensor alone"
+        label += f" ({mean:.2f}, left of the axis)" if mean < _LEAST else ""
+        axis.axvline(max(mean, _LEAST), color=INK, ls="--", lw=1.8, label=label)
     axis.axvline(0, color=INK, lw=1)
     low, high = axis.get_xlim()
     axis.set_xlim(max(low, _LEAST), min(max(high, 0.1), 1.0))
@@ -116,13 +115,6 @@ def bars(study: ProbeStudy) -> Figure:
     legend_below(figure, axis, 3)
     figure.suptitle(_title(study, "What each choice of features says of the action"))
     return figure
-
-
-def _mark_streams(axis: Axes, mean: float) -> None:
-    """Where state + sensor are by themselves, if only in the legend."""
-    beyond = f" ({mean:.2f}, left of the axis)" if mean < _LEAST else ""
-    label = f"state + sensor alone{beyond}"
-    axis.axvline(max(mean, _LEAST), color=INK, ls="--", lw=1.8, label=label)
 
 
 def _grid(places: Sequence[tuple[int, int]], results: Sequence[ProbeResult]) -> NDArray[np.float64]:

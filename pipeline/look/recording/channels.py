@@ -98,10 +98,7 @@ def _frozen(view: EpisodeView, sensor: Stream) -> Iterator[Issue]:
     for start, stop in runs(_repeats(sensor.values, columns)):
         begin, end = float(sensor.time[start]), float(sensor.time[stop])
         if end - begin >= FROZEN_S:
-            message = (
-                f"{what} repeat one reading for {end - begin:.2f} s from {begin - view.zero:.2f} s "
-                f"({stop - start + 1} readings); elsewhere they change"
-            )
+            message = f"{what} repeat one reading {stop - start + 1} times; elsewhere they change"
             yield view.issue("frozen", "sensor", message, begin, end)
 
 
@@ -132,9 +129,9 @@ def _outliers(view: EpisodeView, name: str, entry: str, stream: Stream) -> Itera
         worst = int(places[np.argmax(away[places, column])])
         unit = f" {stream.channels.units[column]}".rstrip()
         message = (
-            f"{stream.channels.names[column]} leaps to {values[worst, column]:.4g}{unit} at "
-            f"{time[worst] - view.zero:.2f} s ({entry} {worst}; {len(places)} such {entry}s); all "
-            f"others stay within {others.min():.4g} to {others.max():.4g}"
+            f"{stream.channels.names[column]} leaps to {values[worst, column]:.4g}{unit} ({entry} "
+            f"{worst}; {len(places)} such {entry}s); all others stay within {others.min():.4g} to "
+            f"{others.max():.4g}"
         )
         stop = float(time[places[-1]]) + usual_step(time)
         yield view.issue(f"{name} outlier", name, message, float(time[places[0]]), stop)
@@ -157,8 +154,7 @@ def _saturated(view: EpisodeView, sensor: Stream) -> Iterator[Issue]:
         message = (
             f"{named(names, columns)} ({len(columns)} of {len(names)} channels) stand at the {end} "
             f"end of their range, {ends[columns[0]]:g}, in "
-            f"{100 * len(places) / len(sensor.time):.1f} % of the readings, first at "
-            f"{sensor.time[places[0]] - view.zero:.2f} s; expected under {100 * CLIPPED_SHARE:g} %"
+            f"{100 * len(places) / len(sensor.time):.1f} % of the readings"
         )
         yield view.issue("saturated", "sensor", message, *sensor.time[places[[0, -1]]].tolist())
 

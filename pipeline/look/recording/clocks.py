@@ -247,9 +247,8 @@ def _dropped(view: EpisodeView, clock: Clock) -> Iterator[Issue]:
     span = float(starts[most]), float(stops[most])
     message = (
         f"{long} of {len(steps)} steps take at least {DROPPED_STEP:g} times the usual "
-        f"{1e3 * clock.step_s:.0f} ms (up to {1e3 * steps.max():.0f} ms), half of them from "
-        f"{span[0] - view.zero:.2f} to {span[1] - view.zero:.2f} s: there is time for {lost:.0f} "
-        f"more frames; {len(steps) / steps.sum():.1f} Hz on average"
+        f"{1e3 * clock.step_s:.0f} ms (up to {1e3 * steps.max():.0f} ms), half of them here: there "
+        f"is time for {lost:.0f} more frames; {len(steps) / steps.sum():.1f} Hz on average"
     )
     yield view.issue("dropped frames", clock.name, message, *span)
 
@@ -281,10 +280,8 @@ def _lost_ticks(view: EpisodeView, recorded: Sequence[Clock]) -> Iterator[Issue]
         late = [c for c, at in zip(recorded, edge, strict=True) if abs(at - extreme) <= near]
         steps = (DROPPED_STEP * clock.step_s for clock in late)
         if lost >= LOST_S or lost > max(LOST_SHARE * length_s, LOST_TICKS * tick_s, *steps):
-            message = (
-                f"{words.format(lost)}; no tick can stand there (about {lost / tick_s:.0f} ticks, "
-                f"{100 * lost / length_s:.0f} % of the episode)"
-            )
+            message = f"{words.format(lost)}, which costs about {lost / tick_s:.0f} ticks, "
+            message += f"{100 * lost / length_s:.0f} % of the episode"
             names = ", ".join(clock.name for clock in late)
             yield view.issue("lost ticks", names, message, *sorted((extreme, usual)))
 
@@ -306,8 +303,7 @@ def _old_frames(view: EpisodeView) -> Iterator[Issue]:
         if usual > OLD * served:
             message = (
                 f"frames are {usual:.2f} s old at the median tick and {age[oldest]:.2f} s at most, "
-                f"expected at most {OLD * served:.2f} s where a VL row serves {served:.2f} s; "
-                f"{len(line.vl_time)} VL rows see {len(np.unique(line.frames[name]))} frames"
+                f"expected at most {OLD * served:.2f} s where a VL row serves {served:.2f} s"
             )
             at = float(line.time[oldest])
             yield view.issue("old frames", f"view {name}", message, at, at)
@@ -334,10 +330,7 @@ def clock_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
     clocks = read_clocks(view)
     if not clocks:
         return []
-    caption = (
-        "When each stream was sampled, over the whole episode and a stretch from near (grey above),"
-        " and which VL row serves which ticks. Gaps are marked."
-    )
+    caption = "When each stream was sampled, and which VL row serves which ticks; gaps are marked."
     return [draw("clocks", caption, draw_lanes), clock_table(view, clocks)]
 
 

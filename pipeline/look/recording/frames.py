@@ -55,16 +55,11 @@ def camera_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
     if not (ticks := spread_ticks(view, params.inspect.ticks)):
         return []
     shown, broken = read_frames(view, ticks)
-    blocks: list[Block] = [
-        Text(f"{issue.stream} is not shown: {issue.message}") for issue in broken
-    ]
-    if shown:
-        caption = (
-            f"What each view shows at {len(ticks)} ticks, evenly from the first to the last: the "
-            "last frame at or before the tick."
-        )
-        blocks.append(draw("views", caption, lambda view: draw_views(view, ticks)))
-    return blocks
+    absent = [Text(f"{issue.stream} is not shown: {issue.message}") for issue in broken]
+    if not shown:
+        return [*absent]
+    caption = f"The last frame of each view at or before {len(ticks)} ticks, evenly spread."
+    return [*absent, draw("views", caption, lambda view: draw_views(view, ticks))]
 
 
 def spread_ticks(view: EpisodeView, count: int) -> list[int]:
@@ -216,18 +211,14 @@ def _resized(view: EpisodeView, name: str, seen: _Looked) -> Iterator[Issue]:
 
 def _dead(view: EpisodeView, name: str, blank: Mapping[int, bool]) -> Iterator[Issue]:
     time, frames = view.cameras[name].time, list(blank)
-    issue, expected = partial(view.issue, "dead camera", f"view {name}"), "expected a picture"
+    issue = partial(view.issue, "dead camera", f"view {name}")
     if frames and all(blank.values()):
-        yield issue(f"all {len(frames)} frames looked at are of one colour; {expected}")
+        yield issue(f"all {len(frames)} frames looked at are of one colour")
         return
     for first, stop in runs(np.array(list(blank.values()), np.bool_)):
         start, last = frames[first], frames[stop - 1]
-        span = float(time[start]), float(time[last])
-        yield issue(
-            f"{stop - first} of the {len(frames)} frames looked at are of one colour: frames "
-            f"{start} to {last}, from {span[0] - view.zero:.2f} s; {expected}",
-            *span,
-        )
+        which = f"frames {start} to {last}, {stop - first} of the {len(frames)} looked at"
+        yield issue(f"{which}, are of one colour", float(time[start]), float(time[last]))
 
 
 def _duplicates(view: EpisodeView, name: str, looked: Mapping[str, _Looked]) -> Iterator[Issue]:
@@ -244,26 +235,18 @@ def _duplicates(view: EpisodeView, name: str, looked: Mapping[str, _Looked]) -> 
         if long and (seen.noisy or _others_move(view, name, looked, *span)):
             single[first:last] = False
             why = "elsewhere no frame is that before" if seen.noisy else "other views move"
-            yield issue(
-                f"frames {start} to {stop} are one picture, {span[1] - span[0]:.2f} s from "
-                f"{span[0] - view.zero:.2f} s; {why}",
-                *span,
-            )
+            yield issue(f"frames {start} to {stop} are one picture; {why}", *span)
     again = time[seen.index[1:][single]]
     if seen.noisy and len(again) >= DUPLICATES and len(again) > DUPLICATE_SHARE * pairs:
-        yield issue(
-            f"{len(again)} of {pairs} frames compared are the picture before, the first at "
-            f"{again[0] - view.zero:.2f} s; the camera is slower than its frames are stamped, or "
-            "frames were stored twice",
-            *again[[0, -1]].tolist(),
-        )
+        message = f"{len(again)} of {pairs} frames compared are the picture before: the camera is "
+        message += "slower than its frames are stamped, or frames were stored twice"
+        yield issue(message, *again[[0, -1]].tolist())
 
 
 def _others_move(
     view: EpisodeView, name: str, looked: Mapping[str, _Looked], start_s: float, stop_s: float
 ) -> bool:
     """Whether every other camera's pictures change between two instants, and there is another."""
-
     counts: list[int] = []
     for other in looked.keys() - {name}:
         time = view.cameras[other].time[looked[other].index]

@@ -281,8 +281,7 @@ def _warn_of_duplicates(summaries: Sequence[EpisodeSummary]) -> None:
                 source = "" if first.source == summary.source else f"{first.source}/"
                 message = (
                     f"the same recording as {source}{first.episode} ({first.path}): all values of "
-                    f"{' and '.join(common)} are equal, and nothing else was compared; it would "
-                    "count twice. Leave one of them out of data.sources"
+                    f"{' and '.join(common)} are equal, and nothing else was compared"
                 )
                 summary.warn("duplicate recording", "", message)
                 break

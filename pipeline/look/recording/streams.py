@@ -99,10 +99,7 @@ def sensor_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
     if view.sensor is None:
         return []
     spans = [f"{start - view.zero:.2f}–{stop - view.zero:.2f} s" for start, stop in contacts(view)]
-    caption = (
-        f"The sensor's {len(view.sensor.channels.names):,} channels over time. Contact (shaded), "
-        f"by the force alone: {', '.join(spans) or 'none'}. {RULE}"
-    )
+    caption = f"Contact (shaded), by the force alone: {', '.join(spans) or 'none'}. {RULE}"
     return [draw("sensor", caption, draw_sensor)]
 
 
