@@ -65,8 +65,7 @@ def check_disk(taken: int, estimate: str, target: Path, free: int, begun: int) -
         text += f"; {target} is finished"
     if taken - begun <= free:
         return ok("disk", text)
-    remedy = "make room, set extract.store to another disk, extract.dtype to float16, or fewer "
-    remedy += "vlm.pooling slots"
+    remedy = "make room, set extract.store to another disk, or extract.dtype to float16"
     return (note if target.exists() else missing)("disk", text, remedy)
 
 
@@ -75,8 +74,7 @@ def check_page_cache(taken: int, memory: int) -> Issue:
     if taken <= 0.7 * memory:
         return ok("page cache", f"the store fits into memory ({size(memory)})")
     text = f"the store is larger than what {size(memory)} of memory keeps, so it is read from disk"
-    remedy = "keep it on a local NVMe disk, or set extract.dtype to float16"
-    return note("page cache", text, remedy)
+    return note("page cache", text, "keep it on a local NVMe disk, or use extract.dtype float16")
 
 
 def measure(

@@ -102,10 +102,7 @@ def _baselines(comparison: Comparison) -> list[Block]:
     errors = tables.error_table(comparison)
     last = frozenset({len(errors.rows) - 1})
     return [
-        Text(
-            "Mean absolute errors over all steps of the chunk, of the policy and of three rules "
-            "that see nothing; below 1, `policy / best` beats the best of them."
-        ),
+        Text("The baselines see nothing; below 1, `policy / best` beats the best of them."),
         replace(errors, caption=sentence(tables.FOOTNOTE), strong=last),
         _picture(plots.dimensions, comparison),
     ]

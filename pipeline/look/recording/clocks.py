@@ -280,9 +280,9 @@ def _lost_ticks(view: EpisodeView, recorded: Sequence[Clock]) -> Iterator[Issue]
         late = [c for c, at in zip(recorded, edge, strict=True) if abs(at - extreme) <= near]
         steps = (DROPPED_STEP * clock.step_s for clock in late)
         if lost >= LOST_S or lost > max(LOST_SHARE * length_s, LOST_TICKS * tick_s, *steps):
-            message = f"{words.format(lost)}, which costs about {lost / tick_s:.0f} ticks, "
-            message += f"{100 * lost / length_s:.0f} % of the episode"
+            cost = f"about {lost / tick_s:.0f} ticks, {100 * lost / length_s:.0f} % of the episode"
             names = ", ".join(clock.name for clock in late)
+            message = f"{words.format(lost)}, which costs {cost}"
             yield view.issue("lost ticks", names, message, *sorted((extreme, usual)))
 
 
@@ -346,10 +346,7 @@ def clock_table(view: EpisodeView, clocks: Sequence[Clock]) -> Table:
         )
         for clock in clocks
     ]
-    caption = (
-        f"On average includes lost entries and gaps, which are steps of at least {GAP_FACTOR:g} "
-        "usual ones. Jitter is the standard deviation of the steps that are no gaps."
-    )
+    caption = f"Gaps are steps of at least {GAP_FACTOR:g} usual ones; jitter is without them."
     return Table(heads, rows, caption)
 
 

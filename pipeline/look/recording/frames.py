@@ -238,8 +238,7 @@ def _duplicates(view: EpisodeView, name: str, looked: Mapping[str, _Looked]) -> 
             yield issue(f"frames {start} to {stop} are one picture; {why}", *span)
     again = time[seen.index[1:][single]]
     if seen.noisy and len(again) >= DUPLICATES and len(again) > DUPLICATE_SHARE * pairs:
-        message = f"{len(again)} of {pairs} frames compared are the picture before: the camera is "
-        message += "slower than its frames are stamped, or frames were stored twice"
+        message = f"{len(again)} of {pairs} frames compared are the picture before"
         yield issue(message, *again[[0, -1]].tolist())
 
 

@@ -1,6 +1,5 @@
 """What the model and the policy get of a recording: samples, the batch, the prompt, its tokens."""
 
-import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import closing
@@ -62,10 +61,7 @@ def sample_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
     except BROKEN as error:
         return [Text(f"No sample can be made: {error}")]
     lengths = window_lengths(params)
-    caption = (
-        f"{len(samples)} training samples side by side: the frames, the sensor and state windows "
-        f"that end at the tick, and the chunk of {lengths['action']} actions that begins at it."
-    )
+    caption = "Training samples: frames, windows that end at the tick, and the chunk of actions."
     picture = draw("samples", caption, lambda view: draw_samples(view, samples, lengths))
     return [picture, batch_table(samples, lengths)]
 
@@ -153,10 +149,7 @@ def batch_table(samples: Sequence[Sample], lengths: Mapping[str, int]) -> Table:
         [sample.tick, *(f"{len(sample.windows[name])} of {lengths[name]}" for name in streams)]
         for sample in samples
     ]
-    caption = (
-        "The same samples as one batch: how many readings and steps are real. Windows are padded "
-        "with zeros before the episode's start, chunks are masked past its end."
-    )
+    caption = "The same samples as a batch: what of each is real, and not padded or masked."
     heads = [f"{name} {'steps' if name == 'action' else 'readings'}" for name in streams]
     return Table(["tick", *heads], rows, caption)
 
@@ -272,7 +265,7 @@ def remembered_spec(params: Params, views: Sequence[str]) -> FeatureSpec:
     `VLMError` where the checkpoint is not there or incomplete.
     """
     with (
-        closing(ContentDigests(digest_ledger(params))) as digests,
+        closing(ContentDigests.to_read(digest_ledger(params))) as digests,
         tqdm(desc="digest of the checkpoint", unit="file", disable=None, leave=False) as bar,
     ):
 
@@ -289,9 +282,7 @@ def digest_ledger(params: Params) -> Path:
     Looking makes no file beside stores: whoever only looks may have none, or may not write there.
     """
     shared = ledger_path(params.extract.store)
-    if shared.is_file() and os.access(shared, os.W_OK) and os.access(shared.parent, os.W_OK):
-        return shared
-    return params.inspect.output / LEDGER
+    return shared if shared.is_file() else params.inspect.output / LEDGER
 
 
 def describe_stretch(recorded: tuple[int, ...], pixels: tuple[int, int]) -> str | None:

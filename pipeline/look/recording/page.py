@@ -66,10 +66,8 @@ def recordings_report(opened: Opened, params: Params, name: str) -> Report:
     sections.append(Section("What the model and the policy get", [words], parts))
     data = params.data
     rate = "the recorded rows" if data.action_hz is None else f"{data.action_hz:g} Hz"
-    summary = (
-        f"Ticks at {rate}, one VL row every {data.vlm_reuse_count} ticks. "
-        "Times count from the first instant of an episode."
-    )
+    summary = f"Ticks at {rate}, one VL row every {data.vlm_reuse_count} ticks. Times count from "
+    summary += "the first instant of an episode."
     return Report(f"Recordings: {name}", summary, _tiles(overview), sections)
 
 
@@ -103,10 +101,7 @@ def _episodes_table(overview: RecordingsOverview, chosen: Sequence[int]) -> Tabl
         )
         for summary in (summaries[at] for at in shown)
     ]  # fmt: skip
-    caption = (
-        f"{len(shown)} of {len(summaries):,} episodes, those with most findings among them. Those "
-        "in bold are shown in detail below."
-    )
+    caption = f"{len(shown)} of {len(summaries):,} episodes; those in bold are shown below."
     strong = frozenset(row for row, index in enumerate(shown) if index in chosen)
     return Table(heads, rows, caption, strong)
 

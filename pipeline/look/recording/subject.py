@@ -67,8 +67,8 @@ def subject_of(params: Params) -> Subject:
     stores = [path for path in matches if _is_store(path)]
     if stores and len(matches) > 1:
         raise ConfigError(
-            f"inspect.path: expected recordings or one store, found {len(matches)} paths, the "
-            f"store {stores[0]} among them. Look at it alone: python -m stages.inspect {stores[0]}"
+            f"inspect.path: {stores[0]} is a store, and {len(matches) - 1} more paths are named. "
+            f"Look at it alone: python -m stages.inspect {stores[0]}"
         )
     # The last part of the first path that is no pattern.
     parts = [part for part in Path(places[0]).absolute().parts if not glob.has_magic(part)]
@@ -84,10 +84,7 @@ def _check(place: str, root: Path) -> None:
         return
     if not path.exists():
         raise ConfigError(f"inspect.path: {path} is not there. {_there_is(place, root)}")
-    remedy = meant(path.absolute()) or (
-        "Unpack it if it is packed. Name the folder of the whole recording: of LeRobot's, the one "
-        "that holds meta/"
-    )
+    remedy = meant(path.absolute()) or "Unpack it, or name the folder of the whole recording"
     raise ConfigError(f"inspect.path: expected a folder, found the file {path}. {remedy}")
 
 

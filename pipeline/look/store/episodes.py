@@ -84,15 +84,9 @@ def show_coverage(episodes: Sequence[EpisodeCoverage]) -> list[Block]:
         own = part.episode
         counts = len(own.ticks), round(part.seconds, 2), len(own.vl_rows)
         rows.append((own.source, own.id, own.instruction, *counts, _lacking(part.covered)))
-    return [
-        _tabulate_sources(episodes),
-        Picture(
-            "coverage",
-            "Length of each episode, and below it which streams and views its ticks see.",
-            partial(draw_coverage, episodes),
-        ),
-        Table(heads, rows, caption),
-    ]
+    words = "Length of each episode, and below it which streams and views its ticks see."
+    picture = Picture("coverage", words, partial(draw_coverage, episodes))
+    return [_tabulate_sources(episodes), picture, Table(heads, rows, caption)]
 
 
 def _tabulate_sources(episodes: Sequence[EpisodeCoverage]) -> Table:

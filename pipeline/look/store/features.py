@@ -158,15 +158,9 @@ def show_features(norms: FeatureNorms, episodes: Sequence[EpisodeCoverage]) -> l
         words += f", but for what is not finite in {broken:,} of them"
     if not np.isfinite(norms.norm).any():
         return [Text(f"{words}; none has features that are numbers.")]
-    return [
-        Text(f"{words}. Of augmented variants, plain frames only."),
-        Picture(
-            "norms",
-            "Left: how long the features of each slot are. Right: their median length in each "
-            "episode divided by that in all; a column that stands out is an episode unlike others.",
-            partial(draw_norms, norms, episodes),
-        ),
-    ]
+    caption = "Length of the features by slot, and the median in each episode / in all."
+    picture = Picture("norms", caption, partial(draw_norms, norms, episodes))
+    return [Text(f"{words}. Of augmented variants, plain frames only."), picture]
 
 
 def draw_norms(norms: FeatureNorms, episodes: Sequence[EpisodeCoverage]) -> Figure:
@@ -233,10 +227,7 @@ def find_feature_issues(
     """Dead slots, odd lengths and what is no number; times are s since the episode's first tick."""
     dead = np.flatnonzero(norms.variation < DEAD).tolist()
     if dead:
-        rows = f"all {len(norms.sampled.rows)} VL rows looked at"
-        text = (
-            f"{named(norms.names, dead)}: the same in {rows}; is a camera dead, or its view black?"
-        )
+        text = f"{named(norms.names, dead)}: the same in all VL rows looked at"
         yield Issue(severity="warning", kind="dead slot", message=text, stream=FEATURES)
     far = find_outliers(norms)
     still = (norms.within < DEAD) & (norms.variation >= DEAD)
@@ -244,10 +235,9 @@ def find_feature_issues(
         own = np.flatnonzero(norms.sampled.episode == index)
         time = norms.sampled.time[own]
         if len(row := np.nonzero(norms.broken[own])[0]):
+            slot, span = norms.broken[own[row[0]]].argmax(), time[row[[0, -1]]]
             text = f"{len(np.unique(row))} VL row(s) are NaN or infinite, the first in slot "
-            text += f"{norms.names[norms.broken[own[row[0]]].argmax()]}; they are left out here, "
-            text += "and training refuses them: extract them anew"
-            span = time[row[[0, -1]]]
+            text += f"{norms.names[slot]}; training refuses them: extract them anew"
             yield episode.issue("not finite", FEATURES, text, *span, severity="error")
         if len(own) >= _STILL_ROWS and still[index].any():
             slots = named(norms.names, np.flatnonzero(still[index]).tolist())
@@ -256,8 +246,6 @@ def find_feature_issues(
         if len(row := np.nonzero(far[own])[0]):
             worst, slot = np.unravel_index(far[own].argmax(), far[own].shape)
             column = norms.norm[:, slot]
-            text = (
-                f"{len(row)} feature norm(s) far from the rest: {column[own[worst]]:.4g} in slot "
-            )
-            text += f"{norms.names[slot]}, of which the median is {np.nanmedian(column):.4g}"
+            text = f"{len(row)} feature norm(s) far from the rest, as {column[own[worst]]:.4g} in "
+            text += f"slot {norms.names[slot]}, of which the median is {np.nanmedian(column):.4g}"
             yield episode.issue("feature norm", FEATURES, text, *time[row[[0, -1]]])

@@ -120,10 +120,8 @@ def _checked(view: StoreView) -> Text:
     looked_at, total = len(view.features.sampled.rows), view.features.sampled.total
     which = f"all {total:,}" if looked_at == total else f"{looked_at:,} of {total:,}"
     command = f"python -m stages.verify --set verify.store={view.store.path}"
-    return Text(
-        f"Metadata, clocks, offsets and the features of {which} VL rows give the checksums that "
-        f"were written with them; the rest was not read: `{command}` reads every byte."
-    )
+    words = f"Metadata, clocks, offsets and the features of {which} VL rows give the checksums"
+    return Text(f"{words} that were written with them; `{command}` reads every byte.")
 
 
 def read_sizes(path: Path) -> dict[str, int]:

@@ -55,15 +55,9 @@ def show_ages(ages: Ages) -> list[Block]:
         if np.isfinite(age).any()
     ]
     return [
-        Text(
-            "What the model saw grows older until the next VL row. The policy is given the age of "
-            "the newest frame as `feature_age`."
-        ),
+        Text("The policy is given the age of the newest frame as `feature_age`."),
         Picture(
-            "ages",
-            "Share of the ticks by the age of what they see: of the newest frame, filled, and of "
-            "each view's; the dashed line is the time of one VL row.",
-            partial(draw_ages, ages),
+            "ages", "Share of the ticks by the age of what they see.", partial(draw_ages, ages)
         ),
         Table(("age [s] of", "1 %", "median", "99 %", "oldest"), rows),
     ]
@@ -103,8 +97,8 @@ def find_age_issues(
             kind = "frames from the future"
             yield episode.issue(kind, "vl/frame_time", text, *span, severity="error")
         if len(old):
-            text = f"{len(old)} of {len(age)} ticks see features up to {age.max():.2f} s old; "
-            text += f"expected less than {limit:.2f} s, the time of {_STALE_PERIODS} VL rows"
+            text = f"{len(old)} of {len(age)} ticks see features up to {age.max():.2f} s old, over "
+            text += f"{limit:.2f} s, the time of {_STALE_PERIODS} VL rows"
             span = time[old[[0, -1]]] - time[0]
             yield episode.issue("old frames", "vl/frame_time", text, *span)
 

@@ -49,7 +49,7 @@ def test_a_path_below_the_data_root_is_found_there(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "said"), [("run.zip", "Unpack it"), ("meta.json", "Name the folder")]
+    ("name", "said"), [("run.zip", "Unpack it"), ("meta.json", "name the folder")]
 )
 def test_a_file_is_no_recording(tmp_path: Path, name: str, said: str) -> None:
     (tmp_path / name).write_bytes(b"")
