@@ -65,19 +65,15 @@ def local_folder(checkpoint: str, revision: str | None) -> Path | None:
 
 def absent_checkpoint(params: Params) -> Issue:
     """What is said of a checkpoint that is not on this machine."""
-    checkpoint = params.vlm.checkpoint
+    checkpoint, subject = params.vlm.checkpoint, "vlm.checkpoint"
+    absent, remedy = f"{checkpoint}: not on this machine", f"hf download {checkpoint}"
     if Path(checkpoint) == params.demo.checkpoint:
-        text = f"{checkpoint}: the demo's checkpoint is not written yet"
-        return missing("vlm.checkpoint", text, "python -m stages.demo (or dvc repro)")
+        return missing(subject, absent, "python -m stages.demo (or dvc repro)")
     if not checkpoint_folder.could_be_hub_id(checkpoint):
-        text = f"{checkpoint}: no such folder, and no hub id"
-        return missing("vlm.checkpoint", text, _EXAMPLE)
-    text = f"{checkpoint}: no such folder, and no complete copy in the hub's cache"
-    remedy = f"hf download {checkpoint}"
+        return missing(subject, f"{absent}, and no hub id", _EXAMPLE)
     if os.environ.get("HF_HUB_OFFLINE", "0").lower() in ("1", "true", "yes", "on"):
-        text += "; HF_HUB_OFFLINE forbids to fetch it"
-        return missing("vlm.checkpoint", text, f"{remedy}, where there is network")
-    return note("vlm.checkpoint", f"{text}; the first extraction downloads it", remedy)
+        return missing(subject, f"{absent}; HF_HUB_OFFLINE forbids to fetch it", remedy)
+    return note(subject, f"{absent}; the first extraction downloads it", remedy)
 
 
 def check_adapter(adapter: str) -> Issue:

@@ -238,10 +238,7 @@ def show_prompt(view: EpisodeView, vlm: VLMParams, spec: FeatureSpec) -> list[Bl
     special = Counter(text for text, kind, _ in tokens if kind != "text")
     pixels = spec.image_size
     return [
-        Text(
-            f"{len(tokens):,} tokens: {len(views):,} of images, {len(tokens) - len(views):,} "
-            "others. Attention is causal: a token sees only what stands before it."
-        ),
+        Text(f"{len(tokens):,} tokens, {len(views):,} of images."),
         Tokens(fold_tokens(tokens)),
         Table(
             ["view", "recorded [pixels]", "for the model [pixels]", "drawn out", "image tokens"],

@@ -54,9 +54,8 @@ _APART_S, _SHORTEST_S = 0.1, 0.05
 
 # The rule in a sentence, for a caption.
 RULE = (
-    f"In contact: from where the force leaves its median of the first {_REST_S:g} s by "
-    f"{_ENTER:g} times its noise (in newtons by {_LEAST_N:g} at least) until it is back within "
-    f"{100 * _LEAVE / _ENTER:.0f} % of that."
+    f"It begins where the force leaves its median of the first {_REST_S:g} s by {_ENTER:g} times "
+    f"its noise, and ends where it is back within {100 * _LEAVE / _ENTER:.0f} % of that."
 )
 # A standard deviation, of normal noise, that outliers do not raise.
 _spread = partial(median_abs_deviation, axis=0, scale=1 / 1.4826)

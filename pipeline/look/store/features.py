@@ -91,7 +91,7 @@ def sample_rows(store: FeatureStore, most: int) -> SampledRows:
 def check_rows(store: FeatureStore, rows: NDArray[np.int64]) -> None:
     """Raise `StoreIncomplete` where one of these VL rows does not give its checksum."""
     features, checksums = store.array(FEATURES), store.array("vl/checksum")
-    for block in _blocks(rows, features[:1].nbytes):
+    for block in np.array_split(rows, max(1, len(rows) * features[:1].nbytes // _BLOCK_BYTES)):
         bad = block[row_checksums(features[block]) != checksums[block]]
         if len(bad):
             raise StoreIncomplete(
@@ -123,9 +123,7 @@ def look_at_features(store: FeatureStore, sampled: SampledRows) -> FeatureNorms:
 
 def read_slot(store: FeatureStore, rows: NDArray[np.int64], slot: int) -> NDArray[np.float32]:
     """(row, dim) of one slot of the plain frames, whatever dtype it is stored in."""
-    features = store.array(FEATURES)
-    blocks = [widen(features[block, slot]) for block in _blocks(rows, features[0, :1].nbytes)]
-    return np.concatenate(blocks).astype(np.float32, copy=False)
+    return widen(store.array(FEATURES)[rows, slot]).astype(np.float32, copy=False)
 
 
 def _slot_name(document: Mapping[str, Any]) -> str:
@@ -133,10 +131,6 @@ def _slot_name(document: Mapping[str, Any]) -> str:
     cell = ",".join(map(str, document.get("cell") or ()))
     layer = f"layer {document['layer']}{'' if document['norm'] else ' no norm'}"
     return " ".join(filter(None, (layer, document["pooling"], document.get("view"), cell)))
-
-
-def _blocks(rows: NDArray[np.int64], row_bytes: int) -> list[NDArray[np.int64]]:
-    return np.array_split(rows, max(1, len(rows) * row_bytes // _BLOCK_BYTES))
 
 
 def _variation(values: NDArray[np.float32]) -> float:

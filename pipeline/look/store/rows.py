@@ -56,9 +56,7 @@ def show_ages(ages: Ages) -> list[Block]:
     ]
     return [
         Text("The policy is given the age of the newest frame as `feature_age`."),
-        Picture(
-            "ages", "Share of the ticks by the age of what they see.", partial(draw_ages, ages)
-        ),
+        Picture("ages", "Ticks by the age of what they see.", partial(draw_ages, ages)),
         Table(("age [s] of", "1 %", "median", "99 %", "oldest"), rows),
     ]
 
@@ -155,9 +153,9 @@ def find_duplicates(store: FeatureStore) -> Duplicates:
 def show_duplicates(duplicates: Duplicates, episodes: Sequence[EpisodeCoverage]) -> list[Block]:
     """How many rows there are twice, and in which episodes."""
     pairs = duplicates.pairs
+    twice = f"{duplicates.rows:,} of {duplicates.total:,} VL rows, in {len(pairs):,} pair(s)"
     text = Text(
-        f"By their keys, {duplicates.rows:,} of {duplicates.total:,} VL rows have exactly the "
-        f"frames and prompt of another row; pairs of episodes with such rows: {len(pairs):,}."
+        f"{twice} of episodes, have exactly the frames and prompt of another by their keys."
     )
     rows: list[tuple[object, ...]] = []
     for pair in pairs[:_LISTED]:
