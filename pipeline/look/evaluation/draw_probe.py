@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.evaluate.probe.inputs import SlotName
 from pipeline.evaluate.probe.study import ProbeResult, ProbeStudy, ranked
-from pipeline.look.page.style import INK, canvas, draw_map, legend_below, panels, write
+from pipeline.look.page.style import INK, canvas, draw_map, finish, panels, write
 
 _BARS = 20
 """Choices that a picture still shows legibly."""
@@ -112,8 +112,7 @@ def bars(study: ProbeStudy) -> Figure:
     axis.set_yticks(range(len(shown)), [_bar_name(result) for result in shown])
     axis.grid(axis="y", visible=False)
     axis.set_xlabel("held-out R², mean over channels and steps (lines: standard error over folds)")
-    legend_below(figure, axis, 3)
-    figure.suptitle(_title(study, "What each choice of features says of the action"))
+    finish(figure, axis, 3, _title(study, "What each choice of features says of the action"))
     return figure
 
 

@@ -26,7 +26,7 @@ from pipeline.look.page.style import (
     canvas,
     draw_frame,
     draw_map,
-    legend_below,
+    finish,
     logarithmic,
     panels,
     shorten_middle,
@@ -72,8 +72,7 @@ def dimensions(comparison: Comparison) -> Figure:
     axis.set_ylim(len(shown) - 0.5, -0.5)
     axis.set_xlim(left=0)
     axis.set_xlabel("mean absolute error [training std] (left is better)")
-    legend_below(figure, axis, 2)
-    figure.suptitle("Error of each action dimension on held-out ticks")
+    finish(figure, axis, 2, "Error of each action dimension on held-out ticks")
     return figure
 
 
@@ -104,15 +103,14 @@ def horizon(comparison: Comparison, action_hz: float | None) -> Figure:
         axis.set_ylabel(with_unit("mean absolute error", group.unit))
         axis.set_ylim(bottom=0)
         axis.xaxis.get_major_locator().set_params(integer=True)
-    legend_below(figure, axes[0], len(METHODS))
-    figure.suptitle("Error over the action chunk on held-out ticks (lower is better)")
+    finish(figure, axes[0], len(METHODS), "Error over the action chunk (lower is better)")
     return figure
 
 
 def episodes(comparison: Comparison, store: FeatureStore) -> Figure:
     """Mean absolute error of each held-out episode, a panel an action group, worst on top."""
     order = np.array(comparison.ranked())
-    title = "Error of each held-out episode"
+    title = "Error of each held-out episode, worst by overall error on top"
     if len(order) > EPISODE_LINES:
         order = order[np.linspace(0, len(order) - 1, EPISODE_LINES).round().astype(int)]
         title += f" ({len(order)} of {len(comparison.episodes)})"
@@ -129,8 +127,7 @@ def episodes(comparison: Comparison, store: FeatureStore) -> Figure:
         axis.set_xlim(left=0)
     axes[0].set_yticks(lines, [_short_name(store.episodes[comparison.episodes[i]]) for i in order])
     axes[0].set_ylim(-0.6, len(order) - 0.4)
-    legend_below(figure, axes[0], len(METHODS))
-    figure.suptitle(f"{title}, worst by overall error on top (left is better)")
+    finish(figure, axes[0], len(METHODS), f"{title} (left is better)")
     return figure
 
 
@@ -181,8 +178,7 @@ def timeline(comparison: Comparison, predictions: Predictions, store: FeatureSto
             low, high = axis.get_ylim()
             axis.set_ylim(min(low, high - 0.2), max(high, low + 0.2))
     figure.align_ylabels(axes[:, 0])
-    legend_below(figure, axes[0, 0], 2)
-    figure.suptitle("Held-out episodes: the recorded action, and what the policy would do next")
+    finish(figure, axes[0, 0], 2, "Held-out episodes: the recorded action, and the policy's next")
     return figure
 
 
@@ -232,9 +228,9 @@ def chunks(
         axis.label_outer()
     axes[-1].set_xlabel("time since the episode began [s]")
     figure.align_ylabels(axes)
-    legend_below(figure, axes[0], 3)
     error = comparison.overall_by_episode("policy")[comparison.episodes.index(episode.index)]
-    figure.suptitle(f"{_short_name(episode)}: overall error {error:.3f} [training std]")
+    title = f"{_short_name(episode)}: overall error {error:.3f} [training std]"
+    finish(figure, axes[0], 3, title)
     return figure
 
 
@@ -297,10 +293,9 @@ def modalities(study: AblationStudy) -> Figure:
         axis.set_title(ways[0].stream)
     axes[0].set_ylabel("held-out error / error with all streams intact")
     axes[0].set_ylim(0, 1.12 * axes[0].get_ylim()[1])
-    legend_below(figure, axes[0], 2)
-    figure.legends[0].set_title(ABLATION_FOOTNOTE)
     judged = f"{study.intact.ticks} held-out ticks, {study.samples} chunk(s) a tick"
-    figure.suptitle(f"What the policy loses with one stream ablated, on {judged}")
+    finish(figure, axes[0], 2, f"What the policy loses with one stream ablated, on {judged}")
+    figure.legends[0].set_title(ABLATION_FOOTNOTE)
     return figure
 
 
@@ -322,8 +317,7 @@ def comparison_of_experiments(experiments: Sequence[Experiment]) -> Figure:
     axis.invert_yaxis()
     axis.grid(axis="y", visible=False)
     axis.set_xlabel("mean absolute error on held-out ticks [training std] (left is better)")
-    legend_below(figure, axis, 3)
-    figure.suptitle("Held-out error by expert and fusion, trained from one store")
+    finish(figure, axis, 3, "Held-out error by expert and fusion, trained from one store")
     return figure
 
 

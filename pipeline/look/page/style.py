@@ -176,7 +176,9 @@ def logarithmic(axis: Axes) -> None:
     axis.yaxis.set_minor_formatter(NullFormatter())
 
 
-def legend_below(figure: Figure, axis: Axes, columns: int) -> None:
-    """The legend of one axis, below all of them."""
+def finish(figure: Figure, axis: Axes, columns: int, title: str | None = None) -> None:
+    """The legend of one axis below all panels, and a title above them."""
     handles, labels = axis.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=columns)
+    if title is not None:
+        figure.suptitle(title)

@@ -96,7 +96,7 @@ class _PageWriter:
         )
         filters: dict[str, Any] = {"prose": prose, "breakable": breakable, "yaml": as_yaml}
         filters |= {"groups": group_issues, "place": place_of, "places": places_of}
-        self._jinja.filters |= filters | {"drawn": self._draw}
+        self._jinja.filters.update(filters | {"drawn": self._draw})
         limits = {"open": OPEN_GROUPS, "named": NAMED_PLACES, "listed": MOST_PLACES}
         shown = {**limits, "findings": FINDINGS}
         self._blocks: Any = self._jinja.get_template("blocks.html", globals=shown).module

@@ -21,10 +21,10 @@ from pipeline.base.errors import PipelineError, RecordingError
 from pipeline.base.ownership import LEDGER_SUFFIX as LEDGER
 from pipeline.base.table import Table
 from pipeline.look.page.blocks import Block, Document, Text, TokenRun, Tokens
-from pipeline.look.page.style import INK, canvas
+from pipeline.look.page.style import INK, draw_frame, panels
 from pipeline.look.recording.episode import BROKEN, Draw, EpisodeView
-from pipeline.look.recording.frames import draw_frame, read_frames
-from pipeline.look.recording.streams import Group, group_channels, legend_beside, plot_curves
+from pipeline.look.recording.frames import read_frames
+from pipeline.look.recording.streams import Group, legend_beside, named_groups, plot_curves
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.processor import TokenKind
@@ -92,19 +92,16 @@ def cut_samples(view: EpisodeView, params: Params) -> list[Sample]:
         for name, camera in view.cameras.items()
     }
     streams = {"sensor": (view.sensor, line.sensor_end), "state": (view.state, line.state_end)}
-    return [
-        Sample(
-            tick,
-            {name: row[place] for name, row in frames.items()},
-            {
-                name: stream.values[max(0, ends[tick] - lengths[name]) : ends[tick]].copy()
-                for name, (stream, ends) in streams.items()
-                if stream is not None
-            }
-            | {"action": line.action[tick : tick + lengths["action"]]},
-        )
-        for place, tick in enumerate(ticks)
-    ]
+    samples: list[Sample] = []
+    for place, tick in enumerate(ticks):
+        windows = {
+            name: stream.values[max(0, ends[tick] - lengths[name]) : ends[tick]].copy()
+            for name, (stream, ends) in streams.items()
+            if stream is not None
+        }
+        windows["action"] = line.action[tick : tick + lengths["action"]]
+        samples.append(Sample(tick, {name: row[place] for name, row in frames.items()}, windows))
+    return samples
 
 
 def draw_samples(
@@ -116,19 +113,14 @@ def draw_samples(
     chunk that lie past its end and are masked. States are drawn as what they changed since the
     first of the window.
     """
-    rows = [
-        (name, group)
-        for name in samples[0].windows
-        for group in group_channels(view.shown[name].channels)
-    ]
+    rows = named_groups({name: view.shown[name] for name in samples[0].windows})
     views = samples[0].frames
     column = float(np.clip((_WIDTH_IN - _BESIDE_IN) / len(samples), _LEAST_COLUMN_IN, _COLUMN_IN))
     heights = [column * frame.shape[0] / frame.shape[1] for frame in views.values()]
     heights += [_PANEL_IN] * len(rows)
-    figure = canvas(column * len(samples) + _BESIDE_IN, sum(heights) + 1.8)
-    axes = figure.subplots(
-        len(heights), len(samples), squeeze=False, sharey="row", height_ratios=heights
-    )
+    size = column * len(samples) + _BESIDE_IN, sum(heights) + 1.8
+    shape = {"squeeze": False, "sharey": "row", "height_ratios": heights}
+    figure, axes = panels(*size, len(heights), len(samples), **shape)
     for place, sample in enumerate(samples):
         axes[0, place].set_title(_sample_title(view, sample.tick), fontsize=_SMALL)
         for line_axes, (name, frame) in zip(axes, sample.frames.items(), strict=False):

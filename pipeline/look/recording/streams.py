@@ -13,7 +13,7 @@ has glided out of tissue; a touch below the threshold is none.
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -93,6 +93,11 @@ def group_channels(channels: Channels) -> list[Group]:
     return sorted(groups.values(), key=lambda group: bool(group.profile))
 
 
+def named_groups(streams: Mapping[str, Stream]) -> list[tuple[str, Group]]:
+    """The groups of all these streams, each with its stream's name."""
+    return [(name, group) for name in streams for group in group_channels(streams[name].channels)]
+
+
 def sensor_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
     """The picture of the sensor, contact marked; empty without one."""
     if view.sensor is None:
@@ -140,18 +145,14 @@ def draw_motion(view: EpisodeView) -> Figure:
     Where channels of a panel lie so far apart that none would be seen to move, it shows what they
     changed since the first reading, and the legend where each began.
     """
-    panels = [
-        (name, stream, group)
-        for name, stream in view.shown.items()
-        if name != "sensor"
-        for group in group_channels(stream.channels)
-    ]
-    figure, axes = _panels([group for _, _, group in panels])
+    shown = {name: stream for name, stream in view.shown.items() if name != "sensor"}
+    drawn = named_groups(shown)
+    figure, axes = _panels([group for _, group in drawn])
     actions = "actions as recorded" if view.timeline is None else "actions at the ticks"
     titled = ""
-    for axis, (name, stream, group) in zip(axes, panels, strict=True):
+    for axis, (name, group) in zip(axes, drawn, strict=True):
         held = name == "action"
-        _draw_curves(axis, stream, group, view.zero, held=held, changes=not held)
+        _draw_curves(axis, shown[name], group, view.zero, held=held, changes=not held)
         axis.set_title("" if name == titled else actions if held else name, loc="left")
         legend_beside(axis)
         titled = name
@@ -186,10 +187,8 @@ def plot_curves(
 def legend_beside(axis: Axes) -> None:
     """The legend of a panel, right of it; in columns where it is long."""
     columns = 1 + len(axis.get_legend_handles_labels()[1]) // 8
-    place = 1.005, 0.5
-    axis.legend(
-        loc="center left", bbox_to_anchor=place, fontsize=8, ncols=columns, handlelength=1.6
-    )
+    place = {"loc": "center left", "bbox_to_anchor": (1.005, 0.5)}
+    axis.legend(fontsize=8, ncols=columns, handlelength=1.6, **place)
 
 
 def _panels(groups: Sequence[Group]) -> tuple[Figure, list[Axes]]:

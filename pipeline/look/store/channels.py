@@ -13,7 +13,7 @@ from pipeline.base.channels import PROFILE_CHANNELS, named, unnumbered
 from pipeline.base.issue import Issue
 from pipeline.data import Channels
 from pipeline.look.page.blocks import Block, Picture, Text
-from pipeline.look.page.style import GRID, PALETTE, legend_below, panels
+from pipeline.look.page.style import GRID, PALETTE, finish, panels
 from pipeline.look.recording.channels import (
     ChannelStatistics,
     describe_still,
@@ -111,7 +111,7 @@ def draw_profiles(profiles: Sequence[Sequence[ChannelStatistics]]) -> Figure:
         axis.set_ylabel(f"{first.stream} [{first.unit}]" if first.unit else first.stream)
         axis.set_xlabel(f"channel: {first.name} to {channels[-1].name}")
         axis.margins(x=0)
-    legend_below(figure, axes[0, 0], 3)
+    finish(figure, axes[0, 0], 3)
     return figure
 
 
