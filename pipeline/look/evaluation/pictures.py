@@ -270,9 +270,7 @@ def modalities(study: AblationStudy) -> Figure:
 
     The error itself, in units of the training standard deviation, where the intact one is 0.
     """
-    streams = [
-        [ablated for ablated in study.ablated if ablated.stream == name] for name in study.streams
-    ]
+    streams = [[one for one in study.ablated if one.stream == name] for name in study.streams]
     widths = [len(ways) for ways in streams]
     size, shared = (max(0.95 * sum(widths) + 1.5, 7.5), 4.6), {"sharey": True, "squeeze": False}
     figure, (axes,) = panels(*size, 1, len(widths), width_ratios=widths, **shared)

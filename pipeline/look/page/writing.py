@@ -47,9 +47,7 @@ def write_report(folder: Path, report: Report) -> list[Path]:
     """
     files = [f"{picture.name}.png" for picture in report.blocks(Picture)]
     if len(set(files)) < len(files) or not all(_PICTURE.fullmatch(f'href="{f}"') for f in files):
-        raise ValueError(
-            f"expected names of pictures that are plain file stems, each once: {files}"
-        )
+        raise ValueError(f"pictures: expected plain file stems, each once, found {files}")
     temporary = folder / f".{PAGE}.new"
     with disk_full_named(folder):
         folder.mkdir(parents=True, exist_ok=True)

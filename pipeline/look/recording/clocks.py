@@ -134,9 +134,7 @@ def merge_equal(clocks: Iterable[Clock]) -> list[Clock]:
     alike: dict[bytes, list[Clock]] = {}
     for clock in clocks:
         alike.setdefault(clock.time.tobytes(), []).append(clock)
-    return [
-        replace(group[0], name=", ".join(clock.name for clock in group)) for group in alike.values()
-    ]
+    return [replace(same[0], name=", ".join(c.name for c in same)) for same in alike.values()]
 
 
 def usual_step(time: NDArray[np.float64]) -> float:
@@ -209,10 +207,8 @@ def _find_jumps(clock: Clock, recorded: Sequence[Clock]) -> dict[Span, str]:
     jumps: dict[Span, str] = {}
     end = float(clock.time[-1])
     for gap in sorted(clock.gaps, key=lambda gap: -gap.length_s):
-        ends = np.array(
-            [c.time[-1] for c in recorded if np.diff(c.time).max(initial=0) < gap.length_s / 2]
-        )
-        moved = gap.length_s - clock.step_s
+        moved, half = gap.length_s - clock.step_s, gap.length_s / 2
+        ends = np.array([c.time[-1] for c in recorded if np.diff(c.time).max(initial=0) < half])
         apart, left = (np.abs(at - ends).min(initial=np.inf) for at in (end, end - moved))
         if LOST_S <= apart < np.inf and left < apart / 2:
             jumps[gap] = f"it ends {apart:.2f} s from the nearest other clock, {left:.2f} s without"

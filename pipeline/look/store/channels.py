@@ -72,11 +72,9 @@ def evenly(total: int, most: int) -> NDArray[np.int64]:
 
 def show_channels(statistics: Sequence[StreamSummary]) -> list[Block]:
     """How much was looked at, the profiles as a picture, and every channel in a table."""
-    looked_at = ", ".join(
-        f"{one.looked_at:,} of {one.rows:,} rows of {one.stream}" for one in statistics
-    )
+    looked_at = [f"{one.looked_at:,} of {one.rows:,} rows of {one.stream}" for one in statistics]
     blocks: list[Block] = [
-        Text(f"Of the whole store. Looked at, evenly: {looked_at}."),
+        Text(f"Of the whole store. Looked at, evenly: {', '.join(looked_at)}."),
         statistics_table([channel for summary in statistics for channel in summary.channels]),
     ]
     if profiles := list(find_profiles(statistics)):

@@ -198,9 +198,7 @@ def _instructions(episodes: Sequence[EpisodeCoverage]) -> Iterator[Issue]:
     by_source: dict[str, Counter[str]] = defaultdict(Counter)
     for episode in episodes:
         by_source[episode.episode.source][episode.episode.instruction] += 1
-    usual = {
-        source: (*counts.most_common(1)[0], counts.total()) for source, counts in by_source.items()
-    }
+    usual = {name: (*said.most_common(1)[0], said.total()) for name, said in by_source.items()}
     for episode in episodes:
         source, words = episode.episode.source, episode.episode.instruction
         most, often, total = usual[source]

@@ -55,9 +55,7 @@ def inspect_store(path: str | Path, params: InspectParams) -> StoreView:
     store = FeatureStore.open(path)
     check_trailers(store.path, but=tuple(WIDE.values()))
     if not len(store.array("vl/time")):
-        raise StoreIncomplete(
-            f"{path}: expected VL rows to look at, found none. Run {extract_command(store.path)}."
-        )
+        raise StoreIncomplete(f"{path}: has no VL row. Run {extract_command(store.path)}.")
     sampled = features.sample_rows(store, params.points)
     features.check_rows(store, sampled.rows)
     coverage = tuple(episodes.read_coverage(store, episode) for episode in store.episodes)

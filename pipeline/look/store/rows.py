@@ -154,9 +154,7 @@ def show_duplicates(duplicates: Duplicates, episodes: Sequence[EpisodeCoverage])
     """How many rows there are twice, and in which episodes."""
     pairs = duplicates.pairs
     twice = f"{duplicates.rows:,} of {duplicates.total:,} VL rows, in {len(pairs):,} pair(s)"
-    text = Text(
-        f"{twice} of episodes, have exactly the frames and prompt of another by their keys."
-    )
+    text = Text(f"{twice} of episodes, have exactly the frames and prompt of another row.")
     rows: list[tuple[object, ...]] = []
     for pair in pairs[:_LISTED]:
         first, second = (episodes[index].name for index in (pair.first, pair.second))
