@@ -153,16 +153,16 @@ def _look(view: EpisodeView, name: str, camera: CameraStream) -> _Looked:
         if (known := camera.sizes(served)) is not None:
             sizes |= zip(served, map(tuple, known.tolist()), strict=True)
     index = _neighbours(count, MOST_FRAMES if repeats is None else 2 * RUNS)
-    wanted, shares = not blank, np.zeros(max(0, len(index) - 1))
+    wanted, steps = not blank, list[float]()
     before: NDArray[np.uint8] | None = None
-    for place, frame in enumerate(camera.read(index.tolist())):
-        number = int(index[place])
+    for number, frame in zip(index.tolist(), camera.read(index.tolist()), strict=True):
         sizes[number] = frame.shape[:2]
         if wanted:
             blank[number] = _is_blank(frame)
         if before is not None:
-            shares[place - 1] = _share_differing(before, frame)
+            steps.append(_share_differing(before, frame))
         before = frame
+    shares = np.array(steps)
     differing = shares[(shares > 0) & (np.diff(index) == 1)]
     noisy = len(differing) > 0 and float(np.percentile(differing, 10)) > NOISY
     sizes = dict(sorted(sizes.items()))

@@ -5,6 +5,7 @@ import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from pathlib import Path
 
 from pipeline.base.config import InspectParams, Params, Source
@@ -102,7 +103,7 @@ def _check_output(folder: Path) -> None:
 
 
 def _there_is(place: str, root: Path) -> str:
-    """What is there instead: below `data.root`, on the hub, or beside it."""
+    """What is there instead: below `data.root`, on the hub, or beside it, the likest first."""
     path = Path(place)
     if (root / path).exists():
         return f"It is under data.root: python -m stages.inspect '{root / path}'"
@@ -110,8 +111,10 @@ def _there_is(place: str, root: Path) -> str:
     if hint and path.parts[:1] != root.parts[:1]:  # data/demo, before the demo is written
         return hint
     parent = next(folder for folder in path.absolute().parents if folder.is_dir())
-    names = sorted(name for name in os.listdir(parent) if not name.startswith("."))
-    return f"In {parent} there is {', '.join(names[:8]) or 'nothing'}"
+    wanted = path.absolute().relative_to(parent).parts[0]
+    names = [name for name in os.listdir(parent) if not name.startswith(".")]
+    close = get_close_matches(wanted, names, n=8, cutoff=0)
+    return f"In {parent} there is {', '.join(close) or 'nothing'}"
 
 
 def _is_store(path: Path) -> bool:
