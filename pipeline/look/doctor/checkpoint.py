@@ -12,8 +12,8 @@ from pipeline.base.errors import VLMError
 from pipeline.base.format import size
 from pipeline.base.issue import Issue
 from pipeline.base.memory import available_bytes
+from pipeline.look.doctor import missing, note, ok
 from pipeline.look.doctor.gpu import GPU, read_gpus, usable_device
-from pipeline.look.doctor.issues import missing, note, ok
 from pipeline.simulation.demo_recordings import MARKER
 from pipeline.vlm import checkpoint_folder
 

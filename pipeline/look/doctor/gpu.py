@@ -14,7 +14,7 @@ from pipeline.base.errors import ConfigError
 from pipeline.base.format import size
 from pipeline.base.issue import Issue
 from pipeline.base.memory import memory_bytes
-from pipeline.look.doctor.issues import missing, note, ok
+from pipeline.look.doctor import missing, note, ok
 from pipeline.vlm.loading import attention_backend
 
 FLASH = "pip install flash-attn --no-build-isolation"

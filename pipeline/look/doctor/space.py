@@ -18,9 +18,9 @@ from pipeline.data.timeline import choose_action_rotation
 from pipeline.extract.layout import build_arrays
 from pipeline.extract.plan import store_bytes
 from pipeline.extract.survey import CheckedEpisode, Survey, SurveyedEpisode
+from pipeline.look.doctor import missing, note, ok
 from pipeline.look.doctor.checkpoint import local_folder
 from pipeline.look.doctor.data import unusable
-from pipeline.look.doctor.issues import missing, note, ok
 from pipeline.store import part_path
 from pipeline.store.episodes import EpisodeRows
 from pipeline.vlm.feature_spec import feature_spec

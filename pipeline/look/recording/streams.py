@@ -15,7 +15,7 @@ has glided out of tissue; a touch below the threshold is none.
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -187,7 +187,7 @@ def plot_curves(
 def legend_beside(axis: Axes) -> None:
     """The legend of a panel, right of it; in columns where it is long."""
     columns = 1 + len(axis.get_legend_handles_labels()[1]) // 8
-    place = {"loc": "center left", "bbox_to_anchor": (1.005, 0.5)}
+    place: dict[str, Any] = {"loc": "center left", "bbox_to_anchor": (1.005, 0.5)}
     axis.legend(fontsize=8, ncols=columns, handlelength=1.6, **place)
 
 
