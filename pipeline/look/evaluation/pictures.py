@@ -292,7 +292,7 @@ def modalities(study: AblationStudy) -> Figure:
     axes[0].set_ylabel("held-out error / error with all streams intact")
     axes[0].set_ylim(0, 1.12 * axes[0].get_ylim()[1])
     judged = f"{study.intact.ticks} held-out ticks, {study.samples} chunk(s) a tick"
-    finish(figure, axes[0], 2, f"What the policy loses with one stream ablated, on {judged}")
+    finish(figure, axes[0], 2, f"What the policy loses with one stream ablated\n{judged}")
     figure.legends[0].set_title(ABLATION_FOOTNOTE)
     return figure
 
