@@ -31,7 +31,8 @@ NAMED_PLACES = 3
 """Of a group, those that show at once; all of them unfold."""
 MOST_PLACES = 300
 """Of a group, those that the page lists; more stand in `findings.csv` only."""
-_PICTURE = re.compile(r'href="([A-Za-z0-9][\w-]*\.png)"')
+_WRITTEN = re.compile(r'<meta name="pictures" content="([^"]*)">')
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 _TEMPORARY = OutputKind("a page in the making", Path.is_dir)
 
 
@@ -45,22 +46,22 @@ def write_report(folder: Path, report: Report) -> list[Path]:
     page in place, and `ValueError` for a picture's name that is twice in the report or no plain
     file stem.
     """
-    files = [f"{picture.name}.png" for picture in report.blocks(Picture)]
-    if len(set(files)) < len(files) or not all(_PICTURE.fullmatch(f'href="{f}"') for f in files):
-        raise ValueError(f"pictures: expected plain file stems, each once, found {files}")
+    names = [picture.name for picture in report.blocks(Picture)]
+    if len(set(names)) < len(names) or not all(map(_NAME.fullmatch, names)):
+        raise ValueError(f"pictures: expected plain file stems, each once, found {names}")
     temporary = folder / f".{PAGE}.new"
     with disk_full_named(folder):
         folder.mkdir(parents=True, exist_ok=True)
         try:
             begin_folder(temporary, _TEMPORARY)
-            texts = {PAGE: _PageWriter(temporary).html(report, len(files))}
+            texts = {PAGE: _PageWriter(temporary).html(report, names)}
             # The first issues are those of all; those of single parts come later.
             if issues := next(report.blocks(Issues), None):
                 texts = {FINDINGS: findings_csv(issues.issues), **texts}
             for name, text in texts.items():
                 # A file's name need not be text: what is none is shown as \udcXX.
                 (temporary / name).write_text(text, encoding="utf-8", errors="backslashreplace")
-            return _put_in_place(temporary, folder, [*files, *texts])
+            return _put_in_place(temporary, folder, [*(f"{name}.png" for name in names), *texts])
         finally:
             remove_folder(temporary, _TEMPORARY)
             release(folder, REPORT)
@@ -73,8 +74,9 @@ def _put_in_place(temporary: Path, folder: Path, files: Sequence[str]) -> list[P
     before = page.read_text(encoding="utf-8", errors="replace") if page.is_file() else ""
     for file in files:
         (temporary / file).replace(folder / file)
-    for name in {*_PICTURE.findall(before)} - {*files}:
-        (folder / name).unlink(missing_ok=True)
+    for name in filter(_NAME.fullmatch, " ".join(_WRITTEN.findall(before)).split()):
+        if f"{name}.png" not in files:
+            (folder / f"{name}.png").unlink(missing_ok=True)
     sync(folder)
     return [folder / file for file in (PAGE, *files[:-1])]
 
@@ -99,15 +101,16 @@ class _PageWriter:
         shown = {**limits, "findings": FINDINGS}
         self._blocks: Any = self._jinja.get_template("blocks.html", globals=shown).module
 
-    def html(self, report: Report, pictures: int) -> str:
-        """The whole page; its pictures, so many, are written on the way."""
-        bar = tqdm(total=pictures, desc="pictures", unit="", disable=None)
+    def html(self, report: Report, pictures: Sequence[str]) -> str:
+        """The whole page; its pictures are written on the way."""
+        bar = tqdm(total=len(pictures), desc="pictures", unit="", disable=None)
         with bar as self._bar, boxes() as notes:
             sections = [self._section(section) for section in report.sections]
         if notes:
             warnings.warn(NO_FONT, stacklevel=3)
         page = self._jinja.get_template("page.html")
-        return page.render(report=report, notes=notes, sections=sections)
+        names = " ".join(pictures)
+        return page.render(report=report, notes=notes, sections=sections, pictures=names)
 
     def _section(self, section: Section) -> dict[str, Any]:
         return {
