@@ -1,4 +1,10 @@
-"""Bytes and seconds, as people read them."""
+"""Bytes, seconds and documents, as people read them."""
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import yaml
 
 
 def size(count: float) -> str:
@@ -15,3 +21,11 @@ def duration(seconds: float) -> str:
         return f"{seconds:.3g} s"
     minutes = seconds / 60
     return f"{minutes:.1f} min" if minutes < 120 else f"{minutes / 60:,.1f} h"
+
+
+def as_yaml(document: Mapping[str, Any]) -> str:
+    """A nested document as YAML in its own order; what holds nothing nested stands in one line."""
+    plain = json.loads(json.dumps(document, default=str))
+    return yaml.safe_dump(
+        plain, sort_keys=False, default_flow_style=None, width=float("inf"), allow_unicode=True
+    )

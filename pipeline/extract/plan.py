@@ -166,17 +166,31 @@ def row_sources(places: Sequence[Path], surveyed: Survey) -> list[RowSource]:
     return [source for source in sources if source.attrs["feature_spec"]["digest"] == digest]
 
 
+_CHANNEL = ("names", "units")
+
+
+def _apart(before: Sequence[tuple[str, str]], now: Sequence[tuple[str, str]]) -> str:
+    """How the channels, names with units, of a stored stream differ from those that are wanted."""
+    if len(before) != len(now):
+        return f"{len(before)} channels there, {len(now)} here"
+    there, here = next(pair for pair in zip(before, now, strict=True) if pair[0] != pair[1])
+    return f"{' in '.join(there)} there, {' in '.join(here)} here"
+
+
 def _refuse_another(source: RowSource, surveyed: Survey, embodiment: Embodiment) -> None:
     known = set(source.episode_contents)
     if not known or known & surveyed.contents or not source.rows:
         return
     there, here = source.attrs["sources"], sorted({r.source for r in surveyed.recordings})
     before, now = source.attrs["streams"], embodiment.document()
-    differing = [
-        f"; {name}: {len(before[name]['names'])} channels there, {len(now[name]['names'])} here"
+    channels = {
+        name: [list(zip(*map(side[name].get, _CHANNEL), strict=True)) for side in (before, now)]
         for name in now
-        if before[name]["names"] and now[name]["names"]
-        if any(before[name][key] != now[name][key] for key in ("names", "units"))
+    }
+    differing = [
+        f"; {name}: {_apart(*sides)}"
+        for name, sides in channels.items()
+        if all(sides) and sides[0] != sides[1]
     ]
     if differing or not set(there) & set(here):
         raise StoreMismatch(

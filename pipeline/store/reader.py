@@ -137,6 +137,10 @@ class FeatureStore:
         steps = steps[np.diff(self.episode_of(np.arange(self.ticks))) == 0]
         return float(np.median(steps)) if len(steps) else float("nan")
 
+    def feature_age(self, ticks: NDArray[np.int64]) -> NDArray[np.float64]:
+        """(tick,) s since the newest frame that the features of these ticks have seen."""
+        return self.gatherer.feature_age(ticks, self._arrays["tick/vl_row"][ticks])
+
     def gather(
         self,
         ticks: Sequence[int] | NDArray[np.int64],

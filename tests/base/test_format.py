@@ -2,7 +2,7 @@
 
 import pytest
 
-from pipeline.base.format import duration, size
+from pipeline.base.format import as_yaml, duration, size
 
 
 @pytest.mark.parametrize(
@@ -37,3 +37,11 @@ def test_bytes(count: float, said: str) -> None:
 )
 def test_seconds(seconds: float, said: str) -> None:
     assert duration(seconds) == said
+
+
+def test_documents_keep_their_order_and_what_is_flat_stands_in_one_line() -> None:
+    slots = [{"layer": -1, "cell": (0, 1)}, {"name": "바늘", "of": None}]
+    written = as_yaml({"b": {"list": list(range(99))}, "a": slots, "no": {}})
+    first, numbers, *rest = written.splitlines()
+    assert (first, numbers[:16], len(numbers)) == ("b:", "  list: [0, 1, 2", 394)
+    assert rest == ["a:", "- layer: -1", "  cell: [0, 1]", "- {name: 바늘, of: null}", "'no': {}"]

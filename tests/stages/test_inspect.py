@@ -62,7 +62,7 @@ def test_a_zarr_group_of_somebody_else_is_told_and_not_to_be_replaced(
     group.create_array("data/action", shape=(3,), dtype="f4")
     assert looked("umi.zarr") == 2
     said = capsys.readouterr().err
-    told = {2: "It looks like a zarr replay buffer", 3: "expected what this project wrote"}
+    told = {2: "It looks like a zarr replay buffer", 3: "no finished store, found"}
     assert "umi.zarr" in said and told[version] in said
     assert "extract.store=" not in said
 

@@ -106,6 +106,11 @@ class TestGather:
                 found = getattr(batch, name)[index].numpy()
                 assert np.allclose(found, value, atol=1e-6), (name, tick)
 
+    def test_the_age_of_a_feature_is_known_without_a_batch(self, store):
+        ticks = np.array([0, 2, 31, 179])
+        wanted = [reference(store, int(tick), 1, 1, 0, 0.0)["feature_age"] for tick in ticks]
+        assert store.feature_age(ticks).tolist() == wanted
+
     def test_fills_the_buffers_it_is_given_and_leaves_nothing_of_before(self, store):
         out = store.gather([100, 170], 8, 65, 20)
         pointers = out.sensor.data_ptr(), out.features.data_ptr()

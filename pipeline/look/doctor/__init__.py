@@ -1,15 +1,15 @@
 """What this machine has, lacks and could have for the pipeline, and what to install or set."""
 
-from collections.abc import Generator
+import textwrap
+from collections.abc import Generator, Sequence
 from importlib import import_module
 
 from pipeline.base.config import Params
 from pipeline.base.errors import PipelineError
 from pipeline.base.issue import Issue
-from pipeline.look.doctor.issues import described, missing, note
 
-__all__ = ["GROUPS", "described", "examine"]
-
+WIDTH = 100
+_INDENT = 30
 GROUPS = {
     "Python and packages": "packages",
     "GPU": "gpu",
@@ -35,3 +35,33 @@ def examine(params: Params) -> Generator[tuple[str, list[Issue]]]:
         except OSError as error:
             issues = [note(module, f"not known: {error}", "look at that path")]
         yield title, issues
+
+
+def ok(subject: str, message: str) -> Issue:
+    """It is as it should be."""
+    return Issue(severity="ok", kind=subject, message=message)
+
+
+def note(subject: str, message: str, remedy: str = "") -> Issue:
+    """It works, but could be better; or it will be needed later."""
+    return Issue(severity="note", kind=subject, message=message, remedy=remedy)
+
+
+def missing(subject: str, message: str, remedy: str) -> Issue:
+    """Without it a stage of the default pipeline does not run with these params."""
+    return Issue(severity="error", kind=subject, message=message, remedy=remedy)
+
+
+def described(title: str, issues: Sequence[Issue]) -> list[str]:
+    """A group of issues as lines of at most `WIDTH` columns."""
+    lines = [title]
+    for issue in issues:
+        severity = "missing" if issue.severity == "error" else issue.severity
+        head = f"  {severity:<8} {issue.kind:<18} ".ljust(_INDENT)
+        for begin, text in ((head, issue.message), (f"{'-> ':>{_INDENT}}", issue.remedy)):
+            # A path or an option is copied, so it is never broken.
+            wrapper = textwrap.TextWrapper(
+                WIDTH, begin, " " * len(begin), break_long_words=False, break_on_hyphens=False
+            )
+            lines += wrapper.wrap(text)
+    return [*lines, ""]

@@ -5,17 +5,18 @@ import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import torch
+
 from pipeline.base.config import Params, VLMParams
 from pipeline.base.errors import VLMError
 from pipeline.base.format import size
 from pipeline.base.issue import Issue
 from pipeline.base.memory import available_bytes
+from pipeline.look.doctor import missing, note, ok
 from pipeline.look.doctor.gpu import GPU, read_gpus, usable_device
-from pipeline.look.doctor.issues import missing, note, ok
 from pipeline.simulation.demo_recordings import MARKER
 from pipeline.vlm import checkpoint_folder
 
-_BYTES = {"float32": 4, "float16": 2, "bfloat16": 2}
 _EXAMPLE = "set vlm.checkpoint to a folder or a hub id, such as Qwen/Qwen2.5-VL-3B-Instruct"
 _BESIDE = 2 * 2**30
 """Roughly what else a GPU holds while the model works: CUDA itself and a batch's activations."""
@@ -39,9 +40,7 @@ def check(params: Params) -> Iterator[Issue]:
         yield missing("vlm.checkpoint", str(error), remedy)
         return
     count = sum(math.prod(shape) for header in headers for _, shape in header.values())
-    here = f"{vlm.checkpoint}, whole, {count:,} parameters"
-    if str(folder) != vlm.checkpoint:
-        here += " (in the hub's cache)"
+    here = f"{folder}, whole, {count:,} parameters"
     if (folder / MARKER).exists():
         here += "; the demo's random weights: to look at the machinery, not to learn from"
         yield note("vlm.checkpoint", here, f"{_EXAMPLE}; docs/real-model.md")
@@ -66,19 +65,15 @@ def local_folder(checkpoint: str, revision: str | None) -> Path | None:
 
 def absent_checkpoint(params: Params) -> Issue:
     """What is said of a checkpoint that is not on this machine."""
-    checkpoint = params.vlm.checkpoint
+    checkpoint, subject = params.vlm.checkpoint, "vlm.checkpoint"
+    absent, remedy = f"{checkpoint}: not on this machine", f"hf download {checkpoint}"
     if Path(checkpoint) == params.demo.checkpoint:
-        text = f"{checkpoint}: the demo's checkpoint is not written yet"
-        return missing("vlm.checkpoint", text, "python -m stages.demo (or dvc repro)")
+        return missing(subject, absent, "python -m stages.demo (or dvc repro)")
     if not checkpoint_folder.could_be_hub_id(checkpoint):
-        text = f"{checkpoint}: no such folder, and no hub id"
-        return missing("vlm.checkpoint", text, _EXAMPLE)
-    text = f"{checkpoint}: no such folder, and no complete copy in the hub's cache"
-    remedy = f"hf download {checkpoint}"
+        return missing(subject, f"{absent}, and no hub id", _EXAMPLE)
     if os.environ.get("HF_HUB_OFFLINE", "0").lower() in ("1", "true", "yes", "on"):
-        text += "; HF_HUB_OFFLINE forbids to fetch it"
-        return missing("vlm.checkpoint", text, f"{remedy}, where there is network")
-    return note("vlm.checkpoint", f"{text}; the first extraction downloads it", remedy)
+        return missing(subject, f"{absent}; HF_HUB_OFFLINE forbids to fetch it", remedy)
+    return note(subject, f"{absent}; the first extraction downloads it", remedy)
 
 
 def check_adapter(adapter: str) -> Issue:
@@ -95,7 +90,7 @@ def check_adapter(adapter: str) -> Issue:
 
 def check_fit(count: int, vlm: VLMParams, gpus: Sequence[GPU], available: int) -> Issue:
     """Whether the weights fit: on the smallest GPU, else into the memory that is free."""
-    weights = count * _BYTES[vlm.dtype]
+    weights = count * getattr(torch, vlm.dtype).itemsize
     where, room, needed = "memory", available, weights
     if gpus:
         smallest = min(gpus, key=lambda gpu: gpu.memory)

@@ -10,7 +10,7 @@ from pipeline.base.config import Params, Source
 from pipeline.base.errors import RecordingError
 from pipeline.base.issue import Issue
 from pipeline.data import Opened, open_recordings
-from pipeline.look.doctor.issues import missing, note, ok
+from pipeline.look.doctor import missing, note, ok
 
 DECODERS = {"AV1": "libdav1d", "H.264": "h264", "HEVC": "hevc"}
 """What decodes the codecs that LeRobot data sets come in, AV1 by default."""

@@ -14,14 +14,13 @@ from pipeline.base.errors import ConfigError
 from pipeline.base.format import size
 from pipeline.base.issue import Issue
 from pipeline.base.memory import memory_bytes
-from pipeline.look.doctor.issues import missing, note, ok
+from pipeline.look.doctor import missing, note, ok
 from pipeline.vlm.loading import attention_backend
 
 FLASH = "pip install flash-attn --no-build-isolation"
 _SEE_GPU = (
-    "look at CUDA_VISIBLE_DEVICES and nvidia-smi (in a container, start it with --gpus all); then "
-    "update the driver, or pip install --force-reinstall torch from the index that "
-    "pytorch.org/get-started names for the driver's CUDA version"
+    "look at CUDA_VISIBLE_DEVICES and nvidia-smi (in a container, start it with --gpus all), or "
+    "install torch for the driver's CUDA version as pytorch.org/get-started says"
 )
 _DRIVERS = ("/proc/driver/nvidia/version", "/dev/kfd")
 """There where an NVIDIA or an AMD driver is."""
@@ -74,9 +73,9 @@ def read_gpus() -> tuple[GPU, ...]:
 
 def check_gpus(gpus: Sequence[GPU], driver: bool, dtype: str) -> Iterator[Issue]:
     """What torch sees and can do; where it sees nothing, why."""
-    made_for = f"CUDA {torch.version.cuda}" if torch.version.cuda else "the CPU only"
-    made_for = f"ROCm {torch.version.hip}" if torch.version.hip else made_for
-    build = f"torch {torch.__version__}, built for {made_for}"
+    built_for = {"CUDA": torch.version.cuda, "ROCm": torch.version.hip}
+    made_for = [f"{name} {version}" for name, version in built_for.items() if version]
+    build = f"torch {torch.__version__}, built for {', '.join(made_for) or 'the CPU only'}"
     if gpus:
         yield ok("build", build)
     elif driver:
@@ -106,8 +105,8 @@ def check_attention(vlm: VLMParams, device: torch.device) -> Issue:
     """What `vlm.attention` comes to."""
     best = attention_backend(vlm.model_copy(update={"attention": "auto"}), device)
     if vlm.attention == "flash_attention_2" != best:
-        text = f"vlm.attention asks for flash-attention, which {device} with vlm.dtype {vlm.dtype} "
-        text += "has not: it needs CUDA, half precision and the package flash-attn"
+        text = f"{vlm.attention} needs CUDA, half precision and the package flash-attn, found "
+        text += f"{device} with vlm.dtype {vlm.dtype}"
         return missing("attention", text, f"set vlm.attention to auto, or {FLASH}")
     taken = attention_backend(vlm, device)
     text = f"vlm.attention: {vlm.attention} takes {taken} on {device}"

@@ -10,7 +10,7 @@ from packaging.requirements import Requirement
 
 from pipeline.base.config import Params
 from pipeline.base.issue import Issue
-from pipeline.look.doctor.issues import missing, ok
+from pipeline.look.doctor import missing, ok
 
 _SHOWN = ("python", "torch", "transformers", "peft", "zarr", "numpy", "av", "dvc")
 

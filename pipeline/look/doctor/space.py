@@ -13,19 +13,20 @@ from pipeline.base.format import size
 from pipeline.base.issue import Issue
 from pipeline.base.memory import memory_bytes
 from pipeline.data import Recording, open_recordings
-from pipeline.data.episode import ReadEpisode, read_episode
+from pipeline.data.episode import read_episode
 from pipeline.data.timeline import choose_action_rotation
+from pipeline.extract.layout import build_arrays
+from pipeline.extract.plan import store_bytes
+from pipeline.extract.survey import CheckedEpisode, Survey
+from pipeline.look.doctor import missing, note, ok
 from pipeline.look.doctor.checkpoint import local_folder
 from pipeline.look.doctor.data import unusable
-from pipeline.look.doctor.issues import missing, note, ok
-from pipeline.store import Sizes, arrays, part_path
+from pipeline.store import part_path
 from pipeline.vlm.feature_spec import feature_spec
 
 BUDGET_S = 2.0
 """How long episodes are read for the estimate; the rest is taken to be like them."""
 MOST_READ = 100
-_TEXT_BYTES = 400
-"""Roughly what an episode's instruction and path take."""
 
 
 def check(params: Params) -> Iterator[Issue]:
@@ -63,8 +64,7 @@ def check_disk(taken: int, estimate: str, target: Path, free: int, begun: int) -
         text += f"; {target} is finished"
     if taken - begun <= free:
         return ok("disk", text)
-    remedy = "make room, set extract.store to another disk, extract.dtype to float16, or fewer "
-    remedy += "vlm.pooling slots"
+    remedy = "make room, set extract.store to another disk, or extract.dtype to float16"
     return (note if target.exists() else missing)("disk", text, remedy)
 
 
@@ -73,57 +73,43 @@ def check_page_cache(taken: int, memory: int) -> Issue:
     if taken <= 0.7 * memory:
         return ok("page cache", f"the store fits into memory ({size(memory)})")
     text = f"the store is larger than what {size(memory)} of memory keeps, so it is read from disk"
-    remedy = "keep it on a local NVMe disk, or set extract.dtype to float16"
-    return note("page cache", text, remedy)
+    return note("page cache", text, "keep it on a local NVMe disk, or use extract.dtype float16")
 
 
 def measure(
     recordings: Sequence[Recording], data: DataParams
-) -> tuple[list[ReadEpisode], list[str]]:
+) -> tuple[list[CheckedEpisode], list[str]]:
     """A few episodes, read within `BUDGET_S`, and why others of them cannot be used."""
     rotation = choose_action_rotation(data.action_rotation, recordings)
     # An order whose every beginning comes from all over: the golden ratio's.
     order = sorted(range(len(recordings)), key=lambda at: at * 0.6180339887498949 % 1)
-    read: list[ReadEpisode] = []
+    read: list[CheckedEpisode] = []
     bad: list[str] = []
     until = time.monotonic() + BUDGET_S
     for recording in (recordings[at] for at in order[:MOST_READ]):
         if (read or bad) and time.monotonic() > until:
             break
         try:
-            reuse = data.vlm_reuse_count
-            read.append(read_episode(recording, data.action_hz, reuse, rotation))
+            episode = read_episode(recording, data.action_hz, data.vlm_reuse_count, rotation)
         except RecordingError as error:
             bad.append(str(error))
+            continue
+        rows = (episode.timeline, episode.readings, episode.states)
+        read.append(CheckedEpisode(*rows, recording.source, {}, recording, episode.embodiment))
     return read, bad
 
 
-def estimated_bytes(read: Sequence[ReadEpisode], episodes: int, params: Params) -> int:
+def estimated_bytes(read: Sequence[CheckedEpisode], episodes: int, params: Params) -> int:
     """About what `extract.plan=true` computes, where all episodes are like those read.
 
-    Raises `VLMError` where the checkpoint does not fit the params.
+    Raises `VLMError` where the checkpoint does not fit the params, and `StoreMismatch` where two
+    sources are not of one embodiment.
     """
-    lines = [episode.timeline for episode in read]
-    embodiments = [episode.embodiment for episode in read]
-    views = {view for line in lines for view in line.frames}
+    views = {view for episode in read for view in episode.ticks.frames}
     # A digest decides nothing of a size, and reading every weight for it takes long.
     spec = feature_spec(params.vlm, params.extract.dtype, sorted(views), lambda path: "")
-    sizes = Sizes(
-        episode=len(read),
-        tick=sum(len(line.time) for line in lines),
-        vl_row=sum(len(line.vl_time) for line in lines),
-        sensor_reading=sum(episode.readings for episode in read),
-        state_reading=sum(episode.states for episode in read),
-        byte=_TEXT_BYTES * len(read),
-        slot=len(spec.slots) * spec.variants,
-        dim=spec.dim,
-        view=len(views),
-        action_dim=len(embodiments[0].action.names),
-        channel=max(len(embodiment.sensor.names) for embodiment in embodiments),
-        state_dim=max(len(embodiment.state.names) for embodiment in embodiments),
-    )
-    specs = arrays(sizes, params.extract.dtype, params.extract.sensor_dtype).values()
-    return math.ceil(sum(spec.data_bytes for spec in specs) * episodes / len(read))
+    surveyed = Survey(params, (), (), (), spec, "rotvec", plan="")
+    return math.ceil(store_bytes(build_arrays(read, surveyed)) * episodes / len(read))
 
 
 def used_bytes(folder: Path) -> int:

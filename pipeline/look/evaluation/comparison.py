@@ -19,17 +19,12 @@ def comparison_report(experiments: Sequence[Experiment]) -> Report:
         caption=f"Mean errors; samples are chunks whose mean was judged. {sentence(FOOTNOTE)}",
         strong=frozenset({experiments.index(best)}),
     )
-    picture = Picture(
-        "experiments",
-        "Held-out error of each experiment, coloured by expert; the baselines are lines.",
-        partial(plots.comparison_of_experiments, experiments),
-    )
+    caption = "Held-out error of each experiment, coloured by expert; the baselines are lines."
+    draw = partial(plots.comparison_of_experiments, experiments)
+    picture = Picture("experiments", caption, draw)
     return Report(
         title="Experiments side by side",
-        summary=(
-            f"{len(experiments)} policies judged on the same held-out ticks, beside the baselines "
-            "of all of them."
-        ),
+        summary=f"{len(experiments)} policies judged on the same held-out ticks.",
         tiles=(("lowest held-out error [training std]", f"{best.error:.3f}"), ("by", best.name)),
         sections=(Section("Errors", (table, picture)),),
     )

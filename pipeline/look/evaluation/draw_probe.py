@@ -5,13 +5,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from pipeline.evaluate.probe.inputs import SlotName
 from pipeline.evaluate.probe.study import ProbeResult, ProbeStudy, ranked
-from pipeline.look.page.style import RECORDED, canvas, draw_map, legend_below, write
+from pipeline.look.page.style import INK, canvas, draw_map, finish, panels, write
 
 _BARS = 20
 """Choices that a picture still shows legibly."""
@@ -44,7 +43,7 @@ def heat_map(study: ProbeStudy) -> Figure:
         if result.name.cell is not None:
             maps[f"{_row(result.name)}, {result.name.view}"].append(result)
     best = {title: max(result.best.mean for result in cells) for title, cells in maps.items()}
-    shown = sorted(maps, key=lambda title: best[title], reverse=True)[:_MAPS]
+    shown = sorted(maps, key=best.__getitem__, reverse=True)[:_MAPS]
     seen = [*named, *(result for title in shown for result in maps[title])]
     values = [result.best.mean for result in seen]
     limits = _limits(values if study.streams is None else [*values, study.streams.mean])
@@ -54,15 +53,15 @@ def heat_map(study: ProbeStudy) -> Figure:
     width = max(8.5, 2.0 + 1.25 * len(kinds), 1.5 + 2.3 * columns)
     figure = canvas(width, 1.8 + 0.5 * len(rows) + 2.2 * lines)
     ratios = [0.6 + 0.5 * len(rows)] + [2.2] * lines
-    panels = figure.add_gridspec(1 + lines, columns, height_ratios=ratios)
-    overview = figure.add_subplot(panels[0, :])
+    places = figure.add_gridspec(1 + lines, columns, height_ratios=ratios)
+    overview = figure.add_subplot(places[0, :])
     # A group of one slot is that slot.
-    places = [(rows.index(_row(r.name)), kinds.index(_column(r.name))) for r in named]
-    image = draw_map(overview, _grid(places, named), limits)
+    cells = [(rows.index(_row(r.name)), kinds.index(_column(r.name))) for r in named]
+    image = draw_map(overview, _grid(cells, named), limits)
     overview.set_xticks(range(len(kinds)), kinds)
     overview.set_yticks(range(len(rows)), rows)
     for index, title in enumerate(shown):
-        axis = figure.add_subplot(panels[1 + index // _MAPS_A_ROW, index % _MAPS_A_ROW])
+        axis = figure.add_subplot(places[1 + index // _MAPS_A_ROW, index % _MAPS_A_ROW])
         cells = [result.name.cell or (0, 0) for result in maps[title]]
         draw_map(axis, _grid(cells, maps[title]), limits)
         axis.set(xticks=[], yticks=[])
@@ -73,9 +72,8 @@ def heat_map(study: ProbeStudy) -> Figure:
     if study.streams is not None:
         alone = study.streams.mean
         overview.set_title(f"state + sensor alone: {alone:.2f}", fontsize=9)
-        bar.set_label(
-            f"held-out R², beside state + sensor\n(line: state + sensor alone, {alone:.2f})"
-        )
+        words = f"held-out R², beside state + sensor\n(line: state + sensor alone, {alone:.2f})"
+        bar.set_label(words)
         bar.ax.axhline(max(alone, limits[0]), color="#D55E00", lw=2.5)
     words = "Where a linear reader finds the action"
     if len(shown) < len(maps):
@@ -90,8 +88,7 @@ def bars(study: ProbeStudy) -> Figure:
     A bar that would end left of the axis ends at an arrow and its number.
     """
     shown = ranked(study.groups)[:_BARS][::-1]
-    figure = canvas(8.5, 2.4 + 0.55 * len(shown))
-    axis = figure.subplots()
+    figure, axis = panels(8.5, 2.4 + 0.55 * len(shown))
     kinds = [("alone", _ALONE, [result.alone for result in shown])]
     if study.streams is not None:
         kinds.append(("beside state + sensor", _BESIDE, [result.best for result in shown]))
@@ -99,31 +96,24 @@ def bars(study: ProbeStudy) -> Figure:
     for number, (label, colour, scores) in enumerate(kinds):
         where = np.arange(len(shown)) + height * ((len(kinds) - 1) / 2 - number)
         means, errors = [score.mean for score in scores], [score.error for score in scores]
-        style = {"ecolor": RECORDED, "capsize": 3, "lw": 1}
+        style = {"ecolor": INK, "capsize": 3, "lw": 1}
         axis.barh(where, means, height, xerr=errors, color=colour, label=label, error_kw=style)
+        style = {"va": "center", "color": "white", "size": 8}
         for place, mean in zip(where, means, strict=True):
             if mean < _LEAST:
-                axis.text(
-                    _LEAST + 0.005, place, f"◀ {mean:.2f}", va="center", color="white", size=8
-                )
+                axis.text(_LEAST + 0.005, place, f"◀ {mean:.2f}", **style)
     if study.streams is not None:
-        _mark_streams(axis, study.streams.mean)
-    axis.axvline(0, color=RECORDED, lw=1)
+        mean, label = study.streams.mean, "state + sensor alone"
+        label += f" ({mean:.2f}, left of the axis)" if mean < _LEAST else ""
+        axis.axvline(max(mean, _LEAST), color=INK, ls="--", lw=1.8, label=label)
+    axis.axvline(0, color=INK, lw=1)
     low, high = axis.get_xlim()
     axis.set_xlim(max(low, _LEAST), min(max(high, 0.1), 1.0))
     axis.set_yticks(range(len(shown)), [_bar_name(result) for result in shown])
     axis.grid(axis="y", visible=False)
     axis.set_xlabel("held-out R², mean over channels and steps (lines: standard error over folds)")
-    legend_below(figure, axis, 3)
-    figure.suptitle(_title(study, "What each choice of features says of the action"))
+    finish(figure, axis, 3, _title(study, "What each choice of features says of the action"))
     return figure
-
-
-def _mark_streams(axis: Axes, mean: float) -> None:
-    """Where state + sensor are by themselves, if only in the legend."""
-    beyond = f" ({mean:.2f}, left of the axis)" if mean < _LEAST else ""
-    label = f"state + sensor alone{beyond}"
-    axis.axvline(max(mean, _LEAST), color=RECORDED, ls="--", lw=1.8, label=label)
 
 
 def _grid(places: Sequence[tuple[int, int]], results: Sequence[ProbeResult]) -> NDArray[np.float64]:

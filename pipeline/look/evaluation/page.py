@@ -27,11 +27,9 @@ _EPISODES = 40
 """Rows of the table of episodes."""
 _CAPTIONS = {
     "dimensions": "Mean absolute error of policy and baselines by dimension, of those that vary.",
-    "scatter": "Predicted against recorded next action at the held-out ticks; a cloud that lies "
-    "flat says that the policy tells no cases apart.",
+    "scatter": "Predicted against recorded next action at the held-out ticks.",
     "horizon": "Mean absolute error of policy and baselines by how far ahead an action lies.",
-    "dimension_horizon": "The policy's error in each dimension (rows) and step of the chunk "
-    "(columns), in units of the dimension's training standard deviation.",
+    "dimension_horizon": "The policy's error by dimension and step [training std].",
     "episodes": "Mean absolute error of policy and baselines in each held-out episode.",
     "timeline": "Every action dimension over the episodes of lowest and highest error.",
     "modalities": "The error with one stream ablated as a multiple of that with all intact.",
@@ -102,15 +100,10 @@ def _tiles(comparison: Comparison) -> list[tuple[str, str]]:
 
 def _baselines(comparison: Comparison) -> list[Block]:
     errors = tables.error_table(comparison)
+    last = frozenset({len(errors.rows) - 1})
     return [
-        Text(
-            "Mean absolute errors over all steps of the chunk, of the policy and of three rules "
-            "that see nothing. `overall` counts each channel in units of its training standard "
-            "deviation; below 1, `policy / best` beats the best rule."
-        ),
-        replace(
-            errors, caption=sentence(tables.FOOTNOTE), strong=frozenset({len(errors.rows) - 1})
-        ),
+        Text("The baselines see nothing; below 1, `policy / best` beats the best of them."),
+        replace(errors, caption=sentence(tables.FOOTNOTE), strong=last),
         _picture(plots.dimensions, comparison),
     ]
 
@@ -168,14 +161,11 @@ def _extremes(evaluation: Evaluation) -> Iterator[Section]:
         above = "Above, the frames that the features at the dotted ticks were computed from. "
         caption = (
             f"Instruction: {episode.instruction}. {above if seen.frames else ''}Recorded action, "
-            "the policy's next action at every tick, and the whole chunks that it predicts at the "
-            "dotted ticks; what was recorded then is the recorded line from there on."
+            "the policy's next action at every tick, and its whole chunks at the dotted ticks."
         )
-        picture = Picture(
-            "episode_worst" if index == worst else "episode_best",
-            caption,
-            partial(plots.chunks, comparison, predictions, store, episode, ticks, seen.frames),
-        )
+        called = "episode_worst" if index == worst else "episode_best"
+        shown = comparison, predictions, store, episode, ticks, seen.frames
+        picture = Picture(called, caption, partial(plots.chunks, *shown))
         words = f"Overall error {errors[index]:.3f} [training std]. {seen.absence}".strip()
         name = f"{title[0].upper()}{title[1:]}: {episode_name(episode)}"
         yield Section(name, [Text(words), picture])
@@ -190,14 +180,9 @@ def _whole(predictions: Predictions, index: int) -> Ticks:
 
 def _modalities(study: AblationStudy | None) -> list[Block]:
     if study is None:
-        text = "Not judged: `evaluate.modalities` is off, or no held-out tick lies 200 ms into its "
-        return [Text(f"{text}episode.")]
-    words = f"{sentence(tables.evaluated_on(study))} {sentence(tables.ABLATION_FOOTNOTE)} An error "
-    words += (
-        "that stays says that the policy does not use the stream, or that others tell it the same."
-    )
+        return [Text("Not judged: `evaluate.modalities` is off, or no episode is long enough.")]
     return [
-        Text(words),
+        Text(f"{sentence(tables.evaluated_on(study))} {sentence(tables.ABLATION_FOOTNOTE)}"),
         replace(tables.ablation_table(study), caption=""),
         *(Text(sentence(note)) for note in study.notes),
         _picture(plots.modalities, study),

@@ -22,12 +22,13 @@ from pipeline.look.page.style import (
     INK,
     LABELS,
     PALETTE,
-    RECORDED,
     STYLES,
     canvas,
+    draw_frame,
     draw_map,
-    legend_below,
+    finish,
     logarithmic,
+    panels,
     shorten_middle,
 )
 from pipeline.store import Episode, FeatureStore, episode_name
@@ -63,25 +64,22 @@ _EXPERTS = ("#0072B2", "#D55E00", "#56B4E9", "#F0E442", "#999999")
 def dimensions(comparison: Comparison) -> Figure:
     """Mean absolute error of each dimension that varies, in units of its training deviation."""
     shown = comparison.varying()
-    figure = canvas(9.0, 0.42 * len(shown) + 2.0)
-    axis = figure.subplots()
+    figure, axis = panels(9.0, 0.42 * len(shown) + 2.0)
     for method in METHODS:
         errors = comparison.in_training_std(comparison.scores[method].mae)
-        axis.plot(errors, range(len(shown)), **_marked(method, linestyle=""))
+        axis.plot(errors, range(len(shown)), **_marked(method, ls=""))
     axis.set_yticks(range(len(shown)), _dimension_names(comparison))
     axis.set_ylim(len(shown) - 0.5, -0.5)
     axis.set_xlim(left=0)
     axis.set_xlabel("mean absolute error [training std] (left is better)")
-    legend_below(figure, axis, 2)
-    figure.suptitle("Error of each action dimension on held-out ticks")
+    finish(figure, axis, 2, "Error of each action dimension on held-out ticks")
     return figure
 
 
 def dimension_horizon(comparison: Comparison) -> Figure:
     """The policy's error over dimensions and steps ahead, each in its training deviation."""
     errors = comparison.in_training_std(comparison.scores["policy"].mae_horizon).T
-    figure = canvas(9.0, 0.42 * len(errors) + 1.9)
-    axis = figure.subplots()
+    figure, axis = panels(9.0, 0.42 * len(errors) + 1.9)
     limits = (0, float(np.nanmax(errors)) or 1.0)
     image = draw_map(axis, errors, limits, "viridis_r", errors.shape[1] <= _NUMBERED_STEPS)
     figure.colorbar(image, ax=axis, pad=0.02, label="error [training std]")
@@ -96,8 +94,7 @@ def horizon(comparison: Comparison, action_hz: float | None) -> Figure:
     """Mean absolute error by how far ahead an action lies, a panel an action group."""
     ahead = "steps ahead" if action_hz is None else f"steps ahead [{1000 / action_hz:.0f} ms each]"
     groups = comparison.varying_groups()
-    figure = canvas(max(4.6 * len(groups), 9.4), 4.4)
-    axes = figure.subplots(1, len(groups), squeeze=False)[0]
+    figure, (axes,) = panels(max(4.6 * len(groups), 9.4), 4.4, 1, len(groups), squeeze=False)
     for axis, group in zip(axes, groups, strict=True):
         for method in METHODS:
             errors = group.mean(comparison.scores[method].mae_horizon)
@@ -106,33 +103,31 @@ def horizon(comparison: Comparison, action_hz: float | None) -> Figure:
         axis.set_ylabel(with_unit("mean absolute error", group.unit))
         axis.set_ylim(bottom=0)
         axis.xaxis.get_major_locator().set_params(integer=True)
-    legend_below(figure, axes[0], len(METHODS))
-    figure.suptitle("Error over the action chunk on held-out ticks (lower is better)")
+    finish(figure, axes[0], len(METHODS), "Error over the action chunk (lower is better)")
     return figure
 
 
 def episodes(comparison: Comparison, store: FeatureStore) -> Figure:
     """Mean absolute error of each held-out episode, a panel an action group, worst on top."""
     order = np.array(comparison.ranked())
-    title = "Error of each held-out episode"
+    title = "Error of each held-out episode, worst by overall error on top"
     if len(order) > EPISODE_LINES:
         order = order[np.linspace(0, len(order) - 1, EPISODE_LINES).round().astype(int)]
         title += f" ({len(order)} of {len(comparison.episodes)})"
     groups = comparison.varying_groups()
-    figure = canvas(max(3.6 * len(groups) + 3, 9.0), 0.3 * len(order) + 2)
-    axes = figure.subplots(1, len(groups), squeeze=False, sharey=True)[0]
+    size = max(3.6 * len(groups) + 3, 9.0), 0.3 * len(order) + 2
+    figure, (axes,) = panels(*size, 1, len(groups), squeeze=False, sharey=True)
     lines = np.arange(len(order))
     for axis, group in zip(axes, groups, strict=True):
         for method in METHODS:
             errors = group.mean(comparison.scores[method].mae_episode)[order]
-            axis.plot(errors, lines, **_marked(method, linestyle=""))
+            axis.plot(errors, lines, **_marked(method, ls=""))
         label = with_unit("mean absolute error", group.unit)
         axis.set(title=_group_title(comparison, group), xlabel=label)
         axis.set_xlim(left=0)
     axes[0].set_yticks(lines, [_short_name(store.episodes[comparison.episodes[i]]) for i in order])
     axes[0].set_ylim(-0.6, len(order) - 0.4)
-    legend_below(figure, axes[0], len(METHODS))
-    figure.suptitle(f"{title}, worst by overall error on top (left is better)")
+    finish(figure, axes[0], len(METHODS), f"{title} (left is better)")
     return figure
 
 
@@ -141,19 +136,18 @@ def scatter(comparison: Comparison, predictions: Predictions) -> Figure:
     shown = comparison.varying()
     columns = min(4, len(shown))
     lines = math.ceil(len(shown) / columns)
-    figure = canvas(3.1 * columns, 3.1 * lines + 0.5)
-    axes = figure.subplots(lines, columns, squeeze=False).ravel()
+    figure, axes = panels(3.1 * columns, 3.1 * lines + 0.5, lines, columns, squeeze=False)
     step = math.ceil(len(predictions.ticks) / SCATTER_POINTS)
-    for axis in axes[len(shown) :]:
+    for axis in axes.flat[len(shown) :]:
         axis.set_axis_off()
-    for index, axis in zip(shown, axes, strict=False):
+    for index, axis in zip(shown, axes.flat, strict=False):
         recorded = predictions.recorded[::step, 0, index]
         predicted = predictions.predicted[::step, 0, index]
         both = np.concatenate([recorded, predicted])
         low, high = float(both.min()), float(both.max())
         margin = max(0.05 * (high - low), 0.02 * max(abs(low), abs(high)), 1e-6)
         low, high = low - margin, high + margin
-        axis.plot([low, high], [low, high], color=RECORDED, lw=1, zorder=1)
+        axis.plot([low, high], [low, high], color=INK, lw=1, zorder=1)
         axis.scatter(recorded, predicted, s=9, alpha=0.35, linewidths=0, color=_POLICY)
         axis.set(xlim=(low, high), ylim=(low, high), aspect="equal")
         axis.locator_params(nbins=4)
@@ -169,8 +163,8 @@ def timeline(comparison: Comparison, predictions: Predictions, store: FeatureSto
     """Recorded and predicted action over time, a row a dimension, a column an episode."""
     shown = comparison.extremes()
     rows = len(comparison.names)
-    figure = canvas(max(5.8 * len(shown) + 0.4, 8.0), 1.15 * rows + 1.4)
-    axes = figure.subplots(rows, len(shown), squeeze=False, sharex="col", sharey="row")
+    size = max(5.8 * len(shown) + 0.4, 8.0), 1.15 * rows + 1.4
+    figure, axes = panels(*size, rows, len(shown), squeeze=False, sharex="col", sharey="row")
     for column, (title, index) in enumerate(shown):
         time_s = _episode_time(store, store.episodes[index])
         for row, axis in enumerate(axes[:, column]):
@@ -184,8 +178,7 @@ def timeline(comparison: Comparison, predictions: Predictions, store: FeatureSto
             low, high = axis.get_ylim()
             axis.set_ylim(min(low, high - 0.2), max(high, low + 0.2))
     figure.align_ylabels(axes[:, 0])
-    legend_below(figure, axes[0, 0], 2)
-    figure.suptitle("Held-out episodes: the recorded action, and what the policy would do next")
+    finish(figure, axes[0, 0], 2, "Held-out episodes: the recorded action, and the policy's next")
     return figure
 
 
@@ -213,10 +206,8 @@ def chunks(
     for row, (view, images) in enumerate(frames.items()):
         for column, image in enumerate(images):
             axis = figure.add_subplot(grid[row, column])
-            axis.imshow(image)
-            axis.set(xticks=[], yticks=[], ylabel="" if column else view)
-            axis.grid(visible=False)
-            axis.spines[:].set_visible(False)
+            draw_frame(axis, image)
+            axis.set_ylabel("" if column else view)
             if row == 0:
                 axis.set_title(f"{time_s[instants[column] - episode.ticks.start]:.1f} s")
     axes: list[Axes] = []
@@ -237,9 +228,9 @@ def chunks(
         axis.label_outer()
     axes[-1].set_xlabel("time since the episode began [s]")
     figure.align_ylabels(axes)
-    legend_below(figure, axes[0], 3)
     error = comparison.overall_by_episode("policy")[comparison.episodes.index(episode.index)]
-    figure.suptitle(f"{_short_name(episode)}: overall error {error:.3f} [training std]")
+    title = f"{_short_name(episode)}: overall error {error:.3f} [training std]"
+    finish(figure, axes[0], 3, title)
     return figure
 
 
@@ -250,15 +241,15 @@ def _plot_next_actions(
     here = predictions.episodes == episode.index
     at = time_s[predictions.ticks[here] - episode.ticks.start]
     recorded, predicted = predictions.recorded[here, 0], predictions.predicted[here, 0]
-    axis.plot(at, recorded[:, dimension], color=RECORDED, lw=2.2, label="recorded")
+    axis.plot(at, recorded[:, dimension], color=INK, lw=2.2, label="recorded")
     axis.plot(at, predicted[:, dimension], color=_POLICY, lw=1.6, label="policy, next action")
 
 
 def curves(logged: TrainingCurves, step: int) -> Figure:
     """Loss, held-out error and learning rate over the steps; a line marks the step judged here."""
     shown = [name for name in _CURVES if name in logged.curves] or sorted(logged.curves)[:3]
-    figure = canvas(max(4.2 * len(shown), 8.4), 3.4)
-    axes = figure.subplots(1, len(shown), squeeze=False, sharex=True)[0]
+    size = max(4.2 * len(shown), 8.4), 3.4
+    figure, (axes,) = panels(*size, 1, len(shown), squeeze=False, sharex=True)
     for axis, name in zip(axes, shown, strict=True):
         curve, (title, colour) = logged.curves[name], _CURVES.get(name, (name, PALETTE[4]))
         marker = "o" if len(curve.step) <= 30 else ""
@@ -279,43 +270,36 @@ def modalities(study: AblationStudy) -> Figure:
 
     The error itself, in units of the training standard deviation, where the intact one is 0.
     """
-    panels = [
-        [ablated for ablated in study.ablated if ablated.stream == name] for name in study.streams
-    ]
-    widths = [len(panel) for panel in panels]
-    figure = canvas(max(0.95 * sum(widths) + 1.5, 7.5), 4.6)
-    axes = figure.subplots(1, len(panels), squeeze=False, sharey=True, width_ratios=widths)[0]
+    streams = [[one for one in study.ablated if one.stream == name] for name in study.streams]
+    widths = [len(ways) for ways in streams]
+    size, shared = (max(0.95 * sum(widths) + 1.5, 7.5), 4.6), {"sharey": True, "squeeze": False}
+    figure, (axes,) = panels(*size, 1, len(widths), width_ratios=widths, **shared)
     unit, best = study.intact.overall("policy") or 1.0, best_baseline(study.intact)
     intact, blind = (study.intact.overall(method) / unit for method in ("policy", best))
-    for axis, panel in zip(axes, panels, strict=True):
-        heights = [ablated.comparison.overall("policy") / unit for ablated in panel]
-        colours = [_ABLATIONS[ablated.how.split()[0]] for ablated in panel]
-        bars = axis.bar(range(len(panel)), heights, color=colours, width=0.7)
+    for axis, ways in zip(axes, streams, strict=True):
+        heights = [ablated.comparison.overall("policy") / unit for ablated in ways]
+        colours = [_ABLATIONS[ablated.how.split()[0]] for ablated in ways]
+        bars = axis.bar(range(len(ways)), heights, color=colours, width=0.7)
         # On a ground of its own, for a line may pass behind a number.
         ground = {"facecolor": GRID, "edgecolor": "none", "pad": 1}
         axis.bar_label(bars, fmt="%.2f", padding=3, bbox=ground)
         axis.axhline(intact, color=_POLICY, lw=1.8, label="policy, all streams intact")
         label = f"best {LABELS[best]}, which sees nothing"
         axis.axhline(blind, color=INK, lw=1.8, ls="--", label=label)
-        axis.set_xticks(range(len(panel)), [ablated.how.replace(" ", "\n", 1) for ablated in panel])
+        axis.set_xticks(range(len(ways)), [ablated.how.replace(" ", "\n", 1) for ablated in ways])
         axis.grid(axis="x", visible=False)
-        axis.set_title(panel[0].stream)
+        axis.set_title(ways[0].stream)
     axes[0].set_ylabel("held-out error / error with all streams intact")
     axes[0].set_ylim(0, 1.12 * axes[0].get_ylim()[1])
-    legend_below(figure, axes[0], 2)
+    judged = f"{study.intact.ticks} held-out ticks, {study.samples} chunk(s) a tick"
+    finish(figure, axes[0], 2, f"What the policy loses with one stream ablated\n{judged}")
     figure.legends[0].set_title(ABLATION_FOOTNOTE)
-    figure.suptitle(
-        f"What the policy loses with one stream ablated, on {study.intact.ticks} held-out ticks, "
-        f"{study.samples} chunk(s) a tick\n"
-        "(well above 1: the stream is used; delays fade where a stream changes slowly)"
-    )
     return figure
 
 
 def comparison_of_experiments(experiments: Sequence[Experiment]) -> Figure:
     """Held-out error of each experiment, coloured by expert, and the baselines as lines."""
-    figure = canvas(9.0, 0.36 * len(experiments) + 2.6)
-    axis = figure.subplots()
+    figure, axis = panels(9.0, 0.36 * len(experiments) + 2.6)
     experts = [experiment.model_type for experiment in experiments]
     colours = dict(zip(dict.fromkeys(experts), cycle(_EXPERTS), strict=False))
     for place, (expert, experiment) in enumerate(zip(experts, experiments, strict=True)):
@@ -325,24 +309,19 @@ def comparison_of_experiments(experiments: Sequence[Experiment]) -> Figure:
         number = f"{experiment.error:.3f}"
         axis.text(1.01, place, number, transform=axis.get_yaxis_transform(), va="center")
     for method in BASELINES:
-        style = {key: STYLES[method][key] for key in ("color", "linestyle")}
+        style = {key: STYLES[method][key] for key in ("color", "ls")}
         axis.axvline(experiments[0].overall[method], lw=2, label=LABELS[method], **style)
     axis.set_yticks(range(len(experiments)), [experiment.name for experiment in experiments])
     axis.invert_yaxis()
     axis.grid(axis="y", visible=False)
     axis.set_xlabel("mean absolute error on held-out ticks [training std] (left is better)")
-    legend_below(figure, axis, 3)
-    figure.suptitle("Held-out error by expert and fusion, trained from one store")
+    finish(figure, axis, 3, "Held-out error by expert and fusion, trained from one store")
     return figure
 
 
 def _marked(method: str, **changed: Any) -> dict[str, Any]:
     """How a way of acting is drawn where its points are marked."""
-    # An open, larger square stays visible where the mean action is next to no motion.
-    size = {"policy": 6.5, "zero_action": 8.5}.get(method, 5)
-    width = 2.4 if method == "policy" else 1.5
-    style = {"linewidth": width, "markersize": size, "label": LABELS[method]}
-    return STYLES[method] | style | changed
+    return {"lw": 1.5, "ms": 5, "label": LABELS[method]} | STYLES[method] | changed
 
 
 def _dimension_names(comparison: Comparison) -> list[str]:

@@ -32,16 +32,16 @@ LABELS = {
     "repeat_last": "baseline: repeat the last action",
 }
 STYLES: dict[str, dict[str, Any]] = {
-    "policy": {"color": "#0072B2", "marker": "o", "linestyle": "-", "zorder": 5},
-    "zero_action": {"color": "#E69F00", "marker": "s", "linestyle": "--", "fillstyle": "none"},
-    "mean_action": {"color": "#009E73", "marker": "^", "linestyle": "-."},
-    "repeat_last": {"color": "#CC79A7", "marker": "D", "linestyle": ":"},
+    "policy": {"color": "#0072B2", "marker": "o", "ls": "-", "zorder": 5, "lw": 2.4, "ms": 6.5},
+    # An open, larger square stays visible where the mean action is next to no motion.
+    "zero_action": {"color": "#E69F00", "marker": "s", "ls": "--", "fillstyle": "none", "ms": 8.5},
+    "mean_action": {"color": "#009E73", "marker": "^", "ls": "-."},
+    "repeat_last": {"color": "#CC79A7", "marker": "D", "ls": ":"},
 }
 INK = "#333333"
 """Text, axes, and whatever else is black on white paper."""
 GRID = "#dddddd"
 """Grid lines, and areas behind data."""
-RECORDED = INK
 PALETTE = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
 """Of what has no colour of its own; Okabe and Ito's, less what is lost on white or on black."""
 _CJK = (
@@ -51,9 +51,8 @@ _CJK = (
 )
 """Fonts of Debian, Windows and macOS with what Chinese, Japanese and Korean names are made of."""
 NO_FONT = (
-    "A name has letters that no font of this machine has: PNG files show boxes in their place. "
-    "Install a font that has them; fonts-noto-cjk of Debian and Ubuntu has Chinese, Japanese and "
-    "Korean."
+    "PNG files show boxes for letters that no font of this machine has. Install one that has them, "
+    "as fonts-noto-cjk of Debian and Ubuntu has Chinese, Japanese and Korean."
 )
 _NO_GLYPH = re.compile(rf"Glyph \d+ |{re.escape(NO_FONT)}")
 
@@ -132,6 +131,20 @@ def canvas(width: float, height: float) -> Figure:
     return figure
 
 
+def panels(width: float, height: float, *grid: int, **options: Any) -> tuple[Figure, Any]:
+    """An empty picture of this size in inches and its panels, as `Figure.subplots` gives them."""
+    figure = canvas(width, height)
+    return figure, figure.subplots(*grid, **options)
+
+
+def draw_frame(axis: Axes, frame: NDArray[np.uint8]) -> None:
+    """A frame (height, width, 3) RGB without ticks and grid."""
+    axis.imshow(frame)
+    axis.set(xticks=[], yticks=[])
+    axis.grid(visible=False)
+    axis.spines[:].set_visible(False)
+
+
 def draw_map(
     axis: Axes,
     grid: NDArray[Any],
@@ -163,7 +176,9 @@ def logarithmic(axis: Axes) -> None:
     axis.yaxis.set_minor_formatter(NullFormatter())
 
 
-def legend_below(figure: Figure, axis: Axes, columns: int) -> None:
-    """The legend of one axis, below all of them."""
+def finish(figure: Figure, axis: Axes, columns: int, title: str | None = None) -> None:
+    """The legend of one axis below all panels, and a title above them."""
     handles, labels = axis.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=columns)
+    if title is not None:
+        figure.suptitle(title)

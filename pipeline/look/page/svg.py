@@ -16,6 +16,8 @@ RASTER_DPI = 144
 POINTS_INCH, POINT_PX = 72, 96 / 72
 PHOTO_BYTES, PHOTO_RATIO, PHOTO_QUALITY = 2**15, 3, 88
 """An image of at least so many bytes that JPEG makes so many times smaller is a photograph."""
+_NONE = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+"""What matplotlib says of itself in a file."""
 FONTS = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Noto Sans', sans-serif"
 COLOURS = {INK: "ink", "#000000": "ink", GRID: "grid", PALETTE[0]: "blue"}
 """Colours of a picture that follow the page's light or dark, by their names in its style."""
@@ -31,15 +33,8 @@ def inline_svg(figure: Figure, name: str, label: str) -> str:
     written = io.StringIO()
     # Matplotlib makes ids of clips and markers from their content and this salt.
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": name, "svg.image_inline": True}):
-        figure.savefig(
-            written,
-            format="svg",
-            dpi=RASTER_DPI,
-            transparent=True,
-            metadata={"Date": None, "Creator": None, "Format": None, "Type": None},
-        )
-    text = written.getvalue()
-    body = re.sub(r"^.*?<svg[^>]*>|</svg>\s*$", "", text, flags=re.DOTALL)
+        figure.savefig(written, format="svg", dpi=RASTER_DPI, transparent=True, metadata=_NONE)
+    body = re.sub(r"^.*?<svg[^>]*>|</svg>\s*$", "", written.getvalue(), flags=re.DOTALL)
     width, height = POINTS_INCH * figure.get_size_inches()
     # No wider than it was drawn. What has no colour of its own is black in SVG: the ink, too.
     return (

@@ -4,11 +4,10 @@ The page makes no request: styles, script and pictures stand in it, and its cont
 forbids the rest. The same report gives the same bytes.
 """
 
-import json
 import re
 import warnings
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +17,9 @@ from markupsafe import Markup, escape
 from tqdm import tqdm
 
 from pipeline.base.durable import disk_full_named, sync
+from pipeline.base.format import as_yaml
 from pipeline.base.ownership import REPORT, OutputKind, begin_folder, release, remove_folder
-from pipeline.base.table import Table
-from pipeline.look.page import blocks
-from pipeline.look.page.blocks import Document, Issues, Picture, Report, Section, Text, Tokens
+from pipeline.look.page.blocks import Block, Issues, Picture, Report, Section
 from pipeline.look.page.issues import FINDINGS, findings_csv, group_issues, place_of, places_of
 from pipeline.look.page.style import NO_FONT, RC, boxes, write
 from pipeline.look.page.svg import inline_svg
@@ -33,11 +31,9 @@ NAMED_PLACES = 3
 """Of a group, those that show at once; all of them unfold."""
 MOST_PLACES = 300
 """Of a group, those that the page lists; more stand in `findings.csv` only."""
-MOST_ITEMS, NAMED_ITEMS = 48, 8
-"""Of a longer list in a document, such as the channels of an A-scan, the first stand there."""
 _WRITTEN = re.compile(r'<meta name="pictures" content="([^"]*)">')
-_TEMPORARY = OutputKind("a page in the making", Path.is_dir)
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
+_TEMPORARY = OutputKind("a page in the making", Path.is_dir)
 
 
 def write_report(folder: Path, report: Report) -> list[Path]:
@@ -52,9 +48,7 @@ def write_report(folder: Path, report: Report) -> list[Path]:
     """
     names = [picture.name for picture in report.blocks(Picture)]
     if len(set(names)) < len(names) or not all(map(_NAME.fullmatch, names)):
-        raise ValueError(
-            f"expected names of pictures that are plain file stems, each once: {names}"
-        )
+        raise ValueError(f"pictures: expected plain file stems, each once, found {names}")
     temporary = folder / f".{PAGE}.new"
     with disk_full_named(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -76,22 +70,15 @@ def write_report(folder: Path, report: Report) -> list[Path]:
 def _put_in_place(temporary: Path, folder: Path, files: Sequence[str]) -> list[Path]:
     for file in files:
         sync(temporary / file)
-    before = _pictures_of(folder / PAGE)
+    page = folder / PAGE
+    before = page.read_text(encoding="utf-8", errors="replace") if page.is_file() else ""
     for file in files:
         (temporary / file).replace(folder / file)
-    for name in before - {*files}:
-        (folder / name).unlink(missing_ok=True)
+    for name in filter(_NAME.fullmatch, " ".join(_WRITTEN.findall(before)).split()):
+        if f"{name}.png" not in files:
+            (folder / f"{name}.png").unlink(missing_ok=True)
     sync(folder)
     return [folder / file for file in (PAGE, *files[:-1])]
-
-
-def _pictures_of(page: Path) -> set[str]:
-    """Files of the pictures that were written with a page; of no page, none."""
-    if not page.is_file():
-        return set()
-    written = _WRITTEN.search(page.read_text(encoding="utf-8", errors="replace"))
-    names = written[1].split() if written else []
-    return {f"{name}.png" for name in names if _NAME.fullmatch(name)}
 
 
 class _PageWriter:
@@ -107,8 +94,9 @@ class _PageWriter:
             trim_blocks=True,
             lstrip_blocks=True,
         )
-        self._jinja.filters |= {"prose": prose, "breakable": breakable}
-        self._jinja.filters |= {"place": place_of, "places": places_of}
+        filters: dict[str, Any] = {"prose": prose, "breakable": breakable, "yaml": as_yaml}
+        filters |= {"groups": group_issues, "place": place_of, "places": places_of}
+        self._jinja.filters.update(filters | {"drawn": self._draw})
         limits = {"open": OPEN_GROUPS, "named": NAMED_PLACES, "listed": MOST_PLACES}
         shown = {**limits, "findings": FINDINGS}
         self._blocks: Any = self._jinja.get_template("blocks.html", globals=shown).module
@@ -120,9 +108,9 @@ class _PageWriter:
             sections = [self._section(section) for section in report.sections]
         if notes:
             warnings.warn(NO_FONT, stacklevel=3)
-        return self._jinja.get_template("page.html").render(
-            report=report, notes=notes, sections=sections, pictures=" ".join(pictures)
-        )
+        page = self._jinja.get_template("page.html")
+        names = " ".join(pictures)
+        return page.render(report=report, notes=notes, sections=sections, pictures=names)
 
     def _section(self, section: Section) -> dict[str, Any]:
         return {
@@ -138,20 +126,9 @@ class _PageWriter:
         count = self._anchors[stem]
         return stem if count == 1 else f"{stem}-{count}"
 
-    def _block(self, block: blocks.Block) -> Markup:
-        match block:
-            case Text():
-                return self._blocks.text(block.words)
-            case Table():
-                return self._blocks.table(block, block.words())
-            case Picture():
-                return self._blocks.picture(block, self._draw(block))
-            case Issues():
-                return self._blocks.issues(group_issues(block.issues), block.none)
-            case Tokens():
-                return self._blocks.tokens(block.runs)
-            case Document():
-                return self._blocks.document(block.title, document_lines(block.content))
+    def _block(self, block: Block) -> Markup:
+        """By the macro of `blocks.html` that is called like its class."""
+        return getattr(self._blocks, type(block).__name__.lower())(block)
 
     def _draw(self, picture: Picture) -> Markup:
         """The picture as SVG; its PNG is written on the way, from the same figure."""
@@ -176,28 +153,3 @@ def prose(words: str) -> Markup:
 def breakable(words: str) -> Markup:
     """Words, a path or an id, that may go on in a new line after a `/` or `_` inside it."""
     return Markup(re.sub(r"(?<=\w)([/_])", r"\1<wbr>", str(escape(words))))
-
-
-def document_lines(content: Mapping[str, Any], depth: int = 0) -> list[tuple[int, str, str]]:
-    """A nested document as (depth, key, value) lines, in its own order."""
-    lines: list[tuple[int, str, str]] = []
-    for key, value in content.items():
-        lines += _entry(depth, str(key), value)
-    return lines
-
-
-def _entry(depth: int, key: str, value: Any) -> list[tuple[int, str, str]]:
-    if isinstance(value, Mapping) and value:
-        inside = document_lines(value, depth + 1)
-        # An entry of a list that is a flat mapping stands in one line.
-        if key == "-" and all(inner == depth + 1 for inner, _, _ in inside):
-            return [(depth, key, ", ".join(f"{name}: {text}" for _, name, text in inside))]
-        return [(depth, key, ""), *inside]
-    if isinstance(value, list | tuple) and any(isinstance(item, Mapping | list) for item in value):
-        inside = [line for item in value for line in _entry(depth + 1, "-", item)]
-        return [(depth, key, ""), *inside]
-    if isinstance(value, list | tuple) and len(value) > MOST_ITEMS:
-        value = [*value[:NAMED_ITEMS], f"… {len(value):,} in all"]
-    if isinstance(value, str) and value.isprintable() and value == value.strip() != "":
-        return [(depth, key, value)]
-    return [(depth, key, json.dumps(value, ensure_ascii=False, default=str))]

@@ -74,9 +74,7 @@ def describe_still(channels: Channels, values: NDArray[np.floating]) -> str:
     largest = max(usual, key=lambda column: std[column] / usual[column])
     return (
         f"{named(names, [*usual])} hardly move{'s' * (len(usual) == 1)}: a standard deviation of "
-        f"{std[largest]:.2g} at most, where {usual[largest]:.2g} is usual for such channels; "
-        "training scales every channel to unit spread, so that their noise would count like a "
-        "motion"
+        f"{std[largest]:.2g} at most, where {usual[largest]:.2g} is usual for such channels"
     )
 
 
@@ -100,10 +98,7 @@ def _frozen(view: EpisodeView, sensor: Stream) -> Iterator[Issue]:
     for start, stop in runs(_repeats(sensor.values, columns)):
         begin, end = float(sensor.time[start]), float(sensor.time[stop])
         if end - begin >= FROZEN_S:
-            message = (
-                f"{what} repeat one reading for {end - begin:.2f} s from {begin - view.zero:.2f} s "
-                f"({stop - start + 1} readings); elsewhere they change"
-            )
+            message = f"{what} repeat one reading {stop - start + 1} times; elsewhere they change"
             yield view.issue("frozen", "sensor", message, begin, end)
 
 
@@ -133,11 +128,9 @@ def _outliers(view: EpisodeView, name: str, entry: str, stream: Stream) -> Itera
             continue
         worst = int(places[np.argmax(away[places, column])])
         unit = f" {stream.channels.units[column]}".rstrip()
-        message = (
-            f"{stream.channels.names[column]} leaps to {values[worst, column]:.4g}{unit} at "
-            f"{time[worst] - view.zero:.2f} s ({entry} {worst}; {len(places)} such {entry}s); all "
-            f"others stay within {others.min():.4g} to {others.max():.4g}"
-        )
+        leap = f"{stream.channels.names[column]} leaps to {values[worst, column]:.4g}{unit}"
+        rest = f"all others stay within {others.min():.4g} to {others.max():.4g}"
+        message = f"{leap} ({entry} {worst}; {len(places)} such {entry}s); {rest}"
         stop = float(time[places[-1]]) + usual_step(time)
         yield view.issue(f"{name} outlier", name, message, float(time[places[0]]), stop)
 
@@ -156,12 +149,9 @@ def _saturated(view: EpisodeView, sensor: Stream) -> Iterator[Issue]:
         if not columns:
             continue
         places = np.flatnonzero((sensor.values[:, columns] == ends[columns]).any(axis=1))
-        message = (
-            f"{named(names, columns)} ({len(columns)} of {len(names)} channels) stand at the {end} "
-            f"end of their range, {ends[columns[0]]:g}, in "
-            f"{100 * len(places) / len(sensor.time):.1f} % of the readings, first at "
-            f"{sensor.time[places[0]] - view.zero:.2f} s; expected under {100 * CLIPPED_SHARE:g} %"
-        )
+        which = f"{named(names, columns)} ({len(columns)} of {len(names)} channels)"
+        at = f"stand at the {end} end of their range, {ends[columns[0]]:g}"
+        message = f"{which} {at}, in {100 * len(places) / len(sensor.time):.1f} % of the readings"
         yield view.issue("saturated", "sensor", message, *sensor.time[places[[0, -1]]].tolist())
 
 
@@ -258,10 +248,7 @@ def statistics_table(statistics: Sequence[ChannelStatistics]) -> Table:
     for _, like in groupby(statistics, lambda c: (c.stream, unnumbered(c.name), c.unit)):
         group = [astuple(channel) for channel in like]
         rows += group if len(group) < PROFILE_CHANNELS else [_joint_row(group)]
-    caption = (
-        "Over the whole episode, before any normalisation. A row of many channels shows the lowest "
-        "minimum, the highest maximum, and of the rest the median over the channels."
-    )
+    caption = "Of many channels in a row: the extremes of all, else the median over the channels."
     return Table(_HEADS, rows, caption)
 
 

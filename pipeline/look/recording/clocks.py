@@ -22,7 +22,7 @@ from pipeline.base.table import Table
 from pipeline.data.recording import Nominal
 from pipeline.data.timeline import Timeline
 from pipeline.look.page.blocks import Block
-from pipeline.look.page.style import GRID, INK, PALETTE, canvas
+from pipeline.look.page.style import GRID, INK, PALETTE, panels
 from pipeline.look.recording.episode import Draw, EpisodeView
 
 # Usual steps from which a step is a gap.
@@ -52,7 +52,7 @@ _TICK_S = 0.1
 _FEWEST = 20
 
 
-class Gap(NamedTuple):
+class Span(NamedTuple):
     """Where a clock skipped: from the last entry before to the first after, in seconds."""
 
     start_s: float
@@ -90,10 +90,10 @@ class Clock:
         return GAP_FACTOR * longest if len(self.time) > 2 and longest > 0 else float("inf")
 
     @cached_property
-    def gaps(self) -> tuple[Gap, ...]:
+    def gaps(self) -> tuple[Span, ...]:
         """Where it skips, in order."""
         places = np.flatnonzero(np.diff(self.time) >= self.shortest_gap_s)
-        return tuple(Gap(float(self.time[at]), float(self.time[at + 1])) for at in places)
+        return tuple(Span(float(self.time[at]), float(self.time[at + 1])) for at in places)
 
     @property
     def rate_hz(self) -> float:
@@ -134,9 +134,7 @@ def merge_equal(clocks: Iterable[Clock]) -> list[Clock]:
     alike: dict[bytes, list[Clock]] = {}
     for clock in clocks:
         alike.setdefault(clock.time.tobytes(), []).append(clock)
-    return [
-        replace(group[0], name=", ".join(clock.name for clock in group)) for group in alike.values()
-    ]
+    return [replace(same[0], name=", ".join(c.name for c in same)) for same in alike.values()]
 
 
 def usual_step(time: NDArray[np.float64]) -> float:
@@ -182,17 +180,16 @@ def _usual(time: NDArray[np.float64]) -> tuple[float, float]:
     return (mean, float(kept[-1])) if median < _BURSTS * mean else (median, median)
 
 
-def _gaps(view: EpisodeView, clock: Clock, jumps: Mapping[Gap, str]) -> Iterator[Issue]:
+def _gaps(view: EpisodeView, clock: Clock, jumps: Mapping[Span, str]) -> Iterator[Issue]:
     line, camera = view.timeline, clock.name.split(", ")[0].removeprefix("view ")
     for gap in clock.gaps:
         if gap.length_s <= _tick_s(view):
             continue
-        kind, since = "gap", f"{gap.start_s - view.zero:.2f} s"
-        message = f"no entry for {gap.length_s:.2f} s from {since}, expected one every "
-        message += f"{clock.step_s:.3g} s"
+        kind, step = "gap", clock.step_s
+        message = f"no entry for {gap.length_s:.2f} s, expected one every {step:.3g} s"
         if gap in jumps:
-            kind, moved = "clock jump", gap.length_s - clock.step_s
-            message = f"the clock jumps by {moved:.2f} s at {since}: {jumps[gap]}"
+            kind, since = "clock jump", f"{gap.start_s - view.zero:.2f} s"
+            message = f"the clock jumps by {gap.length_s - step:.2f} s at {since}: {jumps[gap]}"
         if line is not None and camera in view.cameras:
             newest = line.frame_time[camera][line.vl_row]
             ages = (line.time - newest)[newest == gap.start_s]
@@ -201,19 +198,17 @@ def _gaps(view: EpisodeView, clock: Clock, jumps: Mapping[Gap, str]) -> Iterator
         yield view.issue(kind, clock.name, message, *gap)
 
 
-def _find_jumps(clock: Clock, recorded: Sequence[Clock]) -> dict[Gap, str]:
+def _find_jumps(clock: Clock, recorded: Sequence[Clock]) -> dict[Span, str]:
     """Where a clock was set, the longest jump first, rather than lacks entries; and what shows it.
 
     A clock that was set ends apart from those without such a step, and near them less the step; one
     that lacks entries ends with them.
     """
-    jumps: dict[Gap, str] = {}
+    jumps: dict[Span, str] = {}
     end = float(clock.time[-1])
     for gap in sorted(clock.gaps, key=lambda gap: -gap.length_s):
-        ends = np.array(
-            [c.time[-1] for c in recorded if np.diff(c.time).max(initial=0) < gap.length_s / 2]
-        )
-        moved = gap.length_s - clock.step_s
+        moved, half = gap.length_s - clock.step_s, gap.length_s / 2
+        ends = np.array([c.time[-1] for c in recorded if np.diff(c.time).max(initial=0) < half])
         apart, left = (np.abs(at - ends).min(initial=np.inf) for at in (end, end - moved))
         if LOST_S <= apart < np.inf and left < apart / 2:
             jumps[gap] = f"it ends {apart:.2f} s from the nearest other clock, {left:.2f} s without"
@@ -248,9 +243,8 @@ def _dropped(view: EpisodeView, clock: Clock) -> Iterator[Issue]:
     span = float(starts[most]), float(stops[most])
     message = (
         f"{long} of {len(steps)} steps take at least {DROPPED_STEP:g} times the usual "
-        f"{1e3 * clock.step_s:.0f} ms (up to {1e3 * steps.max():.0f} ms), half of them from "
-        f"{span[0] - view.zero:.2f} to {span[1] - view.zero:.2f} s: there is time for {lost:.0f} "
-        f"more frames; {len(steps) / steps.sum():.1f} Hz on average"
+        f"{1e3 * clock.step_s:.0f} ms (up to {1e3 * steps.max():.0f} ms), half of them here: there "
+        f"is time for {lost:.0f} more frames; {len(steps) / steps.sum():.1f} Hz on average"
     )
     yield view.issue("dropped frames", clock.name, message, *span)
 
@@ -282,11 +276,9 @@ def _lost_ticks(view: EpisodeView, recorded: Sequence[Clock]) -> Iterator[Issue]
         late = [c for c, at in zip(recorded, edge, strict=True) if abs(at - extreme) <= near]
         steps = (DROPPED_STEP * clock.step_s for clock in late)
         if lost >= LOST_S or lost > max(LOST_SHARE * length_s, LOST_TICKS * tick_s, *steps):
-            message = (
-                f"{words.format(lost)}; no tick can stand there (about {lost / tick_s:.0f} ticks, "
-                f"{100 * lost / length_s:.0f} % of the episode)"
-            )
+            cost = f"about {lost / tick_s:.0f} ticks, {100 * lost / length_s:.0f} % of the episode"
             names = ", ".join(clock.name for clock in late)
+            message = f"{words.format(lost)}, which costs {cost}"
             yield view.issue("lost ticks", names, message, *sorted((extreme, usual)))
 
 
@@ -307,8 +299,7 @@ def _old_frames(view: EpisodeView) -> Iterator[Issue]:
         if usual > OLD * served:
             message = (
                 f"frames are {usual:.2f} s old at the median tick and {age[oldest]:.2f} s at most, "
-                f"expected at most {OLD * served:.2f} s where a VL row serves {served:.2f} s; "
-                f"{len(line.vl_time)} VL rows see {len(np.unique(line.frames[name]))} frames"
+                f"expected at most {OLD * served:.2f} s where a VL row serves {served:.2f} s"
             )
             at = float(line.time[oldest])
             yield view.issue("old frames", f"view {name}", message, at, at)
@@ -335,10 +326,7 @@ def clock_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
     clocks = read_clocks(view)
     if not clocks:
         return []
-    caption = (
-        "When each stream was sampled, over the whole episode and a stretch from near (grey above),"
-        " and which VL row serves which ticks. Gaps are marked."
-    )
+    caption = "When each stream was sampled, and which VL row serves which ticks; gaps are marked."
     return [draw("clocks", caption, draw_lanes), clock_table(view, clocks)]
 
 
@@ -354,11 +342,7 @@ def clock_table(view: EpisodeView, clocks: Sequence[Clock]) -> Table:
         )
         for clock in clocks
     ]
-    caption = (
-        "The usual rate is one over the usual step; on average are the steps over their time, lost "
-        f"entries and gaps included. A gap is a step of at least {GAP_FACTOR:g} usual ones. Jitter "
-        "is the standard deviation of the steps that are no gaps."
-    )
+    caption = f"Gaps are steps of at least {GAP_FACTOR:g} usual ones; jitter is without them."
     return Table(heads, rows, caption)
 
 
@@ -374,8 +358,7 @@ def draw_lanes(view: EpisodeView) -> Figure:
     near = _choose_near(view, clocks, start, stop)
     room = 0.01 * max(stop - start, 1e-3)
     heights = [0.34 * len(clocks) + 0.3, 0.46 * len(clocks) + 0.5]
-    figure = canvas(11.0, sum(heights) + 1.6)
-    whole, detail = figure.subplots(2, 1, height_ratios=heights)
+    figure, (whole, detail) = panels(11.0, sum(heights) + 1.6, 2, 1, height_ratios=heights)
     for axis, span in ((whole, (start - room, stop + room)), (detail, near)):
         axis.set_xlim(span[0] - view.zero, span[1] - view.zero)
         for lane, clock in enumerate(clocks):
@@ -417,15 +400,8 @@ def _choose_near(
     step = float("nan") if line is None else usual_step(line.vl_time)
     width = min(_ROWS_NEAR * step if step > 0 else _NEAR_S, max(stop - start, 1e-3))
     by_kind = sorted(clocks, key=lambda clock: clock.kind != "camera")
-    gap = next((gap for clock in by_kind for gap in clock.gaps), None)
-    # Of a gap longer than the stretch, where it begins.
-    around = (start + stop) / 2 if gap is None else min(sum(gap) / 2, gap.start_s + width / 4)
-    begin = around - width / 2
-    if line is not None:
-        # From just before a row, so that it is seen with all of its ticks.
-        row = max(int(np.searchsorted(line.vl_time, begin + width / 10, side="right")) - 1, 0)
-        begin = float(line.vl_time[row]) - width / 10
-    begin = max(min(begin, stop - width), start)
+    gaps = [gap.start_s - width / 4 for clock in by_kind for gap in clock.gaps]
+    begin = max(min([*gaps, (start + stop - width) / 2][0], stop - width), start)
     return begin, begin + width
 
 
@@ -437,11 +413,7 @@ def _draw_lane(axis: Axes, clock: Clock, lane: int, zero: float) -> None:
     time = time[np.unique(places, return_index=True)[1]]
     width = 1.6 if len(time) < _STROKES / 6 else 1.0
     axis.vlines(time, lane - _HALF, lane + _HALF, colors=_KINDS[clock.kind][0], lw=width)
-    spans = [
-        (gap.start_s - zero, gap.length_s)
-        for gap in clock.gaps
-        if gap.stop_s - zero >= low and gap.start_s - zero <= high
-    ]
+    spans = [(gap.start_s - zero, gap.length_s) for gap in clock.gaps]
     # One artist for all: thousands of gaps as patches take many seconds.
     axis.broken_barh(
         spans, (lane - _HALF, 2 * _HALF), facecolor="none", hatch="////", lw=1.4,

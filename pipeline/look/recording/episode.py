@@ -107,23 +107,20 @@ def view_episode(recording: Recording, data: DataParams, rotation: ActionRotatio
     """
     broken: dict[str, str] = {}
 
-    def attempt(stream: str) -> Any:
+    def attempt(part: str) -> Any:
         try:
-            return getattr(recording, stream)()
+            read = getattr(recording, part)
+            return read() if callable(read) else read
         except BROKEN as error:
-            broken[stream] = str(error)
+            broken[part] = str(error)
             return None
 
-    parts = {name: attempt(name) for name in ("cameras", "sensor", "state", "action")}
+    names = ("cameras", "sensor", "state", "action", "instruction")
+    parts = {name: attempt(name) for name in names}
     parts["cameras"] = parts["cameras"] or {}
-    view = EpisodeView(recording, **parts, action_rotation=rotation)
-    try:
-        view = replace(view, instruction=recording.instruction)
-    except BROKEN as error:
-        broken["instruction"] = str(error)
     # Poses are most often columns of the state, whose issue has said what is wrong.
-    if "state" not in broken:
-        view = replace(view, poses=attempt("poses"))
+    parts["poses"] = None if "state" in broken else attempt("poses")
+    view = EpisodeView(recording, **parts, action_rotation=rotation)
     # One broken file breaks every stream that is in it: its message stands once.
     issues = [
         view.issue(

@@ -21,7 +21,6 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -30,7 +29,7 @@ from pipeline.base.issue import Issue
 from pipeline.data import CameraStream
 from pipeline.data.timeline import last_at
 from pipeline.look.page.blocks import Block, Text
-from pipeline.look.page.style import canvas
+from pipeline.look.page.style import draw_frame, panels
 from pipeline.look.recording.episode import BROKEN, Draw, EpisodeView, runs
 
 MOST_FRAMES, RUNS = 120, 12
@@ -56,16 +55,11 @@ def camera_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
     if not (ticks := spread_ticks(view, params.inspect.ticks)):
         return []
     shown, broken = read_frames(view, ticks)
-    blocks: list[Block] = [
-        Text(f"{issue.stream} is not shown: {issue.message}") for issue in broken
-    ]
-    if shown:
-        caption = (
-            f"What each view shows at {len(ticks)} ticks, evenly from the first to the last: the "
-            "last frame at or before the tick."
-        )
-        blocks.append(draw("views", caption, lambda view: draw_views(view, ticks)))
-    return blocks
+    absent = [Text(f"{issue.stream} is not shown: {issue.message}") for issue in broken]
+    if not shown:
+        return [*absent]
+    caption = f"The last frame of each view at or before {len(ticks)} ticks, evenly spread."
+    return [*absent, draw("views", caption, lambda view: draw_views(view, ticks))]
 
 
 def spread_ticks(view: EpisodeView, count: int) -> list[int]:
@@ -98,8 +92,8 @@ def draw_views(view: EpisodeView, ticks: Sequence[int]) -> Figure:
     frames, _ = read_frames(view, ticks)
     time = view.timeline.time[list(ticks)]
     heights = [_COLUMN_IN * row[0].shape[0] / row[0].shape[1] + 0.25 for row in frames.values()]
-    figure = canvas(_COLUMN_IN * max(len(ticks), 2) + 0.4, sum(heights) + 0.6)
-    axes = figure.subplots(len(frames), len(ticks), squeeze=False, height_ratios=heights)
+    size = _COLUMN_IN * max(len(ticks), 2) + 0.4, sum(heights) + 0.6
+    figure, axes = panels(*size, len(frames), len(ticks), squeeze=False, height_ratios=heights)
     for line, (name, row) in zip(axes, frames.items(), strict=True):
         ages = time - view.cameras[name].time[_shown_at(view, name, ticks)]
         for axis, frame, age in zip(line, row, ages, strict=True):
@@ -109,14 +103,6 @@ def draw_views(view: EpisodeView, ticks: Sequence[int]) -> Figure:
     for axis, tick, at in zip(axes[0], ticks, time - view.zero, strict=True):
         axis.set_title(f"tick {tick}, {at:.2f} s", fontsize=10)
     return figure
-
-
-def draw_frame(axis: Axes, frame: NDArray[np.uint8]) -> None:
-    """A frame (height, width, 3) RGB without ticks and grid."""
-    axis.imshow(frame)
-    axis.set(xticks=[], yticks=[])
-    axis.grid(visible=False)
-    axis.spines[:].set_visible(False)
 
 
 @dataclass(frozen=True)
@@ -167,16 +153,16 @@ def _look(view: EpisodeView, name: str, camera: CameraStream) -> _Looked:
         if (known := camera.sizes(served)) is not None:
             sizes |= zip(served, map(tuple, known.tolist()), strict=True)
     index = _neighbours(count, MOST_FRAMES if repeats is None else 2 * RUNS)
-    wanted, shares = not blank, np.zeros(max(0, len(index) - 1))
+    wanted, steps = not blank, list[float]()
     before: NDArray[np.uint8] | None = None
-    for place, frame in enumerate(camera.read(index.tolist())):
-        number = int(index[place])
+    for number, frame in zip(index.tolist(), camera.read(index.tolist()), strict=True):
         sizes[number] = frame.shape[:2]
         if wanted:
             blank[number] = _is_blank(frame)
         if before is not None:
-            shares[place - 1] = _share_differing(before, frame)
+            steps.append(_share_differing(before, frame))
         before = frame
+    shares = np.array(steps)
     differing = shares[(shares > 0) & (np.diff(index) == 1)]
     noisy = len(differing) > 0 and float(np.percentile(differing, 10)) > NOISY
     sizes = dict(sorted(sizes.items()))
@@ -225,18 +211,14 @@ def _resized(view: EpisodeView, name: str, seen: _Looked) -> Iterator[Issue]:
 
 def _dead(view: EpisodeView, name: str, blank: Mapping[int, bool]) -> Iterator[Issue]:
     time, frames = view.cameras[name].time, list(blank)
-    issue, expected = partial(view.issue, "dead camera", f"view {name}"), "expected a picture"
+    issue = partial(view.issue, "dead camera", f"view {name}")
     if frames and all(blank.values()):
-        yield issue(f"all {len(frames)} frames looked at are of one colour; {expected}")
+        yield issue(f"all {len(frames)} frames looked at are of one colour")
         return
     for first, stop in runs(np.array(list(blank.values()), np.bool_)):
         start, last = frames[first], frames[stop - 1]
-        span = float(time[start]), float(time[last])
-        yield issue(
-            f"{stop - first} of the {len(frames)} frames looked at are of one colour: frames "
-            f"{start} to {last}, from {span[0] - view.zero:.2f} s; {expected}",
-            *span,
-        )
+        which = f"frames {start} to {last}, {stop - first} of the {len(frames)} looked at"
+        yield issue(f"{which}, are of one colour", float(time[start]), float(time[last]))
 
 
 def _duplicates(view: EpisodeView, name: str, looked: Mapping[str, _Looked]) -> Iterator[Issue]:
@@ -253,26 +235,17 @@ def _duplicates(view: EpisodeView, name: str, looked: Mapping[str, _Looked]) -> 
         if long and (seen.noisy or _others_move(view, name, looked, *span)):
             single[first:last] = False
             why = "elsewhere no frame is that before" if seen.noisy else "other views move"
-            yield issue(
-                f"frames {start} to {stop} are one picture, {span[1] - span[0]:.2f} s from "
-                f"{span[0] - view.zero:.2f} s; {why}",
-                *span,
-            )
+            yield issue(f"frames {start} to {stop} are one picture; {why}", *span)
     again = time[seen.index[1:][single]]
     if seen.noisy and len(again) >= DUPLICATES and len(again) > DUPLICATE_SHARE * pairs:
-        yield issue(
-            f"{len(again)} of {pairs} frames compared are the picture before, the first at "
-            f"{again[0] - view.zero:.2f} s; the camera is slower than its frames are stamped, or "
-            "frames were stored twice",
-            *again[[0, -1]].tolist(),
-        )
+        message = f"{len(again)} of {pairs} frames compared are the picture before"
+        yield issue(message, *again[[0, -1]].tolist())
 
 
 def _others_move(
     view: EpisodeView, name: str, looked: Mapping[str, _Looked], start_s: float, stop_s: float
 ) -> bool:
     """Whether every other camera's pictures change between two instants, and there is another."""
-
     counts: list[int] = []
     for other in looked.keys() - {name}:
         time = view.cameras[other].time[looked[other].index]

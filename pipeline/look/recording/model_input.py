@@ -1,6 +1,5 @@
 """What the model and the policy get of a recording: samples, the batch, the prompt, its tokens."""
 
-import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import closing
@@ -22,10 +21,10 @@ from pipeline.base.errors import PipelineError, RecordingError
 from pipeline.base.ownership import LEDGER_SUFFIX as LEDGER
 from pipeline.base.table import Table
 from pipeline.look.page.blocks import Block, Document, Text, TokenRun, Tokens
-from pipeline.look.page.style import INK, canvas
+from pipeline.look.page.style import INK, draw_frame, panels
 from pipeline.look.recording.episode import BROKEN, Draw, EpisodeView
-from pipeline.look.recording.frames import draw_frame, read_frames
-from pipeline.look.recording.streams import Group, group_channels, legend_beside, plot_curves
+from pipeline.look.recording.frames import read_frames
+from pipeline.look.recording.streams import Group, legend_beside, named_groups, plot_curves
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.processor import TokenKind
@@ -62,11 +61,7 @@ def sample_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
     except BROKEN as error:
         return [Text(f"No sample can be made: {error}")]
     lengths = window_lengths(params)
-    caption = (
-        f"{len(samples)} training samples side by side: the frames, the sensor and state windows "
-        f"that end at the tick, and the chunk of {lengths['action']} actions that begins at it. "
-        "The first is the episode's first tick, the last its last."
-    )
+    caption = "Training samples: frames, windows that end at the tick, and the chunk of actions."
     picture = draw("samples", caption, lambda view: draw_samples(view, samples, lengths))
     return [picture, batch_table(samples, lengths)]
 
@@ -97,19 +92,16 @@ def cut_samples(view: EpisodeView, params: Params) -> list[Sample]:
         for name, camera in view.cameras.items()
     }
     streams = {"sensor": (view.sensor, line.sensor_end), "state": (view.state, line.state_end)}
-    return [
-        Sample(
-            tick,
-            {name: row[place] for name, row in frames.items()},
-            {
-                name: stream.values[max(0, ends[tick] - lengths[name]) : ends[tick]].copy()
-                for name, (stream, ends) in streams.items()
-                if stream is not None
-            }
-            | {"action": line.action[tick : tick + lengths["action"]]},
-        )
-        for place, tick in enumerate(ticks)
-    ]
+    samples: list[Sample] = []
+    for place, tick in enumerate(ticks):
+        windows = {
+            name: stream.values[max(0, ends[tick] - lengths[name]) : ends[tick]].copy()
+            for name, (stream, ends) in streams.items()
+            if stream is not None
+        }
+        windows["action"] = line.action[tick : tick + lengths["action"]]
+        samples.append(Sample(tick, {name: row[place] for name, row in frames.items()}, windows))
+    return samples
 
 
 def draw_samples(
@@ -121,19 +113,14 @@ def draw_samples(
     chunk that lie past its end and are masked. States are drawn as what they changed since the
     first of the window.
     """
-    rows = [
-        (name, group)
-        for name in samples[0].windows
-        for group in group_channels(view.shown[name].channels)
-    ]
+    rows = named_groups({name: view.shown[name] for name in samples[0].windows})
     views = samples[0].frames
     column = float(np.clip((_WIDTH_IN - _BESIDE_IN) / len(samples), _LEAST_COLUMN_IN, _COLUMN_IN))
     heights = [column * frame.shape[0] / frame.shape[1] for frame in views.values()]
     heights += [_PANEL_IN] * len(rows)
-    figure = canvas(column * len(samples) + _BESIDE_IN, sum(heights) + 1.8)
-    axes = figure.subplots(
-        len(heights), len(samples), squeeze=False, sharey="row", height_ratios=heights
-    )
+    size = column * len(samples) + _BESIDE_IN, sum(heights) + 1.8
+    shape = {"squeeze": False, "sharey": "row", "height_ratios": heights}
+    figure, axes = panels(*size, len(heights), len(samples), **shape)
     for place, sample in enumerate(samples):
         axes[0, place].set_title(_sample_title(view, sample.tick), fontsize=_SMALL)
         for line_axes, (name, frame) in zip(axes, sample.frames.items(), strict=False):
@@ -154,11 +141,7 @@ def batch_table(samples: Sequence[Sample], lengths: Mapping[str, int]) -> Table:
         [sample.tick, *(f"{len(sample.windows[name])} of {lengths[name]}" for name in streams)]
         for sample in samples
     ]
-    caption = (
-        "The same samples as one batch: how many readings and steps are real. Windows are padded "
-        "with zeros on the left before the episode's start; chunks are masked past its end and "
-        "count for no loss there."
-    )
+    caption = "The same samples as a batch: what of each is real, and not padded or masked."
     heads = [f"{name} {'steps' if name == 'action' else 'readings'}" for name in streams]
     return Table(["tick", *heads], rows, caption)
 
@@ -215,21 +198,13 @@ def _sample_title(view: EpisodeView, tick: int) -> str:
 
 def prompt_blocks(view: EpisodeView, params: Params, views: Sequence[str]) -> list[Block]:
     """The prompt of the episode's first VL row, and the spec of the features of these views."""
+    spec: list[Block] = []
     try:
-        spec = remembered_spec(params, views)
+        found = remembered_spec(params, views)
+        spec = [Document("Feature spec: what decides what a feature is", found.attrs())]
+        return [*show_prompt(view, params.vlm, found), *spec]
     except PipelineError as error:
-        return [
-            Text(
-                f"Neither the prompt nor the feature spec can be shown: {str(error).rstrip('.')}. "
-                "Name a checkpoint that is here with `--set vlm.checkpoint=FOLDER`; the demo's is "
-                "written by `python -m stages.demo`."
-            )
-        ]
-    try:
-        blocks = show_prompt(view, params.vlm, spec)
-    except PipelineError as error:
-        blocks = [Text(f"The prompt cannot be shown: {error}")]
-    return [*blocks, Document("Feature spec: what decides what a feature is", spec.attrs())]
+        return [Text(f"The prompt cannot be shown: {error}"), *spec]
 
 
 def show_prompt(view: EpisodeView, vlm: VLMParams, spec: FeatureSpec) -> list[Block]:
@@ -255,11 +230,7 @@ def show_prompt(view: EpisodeView, vlm: VLMParams, spec: FeatureSpec) -> list[Bl
     special = Counter(text for text, kind, _ in tokens if kind != "text")
     pixels = spec.image_size
     return [
-        Text(
-            f"{len(tokens):,} tokens: {len(views):,} of images, {len(tokens) - len(views):,} "
-            f"others. Each image is {pixels[0]} × {pixels[1]} pixels for the model. Attention is "
-            "causal: a token sees only what stands before it."
-        ),
+        Text(f"{len(tokens):,} tokens, {len(views):,} of images."),
         Tokens(fold_tokens(tokens)),
         Table(
             ["view", "recorded [pixels]", "for the model [pixels]", "drawn out", "image tokens"],
@@ -269,8 +240,7 @@ def show_prompt(view: EpisodeView, vlm: VLMParams, spec: FeatureSpec) -> list[Bl
                 for high, wide in [frames[name][0].shape[:2]]
                 for stretch in [describe_stretch((high, wide), pixels)]
             ],
-            "Image tokens by view; sizes are height × width, the model's those of "
-            "`vlm.image_resize_height` and `vlm.image_resize_width`",
+            "Image tokens by view; sizes are height × width",
         ),
         Table(["token", "times"], list(special.items()), "Special tokens by name"),
     ]
@@ -284,7 +254,7 @@ def remembered_spec(params: Params, views: Sequence[str]) -> FeatureSpec:
     `VLMError` where the checkpoint is not there or incomplete.
     """
     with (
-        closing(ContentDigests(digest_ledger(params))) as digests,
+        closing(ContentDigests.to_read(digest_ledger(params))) as digests,
         tqdm(desc="digest of the checkpoint", unit="file", disable=None, leave=False) as bar,
     ):
 
@@ -301,9 +271,7 @@ def digest_ledger(params: Params) -> Path:
     Looking makes no file beside stores: whoever only looks may have none, or may not write there.
     """
     shared = ledger_path(params.extract.store)
-    if shared.is_file() and os.access(shared, os.W_OK) and os.access(shared.parent, os.W_OK):
-        return shared
-    return params.inspect.output / LEDGER
+    return shared if shared.is_file() else params.inspect.output / LEDGER
 
 
 def describe_stretch(recorded: tuple[int, ...], pixels: tuple[int, int]) -> str | None:

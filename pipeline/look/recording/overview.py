@@ -279,11 +279,9 @@ def _warn_of_duplicates(summaries: Sequence[EpisodeSummary]) -> None:
             common = sorted(summary.digests.keys() & first.digests.keys(), reverse=True)
             if all(summary.digests[name] == first.digests[name] for name in common):
                 source = "" if first.source == summary.source else f"{first.source}/"
-                message = (
-                    f"the same recording as {source}{first.episode} ({first.path}): all values of "
-                    f"{' and '.join(common)} are equal, and nothing else was compared; it would "
-                    "count twice. Leave one of them out of data.sources"
-                )
+                named = f"{source}{first.episode} ({first.path})"
+                equal = f"all values of {' and '.join(common)} are equal"
+                message = f"the same recording as {named}: {equal}, and nothing else was compared"
                 summary.warn("duplicate recording", "", message)
                 break
         else:
@@ -295,10 +293,6 @@ def _not_opened(opened: Opened) -> Iterator[Issue]:
     error = partial(Issue, severity="error", kind="unreadable")
     for bad in opened.bad:
         yield error(message=bad.reason, source=bad.source, episode=bad.where.name)
-    by_source: dict[str, list[str]] = defaultdict(list)
     for line in opened.missing:
         source, _, message = line.partition(": ")
-        by_source[source].append(message)
-    for source, messages in by_source.items():
-        more = f" ({len(messages)} such episodes in all)" if len(messages) > 1 else ""
-        yield _warning(kind="missing", message=f"{messages[0]}{more}", source=source)
+        yield _warning(kind="missing", message=message, source=source)

@@ -14,11 +14,7 @@ from pipeline.look.recording.clocks import clock_blocks
 from pipeline.look.recording.episode import Draw, EpisodeView, view_episode
 from pipeline.look.recording.frames import camera_blocks
 from pipeline.look.recording.model_input import prompt_blocks, sample_blocks
-from pipeline.look.recording.overview import (
-    RecordingsOverview,
-    survey_recordings,
-    worst_first,
-)
+from pipeline.look.recording.overview import RecordingsOverview, survey_recordings, worst_first
 from pipeline.look.recording.streams import motion_blocks, sensor_blocks
 
 _TOPICS = {
@@ -63,24 +59,15 @@ def recordings_report(opened: Opened, params: Params, name: str) -> Report:
         plain = re.sub(r"[^A-Za-z0-9]+", "_", summaries[index].episode).strip("_")[-40:]
         draw = drawer(index, f"episode{place}-{plain or 'episode'}-")
         sections.append(_episode_section(overview, index, view_of(index), draw, params))
-    sections.append(
-        Section(
-            "What the model and the policy get",
-            [Text(f"Of the episode `{summaries[model].episode}`, under the params in force.")],
-            [
-                Section(
-                    "Samples and batch", sample_blocks(view_of(model), drawer(model, ""), params)
-                ),
-                Section("Prompt", prompt_blocks(view_of(model), params, overview.views)),
-            ],
-        )
-    )
+    samples = sample_blocks(view_of(model), drawer(model, ""), params)
+    prompt = prompt_blocks(view_of(model), params, overview.views)
+    words = Text(f"Of the episode `{summaries[model].episode}`, under the params in force.")
+    parts = [Section("Samples and batch", samples), Section("Prompt", prompt)]
+    sections.append(Section("What the model and the policy get", [words], parts))
     data = params.data
     rate = "the recorded rows" if data.action_hz is None else f"{data.action_hz:g} Hz"
-    summary = (
-        f"Ticks at {rate}, one VL row every {data.vlm_reuse_count} ticks. "
-        "Times count from the first instant of an episode."
-    )
+    summary = f"Ticks at {rate}, one VL row every {data.vlm_reuse_count} ticks. Times count from "
+    summary += "the first instant of an episode."
     return Report(f"Recordings: {name}", summary, _tiles(overview), sections)
 
 
@@ -114,10 +101,7 @@ def _episodes_table(overview: RecordingsOverview, chosen: Sequence[int]) -> Tabl
         )
         for summary in (summaries[at] for at in shown)
     ]  # fmt: skip
-    caption = (
-        "Those in bold are shown in detail below. Readings are the sensor's. Listed are "
-        f"{len(shown)} of {len(summaries):,} episodes, those with most findings among them."
-    )
+    caption = f"{len(shown)} of {len(summaries):,} episodes; those in bold are shown below."
     strong = frozenset(row for row, index in enumerate(shown) if index in chosen)
     return Table(heads, rows, caption, strong)
 
@@ -135,21 +119,13 @@ def _episode_section(
 ) -> Section:
     """Everything of one episode."""
     summary = overview.summaries[index]
-    blocks: list[Block] = [
-        Text(f"`{summary.path}`, format {summary.format}: “{summary.instruction or '–'}”")
-    ]
+    words = f"`{summary.path}`, format {summary.format}: “{summary.instruction or '–'}”"
+    blocks: list[Block] = [Text(words)]
     if len(overview.summaries) > 1:
         blocks.append(Issues(summary.issues, "Nothing looks wrong in this episode."))
     several = len({summary.source for summary in overview.summaries}) > 1
-    errors = [
-        f" Not read: {issue.message}" for issue in summary.issues if issue.severity == "error"
-    ]
+    title = f"{summary.source} / {summary.episode}" if several else summary.episode
+    errors = [f" {issue.message}" for issue in summary.issues if issue.severity == "error"]
     absent = Text(f"This episode has nothing of this.{''.join(errors)}")
-    return Section(
-        f"{summary.source} / {summary.episode}" if several else summary.episode,
-        blocks,
-        [
-            Section(title, blocks_of(view, draw, params) or [absent])
-            for title, blocks_of in _TOPICS.items()
-        ],
-    )
+    parts = {topic: blocks_of(view, draw, params) for topic, blocks_of in _TOPICS.items()}
+    return Section(title, blocks, [Section(topic, parts[topic] or [absent]) for topic in parts])

@@ -13,9 +13,9 @@ has glided out of tissue; a touch below the threshold is none.
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -30,8 +30,8 @@ from pipeline.base.config import Params
 from pipeline.data import Channels, Stream
 from pipeline.data.timeline import last_at
 from pipeline.look.page.blocks import Block
-from pipeline.look.page.style import PALETTE, canvas
-from pipeline.look.recording.clocks import Clock, usual_step
+from pipeline.look.page.style import PALETTE, panels
+from pipeline.look.recording.clocks import Clock, Span, usual_step
 from pipeline.look.recording.episode import Draw, EpisodeView, runs
 
 CONTACT_COLOUR = "#E69F00"
@@ -54,9 +54,8 @@ _APART_S, _SHORTEST_S = 0.1, 0.05
 
 # The rule in a sentence, for a caption.
 RULE = (
-    f"In contact: from where the force leaves its median of the first {_REST_S:g} s by "
-    f"{_ENTER:g} times its noise (in newtons by {_LEAST_N:g} at least) until it is back within "
-    f"{100 * _LEAVE / _ENTER:.0f} % of that."
+    f"It begins where the force leaves its median of the first {_REST_S:g} s by {_ENTER:g} times "
+    f"its noise, and ends where it is back within {100 * _LEAVE / _ENTER:.0f} % of that."
 )
 # A standard deviation, of normal noise, that outliers do not raise.
 _spread = partial(median_abs_deviation, axis=0, scale=1 / 1.4826)
@@ -94,15 +93,17 @@ def group_channels(channels: Channels) -> list[Group]:
     return sorted(groups.values(), key=lambda group: bool(group.profile))
 
 
+def named_groups(streams: Mapping[str, Stream]) -> list[tuple[str, Group]]:
+    """The groups of all these streams, each with its stream's name."""
+    return [(name, group) for name in streams for group in group_channels(streams[name].channels)]
+
+
 def sensor_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
     """The picture of the sensor, contact marked; empty without one."""
     if view.sensor is None:
         return []
     spans = [f"{start - view.zero:.2f}–{stop - view.zero:.2f} s" for start, stop in contacts(view)]
-    caption = (
-        f"The sensor's {len(view.sensor.channels.names):,} channels over time. Contact (shaded), "
-        f"by the force alone: {', '.join(spans) or 'none'}. {RULE}"
-    )
+    caption = f"Contact (shaded), by the force alone: {', '.join(spans) or 'none'}. {RULE}"
     return [draw("sensor", caption, draw_sensor)]
 
 
@@ -144,18 +145,14 @@ def draw_motion(view: EpisodeView) -> Figure:
     Where channels of a panel lie so far apart that none would be seen to move, it shows what they
     changed since the first reading, and the legend where each began.
     """
-    panels = [
-        (name, stream, group)
-        for name, stream in view.shown.items()
-        if name != "sensor"
-        for group in group_channels(stream.channels)
-    ]
-    figure, axes = _panels([group for _, _, group in panels])
+    shown = {name: stream for name, stream in view.shown.items() if name != "sensor"}
+    drawn = named_groups(shown)
+    figure, axes = _panels([group for _, group in drawn])
     actions = "actions as recorded" if view.timeline is None else "actions at the ticks"
     titled = ""
-    for axis, (name, stream, group) in zip(axes, panels, strict=True):
+    for axis, (name, group) in zip(axes, drawn, strict=True):
         held = name == "action"
-        _draw_curves(axis, stream, group, view.zero, held=held, changes=not held)
+        _draw_curves(axis, shown[name], group, view.zero, held=held, changes=not held)
         axis.set_title("" if name == titled else actions if held else name, loc="left")
         legend_beside(axis)
         titled = name
@@ -190,10 +187,8 @@ def plot_curves(
 def legend_beside(axis: Axes) -> None:
     """The legend of a panel, right of it; in columns where it is long."""
     columns = 1 + len(axis.get_legend_handles_labels()[1]) // 8
-    place = 1.005, 0.5
-    axis.legend(
-        loc="center left", bbox_to_anchor=place, fontsize=8, ncols=columns, handlelength=1.6
-    )
+    place: dict[str, Any] = {"loc": "center left", "bbox_to_anchor": (1.005, 0.5)}
+    axis.legend(fontsize=8, ncols=columns, handlelength=1.6, **place)
 
 
 def _panels(groups: Sequence[Group]) -> tuple[Figure, list[Axes]]:
@@ -201,11 +196,11 @@ def _panels(groups: Sequence[Group]) -> tuple[Figure, list[Axes]]:
         _IMAGE_IN if group.profile else _PANEL_IN if group.names[1:] else _SMALL_IN
         for group in groups
     ]
-    figure = canvas(_WIDTH_IN, sum(heights) + 0.5)
-    axes = figure.subplots(len(groups), squeeze=False, sharex=True, height_ratios=heights)[:, 0]
-    axes[-1].set_xlabel("time since the recording began [s]")
+    shape = {"squeeze": False, "sharex": True, "height_ratios": heights}
+    figure, axes = panels(_WIDTH_IN, sum(heights) + 0.5, len(groups), **shape)
+    axes[-1, 0].set_xlabel("time since the recording began [s]")
     figure.align_ylabels(axes)
-    return figure, list(axes)
+    return figure, list(axes[:, 0])
 
 
 def _draw_curves(
@@ -246,15 +241,8 @@ def _draw_profile(axis: Axes, stream: Stream, group: Group, zero: float) -> None
     axis.figure.colorbar(drawn, cax=bar, label=f"{group.profile} {unit}", extend="both")
 
 
-class Contact(NamedTuple):
-    """A span in which the needle touches something, by the force alone."""
-
-    start_s: float
-    stop_s: float
-
-
-def contacts(view: EpisodeView) -> tuple[Contact, ...]:
-    """Spans of contact, in order; none where there is no sensor or it has no force channel.
+def contacts(view: EpisodeView) -> tuple[Span, ...]:
+    """Spans in which the needle touches something, by the force alone; none without a force.
 
     Several force channels (a wrench) count by the length of their departure from rest.
     """
@@ -275,7 +263,7 @@ def contacts(view: EpisodeView) -> tuple[Contact, ...]:
     least = _LEAST_N if {view.sensor.channels.units[column] for column in columns} == {"N"} else 0.0
     departure = np.linalg.norm(smooth - rest, axis=1)
     enter = max(_ENTER * float(np.linalg.norm(noise)), least)
-    spans: list[Contact] = []
+    spans: list[Span] = []
     for start, stop in runs((departure > enter * _LEAVE / _ENTER) & (departure > 0)):
         reached = np.flatnonzero(departure[start:stop] >= enter)
         if len(reached):
@@ -283,8 +271,8 @@ def contacts(view: EpisodeView) -> tuple[Contact, ...]:
             begin, end = time[start + reached[0]], time[min(stop, len(time) - 1)]
             if spans and begin - spans[-1].stop_s < _APART_S:
                 begin = spans.pop().start_s
-            spans.append(Contact(float(begin), float(end)))
-    return tuple(span for span in spans if span.stop_s - span.start_s >= _SHORTEST_S)
+            spans.append(Span(float(begin), float(end)))
+    return tuple(span for span in spans if span.length_s >= _SHORTEST_S)
 
 
 def force_columns(sensor: Stream) -> list[int]:

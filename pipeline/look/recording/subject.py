@@ -53,10 +53,11 @@ def subject_of(params: Params) -> Subject:
     wanted = params.inspect
     places = (wanted.path,) if isinstance(wanted.path, str) else wanted.path or ()
     _check_output(wanted.output)
+    folder = _folder(wanted, places)
+    refuse_foreign(folder, REPORT)
     if not places:
-        refuse_foreign(wanted.output, REPORT)
         names = ", ".join(source.name for source in params.data.sources)
-        return Subject(names, wanted.output, None, params.data.sources, params.data.root)
+        return Subject(names, folder, None, params.data.sources, params.data.root)
     for place in places:
         _check(place, params.data.root)
     matches = [
@@ -67,11 +68,9 @@ def subject_of(params: Params) -> Subject:
     stores = [path for path in matches if _is_store(path)]
     if stores and len(matches) > 1:
         raise ConfigError(
-            f"inspect.path: expected recordings or one store, found {len(matches)} paths, the "
-            f"store {stores[0]} among them. Look at it alone: python -m stages.inspect {stores[0]}"
+            f"inspect.path: {stores[0]} is a store, and {len(matches) - 1} more paths are named. "
+            f"Look at it alone: python -m stages.inspect {stores[0]}"
         )
-    folder = _folder(wanted, places)
-    refuse_foreign(folder, REPORT)
     # The last part of the first path that is no pattern.
     parts = [part for part in Path(places[0]).absolute().parts if not glob.has_magic(part)]
     name = parts[-1].strip("/") or "recordings"
@@ -86,10 +85,7 @@ def _check(place: str, root: Path) -> None:
         return
     if not path.exists():
         raise ConfigError(f"inspect.path: {path} is not there. {_there_is(place, root)}")
-    remedy = meant(path.absolute()) or (
-        "Unpack it if it is packed. Name the folder of the whole recording: of LeRobot's, the one "
-        "that holds meta/"
-    )
+    remedy = meant(path.absolute()) or "Unpack it, or name the folder of the whole recording"
     raise ConfigError(f"inspect.path: expected a folder, found the file {path}. {remedy}")
 
 
@@ -107,19 +103,18 @@ def _check_output(folder: Path) -> None:
 
 
 def _there_is(place: str, root: Path) -> str:
-    """What is there instead: below `data.root`, of nearly that name, on the hub, or beside it."""
+    """What is there instead: below `data.root`, on the hub, or beside it, the likest first."""
     path = Path(place)
     if (root / path).exists():
         return f"It is under data.root: python -m stages.inspect '{root / path}'"
-    parent = next(folder for folder in path.absolute().parents if folder.is_dir())
-    names = sorted(name for name in os.listdir(parent) if not name.startswith("."))
-    close = get_close_matches(path.absolute().relative_to(parent).parts[0], names, n=3)
-    if close:
-        return f"Did you mean {' or '.join(str(parent / name) for name in close)}?"
     hint = hub_hint(place, Path())
     if hint and path.parts[:1] != root.parts[:1]:  # data/demo, before the demo is written
         return hint
-    return f"In {parent} there is {', '.join(names[:8]) or 'nothing'}"
+    parent = next(folder for folder in path.absolute().parents if folder.is_dir())
+    wanted = path.absolute().relative_to(parent).parts[0]
+    names = [name for name in os.listdir(parent) if not name.startswith(".")]
+    close = get_close_matches(wanted, names, n=8, cutoff=0)
+    return f"In {parent} there is {', '.join(close) or 'nothing'}"
 
 
 def _is_store(path: Path) -> bool:
@@ -138,8 +133,8 @@ def _stores_below(sources: Sequence[Source], root: Path) -> str:
 
 
 def _folder(wanted: InspectParams, places: Sequence[str]) -> Path:
-    """The output as it was given, else a folder in it named after the paths."""
-    if "output" in wanted.model_fields_set:
+    """The output as it was given, else a folder in it named after the paths, if any."""
+    if "output" in wanted.model_fields_set or not places:
         return wanted.output
     first = os.path.relpath(places[0])
     # A path elsewhere is named by its last parts: all of it would be no name.

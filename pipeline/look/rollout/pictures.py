@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from pipeline.evaluate.rollouts import RolloutEpisode, Rollouts
-from pipeline.look.page.style import GRID, INK, PALETTE, canvas, legend_below
+from pipeline.look.page.style import GRID, INK, PALETTE, canvas, draw_frame, finish
 from pipeline.simulation.insertion import AT_LAYER_MM, FORCE_LIMIT_N, MISS_MM, OVERSHOOT_MM
 
 _MOMENTS = 8
@@ -73,8 +73,7 @@ def endings(rollouts: Rollouts) -> Figure:
     _name_rows(axis, list(counts))
     axis.set_xlabel("episodes")
     axis.xaxis.set_major_locator(MaxNLocator(integer=True))
-    legend_below(figure, axis, 3)
-    figure.suptitle("How episodes ended")
+    finish(figure, axis, 3, "How episodes ended")
     return figure
 
 
@@ -90,8 +89,7 @@ def paths(rollouts: Rollouts) -> Figure:
         _draw_paths(column[1], rollouts.of(name), _NEAR_MM)
         column[0].set_title(f"{controller_name(name)}: whole paths")
         column[1].set_title(f"{controller_name(name)}: the last {_NEAR_MM:g} mm")
-    legend_below(figure, axes[0, 0], 3)
-    figure.suptitle("Seen from above, the target in the middle")
+    finish(figure, axes[0, 0], 3, "Seen from above, the target in the middle")
     return figure
 
 
@@ -109,8 +107,9 @@ def courses(episodes: Sequence[RolloutEpisode], strong: Mapping[str, RolloutEpis
         _draw_course(axes, episode, color=colour, lw=2.4, label=label, zorder=5)
     _mark_limits(axes)
     figure.align_ylabels(axes)
-    legend_below(figure, axes[0], 2)
-    figure.suptitle(f"Place and force over time in {len(episodes)} episode(s) of the policy")
+    finish(
+        figure, axes[0], 2, f"Place and force over time in {len(episodes)} episode(s) of the policy"
+    )
     return figure
 
 
@@ -127,11 +126,11 @@ def filmstrip(episode: RolloutEpisode, title: str) -> Figure:
     for row, view in enumerate(shapes):
         for column, shown in enumerate(frames):
             axis = figure.add_subplot(grid[row, column])
+            draw_frame(axis, shown[view])
             # Matplotlib names an image by its content, which may come twice.
-            axis.imshow(shown[view], gid=f"frame-{row}-{column}")
-            axis.set(xticks=[], yticks=[], ylabel="" if column else view)
+            axis.images[0].set_gid(f"frame-{row}-{column}")
+            axis.set_ylabel("" if column else view)
             axis.set_title("" if row else f"{moments[column]:.1f} s")
-            axis.spines[:].set_visible(False)
     axes = [figure.add_subplot(grid[row, :]) for row in range(-4, 0)]
     _draw_course(axes, episode, color=PALETTE[0], lw=2)
     _mark_limits(axes)

@@ -1,7 +1,7 @@
 """The channels of state, sensor and action over a whole store, in bounded memory."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import groupby
 
@@ -13,7 +13,7 @@ from pipeline.base.channels import PROFILE_CHANNELS, named, unnumbered
 from pipeline.base.issue import Issue
 from pipeline.data import Channels
 from pipeline.look.page.blocks import Block, Picture, Text
-from pipeline.look.page.style import GRID, PALETTE, canvas, legend_below
+from pipeline.look.page.style import GRID, PALETTE, finish, panels
 from pipeline.look.recording.channels import (
     ChannelStatistics,
     describe_still,
@@ -72,14 +72,10 @@ def evenly(total: int, most: int) -> NDArray[np.int64]:
 
 def show_channels(statistics: Sequence[StreamSummary]) -> list[Block]:
     """How much was looked at, the profiles as a picture, and every channel in a table."""
-    looked_at = ", ".join(
-        f"{summary.looked_at:,} of {summary.rows:,} rows of {summary.stream}"
-        for summary in statistics
-    )
-    table = statistics_table([channel for summary in statistics for channel in summary.channels])
+    looked_at = [f"{one.looked_at:,} of {one.rows:,} rows of {one.stream}" for one in statistics]
     blocks: list[Block] = [
-        Text(f"Of the whole store, before any normalisation. Looked at, evenly: {looked_at}."),
-        replace(table, caption=table.caption.replace("Over the whole episode", "Physical units")),
+        Text(f"Of the whole store. Looked at, evenly: {', '.join(looked_at)}."),
+        statistics_table([channel for summary in statistics for channel in summary.channels]),
     ]
     if profiles := list(find_profiles(statistics)):
         caption = "Numbered channels side by side: median, 1 to 99 %, least and greatest."
@@ -100,31 +96,27 @@ def find_profiles(
 
 def draw_profiles(profiles: Sequence[Sequence[ChannelStatistics]]) -> Figure:
     """Every channel of each profile: median, 1 to 99 %, and extremes."""
-    figure = canvas(8.5, 0.6 + 2.6 * len(profiles))
-    axes = figure.subplots(len(profiles), 1, squeeze=False)[:, 0]
-    for axis, channels in zip(axes, profiles, strict=True):
+    size = 8.5, 0.6 + 2.6 * len(profiles)
+    figure, axes = panels(*size, len(profiles), 1, squeeze=False)
+    for axis, channels in zip(axes[:, 0], profiles, strict=True):
         at, first = np.arange(len(channels)), channels[0]
-        kinds = ("minimum", "low", "median", "high", "maximum")
-        minimum, low, median, high, maximum = (
-            [getattr(channel, kind) for channel in channels] for kind in kinds
-        )
-        axis.fill_between(at, minimum, maximum, color=GRID, label="least to greatest")
-        axis.fill_between(at, low, high, color=PALETTE[4], alpha=0.5, lw=0, label="1 to 99 %")
-        axis.plot(at, median, color=PALETTE[0], lw=1.2, label="median")
+        ends = [(one.minimum, one.maximum) for one in channels]
+        inner = [(one.low, one.high) for one in channels]
+        axis.fill_between(at, *np.transpose(ends), color=GRID, label="least to greatest")
+        style = {"color": PALETTE[4], "alpha": 0.5, "lw": 0}
+        axis.fill_between(at, *np.transpose(inner), label="1 to 99 %", **style)
+        axis.plot(at, [one.median for one in channels], color=PALETTE[0], lw=1.2, label="median")
         axis.set_ylabel(f"{first.stream} [{first.unit}]" if first.unit else first.stream)
         axis.set_xlabel(f"channel: {first.name} to {channels[-1].name}")
         axis.margins(x=0)
-    legend_below(figure, axes[0], 3)
+    finish(figure, axes[0, 0], 3)
     return figure
 
 
 def find_channel_issues(statistics: Sequence[StreamSummary]) -> Iterator[Issue]:
     """Channels that never change, hardly move, or hold what is no number."""
     for stream in statistics:
-        names, rows = (
-            [channel.name for channel in stream.channels],
-            f"{stream.looked_at} rows looked at",
-        )
+        names, rows = [one.name for one in stream.channels], f"{stream.looked_at} rows looked at"
         broken = [at for at, channel in enumerate(stream.channels) if not np.isfinite(channel.mean)]
         # The gripper of pose-derived actions is 1 by definition.
         flat = [

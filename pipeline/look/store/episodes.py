@@ -10,12 +10,11 @@ from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
-from numpy.typing import NDArray
 
-from pipeline.base.issue import Issue
+from pipeline.base.issue import Issue, Severity
 from pipeline.base.table import Table
 from pipeline.look.page.blocks import Block, Picture
-from pipeline.look.page.style import INK, PALETTE, canvas, draw_map, shorten_middle
+from pipeline.look.page.style import INK, PALETTE, draw_map, panels, shorten_middle
 from pipeline.store import Episode, FeatureStore, episode_name
 
 ROWS = 100
@@ -25,9 +24,6 @@ _GAP_STEPS = 5
 _RARE, _USUAL = 0.05, 0.8
 _SEEN = (("#D55E00", "absent"), ("#E69F00", "by some"), ("#0072B2", "seen by all ticks"))
 _NAMED_EPISODES = 16
-
-
-Times = Sequence[float] | NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -51,13 +47,14 @@ class EpisodeCoverage:
         return slice(self.episode.ticks.start, self.episode.ticks.stop)
 
     def issue(
-        self, kind: str, stream: str, text: str, times: Times = (), error: bool = False
+        self, kind: str, stream: str, message: str, *span: float, severity: Severity = "warning"
     ) -> Issue:
-        """An issue of this episode; `times` are (start, stop) in s since its first tick."""
-        start_s, stop_s = map(float, times) if len(times) else (None, None)
-        severity = "error" if error else "warning"
-        place = partial(Issue, source=self.episode.source, episode=self.episode.id, stream=stream)
-        return place(severity=severity, kind=kind, message=text, start_s=start_s, stop_s=stop_s)
+        """An issue of this episode; `span` is its start and stop in s since the first tick."""
+        start_s, stop_s = map(float, span) if span else (None, None)
+        return Issue(
+            severity=severity, kind=kind, message=message, start_s=start_s, stop_s=stop_s,
+            source=self.episode.source, episode=self.episode.id, stream=stream,
+        )  # fmt: skip
 
 
 def read_coverage(store: FeatureStore, episode: Episode) -> EpisodeCoverage:
@@ -70,8 +67,10 @@ def read_coverage(store: FeatureStore, episode: Episode) -> EpisodeCoverage:
     }
     shown = np.isfinite(store.array("vl/frame_time")[store.array("tick/vl_row")[ticks]])
     seen |= dict(zip(store.streams["views"], shown.T, strict=True))
-    covered = {name: float(there.mean()) if len(time) else 0.0 for name, there in seen.items()}
-    return EpisodeCoverage(episode, float(np.ptp(time)) if len(time) else 0.0, covered)
+    if not len(time):
+        return EpisodeCoverage(episode, 0.0, dict.fromkeys(seen, 0.0))
+    covered = {name: float(there.mean()) for name, there in seen.items()}
+    return EpisodeCoverage(episode, float(np.ptp(time)), covered)
 
 
 def show_coverage(episodes: Sequence[EpisodeCoverage]) -> list[Block]:
@@ -85,15 +84,9 @@ def show_coverage(episodes: Sequence[EpisodeCoverage]) -> list[Block]:
         own = part.episode
         counts = len(own.ticks), round(part.seconds, 2), len(own.vl_rows)
         rows.append((own.source, own.id, own.instruction, *counts, _lacking(part.covered)))
-    return [
-        _tabulate_sources(episodes),
-        Picture(
-            "coverage",
-            "Length of each episode, and below it which streams and views its ticks see.",
-            partial(draw_coverage, episodes),
-        ),
-        Table(heads, rows, caption),
-    ]
+    words = "Length of each episode, and below it which streams and views its ticks see."
+    picture = Picture("coverage", words, partial(draw_coverage, episodes))
+    return [_tabulate_sources(episodes), picture, Table(heads, rows, caption)]
 
 
 def _tabulate_sources(episodes: Sequence[EpisodeCoverage]) -> Table:
@@ -133,9 +126,8 @@ def draw_coverage(episodes: Sequence[EpisodeCoverage]) -> Figure:
     source_of = np.array([episode.episode.source for episode in episodes])
     sources = list(dict.fromkeys(source_of.tolist()))
     seconds = np.array([episode.seconds for episode in episodes])
-    figure = canvas(9.0, 3.8 + 0.3 * len(streams))
-    ratios = (2.2, 0.3 * len(streams) + 0.2)
-    above, below = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": ratios})
+    size, heights = (9.0, 3.8 + 0.3 * len(streams)), (2.2, 0.3 * len(streams) + 0.2)
+    figure, (above, below) = panels(*size, 2, 1, sharex=True, height_ratios=heights)
     for number, source in enumerate(sources):
         own = np.flatnonzero(source_of == source)
         above.bar(own, seconds[own], 0.9, color=PALETTE[number % len(PALETTE)], label=source)
@@ -185,9 +177,8 @@ def find_episode_issues(
         gaps = np.flatnonzero(steps > _GAP_STEPS * usual)
         if usual > 0 and len(gaps):
             at = int(steps.argmax())
-            text = f"{len(gaps)} gap(s), the widest {steps[at]:.2f} s without a tick; a step is "
-            text += f"usually {usual:.3f} s"
-            yield episode.issue("gap", "ticks", text, time[[at, at + 1]] - time[0])
+            text = f"{len(gaps)} gap(s), the widest {steps[at]:.2f} s; usual is {usual:.3f} s"
+            yield episode.issue("gap", "ticks", text, *time[[at, at + 1]] - time[0])
         if len(time) < FEW_TICKS:
             text = f"{len(time)} ticks ({episode.seconds:.1f} s); expected at least {FEW_TICKS}"
             yield episode.issue("short episode", "ticks", text)
@@ -207,11 +198,10 @@ def _instructions(episodes: Sequence[EpisodeCoverage]) -> Iterator[Issue]:
     by_source: dict[str, Counter[str]] = defaultdict(Counter)
     for episode in episodes:
         by_source[episode.episode.source][episode.episode.instruction] += 1
-    usual = {source: counts.most_common(1)[0] for source, counts in by_source.items()}
-    totals = {source: counts.total() for source, counts in by_source.items()}
+    usual = {name: (*said.most_common(1)[0], said.total()) for name, said in by_source.items()}
     for episode in episodes:
         source, words = episode.episode.source, episode.episode.instruction
-        (most, often), total = usual[source], totals[source]
+        most, often, total = usual[source]
         rare = by_source[source][words] <= max(1, _RARE * total) < often
         if not words.strip():
             text = "the prompt says nothing of the task; set `instruction` of its data source"

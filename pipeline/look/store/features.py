@@ -22,7 +22,7 @@ from pipeline.base.errors import StoreIncomplete
 from pipeline.base.finite import non_finite
 from pipeline.base.issue import Issue
 from pipeline.look.page.blocks import Block, Picture, Text
-from pipeline.look.page.style import GRID, PALETTE, canvas, draw_map
+from pipeline.look.page.style import GRID, PALETTE, draw_map, panels
 from pipeline.look.store.channels import evenly
 from pipeline.look.store.episodes import EpisodeCoverage, mark_sources
 from pipeline.store import FEATURES, FeatureStore, place
@@ -91,13 +91,12 @@ def sample_rows(store: FeatureStore, most: int) -> SampledRows:
 def check_rows(store: FeatureStore, rows: NDArray[np.int64]) -> None:
     """Raise `StoreIncomplete` where one of these VL rows does not give its checksum."""
     features, checksums = store.array(FEATURES), store.array("vl/checksum")
-    for block in _blocks(rows, features[:1].nbytes):
+    for block in np.array_split(rows, max(1, len(rows) * features[:1].nbytes // _BLOCK_BYTES)):
         bad = block[row_checksums(features[block]) != checksums[block]]
         if len(bad):
             raise StoreIncomplete(
-                f"{store.path}: expected features that give their checksum, found {len(bad)} VL "
-                f"row(s) that do not, the first {place(store, 'vl', int(bad[0]))}: the store is "
-                f"damaged. {mend(store.path)}"
+                f"{store.path}: {len(bad)} VL row(s) do not give their checksum, the first "
+                f"{place(store, 'vl', int(bad[0]))}: the store is damaged. {mend(store.path)}"
             )
 
 
@@ -124,9 +123,7 @@ def look_at_features(store: FeatureStore, sampled: SampledRows) -> FeatureNorms:
 
 def read_slot(store: FeatureStore, rows: NDArray[np.int64], slot: int) -> NDArray[np.float32]:
     """(row, dim) of one slot of the plain frames, whatever dtype it is stored in."""
-    features = store.array(FEATURES)
-    blocks = [widen(features[block, slot]) for block in _blocks(rows, features[0, :1].nbytes)]
-    return np.concatenate(blocks).astype(np.float32, copy=False)
+    return widen(store.array(FEATURES)[rows, slot]).astype(np.float32, copy=False)
 
 
 def _slot_name(document: Mapping[str, Any]) -> str:
@@ -134,10 +131,6 @@ def _slot_name(document: Mapping[str, Any]) -> str:
     cell = ",".join(map(str, document.get("cell") or ()))
     layer = f"layer {document['layer']}{'' if document['norm'] else ' no norm'}"
     return " ".join(filter(None, (layer, document["pooling"], document.get("view"), cell)))
-
-
-def _blocks(rows: NDArray[np.int64], row_bytes: int) -> list[NDArray[np.int64]]:
-    return np.array_split(rows, max(1, len(rows) * row_bytes // _BLOCK_BYTES))
 
 
 def _variation(values: NDArray[np.float32]) -> float:
@@ -151,31 +144,24 @@ def _variation(values: NDArray[np.float32]) -> float:
 
 def show_features(norms: FeatureNorms, episodes: Sequence[EpisodeCoverage]) -> list[Block]:
     """How many rows were looked at, and how long their features are."""
-    sampled = norms.sampled
+    looked_at, total = len(norms.sampled.rows), norms.sampled.total
     words = "Looked at: all VL rows"
-    if len(sampled.rows) < sampled.total:
-        words = f"Looked at: {len(sampled.rows):,} of {sampled.total:,} VL rows, the same moments "
-        words += "of each episode (`inspect.points`)"
+    if looked_at < total:
+        words = f"Looked at: {looked_at:,} of {total:,} VL rows (`inspect.points`)"
     if broken := int(norms.broken.any(axis=1).sum()):
         words += f", but for what is not finite in {broken:,} of them"
     if not np.isfinite(norms.norm).any():
         return [Text(f"{words}; none has features that are numbers.")]
-    return [
-        Text(f"{words}. Of augmented variants, plain frames only."),
-        Picture(
-            "norms",
-            "Left: how long the features of each slot are. Right: their median length in each "
-            "episode divided by that in all; a column that stands out is an episode unlike others.",
-            partial(draw_norms, norms, episodes),
-        ),
-    ]
+    caption = "Length of the features by slot, and the median in each episode / in all."
+    picture = Picture("norms", caption, partial(draw_norms, norms, episodes))
+    return [Text(f"{words}. Of augmented variants, plain frames only."), picture]
 
 
 def draw_norms(norms: FeatureNorms, episodes: Sequence[EpisodeCoverage]) -> Figure:
     """Length of the features: by slot on the left, by slot and episode on the right."""
     slots = len(norms.names)
-    figure = canvas(9.5, 3.0 + min(5.0, 0.3 * slots))
-    left, right = figure.subplots(1, 2, sharey=True, gridspec_kw={"width_ratios": (1, 1.7)})
+    size = 9.5, 3.0 + min(5.0, 0.3 * slots)
+    figure, (left, right) = panels(*size, 1, 2, sharey=True, width_ratios=(1, 1.7))
     at = np.arange(slots)
     low, middle, high = _quantiles(norms.norm, (0.01, 0.5, 0.99))
     left.hlines(at, low, high, color=PALETTE[4], lw=min(5.0, 160 / slots), label="1 to 99 %")
@@ -235,9 +221,7 @@ def find_feature_issues(
     """Dead slots, odd lengths and what is no number; times are s since the episode's first tick."""
     dead = np.flatnonzero(norms.variation < DEAD).tolist()
     if dead:
-        text = f"{named(norms.names, dead)}: the same in all {len(norms.sampled.rows)} VL rows "
-        text += "looked at; expected features that follow the scene (is a camera dead, or its view "
-        text += "black?)"
+        text = f"{named(norms.names, dead)}: the same in all VL rows looked at"
         yield Issue(severity="warning", kind="dead slot", message=text, stream=FEATURES)
     far = find_outliers(norms)
     still = (norms.within < DEAD) & (norms.variation >= DEAD)
@@ -245,20 +229,17 @@ def find_feature_issues(
         own = np.flatnonzero(norms.sampled.episode == index)
         time = norms.sampled.time[own]
         if len(row := np.nonzero(norms.broken[own])[0]):
-            text = f"{len(np.unique(row))} VL row(s) with features that are NaN or infinite, the "
-            text += f"first in slot {norms.names[norms.broken[own[row[0]]].argmax()]} at "
-            text += f"{time[row[0]]:.2f} s; left out of all that is shown of features. Training "
-            text += "refuses them: extract these rows anew"
-            yield episode.issue("not finite", FEATURES, text, time[row[[0, -1]]], error=True)
+            slot, span = norms.broken[own[row[0]]].argmax(), time[row[[0, -1]]]
+            text = f"{len(np.unique(row))} VL row(s) are NaN or infinite, the first in slot "
+            text += f"{norms.names[slot]}; training refuses them: extract them anew"
+            yield episode.issue("not finite", FEATURES, text, *span, severity="error")
         if len(own) >= _STILL_ROWS and still[index].any():
-            text = f"{named(norms.names, np.flatnonzero(still[index]).tolist())}: the same in all "
-            text += f"{len(own)} VL rows looked at of this episode; expected them to follow the "
-            text += "scene"
+            slots = named(norms.names, np.flatnonzero(still[index]).tolist())
+            text = f"{slots}: the same in all {len(own)} VL rows looked at of this episode"
             yield episode.issue("still features", FEATURES, text)
         if len(row := np.nonzero(far[own])[0]):
             worst, slot = np.unravel_index(far[own].argmax(), far[own].shape)
             column = norms.norm[:, slot]
-            text = f"{len(row)} feature norm(s) far from the rest, the furthest "
-            text += f"{column[own[worst]]:.4g} in slot {norms.names[slot]}, of which the median is "
-            text += f"{np.nanmedian(column):.4g}"
-            yield episode.issue("feature norm", FEATURES, text, time[row[[0, -1]]])
+            text = f"{len(row)} feature norm(s) far from the rest, as {column[own[worst]]:.4g} in "
+            text += f"slot {norms.names[slot]}, of which the median is {np.nanmedian(column):.4g}"
+            yield episode.issue("feature norm", FEATURES, text, *time[row[[0, -1]]])

@@ -11,22 +11,18 @@ from pipeline.base.format import duration, size
 from pipeline.base.issue import Issue
 from pipeline.base.table import Table
 from pipeline.look.page.blocks import Document, Issues, Report, Section, Text
-from pipeline.look.store import ages, channels, duplicates, episodes, features
-from pipeline.look.store.ages import Ages
+from pipeline.look.store import channels, episodes, features, rows
 from pipeline.look.store.channels import StreamSummary
-from pipeline.look.store.duplicates import Duplicates
 from pipeline.look.store.episodes import EpisodeCoverage
 from pipeline.look.store.features import FeatureNorms
+from pipeline.look.store.rows import Ages, Duplicates
 from pipeline.store import FeatureStore, check_trailers
 from pipeline.store.gather import WIDE
 from pipeline.store.repair_hints import extract_command
 from pipeline.store.schema import read_specs
 
 METADATA = "metadata"
-_NOTHING = (
-    "Nothing: clocks have no gaps, every stream is where others of its kind are, channels move, "
-    "features follow the scene, and no recording is there twice."
-)
+_NOTHING = "Nothing looks wrong: every check passed."
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,20 +55,18 @@ def inspect_store(path: str | Path, params: InspectParams) -> StoreView:
     store = FeatureStore.open(path)
     check_trailers(store.path, but=tuple(WIDE.values()))
     if not len(store.array("vl/time")):
-        raise StoreIncomplete(
-            f"{path}: expected VL rows to look at, found none. Run {extract_command(store.path)}."
-        )
+        raise StoreIncomplete(f"{path}: has no VL row. Run {extract_command(store.path)}.")
     sampled = features.sample_rows(store, params.points)
     features.check_rows(store, sampled.rows)
     coverage = tuple(episodes.read_coverage(store, episode) for episode in store.episodes)
-    age, statistics = ages.read_ages(store), channels.summarize_streams(store)
-    norms, same = features.look_at_features(store, sampled), duplicates.find_duplicates(store)
+    age, statistics = rows.read_ages(store), channels.summarize_streams(store)
+    norms, same = features.look_at_features(store, sampled), rows.find_duplicates(store)
     issues = (
         *episodes.find_episode_issues(store, coverage),
-        *ages.find_age_issues(store, coverage, age),
+        *rows.find_age_issues(store, coverage, age),
         *channels.find_channel_issues(statistics),
         *features.find_feature_issues(norms, coverage),
-        *duplicates.find_duplicate_issues(same, coverage),
+        *rows.find_duplicate_issues(same, coverage),
     )
     sizes = read_sizes(store.path)
     return StoreView(store, coverage, age, sizes, norms, same, statistics, issues)
@@ -83,6 +77,7 @@ def store_report(view: StoreView) -> Report:
     store = view.store
     rate = "as recorded" if store.action_hz is None else f"at {store.action_hz:g} Hz"
     reuse = store.vlm_reuse_count
+    often = "each of them" if reuse == 1 else f"one in {reuse}"
     documents = (
         Document("Feature spec", store.spec),
         Document("Streams", store.streams),
@@ -91,18 +86,17 @@ def store_report(view: StoreView) -> Report:
     return Report(
         title=f"Store: {store.path.name}",
         summary=(
-            f"Ticks {rate}, features of the model (a VL row) at "
-            f"{'each of them' if reuse == 1 else f'one in {reuse}'}; feature spec "
+            f"Ticks {rate}, features of the model (a VL row) at {often}; feature spec "
             f"`{store.spec['digest']}`. Times count from the first tick of their episode."
         ),
         tiles=_tiles(view),
         sections=(
             Section("What looks wrong", [Issues(view.issues, _NOTHING), _checked(view)]),
             Section("Coverage", episodes.show_coverage(view.episodes)),
-            Section("Age of the features", ages.show_ages(view.ages)),
+            Section("Age of the features", rows.show_ages(view.ages)),
             Section("Size", [tabulate_sizes(store.path, view.sizes)]),
             Section("Features", features.show_features(view.features, view.episodes)),
-            Section("Duplicates", duplicates.show_duplicates(view.duplicates, view.episodes)),
+            Section("Duplicates", rows.show_duplicates(view.duplicates, view.episodes)),
             Section("Channels", channels.show_channels(view.statistics)),
             Section("What it was made of", documents),
         ),
@@ -122,12 +116,10 @@ def _tiles(view: StoreView) -> list[tuple[str, str]]:
 
 def _checked(view: StoreView) -> Text:
     looked_at, total = len(view.features.sampled.rows), view.features.sampled.total
-    rows = f"all {total:,}" if looked_at == total else f"{looked_at:,} of {total:,}"
+    which = f"all {total:,}" if looked_at == total else f"{looked_at:,} of {total:,}"
     command = f"python -m stages.verify --set verify.store={view.store.path}"
-    return Text(
-        f"Metadata, clocks, offsets and the features of {rows} VL rows give the checksums that "
-        f"were written with them; the rest was not read: `{command}` reads every byte."
-    )
+    words = f"Metadata, clocks, offsets and the features of {which} VL rows give the checksums"
+    return Text(f"{words} that were written with them; `{command}` reads every byte.")
 
 
 def read_sizes(path: Path) -> dict[str, int]:
@@ -148,13 +140,12 @@ def read_sizes(path: Path) -> dict[str, int]:
 def tabulate_sizes(path: Path, sizes: Mapping[str, int]) -> Table:
     """A row an array of the store at `path`."""
     specs, total = read_specs(path), sum(sizes.values())
-    rows: list[tuple[object, ...]] = []
+    lines: list[tuple[object, ...]] = []
     for name, taken in sizes.items():
-        shape, dtype, chunks = "", "", 0
-        if name in specs:
-            spec = specs[name]
+        spec, held = specs.get(name), ("", "", 0)
+        if spec is not None:
             shape = " × ".join(f"{count:,}" for count in spec.shape)
-            dtype, chunks = spec.attributes.get("dtype", spec.dtype.name), spec.chunk_count
-        rows.append((name, shape, dtype, chunks, taken / 2**20, 100 * taken / total))
+            held = shape, spec.attributes.get("dtype", spec.dtype.name), spec.chunk_count
+        lines.append((name, *held, taken / 2**20, 100 * taken / total))
     heads = ("array", "shape", "dtype", "chunks", "on the disk [MiB]", "share [%]")
-    return Table(heads, rows, "Bytes on the disk by array.")
+    return Table(heads, lines, "Bytes on the disk by array.")

@@ -9,7 +9,7 @@ import pytest
 from pipeline.base.config import Params
 from pipeline.base.errors import ConfigError
 from pipeline.look import doctor as machine
-from pipeline.look.doctor.issues import WIDTH, described, missing, note, ok
+from pipeline.look.doctor import WIDTH, described, missing, note, ok
 
 
 @pytest.fixture

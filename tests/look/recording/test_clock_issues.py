@@ -125,5 +125,4 @@ def test_frames_that_are_lost_have_a_place(find: Find) -> None:
     assert issue.kind == "dropped frames"
     assert issue.start_s is not None and issue.stop_s is not None
     assert 19.9 <= issue.start_s < issue.stop_s <= 23.95
-    assert f"half of them from {issue.start_s:.2f} to {issue.stop_s:.2f} s" in issue.message
     assert issue.stop_s - issue.start_s == pytest.approx(16 * 0.2)  # of 31

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from pipeline.data import Channels, Stream
+from pipeline.look.recording.clocks import Span
 from pipeline.look.recording.episode import EpisodeView
-from pipeline.look.recording.streams import Contact, contacts, force_columns
+from pipeline.look.recording.streams import contacts, force_columns
 from pipeline.simulation.insertion import TICK_HZ
 from pipeline.simulation.recorder import SimulatedEpisode, simulate_episode
 
@@ -60,7 +61,7 @@ def test_contact_may_pull_and_may_be_sampled_slowly(base: EpisodeView) -> None:
     time = np.arange(60) / 10
     force = 2.0 + np.random.default_rng(0).normal(0, 0.005, 60)
     force[30:45] -= 0.5
-    assert contacts(view_of(base, time, force)) == (Contact(time[30], time[45]),)
+    assert contacts(view_of(base, time, force)) == (Span(time[30], time[45]),)
 
 
 def test_contact_begins_where_the_force_rises_and_not_where_it_creeps(base: EpisodeView) -> None:

@@ -151,9 +151,9 @@ def test_episodes_that_meta_lists_and_are_not_there(healthy: Path, tmp_path: Pat
         + line.replace('"episode_index": 0', '"episode_index": 2')
     )
     found = survey(Source(name="s", path=str(root)))
-    (issue,) = found.issues
-    assert (issue.kind, issue.severity, issue.source) == ("missing", "warning", "s")
-    assert "episode_000001" in issue.message and "(2 such episodes in all)" in issue.message
+    told = [(issue.kind, issue.severity, issue.source) for issue in found.issues]
+    assert told == [("missing", "warning", "s")] * 2
+    assert "episode_000001" in found.issues[0].message
 
 
 def test_ticks_at_another_rate_than_the_recorded_rows(healthy: Path) -> None:

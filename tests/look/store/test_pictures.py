@@ -11,11 +11,11 @@ from matplotlib.figure import Figure
 
 from pipeline.base.config import InspectParams
 from pipeline.look.page.style import INK, RC, write
-from pipeline.look.store.ages import draw_ages
 from pipeline.look.store.channels import draw_profiles, find_profiles
 from pipeline.look.store.episodes import draw_coverage
 from pipeline.look.store.features import draw_norms
 from pipeline.look.store.page import StoreView, inspect_store
+from pipeline.look.store.rows import draw_ages
 from pipeline.store import FeatureStore
 
 ROWS = 10
