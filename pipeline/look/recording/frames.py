@@ -227,9 +227,12 @@ def _duplicates(view: EpisodeView, name: str, looked: Mapping[str, _Looked]) -> 
     if pairs >= STILL_PAIRS and seen.equal.all():
         yield issue(f"all {pairs + 1} frames looked at are one picture; expected a running camera")
         return
-    single = seen.equal.copy()
+    single, dead = seen.equal.copy(), [number for number, blank in seen.blank.items() if blank]
     for first, last in runs(seen.equal):
         start, stop = seen.index[[first, last]].tolist()
+        if any(start <= number <= stop for number in dead):  # which is told of by itself
+            single[first:last] = False
+            continue
         span = float(time[start]), float(time[stop])
         long = last - first >= (DUPLICATES if seen.noisy else STILL_PAIRS)
         if long and (seen.noisy or _others_move(view, name, looked, *span)):

@@ -18,6 +18,7 @@ from pipeline.data.timeline import choose_action_rotation
 from pipeline.look.page.style import RC
 from pipeline.look.recording.episode import EpisodeView, view_episode
 from pipeline.look.recording.overview import find_issues
+from pipeline.simulation import rendering
 from pipeline.simulation.insertion_formats import ABUTTING, write_new, write_old, write_raw
 from pipeline.simulation.lerobot_format import write_lerobot
 from pipeline.simulation.recorder import simulate_episode
@@ -34,13 +35,22 @@ def common_style() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def healthy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """`raw/`, `new/`, `old/` and `lerobot/`: the same episode in each, seen by other clocks."""
+    """`raw/`, `new/`, `old/` and `lerobot/`: the same episode in each, seen by other clocks.
+
+    By cameras without noise, so that a scene that stands still gives equal frames.
+    """
     root = tmp_path_factory.mktemp("healthy")
-    write_raw(root / "raw" / "Red_point", simulate_episode(4, EPOCH_S))
-    write_new(root / "new" / "Red_point", simulate_episode(4, EPOCH_S), ABUTTING, robot_clock=True)
-    write_old(root / "old" / "Red_point", simulate_episode(4, EPOCH_S))
-    write_lerobot(root / "lerobot", iter([simulate_episode(4, EPOCH_S)]))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rendering, "_NOISE", 0.0)
+        write_all(root)
     return root
+
+
+def write_all(root: Path) -> None:
+    write_raw(root / "raw" / "Red_point", simulate_episode(23, EPOCH_S))
+    write_new(root / "new" / "Red_point", simulate_episode(23, EPOCH_S), ABUTTING, robot_clock=True)
+    write_old(root / "old" / "Red_point", simulate_episode(23, EPOCH_S))
+    write_lerobot(root / "lerobot", iter([simulate_episode(23, EPOCH_S)]))
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -90,6 +91,14 @@ class TestCameras:
         assert time_of(dead[0]) <= issue.start_s < issue.stop_s <= time_of(dead[-1])
         assert issue.stop_s - issue.start_s > 1
 
+    def test_dead_for_a_while_among_noisy_frames(self, copied: Copied, issues_of: Find) -> None:
+        """They are one picture too, which is not told of a second time."""
+        folder = copied("raw")
+        noisy(folder, "View2")
+        for path in frames(folder, "View2")[20:50]:
+            Image.new("RGB", (224, 126), (90, 90, 90)).save(path)
+        assert [issue.kind for issue in issues_of(folder, views=["View2"])] == ["dead camera"]
+
     @pytest.mark.parametrize("colour", [(0, 0, 0), (0, 135, 0)])
     def test_dead_for_some_frames(
         self, copied: Copied, issues_of: Find, colour: tuple[int, int, int]
@@ -107,11 +116,11 @@ class TestCameras:
     def test_dead_twice(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("raw")
         paths = frames(folder, "View2")
-        for path in (*paths[5:10], *paths[40:50]):
+        for path in (*paths[7:12], *paths[40:50]):
             Image.new("RGB", (224, 126)).save(path)
         found = issues_of(folder, vlm_reuse_count=1)
         assert [(issue.kind, issue.start_s, issue.stop_s) for issue in found] == [
-            ("dead camera", time_of(paths[5]), time_of(paths[9])),
+            ("dead camera", time_of(paths[7]), time_of(paths[11])),
             ("dead camera", time_of(paths[40]), time_of(paths[49])),
         ]
 
@@ -296,7 +305,8 @@ class TestCameras:
             path.unlink()
         (issue,) = [issue for issue in issues_of(folder) if issue.kind == "dropped frames"]
         assert (issue.stream, issue.severity) == ("view View2", "warning")
-        assert f"time for {len(lost)} more frames" in issue.message
+        # The last of them may leave no time that is long enough.
+        assert re.search(rf"time for ({len(lost)}|{len(lost) - 1}) more frames", issue.message)
         assert " Hz on average" in issue.message
 
     def test_jitter_loses_no_frame(self, copied: Copied, issues_of: Find) -> None:

@@ -32,7 +32,7 @@ def many(healthy: Path, tmp_path: Path) -> Path:
     for name in "abc":
         folder = Path(shutil.copytree(episode, tmp_path / "many" / name))
         document = pickle.loads((folder / "data.pkl").read_bytes())
-        document["action"][1, 0] += 0.01 * ord(name)
+        document["action"][1, 0] += 0.001 * ord(name)
         (folder / "data.pkl").write_bytes(pickle.dumps(document))
     return tmp_path / "many"
 
