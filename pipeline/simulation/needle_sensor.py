@@ -12,9 +12,10 @@ the last.
 """
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from pipeline.data.insertion import ALINE_BINS
@@ -88,17 +89,15 @@ class NeedleSensor:
         self, contact: NeedleContact, time_s: NDArray[np.float64], rng: np.random.Generator
     ) -> NDArray[np.float32]:
         """A-scans (row, 1025) in counts, a whole number in 0..255, with digitiser noise."""
-        bins = np.arange(A_SCAN_BINS)
+        surface = _ORIGIN - np.where(contact.inside, 0, distance_bin(contact.distance_mm))
+        layer = _ORIGIN - distance_bin(contact.layer_mm)
         outside = ~contact.inside[:, None]
-        surface = np.where(contact.inside, 0, distance_bin(contact.distance_mm))
-        behind_surface = bins - surface[:, None] + _ORIGIN
-        behind_layer = bins - distance_bin(contact.layer_mm)[:, None] + _ORIGIN
-        scattered = (_SCATTER[behind_surface] + _LAYER[behind_layer]) * self._speckle[behind_layer]
+        scattered = (_SCATTER[surface] + _LAYER[layer]) * self._speckle[layer]
         gain = 1 + _GAIN_DRIFT * np.sin(2 * np.pi * _GAIN_DRIFT_HZ * time_s + self._phase)
         signal = (
             np.float32(self._gain)
             * gain.astype(np.float32)[:, None]
-            * (scattered + outside * _SURFACE[behind_surface])
+            * (scattered + outside * _SURFACE[surface])
         )
         noise = rng.standard_normal(signal.shape, np.float32) * np.float32(_NOISE)
         # Rounded apart, rows of a still needle differ in few bins and compress.
@@ -110,25 +109,30 @@ def distance_bin(distance_mm: NDArray[np.float64]) -> NDArray[np.int64]:
     return np.clip(np.rint(distance_mm / BIN_MM), -A_SCAN_BINS, _ORIGIN).astype(np.int64)
 
 
+def _scans_of(table: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
+    """(start, 1025) every stretch of a table that a scan may see, without a copy."""
+    return sliding_window_view(table.astype(np.float32), A_SCAN_BINS)
+
+
 def _speckle(rng: np.random.Generator) -> NDArray[np.float32]:
-    """A grain of mean 1 along the tissue: the amplitude of summed random phasors (Rayleigh)."""
+    """A grain of mean 1 along the tissue, as `_scans_of`: the amplitude of summed random phasors."""
     size = (2, 2 * _ORIGIN + _SPECKLE_BINS)
     phasors = np.cumsum(rng.standard_normal(size), axis=1)
     amplitude = np.hypot(*(phasors[:, _SPECKLE_BINS:] - phasors[:, :-_SPECKLE_BINS]))
     grain = 1 + _SPECKLE_CONTRAST * (amplitude / amplitude.mean() - 1) / 0.523
-    return np.maximum(grain, 0).astype(np.float32)
+    return _scans_of(np.maximum(grain, 0))
 
 
 def _peak(height: float, width_bins: float) -> NDArray[np.float32]:
     offset = np.arange(-_ORIGIN, 2 * A_SCAN_BINS + 1)
-    return (height * np.exp(-0.5 * (offset / width_bins) ** 2)).astype(np.float32)
+    return _scans_of(height * np.exp(-0.5 * (offset / width_bins) ** 2))
 
 
 def _scatter(height: float, decay_bins: float) -> NDArray[np.float32]:
     """Scattered light behind the surface."""
     offset = np.arange(-_ORIGIN, 2 * A_SCAN_BINS + 1)
     decay = height * np.exp(-np.maximum(offset, 0) / decay_bins)
-    return np.where(offset >= 0, decay, 0).astype(np.float32)
+    return _scans_of(np.where(offset >= 0, decay, 0))
 
 
 _SCATTER: Final = _scatter(60.0, 180.0)
