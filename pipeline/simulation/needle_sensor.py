@@ -115,7 +115,7 @@ def _scans_of(table: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
 
 
 def _speckle(rng: np.random.Generator) -> NDArray[np.float32]:
-    """A grain of mean 1 along the tissue, as `_scans_of`: the amplitude of summed random phasors."""
+    """A grain of mean 1 along the tissue, as `_scans_of`: amplitudes of summed random phasors."""
     size = (2, 2 * _ORIGIN + _SPECKLE_BINS)
     phasors = np.cumsum(rng.standard_normal(size), axis=1)
     amplitude = np.hypot(*(phasors[:, _SPECKLE_BINS:] - phasors[:, :-_SPECKLE_BINS]))
