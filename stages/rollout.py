@@ -3,8 +3,8 @@
 Takes what stages.train_head wrote to train_head.output, or rollout.checkpoint if it is given, and
 the model of vlm.checkpoint, which must give the features that the policy was trained on. Beside the
 policy: the demonstrator, and the policy without sensor and without features. Writes metrics.json
-(success with its 95 % interval), episodes.csv, beside.csv (those of the others) and a page
-(report.html) into `rollout.output`.
+(success with its 95 % interval), episodes.csv, beside.csv (those of the others), settings.json and
+a page (report.html) into `rollout.output`.
 
   python -m stages.rollout                                     50 episodes at level full
   python -m stages.rollout --set rollout.level=moved           the target is pushed meanwhile
@@ -22,7 +22,7 @@ from pathlib import Path
 from pipeline.base.config import Params
 from pipeline.base.device import resolve_device
 from pipeline.base.durable import write_document
-from pipeline.base.ownership import REPORT, claim, refuse_foreign
+from pipeline.base.ownership import REPORT, begin_folder, claim, refuse_foreign
 from pipeline.evaluate.rollouts import Rollouts, roll_out
 from pipeline.look.page.writing import write_report
 from pipeline.look.rollout.page import rollout_report
@@ -34,13 +34,18 @@ def main(params: Params) -> None:
     """Run the checkpoint that `rollout` names, else what `train_head` wrote."""
     wanted = params.rollout
     refuse_foreign(wanted.output, REPORT)
+    if wanted.environment is None:
+        begin_folder(wanted.output, REPORT)
+        write_document(wanted.output / "metrics.json", {"success": {}})
+        print("nothing is rolled out, as rollout.environment is null")
+        return
     folder = wanted.checkpoint or params.train_head.output
     checkpoint = load_policy(find_policy(folder))
-    device = resolve_device(wanted.device)
+    device, say = resolve_device(wanted.device), partial(print, flush=True)
     load = partial(LiveFeatures, params.vlm, checkpoint.source["feature_spec"], str(device))
     print(f"{folder} (step {checkpoint.step}), level {wanted.level}, device {device}", flush=True)
     policy = checkpoint.policy(device)
-    rollouts = roll_out(checkpoint, str(folder), policy, load, wanted, progress=True)
+    rollouts = roll_out(checkpoint, str(folder), policy, load, wanted, say)
     files = _write(wanted.output, rollouts)
     for line in rollouts.summary().text():
         print(line)
@@ -51,8 +56,14 @@ def _write(folder: Path, rollouts: Rollouts) -> list[Path]:
     """Metrics, the table of episodes and the page; returns their paths."""
     claim(folder, REPORT)
     write_document(folder / "metrics.json", rollouts.document())
+    write_document(folder / "settings.json", dict(rollouts.settings))
     tables = [
         rollouts.table(policy=True).write_csv(folder / "episodes.csv"),
         rollouts.table(policy=False).write_csv(folder / "beside.csv"),
     ]
-    return [folder / "metrics.json", *tables, *write_report(folder, rollout_report(rollouts))]
+    return [
+        folder / "metrics.json",
+        folder / "settings.json",
+        *tables,
+        *write_report(folder, rollout_report(rollouts)),
+    ]

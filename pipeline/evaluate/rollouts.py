@@ -36,6 +36,12 @@ SIDE_BY_SIDE: Final = 50
 """Environments that are stepped together, and share passes of the model."""
 
 
+def controller_name(controller: str) -> str:
+    """What people read of a controller."""
+    known = {POLICY: "policy", EXPERT: "demonstrator"}
+    return known.get(controller, f"policy, {controller}")
+
+
 @dataclass(frozen=True)
 class RolloutEpisode:
     """One episode, and how it ended.
@@ -115,23 +121,21 @@ class Rollouts:
         for name, rate in self.rates().items():
             episodes = self.of(name)
             lateral = float(np.median([episode.lateral_mm for episode in episodes]))
-            time = float(np.median([episode.time_s for episode in episodes]))
+            times = [episode.time_s for episode in episodes if episode.success]
             failed = Counter(e.reason for e in episodes if not e.success).most_common()
             reasons = ", ".join(f"{count} {reason}" for reason, count in failed)
-            rows.append((name, str(rate), len(episodes), lateral, time, reasons))
+            rows.append(
+                (controller_name(name), str(rate), len(episodes), lateral,
+                 float(np.median(times)) if times else None, reasons)
+            )  # fmt: skip
         heads = ("controller", "success (95 % interval)", "episodes", "median lateral miss [mm]",
-                 "median time [s]", "failed by")  # fmt: skip
+                 "median time to success [s]", "failed by")  # fmt: skip
         return Table(heads, rows, f"Success at level {self.level}")
 
     def document(self) -> dict[str, Any]:
         """The content of metrics.json."""
         success = {name: vars(rate) for name, rate in self.rates().items()}
-        return {
-            "success": success,
-            "levels": {self.level: success},
-            "checkpoint": self.checkpoint,
-            "settings": dict(self.settings),
-        }
+        return {"success": success, "levels": {self.level: success}}
 
     def table(self, policy: bool) -> Table:
         """A row an episode: those of the policy, or those beside it with who controlled them."""
@@ -152,9 +156,11 @@ def roll_out(
     policy: Policy,
     load_features: Callable[[], LiveFeatures],
     wanted: RolloutParams,
-    progress: bool = False,
+    say: Callable[[str], None] = lambda line: None,
 ) -> Rollouts:
     """Episodes of the policy, of it with a stream off, and of the demonstrator.
+
+    `say` is told of each controller whose episodes have ended.
 
     `load_features` is called where the policy looks at features, once all that can be refused
     without it is known to be good. Raises `CheckpointMismatch` where the phantom has not what the
@@ -177,7 +183,7 @@ def roll_out(
     groups = [seeds[at : at + SIDE_BY_SIDE] for at in range(0, len(seeds), SIDE_BY_SIDE)]
     episodes: list[RolloutEpisode] = []
     total = (1 + len(streams)) * len(seeds)
-    with tqdm(total=total, unit="episode", disable=None if progress else True) as bar:
+    with tqdm(total=total, unit="episode", disable=None) as bar:
         for stream in streams:
             controller = f"{stream} off" if stream else POLICY
             bar.set_description(controller)
@@ -188,6 +194,8 @@ def roll_out(
                     _episode(controller, wanted.level, seed, robot.insertion, stop)
                     for seed, robot, stop in zip(group, robots, stops, strict=True)
                 ]
+            rate = SuccessRate.of([e for e in episodes if e.controller == controller])
+            say(f"{controller_name(controller)}: {rate} of {rate.episodes} episodes")
         bar.set_description(EXPERT)
         for seed in seeds:
             insertion = driver.begin(seed).insertion
@@ -196,26 +204,33 @@ def roll_out(
             episodes.append(_episode(EXPERT, wanted.level, seed, insertion, None))
             bar.update()
     settings = wanted.model_dump(mode="json", exclude={"checkpoint", "output", "device"})
-    return Rollouts(name, settings | {"instruction": driver.instruction}, tuple(episodes))
+    settings |= {"checkpoint": name, "step": checkpoint.step}
+    settings |= {"model_type": policy.params.model_type, "instruction": driver.instruction}
+    return Rollouts(name, settings, tuple(episodes))
 
 
 def refuse_other_robot(checkpoint: PolicyCheckpoint) -> None:
     """Raise `CheckpointMismatch` where the phantom has not what a policy was trained on."""
     source, shape = checkpoint.source, checkpoint.shape
+    views = tuple(source["streams"]["views"])
     checked = {
-        "views": (tuple(sorted({*source["streams"]["views"], *VIEWS})), (VIEWS,)),
-        "action kind": (source["streams"]["action"]["kind"], ("delta",)),
-        "action channels": (shape.action_dim, (7,)),
-        "state channels": (shape.state_dim, (0, 12)),
-        "sensor channels": (shape.sensor_channels, (0, 1026)),
-        "action_hz": (source["action_hz"], (TICK_HZ,)),
+        "views": (views, VIEWS, set(views) <= set(VIEWS)),
+        "action": (source["streams"]["action"]["kind"], "delta", None),
+        "action channels": (shape.action_dim, 7, None),
+        "state channels": (shape.state_dim, 12, shape.state_dim in (0, 12)),
+        "sensor channels": (shape.sensor_channels, 1026, shape.sensor_channels in (0, 1026)),
+        "action_hz": (source["action_hz"], TICK_HZ, None),
     }
-    differs = [f"{name} {got}" for name, (got, allowed) in checked.items() if got not in allowed]
+    differs = [
+        f"{name} {trained}, of the phantom {own}"
+        for name, (trained, own, fits) in checked.items()
+        if not (trained == own if fits is None else fits)
+    ]
     if differs:
         raise CheckpointMismatch(
             "rollout.environment: the policy was trained on another robot than the phantom: "
-            f"{'; '.join(differs)}. Roll out a policy of recordings of the phantom "
-            "(python -m stages.demo)."
+            f"{'; '.join(differs)}. Judge it on its own recordings (python -m stages.evaluate) and "
+            "set rollout.environment to null, which leaves rollouts out of dvc repro."
         )
 
 

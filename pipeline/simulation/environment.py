@@ -1,7 +1,7 @@
 """The needle insertion as a gymnasium environment, with the clocks of a real arm's cameras."""
 
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import Any, Final, get_args
 
 import gymnasium
 import numpy as np
@@ -51,7 +51,13 @@ class InsertionEnvironment(gymnasium.Env[Any, NDArray[np.floating[Any]]]):
         cameras: bool = True,
         render_mode: str | None = None,
     ) -> None:
-        """Without `cameras` frames are only drawn when `frames` asks for them."""
+        """Without `cameras` frames are only drawn when `frames` asks for them.
+
+        Raises `ValueError` for a level or a convention of rotations that there is not.
+        """
+        for value, known in ((level, get_args(Level)), (action_rotation, get_args(ActionRotation))):
+            if value not in known:
+                raise ValueError(f"expected one of {', '.join(known)}, found {value!r}")
         self.render_mode = render_mode
         self.level: Level = level
         self.insertion = NeedleInsertion(action_rotation)
@@ -87,8 +93,14 @@ class InsertionEnvironment(gymnasium.Env[Any, NDArray[np.floating[Any]]]):
     def step(
         self, action: NDArray[np.floating[Any]]
     ) -> tuple[Readings, float, bool, bool, dict[str, Any]]:
-        """Carry out one tick of 0.1 s."""
-        self.insertion.step(action.astype(np.float64))
+        """Carry out one tick of 0.1 s; an action beyond the space is carried out as far as it goes.
+
+        Raises `ResetNeeded` before the first and after the end of an episode, and `ValueError` for
+        an action that is not seven finite numbers.
+        """
+        if not hasattr(self, "_shots") or self.insertion.finished:
+            raise gymnasium.error.ResetNeeded("the episode has not begun, or has ended: call reset")
+        self.insertion.step(np.asarray(action, np.float64))
         info, ended = self._info(), self.insertion.finished
         late = ended and str(self.insertion.outcome).startswith(TIME_IS_UP)
         return self.readings(), float(info["success"]), ended and not late, late, info

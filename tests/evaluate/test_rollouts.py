@@ -89,7 +89,7 @@ def rolled(parts: tuple[PolicyCheckpoint, Policy, Glance], **changed: Any) -> Ro
 
 
 def figures(rollouts: Rollouts) -> list[Any]:
-    return [rollouts.document()["success"], *(rollouts.table(kind).csv() for kind in (True, False))]
+    return [rollouts.document(), *(rollouts.table(kind).csv() for kind in (True, False))]
 
 
 @pytest.fixture(scope="module")

@@ -1,9 +1,11 @@
 """The gymnasium environment: its contract, its clocks, its frames."""
 
 import warnings
+from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
 from pipeline.simulation.environment import InsertionEnvironment
@@ -84,3 +86,20 @@ def test_seeds_differ_and_none_draws_one() -> None:
     assert not np.array_equal(first, environment.reset(seed=2)[0]["state"])
     drawn = environment.reset()[0]["state"]
     assert not np.array_equal(drawn, environment.reset()[0]["state"])
+
+
+def test_what_makes_no_sense_is_refused() -> None:
+    wrong: Any = "hard"
+    with pytest.raises(ValueError, match="depth, full, moved, found 'hard'"):
+        InsertionEnvironment(wrong)
+    with pytest.raises(ValueError, match="found 'hard'"):
+        InsertionEnvironment(action_rotation=wrong)
+    environment = InsertionEnvironment(cameras=False)
+    with pytest.raises(ResetNeeded):
+        environment.step(STILL)
+    environment.reset(seed=1)
+    environment.step([0.0] * 7)
+    while not environment.insertion.finished:
+        environment.step(environment.insertion.expert_action())
+    with pytest.raises(ResetNeeded):
+        environment.step(STILL)

@@ -55,8 +55,9 @@ def test_it_writes_metrics_table_and_page_the_same_every_time(
     for output in ("first", "second"):
         assert run("", rollout.main, arguments(trained, output=tmp_path / output)) == 0
         said = capsys.readouterr().out
-        assert "expert" in said and "100%" in said
-    for name in ("metrics.json", "episodes.csv", "beside.csv", "report.html"):
+        assert "demonstrator" in said and "100%" in said
+        assert "policy, sensor off: " in said
+    for name in ("metrics.json", "settings.json", "episodes.csv", "beside.csv", "report.html"):
         assert (tmp_path / "first" / name).read_bytes() == (tmp_path / "second" / name).read_bytes()
     success = json.loads((tmp_path / "first" / "metrics.json").read_text())["success"]
     assert success["expert"] | {"rate": 1.0, "episodes": 2} == success["expert"]
@@ -101,7 +102,13 @@ def test_a_policy_of_another_robot_is_refused(
     path.write_text(yaml.safe_dump(quick_params(tmp_path)))
     assert run("", train_head.main, ["--params", str(path)]) == 0
     assert run("", rollout.main, ["--params", str(path)]) == 2
-    assert "trained on another robot than the phantom" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "trained on another robot than the phantom: " in said
+    assert ", of the phantom " in said
+    assert "set rollout.environment to null" in said
+    nothing = ["--set", "rollout.environment=null", "--set", f"rollout.output={tmp_path / 'none'}"]
+    assert run("", rollout.main, ["--params", str(path), *nothing]) == 0
+    assert json.loads((tmp_path / "none" / "metrics.json").read_text()) == {"success": {}}
 
 
 def test_a_folder_of_somebody_else_is_left_alone(

@@ -174,8 +174,9 @@ class RolloutParams(Section):
 
     checkpoint: Path | None = None
     """A training run's folder, or one checkpoint in it; `train_head.output` where null."""
-    environment: Literal["phantom"] = "phantom"
-    """The simulated needle insertion of the demo."""
+    environment: Literal["phantom"] | None = "phantom"
+    """The simulated needle insertion of the demo. null rolls nothing out, which suits recordings of
+    another robot: the stage then only says so."""
     level: Level = "full"
     """depth: the needle begins above the target, so that the sensor suffices. full: it begins
     anywhere. moved: besides, target and tissue are pushed meanwhile."""

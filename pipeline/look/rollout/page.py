@@ -5,11 +5,10 @@ from functools import partial
 
 import numpy as np
 
-from pipeline.evaluate.rollouts import RolloutEpisode, Rollouts
+from pipeline.evaluate.rollouts import RolloutEpisode, Rollouts, controller_name
 from pipeline.look.page.blocks import Block, Document, Picture, Report, Section, Text
 from pipeline.look.page.writing import sentence
 from pipeline.look.rollout import pictures as plots
-from pipeline.look.rollout.pictures import controller_name
 from pipeline.simulation.insertion import (
     AT_LAYER_MM,
     FORCE_LIMIT_N,
@@ -98,7 +97,7 @@ def _places(rollouts: Rollouts) -> list[Block]:
     above = (
         "The way of the needle's tip as seen from the target. Points are where it punctured, or "
         "where it was in the end when it never did; in the circle, an insertion may succeed. Where "
-        "a push moves the target, a line jumps."
+        "a push moves the target, a line jumps. What goes farther leaves the picture."
     )
     over_time = (
         "A thin line is an episode. The tip is to be near the target before it goes below the "
@@ -126,8 +125,8 @@ def _filmstrips(episodes: Sequence[RolloutEpisode]) -> Iterator[Section]:
     for kind, episode in _extremes(episodes).items():
         side = "short of" if episode.depth_mm > 0 else "beyond"
         words = (
-            f"{sentence(episode.reason)} {episode.lateral_mm:.2f} mm sideways from the target, "
-            f"{abs(episode.depth_mm):.2f} mm {side} the layer in the end, at most "
+            f"{sentence(episode.reason)} {episode.lateral_mm:.2f} mm sideways from the target at "
+            f"the puncture, {abs(episode.depth_mm):.2f} mm {side} the layer in the end, at most "
             f"{episode.overshoot_mm:.2f} mm beyond it and {episode.max_force_n:.2f} N, "
             f"{episode.time_s:.1f} s."
         )

@@ -10,25 +10,21 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from pipeline.evaluate.rollouts import RolloutEpisode, Rollouts
+from pipeline.evaluate.rollouts import RolloutEpisode, Rollouts, controller_name
 from pipeline.look.page.style import GRID, INK, PALETTE, canvas, draw_frame, finish
 from pipeline.simulation.insertion import AT_LAYER_MM, FORCE_LIMIT_N, MISS_MM, OVERSHOOT_MM
 
 _MOMENTS = 8
 _NEAR_MM = 3.0
 """Around the target, what the nearer view of the paths shows."""
+_REACH = 1.3
+"""Of pictures, as a multiple of how far from the target episodes begin."""
 _WIDTH = 9.0
 _OTHER = "#999999"
 """Of an episode among many, and of a controller beside the policy."""
 _OUTCOMES = {True: ("inserted", PALETTE[0], "o"), False: ("not inserted", PALETTE[5], "X")}
 _MANY = 100
 """Episodes from which on paths are pixels in the page, for thousands of lines are slow."""
-
-
-def controller_name(controller: str) -> str:
-    """What a page calls a controller."""
-    known = {"policy": "policy", "expert": "demonstrator"}
-    return known.get(controller, f"policy, {controller}")
 
 
 def success(rollouts: Rollouts) -> Figure:
@@ -80,8 +76,8 @@ def endings(rollouts: Rollouts) -> Figure:
 def paths(rollouts: Rollouts) -> Figure:
     """The tip's ways seen from above, of policy and demonstrator; below, those near the target."""
     shown = [name for name in ("policy", "expert") if rollouts.of(name)]
-    offsets = [episode.trace.offset_mm for name in shown for episode in rollouts.of(name)]
-    far = max(_NEAR_MM, 1.05 * float(np.abs(np.concatenate(offsets)).max()))
+    begins = [episode.trace.offset_mm[:1] for name in shown for episode in rollouts.of(name)]
+    far = max(_NEAR_MM, _REACH * float(np.abs(np.concatenate(begins)).max()))
     figure = canvas(_WIDTH * max(len(shown), 1.4) / 2, _WIDTH + 0.9)
     axes = figure.subplots(2, len(shown), squeeze=False)
     for column, name in zip(axes.T, shown, strict=True):

@@ -50,8 +50,8 @@ def test_figures_are_those_of_the_rollouts(rollouts: Rollouts) -> None:
     policy = "60% (23% to 88%)"
     assert [row[:3] for row in success.rows] == [
         ("policy", policy, 5),
-        ("expert", "100% (57% to 100%)", 5),
-        ("features off", "0% (0% to 43%)", 5),
+        ("demonstrator", "100% (57% to 100%)", 5),
+        ("policy, features off", "0% (0% to 43%)", 5),
     ]
     assert [row[3] for row in success.rows] == pytest.approx([0.4, 0.4, 40.0])
     failed = [row[5] for row in success.rows]
@@ -83,7 +83,9 @@ def test_without_any_success(
     assert {file.stem for file in write_report(tmp_path, report)} >= ALWAYS
     worst = next(part for part in report.sections[2].parts if part.title.startswith("Worst"))
     (words,) = (block.words for block in worst.blocks if isinstance(block, Text))
-    assert words.startswith("Time is up. 3.00 mm sideways from the target, 1.50 mm short of ")
+    assert words.startswith(
+        "Time is up. 3.00 mm sideways from the target at the puncture, 1.50 mm short of "
+    )
 
 
 def test_a_single_episode_is_shown_once(
