@@ -114,8 +114,9 @@ def _split_tail(store: FeatureStore, episodes: list[Episode], horizon: int) -> S
     if not begins:
         return Split(_ticks(episodes), _ticks([]), (), f"{named}, too short to hold ticks out")
     train, held_out = [], []
+    usual = float(np.median(np.concatenate([np.diff(clock) for clock in clocks])))
     for episode, clock in zip(episodes, clocks, strict=True):
-        trained, first = _sides(clock, min(begins), horizon)
+        trained, first = _sides(clock, min(begins), horizon, usual)
         train.append(_ticks([episode])[:trained])
         held_out.append(_ticks([episode])[first:])
     if not any(map(len, train)):
@@ -144,10 +145,15 @@ def _elapsed(store: FeatureStore, episode: Episode) -> NDArray[np.float64]:
     return time - (taken.max() if len(taken) else time[0])
 
 
-def _sides(clock: NDArray[np.float64], cut: float, horizon: int) -> tuple[int, int]:
-    """How many leading ticks have chunks that end before the cut, and the first tick at it."""
+def _sides(
+    clock: NDArray[np.float64], cut: float, horizon: int, usual_step: float
+) -> tuple[int, int]:
+    """How many leading ticks have chunks that end before the cut, and the first tick at it.
+
+    A clock's last action lasts its median step, and `usual_step` where it has but one tick.
+    """
     first = int(np.searchsorted(clock, cut - _SLACK_S))
-    last_step = np.median(np.diff(clock)) if len(clock) > 1 else 0.0
+    last_step = np.median(np.diff(clock)) if len(clock) > 1 else usual_step
     ends = np.append(clock[1:], clock[-1] + last_step)
     # Where ticks of two formats alternate, the action of the tick before the cut lasts beyond it.
     done = first - 1 if first and ends[first - 1] > cut + _SLACK_S else first

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from pipeline.base.errors import ConfigError, StoreMismatch
@@ -205,6 +205,7 @@ class TestSplit:
         st.lists(st.tuples(st.integers(1, 90), st.floats(0, 3)), min_size=1, max_size=4),
         st.integers(1, 12),
     )
+    @example([(1, 1.25), (16, 0.0)], 1)  # of one tick, whose action lasts beyond the cut
     @settings(deadline=None)
     def test_no_trained_chunk_reaches_into_what_is_held_out(
         self, formats: list[tuple[int, float]], horizon: int
