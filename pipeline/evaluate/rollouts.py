@@ -313,7 +313,9 @@ class _Driver:
         """Begin a pass of the model for all whose frames are due."""
         if not due or self.features is None:
             return
-        taken = [robot.frames() for robot, _ in due]
+        trained = self.checkpoint.source["streams"]["views"]
+        shots = [robot.frames() for robot, _ in due]
+        taken = [{view: views[view] for view in trained} for views in shots]
         frames = [{view: frame for view, (_, frame) in views.items()} for views in taken]
         features, valid = self.features(frames, self.instruction)
         rows = zip(features.numpy(), valid.numpy(), strict=True)

@@ -23,7 +23,7 @@ class LiveFeatures:
         """Load it; `trained` is the feature spec of the policy's checkpoint.
 
         Raises `CheckpointMismatch` where the policy was trained on other features than this model
-        gives, before its weights are read, and `VLMError` as `LiveVLM.load`.
+        gives, and `VLMError` as `LiveVLM.load`.
         """
         spec = live_spec(vlm, trained["views"])
         self._model = LiveVLM.load(vlm, spec, TuningParams(method="none"), device).eval()

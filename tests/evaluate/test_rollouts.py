@@ -171,6 +171,14 @@ def test_robots_share_a_pass_of_the_model_and_are_told_the_task() -> None:
         assert not np.array_equal(frame, photograph(view, robot.insertion, time))
 
 
+def test_the_model_sees_only_the_views_that_the_policy_was_trained_on() -> None:
+    checkpoint, policy, glance = made()
+    streams = {"action": ACTION, "views": ["View2", "View5"]}
+    fewer = replace(checkpoint, source=SOURCE | {"streams": streams})
+    rolled((fewer, policy, glance), episodes=1, ablations=False)
+    assert {tuple(views) for frames in glance.passes for views in frames} == {("View2", "View5")}
+
+
 def test_what_the_policy_sees_is_as_old_as_it_says(monkeypatch: pytest.MonkeyPatch) -> None:
     for latency in (0, 400):
         parts = made()
