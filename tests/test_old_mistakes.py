@@ -29,6 +29,7 @@ from pipeline.policy.regression import RegressionActionExpert
 from pipeline.simulation.insertion_formats import ABUTTING, write_new
 from pipeline.simulation.recorder import simulate_episode
 from pipeline.store import FeatureStore
+from pipeline.train.batches import Windows
 from pipeline.train.run import policy_shape
 from pipeline.train.split import split_by_episode
 from pipeline.train.statistics import fit_normalization
@@ -37,6 +38,7 @@ from pipeline.vlm.pooling import batch_weights, pool
 from pipeline.vlm.preparation import TokenLayout
 from pipeline.vlm.slots import Slot
 
+WINDOWS = Windows(8, 65, 100, 0.1, 1.0)
 SMALL = {
     "sensor_encoder": {"channels": [16], "layers": 1, "heads": 2, "output_dim": 16},
     "state_encoder": {"dim": 16, "layers": 1, "heads": 2, "output_dim": 16},
@@ -96,7 +98,7 @@ def store(tiny_store: Callable[..., Path], tmp_path: Path) -> FeatureStore:
 def policy_of(store: FeatureStore) -> Policy:
     """A regression policy that learnt nothing yet, normalised as a training on this store does."""
     torch.manual_seed(0)
-    normalization = fit_normalization(store, np.arange(store.ticks))
+    normalization = fit_normalization(store, np.arange(store.ticks), WINDOWS)
     params = TrainHeadParams.model_validate(SMALL)
     return Policy(params, policy_shape(store, normalization), normalization).eval()
 

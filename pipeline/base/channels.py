@@ -36,19 +36,31 @@ def hardly_moving(
 ) -> dict[int, float]:
     """Channels that vary, but far less than those alike; each with what is usual for these.
 
+    `std` is (channel,), 0 where one does not vary.
+    """
+    usual = usual_spread(std, names, units)
+    return {
+        column: float(usual[column])
+        for column in np.flatnonzero(std > 0).tolist()
+        if std[column] < STILL * usual[column]
+    }
+
+
+def usual_spread(
+    std: NDArray[np.floating], names: Sequence[str], units: Sequence[str]
+) -> NDArray[np.float64]:
+    """What is usual for the channels that are like each, (channel,); 0 where too few are.
+
     `std` is (channel,), 0 where one does not vary. Alike are channels of one unit and, but for its
-    numbers, one name, such as joints; usual is the upper quartile of their `std`, which still
+    numbers, one name, such as joints; usual is the upper quartile of those that vary, which still
     channels beside moving ones do not lower.
     """
     kinds: dict[tuple[str, str], list[int]] = defaultdict(list)
-    for column in np.flatnonzero(std > 0).tolist():
-        kinds[unnumbered(names[column]), units[column]].append(column)
-    usual = {
-        column: float(np.percentile(std[alike], 75, method="higher"))
-        for alike in kinds.values()
-        if len(alike) >= _ALIKE
-        for column in alike
-    }
-    return {
-        column: usual[column] for column in sorted(usual) if std[column] < STILL * usual[column]
-    }
+    for column, kind in enumerate(zip(map(unnumbered, names), units, strict=True)):
+        kinds[kind].append(column)
+    usual = np.zeros(len(std))
+    for alike in kinds.values():
+        moving = std[alike][std[alike] > 0]
+        if len(moving) >= _ALIKE:
+            usual[alike] = np.percentile(moving, 75, method="higher")
+    return usual

@@ -5,6 +5,9 @@ from dataclasses import dataclass
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+CLOCK_SLACK_S = 1e-6
+"""A reading that is older than a window by less is in it: clocks are rounded."""
+
 
 @dataclass
 class Observation:
@@ -19,7 +22,13 @@ class Observation:
     slot_valid: Bool[Tensor, "batch slot"]
     feature_age: Float[Tensor, " batch"]
     """Seconds since the newest frame that the features have seen."""
+    view_age: Float[Tensor, "batch view"]
+    """Seconds since the frame of each view that the features have seen; NaN of a missing view."""
     sensor: Float[Tensor, "batch sensor_window channel"]
     sensor_valid: Int[Tensor, " batch"]
+    sensor_age: Float[Tensor, "batch sensor_window"]
+    """Seconds since each reading, 0 where it is not real."""
     state: Float[Tensor, "batch state_window state_dim"]
     state_valid: Int[Tensor, " batch"]
+    state_age: Float[Tensor, "batch state_window"]
+    """As `sensor_age`."""

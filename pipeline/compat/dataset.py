@@ -1,7 +1,7 @@
 """One data set over every format, with frames or with cached features."""
 
 from collections.abc import Sequence
-from dataclasses import astuple
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -84,7 +84,7 @@ class UnifiedVLADataset(Dataset[Sample]):
         self._sources = named_sources(() if data is None else data, format, instruction)
         self._format, self._views, self._given = format, views, recordings
         self._cached = FeatureStore.open(store) if isinstance(store, str | Path) else store
-        if min(astuple(self.windows)) < 1 or vlm_reuse_count < 1:
+        if min(horizon, sensor_window_size, state_window_size, vlm_reuse_count) < 1:
             raise ConfigError(
                 "horizon, windows and vlm_reuse_count count from 1, found "
                 f"{self.windows} and vlm_reuse_count={vlm_reuse_count}"
@@ -110,7 +110,7 @@ class UnifiedVLADataset(Dataset[Sample]):
     def __getitems__(self, indices: Sequence[int]) -> UnifiedBatch:
         """These items in one gather; what torch's DataLoader calls for a batch."""
         ticks = self.ticks[np.asarray(indices, np.int64)]
-        batch = self.store.gather(ticks, *astuple(self.windows))
+        batch = self.store.gather(ticks, **asdict(self.windows))
         rows = self.store.array("tick/vl_row")[ticks]
         episodes = self.store.episode_of(ticks)
         instructions = [self.store.episodes[episode].instruction for episode in episodes.tolist()]

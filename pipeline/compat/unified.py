@@ -17,7 +17,7 @@ from pipeline.base.config import FusionStrategy, ModelType, TrainHeadParams, Tun
 from pipeline.base.errors import ObservationError
 from pipeline.policy.live_policy import LivePolicy
 from pipeline.policy.normalization import ChannelStatistics, Normalization
-from pipeline.policy.observation import VALIDITY, LiveObservation, PolicyShape, check_axes
+from pipeline.policy.observation import AGES, VALIDITY, LiveObservation, PolicyShape, check_axes
 from pipeline.policy.policy import Policy
 from pipeline.vlm.feature_spec import feature_shape
 
@@ -41,6 +41,7 @@ _SEED_PARTS: Mapping[str, Mapping[str, Any]] = {
 }
 """Of the parts this class has always had, where params.yaml has leaner defaults."""
 
+_FEATURE_AGES = ("feature_age", "view_age")
 _ACTION_GROUPS = ("translation",) * 3 + ("rotation",) * 3 + ("gripper",)
 
 
@@ -79,7 +80,8 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
         """Build the policy; `vlm`, `tuning` and `head` are more params of those sections.
 
         `head` is that of `train_head`: `sensor_enabled` and `robot_state_enabled` (True), `horizon`
-        (8), `sensor_window` (65), `state_window` (100) and all others. Of a part of the policy,
+        (8), `sensor_window` (65 readings), `sensor_window_s` (0.1), `state_window` (100),
+        `state_window_s` (1.0) and all others. Of a part of the policy,
         such as `sensor_encoder`, what `head` does not name stays as this class has always had it.
 
         `feature_dim` is the width of the checkpoint's hidden states: by default what a checkpoint
@@ -106,7 +108,7 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
         slots, width = feature_shape(vlm_params, names)
         groups = _ACTION_GROUPS if action_dim == len(_ACTION_GROUPS) else ("other",) * action_dim
         sizes = (slots, feature_dim or width, sensor_channels, state_dim, action_dim)
-        shape = PolicyShape(*sizes, action_groups=groups)
+        shape = PolicyShape(*sizes, action_groups=groups, views=len(names))
         policy = Policy(params, shape, normalization or no_normalization(shape))
         self._assemble(policy, vlm_params, tuned, names)
 
@@ -155,7 +157,8 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
         `state` (batch, window, dim) and `actions` (batch, horizon, action) are in physical units,
         tensors or arrays; what is not given is missing. Of a stream is real what `slot_valid`
         (batch, slot) marks and the last `sensor_valid`, `state_valid` (batch,) readings, without
-        them all; `feature_age` (batch,) is in s. A chunk is computed without dropout even in
+        them all; `feature_age` (batch,), `view_age` (batch, view), `sensor_age` and `state_age`
+        (batch, window) are in s. A chunk is computed without dropout even in
         `train()` mode, which stays as it is. Raises `ObservationError` for a shape that does not
         fit and where there is nothing to look at.
         """
@@ -183,7 +186,7 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
         **validity: Any,
     ) -> LiveObservation:
         """The observation of what `forward` takes; equal frames and text share a row."""
-        if unknown := set(validity) - {*VALIDITY.values(), "feature_age"}:
+        if unknown := set(validity) - {*VALIDITY.values(), *AGES.values(), *_FEATURE_AGES}:
             raise TypeError(f"unexpected arguments: {', '.join(sorted(unknown))}")
         rows: list[PreparedRow] = []
         row_of = [] if images is None else [-1] * len(images)

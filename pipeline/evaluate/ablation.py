@@ -5,7 +5,7 @@ An error that stays says that the policy does not use the stream, or that others
 
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import astuple, dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 import torch
@@ -25,11 +25,11 @@ MOST_TICKS = 1000
 MOST_SAMPLES = 4
 """Chunks a tick of a stochastic policy whose mean is evaluated, for the same reason."""
 FIELDS = {
-    "sensor": ("sensor", "sensor_valid"),
-    "state": ("state", "state_valid"),
-    "features": ("features", "slot_valid", "feature_age"),
+    "sensor": ("sensor", "sensor_valid", "sensor_age"),
+    "state": ("state", "state_valid", "state_age"),
+    "features": ("features", "slot_valid", "feature_age", "view_age"),
 }
-"""What belongs to each stream: its values, which of them are real, and of features their age."""
+"""What belongs to each stream: its values, which of them are real, and their ages."""
 
 Alter = Callable[[BatchIndices, Batch], Batch]
 """A batch as the policy is to see it; the one it is given stays as it is."""
@@ -117,7 +117,7 @@ def feed_maker(
     store: FeatureStore,
     windows: Windows,
     device: torch.device,
-    lags: Lags = NO_LAGS,
+    lags: Lags | None = None,
     alter: Alter | None = None,
 ) -> FeedMaker:
     """Feeds of this store in which streams come late or are altered, once, before anyone looks."""
@@ -137,9 +137,7 @@ def _alterations(
     checkpoint: PolicyCheckpoint, store: FeatureStore, ticks: Ticks, stream: str
 ) -> tuple[dict[str, Alter], list[str]]:
     """Ways to alter a stream at these ticks, and why one is not there or a delay not as asked."""
-    statistics = getattr(checkpoint.normalization, stream)
-    assert statistics is not None, "a policy has statistics of each stream that it sees"
-    ways, notes = {"zeroed": zeroed(stream, statistics.mean)}, []
+    ways, notes = {"zeroed": zeroed(stream, checkpoint.typical(stream))}, []
     if _knows_missing(checkpoint, store, stream):
         ways["missing"] = missing(stream)
     else:
@@ -196,7 +194,7 @@ def exchanged(
 
     def alter(indices: BatchIndices, batch: Batch) -> Batch:
         here = donors[np.searchsorted(ticks, indices.ticks)]
-        other = store.gather(here, *astuple(windows)).to(batch.action.device)
+        other = store.gather(here, **asdict(windows)).to(batch.action.device)
         return replace(batch, **{name: getattr(other, name) for name in FIELDS[stream]})
 
     return alter

@@ -320,7 +320,8 @@ class _Driver:
         features, valid = self.features(frames, self.instruction)
         rows = zip(features.numpy(), valid.numpy(), strict=True)
         for (_, loop), views, (row, real) in zip(due, taken, rows, strict=True):
-            loop.see(SeenFeatures(row, real, max(time for time, _ in views.values())))
+            times = np.array([time for time, _ in views.values()])
+            loop.see(SeenFeatures(row, real, times))
 
     def _chunks(
         self, loops: Sequence[ControlLoop], generators: Sequence[torch.Generator], off: str | None
@@ -332,7 +333,7 @@ class _Driver:
         fields = [loop.memory.observation() for loop in loops]
         streams = {name: np.stack([own[name] for own in fields]) for name in fields[0]}
         if off is not None:  # every value at its training mean, as in an evaluation
-            mean = getattr(self.checkpoint.normalization, off).mean.astype(np.float32)
+            mean = self.checkpoint.typical(off).astype(np.float32)
             streams[off] = np.broadcast_to(mean, streams[off].shape).copy()
         observation = self.policy.observe(streams)
         guide = stack_guides(guides, observation.features.device)

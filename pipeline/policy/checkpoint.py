@@ -14,6 +14,9 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.durable import (
     DIGEST,
@@ -77,6 +80,16 @@ class PolicyCheckpoint:
                 "again, or use the version of this code that wrote it."
             ) from None
         return policy.to(device).eval()
+
+    def typical(self, stream: str) -> NDArray[np.float64]:
+        """What a stream is at its training mean: a reading (channel,), or features (slot, dim)."""
+        from pipeline.policy.state_channels import typical_state
+
+        statistics = getattr(self.normalization, stream)
+        assert statistics is not None, "a policy has statistics of each stream that it sees"
+        if stream != "state":
+            return statistics.mean
+        return np.array(typical_state(statistics.mean.tolist(), self.shape.kinds))
 
     def document(self, weights_sha256: str) -> dict[str, Any]:
         """The content of `policy.json`."""
@@ -150,7 +163,11 @@ def load_policy(folder: Path) -> PolicyCheckpoint:
         shape = PolicyShape(**document["shape"])
         return PolicyCheckpoint(
             params=_params(document),
-            shape=replace(shape, action_groups=tuple(shape.action_groups)),
+            shape=replace(
+                shape,
+                action_groups=tuple(shape.action_groups),
+                state_kinds=tuple(shape.state_kinds),
+            ),
             normalization=Normalization.from_document(document["normalization"]),
             source={key: document[key] for key in SOURCE_KEYS},
             held_out_ticks={

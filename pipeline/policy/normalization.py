@@ -5,7 +5,7 @@ Numpy only; `pipeline.policy.policy.Normalizer` applies them to tensors.
 
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain, islice
 from typing import Any
@@ -24,6 +24,9 @@ Reading = Block | Callable[[], Block]
 
 _PIECE_VALUES = 4_194_304
 """Values converted to float64 at a time: 32 MB, whatever the size of the blocks."""
+
+_LEAST_SPREAD = 0.05
+"""Of what is usual for inputs alike: what rested in training is noise, and may move later."""
 
 _RELATIVE_FLOOR = 4 * float(np.finfo(np.float32).eps)
 """A spread below a few float32 steps of the mean is rounding, not signal."""
@@ -48,6 +51,13 @@ class ChannelStatistics:
         """
         floor = np.maximum(_RELATIVE_FLOOR * np.abs(self.mean), float(np.finfo(np.float32).tiny))
         return np.where(self.std > floor, self.std, 1.0)
+
+    def floored(self, usual: NDArray[np.float64]) -> "ChannelStatistics":
+        """The same, of which no spread is far below what is `usual` for channels alike.
+
+        `usual` broadcasts to the channels, 0 where nothing is known of any alike.
+        """
+        return replace(self, std=np.maximum(self.std, _LEAST_SPREAD * usual))
 
     def document(self) -> dict[str, Any]:
         """The statistics as JSON values; Python writes the shortest digits that read back equal."""

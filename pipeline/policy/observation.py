@@ -11,10 +11,15 @@ from torch import Tensor
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import ObservationError
 from pipeline.base.observation import Observation
+from pipeline.policy.ages import even_ages
+from pipeline.policy.state_channels import Kind, expanded_names
 
 VALIDITY = {"features": "slot_valid", "sensor": "sensor_valid", "state": "state_valid"}
 """What a policy may have encoders of, in the order in which it builds them, and the field that says
 what of it is real: (batch, slot) bool of the features, else (batch,) counts."""
+
+AGES = {"sensor": "sensor_age", "state": "state_age"}
+"""The field with the ages of a stream's readings."""
 
 _GROUP_BY_UNIT = dict.fromkeys(("m", "cm", "mm"), "translation") | {
     "deg": "rotation",
@@ -48,14 +53,25 @@ class PolicyShape:
     state_dim: int
     action_dim: int
     action_groups: tuple[str, ...]
+    views: int = 0
+    """Whose ages a policy is told."""
+    state_kinds: tuple[Kind, ...] = ()
+    """Of each state channel; empty where all are plain."""
+
+    @property
+    def kinds(self) -> tuple[Kind, ...]:
+        """The kind of each state channel."""
+        plain: tuple[Kind, ...] = ("plain",)
+        return self.state_kinds or plain * self.state_dim
 
     @property
     def channels(self) -> dict[str, tuple[int, ...]]:
-        """The shape of each stream's statistics, and of the action's."""
+        """The shape of each stream's statistics, and of the action's; a state's is expanded."""
+        expanded = expanded_names([""] * self.state_dim, self.kinds)
         return {
             "features": (self.slots, self.feature_dim),
             "sensor": (self.sensor_channels,),
-            "state": (self.state_dim,),
+            "state": (len(expanded),),
             "action": (self.action_dim,),
         }
 
@@ -65,11 +81,14 @@ class PolicyShape:
             "features": {"slot": self.slots, "dim": self.feature_dim},
             "slot_valid": {"slot": self.slots},
             "feature_age": {},
-            # Of any length: it is resampled. The state's tokens have places, as many as configured.
+            "view_age": {"view": self.views},
+            # Of any length: readings have steps by their ages.
             "sensor": {"window": None, "channel": self.sensor_channels},
             "sensor_valid": {},
-            "state": {"window": params.state_window, "channel": self.state_dim},
+            "sensor_age": {"window": None},
+            "state": {"window": None, "channel": self.state_dim},
             "state_valid": {},
+            "state_age": {"window": None},
         }
 
 
@@ -86,7 +105,9 @@ def action_groups(names: Sequence[str], units: Sequence[str]) -> tuple[str, ...]
 
 def stream_of(field: str) -> str:
     """The stream that a field of an observation is about."""
-    return "features" if field in ("slot_valid", "feature_age") else field.removesuffix("_valid")
+    if field in ("slot_valid", "feature_age", "view_age"):
+        return "features"
+    return field.removesuffix("_valid").removesuffix("_age")
 
 
 def build_observation(
@@ -99,31 +120,44 @@ def build_observation(
 ) -> LiveObservation:
     """The observation of the fields that are given; what is not given is missing.
 
-    Without its `*_valid` a stream is all real, without `feature_age` features are new. Raises
-    `ObservationError` for a `*_valid` without its stream, and for a shape that is not the policy's
-    or not the batch's.
+    Without its `*_valid` a stream is all real, without `*_age` its readings are spread evenly over
+    the seconds of its window; without `feature_age` features are new, and without `view_age` all
+    views as old as they are. Raises `ObservationError` for a `*_valid` or an age without its
+    stream, and for a shape that is not the policy's or not the batch's.
     """
     for name in given:
-        if name.endswith("_valid") and stream_of(name) not in given:
-            raise ObservationError(
-                f"{name}: expected {stream_of(name)} beside it, of which it says what is real"
-            )
+        told = name.endswith("_valid") or name in AGES.values()
+        if told and stream_of(name) not in given:
+            raise ObservationError(f"{name}: expected {stream_of(name)} beside it, which it is of")
     first = next((name for name in VALIDITY if name in given), "images")
     index = torch.tensor(row_of, dtype=torch.int64, device=device)
     # The number of elements and not len, which a scalar lacks; its shape is refused all the same.
     count = given[first].shape[:1].numel() if first in given else len(index)
     axes = shape.stream_axes(params)
+    lengths = {"sensor": params.sensor_window, "state": params.state_window}
+    for stream in lengths & given.keys():
+        if given[stream].ndim == 3:
+            lengths[stream] = given[stream].shape[1]
+            axes[AGES[stream]] = {"window": lengths[stream]}
     for name, value in given.items():
         check_axes(name, value, {"batch": count, **axes[name]}, first)
     if len(index):
         check_axes("images", index, {"batch": count}, first)
     else:
         index = torch.full((count,), -1, device=device)
-    window = params.sensor_window
     fields = {
-        name: torch.zeros(count, *(window if n is None else n for n in a.values()), device=device)
+        name: torch.zeros(
+            count,
+            *(lengths[stream_of(name)] if n is None else n for n in a.values()),
+            device=device,
+        )
         for name, a in axes.items()
     }
+    spans = {"sensor": params.sensor_reach_s, "state": params.state_window_s}
+    for stream, length in lengths.items():
+        fields[AGES[stream]] += even_ages(length, spans[stream] or 1.0, fields[stream])
+    if "feature_age" in given:
+        fields["view_age"] += given["feature_age"][:, None]
     for stream, valid in VALIDITY.items():
         real = given[stream].shape[1] if stream in given else 0
         fields[valid] = torch.full_like(fields[valid], real, dtype=torch.int64)

@@ -19,6 +19,7 @@ from pipeline.policy.fusion import build_fusion
 from pipeline.policy.guidance import Guide
 from pipeline.policy.normalization import ChannelStatistics, Normalization
 from pipeline.policy.observation import (
+    AGES,
     VALIDITY,
     LiveObservation,
     PolicyShape,
@@ -26,6 +27,7 @@ from pipeline.policy.observation import (
     stream_of,
 )
 from pipeline.policy.regression import RegressionActionExpert
+from pipeline.policy.state_channels import expand
 from pipeline.policy.tensors import Chunk, Context, Generators, Losses, StepMask
 from pipeline.policy.window_encoders import (
     ForceAwareSensorEncoder,
@@ -45,6 +47,11 @@ SENSOR_ENCODERS: dict[str, type[SensorEncoder] | type[ForceAwareSensorEncoder]] 
     "force_aware": ForceAwareSensorEncoder,
 }
 """The class of each `train_head.sensor_encoder.kind`."""
+
+
+_LARGEST = 10.0
+"""Beyond so many deviations from the training mean an input says no more: what rested in training
+and moves later must not drown all else."""
 
 
 class Trainable(nn.Module, ABC):
@@ -240,10 +247,13 @@ class Policy(Trainable):
         """The tokens of a stream, of which only what `valid` counts or marks is looked at."""
         normalizer, encoder = self.normalizers[stream], self.encoders[stream]
         assert isinstance(normalizer, Normalizer)
-        values = normalizer.normalize(getattr(observation, stream))
+        values = getattr(observation, stream)
+        if stream == "state":
+            values = expand(values, self.shape.kinds)
+        values = normalizer.normalize(values).clamp_(-_LARGEST, _LARGEST)
         if stream == "features":
-            return encoder(values, valid, observation.feature_age)
-        return encoder(values, valid).unsqueeze(1)
+            return encoder(values, valid, observation.feature_age, observation.view_age)
+        return encoder(values, valid, getattr(observation, AGES[stream])).unsqueeze(1)
 
     def _validity(self, observation: Observation) -> dict[str, Tensor]:
         return {name: getattr(observation, VALIDITY[name]) for name in self.encoders}
@@ -258,18 +268,24 @@ def build_encoders(
     """
     encoders, tokens = nn.ModuleDict(), dict[str, tuple[int, int]]()
     if params.features_enabled and shape.slots and shape.feature_dim:
-        features = FeatureEncoder(shape.slots, shape.feature_dim)
+        features = FeatureEncoder(shape.slots, shape.feature_dim, views=shape.views)
         encoders["features"], tokens["features"] = features, (shape.slots, features.width)
     if params.sensor_enabled and shape.sensor_channels:
         sensor = params.sensor_encoder
         encoders["sensor"] = SENSOR_ENCODERS[sensor.kind](
-            shape.sensor_channels, params.sensor_window, **sensor.model_dump(exclude={"kind"})
+            shape.sensor_channels,
+            params.sensor_window,
+            span_s=params.sensor_reach_s,
+            **sensor.model_dump(exclude={"kind"}),
         )
         tokens["sensor"] = (1, sensor.output_dim)
     if params.robot_state_enabled and shape.state_dim:
         state = params.state_encoder
         encoders["state"] = RobotStateEncoder(
-            shape.state_dim, params.state_window, **state.model_dump()
+            shape.channels["state"][0],
+            params.state_window,
+            span_s=params.state_window_s,
+            **state.model_dump(),
         )
         tokens["state"] = (1, state.output_dim)
     if not tokens:

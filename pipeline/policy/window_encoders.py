@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from pipeline.base.errors import ConfigError
+from pipeline.policy.ages import AgeEncoder, at_even_ages, even_ages
 from pipeline.policy.attention import TransformerLayer, learned, masked_mean, right_aligned
 
 _FORCE_SHARE = 4
@@ -48,11 +49,30 @@ class HalvingBlock(nn.Module):
 
 
 class WindowEncoder(nn.Module):
-    """What the encoders of a window share: a transformer over its tokens, and their mean.
+    """What the encoders of a window share: readings placed by age, a transformer, a mean.
 
     Windows are right-aligned: the last `valid[i]` readings of row i are real, the rest is padding
-    that never reaches the output. Where `valid[i]` is 0 the output is a learned embedding.
+    that never reaches the output. Where `valid[i]` is 0 the output is a learned embedding. Readings
+    come by their ages (batch, window) in s onto `window` steps of equal age that span `span_s`;
+    without a span or ages they are taken as evenly spread over it. The newest age is an input.
     """
+
+    window: int
+    span_s: float | None
+
+    def place(
+        self,
+        values: Float[Tensor, "batch reading channel"],
+        valid: Int[Tensor, " batch"],
+        age_s: Float[Tensor, "batch reading"] | None,
+    ) -> tuple[Float[Tensor, "batch step channel"], Bool[Tensor, "batch step"]]:
+        """The readings at the encoder's steps, and which of these stand on a reading."""
+        mask, span_s = right_aligned(valid, values.shape[1]), self.span_s or 1.0
+        if age_s is None or self.span_s is None:
+            if values.shape[1] == self.window:
+                return values, mask
+            age_s = even_ages(values.shape[1], span_s, mask).expand(mask.shape)
+        return at_even_ages(values, mask, age_s, self.window, span_s)
 
     def build_layers(
         self, tokens: int, dim: int, layers: int, heads: int, expansion: int, output_dim: int
@@ -62,6 +82,7 @@ class WindowEncoder(nn.Module):
         self.layers = nn.ModuleList(TransformerLayer(dim, heads, expansion) for _ in range(layers))
         self.norm = nn.LayerNorm(dim)
         self.project = nn.Linear(dim, output_dim)
+        self.age = AgeEncoder(1, output_dim)
         self.missing = learned(output_dim)
 
     def summarize(
@@ -69,6 +90,7 @@ class WindowEncoder(nn.Module):
         tokens: Float[Tensor, "batch token dim"],
         present: Bool[Tensor, "batch token"],
         valid: Int[Tensor, " batch"],
+        age_s: Float[Tensor, "batch reading"] | None,
     ) -> Float[Tensor, "batch output"]:
         """The vector of a window from its tokens, of which those `present` stand on a reading."""
         missing = (valid == 0).unsqueeze(-1)
@@ -78,6 +100,8 @@ class WindowEncoder(nn.Module):
         for layer in self.layers:
             tokens = layer(tokens, attended)
         encoded = self.project(masked_mean(self.norm(tokens), present))
+        newest = age_s[:, -1:] if age_s is not None else encoded.new_zeros(len(encoded), 1)
+        encoded = encoded + self.age(newest.masked_fill(missing, 0.0))
         return torch.where(missing, self.missing.to(encoded.dtype), encoded)
 
 
@@ -100,9 +124,10 @@ class SensorEncoder(WindowEncoder):
         layers: int = 2,
         heads: int = 8,
         output_dim: int = 1024,
+        span_s: float | None = 0.1,
     ) -> None:
         super().__init__()
-        self.window = window
+        self.window, self.span_s = window, span_s
         widths = (sensor_channels, *channels)
         self.blocks = nn.ModuleList(HalvingBlock(*pair) for pair in pairwise(widths))
         tokens = window
@@ -114,16 +139,14 @@ class SensorEncoder(WindowEncoder):
         self,
         values: Float[Tensor, "batch window channel"],
         valid: Int[Tensor, " batch"] | None = None,
+        age_s: Float[Tensor, "batch window"] | None = None,
     ) -> Float[Tensor, "batch output"]:
         """Encode; `valid` None means that every reading is real."""
         valid = all_valid(values) if valid is None else valid
-        mask = right_aligned(valid, values.shape[1])
-        if values.shape[1] != self.window:
-            values, mask = resampled(values, mask, self.window)
-        values, mask = silenced(values, mask)
+        values, mask = silenced(*self.place(values, valid, age_s))
         for block in self.blocks:
             values, mask = block(values, mask)
-        return self.summarize(values, mask, valid)
+        return self.summarize(values, mask, valid, age_s)
 
 
 class ForceAwareSensorEncoder(nn.Module):
@@ -143,6 +166,7 @@ class ForceAwareSensorEncoder(nn.Module):
         layers: int = 2,
         heads: int = 8,
         output_dim: int = 1024,
+        span_s: float | None = 0.1,
     ) -> None:
         super().__init__()
         if min(sensor_channels, output_dim) < 2:
@@ -153,19 +177,20 @@ class ForceAwareSensorEncoder(nn.Module):
             )
         narrow = [heads * -(-width // (_FORCE_SHARE * heads)) for width in channels]
         force_dim = -(-output_dim // _FORCE_SHARE)
-        self.force = SensorEncoder(1, window, narrow, layers, heads, force_dim)
+        self.force = SensorEncoder(1, window, narrow, layers, heads, force_dim, span_s)
         self.scan = SensorEncoder(
-            sensor_channels - 1, window, channels, layers, heads, output_dim - force_dim
+            sensor_channels - 1, window, channels, layers, heads, output_dim - force_dim, span_s
         )
 
     def forward(
         self,
         values: Float[Tensor, "batch window channel"],
         valid: Int[Tensor, " batch"] | None = None,
+        age_s: Float[Tensor, "batch window"] | None = None,
     ) -> Float[Tensor, "batch output"]:
         """Encode; `valid` None means that every reading is real."""
         force, scan = values[..., :1], values[..., 1:]
-        return torch.cat([self.force(force, valid), self.scan(scan, valid)], dim=-1)
+        return torch.cat([self.force(force, valid, age_s), self.scan(scan, valid, age_s)], dim=-1)
 
 
 class RobotStateEncoder(WindowEncoder):
@@ -185,24 +210,29 @@ class RobotStateEncoder(WindowEncoder):
         heads: int = 8,
         output_dim: int = 512,
         patch: int = 10,
+        span_s: float | None = 1.0,
     ) -> None:
         super().__init__()
-        self.patch = patch
+        self.patch, self.window, self.span_s = patch, window, span_s
         self.embed = nn.Linear(patch * (state_dim + 1), dim)
         self.build_layers(-(-window // patch), dim, layers, heads, 4, output_dim)
 
     def forward(
-        self, values: Float[Tensor, "batch window dim"], valid: Int[Tensor, " batch"] | None = None
+        self,
+        values: Float[Tensor, "batch window dim"],
+        valid: Int[Tensor, " batch"] | None = None,
+        age_s: Float[Tensor, "batch window"] | None = None,
     ) -> Float[Tensor, "batch output"]:
         """Encode; `valid` None means that every reading is real."""
         valid = all_valid(values) if valid is None else valid
+        values, present = self.place(values, valid, age_s)
         short = -values.shape[1] % self.patch
-        mask = right_aligned(valid, values.shape[1] + short).unsqueeze(-1)
+        mask = F.pad(present, (short, 0)).unsqueeze(-1)
         values = F.pad(values, (0, 0, short, 0)).masked_fill(~mask, 0.0)
         values = torch.cat([values, mask.to(values.dtype)], dim=-1)
         present = mask.squeeze(-1).unflatten(1, (-1, self.patch)).any(dim=-1)
         tokens = self.embed(values.unflatten(1, (-1, self.patch)).flatten(2))
-        return self.summarize(tokens, present, valid)
+        return self.summarize(tokens, present, valid, age_s)
 
 
 def silenced(
@@ -216,21 +246,3 @@ def silenced(
     front = values.new_zeros(len(values), odd, values.shape[2])
     values, valid = torch.cat([front, values], dim=1), F.pad(valid, (odd, 0))
     return values.masked_fill_(~valid.unsqueeze(-1), 0.0), valid
-
-
-def resampled(
-    values: Float[Tensor, "batch length channel"], valid: Bool[Tensor, "batch length"], window: int
-) -> tuple[Float[Tensor, "batch window channel"], Bool[Tensor, "batch window"]]:
-    """The windows at `window` steps, and which of them stand on at least one valid reading.
-
-    Longer ones are averaged over equal spans, so that nothing aliases; shorter ones are
-    interpolated linearly. Weights are renormalised over the valid readings (normalised
-    convolution, Knutsson and Westin 1993), so that padding does not pull on its neighbours.
-    """
-    mode = "area" if values.shape[1] > window else "linear"
-    weight = valid.unsqueeze(1).to(values.dtype)
-    known = values.masked_fill(~valid.unsqueeze(-1), 0.0).transpose(1, 2)
-    total = F.interpolate(known, size=window, mode=mode)
-    weight = F.interpolate(weight, size=window, mode=mode)
-    mean = total / weight.clamp(min=torch.finfo(weight.dtype).tiny)
-    return mean.transpose(1, 2), weight.squeeze(1) > 0

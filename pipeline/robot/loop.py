@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pipeline.base.config import Chunking, TrainHeadParams
 from pipeline.policy.observation import PolicyShape
 from pipeline.robot.chunking import Executor
-from pipeline.robot.memory import RobotMemory, SeenFeatures
+from pipeline.robot.memory import RobotMemory, SeenFeatures, WindowSize
 
 
 class SafeStop(Exception):
@@ -40,7 +40,8 @@ class ControlLoop:
         self, params: TrainHeadParams, shape: PolicyShape, timing: LoopTiming, uses_features: bool
     ) -> None:
         self.memory = RobotMemory(
-            (params.sensor_window, shape.sensor_channels), (params.state_window, shape.state_dim)
+            WindowSize(params.sensor_window, shape.sensor_channels, params.sensor_reach_s),
+            WindowSize(params.state_window, shape.state_dim, params.state_window_s),
         )
         self.executor = Executor(timing.chunking, timing.execute, params.horizon)
         self._timing, self._uses_features = timing, uses_features

@@ -7,63 +7,87 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.base.observation import CLOCK_SLACK_S
+
+
+@dataclass(frozen=True)
+class WindowSize:
+    """Of a stream's window: most readings, their channels, and how old they may be (None: any)."""
+
+    readings: int
+    channels: int
+    oldest_s: float | None
+
 
 class ReadingWindow:
-    """The newest `size` readings of a stream, right-aligned, in one buffer that stays."""
+    """The newest readings of a stream, right-aligned, in buffers that stay."""
 
-    def __init__(self, size: int, channels: int) -> None:
-        self.values = np.zeros((size, channels), np.float32)
-        self.valid = 0
-        """How many of them are real, the last ones."""
+    def __init__(self, size: WindowSize) -> None:
+        self.values = np.zeros((size.readings, size.channels), np.float32)
+        self._time_s = np.full(size.readings, -np.inf)
+        self._oldest_s = np.inf if size.oldest_s is None else size.oldest_s + CLOCK_SLACK_S
 
-    def append(self, readings: NDArray[np.float32]) -> None:
-        """Take the readings (reading, channel) that follow."""
-        newest = readings[-len(self.values) :]
-        kept = len(self.values) - len(newest)
-        self.values[:kept] = self.values[len(newest) :]
-        self.values[kept:] = newest
-        self.valid = min(len(self.values), self.valid + len(newest))
+    def append(self, readings: NDArray[np.float32], time_s: NDArray[np.float64]) -> None:
+        """Take the readings (reading, channel) that follow, and the times (reading,) of them."""
+        for buffer, following in ((self.values, readings), (self._time_s, time_s)):
+            newest = following[-len(buffer) :]
+            kept = len(buffer) - len(newest)
+            buffer[:kept] = buffer[len(newest) :]
+            buffer[kept:] = newest
+
+    def at(self, now_s: float) -> tuple[NDArray[np.float32], int, NDArray[np.float32]]:
+        """The readings, how many of them are real, the last ones, and their ages in s."""
+        age_s = now_s - self._time_s
+        real = np.isfinite(age_s) & (age_s <= self._oldest_s)
+        ages = np.where(real, age_s, 0).astype(np.float32)
+        return self.values * real[:, None], int(real.sum()), ages
 
 
 @dataclass(frozen=True)
 class SeenFeatures:
-    """Features (slot, dim), which of their slots are valid, and the time of their newest frame."""
+    """Features (slot, dim), which of their slots are valid, and the time of each view's frame."""
 
     features: NDArray[np.float32]
     slot_valid: NDArray[np.bool_]
-    frame_time_s: float
+    frame_time_s: NDArray[np.float64]
+    """(view,) in s, NaN of a missing one."""
 
 
 class RobotMemory:
     """What a policy with windows of these sizes remembers of one robot."""
 
-    def __init__(self, sensor: tuple[int, int], state: tuple[int, int]) -> None:
-        """`sensor` and `state` are (readings, channels) of the windows; without channels none."""
+    def __init__(self, sensor: WindowSize, state: WindowSize) -> None:
+        """Of a stream without channels nothing is remembered."""
         sizes = {"sensor": sensor, "state": state}
-        self._windows = {name: ReadingWindow(*size) for name, size in sizes.items() if size[1]}
+        self._windows = {name: ReadingWindow(size) for name, size in sizes.items() if size.channels}
         self.features: SeenFeatures | None = None
         self.time_s = 0.0
 
     def sense(self, readings: Mapping[str, NDArray[Any]]) -> None:
-        """Take what came since the last tick: `state`, `sensor`, and `time` (1,) now, in s."""
+        """Take what came since the last tick, and `time` (1,) now, in s.
+
+        `state` and `sensor` are (reading, channel); `state_time` and `sensor_time` (reading,).
+        """
         self.time_s = float(readings["time"][0])
         for name, window in self._windows.items():
             if name in readings:
-                window.append(readings[name])
+                window.append(readings[name], readings[f"{name}_time"])
 
     def observation(self) -> dict[str, NDArray[Any]]:
         """The fields of an `Observation` of one sample; features are missing until the first came.
 
-        `feature_age` is the true one: now, less the time of their newest frame.
+        Ages are true ones: now, less the time of a reading or of a frame.
         """
         fields: dict[str, NDArray[Any]] = {}
         for name, window in self._windows.items():
-            fields[name] = window.values.copy()
-            fields[f"{name}_valid"] = np.array(window.valid)
+            values, valid, ages = window.at(self.time_s)
+            fields |= {name: values, f"{name}_valid": np.array(valid), f"{name}_age": ages}
         if (seen := self.features) is not None:
+            ages = (self.time_s - seen.frame_time_s).astype(np.float32)
             fields |= {
                 "features": seen.features,
                 "slot_valid": seen.slot_valid,
-                "feature_age": np.array(self.time_s - seen.frame_time_s, np.float32),
+                "feature_age": np.array(np.nanmin(ages)),
+                "view_age": ages,
             }
         return fields

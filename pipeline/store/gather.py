@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pipeline.base.memory import available_bytes
+from pipeline.base.observation import CLOCK_SLACK_S
 from pipeline.store.batch import Batch
 from pipeline.store.episodes import episode_of
 from pipeline.store.mapping import fitting, populate, read_at_random, will_need
@@ -31,6 +32,8 @@ among its threads in turn instead of dividing the blocks among them, and copies 
 _CACHE_LINE = 64
 
 Index = NDArray[np.int64]
+Late = int | float | NDArray[Any]
+"""How late a stream is: for all samples of a batch, or (batch,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,14 +75,16 @@ class Gatherer:
         self,
         batch: Batch,
         tick: Index,
-        feature_lag: int,
-        sensor_lag_s: float,
-        state_lag_s: float,
+        feature_lag: Late,
+        sensor_lag_s: Late,
+        state_lag_s: Late,
         variant: Index | None,
+        oldest_s: Mapping[str, float | None],
     ) -> Selection:
         """Fill all but the wide fields of `batch`, and say where those lie.
 
-        See `FeatureStore.gather`.
+        `oldest_s` has the seconds that the window of `sensor` and `state` reaches back. See
+        `FeatureStore.gather`.
         """
         episode = episode_of(self._arrays, tick)
         return Selection(
@@ -88,8 +93,8 @@ class Gatherer:
                 "action": self._action(batch, tick, episode),
             },
             {
-                "sensor": self._window("sensor", batch, tick, episode, sensor_lag_s),
-                "state": self._window("state", batch, tick, episode, state_lag_s),
+                stream: self._window(stream, batch, tick, episode, lag_s, oldest_s[stream])
+                for stream, lag_s in (("sensor", sensor_lag_s), ("state", state_lag_s))
             },
         )
 
@@ -128,10 +133,13 @@ class Gatherer:
             features=wide("features", batch),
             slot_valid=torch.empty((batch, slots), dtype=torch.bool),
             feature_age=torch.empty(batch),
+            view_age=torch.empty(batch, self._arrays["vl/frame_time"].shape[1]),
             sensor=wide("sensor", batch, sensor_window),
             sensor_valid=torch.empty(batch, dtype=torch.int64),
+            sensor_age=torch.empty(batch, sensor_window),
             state=wide("state", batch, state_window),
             state_valid=torch.empty(batch, dtype=torch.int64),
+            state_age=torch.empty(batch, state_window),
             action=wide("action", batch, horizon),
             action_valid=torch.empty((batch, horizon), dtype=torch.bool),
         )
@@ -155,6 +163,11 @@ class Gatherer:
         newest = np.where(np.isfinite(newest), newest, self._arrays["vl/time"][row])
         return self._arrays["tick/time"][tick] - newest
 
+    def vl_rows(self, tick: Index, episode: Index, lag: Late = 0) -> Index:
+        """(tick,) the VL row of each tick, `lag` rows back, not beyond the episode's first."""
+        row = self._arrays["tick/vl_row"][tick]
+        return np.maximum(row - lag, self._arrays["episode/vl_start"][episode])
+
     def populate(self, but: Collection[str]) -> None:
         """Read the wide fields that fit in memory into it, one by one, without those in `but`."""
         for name in self.in_memory:
@@ -166,28 +179,46 @@ class Gatherer:
         return rows * self._variants, slots // self._variants, *rest
 
     def _features(
-        self, batch: Batch, tick: Index, episode: Index, lag: int, variant: Index | None
+        self, batch: Batch, tick: Index, episode: Index, lag: Late, variant: Index | None
     ) -> Index:
-        row = self._arrays["tick/vl_row"][tick]
-        if lag:
-            row = np.maximum(row - lag, self._arrays["episode/vl_start"][episode])
+        row = self.vl_rows(tick, episode, lag)
         view = row if self._variants == 1 else row * self._variants
         view = view if variant is None else view + variant
         valid = self._arrays["vl/slot_valid"]
         np.not_equal(valid.reshape(self._by_variant(valid))[view], 0, out=batch.slot_valid.numpy())
         batch.feature_age.numpy()[:] = self.feature_age(tick, row)
+        now = self._arrays["tick/time"][tick][:, None]
+        batch.view_age.numpy()[:] = now - self._arrays["vl/frame_time"][row]
         return view
 
     def _window(
-        self, stream: str, batch: Batch, tick: Index, episode: Index, lag_s: float
+        self,
+        stream: str,
+        batch: Batch,
+        tick: Index,
+        episode: Index,
+        lag_s: Late,
+        oldest_s: float | None,
     ) -> Window:
         first = self._arrays[f"episode/{stream}_start"][episode]
         end = self._arrays[f"tick/{stream}_end"][tick]
-        if lag_s:
-            until = self._arrays["tick/time"][tick] - lag_s
-            end = _first_after(self._arrays[f"{stream}/time"], first, end, until)
-        window, counts = getattr(batch, stream).shape[1], getattr(batch, f"{stream}_valid")
-        return Window(end, np.minimum(end - first, window, out=counts.numpy()))
+        now, clock = self._arrays["tick/time"][tick], self._arrays[f"{stream}/time"]
+        if np.any(lag_s):
+            end = _first_after(clock, first, end, now - lag_s)
+        window, counts = getattr(batch, stream).shape[1], getattr(batch, f"{stream}_valid").numpy()
+        valid = np.minimum(end - first, window, out=counts)
+        ages = getattr(batch, f"{stream}_age").numpy()
+        if not len(clock):
+            ages[:] = 0
+            return Window(end, valid)
+        steps = np.arange(-window, 0)
+        age_s = now[:, None] - clock[np.maximum(end[:, None] + steps, 0)]
+        real = steps >= -valid[:, None]
+        if oldest_s is not None:
+            real &= age_s <= oldest_s + CLOCK_SLACK_S
+            np.sum(real, axis=1, out=valid)
+        np.multiply(age_s, real, out=ages, casting="same_kind")
+        return Window(end, valid)
 
     def _action(self, batch: Batch, tick: Index, episode: Index) -> Index:
         horizon = batch.action.shape[1]

@@ -23,7 +23,7 @@ from pipeline.store.schema import STREAMS, TRAILER_BYTES, ArraySpec, chunk_paths
 
 if TYPE_CHECKING:
     from pipeline.store.batch import Batch
-    from pipeline.store.gather import Gatherer, Selection
+    from pipeline.store.gather import Gatherer, Late, Selection
 
 
 def _one_thread() -> None:
@@ -147,39 +147,43 @@ class FeatureStore:
         horizon: int = 8,
         sensor_window: int = 65,
         state_window: int = 100,
-        feature_lag: int = 0,
-        sensor_lag_s: float = 0.0,
-        state_lag_s: float = 0.0,
+        feature_lag: "int | NDArray[np.int64]" = 0,
+        sensor_lag_s: "float | NDArray[np.float64]" = 0.0,
+        state_lag_s: "float | NDArray[np.float64]" = 0.0,
         out: "Batch | None" = None,
         variants: NDArray[np.int64] | None = None,
+        sensor_window_s: float | None = None,
+        state_window_s: float | None = None,
     ) -> "Batch":
         """The batch of these ticks (store-global), into the buffers of `out` where given.
 
-        Windows end at the last reading at or before the tick less the lag; `feature_lag` goes back
-        whole VL rows, not beyond the episode's first. The action chunk begins at its own tick and
-        repeats the episode's last action, marked invalid, beyond its end. `variants` (batch,) says
-        which variant of its VL row each tick sees; without it all see 0, the plain frames.
+        Windows end at the last reading at or before the tick less the lag. They hold at most
+        `sensor_window` and `state_window` readings, and none that is more than `sensor_window_s`
+        or `state_window_s` older than the tick. `feature_lag` goes back whole VL rows, not beyond
+        the episode's first. A lag is that of all ticks, or (batch,). Ages are those at the tick.
+        The action chunk begins at its own tick and repeats the episode's last action, marked
+        invalid, beyond its end. `variants` (batch,) says which variant of its VL row each tick
+        sees; without it all see 0, the plain frames.
 
         Raises `IndexError` for a tick the store does not have and `ValueError` for a variant it
         does not have, an `out` of other sizes, or a negative lag, which would show the future.
         """
+        windows = (horizon, sensor_window, state_window, sensor_window_s, state_window_s)
         lags = (feature_lag, sensor_lag_s, state_lag_s)
-        batch, selection = self.select(
-            ticks, (horizon, sensor_window, state_window), lags, out, variants
-        )
+        batch, selection = self.select(ticks, windows, lags, out, variants)
         self.gatherer.copy(selection, batch)
         return batch
 
     def select(
         self,
         ticks: Sequence[int] | NDArray[np.int64],
-        windows: tuple[int, int, int],
-        lags: tuple[int, float, float],
+        windows: tuple[int, int, int, float | None, float | None],
+        lags: "tuple[Late, Late, Late]",
         out: "Batch | None",
         variants: NDArray[np.int64] | None,
     ) -> "tuple[Batch, Selection]":
         """The first half of `gather`: all but the wide fields of a batch, and where those lie."""
-        if min(lags) < 0:
+        if any(np.min(lag, initial=0) < 0 for lag in lags):
             raise ValueError(f"a lag goes back in time and cannot be negative, found {lags}")
         tick = np.asarray(ticks, np.int64)
         if tick.size and (tick.min() < 0 or tick.max() >= self.ticks):
@@ -192,14 +196,15 @@ class FeatureStore:
                 f"{self.path}: expected a variant in 0..{self.variants - 1} for each of "
                 f"{len(tick)} ticks, asked for {variants}. A store holds `vlm.variants` of them."
             )
-        sizes = (len(tick), *windows)
+        sizes = (len(tick), *windows[:3])
         batch = self.gatherer.empty_batch(*sizes) if out is None else out
         if batch.sizes != sizes:
             raise ValueError(
                 "`out` has (batch, horizon, sensor_window, state_window) "
                 f"{batch.sizes}, asked for {sizes}"
             )
-        return batch, self.gatherer.select(batch, tick, *lags, variants)
+        oldest_s = {"sensor": windows[3], "state": windows[4]}
+        return batch, self.gatherer.select(batch, tick, *lags, variants, oldest_s)
 
     def warm(self, but: Collection[str] = ()) -> None:
         """Begin to read what memory has room for, once, in the background; no field of `but`.

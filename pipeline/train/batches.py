@@ -23,12 +23,27 @@ from pipeline.base.config import TrainHeadParams
 from pipeline.base.format import size
 from pipeline.base.memory import available_bytes
 from pipeline.store import Batch, FeatureStore
-from pipeline.store.gather import WIDE, Index, Selection, Window
+from pipeline.store.gather import WIDE, Index, Late, Selection, Window
 from pipeline.store.mapping import fitting
 
 Ticks = NDArray[np.int64]
 _DEVICE_SHARE = 0.6
 """Of the device's free memory, what a store may fill: the rest is for the model and its step."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lags:
+    """How late each stream is: `features` in whole VL rows, the others in seconds.
+
+    Of all samples of a batch, or (batch,).
+    """
+
+    features: Late = 0
+    sensor_s: Late = 0.0
+    state_s: Late = 0.0
+
+
+NO_LAGS = Lags()
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +54,7 @@ class BatchIndices:
     """(batch,) store-global."""
     variants: NDArray[np.int64] | None = None
     """(batch,) which stored variant of its VL row each tick sees; None: all 0, the plain frames."""
+    lags: Lags = NO_LAGS
 
 
 def cut_batches(ticks: Ticks, batch_size: int) -> list[BatchIndices]:
@@ -49,24 +65,17 @@ def cut_batches(ticks: Ticks, batch_size: int) -> list[BatchIndices]:
 
 
 @dataclass(frozen=True)
-class Lags:
-    """How late each stream is: `features` in whole VL rows, the others in seconds."""
-
-    features: int = 0
-    sensor_s: float = 0.0
-    state_s: float = 0.0
-
-
-NO_LAGS = Lags()
-
-
-@dataclass(frozen=True)
 class Windows:
-    """How much of each stream a sample sees, in ticks (`horizon`) and readings."""
+    """How much of each stream a sample sees: ticks, most readings, and seconds before the tick.
+
+    None is any age. The names are those of `FeatureStore.gather`.
+    """
 
     horizon: int
     sensor_window: int
     state_window: int
+    sensor_window_s: float | None = None
+    state_window_s: float | None = None
 
     @classmethod
     def of(cls, params: TrainHeadParams) -> Self:
@@ -75,6 +84,8 @@ class Windows:
             params.horizon,
             params.sensor_window if params.sensor_enabled else 1,
             params.state_window if params.robot_state_enabled else 1,
+            params.sensor_reach_s,
+            params.state_window_s,
         )
 
 
@@ -176,9 +187,9 @@ class Prefetch(Iterator[tuple[BatchIndices, Batch]]):
     out of `next` at the batch it belongs to. Use as a context manager, or call `close`. The thread
     does not survive a fork: a forked process reads from the same store with a `Prefetch` it makes.
 
-    What `resident` holds of the store is gathered on its device, into fresh memory; on CUDA when
-    the batch is handed out, in the order of the consumer's stream. The rest of the store is read
-    into memory in the background, as far as it fits.
+    `lags` replaces those of the plan. What `resident` holds of the store is gathered on its device,
+    into fresh memory; on CUDA when the batch is handed out, in the order of the consumer's stream.
+    The rest of the store is read into memory in the background, as far as it fits.
     """
 
     def __init__(
@@ -188,14 +199,14 @@ class Prefetch(Iterator[tuple[BatchIndices, Batch]]):
         windows: Windows,
         device: torch.device,
         buffers: int = 2,
-        lags: Lags = NO_LAGS,
+        lags: Lags | None = None,
         resident: DeviceStore | None = None,
     ) -> None:
         assert buffers >= 2, "one buffer in use, one being filled"
         self.waited_s = 0.0
         """Time that the consumer has spent waiting for data."""
         self._store, self._device, self._resident = store, device, resident
-        self._windows, self._lags = astuple(windows), astuple(lags)
+        self._windows, self._lags = astuple(windows), lags
         self._on_device = frozenset[str]() if resident is None else resident.fields
         self._plan = self._warmed(plan)
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="prefetch")
@@ -255,10 +266,13 @@ class Prefetch(Iterator[tuple[BatchIndices, Batch]]):
             buffer.copied.synchronize()
         count = len(indices.ticks)
         if buffer.batch is None or len(buffer.batch) != count:
-            empty = self._store.gatherer.empty_batch(count, *self._windows, but=self._on_device)
+            lengths = self._windows[:3]
+            empty = self._store.gatherer.empty_batch(count, *lengths, but=self._on_device)
             buffer.batch = empty.pin() if self._device.type == "cuda" else empty.touch()
+        late = self._lags or indices.lags
+        lags = (late.features, late.sensor_s, late.state_s)
         batch, selection = self._store.select(
-            indices.ticks, self._windows, self._lags, buffer.batch, indices.variants
+            indices.ticks, self._windows, lags, buffer.batch, indices.variants
         )
         self._store.gatherer.copy(selection, batch, but=self._on_device)
         if self._device.type != "cuda":

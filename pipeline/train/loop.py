@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from pathlib import Path
 
@@ -89,7 +90,9 @@ class Trainer:
             self._build()
             self._restore(state)
         else:
-            self.normalization = self.world.shared(lambda: fit_normalization(store, split.train))
+            windows = Windows.of(params)
+            fitted = partial(fit_normalization, store, split.train, windows)
+            self.normalization = self.world.shared(fitted)
             self.shape = policy_shape(store, self.normalization)
             self._build()
 

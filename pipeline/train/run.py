@@ -270,14 +270,17 @@ def policy_shape(store: FeatureStore, normalization: Normalization) -> "PolicySh
     A stream without statistics is absent from what the policy is trained on, so it has width 0.
     """
     from pipeline.policy.observation import PolicyShape, action_groups
+    from pipeline.policy.state_channels import channel_kinds
 
-    action = store.streams["action"]
+    action, state = store.streams["action"], store.streams["state"]
     return PolicyShape(
         *store.feature_shape,
         sensor_channels=store.sensor_channels if normalization.sensor else 0,
         state_dim=store.state_dim if normalization.state else 0,
         action_dim=store.action_dim,
         action_groups=action_groups(action["names"], action["units"]),
+        views=store.array("vl/frame_time").shape[1],
+        state_kinds=channel_kinds(state["names"], state["units"]) if normalization.state else (),
     )
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import ConfigError
 from pipeline.store import FeatureStore
-from pipeline.train.batches import BatchIndices, Ticks
+from pipeline.train.batches import BatchIndices, Lags, Ticks
 from pipeline.train.split import Split, hash64
 from pipeline.train.world import World
 
@@ -126,9 +126,9 @@ def _mixture(masses: Mapping[str, Fraction]) -> _Node:
     return nodes[0]
 
 
-_VARIANTS = (0, 1)
-"""After (seed, step), tells the random numbers that pick variants from those of any part: numpy
-takes (seed, step, part) for (seed, step, part, 0), so that a third number would not do."""
+_VARIANTS, _LAGS = (0, 1), (0, 2)
+"""After (seed, step), tell the random numbers that pick variants and lags from those of any part:
+numpy takes (seed, step, part) for (seed, step, part, 0), so that a third number would not do."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -186,12 +186,14 @@ class Plan:
         if self._variants > 1:
             rng = np.random.default_rng((seed, step, *_VARIANTS))
             variants = rng.integers(self._variants, size=len(ticks))
+        feature_lag, sensor_lag_s = self._draw_lags(step, len(ticks))
         counts = self._count_valid(ticks)
         cuts = np.array_split(np.arange(len(ticks)), self.parts)
         return [
             StepPart(
                 ticks[cuts[p]],
                 None if variants is None else variants[cuts[p]],
+                Lags(feature_lag[cuts[p]], sensor_lag_s[cuts[p]]),
                 share=float(counts[cuts[p]].sum() / counts.sum()),
                 seed=int(np.random.SeedSequence((seed, step, p)).generate_state(1, np.uint64)[0]),
             )
@@ -201,6 +203,12 @@ class Plan:
     def parts_of(self, steps: range) -> Iterator[StepPart]:
         """This process's parts of these steps, one after the other."""
         return (part for step in steps for part in self.step(step))
+
+    def _draw_lags(self, step: int, ticks: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """How late features (in VL rows) and sensor (in s) are in each sample, drawn evenly."""
+        rng = np.random.default_rng((self._params.seed, step, *_LAGS))
+        rows = rng.integers(self._params.feature_lag + 1, size=ticks)
+        return rows, rng.uniform(0, self._params.sensor_lag_s, ticks)
 
     def _count_valid(self, ticks: Ticks) -> NDArray[np.int64]:
         """How many steps of each tick's chunk count in the loss: those before its episode's end."""

@@ -1,5 +1,7 @@
 """The normalisation, fitted on what training may see and nothing else."""
 
+from collections.abc import Sequence
+from dataclasses import asdict, replace
 from functools import partial
 from typing import Any, NoReturn
 
@@ -9,13 +11,19 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from pipeline.base.bfloat16 import widen
+from pipeline.base.channels import usual_spread
 from pipeline.base.errors import NumericsError
 from pipeline.base.finite import first_non_finite
+from pipeline.policy.attention import right_aligned
 from pipeline.policy.normalization import Block, ChannelStatistics, Normalization, fit_channels
+from pipeline.policy.state_channels import channel_kinds, expand, expanded_names
 from pipeline.store import FeatureStore, place
-from pipeline.train.batches import Ticks
+from pipeline.train.batches import Ticks, Windows
 
 CHUNK_BYTES = 64 * 2**20
+_STATE_TICKS = 16_384
+"""Training ticks at most whose windows of states give the statistics of these."""
+_AT_ONCE = 1024
 Rows = range | NDArray[np.int64]
 """Rows of one of the store's arrays."""
 
@@ -26,23 +34,27 @@ _ARRAYS = {"tick": "tick/action", "vl": "vl/features"} | {
 
 
 def fit_normalization(
-    store: FeatureStore, ticks: Ticks, threads: int | None = None
+    store: FeatureStore,
+    ticks: Ticks,
+    windows: Windows,
+    threads: int | None = None,
 ) -> Normalization:
     """Statistics per channel over the training `ticks` and what was known at them.
 
     Features over the VL rows that these ticks use, each once, and over all its variants alike, so
-    (slot, dim) of one variant; sensor and state over the readings from each episode's start to the
-    last of its ticks; a stream that none of them has, has none. Reads the store once, in chunks of
-    about 64 MB, a few at a time on `threads` threads (as many as torch has, where None), with a bar
-    on a terminal; the same bits for any number of them. Raises `NumericsError` on NaN or inf,
-    naming episode, tick or reading, time and channel.
+    (slot, dim) of one variant; sensor over the readings from each episode's start to the last of
+    its ticks; states as a policy takes them (`state_channels.expand`), over the windows of at most
+    16,384 evenly spaced ticks; a stream that none of them has, has none. No spread of an input is
+    far below what is usual for inputs alike (`ChannelStatistics.floored`). Reads the store once, in
+    chunks of about 64 MB, a few at a time on `threads` threads (as many as torch has, where None),
+    with a bar on a terminal; the same bits for any number of them. Raises `NumericsError` on NaN or
+    inf, naming episode, tick or reading, time and channel.
     """
     threads = torch.get_num_threads() if threads is None else threads
     parts: dict[str, list[Rows]] = {
         "tick": _cut(store, "tick", ticks),
         "vl": _cut(store, "vl", np.unique(store.array("tick/vl_row")[ticks])),
         "sensor": _readings(store, ticks, "sensor"),
-        "state": _readings(store, ticks, "state"),
     }
     total = sum(len(rows) for several in parts.values() for rows in several)
     with tqdm(total=total, desc="normalisation", unit="row", leave=False, disable=None) as bar:
@@ -51,7 +63,50 @@ def fit_normalization(
             for stream, several in parts.items()
             if several or stream == "tick"
         }
-    return Normalization(fitted.pop("tick"), fitted.pop("vl", None), **fitted)
+    features, sensor = fitted.get("vl"), fitted.get("sensor")
+    if features is not None:
+        usual = np.percentile(features.std, 75, axis=-1, keepdims=True)
+        features = features.floored(usual)
+    if sensor is not None:
+        sensor = _floored(sensor, **_channels(store, "sensor"))
+    return Normalization(fitted["tick"], features, sensor, _fit_state(store, ticks, windows))
+
+
+def _fit_state(store: FeatureStore, ticks: Ticks, windows: Windows) -> ChannelStatistics | None:
+    readings = _readings(store, ticks, "state")
+    if not readings:
+        return None
+    channels = _channels(store, "state")
+    kinds = channel_kinds(**channels)
+    evenly = np.linspace(0, len(ticks) - 1, min(len(ticks), _STATE_TICKS)).round().astype(np.int64)
+    seen = replace(windows, horizon=1, sensor_window=1)
+
+    def read(some: Ticks) -> Block:
+        batch = store.gather(some, **asdict(seen))
+        real = right_aligned(batch.state_valid, batch.state.shape[1])
+        return expand(batch.state, kinds).flatten(0, 1).numpy(), real.flatten().numpy()
+
+    parts = np.array_split(ticks[evenly], -(-len(evenly) // _AT_ONCE))
+    what = "training readings of state"
+    try:
+        fitted = fit_channels([partial(read, part) for part in parts], what)
+    except NumericsError:
+        for rows in readings:
+            _check_finite(store, "state", rows, what)
+        raise
+    names = expanded_names(channels["names"], kinds)
+    return _floored(fitted, names, [""] * len(names))
+
+
+def _channels(store: FeatureStore, stream: str) -> dict[str, list[str]]:
+    return {name: list(store.streams[stream][name]) for name in ("names", "units")}
+
+
+def _floored(
+    fitted: ChannelStatistics, names: Sequence[str], units: Sequence[str]
+) -> ChannelStatistics:
+    varying = np.where(fitted.scale == fitted.std, fitted.std, 0.0)
+    return fitted.floored(usual_spread(varying, names, units))
 
 
 def _fit(

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.observation import Observation
+from pipeline.policy.ages import even_ages
 from pipeline.policy.normalization import ChannelStatistics, Normalization
 from pipeline.policy.observation import PolicyShape
 from pipeline.policy.policy import Policy
@@ -33,7 +34,7 @@ def _seeded() -> None:
 def shape() -> PolicyShape:
     """Of a needle insertion with a narrow sensor."""
     groups = ("translation",) * 3 + ("rotation",) * 3 + ("gripper",)
-    return PolicyShape(5, 16, 9, 12, 7, groups)
+    return PolicyShape(5, 16, 9, 12, 7, groups, views=2)
 
 
 @pytest.fixture
@@ -45,10 +46,13 @@ def observe(shape: PolicyShape) -> Callable[..., Seen]:
             features=torch.randn(batch, shape.slots, shape.feature_dim),
             slot_valid=torch.ones(batch, shape.slots, dtype=torch.bool),
             feature_age=torch.rand(batch),
+            view_age=torch.rand(batch, shape.views),
             sensor=torch.randn(batch, sensor_window, shape.sensor_channels),
             sensor_valid=torch.full((batch,), sensor_window),
+            sensor_age=even_ages(sensor_window, 0.1, torch.empty(0)).repeat(batch, 1),
             state=torch.randn(batch, state_window, shape.state_dim),
             state_valid=torch.full((batch,), state_window),
+            state_age=even_ages(state_window, 1.0, torch.empty(0)).repeat(batch, 1),
             action=torch.randn(batch, 8, shape.action_dim),
             action_valid=torch.ones(batch, 8, dtype=torch.bool),
         )

@@ -19,10 +19,12 @@ from pipeline.policy.checkpoint import (
 )
 from pipeline.policy.policy import Policy
 from pipeline.store import FeatureStore
+from pipeline.train.batches import Windows
 from pipeline.train.run import policy_shape
 from pipeline.train.split import source_of
 from pipeline.train.statistics import fit_normalization
 
+WINDOWS = Windows(8, 65, 100, 0.1, 1.0)
 PARAMS = TrainHeadParams.model_validate(
     {
         "sensor_encoder": {"channels": [8], "layers": 0, "heads": 1, "output_dim": 8},
@@ -46,7 +48,7 @@ def store(
 
 @pytest.fixture
 def checkpoint(store: FeatureStore) -> PolicyCheckpoint:
-    normalization = fit_normalization(store, torch.arange(60).numpy())
+    normalization = fit_normalization(store, torch.arange(60).numpy(), WINDOWS)
     shape = policy_shape(store, normalization)
     torch.manual_seed(3)
     return PolicyCheckpoint(

@@ -1,7 +1,8 @@
 import pytest
 import torch
 
-from pipeline.policy.feature_encoder import FeatureEncoder, fourier
+from pipeline.policy.ages import fourier
+from pipeline.policy.feature_encoder import FeatureEncoder
 
 
 @pytest.fixture

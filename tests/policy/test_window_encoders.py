@@ -7,13 +7,13 @@ import torch
 from torch import Tensor, nn
 
 from pipeline.base.errors import ConfigError
+from pipeline.policy.ages import at_even_ages, even_ages
 from pipeline.policy.attention import right_aligned
 from pipeline.policy.window_encoders import (
     ForceAwareSensorEncoder,
     HalvingBlock,
     RobotStateEncoder,
     SensorEncoder,
-    resampled,
 )
 
 CHANNELS, WINDOW, OUTPUT = 9, 13, 24
@@ -152,24 +152,58 @@ def test_sensor_windows_of_another_length_are_resampled_without_leaks(
     assert torch.equal(encoder(values, valid), encoder(changed, valid))
 
 
-def test_resampling_keeps_a_constant_constant_beside_padding() -> None:
-    values = torch.full((1, 26, 2), 5.0)
-    values[0, :11] = 0.0
-    valid = torch.arange(26).unsqueeze(0) >= 11
-    for window in (13, 40):
-        resized, known = resampled(values, valid, window)
-        torch.testing.assert_close(resized[known], torch.full_like(resized[known], 5.0))
-        assert known[0, -1]
-        assert not known[0, 0]
+def recorded(rate_hz: float, span_s: float, begun_s: float = 0.0) -> tuple[Tensor, Tensor]:
+    """Windows (1, reading, channel) of slow waves at a rate, and the ages of their readings."""
+    count = int(span_s * rate_hz + 1e-6)
+    age = (begun_s + torch.arange(count - 1, -1, -1) / rate_hz)[None]
+    phase = torch.linspace(0, 3, CHANNELS)
+    return torch.sin(2 * torch.pi * 0.4 * (age[..., None] - phase)), age
 
 
-def test_a_ten_times_longer_window_encodes_what_its_averages_encode(
-    sensor_encoder: nn.Module,
-) -> None:
-    encoder = sensor_encoder
-    values = torch.randn(2, 10 * WINDOW, CHANNELS)
-    averaged = values.unflatten(1, (WINDOW, 10)).mean(dim=2)
-    torch.testing.assert_close(encoder(values), encoder(averaged), atol=1e-5, rtol=1e-4)
+class TestAges:
+    def test_a_signal_recorded_at_two_rates_gives_the_same_context(self) -> None:
+        """But for a twentieth: what interpolation misses of a wave of 2.5 s read at 10 Hz."""
+        for kind in (SensorEncoder, ForceAwareSensorEncoder, RobotStateEncoder):
+            encoder = kind(CHANNELS, 100, output_dim=OUTPUT, span_s=1.0).eval()
+            contexts = []
+            for rate_hz in (10, 100, 650):
+                values, age = recorded(rate_hz, 1.0)
+                contexts.append(encoder(values, torch.tensor([values.shape[1]]), age))
+            still = encoder(torch.zeros_like(values), torch.tensor([values.shape[1]]), age)
+            size = (contexts[1] - still).norm()
+            for context in contexts:
+                assert (context - contexts[1]).norm() < 0.05 * size
+
+    def test_by_their_order_alone_they_differ(self) -> None:
+        encoder = SensorEncoder(CHANNELS, 100, (16, 32), 1, 2, OUTPUT, span_s=None)
+        (slow, _), (fast, _) = recorded(10, 1.0), recorded(100, 1.0)
+        contexts = [encoder(values[:, -10:]) for values in (slow, fast)]
+        assert (contexts[0] - contexts[1]).norm() > 0.1 * contexts[1].norm()
+
+    def test_a_stalled_stream_differs_from_a_fresh_one(self, encoder: nn.Module) -> None:
+        values = windows(1)[:, -3:]
+        age = torch.tensor([[0.002, 0.001, 0.0]])
+        fresh = encoder(values, torch.tensor([3]), age)
+        stalled = encoder(values, torch.tensor([3]), age + 0.05)
+        assert (fresh - stalled).abs().max() > 1e-3
+
+    def test_a_gap_is_no_reading(self) -> None:
+        valid, age = torch.ones(1, 20, dtype=torch.bool), torch.arange(19.0, -1, -1)[None] / 20
+        valid[0, 8:14] = False
+        _, stands = at_even_ages(torch.zeros(1, 20, 1), valid, age, 20, 1.0)
+        assert stands[0].tolist() == [True] * 9 + [False] * 4 + [True] * 7
+
+    @pytest.mark.parametrize("readings", [7, 26, 300])
+    @pytest.mark.parametrize("real", [1, 5, 7])
+    def test_a_constant_stays_constant_beside_padding(self, readings: int, real: int) -> None:
+        valid = torch.arange(readings)[None] >= readings - real
+        values = torch.where(valid[..., None], 5.0, float("nan")).expand(1, readings, 2)
+        age = even_ages(readings, 1.0, values)[None]
+        placed, stands = at_even_ages(values, valid, age, 13, 1.0)
+        torch.testing.assert_close(placed[stands], torch.full_like(placed[stands], 5.0))
+        assert stands[0, -1]
+        assert not placed[~stands].any()
+        assert bool(stands[0, 0]) == (real == readings)
 
 
 def test_state_patches_know_which_readings_are_real() -> None:
@@ -189,8 +223,8 @@ def test_default_sizes_are_the_seeds() -> None:
         (1024, 2 * 1024),
         (1024, 2 * 1024),
     ]
-    assert sum(p.numel() for p in sensor.parameters()) == 34_388_992
-    assert sum(p.numel() for p in state.parameters()) == 1_748_224
+    assert sum(p.numel() for p in sensor.parameters()) == 35457024
+    assert sum(p.numel() for p in state.parameters()) == 2020096
 
 
 @pytest.mark.parametrize("configured", [65, 650])
@@ -260,4 +294,4 @@ class TestForce:
         assert encoder.force.blocks[0].down.weight.shape == (128, 2)
         assert encoder.force.missing.shape == (256,)
         assert encoder.scan.missing.shape == (768,)
-        assert sum(p.numel() for p in encoder.parameters()) == 36_217_856
+        assert sum(p.numel() for p in encoder.parameters()) == 36892672

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from pipeline.store import FeatureStore
-from pipeline.train.batches import Prefetch
+from pipeline.train.batches import Prefetch, Windows
 from pipeline.train.log import speed_file
 from pipeline.train.progress import Progress, describe_data, peak_memory_bytes
 from pipeline.train.run import policy_shape
@@ -23,6 +23,9 @@ from pipeline.train.statistics import fit_normalization
 
 Make = Callable[..., Any]
 CPU = torch.device("cpu")
+
+
+WINDOWS = Windows(8, 65, 100, 0.1, 1.0)
 
 
 class Waiting(Prefetch):
@@ -161,7 +164,7 @@ def warnings(store: FeatureStore, params: Make) -> Callable[..., list[str]]:
 
     def found(train: np.ndarray, absent: dict[str, int] | None = None, **head: Any) -> list[str]:
         held_out = np.setdiff1d(np.arange(store.ticks), train)
-        shape = policy_shape(store, fit_normalization(store, train))
+        shape = policy_shape(store, fit_normalization(store, train, WINDOWS))
         split = Split(train, held_out, (), None)
         lines = describe_data(store, replace(shape, **(absent or {})), params(**head), split)
         return [line for line in lines if line.startswith("warning: ")]

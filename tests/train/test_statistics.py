@@ -9,7 +9,10 @@ import zarr
 
 from pipeline.base.errors import NumericsError
 from pipeline.store import FeatureStore
+from pipeline.train.batches import Windows
 from pipeline.train.statistics import fit_normalization
+
+WINDOWS = Windows(8, 65, 100, 0.1, 1.0)
 
 
 @pytest.mark.parametrize("chunk_bytes", [1, 500, 2**26])
@@ -19,7 +22,7 @@ def test_statistics_are_those_of_the_training_ticks(
     monkeypatch.setattr("pipeline.train.statistics.CHUNK_BYTES", chunk_bytes)
     # All of episode 1, and of episode 4 the first 7 ticks: a tail is held out.
     ticks = np.concatenate([np.arange(30, 60), np.arange(120, 127)])
-    found = fit_normalization(store, ticks)
+    found = fit_normalization(store, ticks, WINDOWS)
 
     action = store.array("tick/action")[ticks]
     rows = [*range(10, 20), 40, 41, 42]
@@ -50,7 +53,7 @@ def test_features_are_counted_over_all_variants(
     zarr.open_group(path, mode="r+").attrs["feature_spec"] = {"digest": "x", "variants": 3}
     store = FeatureStore.open(path)
     store.array("vl/slot_valid")[10:13, [1, 3, 5]] = 0
-    found = fit_normalization(store, np.arange(30, 60)).features
+    found = fit_normalization(store, np.arange(30, 60), WINDOWS).features
     assert found is not None
     assert found.mean.shape == (2, 8)
     assert found.count == 3 * 10
@@ -60,12 +63,12 @@ def test_features_are_counted_over_all_variants(
         assert found.std[slot] == pytest.approx(values.std(0, np.float64), abs=1e-6)
 
     store.array("vl/features")[12, 5, 3] = np.nan
-    fit_normalization(store, np.arange(30, 60))  # there, that slot is not valid
+    fit_normalization(store, np.arange(30, 60), WINDOWS)  # there, that slot is not valid
     store.array("vl/features")[14, 5, 3] = np.nan
     with pytest.raises(
         NumericsError, match=r"episode_001, VL row 4 .*, channel 1, 3 of variant 2, in "
     ):
-        fit_normalization(store, np.arange(30, 60))
+        fit_normalization(store, np.arange(30, 60), WINDOWS)
 
 
 def test_absent_streams_have_none_and_bfloat16_is_read(
@@ -74,7 +77,7 @@ def test_absent_streams_have_none_and_bfloat16_is_read(
     store = FeatureStore.open(
         tiny_store(tmp_path, sensor_channels=0, state_dim=0, dtype="bfloat16")
     )
-    found = fit_normalization(store, np.arange(store.ticks))
+    found = fit_normalization(store, np.arange(store.ticks), WINDOWS)
     assert found.sensor is None
     assert found.state is None
     assert found.features is not None
@@ -98,14 +101,14 @@ def test_a_number_that_is_none_is_named_by_episode_and_time(
     store = FeatureStore.open(tiny_store(tmp_path))
     store.array(array)[row] = np.nan
     with pytest.raises(NumericsError) as caught:
-        fit_normalization(store, np.arange(30, 60))
+        fit_normalization(store, np.arange(30, 60), WINDOWS)
     assert said in str(caught.value)
     assert "found nan" in str(caught.value)
 
 
 def test_no_ticks_are_no_statistics(tiny_store: Callable[..., Path], tmp_path: Path) -> None:
     with pytest.raises(NumericsError, match="no rows"):
-        fit_normalization(FeatureStore.open(tiny_store(tmp_path)), np.arange(0))
+        fit_normalization(FeatureStore.open(tiny_store(tmp_path)), np.arange(0), WINDOWS)
 
 
 @pytest.mark.parametrize("chunk_bytes", [300, 2**26])
@@ -120,9 +123,9 @@ def test_threads_change_no_bit(
     store = FeatureStore.open(tiny_store(tmp_path))
     store.array("vl/slot_valid")[12, 1] = 0
     ticks = np.arange(20, 160)
-    alone = fit_normalization(store, ticks, threads=1).document()
-    assert fit_normalization(store, ticks, threads=3).document() == alone
+    alone = fit_normalization(store, ticks, WINDOWS, threads=1).document()
+    assert fit_normalization(store, ticks, WINDOWS, threads=3).document() == alone
 
     store.array("state/values")[121, 0] = np.inf
     with pytest.raises(NumericsError, match=r"episode_001, state reading 1 \(at 0.025 s\)"):
-        fit_normalization(store, ticks, threads=3)
+        fit_normalization(store, ticks, WINDOWS, threads=3)

@@ -51,10 +51,20 @@ class TrainHeadParams(Section):
     horizon: int = Field(default=8, ge=1)
     """Ticks an action chunk."""
     sensor_window: int = Field(default=65, ge=1)
-    """Readings up to the tick, at the sensor's own rate: 65 are 0.1 s at 650 Hz."""
+    """Most readings of the sensor before the tick, and the steps that the encoder makes of them."""
+    sensor_window_s: float | None = Field(default=0.1, gt=0)
+    """Seconds before the tick that the sensor's window covers, whatever the rate of a recording.
+    null takes readings of any age, and their order for their time."""
     state_window: int = Field(default=100, ge=1)
-    """Readings up to the tick, not ticks: take the seconds that matter times the state's own rate.
-    100 are 1 s at 100 Hz, but 10 s of a data set at 10 Hz."""
+    """As `sensor_window`, of the robot's state."""
+    state_window_s: float | None = Field(default=1.0, gt=0)
+    """As `sensor_window_s`, of the robot's state."""
+    feature_lag: int = Field(default=0, ge=0)
+    """Most VL rows that features come late in training, drawn evenly for each sample: so a policy
+    learns what a slow model does to it."""
+    sensor_lag_s: float = Field(default=0.0, ge=0)
+    """Most seconds that the sensor comes late in training, likewise; its window then reaches back
+    as much further."""
     terminal_stop: bool = False
     """Beyond an episode's end, train to stand still (zero deltas and velocities, the last absolute
     action) instead of leaving those steps of the chunk out of the loss."""
@@ -128,6 +138,11 @@ class TrainHeadParams(Section):
     files in `<logs>.tensorboard`, `wandb` Weights & Biases."""
     wandb_project: str = "vla-feature-cache"
     """Where Weights & Biases puts the run; its own environment variables decide the rest."""
+
+    @property
+    def sensor_reach_s(self) -> float | None:
+        """Seconds before the tick of the oldest reading that the sensor's encoder looks at."""
+        return None if self.sensor_window_s is None else self.sensor_window_s + self.sensor_lag_s
 
     @field_validator("output", "logs")
     @classmethod

@@ -94,7 +94,7 @@ class LiveFeed(Prefetch):
         device: torch.device,
         threads: int,
     ) -> None:
-        self._vl_row, self._rows = store.array("tick/vl_row"), rows
+        self._rows = rows
         self._decoding: deque[tuple[NDArray[np.int64], list[Future[list[PreparedRow]]]]] = deque()
         self._pool = ThreadPoolExecutor(threads, thread_name_prefix="decode")
         announced = (self._announce(indices) for indices in plan)
@@ -116,7 +116,9 @@ class LiveFeed(Prefetch):
 
     def _announce(self, indices: BatchIndices) -> BatchIndices:
         """Begin with the rows of a batch; called in the thread that consumes the plan, in order."""
-        distinct, row_of = np.unique(self._vl_row[indices.ticks], return_inverse=True)
+        episode = self._store.episode_of(indices.ticks)
+        seen = self._store.gatherer.vl_rows(indices.ticks, episode, indices.lags.features)
+        distinct, row_of = np.unique(seen, return_inverse=True)
         parts = by_episode(distinct, self._rows.vl_start)
         decoded = [self._pool.submit(self._rows.prepare, rows) for _, rows in parts]
         self._decoding.append((row_of.astype(np.int64), decoded))

@@ -1,0 +1,71 @@
+"""Readings by their age: waves that tell a network an age, and windows at steps of equal age."""
+
+import math
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+_PERIODS = 8
+_SHORTEST_PERIOD_S, _LONGEST_PERIOD_S = 0.5, 64.0
+_LEAST_WEIGHT = 1e-3
+"""A step on which less of any reading stands has none: differences of float32 ages are rounded."""
+
+
+def fourier(seconds: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch wave"]:
+    """Sines and cosines of a duration at geometric periods from 0.5 s to 64 s."""
+    steps = torch.linspace(0.0, 1.0, _PERIODS, device=seconds.device)
+    period = _SHORTEST_PERIOD_S * (_LONGEST_PERIOD_S / _SHORTEST_PERIOD_S) ** steps
+    angle = 2 * math.pi * seconds.float().unsqueeze(-1) / period
+    return torch.cat([angle.sin(), angle.cos()], dim=-1)
+
+
+class AgeEncoder(nn.Module):
+    """A vector (batch, width) for several ages (batch, age) in s; an unknown age is NaN."""
+
+    def __init__(self, ages: int, width: int) -> None:
+        super().__init__()
+        self.network = nn.Sequential(
+            nn.Linear(ages * (2 * _PERIODS + 1), width), nn.GELU(), nn.Linear(width, width)
+        )
+
+    def forward(self, age_s: Float[Tensor, "batch age"]) -> Float[Tensor, "batch width"]:
+        """Encode; neither output nor gradients depend on what stands for an unknown age."""
+        known = ~age_s.isnan()
+        # Masked before it is encoded: zero times the gradient of a NaN is NaN.
+        waves = fourier(age_s.masked_fill(~known, 0.0)) * known.unsqueeze(-1)
+        return self.network(torch.cat([waves, known.unsqueeze(-1)], dim=-1).flatten(1))
+
+
+def even_ages(readings: int, span_s: float, like: Tensor) -> Float[Tensor, " reading"]:
+    """The ages in s of so many readings that are spread evenly over a span, the newest 0."""
+    steps = torch.arange(readings - 1, -1, -1, device=like.device, dtype=torch.float32)
+    return steps * (span_s / readings)
+
+
+def at_even_ages(
+    values: Float[Tensor, "batch reading channel"],
+    valid: Bool[Tensor, "batch reading"],
+    age_s: Float[Tensor, "batch reading"],
+    steps: int,
+    span_s: float,
+) -> tuple[Float[Tensor, "batch step channel"], Bool[Tensor, "batch step"]]:
+    """The windows at `steps` evenly spread ages of a span, and which stand on a valid reading.
+
+    The weight of a reading falls linearly with its distance in age, to 0 at the mean distance
+    between readings or, where that is shorter, between steps: sparse readings are interpolated,
+    dense ones averaged, so that nothing aliases. Weights are normalised (normalised convolution,
+    Knutsson and Westin 1993), so that padding does not pull on its neighbours. The same signal
+    recorded at two rates gives the same windows but for what linear interpolation misses of it.
+    """
+    ages = age_s.masked_fill(~valid, 0.0)
+    newest = age_s.masked_fill(~valid, torch.inf).amin(dim=1)
+    gaps = (valid.sum(dim=1) - 1).clamp(min=1)
+    between = ((ages.amax(dim=1) - newest) / gaps).clamp(min=span_s / steps)
+    distance = (even_ages(steps, span_s, age_s)[:, None] - ages[:, None, :]).abs()
+    weight = (1 - distance / between[:, None, None]).clamp(min=0) * valid[:, None, :]
+    total = weight.sum(dim=-1, keepdim=True)
+    stands = total > _LEAST_WEIGHT
+    weight = torch.where(stands, weight / total.clamp(min=_LEAST_WEIGHT), 0.0)
+    known = values.masked_fill(~valid.unsqueeze(-1), 0.0)
+    return weight.to(values.dtype) @ known, stands.squeeze(-1)

@@ -1,0 +1,91 @@
+"""Robot states as networks take them: no value jumps where an angle is written a turn further."""
+
+import math
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+Kind = Literal["plain", "deg", "rad", "rotation"]
+"""Of a channel: as it is; an angle; one of three, in degrees, that turn a pose."""
+
+_POSE_ANGLES = ("pose_a", "pose_b", "pose_r")
+_ANGLES: dict[str, Kind] = {"deg": "deg", "rad": "rad"}
+_SIX = tuple(f"rotation_{index}" for index in range(6))
+
+
+def channel_kinds(names: Sequence[str], units: Sequence[str]) -> tuple[Kind, ...]:
+    """The kind of each channel; the arm's pose angles are a rotation where all three are there."""
+    turned = {*_POSE_ANGLES} <= {*names}
+    kinds: list[Kind] = []
+    for name, unit in zip(names, units, strict=True):
+        kind = _ANGLES.get(unit.lower(), "plain")
+        kinds.append("rotation" if turned and name in _POSE_ANGLES and kind == "deg" else kind)
+    return tuple(kinds)
+
+
+def expanded_names(names: Sequence[str], kinds: Sequence[Kind]) -> list[str]:
+    """The channels of `expand`, in its order."""
+    plain = [name for name, kind in zip(names, kinds, strict=True) if kind == "plain"]
+    angles = [name for name, kind in zip(names, kinds, strict=True) if kind in ("deg", "rad")]
+    waves = [f"{name}_{wave}" for wave in ("sin", "cos") for name in angles]
+    return [*plain, *waves, *(_SIX if "rotation" in kinds else ())]
+
+
+def expand(
+    values: Float[Tensor, "batch reading channel"], kinds: Sequence[Kind]
+) -> Float[Tensor, "batch reading expanded"]:
+    """Windows of states (float32) whose angles are sines and cosines, and their rotations 6-D.
+
+    A pose's rotation R = Rx(a)·Ry(b)·Rz(r) is taken relative to that of the window's last reading,
+    and written as the first two columns of the matrix (Zhou et al. 2019, "On the Continuity of
+    Rotation Representations", section 4.2). So an angle written a turn further changes nothing.
+    """
+    if not {*kinds} - {"plain"}:
+        return values
+    values = values.float()
+    parts = [_of_kind(values, kinds, "plain")]
+    degrees = [math.pi / 180 if kind == "deg" else 1.0 for kind in kinds if kind in ("deg", "rad")]
+    angles = _of_kind(values, kinds, "deg", "rad") * values.new_tensor(degrees)
+    parts += [angles.sin(), angles.cos()]
+    if "rotation" in kinds:
+        matrices = _rotation(_of_kind(values, kinds, "rotation").deg2rad())
+        relative = matrices[:, -1:].mT @ matrices
+        parts.append(relative[..., :2].mT.flatten(2))
+    return torch.cat(parts, dim=-1)
+
+
+def typical_state(mean: Sequence[float], kinds: Sequence[Kind]) -> list[float]:
+    """A state (channel,) whose `expand` is the mean (expanded,), as near as there is such a state.
+
+    Of a rotation any is: relative to itself it is none.
+    """
+    if not {*kinds} - {"plain"}:
+        return list(mean)
+    plain, angles = kinds.count("plain"), kinds.count("deg") + kinds.count("rad")
+    waves = mean[plain : plain + 2 * angles]
+    known = iter(mean[:plain])
+    turned = iter(zip(waves[:angles], waves[angles:], strict=True))
+    state: list[float] = []
+    for kind in kinds:
+        angle = math.atan2(*next(turned)) if kind in ("deg", "rad") else 0.0
+        written = math.degrees(angle) if kind == "deg" else angle
+        state.append(next(known) if kind == "plain" else written)
+    return state
+
+
+def _of_kind(values: Tensor, kinds: Sequence[Kind], *wanted: Kind) -> Tensor:
+    return values[..., [place for place, kind in enumerate(kinds) if kind in wanted]]
+
+
+def _rotation(angles: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rx(a)·Ry(b)·Rz(r) of (a, b, r) in radians."""
+    (sa, sb, sr), (ca, cb, cr) = angles.sin().unbind(-1), angles.cos().unbind(-1)
+    rows = [
+        [cb * cr, -cb * sr, sb],
+        [ca * sr + sa * sb * cr, ca * cr - sa * sb * sr, -sa * cb],
+        [sa * sr - ca * sb * cr, sa * cr + ca * sb * sr, ca * cb],
+    ]
+    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
