@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from functools import partial
+from itertools import chain
 from typing import Any, NoReturn
 
 import numpy as np
@@ -81,15 +82,18 @@ def _fit_state(store: FeatureStore, ticks: Ticks, windows: Windows) -> ChannelSt
     evenly = np.linspace(0, len(ticks) - 1, min(len(ticks), _STATE_TICKS)).round().astype(np.int64)
     seen = replace(windows, horizon=1, sensor_window=1)
 
-    def read(some: Ticks) -> Block:
+    def read(some: Ticks) -> NDArray[np.float32]:
         batch = store.gather(some, **asdict(seen))
         real = right_aligned(batch.state_valid, batch.state.shape[1])
-        return expand(batch.state, kinds).flatten(0, 1).numpy(), real.flatten().numpy()
+        return expand(batch.state, kinds)[real].numpy()
 
     parts = np.array_split(ticks[evenly], -(-len(evenly) // _AT_ONCE))
     what = "training readings of state"
+    blocks = (block for part in parts if len(block := read(part)))
+    if (first := next(blocks, None)) is None:
+        return None  # all readings are older than the window
     try:
-        fitted = fit_channels([partial(read, part) for part in parts], what)
+        fitted = fit_channels(chain([first], blocks), what)
     except NumericsError:
         for rows in readings:
             _check_finite(store, "state", rows, what)

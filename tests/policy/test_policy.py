@@ -258,9 +258,9 @@ def test_a_constructed_batch_is_learned_to_near_zero(
     policy, seen = build_policy(), observe(batch=8)
     action = policy.action_normalizer.invert(torch.randn(8, 8, 7))
     optimizer = torch.optim.AdamW(policy.parameters(), lr=3e-3, weight_decay=0.0)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 200)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 300)
     first = None
-    for _ in range(200):
+    for _ in range(300):
         loss, _ = policy.loss(seen, action, seen.action_valid)
         first = first or loss.item()
         optimizer.zero_grad()

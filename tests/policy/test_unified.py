@@ -238,7 +238,8 @@ def test_validity_is_taken_as_a_store_has_it(
         ({"sensor": (4, 0, 9)}, r"sensor: .*window any, .* found \(4, 0, 9\)"),
         ({"sensor": ()}, r"sensor: .* found \(\)"),
         ({"sensor_valid": (4, 13)}, r"sensor_valid: .*\(batch 4\), found \(4, 13\)"),
-        ({"state": (4, 20, 12)}, r"state: .*window 25, channel 12\), found \(4, 20, 12\)"),
+        ({"state": (4, 20, 11)}, r"state: .*window any, channel 12\), found \(4, 20, 11\)"),
+        ({"state_age": (4, 20)}, r"state_age: .*window 25\), found \(4, 20\)"),
         ({"state": (5, 25, 12)}, r"state: .*batch 4, .* found \(5, .*that of sensor"),
         ({"state_valid": (2,)}, r"state_valid: .*\(batch 4\), found \(2,\)"),
         ({"actions": (4, 9, 7)}, r"actions: .*horizon 8, channel 7\), found \(4, 9, 7\)"),
@@ -528,7 +529,7 @@ def test_the_arguments_it_has_always_had() -> None:
     assert (params.diffusion.timesteps, params.diffusion.schedule) == (100, "cosine")
     assert params.diffusion.prediction == "epsilon"
     assert shape == PolicyShape(
-        1, 2048, 1026, 12, 7, ("translation",) * 3 + ("rotation",) * 3 + ("gripper",)
+        1, 2048, 1026, 12, 7, ("translation",) * 3 + ("rotation",) * 3 + ("gripper",), views=5
     )
     tuning, vlm = model.tuning, model.vlm_params
     assert (tuning.method, tuning.lora_r, tuning.lora_alpha) == ("none", 16, 32)

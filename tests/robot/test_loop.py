@@ -18,7 +18,9 @@ def make_loop(latency_s: float = 0.0, execute: int = 1, uses_features: bool = Tr
 
 
 def seen(time_s: float) -> SeenFeatures:
-    return SeenFeatures(np.full((1, 3), time_s, np.float32), np.ones(1, np.bool_), time_s)
+    return SeenFeatures(
+        np.full((1, 3), time_s, np.float32), np.ones(1, np.bool_), np.array([time_s])
+    )
 
 
 def chunk_of(tick: int) -> np.ndarray:

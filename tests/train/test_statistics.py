@@ -1,6 +1,7 @@
 """The normalisation sees what training may see, once, and nothing else."""
 
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 import zarr
 
 from pipeline.base.errors import NumericsError
+from pipeline.policy.attention import right_aligned
 from pipeline.store import FeatureStore
 from pipeline.train.batches import Windows
 from pipeline.train.statistics import fit_normalization
@@ -28,7 +30,9 @@ def test_statistics_are_those_of_the_training_ticks(
     rows = [*range(10, 20), 40, 41, 42]
     features = store.array("vl/features")[rows]
     sensor = store.array("sensor/values")[[*range(240, 480), *range(960, 960 + 7 * 8)]]
-    state = store.array("state/values")[[*range(120, 240), *range(480, 480 + 7 * 4)]]
+    windows = store.gather(ticks, **asdict(WINDOWS))
+    state = windows.state[right_aligned(windows.state_valid, 100)].numpy()
+    assert len(state) > 1000
     for name, values in (
         ("action", action),
         ("features", features),
@@ -129,3 +133,30 @@ def test_threads_change_no_bit(
     store.array("state/values")[121, 0] = np.inf
     with pytest.raises(NumericsError, match=r"episode_001, state reading 1 \(at 0.025 s\)"):
         fit_normalization(store, ticks, WINDOWS, threads=3)
+
+
+def test_what_rested_in_training_is_no_unit_of_what_moves_later(
+    tiny_store: Callable[..., Path], tmp_path: Path
+) -> None:
+    path = tiny_store(tmp_path)
+    store = FeatureStore.open(path)
+    readings = store.array("state/values")
+    readings[:, 1] = readings[:, 1] * 1e-4  # its likes move as before
+    fitted = fit_normalization(store, np.arange(30, 60), WINDOWS).state
+    assert fitted is not None
+    assert fitted.std[1] == pytest.approx(0.05 * np.sort(fitted.std)[-2:].min(), rel=0.5)
+
+
+def test_angles_are_fitted_as_a_policy_takes_them(
+    tiny_store: Callable[..., Path], tmp_path: Path
+) -> None:
+    path = tiny_store(tmp_path)
+    streams = dict(zarr.open_group(path, mode="r").attrs["streams"])
+    streams["state"] |= {"units": ["deg"] * len(streams["state"]["names"])}
+    zarr.open_group(path, mode="r+").attrs["streams"] = streams
+    store = FeatureStore.open(path)
+    store.array("state/values")[:, 0] += 360.0 * np.arange(len(store.array("state/values")))
+    fitted = fit_normalization(store, np.arange(30, 60), WINDOWS).state
+    assert fitted is not None
+    assert fitted.mean.shape == (2 * store.state_dim,)
+    assert (np.abs(fitted.mean) <= 1).all()
