@@ -134,6 +134,8 @@ def tiny_head() -> Callable[..., dict[str, Any]]:
             "expert": {"dim": 8, "layers": 1, "heads": 1},
             "sensor_window": 6,
             "state_window": 5,
+            "sensor_window_s": 0.075,
+            "state_window_s": 0.125,
             "batch_size": 8,
             "max_steps": 3,
             "device": "cpu",

@@ -50,19 +50,20 @@ def at_even_ages(
     steps: int,
     span_s: float,
 ) -> tuple[Float[Tensor, "batch step channel"], Bool[Tensor, "batch step"]]:
-    """The windows at `steps` evenly spread ages of a span, and which stand on a valid reading.
+    """The windows at `steps` evenly spread times of a span, and which stand on a valid reading.
 
-    The weight of a reading falls linearly with its distance in age, to 0 at the mean distance
+    The last step is at the newest valid reading, whatever its age, so that readings as dense as
+    steps stay as they are. The weight of a reading falls linearly with its distance in age, to 0 at the mean distance
     between readings or, where that is shorter, between steps: sparse readings are interpolated,
     dense ones averaged, so that nothing aliases. Weights are normalised (normalised convolution,
     Knutsson and Westin 1993), so that padding does not pull on its neighbours. The same signal
     recorded at two rates gives the same windows but for what linear interpolation misses of it.
     """
-    ages = age_s.masked_fill(~valid, 0.0)
-    newest = age_s.masked_fill(~valid, torch.inf).amin(dim=1)
+    newest = age_s.masked_fill(~valid, torch.inf).amin(dim=1, keepdim=True)
+    since = (age_s - newest).masked_fill(~valid, 0.0)
     gaps = (valid.sum(dim=1) - 1).clamp(min=1)
-    between = ((ages.amax(dim=1) - newest) / gaps).clamp(min=span_s / steps)
-    distance = (even_ages(steps, span_s, age_s)[:, None] - ages[:, None, :]).abs()
+    between = (since.amax(dim=1) / gaps).clamp(min=span_s / steps)
+    distance = (even_ages(steps, span_s, age_s)[:, None] - since[:, None, :]).abs()
     weight = (1 - distance / between[:, None, None]).clamp(min=0) * valid[:, None, :]
     total = weight.sum(dim=-1, keepdim=True)
     stands = total > _LEAST_WEIGHT

@@ -153,7 +153,7 @@ def build_observation(
         )
         for name, a in axes.items()
     }
-    spans = {"sensor": params.sensor_reach_s, "state": params.state_window_s}
+    spans = {"sensor": params.sensor_window_s, "state": params.state_window_s}
     for stream, length in lengths.items():
         fields[AGES[stream]] += even_ages(length, spans[stream] or 1.0, fields[stream])
     if "feature_age" in given:

@@ -275,7 +275,7 @@ def build_encoders(
         encoders["sensor"] = SENSOR_ENCODERS[sensor.kind](
             shape.sensor_channels,
             params.sensor_window,
-            span_s=params.sensor_reach_s,
+            span_s=params.sensor_window_s,
             **sensor.model_dump(exclude={"kind"}),
         )
         tokens["sensor"] = (1, sensor.output_dim)

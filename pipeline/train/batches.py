@@ -31,7 +31,7 @@ _DEVICE_SHARE = 0.6
 """Of the device's free memory, what a store may fill: the rest is for the model and its step."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Lags:
     """How late each stream is: `features` in whole VL rows, the others in seconds.
 

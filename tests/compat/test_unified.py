@@ -416,7 +416,9 @@ class TestModels:
     ) -> None:
         for data in (live, cached):
             batch = data.__getitems__([0, 50, 120])
-            shape = PolicyShape(*cached.store.feature_shape, 1026, 12, 7, ("other",) * 7)
+            views = len(cached.store.streams["views"])
+            sizes = (*cached.store.feature_shape, 1026, 12, 7)
+            shape = PolicyShape(*sizes, ("other",) * 7, views=views)
             if data is live:
                 shape = replace(shape, slots=0, feature_dim=0)
             loss, _ = Policy(SMALL, shape, no_normalization(shape)).loss(

@@ -50,7 +50,9 @@ class Glance:
         return features, torch.ones(len(frames), SLOTS, dtype=torch.bool)
 
 
-def made(model_type: str = "regression", **changed: Any) -> tuple[PolicyCheckpoint, Policy, Glance]:
+def made(
+    model_type: str = "regression", views: int = 3, **changed: Any
+) -> tuple[PolicyCheckpoint, Policy, Glance]:
     """A policy of few random weights, its checkpoint, and what stands for its model."""
     params = TrainHeadParams.model_validate(
         {
@@ -65,7 +67,13 @@ def made(model_type: str = "regression", **changed: Any) -> tuple[PolicyCheckpoi
         | changed
     )
     shape = PolicyShape(
-        SLOTS, DIM, 1026, 12, 7, ("translation",) * 3 + ("rotation",) * 3 + ("gripper",)
+        SLOTS,
+        DIM,
+        1026,
+        12,
+        7,
+        ("translation",) * 3 + ("rotation",) * 3 + ("gripper",),
+        views=views,
     )
     normal = no_normalization(shape)
     # So that a random policy moves by tenths of a millimetre.
@@ -172,7 +180,7 @@ def test_robots_share_a_pass_of_the_model_and_are_told_the_task() -> None:
 
 
 def test_the_model_sees_only_the_views_that_the_policy_was_trained_on() -> None:
-    checkpoint, policy, glance = made()
+    checkpoint, policy, glance = made(views=2)
     streams = {"action": ACTION, "views": ["View2", "View5"]}
     fewer = replace(checkpoint, source=SOURCE | {"streams": streams})
     rolled((fewer, policy, glance), episodes=1, ablations=False)

@@ -24,6 +24,8 @@ SMALL: dict[str, Any] = {
     "horizon": 3,
     "sensor_window": 6,
     "state_window": 5,
+    "sensor_window_s": 0.075,
+    "state_window_s": 0.125,
     "batch_size": 8,
     "max_steps": 20,
     "warmup_steps": 4,

@@ -51,7 +51,7 @@ def test_all_that_learns_does_at_its_own_rate_and_the_loss_falls(
     still = {"dim": 16, "layers": 1, "heads": 2, "dropout": 0.0}
     given = params(
         train_head={"expert": still, "lr_schedule": "constant"},
-        finetune={"batch_size": 12, "max_steps": 16, "eval_every": 16, "checkpoint_every": 16},
+        finetune={"batch_size": 12, "max_steps": 24, "eval_every": 24, "checkpoint_every": 24},
     )
     made = trainer(given)
     names = {id(p): n for n, p in made.module.named_parameters()}

@@ -53,7 +53,9 @@ def test_batches_are_the_stores_and_rows_those_of_their_ticks(
             expected = store.gather(draw.ticks, 2, 1, 3)
             for field in fields(Batch):
                 stream = getattr(expected, field.name)
-                torch.testing.assert_close(getattr(batch, field.name), stream, rtol=0, atol=0)
+                torch.testing.assert_close(
+                    getattr(batch, field.name), stream, rtol=0, atol=0, equal_nan=True
+                )
             vl_row = store.array("tick/vl_row")[draw.ticks]
             assert len(batch.rows) == len(np.unique(vl_row)), "each distinct row once"
             same = batch.row_of[:, None] == batch.row_of
