@@ -53,11 +53,11 @@ def at_even_ages(
     """The windows at `steps` evenly spread times of a span, and which stand on a valid reading.
 
     The last step is at the newest valid reading, whatever its age, so that readings as dense as
-    steps stay as they are. The weight of a reading falls linearly with its distance in age, to 0 at the mean distance
-    between readings or, where that is shorter, between steps: sparse readings are interpolated,
-    dense ones averaged, so that nothing aliases. Weights are normalised (normalised convolution,
-    Knutsson and Westin 1993), so that padding does not pull on its neighbours. The same signal
-    recorded at two rates gives the same windows but for what linear interpolation misses of it.
+    steps stay as they are. The weight of a reading falls linearly with its distance in age, to 0 at
+    the mean distance between readings or, where that is shorter, between steps: sparse readings are
+    interpolated, dense ones averaged, so that nothing aliases. Weights are normalised (normalised
+    convolution, Knutsson and Westin 1993), so that padding does not pull on its neighbours. The
+    same signal recorded at two rates gives the same windows but for what interpolation misses.
     """
     newest = age_s.masked_fill(~valid, torch.inf).amin(dim=1, keepdim=True)
     since = (age_s - newest).masked_fill(~valid, 0.0)
