@@ -47,7 +47,7 @@ def main(params: Params) -> None:
                 return
             if head.check_store:
                 world.shared(lambda: check_trailers(store.path))
-            split = split_by_episode(store, head.val_fraction, head.horizon)
+            split = split_by_episode(store, head.split, head.horizon)
             trainer = Trainer(store, head, split, opened, source)
             world.say(*trainer.summary(), *source.summary())
             trainer.fit()

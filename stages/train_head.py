@@ -57,7 +57,7 @@ def _train(params: Params) -> None:
                 return
             if head.check_store:
                 world.shared(lambda: check_trailers(store.path))
-            split = split_by_episode(store, head.val_fraction, head.horizon)
+            split = split_by_episode(store, head.split, head.horizon)
             trainer = Trainer(store, head, split, opened)
             world.say(*trainer.summary())
             trainer.fit()

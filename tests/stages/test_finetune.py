@@ -53,7 +53,7 @@ def extracted(tmp_path_factory: pytest.TempPathFactory, demo_checkpoint: Path) -
         "train_head": {
             "robot_state_enabled": False,
             "expert": {"dim": 8, "layers": 1, "heads": 1},
-            "val_fraction": 0.3,
+            "split": {"val": 0.3, "test": 0.3},
             "max_steps": 3,
             "device": "cpu",
             "output": str(root / "head"),

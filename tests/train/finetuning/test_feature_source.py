@@ -22,7 +22,7 @@ from pipeline.train.finetuning import LiveFeatures, head_params, out_of_memory_n
 from pipeline.train.loop import Trainer
 from pipeline.train.run import open_run
 from pipeline.train.scores import evaluate_policy
-from pipeline.train.split import check_store, find_held_out, split_by_episode
+from pipeline.train.split import check_store, find_ticks, split_by_episode
 
 CPU = torch.device("cpu")
 
@@ -33,7 +33,7 @@ def trainer(params: Params) -> Trainer:
     head = head_params(params)
     front = LiveFeatures(store, params, CPU)
     run = open_run(head, store, front.identity)
-    return Trainer(store, head, split_by_episode(store, head.val_fraction, 2), run, front)
+    return Trainer(store, head, split_by_episode(store, head.split, 2), run, front)
 
 
 def learned(output: Path, which: str = "last") -> dict[str, torch.Tensor]:
@@ -107,7 +107,7 @@ def test_what_is_kept_is_the_averaged_model_that_was_judged(
     check_store(best, store)
     with pytest.raises(CheckpointMismatch, match=r"feature_spec\.adapter"):
         check_store(best, base)
-    ticks, _ = find_held_out(store, best)
+    ticks, _ = find_ticks(store, best, "val")
     comparison, _ = evaluate_policy(
         best.policy(), store, ticks, Windows.of(best.params), 64, best.normalization
     )
