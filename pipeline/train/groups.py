@@ -85,7 +85,7 @@ def _equal_actions(
         tolerance = _TOLERANCE * np.maximum(ranges, _RESTING * widest)
         # Cheap to compare, and equal where the actions are.
         outline = np.stack([[own[0], own.mean(axis=0, dtype=float), own[-1]] for own in actions])
-        moving = np.flatnonzero(widest[:, 0] > 0)
+        moving = np.flatnonzero((widest[:, 0] > 0) & (widest[:, 0] < np.inf))
         for at, one in enumerate(moving):
             others = moving[at + 1 :]
             allowed = np.maximum(tolerance[others], tolerance[one])
