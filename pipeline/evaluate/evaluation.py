@@ -16,7 +16,7 @@ from pipeline.store import FeatureStore
 from pipeline.train.batches import Windows
 from pipeline.train.predictions import Predictions
 from pipeline.train.scores import Comparison, evaluate_policy
-from pipeline.train.split import find_held_out, source_of
+from pipeline.train.split import find_ticks, source_of
 
 JUDGED = "judged.json"
 """Its name in the folder of an evaluation, beside metrics.json."""
@@ -49,20 +49,20 @@ def evaluate_checkpoint(
     recordings: Path,
     say: Callable[[str], None],
 ) -> Evaluation:
-    """The policy of the checkpoint in `folder`, on its held-out ticks of a store it fits.
+    """The policy of the checkpoint in `folder`, on its test ticks of a store it fits.
 
-    `say` is told first what is evaluated on what. Raises `CheckpointMismatch` as `find_held_out`
+    `say` is told first what is evaluated on what. Raises `CheckpointMismatch` as `find_ticks`
     does, and `NumericsError` as `predict`.
     """
-    names = checkpoint.held_out_ticks.keys()
-    ticks, checkpoint = find_held_out(store, checkpoint)
-    if renamed := names - checkpoint.held_out_ticks.keys():
+    names = checkpoint.split["test"].keys()
+    ticks, checkpoint = find_ticks(store, checkpoint, "test")
+    if renamed := names - checkpoint.split["test"].keys():
         say(f"held-out episodes renamed since the training: {len(renamed)}, told by their content")
     policy = checkpoint.policy(device)
     judged = judged_document(checkpoint, policy, store, wanted.samples, wanted.batch_size)
     say(
         f"{folder} (step {checkpoint.step}) on {len(ticks)} held-out ticks of "
-        f"{len(checkpoint.held_out_ticks)} episode(s) in {store.path}, device {device}, "
+        f"{len(checkpoint.split['test'])} episode(s) in {store.path}, device {device}, "
         f"{judged['policy']['samples']} chunk(s) a tick"
     )
     seen = (policy, store, ticks, Windows.of(checkpoint.params), wanted.batch_size)
@@ -114,8 +114,8 @@ def judged_document(
             "vlm_reuse_count": source["vlm_reuse_count"],
             "horizon": params.horizon,
             "held_out": {
-                name: {"ticks": list(ticks), "content": checkpoint.held_out_content[name]}
-                for name, ticks in checkpoint.held_out_ticks.items()
+                name: {"ticks": list(part.ticks), "content": part.content}
+                for name, part in checkpoint.split["test"].items()
             },
         },
     }

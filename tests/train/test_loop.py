@@ -178,11 +178,42 @@ def test_it_learns_what_the_store_says(store: FeatureStore, params: Make, traine
 def test_without_held_out_episodes_the_best_is_the_newest(
     store: FeatureStore, params: Make, trainer: Make
 ) -> None:
-    done = trainer(store, params(val_fraction=0, max_steps=4, eval_every=2))
+    done = trainer(store, params(split={"val": 0, "test": 0}, max_steps=4, eval_every=2))
     done.fit()
     best = load_policy(done.run.output / "best")
     assert best.step == 4
-    assert best.held_out_ticks == {}
+    assert not best.split["val"]
+    assert not best.split["test"]
+
+
+def test_nothing_in_training_looks_at_test(
+    tiny_store: Make, params: Make, trainer: Make, tmp_path: Path
+) -> None:
+    """Other features, actions and readings in the test episodes change no bit of what is kept."""
+    kept: list[dict[str, Any]] = []
+    for name in ("plain", "spoilt"):
+        store = FeatureStore.open(tiny_store(tmp_path / name))
+        given = {"split": {"val": 0.3, "test": 0.3}, "early_stopping": 2}
+        folders = {"output": tmp_path / name / "head", "logs": tmp_path / name / "logs"}
+        done = trainer(store, params(max_steps=24, **given, **folders))
+        for episode in {store.episodes[i] for i in store.episode_of(done.split.test)}:
+            for array, rows in (
+                ("tick/action", episode.ticks),
+                ("vl/features", episode.vl_rows),
+                ("sensor/values", episode.readings),
+                ("state/values", episode.states),
+            ):
+                if name == "spoilt":
+                    store.array(array)[rows.start : rows.stop] += 1e6
+        assert len(done.split.val)
+        assert len(done.split.test)
+        done.fit()
+        kept.append({which: load_policy(done.run.output / which) for which in ("best", "last")})
+    for which, plain in kept[0].items():
+        spoilt = kept[1][which]
+        assert (spoilt.step, spoilt.metrics) == (plain.step, plain.metrics)
+        assert spoilt.normalization.document() == plain.normalization.document()
+        assert all(torch.equal(spoilt.weights[name], plain.weights[name]) for name in plain.weights)
 
 
 @pytest.mark.parametrize("disabled", ["features_enabled", "sensor_enabled", "robot_state_enabled"])
@@ -342,7 +373,7 @@ def test_on_a_gpu_a_run_is_stopped_resumed_and_judged(
     comparison, _ = evaluate_policy(
         best.policy("cuda"),
         store,
-        resumed.split.held_out,
+        resumed.split.val,
         Windows.of(resumed.params),
         8,
         best.normalization,
