@@ -5,12 +5,14 @@ of several methods on the same groups are drawn together: the difference of thei
 paired bootstrap.
 """
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
 DRAWS = 2000
 FEWEST_GROUPS = 2
-"""Fewer than this many groups give no interval."""
+"""Of fewer groups there is nothing to draw: they give no interval."""
 
 
 def bootstrap_means(
@@ -23,11 +25,17 @@ def bootstrap_means(
     the figures.
     """
     sums, counts = np.asarray(sums, np.float64), np.asarray(counts, np.float64)
-    groups = len(sums)
-    times = np.random.default_rng(seed).multinomial(groups, np.full(groups, 1 / groups), draws)
+    times = _draw(len(sums), draws, seed)
     total, count = times @ sums, times @ counts
     count = np.broadcast_to(count, total.shape)
     return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
+
+
+@lru_cache(maxsize=4)
+def _draw(groups: int, draws: int, seed: int) -> NDArray[np.float64]:
+    """How often each group is drawn: (draw, group)."""
+    chances = np.full(groups, 1 / groups)
+    return np.random.default_rng(seed).multinomial(groups, chances, draws).astype(np.float64)
 
 
 def interval(draws: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
