@@ -1,4 +1,4 @@
-"""Evaluate a trained policy on the episodes it has not seen, beside three baselines.
+"""Evaluate a trained policy on its test episodes, beside what simple rules would do.
 
 Takes what stages.train_head wrote to train_head.output, or evaluate.checkpoint if it is given.
 Writes metrics.json, tables (CSV) and a page with its pictures (report.html, PNG) into
@@ -12,6 +12,7 @@ from stages.command import run
 if __name__ == "__main__":  # here, for --help waits for no import below
     raise SystemExit(run(__doc__ or "", "stages.evaluate", sections=("evaluate",)))
 
+import os
 from functools import partial
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from pipeline.base.ownership import REPORT, claim, refuse_foreign
 from pipeline.evaluate.evaluation import JUDGED, Evaluation, evaluate_checkpoint
 from pipeline.evaluate.tables import ablation_text, error_text, write_tables
 from pipeline.look.evaluation.page import evaluation_report
-from pipeline.look.page.writing import write_report
+from pipeline.look.page.writing import PAGE, write_report
 from pipeline.policy.checkpoint import PolicyCheckpoint, find_policy, load_policy
 from pipeline.store import FeatureStore, check_trailers
 from pipeline.train.split import check_store
@@ -38,12 +39,12 @@ def main(params: Params) -> None:
     evaluation = evaluate_checkpoint(
         folder, checkpoint, store, params.evaluate, device, params.data.root, say
     )
-    files = _write(params.evaluate.output, evaluation)
-    print(error_text(evaluation.comparison))
+    files = _write(params.evaluate.output, evaluation, params.rollout.output / PAGE)
+    print(error_text(evaluation.comparison, evaluation.energy))
     if evaluation.study is not None:
         print(f"\n{ablation_text(evaluation.study)}")
     elif params.evaluate.modalities:
-        print("streams were not ablated: no held-out tick lies 200 ms into its episode")
+        print("streams were not ablated: no test tick lies 200 ms into its episode")
     print(f"{params.evaluate.output}: {', '.join(file.name for file in files)}")
 
 
@@ -57,8 +58,11 @@ def _store_for(checkpoint: PolicyCheckpoint, params: Params) -> FeatureStore:
     return store
 
 
-def _write(folder: Path, evaluation: Evaluation) -> list[Path]:
-    """The tables, the page with its pictures, and what was evaluated; returns their paths."""
+def _write(folder: Path, evaluation: Evaluation, rollout: Path) -> list[Path]:
+    """The tables, the page with its pictures, and what was evaluated; returns their paths.
+
+    The page links to that of the rollouts, where there is one.
+    """
     claim(folder, REPORT)
     files = write_tables(
         folder,
@@ -66,6 +70,8 @@ def _write(folder: Path, evaluation: Evaluation) -> list[Path]:
         evaluation.predictions,
         evaluation.store,
         evaluation.study,
+        evaluation.energy,
     )
     write_document(folder / JUDGED, evaluation.judged)
-    return [*files, folder / JUDGED, *write_report(folder, evaluation_report(evaluation))]
+    link = os.path.relpath(rollout, folder) if rollout.exists() else ""
+    return [*files, folder / JUDGED, *write_report(folder, evaluation_report(evaluation, link))]

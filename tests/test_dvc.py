@@ -101,7 +101,7 @@ def test_metrics_and_plots_are_declared(project):
         shown[""]["data"][f"reports/{stage}/metrics.json"]["data"]
         for stage in ("evaluate", "rollout")
     )
-    assert "policy" in evaluated["overall"]
+    assert "policy" in evaluated["executed"]["overall"]
     assert set(rolled_out["success"]["policy"]) == {"rate", "low", "high", "episodes"}
     assert (project.folder / "reports/evaluate/timeline.png").exists()
 

@@ -5,31 +5,35 @@ An error that stays says that the policy does not use the stream, or that others
 
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from pipeline.base.observation import Observation
+from pipeline.evaluate.baselines import Baselines
+from pipeline.evaluate.figures import Figure, times
 from pipeline.policy.checkpoint import PolicyCheckpoint
+from pipeline.policy.observation import VALIDITY, stream_of
 from pipeline.policy.policy import Policy
 from pipeline.store import Batch, FeatureStore, episode_name
 from pipeline.train.batches import NO_LAGS, BatchIndices, Lags, Prefetch, Ticks, Windows
-from pipeline.train.predictions import FeedMaker
-from pipeline.train.scores import Comparison, evaluate_policy
+from pipeline.train.predictions import FeedMaker, predict
+from pipeline.train.scores import Comparison, action_space, compare
+from pipeline.train.split import groups_of
 
 DELAYS_MS = (50, 100, 200)
 MOST_TICKS = 1000
-"""Held-out ticks evaluated: every way to ablate a stream costs a pass over them."""
+"""Test ticks evaluated: every way to ablate a stream costs a pass over them."""
 MOST_SAMPLES = 4
-"""Chunks a tick of a stochastic policy whose mean is evaluated, for the same reason."""
+"""Chunks a tick of a stochastic policy, whose errors are averaged, for the same reason."""
 FIELDS = {
-    "sensor": ("sensor", "sensor_valid", "sensor_age"),
-    "state": ("state", "state_valid", "state_age"),
-    "features": ("features", "slot_valid", "feature_age", "view_age"),
+    stream: tuple(field.name for field in fields(Observation) if stream_of(field.name) == stream)
+    for stream in ("sensor", "state", "features")
 }
-"""What belongs to each stream: its values, which of them are real, and their ages."""
+"""What belongs to each stream: its values, which of them are real, how old they are."""
 
 Alter = Callable[[BatchIndices, Batch], Batch]
 """A batch as the policy is to see it; the one it is given stays as it is."""
@@ -54,17 +58,16 @@ class AblationStudy:
     notes: tuple[str, ...]
     """What could not be evaluated as asked, and why."""
     samples: int
-    """Chunks a tick whose mean was evaluated; 1 where the policy does not sample."""
+    """Chunks a tick whose errors were averaged; 1 where the policy does not sample."""
 
     @property
     def streams(self) -> tuple[str, ...]:
         """The streams that the policy sees."""
         return tuple(dict.fromkeys(ablated.stream for ablated in self.ablated))
 
-    def times_intact(self, ablated: Ablated) -> float | None:
+    def times_intact(self, ablated: Ablated) -> Figure | None:
         """The error with a stream ablated, in multiples of the intact one; None where that is 0."""
-        intact = self.intact.overall("policy")
-        return ablated.comparison.overall("policy") / intact if intact > 0 else None
+        return times(ablated.comparison, self.intact)
 
 
 def evaluate_ablation(
@@ -72,16 +75,18 @@ def evaluate_ablation(
     policy: Policy,
     store: FeatureStore,
     ticks: Ticks,
+    baselines: Baselines,
     batch_size: int,
     samples: int = 1,
     progress: bool = False,
 ) -> AblationStudy | None:
-    """The study of this policy, which is `checkpoint.policy()`, on these held-out ticks.
+    """The study of this policy, which is `checkpoint.policy()`, on these test ticks.
 
     At most `MOST_TICKS` evenly spaced ones are taken, of those so far into their episode that the
     longest delay stays inside it; None where there is no such tick. Of a stochastic policy, the
-    mean of `samples` chunks, but of `MOST_SAMPLES` at most. Every evaluation draws from the same
-    seed, so that the same noise stands on both sides of a difference. Raises as `judge` does.
+    error of one chunk is averaged over `samples`, but `MOST_SAMPLES` at most. Every evaluation
+    draws from the same seed, so that the same noise stands on both sides of a difference. Raises
+    as `predict` does.
     """
     samples = min(samples, MOST_SAMPLES) if policy.stochastic else 1
     settled = _settled(store, ticks)
@@ -89,7 +94,7 @@ def evaluate_ablation(
         return None
     left_out = len(ticks) - len(settled)
     notes = [
-        f"intact is not the error above: {left_out} of {len(ticks)} held-out ticks are left "
+        f"intact is not the error above: {left_out} of {len(ticks)} test ticks are left "
         "out, so near their episode's start that a delay would reach beyond it"
     ] * (left_out > 0)
     count = min(len(settled), MOST_TICKS)
@@ -103,9 +108,13 @@ def evaluate_ablation(
             ways.append((stream, how, feed_maker(store, windows, device, alter=alter)))
         for how, lags in delays(store, stream).items():
             ways.append((stream, how, feed_maker(store, windows, device, lags)))
-    seen = (store, ticks, windows, batch_size, checkpoint.normalization, False, samples)
+    seen = (store, ticks, windows, batch_size, False, samples)
+    others, groups = baselines.act(ticks), groups_of(store, checkpoint, ticks)
+    space = action_space(store, checkpoint.normalization)
     bar = tqdm(ways, "ablating streams", unit="way", disable=None if progress else True)
-    comparisons = [evaluate_policy(policy, *seen, feed)[0] for *_, feed in bar]
+    comparisons = [
+        compare(predict(policy, *seen, feed), others, *space, groups) for *_, feed in bar
+    ]
     ablated = (
         Ablated(stream, how, comparison)
         for (stream, how, _), comparison in zip(ways[1:], comparisons[1:], strict=True)
@@ -144,7 +153,7 @@ def _alterations(
         notes.append(f"{stream} missing: not judged, as training never showed it (drop_{stream} 0)")
     donors = donors_of(store, ticks, stream)
     if donors is None:
-        notes.append(f"{stream} shuffled: not judged, it takes two held-out episodes with it")
+        notes.append(f"{stream} shuffled: not judged, it takes two test episodes with it")
     else:
         windows = Windows.of(checkpoint.params)
         ways["shuffled"] = exchanged(stream, store, windows, ticks, donors)
@@ -183,7 +192,7 @@ def zeroed(stream: str, mean: NDArray[np.floating]) -> Alter:
 
 def missing(stream: str) -> Alter:
     """Nothing of the stream is real: the policy's encoder gives its embedding for that."""
-    valid = FIELDS[stream][1]
+    valid = VALIDITY[stream]
     return lambda indices, batch: replace(batch, **{valid: torch.zeros_like(getattr(batch, valid))})
 
 

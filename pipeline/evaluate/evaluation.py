@@ -8,15 +8,20 @@ from typing import Any
 import torch
 
 from pipeline.base.config import EvaluateParams
+from pipeline.base.errors import ConfigError
 from pipeline.evaluate.ablation import AblationStudy, evaluate_ablation
+from pipeline.evaluate.baselines import Baselines
 from pipeline.evaluate.curves import TrainingCurves, read_curves
+from pipeline.evaluate.figures import Figure, mean_over_ticks
+from pipeline.evaluate.phases import phases_of
+from pipeline.evaluate.samples import SampledChunks
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.policy import Trainable
 from pipeline.store import FeatureStore
 from pipeline.train.batches import Windows
-from pipeline.train.predictions import Predictions
-from pipeline.train.scores import Comparison, evaluate_policy
-from pipeline.train.split import find_ticks, source_of
+from pipeline.train.predictions import Predictions, predict
+from pipeline.train.scores import Comparison, action_space, compare
+from pipeline.train.split import find_ticks, groups_of, source_of
 
 JUDGED = "judged.json"
 """Its name in the folder of an evaluation, beside metrics.json."""
@@ -32,6 +37,8 @@ class Evaluation:
     store: FeatureStore
     comparison: Comparison
     predictions: Predictions
+    energy: Figure | None
+    """The energy score of the policy's samples; None of a policy that does not sample."""
     study: AblationStudy | None
     judged: Mapping[str, Any]
     """`judged_document`."""
@@ -51,32 +58,56 @@ def evaluate_checkpoint(
 ) -> Evaluation:
     """The policy of the checkpoint in `folder`, on its test ticks of a store it fits.
 
-    `say` is told first what is evaluated on what. Raises `CheckpointMismatch` as `find_ticks`
-    does, and `NumericsError` as `predict`.
+    `say` is told first what is evaluated on what. Raises `ConfigError` where more steps would be
+    executed than a chunk has, `CheckpointMismatch` as `find_ticks` does, and `NumericsError` as
+    `predict`.
     """
+    horizon = checkpoint.params.horizon
+    if wanted.execute > horizon:
+        raise ConfigError(
+            f"evaluate.execute {wanted.execute}: expected at most the {horizon} steps of a chunk "
+            "(train_head.horizon)"
+        )
     names = checkpoint.split["test"].keys()
     ticks, checkpoint = find_ticks(store, checkpoint, "test")
+    trained, checkpoint = find_ticks(store, checkpoint, "train")
     if renamed := names - checkpoint.split["test"].keys():
-        say(f"held-out episodes renamed since the training: {len(renamed)}, told by their content")
+        say(f"test episodes renamed since the training: {len(renamed)}, told by their content")
     policy = checkpoint.policy(device)
-    judged = judged_document(checkpoint, policy, store, wanted.samples, wanted.batch_size)
+    judged = judged_document(checkpoint, policy, store, wanted)
     say(
-        f"{folder} (step {checkpoint.step}) on {len(ticks)} held-out ticks of "
+        f"{folder} (step {checkpoint.step}) on {len(ticks)} test ticks of "
         f"{len(checkpoint.split['test'])} episode(s) in {store.path}, device {device}, "
         f"{judged['policy']['samples']} chunk(s) a tick"
     )
-    seen = (policy, store, ticks, Windows.of(checkpoint.params), wanted.batch_size)
-    comparison, predictions = evaluate_policy(
-        *seen, checkpoint.normalization, progress=True, samples=wanted.samples
+    features = checkpoint.normalization.features
+    baselines = Baselines(store, trained, horizon, features)
+    space, groups = (
+        action_space(store, checkpoint.normalization),
+        groups_of(store, checkpoint, ticks),
     )
+    sampled = SampledChunks(space[-1])
+    seen = (policy, store, ticks, Windows.of(checkpoint.params), wanted.batch_size)
+    predictions = predict(*seen, progress=True, samples=wanted.samples, watch=sampled)
+    others = baselines.act(ticks) | sampled.chunks()
+    phases = phases_of(store, ticks)
+    comparison = compare(predictions, others, *space, groups, phases, wanted.execute)
     study = None
     if wanted.modalities:
-        study = evaluate_ablation(
-            checkpoint, policy, store, ticks, wanted.batch_size, wanted.samples, progress=True
-        )
-    curves = read_curves(checkpoint)
+        rest = (ticks, baselines, wanted.batch_size, wanted.samples)
+        study = evaluate_ablation(checkpoint, policy, store, *rest, progress=True)
+    energy = sampled.energy()
     return Evaluation(
-        str(folder), checkpoint, store, comparison, predictions, study, judged, curves, recordings
+        name=str(folder),
+        checkpoint=checkpoint,
+        store=store,
+        comparison=comparison,
+        predictions=predictions,
+        energy=mean_over_ticks(energy, groups) if len(energy) else None,
+        study=study,
+        judged=judged,
+        curves=read_curves(checkpoint),
+        recordings=recordings,
     )
 
 
@@ -84,19 +115,20 @@ def judged_document(
     checkpoint: PolicyCheckpoint,
     policy: Trainable,
     store: FeatureStore,
-    samples: int,
-    batch_size: int,
+    wanted: EvaluateParams,
 ) -> dict[str, Any]:
     """What was evaluated (`policy`), how it was sampled (`drawn`) and on what (`on`), as JSON.
 
     `on` is equal for all evaluations whose errors may stand in one table, whatever features the
     policies saw: which are better is a question to ask. `drawn` is equal for those
-    of stochastic policies: the mean of fewer samples errs more, and a batch shares its noise. It
+    of stochastic policies: the best of fewer samples errs more, and a batch shares its noise. It
     is null for policies that do not sample.
     """
     params = checkpoint.params
     source = source_of(store)
-    drawn = {"samples": samples, "batch_size": batch_size} if policy.stochastic else None
+    drawn = None
+    if policy.stochastic:
+        drawn = {"samples": wanted.samples, "batch_size": wanted.batch_size}
     return {
         "policy": {
             "model_type": params.model_type,
@@ -113,8 +145,9 @@ def judged_document(
             "action_hz": source["action_hz"],
             "vlm_reuse_count": source["vlm_reuse_count"],
             "horizon": params.horizon,
-            "held_out": {
-                name: {"ticks": list(part.ticks), "content": part.content}
+            "execute": wanted.execute,
+            "test": {
+                name: {"ticks": list(part.ticks), "content": part.content, "group": part.group}
                 for name, part in checkpoint.split["test"].items()
             },
         },

@@ -13,18 +13,18 @@ from pipeline.base.config import FusionStrategy, ModelType
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import ConfigError
 from pipeline.base.table import Table
+from pipeline.evaluate.baselines import BASELINES, METHODS
 from pipeline.evaluate.evaluation import JUDGED
 from pipeline.evaluate.names import with_unit
 from pipeline.evaluate.tables import ERRORS, HEADINGS, OVERALL
 from pipeline.train.log import speed_file
-from pipeline.train.predictions import BASELINES, METHODS
 from pipeline.train.scores import ActionGroup
 
 _OVERALL = (OVERALL, "training std")
 _SAME = 1e-4
 """Relative difference of two baselines that rounding on another machine explains."""
 _SHARED = {
-    "on": ("on the same held-out ticks", "recordings"),
+    "on": ("on the same test ticks", "recordings"),
     "drawn": ("from as many samples and ticks a batch", "evaluate.samples and evaluate.batch_size"),
 }
 """By key of `JUDGED`: how evaluations in one table are alike, and by what they become so."""

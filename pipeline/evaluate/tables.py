@@ -1,81 +1,170 @@
-"""Scores -> what is printed, what DVC shows, what others plot."""
+"""Figures -> what is printed, what DVC shows, what others plot."""
 
+from collections.abc import Iterable
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.base.channels import named
 from pipeline.base.durable import write_document
 from pipeline.base.table import Table
 from pipeline.evaluate.ablation import AblationStudy
+from pipeline.evaluate.baselines import METHODS
+from pipeline.evaluate.figures import (
+    NO_INTERVAL,
+    Figure,
+    Rivalry,
+    best_baseline,
+    by_group,
+    error,
+    rivalry,
+    sums_by_group,
+)
 from pipeline.evaluate.names import rounded, with_unit
+from pipeline.evaluate.phases import PHASE_RULE, PHASES
+from pipeline.evaluate.samples import BEST, ENERGY, MEAN
 from pipeline.store import FeatureStore
-from pipeline.train.predictions import BASELINES, METHODS, Predictions
+from pipeline.train.predictions import Predictions
 from pipeline.train.scores import ActionGroup, Comparison
 
 FOOTNOTE = (
-    "repeat last: at an episode's first tick, which has none before it, it does nothing; where "
-    "actions are absolute, it takes the mean training action"
+    "linear fit: on the two actions before; nearest neighbour: the training tick most alike in "
+    "state and features. What an episode's first ticks lack before them is zero, or the median "
+    "where actions are absolute"
 )
 ABLATION_FOOTNOTE = "zeroed: every value at its training mean, which the policy sees as zeros"
 METRICS = "metrics.json"
 ERRORS = "errors.csv"
-"""The file with the errors of all methods, a line an action group and one `OVERALL`."""
+"""The file with the errors of all methods over the whole chunk, a line an action group and one
+`OVERALL`."""
+EXECUTED = "executed.csv"
+"""The same of the steps that are executed."""
+GROUPS = "groups.csv"
+"""The file with the errors of all methods by group of test recordings."""
 OVERALL = "overall"
 _STD = "training std"
 HEADINGS = {
     "policy": "policy",
     "zero_action": "zero",
-    "mean_action": "mean",
+    "median_action": "median",
     "repeat_last": "repeat last",
+    "linear_fit": "linear fit",
+    "nearest_neighbour": "nearest neighbour",
 }
 
 
-def metrics(comparison: Comparison) -> dict[str, Any]:
-    """The few numbers that tell two evaluations apart, for `metrics.json`; the rest is in tables.
+def scopes(comparison: Comparison) -> dict[str, Comparison]:
+    """Errors of the steps that are executed first, then of the whole chunk.
 
-    Mean absolute errors of the policy, `overall` in units of the training standard deviation
-    (`Comparison.overall`), a group's in its own; `relative` is the error divided by the best
-    baseline's. Numbers have 6 significant digits: less would hide, more would be noise.
+    Where several are executed, the first alone stands between them.
+    """
+    first = {"first_step": comparison.part(steps=slice(1))} if comparison.execute > 1 else {}
+    return {"executed": comparison.executed, **first, "chunk": comparison}
+
+
+def titles(comparison: Comparison) -> tuple[str, str]:
+    """What is executed and the whole chunk in words."""
+    horizon = comparison.cells.entries.shape[1]
+    steps = "step 0" if comparison.execute == 1 else f"the first {comparison.execute} steps"
+    return f"what is executed, {steps} of {horizon}", f"the whole chunk of {horizon} step(s)"
+
+
+def metrics(comparison: Comparison, energy: Figure | None = None) -> dict[str, Any]:
+    """The numbers that tell two evaluations apart, for `metrics.json`; the rest is in tables.
+
+    See docs/reports.md. Numbers have 6 significant digits: less would hide, more would be noise.
     """
     document: dict[str, Any] = {
-        "held_out": {"episodes": len(comparison.episodes), "ticks": comparison.ticks},
-        "overall": rounded(
-            {"policy": comparison.overall("policy"), "relative": comparison.relative()}
-        ),
+        "test": {
+            "episodes": len(comparison.episodes),
+            "groups": len(np.unique(comparison.cells.group)),
+            "ticks": comparison.ticks,
+        }
     }
-    for group in comparison.groups:
-        policy, relative = comparison.group_mae("policy", group), comparison.relative(group)
-        document[group.key] = rounded({"policy": policy, "relative": relative})
+    for scope, part in scopes(comparison).items():
+        varying = part.varying_groups()
+        document[scope] = {OVERALL: _rivals(rivalry(part))}
+        for group in part.groups:
+            rivals = _rivals(rivalry(part, group))
+            document[scope][group.key] = (
+                rivals if group in varying else {"policy": rivals["policy"]}
+            )
+    if sampled := sample_figures(comparison, energy):
+        document["samples"] = {name.replace(" ", "_"): _plain(f) for name, f in sampled.items()}
+    if phases := by_phase(comparison):
+        document["phases"] = {
+            phase: {"ticks": part.ticks}
+            | {scope: _plain(error(p, "policy")) for scope, p in scopes(part).items()}
+            for phase, part in phases.items()
+        }
     return document
 
 
-def best_baseline(comparison: Comparison) -> str:
-    """The baseline with the lowest overall error."""
-    return min(BASELINES, key=comparison.overall)
+def _rivals(rivals: Rivalry) -> dict[str, dict[str, float]]:
+    figures = {"policy": rivals.policy, "best_baseline": rivals.baseline}
+    return {name: _plain(f) for name, f in (figures | {"difference": rivals.difference}).items()}
+
+
+def _plain(figure: Figure) -> dict[str, float]:
+    return rounded(vars(figure))
+
+
+def sample_figures(comparison: Comparison, energy: Figure | None) -> dict[str, Figure]:
+    """What several samples say beside one, over the whole chunk; none of a policy with one."""
+    if MEAN not in comparison.scores or energy is None:
+        return {}
+    names = {"one": "policy", MEAN: MEAN, BEST: BEST}
+    return {name: error(comparison, way) for name, way in names.items()} | {ENERGY: energy}
+
+
+def by_phase(comparison: Comparison) -> dict[str, Comparison]:
+    """The comparison on the ticks of each phase that there is."""
+    return {p: comparison.of_phase(p) for p in PHASES if p in comparison.cells.phase}
 
 
 def error_table(comparison: Comparison) -> Table:
-    """Mean absolute errors of policy and baselines, a row an action group, the overall one last."""
+    """Mean absolute errors with their intervals, a row a method."""
+    groups = (*comparison.groups, None)
     rows = [
-        [_heading(group), *_errors(comparison, group), comparison.relative(group)]
-        for group in (*comparison.groups, None)
+        [HEADINGS[way], *(error(comparison, way, group).text() for group in groups)]
+        for way in METHODS
     ]
-    heads = (HEADINGS[method] for method in METHODS)
-    return Table(["mean absolute error", *heads, "policy / best"], rows)
+    return Table(["mean absolute error", *map(_heading, groups)], rows, strong=frozenset({0}))
+
+
+def difference_table(comparison: Comparison) -> Table:
+    """Policy minus best baseline in each figure, and whether the difference is resolved."""
+    rows: list[list[Any]] = []
+    for scope, part in scopes(comparison).items():
+        for group in (*part.varying_groups(), None):
+            rivals = rivalry(part, group)
+            words = (scope.replace("_", " "), _heading(group), HEADINGS[rivals.best])
+            errors = (rivals.baseline.text(), rivals.difference.text("+"))
+            rows.append([*words, *errors, rivals.verdict, rivals.ratio])
+    heads = ["steps", "error", "best baseline", "its error", "policy minus it", "the policy is"]
+    return Table([*heads, "policy / best"], rows)
+
+
+def phase_table(comparison: Comparison) -> Table:
+    """Overall errors by phase, of the policy and of the baseline that is best there."""
+    rows: list[list[Any]] = []
+    for phase, part in by_phase(comparison).items():
+        both = rivalry(part.executed), rivalry(part)
+        cells = (
+            [r.policy.text(), f"{r.baseline.text()} {HEADINGS[r.best]}", r.verdict] for r in both
+        )
+        rows.append([phase, part.ticks, *chain(*cells)])
+    kinds = ("policy", "best baseline", "the policy is")
+    heads = (f"{scope}: {kind}" for scope in ("executed", "chunk") for kind in kinds)
+    return Table(["phase", "ticks", *heads], rows)
 
 
 def _heading(group: ActionGroup | None) -> str:
     """The name of a group with its unit, or of the overall error."""
     return with_unit(OVERALL, _STD) if group is None else with_unit(group.name, group.unit)
-
-
-def _errors(comparison: Comparison, group: ActionGroup | None) -> list[float]:
-    """Of each method, in the group's unit; of None, overall."""
-    if group is None:
-        return [comparison.overall(method) for method in METHODS]
-    return [comparison.group_mae(method, group) for method in METHODS]
 
 
 def still_dimensions(comparison: Comparison) -> str:
@@ -85,37 +174,70 @@ def still_dimensions(comparison: Comparison) -> str:
         return ""
     largest = max(still, key=lambda index: comparison.scale[index] / still[index])
     moving = comparison.without_low_variance()
-    relative = moving.relative() or np.nan
+    rivals = rivalry(moving)
     return (
         f"hardly moving: {named(comparison.names, list(still))} (training std at most "
         f"{comparison.scale[largest]:.2g}, where {still[largest]:.2g} is usual for such "
         f"dimensions), {len(still)} of the {len(comparison.varying())} dimensions in the overall "
-        f"error; without, it is {moving.overall('policy'):.3f}, {relative:.2f} times the best "
-        f"baseline's ({HEADINGS[best_baseline(moving)]})"
+        f"error; without, that of the chunk is {rivals.policy.value:.3f}, "
+        f"{rivals.ratio or np.nan:.2f} times the best baseline's ({HEADINGS[rivals.best]})"
     )
 
 
-def error_text(comparison: Comparison) -> str:
-    """`error_table` and its footnote as lines; below them the dimensions that hardly move."""
-    lines = [*error_table(comparison).text(), FOOTNOTE, still_dimensions(comparison)]
-    return "\n".join(lines).rstrip("\n")
+def verdicts(comparison: Comparison) -> str:
+    """Whether policy and best baseline differ overall, in each scope."""
+    if len(np.unique(comparison.cells.group)) < 2:
+        return NO_INTERVAL
+    words: list[str] = []
+    for scope, part in scopes(comparison).items():
+        rivals = rivalry(part)
+        verdict = rivals.verdict if rivals.verdict[:3] == "not" else f"resolved {rivals.verdict}"
+        apart = f"{rivals.difference.text('+')} ({HEADINGS[rivals.best]})"
+        words.append(f"{scope.replace('_', ' ')} {apart}: {verdict}")
+    return f"policy minus best baseline [{_STD}]: {'; '.join(words)}"
+
+
+def samples_text(comparison: Comparison, energy: Figure | None) -> str:
+    """What several samples say beside one, in a line."""
+    sampled = sample_figures(comparison, energy)
+    if not sampled:
+        return "the expert gives one chunk a tick: nothing to say of several samples"
+    figures = ", ".join(f"{name} {figure.text()}" for name, figure in sampled.items())
+    return f"samples, whole chunk [{_STD}]: {figures}"
+
+
+def error_text(comparison: Comparison, energy: Figure | None = None) -> str:
+    """The errors of what is executed, then of the chunk; samples, verdicts, phases below them."""
+    lines: list[str] = []
+    for title, part in zip(titles(comparison), (comparison.executed, comparison), strict=True):
+        lines += [f"{title}, with 95 % intervals:", *error_table(part).text(), ""]
+    lines += [FOOTNOTE, samples_text(comparison, energy), verdicts(comparison)]
+    lines += [still] if (still := still_dimensions(comparison)) else []
+    if by_phase(comparison):
+        lines += ["", f"by phase, overall [{_STD}]:", *phase_table(comparison).text(), PHASE_RULE]
+    return "\n".join(lines)
 
 
 def ablation_table(study: AblationStudy) -> Table:
     """Each way to ablate a stream, between intact and best baseline.
 
-    Two words, the errors of each group and the overall one, and the latter's multiple of intact.
+    Two words, the errors of each group and the overall one, and the latter's multiple of intact
+    with its interval.
     """
     best, intact = best_baseline(study.intact), study.intact.overall("policy")
     groups = study.intact.varying_groups()
-    ways = [("all", "intact", study.intact, "policy")]
-    ways += [(way.stream, way.how, way.comparison, "policy") for way in study.ablated]
-    ways.append(("none", best.replace("_", " "), study.intact, best))
     rows: list[list[Any]] = []
-    for stream, how, comparison, method in ways:
-        errors = (comparison.group_mae(method, group) for group in groups)
-        overall = comparison.overall(method)
-        rows.append([stream, how, *errors, overall, overall / intact if intact > 0 else None])
+
+    def add(words: tuple[str, str], comparison: Comparison, method: str, times: object) -> None:
+        errors = (comparison.error(method, group) for group in (*groups, None))
+        rows.append([*words, *errors, times])
+
+    add(("all", "intact"), study.intact, "policy", "1" if intact > 0 else None)
+    for way in study.ablated:
+        times = study.times_intact(way)
+        add((way.stream, way.how), way.comparison, "policy", times and times.text())
+    blind = f"{study.intact.overall(best) / intact:.2f}" if intact > 0 else None
+    add(("none", HEADINGS[best]), study.intact, best, blind)
     names = map(_heading, (*groups, None))
     heads = ["stream", "policy sees it", *names, "times intact"]
     return Table(heads, rows, caption=ABLATION_FOOTNOTE, strong=frozenset({0}))
@@ -130,7 +252,7 @@ def ablation_text(study: AblationStudy) -> str:
 def evaluated_on(study: AblationStudy) -> str:
     """What a table of this study says above it."""
     return (
-        f"mean absolute error on {study.intact.ticks} held-out ticks, {study.samples} chunk(s) a "
+        f"mean absolute error on {study.intact.ticks} test ticks, {study.samples} chunk(s) a "
         "tick, one stream ablated each"
     )
 
@@ -141,15 +263,18 @@ def write_tables(
     predictions: Predictions,
     store: FeatureStore,
     study: AblationStudy | None = None,
+    energy: Figure | None = None,
 ) -> list[Path]:
-    """Write metrics.json and one CSV each of all errors, by dimension, horizon, episode and tick.
+    """Write metrics.json and one CSV each of all errors: see docs/reports.md.
 
-    And two by ablated stream, which have headings alone without a `study`: `dvc plots` would miss
-    the file, and one of an evaluation before would stay. steps.csv and streams.csv have one line a
+    The two by ablated stream have headings alone without a `study`: `dvc plots` would miss the
+    file, and one of an evaluation before would stay. steps.csv and streams.csv have one line a
     point, as `dvc plots` takes them; the rest is for others.
     """
     files = {
+        EXECUTED: _group_errors(comparison.executed),
         ERRORS: _group_errors(comparison),
+        GROUPS: _recording_groups(comparison),
         "dimensions.csv": _dimensions(comparison),
         "horizon.csv": _horizon(comparison),
         "steps.csv": _steps(comparison),
@@ -158,55 +283,69 @@ def write_tables(
         "modalities.csv": _ablation_errors(study),
         "streams.csv": _streams(study),
     }
-    write_document(folder / METRICS, metrics(comparison))
+    write_document(folder / METRICS, metrics(comparison, energy))
     return [folder / METRICS, *(files[name].write_csv(folder / name) for name in files)]
 
 
+def _intervals(methods: Iterable[str]) -> list[str]:
+    """The heads of `_cells`."""
+    return [head for name in methods for head in (name, f"{name}_low", f"{name}_high")]
+
+
+def _cells(figures: Iterable[Figure]) -> list[float | None]:
+    """Value, low and high of each figure."""
+    return [cell for figure in figures for cell in (figure.value, figure.low, figure.high)]
+
+
 def _group_errors(comparison: Comparison) -> Table:
-    rows: list[list[Any]] = [
-        [
-            group.name,
-            group.unit,
-            *_errors(comparison, group),
-            comparison.group_rmse("policy", group),
-        ]
-        for group in comparison.groups
-    ]
-    rows.append([OVERALL, _STD, *_errors(comparison, None), None])
-    return Table(["group", "unit", *METHODS, "policy_rmse"], rows)
+    rows: list[list[Any]] = []
+    for group in (*comparison.groups, None):
+        name = (OVERALL, _STD) if group is None else (group.name, group.unit)
+        rows.append([*name, *_cells(error(comparison, way, group) for way in METHODS)])
+    return Table(["group", "unit", *_intervals(METHODS)], rows)
+
+
+def _recording_groups(comparison: Comparison) -> Table:
+    """The overall error by group of test recordings: what another evaluation is paired with."""
+    columns: dict[str, NDArray[Any]] = {"group": np.unique(comparison.cells.group)}
+    spans = {"executed": comparison.executed, OVERALL: comparison}
+    for span, part in spans.items():
+        columns[f"{span}_entries"] = by_group(part, part.cells.entries.sum(axis=1)).astype(np.int64)
+    for span, part in spans.items():
+        for method in METHODS:
+            sums, entries = sums_by_group(part, method)
+            columns[f"{method}_{span}"] = sums / entries
+    return Table([*columns], list(zip(*(c.tolist() for c in columns.values()), strict=True)))
 
 
 def _dimensions(comparison: Comparison) -> Table:
-    scores = [comparison.scores[method] for method in METHODS]
-    errors = np.array([*(score.mae for score in scores), *(score.rmse for score in scores)])
-    rows = [
-        [*dimension, *values]
-        for *dimension, values in zip(
-            comparison.names, comparison.units, errors.T.tolist(), strict=True
-        )
-    ]
-    heads = (f"{method}_{error}" for error in ("mae", "rmse") for method in METHODS)
+    """Over the whole chunk."""
+    rows: list[list[Any]] = []
+    for index, (name, unit) in enumerate(zip(comparison.names, comparison.units, strict=True)):
+        alone = ActionGroup(name, unit, (index,))
+        rmse = (comparison.scores[method].rmse[index] for method in METHODS)
+        rows.append([name, unit, *_cells(error(comparison, way, alone) for way in METHODS), *rmse])
+    heads = [*_intervals(f"{way}_mae" for way in METHODS), *(f"{way}_rmse" for way in METHODS)]
     return Table(["dimension", "unit", *heads], rows)
 
 
 def _horizon(comparison: Comparison) -> Table:
-    scores = [comparison.scores[method] for method in METHODS]
-    errors = [*(score.mae_horizon for score in scores), *(score.rmse_horizon for score in scores)]
+    errors = [comparison.scores[method].mae_horizon for method in METHODS]
     rows = [
         [step, *dimension, *values]
         for step, of_step in enumerate(np.stack(errors, axis=-1).tolist())
         for *dimension, values in zip(comparison.names, comparison.units, of_step, strict=True)
     ]
-    rmse = (f"{method}_rmse" for method in METHODS)
-    return Table(["steps_ahead", "dimension", "unit", *METHODS, *rmse], rows)
+    return Table(["steps_ahead", "dimension", "unit", *METHODS], rows)
 
 
 def _steps(comparison: Comparison) -> Table:
     """The overall error [training std] by steps ahead."""
-    scores = [comparison.scores[method].mae_horizon for method in METHODS]
-    errors = np.array([comparison.in_training_std(score).mean(axis=-1) for score in scores])
-    rows = [[step, *values] for step, values in enumerate(errors.T.tolist())]
-    return Table(["steps_ahead", *METHODS], rows)
+    rows: list[list[Any]] = []
+    for step in range(comparison.cells.entries.shape[1]):
+        part = comparison.part(steps=slice(step, step + 1))
+        rows.append([step, *_cells(error(part, way) for way in METHODS)])
+    return Table(["steps_ahead", *_intervals(METHODS)], rows)
 
 
 def _episodes(comparison: Comparison, store: FeatureStore) -> Table:
@@ -237,24 +376,22 @@ def _ablation_errors(study: AblationStudy | None) -> Table:
     """Error by stream, way to ablate it, and action group."""
     rows: list[list[Any]] = []
     if study is not None:
-        best = METHODS.index(best_baseline(study.intact))
+        best = best_baseline(study.intact)
         for way in study.ablated:
             for group in (*study.intact.groups, None):
                 name = (OVERALL, _STD) if group is None else (group.name, group.unit)
-                error, intact = _errors(way.comparison, group)[0], _errors(study.intact, group)
-                rows.append([way.stream, way.how, *name, error, intact[0], intact[best]])
+                intact = (study.intact.error(method, group) for method in ("policy", best))
+                error = way.comparison.error("policy", group)
+                rows.append([way.stream, way.how, *name, error, *intact])
     errors = ("error", "intact_error", "best_baseline_error")
     return Table(["stream", "how", "group", "unit", *errors], rows)
 
 
 def _streams(study: AblationStudy | None) -> Table:
     """The overall error by way to ablate a stream, and what of the intact."""
-    rows = (
-        []
-        if study is None
-        else [
-            [f"{way.stream} {way.how}", study.times_intact(way), way.comparison.overall("policy")]
-            for way in study.ablated
-        ]
-    )
-    return Table(["spoilt", "times_intact", "overall_error"], rows)
+    rows: list[list[Any]] = []
+    if study is not None:
+        for way in study.ablated:
+            figures = study.times_intact(way) or Figure(np.nan), error(way.comparison, "policy")
+            rows.append([f"{way.stream} {way.how}", *_cells(figures)])
+    return Table(["spoilt", *_intervals(["times_intact", "overall_error"])], rows)

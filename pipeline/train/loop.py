@@ -288,7 +288,7 @@ class Trainer:
             feed=lambda plan: self.source.feed(plan, windows, self.device),
         )
         metrics = {"val/error": comparison.overall("policy")} | {
-            f"val/{group.key}": comparison.group_mae("policy", group) for group in comparison.groups
+            f"val/{group.key}": comparison.error("policy", group) for group in comparison.groups
         }
         log.write(self.step, metrics)
         return metrics

@@ -1,4 +1,4 @@
-"""What a policy does at recorded ticks, and what simple rules would have done there."""
+"""What a policy does at recorded ticks, beside what was recorded there."""
 
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from numpy.typing import NDArray
-from torch import Generator, Tensor
+from torch import Generator
 from tqdm import tqdm
 
 from pipeline.base.errors import NumericsError
@@ -17,12 +18,12 @@ from pipeline.store import Batch, FeatureStore, place
 from pipeline.train.batches import BatchIndices, Prefetch, Ticks, Windows, cut_batches
 
 Actions = NDArray[np.float32]
-METHODS = ("policy", "zero_action", "mean_action", "repeat_last")
-BASELINES = METHODS[1:]
 FeedMaker = Callable[
     [Sequence[BatchIndices]], AbstractContextManager[Iterable[tuple[BatchIndices, Batch]]]
 ]
 """Makes the feed of a plan: what a policy is to see at these ticks."""
+Watch = Callable[[Actions, Actions, NDArray[np.bool_]], None]
+"""Is shown all chunks (sample, tick, horizon, action_dim) of a batch, and what was recorded."""
 _SEED = 0
 _CHUNKS_AT_ONCE = 1024
 """Chunks sampled in one forward pass at most, but one a tick: what bounds the memory."""
@@ -39,8 +40,22 @@ class Predictions:
     episodes: NDArray[np.int64]
     """(tick,) index of each tick's episode in the store."""
     predicted: Actions
+    """Of a policy that samples, its first sample: what a robot would execute."""
     recorded: Actions
     valid: NDArray[np.bool_]
+    sampled: tuple[Actions, Actions] | None = None
+    """The absolute and the squared error of one sample, each the mean over independent samples;
+    None where these are the errors of `predicted`."""
+
+    def errors(self) -> tuple[Actions, Actions]:
+        """Absolute and squared error of one chunk of the policy, (tick, horizon, action_dim)."""
+        return self.sampled or errors_of(self.predicted, self.recorded)
+
+
+def errors_of(acted: Actions, recorded: Actions) -> tuple[Actions, Actions]:
+    """Absolute and squared error of every entry; `acted` broadcasts."""
+    error = acted.astype(np.float64) - recorded
+    return np.abs(error).astype(np.float32), np.square(error).astype(np.float32)
 
 
 def predict(
@@ -52,21 +67,24 @@ def predict(
     progress: bool = False,
     samples: int = 1,
     feed: FeedMaker | None = None,
+    watch: Watch | None = None,
 ) -> Predictions:
     """What the policy, in evaluation mode, does at these ticks, beside what was recorded.
 
-    Of a stochastic policy, the mean of `samples` chunks; any other gives one. Their noise comes
-    from one generator of fixed seed, batch after batch: the same weights give the same figures for
-    the same ticks, `samples` and `batch_size`, and a stochastic policy others for another
-    `batch_size`. Runs on the policy's device, which sees what `feed` hands out: by default the
-    store as it is, gathered ahead. `progress` shows a bar on a terminal. Raises `NumericsError`,
-    naming episode, tick and time, where a prediction or a recorded action is NaN or infinite.
+    A robot executes one sample, so the errors are those of one: of a stochastic policy their mean
+    over `samples` independent ones, for less noise, and never those of the samples' mean. Their
+    noise comes from one generator of fixed seed, batch after batch: the same weights give the same
+    figures for the same ticks, `samples` and `batch_size`, and a stochastic policy others for
+    another `batch_size`. Runs on the policy's device, which sees what `feed` hands out: by default
+    the store as it is, gathered ahead. `watch` is shown all samples. `progress` shows a bar on a
+    terminal. Raises `NumericsError`, naming episode, tick and time, where a prediction or a
+    recorded action is NaN or infinite.
     """
     device = next(policy.parameters()).device
     # On the CPU, so that every device is given the same noise.
     generator = Generator().manual_seed(_SEED)
     plan = cut_batches(ticks, batch_size)
-    predicted, recorded, valid = [], [], []
+    predicted, recorded, valid, absolute, squared = [], [], [], [], []
     with (
         torch.inference_mode(),
         Prefetch(store, plan, windows, device) if feed is None else feed(plan) as batches,
@@ -76,12 +94,19 @@ def predict(
     ):
         for indices, batch in batches:
             at = indices.ticks
-            action = _mean_chunk(policy, batch, samples, generator)
-            predicted.append(action.float().cpu().numpy())
+            chunks = _sample(policy, batch, samples, generator)
+            predicted.append(chunks[0])
             recorded.append(batch.action.cpu().numpy().copy())
             valid.append(batch.action_valid.cpu().numpy().astype(bool))
             _check_finite(store, at, recorded[-1], "recorded action", valid[-1])
-            _check_finite(store, at, predicted[-1], "action of the policy")
+            for chunk in chunks:
+                _check_finite(store, at, chunk, "action of the policy")
+            if len(chunks) > 1:
+                errors = [errors_of(chunk, recorded[-1]) for chunk in chunks]
+                absolute.append(np.mean([error for error, _ in errors], axis=0))
+                squared.append(np.mean([square for _, square in errors], axis=0))
+            if watch is not None:
+                watch(chunks, recorded[-1], valid[-1])
             bar.update(len(at))
     return Predictions(
         ticks=ticks,
@@ -89,43 +114,21 @@ def predict(
         predicted=np.concatenate(predicted),
         recorded=np.concatenate(recorded),
         valid=np.concatenate(valid),
+        sampled=(np.concatenate(absolute), np.concatenate(squared)) if absolute else None,
     )
 
 
-def baselines(
-    store: FeatureStore, predictions: Predictions, mean_action: NDArray[np.floating]
-) -> dict[str, Actions]:
-    """What three rules that see nothing would have done: name -> (tick, 1, action_dim).
-
-    `zero_action`: no motion. `mean_action`: the mean over the training ticks. `repeat_last`: the
-    action of the tick before, the whole chunk long; at an episode's first tick, which has none
-    before it, zero where actions are deltas or velocities, and the mean training action where they
-    are absolute: zero would be a pose far from all others.
-    """
-    ticks = predictions.ticks
-    action = store.array("tick/action")
-    first = ticks == store.array("episode/tick_start")[predictions.episodes]
-    mean = np.asarray(mean_action, np.float32)
-    start = mean if store.streams["action"]["kind"] == "absolute" else np.zeros_like(mean)
-    last = np.where(first[:, None], start, action[np.maximum(ticks - 1, 0)])
-    zero = np.zeros((len(ticks), 1, action.shape[1]), np.float32)
-    return {
-        "zero_action": zero,
-        "mean_action": zero + mean,
-        "repeat_last": last[:, None],
-    }
-
-
-def _mean_chunk(policy: Trainable, batch: Batch, samples: int, generator: Generator) -> Tensor:
-    """The mean of the sampled chunks, (tick, horizon, action_dim), in float32."""
+def _sample(
+    policy: Trainable, batch: Batch, samples: int, generator: Generator
+) -> Float[np.ndarray, "sample tick horizon action_dim"]:
+    """Independent chunks of each tick in float32: one, where the policy does not sample."""
     samples = samples if policy.stochastic else 1
     at_once = max(1, _CHUNKS_AT_ONCE // len(batch))
-    total: Tensor | float = 0.0
-    for done in range(0, samples, at_once):
-        chunks = policy.sample(batch, min(at_once, samples - done), generator)
-        total = total + chunks.float().sum(dim=0)
-    assert isinstance(total, Tensor)
-    return total / samples
+    parts = [
+        policy.sample(batch, min(at_once, samples - done), generator).float().cpu().numpy()
+        for done in range(0, samples, at_once)
+    ]
+    return np.concatenate(parts)
 
 
 def _check_finite(

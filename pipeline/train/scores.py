@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -13,32 +14,72 @@ from pipeline.policy.observation import action_groups
 from pipeline.policy.policy import Trainable
 from pipeline.store import FeatureStore
 from pipeline.train.batches import Ticks, Windows
-from pipeline.train.predictions import (
-    BASELINES,
-    Actions,
-    FeedMaker,
-    Predictions,
-    baselines,
-    predict,
-)
+from pipeline.train.predictions import Actions, FeedMaker, Predictions, errors_of, predict
 
 Errors = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class ActionErrors:
-    """Mean absolute and root mean square error of one way to act, over valid chunk entries.
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """The sets of ticks over which errors are summed up: those of one episode and one phase.
 
-    NaN where no entry is valid. The last axis is the action dimension.
+    Whatever a figure is about, it is a sum over cells: its episodes, groups of these, or a phase.
     """
 
-    mae: Errors
-    rmse: Errors
-    mae_horizon: Errors
-    """(horizon, action_dim): by steps ahead."""
-    rmse_horizon: Errors
-    mae_episode: Errors
-    """(episode, action_dim), the episodes in the order of `Comparison.episodes`."""
+    episode: NDArray[np.int64]
+    """(cell,) index in the store."""
+    group: NDArray[np.str_]
+    """(cell,) the group of recordings that its episode is of: what a bootstrap draws."""
+    phase: NDArray[np.str_]
+    """(cell,) empty where phases are not known."""
+    ticks: NDArray[np.int64]
+    """(cell,) how many."""
+    entries: Errors
+    """(cell, horizon) valid chunk entries by steps ahead."""
+
+
+@dataclass(frozen=True, eq=False)
+class ActionErrors:
+    """Errors of one way to act, summed up over the valid chunk entries of each cell.
+
+    Means are NaN where no entry is valid. Their last axis is the action dimension.
+    """
+
+    cells: Cells
+    absolute: Errors
+    """(cell, horizon, action_dim)."""
+    squared: Errors
+
+    @cached_property
+    def mae(self) -> Errors:
+        """(action_dim,) mean absolute error."""
+        return _ratio(self.absolute.sum(axis=(0, 1)), self.cells.entries.sum())
+
+    @cached_property
+    def rmse(self) -> Errors:
+        """(action_dim,) root mean square error."""
+        return np.sqrt(_ratio(self.squared.sum(axis=(0, 1)), self.cells.entries.sum()))
+
+    @cached_property
+    def mae_horizon(self) -> Errors:
+        """(horizon, action_dim): by steps ahead."""
+        return _ratio(self.absolute.sum(axis=0), self.cells.entries.sum(axis=0)[:, None])
+
+    @cached_property
+    def mae_episode(self) -> Errors:
+        """(episode, action_dim), the episodes in the order of `Comparison.episodes`."""
+        _, place = np.unique(self.cells.episode, return_inverse=True)
+        total, count = (
+            summed(values.sum(axis=1), place) for values in (self.absolute, self.cells.entries)
+        )
+        return _ratio(total, count[:, None])
+
+
+def summed(values: NDArray[Any], place: NDArray[np.intp]) -> Errors:
+    """The sums over the rows of `values` with the same place, (place, …)."""
+    total = np.zeros((int(place.max(initial=-1)) + 1, *values.shape[1:]))
+    np.add.at(total, place, values)
+    return total
 
 
 @dataclass(frozen=True)
@@ -61,17 +102,60 @@ class ActionGroup:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A policy beside the baselines on the same ticks."""
+    """A policy, and whatever else is judged beside it, on the same ticks."""
 
     names: tuple[str, ...]
     units: tuple[str, ...]
     groups: tuple[ActionGroup, ...]
     scale: Errors
     """(action_dim,): standard deviation over the training ticks, 0 where it does not vary."""
-    episodes: tuple[int, ...]
-    """Store indices of the episodes with ticks here."""
-    ticks: int
+    cells: Cells
     scores: Mapping[str, ActionErrors]
+    """By method, the `policy` among them."""
+    execute: int = 1
+    """Steps of a chunk that a robot executes."""
+
+    @property
+    def episodes(self) -> tuple[int, ...]:
+        """Store indices of the episodes with ticks here, ascending."""
+        return tuple(np.unique(self.cells.episode).tolist())
+
+    @property
+    def ticks(self) -> int:
+        """How many."""
+        return int(self.cells.ticks.sum())
+
+    @property
+    def executed(self) -> "Comparison":
+        """The same over the steps that are executed."""
+        return self.part(steps=slice(self.execute))
+
+    def of_phase(self, phase: str) -> "Comparison":
+        """The same on the ticks of one phase."""
+        return self.part(self.cells.phase == phase)
+
+    def part(
+        self, here: NDArray[np.bool_] | slice = slice(None), steps: slice = slice(None)
+    ) -> "Comparison":
+        """The same over some cells and some steps of the chunk."""
+        cells = Cells(*(values[here] for values in vars(self.cells).values()))
+        cells = replace(cells, entries=cells.entries[:, steps])
+        scores = {
+            name: ActionErrors(cells, score.absolute[here, steps], score.squared[here, steps])
+            for name, score in self.scores.items()
+        }
+        return replace(self, cells=cells, scores=scores)
+
+    def weights(self, group: ActionGroup | None = None) -> Errors:
+        """(action_dim,) what each dimension weighs in the error of a group; of None, overall."""
+        dimensions = self.varying() if group is None else list(group.dimensions)
+        weights = np.zeros(len(self.names))
+        weights[dimensions] = 1 / len(dimensions)
+        return weights / np.where(self.scale > 0, self.scale, 1) if group is None else weights
+
+    def error(self, method: str, group: ActionGroup | None = None) -> float:
+        """Mean absolute error: a group's in its unit; of None, `overall`."""
+        return float(self.scores[method].mae @ self.weights(group))
 
     def overall(self, method: str) -> float:
         """Mean absolute error in units of the training standard deviation.
@@ -80,7 +164,7 @@ class Comparison:
         normally distributed actions, always acting the mean then costs 0.8. Where none varies, all
         count, undivided.
         """
-        return float(self.in_training_std(self.scores[method].mae).mean())
+        return self.error(method)
 
     def overall_by_episode(self, method: str) -> Errors:
         """`overall` of each episode, (episode,), in the order of `episodes`."""
@@ -101,7 +185,7 @@ class Comparison:
         order = self.ranked()
         best, worst = order[0], order[-1]
         if best == worst:
-            return [("the held-out episode", self.episodes[best])]
+            return [("the only episode", self.episodes[best])]
         return [("lowest error", self.episodes[best]), ("highest error", self.episodes[worst])]
 
     def varying(self) -> list[int]:
@@ -132,27 +216,9 @@ class Comparison:
         dimensions = self.varying()
         return errors[..., dimensions] / np.where(self.scale > 0, self.scale, 1)[dimensions]
 
-    def group_mae(self, method: str, group: ActionGroup) -> float:
-        """Mean absolute error of a group, in its unit."""
-        return float(group.mean(self.scores[method].mae))
-
     def group_rmse(self, method: str, group: ActionGroup) -> float:
         """Root mean square error of a group, in its unit."""
         return float(np.sqrt(group.mean(self.scores[method].rmse ** 2)))
-
-    def relative(self, group: ActionGroup | None = None) -> float | None:
-        """The policy's mean absolute error divided by that of the best baseline; below 1 it wins.
-
-        None for a group that never varies in training, where the mean action is right by itself.
-        """
-        if group is not None and not (self.scale[list(group.dimensions)] > 0).any():
-            return None
-        errors = {
-            method: self.overall(method) if group is None else self.group_mae(method, group)
-            for method in ("policy", *BASELINES)
-        }
-        best = min(errors[method] for method in BASELINES)
-        return errors["policy"] / best if best > 0 else None
 
 
 def evaluate_policy(
@@ -166,66 +232,68 @@ def evaluate_policy(
     samples: int = 1,
     feed: FeedMaker | None = None,
 ) -> tuple[Comparison, Predictions]:
-    """The policy beside the baselines on these ticks, and its predictions there.
+    """The errors of the policy on these ticks, and its predictions there.
 
     `samples`, `feed` and what is raised are those of `predict`.
     """
     predictions = predict(policy, store, ticks, windows, batch_size, progress, samples, feed)
+    return compare(predictions, {}, *action_space(store, normalization)), predictions
+
+
+def action_space(
+    store: FeatureStore, normalization: Normalization
+) -> tuple[tuple[str, ...], tuple[str, ...], tuple[ActionGroup, ...], Errors]:
+    """Names, units, groups and `Comparison.scale` of the action's dimensions."""
     action, statistics = store.streams["action"], normalization.action
+    names, units = tuple(action["names"]), tuple(action["units"])
     members: dict[tuple[str, str], list[int]] = {}
-    for index, group in enumerate(action_groups(action["names"], action["units"])):
-        members.setdefault((group, action["units"][index]), []).append(index)
-    comparison = compare(
-        predictions,
-        baselines(store, predictions, statistics.mean),
-        action["names"],
-        action["units"],
-        [ActionGroup(*key, tuple(dimensions)) for key, dimensions in members.items()],
-        # A channel that does not vary has a scale of 1 that is not its spread.
-        np.where(statistics.scale == statistics.std, statistics.std, 0.0),
-    )
-    return comparison, predictions
+    for index, group in enumerate(action_groups(names, units)):
+        members.setdefault((group, units[index]), []).append(index)
+    groups = tuple(ActionGroup(*key, tuple(dimensions)) for key, dimensions in members.items())
+    # A channel that does not vary has a scale of 1 that is not its spread.
+    scale = np.where(statistics.scale == statistics.std, statistics.std, 0.0)
+    return names, units, groups, scale
 
 
 def compare(
     predictions: Predictions,
-    baselines: Mapping[str, Actions],
+    others: Mapping[str, Actions],
     names: Sequence[str],
     units: Sequence[str],
     groups: Sequence[ActionGroup],
     scale: NDArray[np.floating],
+    group: NDArray[np.str_] | None = None,
+    phase: NDArray[np.str_] | None = None,
+    execute: int = 1,
 ) -> Comparison:
-    """The scores of the policy and of each baseline on these predictions."""
-    ways = {"policy": predictions.predicted, **baselines}
-    episodes, place = np.unique(predictions.episodes, return_inverse=True)
-    return Comparison(
-        names=tuple(names),
-        units=tuple(units),
-        groups=tuple(groups),
-        scale=np.asarray(scale, np.float64),
-        episodes=tuple(episodes.tolist()),
-        ticks=len(predictions.ticks),
-        scores={name: _score(acted, predictions, place) for name, acted in ways.items()},
-    )
+    """The errors of the policy and of what `others` did, (tick, horizon or 1, action_dim).
 
-
-def _score(acted: Actions, predictions: Predictions, episode: NDArray[np.intp]) -> ActionErrors:
-    valid = predictions.valid.astype(np.float64)
-    error = (acted.astype(np.float64) - predictions.recorded) * valid[..., None]
-    absolute, squared = np.abs(error), error**2
-    count = valid.sum()
-    count_horizon = valid.sum(axis=0)[:, None]
-    episodes = int(episode.max()) + 1
-    by_episode = np.zeros((episodes, error.shape[2]))
-    np.add.at(by_episode, episode, absolute.sum(axis=1))
-    count_episode = np.bincount(episode, valid.sum(axis=1), episodes)[:, None]
-    return ActionErrors(
-        mae=_ratio(absolute.sum(axis=(0, 1)), count),
-        rmse=np.sqrt(_ratio(squared.sum(axis=(0, 1)), count)),
-        mae_horizon=_ratio(absolute.sum(axis=0), count_horizon),
-        rmse_horizon=np.sqrt(_ratio(squared.sum(axis=0), count_horizon)),
-        mae_episode=_ratio(by_episode, count_episode),
+    `group` and `phase` are (tick,): those of each tick. Without, each episode is a group, and
+    phases are not known.
+    """
+    episodes = predictions.episodes
+    labels = [
+        episodes.astype(np.str_) if group is None else group,
+        np.full(len(episodes), "") if phase is None else phase,
+    ]
+    codes = np.stack([np.unique(label, return_inverse=True)[1] for label in (episodes, *labels)])
+    _, first, place = np.unique(codes, axis=1, return_index=True, return_inverse=True)
+    place, valid = place.reshape(-1), predictions.valid
+    cells = Cells(
+        episodes[first],
+        *(label[first] for label in labels),
+        ticks=np.bincount(place),
+        entries=summed(valid, place),
     )
+    errors = {"policy": predictions.errors()} | {
+        name: errors_of(acted, predictions.recorded) for name, acted in others.items()
+    }
+    scores = {
+        name: ActionErrors(cells, *(summed(kind * valid[..., None], place) for kind in both))
+        for name, both in errors.items()
+    }
+    scale = np.asarray(scale, np.float64)
+    return Comparison(tuple(names), tuple(units), tuple(groups), scale, cells, scores, execute)
 
 
 def _ratio(total: Errors, entries: NDArray[Any] | np.float64) -> Errors:

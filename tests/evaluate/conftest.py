@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.evaluate.baselines import Baselines
 from pipeline.store import FeatureStore
-from pipeline.train.predictions import Predictions, baselines
+from pipeline.train.predictions import Predictions
 from pipeline.train.scores import ActionGroup, Comparison, compare
 
 GROUPS = (
@@ -51,7 +52,9 @@ def compared(store: FeatureStore) -> Callable[[Predictions], Comparison]:
         spread = np.where(action.std(0) > 1e-9, action.std(0), 0)
         return compare(
             predictions,
-            baselines(store, predictions, action.mean(0)),
+            Baselines(store, np.arange(90, 180), predictions.recorded.shape[1], None).act(
+                predictions.ticks
+            ),
             store.streams["action"]["names"],
             store.streams["action"]["units"],
             GROUPS,

@@ -12,36 +12,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.base.errors import NumericsError
+from pipeline.evaluate.baselines import BASELINES
+from pipeline.evaluate.figures import rivalry
 from pipeline.store import FeatureStore
 from pipeline.train.batches import Windows
-from pipeline.train.predictions import Predictions, baselines, predict
+from pipeline.train.predictions import Predictions, predict
 from pipeline.train.scores import ActionGroup, Comparison, compare
 
 Recorded = Callable[..., Predictions]
 Compared = Callable[[Predictions], Comparison]
 
 
-def test_the_baselines_are_the_rules_they_are_named_after(
-    store: FeatureStore, recorded: Recorded
-) -> None:
-    action = store.array("tick/action")
-    mean = np.array([1.0, 2.0, 3.0, 4.0, 5.0])
-    found = baselines(store, recorded(np.array([0, 1, 29, 30, 31])), mean)
-    assert np.array_equal(found["zero_action"], np.zeros((5, 1, 5)))
-    assert np.array_equal(found["mean_action"], np.tile(mean, (5, 1, 1)))
-    nothing = np.zeros(5)
-    # Ticks 0 and 30 begin episodes: what the other episode did last is not theirs to repeat.
-    expected = [nothing, action[0], action[28], nothing, action[30]]
-    assert np.array_equal(found["repeat_last"][:, 0], expected)
-
-
 def test_a_perfect_policy_has_no_error(recorded: Recorded, compared: Compared) -> None:
     comparison = compared(recorded(np.arange(60)))
     score = comparison.scores["policy"]
-    for errors in (score.mae, score.rmse, score.mae_horizon, score.rmse_horizon, score.mae_episode):
+    for errors in (score.mae, score.rmse, score.mae_horizon, score.mae_episode):
         assert np.array_equal(errors, np.zeros_like(errors))
     assert comparison.overall("policy") == 0
-    assert comparison.relative() == 0
+    assert rivalry(comparison).ratio == 0
     assert comparison.overall("zero_action") > 0
 
 
@@ -56,7 +44,7 @@ def test_errors_worked_out_by_hand() -> None:
         valid=np.array([[True, True], [True, False]]),  # the second chunk leaves its episode
     )
     groups = (ActionGroup("both", "mm", (0, 1)),)
-    rules = {name: np.full((2, 1, 2), 30, np.float32) for name in ("zero_action", "mean_action")}
+    rules = {name: np.full((2, 1, 2), 30, np.float32) for name in BASELINES}
     rules["repeat_last"] = np.full((2, 1, 2), -13, np.float32)
     found = compare(predictions, rules, ["x", "y"], ["mm", "mm"], groups, np.array([2.0, 10.0]))
     score = found.scores["policy"]
@@ -64,13 +52,15 @@ def test_errors_worked_out_by_hand() -> None:
     assert score.mae == pytest.approx([3, 20])
     assert score.rmse == pytest.approx(np.sqrt([35 / 3, 1400 / 3]))
     assert score.mae_horizon == pytest.approx(np.array([[3, 20], [3, 20]]))
-    assert score.rmse_horizon == pytest.approx(np.sqrt([[13, 500], [9, 400]]))
     assert score.mae_episode == pytest.approx(np.array([[2, 15], [5, 30]]))
-    assert found.group_mae("policy", groups[0]) == pytest.approx(11.5)
+    assert found.error("policy", groups[0]) == pytest.approx(11.5)
     assert found.group_rmse("policy", groups[0]) == pytest.approx(np.sqrt(1435 / 6))
     assert found.overall("policy") == pytest.approx((3 / 2 + 20 / 10) / 2)
-    assert found.relative(groups[0]) == pytest.approx(11.5 / 13)
-    assert found.relative() == pytest.approx(1.75 / ((13 / 2 + 13 / 10) / 2))
+    assert found.executed.error("policy", groups[0]) == pytest.approx(11.5)
+    assert found.part(steps=slice(1, 2)).error("policy") == pytest.approx((3 / 2 + 20 / 10) / 2)
+    assert found.ticks == 2 and found.cells.group.tolist() == ["2", "7"]
+    assert rivalry(found, groups[0]).ratio == pytest.approx(11.5 / 13)
+    assert rivalry(found).ratio == pytest.approx(1.75 / ((13 / 2 + 13 / 10) / 2))
 
 
 def test_a_horizon_no_episode_reaches_has_no_error_and_counts_nowhere(
@@ -96,13 +86,9 @@ def test_what_lies_beyond_an_episode_changes_no_score(seed: int, ticks: int, hor
         predictions = Predictions(
             np.arange(ticks), np.arange(ticks) // 3, predicted, np.zeros(shape, np.float32), valid
         )
-        nothing = {
-            name: np.zeros((ticks, 1, 3), np.float32)
-            for name in ("zero_action", "mean_action", "repeat_last")
-        }
-        found = compare(predictions, nothing, "abc", ["", "", ""], groups, np.ones(3))
+        found = compare(predictions, {}, "abc", ["", "", ""], groups, np.ones(3))
         scores.append(found.scores["policy"])
-    for name in vars(scores[0]):
+    for name in ("mae", "rmse", "mae_horizon", "mae_episode"):
         assert np.array_equal(getattr(scores[0], name), getattr(scores[1], name), equal_nan=True)
 
 
@@ -112,8 +98,8 @@ def test_a_group_that_never_varies_is_not_compared_and_weighs_nothing(
     error = np.array([0, 0, 0, 0, 5.0])
     comparison = compared(recorded(np.arange(60), error))
     gripper = comparison.groups[2]
-    assert comparison.relative(gripper) is None
-    assert comparison.group_mae("policy", gripper) == pytest.approx(5.0)
+    assert rivalry(comparison, gripper).ratio is None
+    assert comparison.error("policy", gripper) == pytest.approx(5.0)
     assert comparison.overall("policy") == pytest.approx(0.0, abs=1e-6)
 
 
@@ -202,16 +188,6 @@ def test_a_number_that_is_none_is_named_by_episode_tick_and_time(
     assert what in said
     # Beyond the end of an episode nothing was recorded, so nothing can be wrong there.
     assert len(predict(FirstFeature(), store, np.arange(26, 30), WINDOWS, 8).ticks)  # type: ignore[arg-type]
-
-
-def test_absolute_actions_are_not_repeated_from_nothing(
-    store: FeatureStore, recorded: Recorded, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    mean = np.array([1.0, 2.0, 3.0, 4.0, 5.0])
-    absolute = store.streams | {"action": store.streams["action"] | {"kind": "absolute"}}
-    monkeypatch.setattr(FeatureStore, "streams", absolute)
-    found = baselines(store, recorded(np.array([0, 1, 30])), mean)["repeat_last"][:, 0]
-    assert np.array_equal(found, [mean, store.array("tick/action")[0], mean])
 
 
 def test_the_overall_error_of_episodes_of_one_length_is_their_mean(

@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 
 from pipeline.base.errors import DiskFull
-from pipeline.evaluate.tables import FOOTNOTE, error_text, metrics, write_tables
+from pipeline.evaluate.baselines import BASELINES, METHODS
+from pipeline.evaluate.figures import Figure, rivalry
+from pipeline.evaluate.tables import FOOTNOTE, HEADINGS, error_text, metrics, write_tables
 from pipeline.store import FeatureStore
-from pipeline.train.predictions import BASELINES, Predictions
-from pipeline.train.scores import Comparison
+from pipeline.train.predictions import Predictions
+from pipeline.train.scores import Comparison, compare
 
 TICKS = np.arange(30, 90)
 
@@ -39,31 +41,69 @@ def numbers(document: dict[str, Any]) -> list[float]:
     ]
 
 
-def test_the_metrics_are_few_and_numbers_only(comparison: Comparison) -> None:
+def test_the_metrics_are_numbers_only_the_executed_first(comparison: Comparison) -> None:
     document = metrics(comparison)
-    assert document["held_out"] == {"episodes": 2, "ticks": 60}
-    assert document["translation_mm"]["policy"] == pytest.approx(0.2)
-    assert document["rotation_deg"]["policy"] == pytest.approx(0.5)
-    assert "relative" not in document["gripper"]
-    assert document["overall"]["relative"] < 1
-    # As many columns as `dvc metrics show` can put in a line.
-    assert len(numbers(document)) == 2 + 2 + (2 + 2 + 1)
+    assert list(document) == ["test", "executed", "chunk"]
+    assert document["test"] == {"episodes": 2, "groups": 2, "ticks": 60}
+    assert document["chunk"]["translation_mm"]["policy"]["value"] == pytest.approx(0.2)
+    assert document["executed"]["rotation_deg"]["policy"]["value"] == pytest.approx(0.5)
+    assert list(document["executed"]["gripper"]) == ["policy"], "it never varies"
+    overall = document["chunk"]["overall"]
+    assert overall["difference"]["value"] < 0
+    assert overall["policy"]["low"] <= overall["policy"]["value"] <= overall["policy"]["high"]
+    found = sum(overall[name]["value"] for name in ("best_baseline", "difference"))
+    assert found == pytest.approx(overall["policy"]["value"], rel=1e-4)
     assert all(number == float(f"{number:.6g}") for number in numbers(document))
     assert all(np.isfinite(numbers(document)))
 
 
-def test_the_table_lines_up(comparison: Comparison) -> None:
+def test_several_executed_steps_have_the_first_beside_them(comparison: Comparison) -> None:
+    several = replace(comparison, execute=3)
+    document = metrics(several)
+    assert list(document) == ["test", "executed", "first_step", "chunk"]
+    assert document["first_step"] == metrics(comparison)["executed"]
+    lines = error_text(several).splitlines()
+    assert lines[0] == "what is executed, the first 3 steps of 4, with 95 % intervals:"
+    assert "; first step -" in lines[-1]
+
+
+def test_samples_and_phases_are_there_where_they_are_known(
+    predictions: Predictions, comparison: Comparison
+) -> None:
+    phases = np.where(TICKS < 60, "approach", "hold")
+    others = {
+        name: np.zeros((60, 4, 5), np.float32) for name in (*BASELINES, "mean of n", "best of n")
+    }
+    action = (comparison.names, comparison.units, comparison.groups, comparison.scale)
+    found = compare(predictions, others, *action, (TICKS % 5).astype(np.str_), phases)
+    document = metrics(found, Figure(0.3, 0.2, 0.4))
+    assert list(document["samples"]) == ["one", "mean_of_n", "best_of_n", "energy_score"]
+    assert document["samples"]["energy_score"] == {"value": 0.3, "low": 0.2, "high": 0.4}
+    assert [part["ticks"] for part in document["phases"].values()] == [30, 30]
+    text = error_text(found, Figure(0.3, 0.2, 0.4))
+    assert "energy score 0.300 (0.200–0.400)" in text and "\napproach     30  " in text
+    assert "by phase" not in error_text(comparison)
+
+
+def test_the_text_is_two_tables_and_few_lines(comparison: Comparison) -> None:
     lines = error_text(comparison).splitlines()
-    assert [line.split("  ")[0] for line in lines] == [
-        "mean absolute error",
-        "translation [mm]",
-        "rotation [deg]",
-        "gripper",
-        "overall [training std]",
-        FOOTNOTE,
-    ]
-    assert len({len(line) for line in lines[:-1]}) == 1
-    assert lines[3].endswith("–")
+    methods = ["policy", "zero", "median", "repeat last", "linear fit", "nearest neighbour"]
+    for first, title in ((0, "what is executed, step 0 of 4"), (9, "the whole chunk of 4 step(s)")):
+        assert lines[first] == f"{title}, with 95 % intervals:"
+        assert lines[first + 1].startswith("mean absolute error  translation [mm]")
+        assert [line.split("  ")[0] for line in lines[first + 2 : first + 8]] == methods
+    footnote, samples, verdict = lines[18:]
+    assert footnote == FOOTNOTE and samples.startswith("the expert gives one chunk a tick")
+    assert verdict.startswith("policy minus best baseline [training std]: executed -")
+    assert verdict.count("resolved better") == 2
+
+
+def test_of_one_group_it_is_said_that_there_is_no_interval(
+    recorded: Callable[..., Predictions], compared: Callable[[Predictions], Comparison]
+) -> None:
+    text = error_text(compared(recorded(np.arange(30, 60), 0.1)))
+    assert text.endswith("no intervals: they take at least two groups of test recordings")
+    assert "(" not in text.splitlines()[2]
 
 
 def test_dimensions_that_hardly_move_are_said_below_the_table(comparison: Comparison) -> None:
@@ -72,16 +112,16 @@ def test_dimensions_that_hardly_move_are_said_below_the_table(comparison: Compar
     scale = np.array([0.05, 0.06, 0.07, 1e-9, 0.0])
     still = replace(comparison, names=names, units=("",) * 5, scale=scale)
     moving = replace(still, scale=np.array([0.05, 0.06, 0.07, 0.0, 0.0]))
-    error = f"{moving.overall('policy'):.3f}, {moving.relative():.2f} times the best baseline's"
-    best = min(BASELINES, key=moving.overall).replace("_action", "").replace("_", " ")
-    *_, footnote, line = error_text(still).splitlines()
-    assert footnote == FOOTNOTE
+    error = f"{moving.overall('policy'):.3f}, {rivalry(moving).ratio:.2f} times the best baseline's"
+    best = HEADINGS[min(BASELINES, key=moving.overall)]
+    *_, line = error_text(still).splitlines()
     assert line == (
         "hardly moving: joint_3 (training std at most 1e-09, where 0.07 is usual for such "
-        "dimensions), 1 of the 4 dimensions in the overall error; without, it is "
+        "dimensions), 1 of the 4 dimensions in the overall error; without, that of the chunk is "
         f"{error} ({best})"
     )
-    assert metrics(still)["overall"]["policy"] == pytest.approx(still.overall("policy"), rel=1e-5)
+    overall = metrics(still)["chunk"]["overall"]["policy"]["value"]
+    assert overall == pytest.approx(still.overall("policy"), rel=1e-5)
     assert moving.overall("policy") < 0.01 * still.overall("policy")
 
 
@@ -98,7 +138,16 @@ def test_files_hold_every_dimension_step_episode_and_tick(
     }
     groups = {row["group"]: row for row in rows["errors"]}
     assert list(groups) == ["translation", "rotation", "gripper", "overall"]
-    assert float(groups["rotation"]["policy_rmse"]) == pytest.approx(0.5)
+    assert float(groups["rotation"]["policy"]) == pytest.approx(0.5)
+    low, high = (float(groups["overall"][f"zero_action_{end}"]) for end in ("low", "high"))
+    assert low <= float(groups["overall"]["zero_action"]) <= high
+    assert list(rows["executed"][0]) == list(rows["errors"][0])
+    group, other = rows["groups"]
+    assert (group["group"], other["group"]) == ("1", "2")
+    assert (group["executed_entries"], group["overall_entries"]) == ("30", "114")
+    mean = (float(group["repeat_last_overall"]) + float(other["repeat_last_overall"])) / 2
+    assert mean == pytest.approx(comparison.overall("repeat_last"), rel=1e-5)
+    assert {f"{way}_executed" for way in METHODS} < group.keys()
     assert float(groups["overall"]["repeat_last"]) == pytest.approx(
         comparison.overall("repeat_last"), rel=1e-5
     )
@@ -124,8 +173,8 @@ def test_files_hold_every_dimension_step_episode_and_tick(
 
 
 def test_a_number_that_is_none_is_not_left_out(comparison: Comparison) -> None:
-    comparison.scores["policy"].mae[0] = np.nan
-    assert np.isnan(metrics(comparison)["translation_mm"]["policy"])
+    comparison.scores["policy"].absolute[:, :, 0] = np.nan
+    assert np.isnan(metrics(comparison)["chunk"]["translation_mm"]["policy"]["value"])
 
 
 def test_a_step_no_chunk_reaches_is_empty(
@@ -137,7 +186,7 @@ def test_a_step_no_chunk_reaches_is_empty(
     predictions = recorded(np.array([28, 58]))
     write_tables(tmp_path, compared(predictions), predictions, store)
     lines = (tmp_path / "steps.csv").read_text().splitlines()
-    assert lines[3:] == ["2,,,,", "3,,,,"] and ",," not in lines[2]
+    assert lines[3:] == [f"2{',' * 18}", f"3{',' * 18}"] and ",," not in lines[2]
 
 
 def test_what_a_report_is_linked_to_is_not_written(

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 import yaml
 
+from pipeline.evaluate.baselines import BASELINES
 from pipeline.evaluate.evaluation import JUDGED
 from pipeline.evaluate.experiments import read_experiments
-from pipeline.train.predictions import BASELINES
 from stages import compare, evaluate, train_head
 from stages.command import run
 
@@ -147,10 +147,10 @@ def test_other_baselines_are_refused(
     path = reports / "regression-gated" / "errors.csv"
     rows = list(csv.DictReader(path.read_text().splitlines()))
     assert (rows[0]["group"], rows[0]["unit"]) == ("translation", "mm")
-    text = path.read_text().replace(rows[0]["mean_action"], "7.5")
+    text = path.read_text().replace(rows[0]["median_action"], "7.5")
     path.write_text(text)
     error = refused(reports, experiments, capsys)
-    assert "found mean_action (translation_mm)" in error
+    assert "found median_action (translation_mm)" in error
     assert "trained on other recordings" in error
 
 

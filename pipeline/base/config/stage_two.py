@@ -152,7 +152,8 @@ class TrainHeadParams(Section):
     eval_every: int = Field(default=50, ge=1)
     """Steps between evaluations on the ticks of val."""
     eval_samples: int = Field(default=4, ge=1)
-    """Chunks sampled a tick, whose mean is judged; experts that do not sample give one."""
+    """Chunks sampled a tick, over which the error of one is averaged; experts that do not sample
+    give one."""
     early_stopping: int | None = Field(default=None, ge=1)
     """Stop after this many evaluations in a row without a better one; null never stops early."""
     checkpoint_every: int = Field(default=200, ge=1)
@@ -212,7 +213,12 @@ class EvaluateParams(Section):
     batch_size: int = Field(default=64, ge=1)
     """Ticks a forward pass."""
     samples: int = Field(default=16, ge=1)
-    """Chunks sampled a tick, whose mean is judged; experts that do not sample give one."""
+    """Chunks sampled a tick: the error is that of one, averaged over them for less noise; the error
+    of their mean, of the best of them and the energy score stand beside it. Experts that do not
+    sample give one."""
+    execute: int = Field(default=1, ge=1)
+    """Steps of a chunk that the robot carries out before it asks for the next: their error stands
+    first."""
     modalities: bool = True
     """Also judge with each stream zeroed, shuffled across episodes and delayed."""
     device: str = "auto"

@@ -10,38 +10,47 @@ from pipeline.base.digests import file_digest
 from pipeline.base.table import Table
 from pipeline.evaluate import tables
 from pipeline.evaluate.ablation import AblationStudy
+from pipeline.evaluate.baselines import METHODS
 from pipeline.evaluate.episode_frames import read_episode_frames, shown_ticks
 from pipeline.evaluate.evaluation import Evaluation
-from pipeline.evaluate.names import with_unit
+from pipeline.evaluate.figures import best_baseline, rivalry
 from pipeline.look.evaluation import pictures as plots
 from pipeline.look.page.blocks import Block, Document, Picture, Report, Section, Text
 from pipeline.look.page.writing import sentence
 from pipeline.store import episode_name
 from pipeline.train.batches import Ticks
-from pipeline.train.predictions import METHODS, Predictions
+from pipeline.train.predictions import Predictions
 from pipeline.train.scores import Comparison
 
 _INSTANTS = 5
 """Ticks of an episode at which its frames are shown."""
 _EPISODES = 40
 """Rows of the table of episodes."""
+_PAIRED = (
+    "Policy minus best baseline in each figure, by the paired bootstrap over groups of test "
+    "recordings: not resolved is a difference whose 95 % interval holds 0."
+)
 _CAPTIONS = {
-    "dimensions": "Mean absolute error of policy and baselines by dimension, of those that vary.",
-    "scatter": "Predicted against recorded next action at the held-out ticks.",
-    "horizon": "Mean absolute error of policy and baselines by how far ahead an action lies.",
+    "methods": "Overall error of policy and baselines, of what is executed and of the whole chunk, "
+    "with 95 % intervals.",
+    "dimensions": "Mean absolute error of policy and baselines by dimension, of those that vary, "
+    "over the whole chunk.",
+    "scatter": "Predicted against recorded next action at the test ticks.",
+    "horizon": "Mean absolute error of policy and baselines by how far ahead an action lies; the "
+    "bands of the policy and of the best baseline are 95 % intervals.",
     "dimension_horizon": "The policy's error by dimension and step [training std].",
-    "episodes": "Mean absolute error of policy and baselines in each held-out episode.",
+    "episodes": "Mean absolute error of policy and baselines in each test episode.",
     "timeline": "Every action dimension over the episodes of lowest and highest error.",
     "modalities": "The error with one stream ablated as a multiple of that with all intact.",
     "curves": "The training by its steps; dashed, the step of the checkpoint.",
 }
 
 
-def evaluation_report(evaluation: Evaluation) -> Report:
+def evaluation_report(evaluation: Evaluation, rollout: str = "") -> Report:
     """The page of a judgement, its recordings' frames read where they still lie.
 
-    Says nothing of the clock and nothing of where it is written: the same judgement gives the same
-    page.
+    `rollout` is the page of the closed loop, relative to this one, where there is one. Says nothing
+    of the clock and nothing of where it is written: the same judgement gives the same page.
     """
     comparison, policy = evaluation.comparison, evaluation.judged["policy"]
     # The overall error counts dimensions that hardly move like the others.
@@ -51,13 +60,15 @@ def evaluation_report(evaluation: Evaluation) -> Report:
         summary=(
             f"{policy['model_type']} expert, {policy['fusion_strategy']} fusion, step "
             f"{policy['step']}, {policy['parameters']:,} parameters, judged on "
-            f"{comparison.ticks:,} held-out ticks of {len(comparison.episodes)} episode(s) of "
+            f"{comparison.ticks:,} test ticks of {len(comparison.episodes)} episode(s) of "
             f"{evaluation.store.path.name}, {policy['samples']} chunk(s) a tick."
             f"{_beaten(comparison)}{f' {sentence(still)}' if still else ''}"
         ),
         tiles=_tiles(comparison),
         sections=(
-            Section("Errors beside baselines", _baselines(comparison)),
+            Section("Error of what is executed", _executed(comparison, rollout)),
+            Section("Error of the whole chunk", _chunk(evaluation)),
+            *([Section("Phases", _phases(comparison))] if tables.by_phase(comparison) else []),
             Section("Dimensions and steps ahead", _dimensions(evaluation)),
             Section("Episodes", _episodes(evaluation), tuple(_extremes(evaluation))),
             Section("Which streams are used", _modalities(evaluation.study)),
@@ -73,42 +84,64 @@ def _picture(draw: Callable[..., Figure], *shown: object) -> Picture:
 
 
 def _beaten(comparison: Comparison) -> str:
-    """A sentence on the groups in which a baseline is better, which the overall error hides."""
+    """A sentence on the figures in which a baseline is better, beyond what chance explains."""
     worse = [
-        f"{group.name} ({relative:.2f} times the best baseline's error)"
-        for group in comparison.varying_groups()
-        if (relative := comparison.relative(group)) is not None and round(relative, 2) > 1
+        f"{scope} {group.name if group else 'overall'} ({rivals.ratio:.2f} times the best's error)"
+        for scope, part in tables.scopes(comparison).items()
+        for group in (*part.varying_groups(), None)
+        if (rivals := rivalry(part, group)).verdict in ("worse", "no interval")
+        and rivals.ratio is not None
+        and round(rivals.ratio, 2) > 1
     ]
-    return f" A baseline is better in {', '.join(worse)}." if worse else ""
+    return f" A baseline is better in: {', '.join(worse)}." if worse else ""
 
 
 def _tiles(comparison: Comparison) -> list[tuple[str, str]]:
-    tiles = [("overall error [training std]", f"{comparison.overall('policy'):.3f}")]
-    ways = {"of the best baseline's": comparison}
-    if comparison.low_variance():
-        ways["the same, without what hardly moves"] = comparison.without_low_variance()
-    for words, judged in ways.items():
-        if (relative := judged.relative()) is not None:
-            label = f"{words} ({tables.HEADINGS[tables.best_baseline(judged)]})"
-            tiles.append((label, f"{100 * relative:.0f} %"))
-    tiles += [
-        (with_unit(group.name, group.unit), f"{comparison.group_mae('policy', group):.3g}")
-        for group in comparison.varying_groups()
-    ]
-    return [*tiles, ("held-out episodes", f"{len(comparison.episodes)}")]
+    tiles: list[tuple[str, str]] = []
+    for scope, part in (("executed", comparison.executed), ("chunk", comparison)):
+        rivals = rivalry(part)
+        best = tables.HEADINGS[rivals.best]
+        tiles.append((f"{scope}: overall error [training std]", rivals.policy.text()))
+        label = f"{scope}: {rivals.difference.text('+')} beside the best baseline ({best})"
+        tiles.append((label, rivals.verdict))
+    rivals = rivalry(comparison.without_low_variance())
+    if comparison.low_variance() and rivals.ratio is not None:
+        best = tables.HEADINGS[rivals.best]
+        label = f"chunk: of the best baseline's, without what hardly moves ({best})"
+        tiles.append((label, f"{100 * rivals.ratio:.0f} %"))
+    return [*tiles, ("test episodes", f"{len(comparison.episodes)}")]
 
 
-def _baselines(comparison: Comparison) -> list[Block]:
-    errors = tables.error_table(comparison)
-    last = frozenset({len(errors.rows) - 1})
+def _executed(comparison: Comparison, rollout: str) -> list[Block]:
+    title, _ = tables.titles(comparison)
+    errors = tables.error_table(comparison.executed)
+    success = "Whether the task succeeds, recorded ticks do not tell: the rollouts do."
     return [
-        Text("The baselines see nothing; below 1, `policy / best` beats the best of them."),
-        replace(errors, caption=sentence(tables.FOOTNOTE), strong=last),
-        _picture(plots.dimensions, comparison),
+        Text(f"{sentence(title)} With 95 % intervals over groups of test recordings."),
+        replace(errors, caption=sentence(tables.FOOTNOTE)),
+        _picture(plots.methods, comparison),
+        Text(success, rollout),
     ]
+
+
+def _chunk(evaluation: Evaluation) -> list[Block]:
+    comparison = evaluation.comparison
+    _, title = tables.titles(comparison)
+    caption = f"{sentence(title)} With 95 % intervals."
+    return [
+        replace(tables.error_table(comparison), caption=caption),
+        Text(sentence(tables.samples_text(comparison, evaluation.energy))),
+        replace(tables.difference_table(comparison), caption=_PAIRED),
+    ]
+
+
+def _phases(comparison: Comparison) -> list[Block]:
+    caption = f"Overall error [training std] by phase. {sentence(tables.PHASE_RULE)}"
+    return [replace(tables.phase_table(comparison), caption=caption)]
 
 
 def _dimensions(evaluation: Evaluation) -> list[Block]:
+    """Over the whole chunk."""
     comparison = evaluation.comparison
     columns = ["dimension", "unit", *(tables.HEADINGS[method] for method in METHODS), "policy RMSE"]
     scores = comparison.scores
@@ -116,6 +149,7 @@ def _dimensions(evaluation: Evaluation) -> list[Block]:
     rows = list(zip(comparison.names, comparison.units, *errors, strict=True))
     return [
         Table(columns, rows, caption="Mean absolute error by dimension, and the policy's RMSE."),
+        _picture(plots.dimensions, comparison),
         _picture(plots.scatter, comparison, evaluation.predictions),
         _picture(plots.horizon, comparison, evaluation.store.action_hz),
         _picture(plots.dimension_horizon, comparison),
@@ -123,9 +157,9 @@ def _dimensions(evaluation: Evaluation) -> list[Block]:
 
 
 def _episodes(evaluation: Evaluation) -> list[Block]:
-    """All held-out episodes by error."""
+    """All test episodes by error."""
     comparison, store = evaluation.comparison, evaluation.store
-    best = tables.best_baseline(comparison)
+    best = best_baseline(comparison)
     errors = {method: comparison.overall_by_episode(method) for method in ("policy", best)}
     rows: list[tuple[object, ...]] = []
     for place in comparison.ranked()[::-1][:_EPISODES]:
@@ -136,7 +170,7 @@ def _episodes(evaluation: Evaluation) -> list[Block]:
     caption = "Overall error [training std] by episode, the worst first"
     if len(rows) < len(comparison.episodes):
         caption += f"; the worst {len(rows)} of {len(comparison.episodes)}"
-    heads = ["episode", "held-out ticks", "policy", tables.HEADINGS[best], "policy / baseline"]
+    heads = ["episode", "test ticks", "policy", tables.HEADINGS[best], "policy / baseline"]
     return [
         Table(heads, rows, f"{caption}."),
         _picture(plots.episodes, comparison, store),

@@ -12,11 +12,13 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from pipeline.evaluate.ablation import AblationStudy
+from pipeline.evaluate.ablation import Ablated, AblationStudy
+from pipeline.evaluate.baselines import BASELINES, METHODS
 from pipeline.evaluate.curves import TrainingCurves
 from pipeline.evaluate.experiments import Experiment
+from pipeline.evaluate.figures import best_baseline, error
 from pipeline.evaluate.names import with_unit
-from pipeline.evaluate.tables import ABLATION_FOOTNOTE, best_baseline
+from pipeline.evaluate.tables import ABLATION_FOOTNOTE, HEADINGS
 from pipeline.look.page.style import (
     GRID,
     INK,
@@ -32,7 +34,7 @@ from pipeline.look.page.style import (
     shorten_middle,
 )
 from pipeline.store import Episode, FeatureStore, episode_name
-from pipeline.train.predictions import BASELINES, METHODS, Predictions
+from pipeline.train.predictions import Predictions
 from pipeline.train.scores import ActionGroup, Comparison
 
 SCATTER_POINTS = 4000
@@ -61,10 +63,28 @@ _EXPERTS = ("#0072B2", "#D55E00", "#56B4E9", "#F0E442", "#999999")
 """In the order in which they come."""
 
 
+def methods(comparison: Comparison) -> Figure:
+    """The overall error of policy and baselines with 95 % intervals, executed and whole chunk."""
+    scopes = {"what is executed": comparison.executed, "the whole chunk": comparison}
+    figure, axes = panels(9.4, 3.6, 1, len(scopes), sharey=True)
+    for axis, (title, part) in zip(axes, scopes.items(), strict=True):
+        for place, method in enumerate(METHODS):
+            found = error(part, method)
+            axis.barh(place, found.value, 0.7, color=STYLES[method]["color"])
+            if found.low is not None and found.high is not None:
+                axis.plot([found.low, found.high], [place, place], color=INK, lw=1.6, marker="|")
+        axis.set(title=title, xlabel="mean absolute error [training std]")
+        axis.grid(axis="y", visible=False)
+    axes[0].set_yticks(range(len(METHODS)), [HEADINGS[method] for method in METHODS])
+    axes[0].invert_yaxis()
+    figure.suptitle("Overall error on test ticks, with 95 % intervals (left is better)")
+    return figure
+
+
 def dimensions(comparison: Comparison) -> Figure:
     """Mean absolute error of each dimension that varies, in units of its training deviation."""
     shown = comparison.varying()
-    figure, axis = panels(9.0, 0.42 * len(shown) + 2.0)
+    figure, axis = panels(9.0, 0.42 * len(shown) + 2.2)
     for method in METHODS:
         errors = comparison.in_training_std(comparison.scores[method].mae)
         axis.plot(errors, range(len(shown)), **_marked(method, ls=""))
@@ -72,7 +92,7 @@ def dimensions(comparison: Comparison) -> Figure:
     axis.set_ylim(len(shown) - 0.5, -0.5)
     axis.set_xlim(left=0)
     axis.set_xlabel("mean absolute error [training std] (left is better)")
-    finish(figure, axis, 2, "Error of each action dimension on held-out ticks")
+    finish(figure, axis, 2, "Error of each action dimension on test ticks, over the whole chunk")
     return figure
 
 
@@ -99,18 +119,30 @@ def horizon(comparison: Comparison, action_hz: float | None) -> Figure:
         for method in METHODS:
             errors = group.mean(comparison.scores[method].mae_horizon)
             axis.plot(np.arange(len(errors)), errors, **_marked(method))
+        for method in ("policy", best_baseline(comparison, group)):
+            _draw_band(axis, comparison, method, group)
         axis.set(title=_group_title(comparison, group), xlabel=ahead)
         axis.set_ylabel(with_unit("mean absolute error", group.unit))
         axis.set_ylim(bottom=0)
         axis.xaxis.get_major_locator().set_params(integer=True)
-    finish(figure, axes[0], len(METHODS), "Error over the action chunk (lower is better)")
+    finish(figure, axes[0], 3, "Error over the action chunk (lower is better)")
     return figure
 
 
+def _draw_band(axis: Axes, comparison: Comparison, method: str, group: ActionGroup) -> None:
+    """The 95 % interval of a group's error at each step."""
+    steps = range(comparison.cells.entries.shape[1])
+    parts = (comparison.part(steps=slice(step, step + 1)) for step in steps)
+    found = [error(part, method, group) for part in parts]
+    low = [np.nan if figure.low is None else figure.low for figure in found]
+    high = [np.nan if figure.high is None else figure.high for figure in found]
+    axis.fill_between(steps, low, high, color=STYLES[method]["color"], alpha=0.18, lw=0)
+
+
 def episodes(comparison: Comparison, store: FeatureStore) -> Figure:
-    """Mean absolute error of each held-out episode, a panel an action group, worst on top."""
+    """Mean absolute error of each test episode, a panel an action group, worst on top."""
     order = np.array(comparison.ranked())
-    title = "Error of each held-out episode, worst by overall error on top"
+    title = "Error of each test episode, worst by overall error on top"
     if len(order) > EPISODE_LINES:
         order = order[np.linspace(0, len(order) - 1, EPISODE_LINES).round().astype(int)]
         title += f" ({len(order)} of {len(comparison.episodes)})"
@@ -127,7 +159,7 @@ def episodes(comparison: Comparison, store: FeatureStore) -> Figure:
         axis.set_xlim(left=0)
     axes[0].set_yticks(lines, [_short_name(store.episodes[comparison.episodes[i]]) for i in order])
     axes[0].set_ylim(-0.6, len(order) - 0.4)
-    finish(figure, axes[0], len(METHODS), f"{title} (left is better)")
+    finish(figure, axes[0], 3, f"{title} (left is better)")
     return figure
 
 
@@ -155,7 +187,7 @@ def scatter(comparison: Comparison, predictions: Predictions) -> Figure:
         name, unit = comparison.names[index], comparison.units[index]
         axis.set(xlabel=with_unit("recorded", unit), ylabel=with_unit("policy", unit))
         axis.set_title(with_unit(name, unit))
-    figure.suptitle("Next action at held-out ticks: on the line, the policy does what was recorded")
+    figure.suptitle("Next action at test ticks: on the line, the policy does what was recorded")
     return figure
 
 
@@ -178,7 +210,7 @@ def timeline(comparison: Comparison, predictions: Predictions, store: FeatureSto
             low, high = axis.get_ylim()
             axis.set_ylim(min(low, high - 0.2), max(high, low + 0.2))
     figure.align_ylabels(axes[:, 0])
-    finish(figure, axes[0, 0], 2, "Held-out episodes: the recorded action, and the policy's next")
+    finish(figure, axes[0, 0], 2, "Test episodes: the recorded action, and the policy's next")
     return figure
 
 
@@ -192,7 +224,7 @@ def chunks(
 ) -> Figure:
     """Frames at `instants` above, and below them recorded and predicted actions over time.
 
-    `instants` are held-out ticks of the episode, store-global; `frames` has one a view for each, or
+    `instants` are test ticks of the episode, store-global; `frames` has one a view for each, or
     no view at all. Drawn are the next action at every tick, and the whole chunk at the instants.
     """
     time_s = _episode_time(store, episode)
@@ -279,22 +311,36 @@ def modalities(study: AblationStudy) -> Figure:
     for axis, ways in zip(axes, streams, strict=True):
         heights = [ablated.comparison.overall("policy") / unit for ablated in ways]
         colours = [_ABLATIONS[ablated.how.split()[0]] for ablated in ways]
-        bars = axis.bar(range(len(ways)), heights, color=colours, width=0.7)
+        bars = axis.bar(
+            range(len(ways)), heights, color=colours, width=0.7, **_whiskers(study, ways)
+        )
         # On a ground of its own, for a line may pass behind a number.
         ground = {"facecolor": GRID, "edgecolor": "none", "pad": 1}
         axis.bar_label(bars, fmt="%.2f", padding=3, bbox=ground)
         axis.axhline(intact, color=_POLICY, lw=1.8, label="policy, all streams intact")
-        label = f"best {LABELS[best]}, which sees nothing"
+        label = f"best {LABELS[best]}"
         axis.axhline(blind, color=INK, lw=1.8, ls="--", label=label)
         axis.set_xticks(range(len(ways)), [ablated.how.replace(" ", "\n", 1) for ablated in ways])
         axis.grid(axis="x", visible=False)
         axis.set_title(ways[0].stream)
-    axes[0].set_ylabel("held-out error / error with all streams intact")
+    axes[0].set_ylabel("test error / error with all streams intact")
     axes[0].set_ylim(0, 1.12 * axes[0].get_ylim()[1])
-    judged = f"{study.intact.ticks} held-out ticks, {study.samples} chunk(s) a tick"
+    judged = f"{study.intact.ticks} test ticks, {study.samples} chunk(s) a tick"
     finish(figure, axes[0], 2, f"What the policy loses with one stream ablated\n{judged}")
     figure.legends[0].set_title(ABLATION_FOOTNOTE)
     return figure
+
+
+def _whiskers(study: AblationStudy, ways: Sequence[Ablated]) -> dict[str, Any]:
+    """Of the bars of these ways: how far their 95 % intervals reach below and above."""
+    times = [study.times_intact(way) for way in ways]
+    ends = [
+        (figure.value - figure.low, figure.high - figure.value)
+        for figure in times
+        if figure is not None and figure.low is not None and figure.high is not None
+    ]
+    style = {"ecolor": INK, "error_kw": {"elinewidth": 1.4}}
+    return {"yerr": np.transpose(ends), **style} if len(ends) == len(ways) else {}
 
 
 def comparison_of_experiments(experiments: Sequence[Experiment]) -> Figure:

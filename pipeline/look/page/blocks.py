@@ -15,6 +15,8 @@ class Text:
     """A paragraph of plain words; backticks make code."""
 
     words: str
+    page: str = ""
+    """Another page of this project, relative to this one, that a link behind the words opens."""
 
 
 @dataclass(frozen=True)

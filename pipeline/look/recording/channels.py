@@ -17,10 +17,10 @@ from pipeline.base.config import Params
 from pipeline.base.issue import Issue
 from pipeline.base.table import Table
 from pipeline.data import Channels, Stream
+from pipeline.data.contact import force_columns
 from pipeline.look.page.blocks import Block
 from pipeline.look.recording.clocks import usual_step
 from pipeline.look.recording.episode import Draw, EpisodeView, runs
-from pipeline.look.recording.streams import force_columns
 
 # A sensor whose channels all repeat for as long stands still.
 FROZEN_S = 0.5
@@ -90,7 +90,7 @@ def _describe_flat(stream: Stream) -> str:
 
 def _frozen(view: EpisodeView, sensor: Stream) -> Iterator[Issue]:
     """Spans in which the whole sensor, or all of it but the force, repeats one reading."""
-    force = force_columns(sensor)
+    force = force_columns(sensor.channels.names)
     columns = [column for column in range(sensor.values.shape[1]) if column not in force] or force
     if not np.ptp(sensor.values, axis=0)[columns].any():
         return  # flat throughout, which is told already
@@ -137,7 +137,7 @@ def _outliers(view: EpisodeView, name: str, entry: str, stream: Stream) -> Itera
 
 def _saturated(view: EpisodeView, sensor: Stream) -> Iterator[Issue]:
     """Channels that are clipped, a line for each end of the range."""
-    names, force = sensor.channels.names, force_columns(sensor)
+    names, force = sensor.channels.names, force_columns(sensor.channels.names)
     wide = [column for column in range(len(names)) if column not in force]
     if len({sensor.channels.units[column] for column in wide}) != 1 or len(wide) < _WIDE:
         wide = []

@@ -1,20 +1,7 @@
-"""What was felt and how the robot moved: contact, and the pictures of sensor, state and actions.
-
-The rule of contact, by the force alone: at the start the needle is clear, so the median force of
-the first `_REST_S` is rest; the noise is what the force does from reading to reading and within
-that time. The force, smoothed by a running median, is in contact from where it leaves rest by
-`_ENTER` times its noise until it is back within `_LEAVE` times: hysteresis, as in O. H. Schmitt,
-"A thermionic trigger", Journal of Scientific Instruments 15(1), 1938. A force in newtons has to
-leave rest by `_LEAST_N` at least.
-
-Its limits: a recording that begins in contact shows only what presses harder or less; a sensor that
-drifts by more than the threshold makes a contact seem to begin early, or to last when the needle
-has glided out of tissue; a touch below the threshold is none.
-"""
+"""What was felt and how the robot moved: contact, and the pictures of sensor, state and actions."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,17 +9,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.rcsetup import cycler
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
-from scipy.stats import median_abs_deviation
 
 from pipeline.base.channels import PROFILE_CHANNELS, unnumbered
 from pipeline.base.config import Params
 from pipeline.data import Channels, Stream
+from pipeline.data.contact import CONTACT_RULE, contact_spans, force_columns
 from pipeline.data.timeline import last_at
 from pipeline.look.page.blocks import Block
 from pipeline.look.page.style import PALETTE, panels
 from pipeline.look.recording.clocks import Clock, Span, usual_step
-from pipeline.look.recording.episode import Draw, EpisodeView, runs
+from pipeline.look.recording.episode import Draw, EpisodeView
 
 CONTACT_COLOUR = "#E69F00"
 _LINES = cycler(ls=("-", "--", ":")) * cycler(color=PALETTE)
@@ -43,22 +29,6 @@ _STANDS_STILL = 0.2
 _BITMAP, _COLUMNS = 5000, 1200
 # Seconds that an image covers at least.
 _LEAST_S = 1e-3
-
-
-_REST_S = 0.5
-_SMOOTHED_S = 0.02
-_ENTER, _LEAVE = 6.0, 3.0
-_LEAST_N = 0.05
-# Contacts nearer than this are one; shorter ones are none.
-_APART_S, _SHORTEST_S = 0.1, 0.05
-
-# The rule in a sentence, for a caption.
-RULE = (
-    f"It begins where the force leaves its median of the first {_REST_S:g} s by {_ENTER:g} times "
-    f"its noise, and ends where it is back within {100 * _LEAVE / _ENTER:.0f} % of that."
-)
-# A standard deviation, of normal noise, that outliers do not raise.
-_spread = partial(median_abs_deviation, axis=0, scale=1 / 1.4826)
 
 
 class Group(NamedTuple):
@@ -103,7 +73,7 @@ def sensor_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
     if view.sensor is None:
         return []
     spans = [f"{start - view.zero:.2f}–{stop - view.zero:.2f} s" for start, stop in contacts(view)]
-    caption = f"Contact (shaded), by the force alone: {', '.join(spans) or 'none'}. {RULE}"
+    caption = f"Contact (shaded), by the force alone: {', '.join(spans) or 'none'}. {CONTACT_RULE}"
     return [draw("sensor", caption, draw_sensor)]
 
 
@@ -242,43 +212,12 @@ def _draw_profile(axis: Axes, stream: Stream, group: Group, zero: float) -> None
 
 
 def contacts(view: EpisodeView) -> tuple[Span, ...]:
-    """Spans in which the needle touches something, by the force alone; none without a force.
-
-    Several force channels (a wrench) count by the length of their departure from rest.
-    """
-    if view.sensor is None:
+    """Spans in which the needle touches something, by the force alone; none without a force."""
+    sensor = view.sensor
+    columns = [] if sensor is None else force_columns(sensor.channels.names)
+    if sensor is None or not columns:
         return ()
-    columns = force_columns(view.sensor)
-    if not columns or len(view.sensor.time) < 3:
-        return ()
-    time = view.sensor.time
-    force = view.sensor.values[:, columns].astype(np.float64)
-    resting = time <= time[0] + _REST_S
-    # Where times only repeat there is no step, and nothing is smoothed.
-    window = max(1, round(_SMOOTHED_S / (usual_step(time) or _SMOOTHED_S))) | 1
-    smooth = median_filter(force, size=(window, 1), mode="nearest")
-    rest = np.median(smooth[resting], axis=0)
-    # Of the smoothed force, by the steps of the raw one, which hold no slow motion; and at rest.
-    noise = _spread(np.diff(force, axis=0)) / np.sqrt(2 * window) + _spread(smooth[resting])
-    least = _LEAST_N if {view.sensor.channels.units[column] for column in columns} == {"N"} else 0.0
-    departure = np.linalg.norm(smooth - rest, axis=1)
-    enter = max(_ENTER * float(np.linalg.norm(noise)), least)
-    spans: list[Span] = []
-    for start, stop in runs((departure > enter * _LEAVE / _ENTER) & (departure > 0)):
-        reached = np.flatnonzero(departure[start:stop] >= enter)
-        if len(reached):
-            # To the first reading after it, or the last.
-            begin, end = time[start + reached[0]], time[min(stop, len(time) - 1)]
-            if spans and begin - spans[-1].stop_s < _APART_S:
-                begin = spans.pop().start_s
-            spans.append(Span(float(begin), float(end)))
-    return tuple(span for span in spans if span.length_s >= _SHORTEST_S)
-
-
-def force_columns(sensor: Stream) -> list[int]:
-    """The columns of a sensor whose names say force."""
-    return [
-        column
-        for column, name in enumerate(sensor.channels.names)
-        if "force" in name.lower() or name.lower() in ("fx", "fy", "fz")
-    ]
+    newton = {sensor.channels.units[column] for column in columns} == {"N"}
+    step_s = usual_step(sensor.time)
+    spans = contact_spans(sensor.time, sensor.values[:, columns], newton, step_s)
+    return tuple(Span(*span) for span in spans)

@@ -8,13 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.base.config import TrainHeadParams
+from pipeline.base.config import EvaluateParams, TrainHeadParams
 from pipeline.base.table import Table
 from pipeline.evaluate.ablation import evaluate_ablation
+from pipeline.evaluate.baselines import BASELINES, Baselines
 from pipeline.evaluate.curves import TrainingCurve, TrainingCurves
 from pipeline.evaluate.episode_frames import EpisodeFrames
 from pipeline.evaluate.evaluation import Evaluation, judged_document
 from pipeline.evaluate.experiments import Experiment
+from pipeline.evaluate.figures import best_baseline, error, rivalry
+from pipeline.evaluate.tables import error_table
 from pipeline.look.evaluation import page as evaluation_page
 from pipeline.look.evaluation.comparison import comparison_report
 from pipeline.look.evaluation.page import evaluation_report
@@ -25,9 +28,9 @@ from pipeline.policy.normalization import ChannelStatistics, Normalization
 from pipeline.policy.policy import Policy
 from pipeline.store import FeatureStore, episode_name
 from pipeline.train.batches import Windows
-from pipeline.train.predictions import BASELINES
+from pipeline.train.predictions import predict
 from pipeline.train.run import policy_shape
-from pipeline.train.scores import evaluate_policy
+from pipeline.train.scores import action_space, compare
 from pipeline.train.split import Split, source_of, split_parts
 
 Sound = Callable[[Path], None]
@@ -75,15 +78,19 @@ def judgement(
         weights=policy.state_dict(),
     )
     windows = Windows.of(PARAMS)
-    comparison, predictions = evaluate_policy(policy, store, ticks, windows, 64, normalization)
+    baselines = Baselines(store, np.arange(90), 4, normalization.features)
+    predictions = predict(policy, store, ticks, windows, 64)
+    space, phases = action_space(store, normalization), np.where(ticks % 2, "approach", "hold")
+    comparison = compare(predictions, baselines.act(ticks), *space, None, phases)
     return Evaluation(
         name="models/head",
         checkpoint=checkpoint,
         store=store,
         comparison=comparison,
         predictions=predictions,
-        study=evaluate_ablation(checkpoint, policy, store, ticks, 64),
-        judged=judged_document(checkpoint, policy, store, 1, 64),
+        energy=None,
+        study=evaluate_ablation(checkpoint, policy, store, ticks, baselines, 64),
+        judged=judged_document(checkpoint, policy, store, EvaluateParams()),
         curves=CURVES,
         recordings=Path("data/nowhere"),
     )
@@ -97,36 +104,51 @@ def section(report: Report, title: str) -> Section:
 def test_tables_say_what_the_comparison_says(judgement: Evaluation) -> None:
     comparison = judgement.comparison
     report = evaluation_report(judgement)
-    errors, dimensions, episodes, streams = report.blocks(Table)
-    assert errors.rows[-1][1] == comparison.overall("policy")
-    assert errors.rows[-1][-1] == comparison.relative()
-    assert errors.strong == {len(errors.rows) - 1}
-    assert errors.caption.startswith("Repeat last: ") and errors.caption.endswith(".")
+    executed, chunk, differences, phases, dimensions, episodes, streams = report.blocks(Table)
+    assert executed.rows == error_table(comparison.executed).rows
+    assert chunk.rows == error_table(comparison).rows
+    assert chunk.rows[0][-1] == error(comparison, "policy").text()
+    assert executed.strong == chunk.strong == {0}
+    assert executed.caption.startswith("Linear fit: ") and executed.caption.endswith(".")
+    assert [row[0] for row in differences.rows] == ["executed"] * 3 + ["chunk"] * 3
+    assert differences.rows[-1][-1] == rivalry(comparison).ratio
+    assert [row[:2] for row in phases.rows] == [["approach", 45], ["hold", 45]]
     assert [row[0] for row in dimensions.rows] == list(comparison.names)
     assert dimensions.rows[1][2] == comparison.scores["policy"].mae[1]
     worst_first = [row[2] for row in episodes.rows]
     assert worst_first == sorted(comparison.overall_by_episode("policy"), reverse=True)
     assert [row[1] for row in episodes.rows] == [30, 30, 30]
     assert streams.rows[0][:2] == ["all", "intact"] and len(streams.rows) > 5
-    assert dict(report.tiles)["held-out episodes"] == "3"
+    tiles = dict(report.tiles)
+    assert tiles["test episodes"] == "3"
+    assert next(iter(tiles)) == "executed: overall error [training std]"
 
 
-def test_groups_in_which_a_baseline_is_better_stand_at_the_top(judgement: Evaluation) -> None:
+def test_figures_in_which_a_baseline_is_better_stand_at_the_top(judgement: Evaluation) -> None:
     comparison = judgement.comparison
     group, *_ = comparison.varying_groups()
-    places = list(group.dimensions)
-    best = min((comparison.scores[one].mae for one in BASELINES), key=group.mean)
-    lowest = np.min([comparison.scores[one].mae for one in BASELINES], axis=0)
+    best = comparison.scores[best_baseline(comparison.executed, group)]
     # 1.002 times would read "1.00 times", which is no better.
     for factor, times in ((0.5, ""), (1.002, ""), (1.008, "1.01"), (1.72, "1.72")):
-        mae = 0.5 * lowest
-        mae[places] = factor * best[places]
-        policy = replace(comparison.scores["policy"], mae=mae)
+        policy = replace(best, absolute=factor * best.absolute)
         scores = {**comparison.scores, "policy": policy}
         found = replace(judgement, comparison=replace(comparison, scores=scores))
-        said = f"A baseline is better in {group.name} ({times} times the best baseline's error)."
+        said = f"executed {group.name} ({times} times the best's error)"
         summary = evaluation_report(found).summary
-        assert (said in summary) == ("A baseline is better" in summary) == bool(times)
+        assert (said in summary) == bool(times)
+
+
+def test_the_page_of_rollouts_is_linked_where_there_is_one(
+    judgement: Evaluation, tmp_path: Path, assert_page_is_sound: Sound
+) -> None:
+    bare = replace(judgement, study=None)
+    (tmp_path / "rollout").mkdir()
+    (tmp_path / "rollout" / PAGE).write_text("<!doctype html>")
+    write_report(tmp_path / "evaluate", evaluation_report(bare, f"../rollout/{PAGE}"))
+    page = tmp_path / "evaluate" / PAGE
+    assert f'<a href="../rollout/{PAGE}">' in page.read_text()
+    assert_page_is_sound(page)
+    assert f"rollout/{PAGE}" not in str(evaluation_report(bare))
 
 
 def test_dimensions_that_hardly_move_stand_at_the_top(judgement: Evaluation) -> None:
@@ -138,9 +160,10 @@ def test_dimensions_that_hardly_move_stand_at_the_top(judgement: Evaluation) -> 
     report = evaluation_report(replace(judgement, comparison=still))
     assert "Hardly moving: joint_3 (training std at most 0.001, where 1 is usual" in report.summary
     said = {label.split(" (")[0]: value for label, value in report.tiles}
-    relative = still.without_low_variance().relative()
-    assert relative is not None and relative != still.relative()
-    assert said["the same, without what hardly moves"] == f"{100 * relative:.0f} %"
+    share = rivalry(still.without_low_variance()).ratio
+    assert share is not None and share != rivalry(still).ratio
+    label = "chunk: of the best baseline's, without what hardly moves"
+    assert said[label] == f"{100 * share:.0f} %"
     report = evaluation_report(judgement)
     assert "ardly mov" not in f"{report.summary} {report.tiles}"
 
@@ -173,7 +196,7 @@ def test_a_page_with_frames_and_without_is_sound(
     monkeypatch.setattr(evaluation_page, "read_episode_frames", half)
     files = write_report(tmp_path, evaluation_report(judgement))
     assert {file.stem for file in files} == {
-        *("report", "dimensions", "scatter", "horizon", "dimension_horizon", "episodes"),
+        *("report", "methods", "dimensions", "scatter", "horizon", "dimension_horizon", "episodes"),
         *("timeline", "episode_best", "episode_worst", "modalities", "curves"),
     }
     page = (tmp_path / PAGE).read_text()
@@ -195,7 +218,7 @@ def test_what_is_missing_is_said(judgement: Evaluation) -> None:
 
 
 def test_experiments_are_one_page(tmp_path: Path, assert_page_is_sound: Sound) -> None:
-    rules = {"zero_action": 0.5, "mean_action": 0.4, "repeat_last": 0.45}
+    rules = dict(zip(BASELINES, (0.5, 0.4, 0.45, 0.42, 0.6), strict=True))
     experiments = [
         Experiment(
             f"{expert}-concat", expert, "concat", 10, 1000, 1,
@@ -212,7 +235,7 @@ def test_experiments_are_one_page(tmp_path: Path, assert_page_is_sound: Sound) -
     assert [row[-4] for row in table.rows[:2]] == ["regression", "diffusion"]
     assert table.strong == {1}
     assert table.columns[:3] == ["experiment", "overall [training std]", "translation [mm]"]
-    assert [row[1] for row in table.rows] == [0.3, 0.2, 0.5, 0.4, 0.45]
+    assert [row[1] for row in table.rows] == [0.3, 0.2, *rules.values()]
     assert dict(report.tiles)["by"] == "diffusion-concat"
     write_report(tmp_path, report)
     assert_page_is_sound(tmp_path / PAGE)

@@ -12,6 +12,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from pipeline.evaluate.ablation import Ablated, AblationStudy
+from pipeline.evaluate.baselines import BASELINES
 from pipeline.evaluate.curves import TrainingCurve, TrainingCurves
 from pipeline.evaluate.experiments import Experiment
 from pipeline.evaluate.probe.folds import ProbeFolds
@@ -21,7 +22,7 @@ from pipeline.evaluate.probe.study import ProbeResult, ProbeStudy
 from pipeline.look.evaluation import draw_probe as probe
 from pipeline.look.evaluation import pictures as plots
 from pipeline.look.page.style import write
-from pipeline.train.predictions import Predictions, baselines
+from pipeline.train.predictions import Predictions
 from pipeline.train.scores import ActionGroup, Comparison, compare
 
 Drawn = tuple[Comparison, Predictions, SimpleNamespace]
@@ -74,7 +75,7 @@ def evaluated(
     spread = np.where(np.arange(dimensions) < dimensions - constant, 1.0, 0.0)
     comparison = compare(
         predictions,
-        baselines(store, predictions, action.mean(0)),  # type: ignore[arg-type]
+        {name: np.full((len(tick), 1, dimensions), 0.1 * i) for i, name in enumerate(BASELINES)},
         names,
         units,
         groups,
@@ -97,6 +98,7 @@ def pictures(comparison: Comparison, predictions: Predictions, store: Any) -> di
         "scatter.png": lambda: plots.scatter(comparison, predictions),
         "horizon.png": lambda: plots.horizon(comparison, store.action_hz),
         "episodes.png": lambda: plots.episodes(comparison, store),
+        "methods.png": lambda: plots.methods(comparison),
         "dimensions.png": lambda: plots.dimensions(comparison),
         "dimension_horizon.png": lambda: plots.dimension_horizon(comparison),
         "chunks.png": chunks,
@@ -112,7 +114,7 @@ def test_every_picture_is_written(
 ) -> None:
     shown = evaluated(episodes, dimensions, constant=constant, horizon=horizon)
     files = write(tmp_path, pictures(*shown))
-    assert len(files) == 7
+    assert len(files) == 8
     for file in files:
         assert file.read_bytes().startswith(b"\x89PNG")
         assert file.stat().st_size > 5000
@@ -309,7 +311,7 @@ def studied(*errors: float) -> AblationStudy:
         )
         rules = {
             name: np.full((4, 1, 1), wrong, np.float32)
-            for name, wrong in (("zero_action", 5), ("mean_action", 3), ("repeat_last", 4))
+            for name, wrong in zip(BASELINES, (5, 3, 4, 6, 7), strict=True)
         }
         one = (ActionGroup("translation", "mm", (0,)),)
         return compare(predictions, rules, ["dx"], ["mm"], one, np.ones(1))
@@ -328,8 +330,8 @@ def test_what_each_stream_is_worth_stands_beside_intact_and_best_baseline(tmp_pa
     assert heights(figure) == [[2.0, 1.5], [4.0]]
     for axis in figure.axes:
         assert [line.get_ydata()[0] for line in axis.lines] == [1.0, 6.0]
-    assert "mean training action" in figure.legends[0].get_texts()[1].get_text()
-    assert "4 held-out ticks, 4 chunk(s) a tick" in figure.get_suptitle()
+    assert "median training action" in figure.legends[0].get_texts()[1].get_text()
+    assert "4 test ticks, 4 chunk(s) a tick" in figure.get_suptitle()
     assert "zeroed: every value at its training mean" in figure.legends[0].get_title().get_text()
     (file,) = write(tmp_path, {"modalities.png": lambda: figure})
     assert file.read_bytes().startswith(b"\x89PNG")
@@ -352,7 +354,7 @@ def compared(errors: dict[str, float], rules: dict[str, float]) -> list[Experime
 
 
 def test_experiments_are_bars_and_baselines_lines(tmp_path: Path) -> None:
-    rules = {"zero_action": 3.0, "mean_action": 2.0, "repeat_last": 1.0}
+    rules = dict(zip(BASELINES, (3.0, 2.0, 1.0, 0.9, 1.1), strict=True))
     experiments = compared({"regression": 0.3, "diffusion": 0.4}, rules)
     figure = plots.comparison_of_experiments(experiments)
     (axis,) = figure.axes
@@ -366,7 +368,7 @@ def test_experiments_are_bars_and_baselines_lines(tmp_path: Path) -> None:
 
 def test_numbers_of_experiments_lie_on_nothing() -> None:
     """Errors just short of a baseline, where a number at the bar's end would lie on its line."""
-    rules = {"zero_action": 0.52, "mean_action": 0.46, "repeat_last": 0.45}
+    rules = dict(zip(BASELINES, (0.52, 0.46, 0.45, 0.47, 0.6), strict=True))
     figure = plots.comparison_of_experiments(
         compared({"regression": 0.44, "diffusion": 0.5}, rules)
     )

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from pipeline.data import Channels, Stream
+from pipeline.data.contact import force_columns
 from pipeline.look.recording.clocks import Span
 from pipeline.look.recording.episode import EpisodeView
-from pipeline.look.recording.streams import contacts, force_columns
+from pipeline.look.recording.streams import contacts
 from pipeline.simulation.insertion import TICK_HZ
 from pipeline.simulation.recorder import SimulatedEpisode, simulate_episode
 
@@ -94,7 +95,7 @@ def test_wrenches_count_by_their_length(base: EpisodeView) -> None:
 def test_no_force_no_contact(base: EpisodeView) -> None:
     assert contacts(replace(base, sensor=None)) == ()
     view = view_of(base, np.arange(100) / 10, np.linspace(0, 9, 100), ("depth",))
-    assert view.sensor is not None and force_columns(view.sensor) == []
+    assert view.sensor is not None and force_columns(view.sensor.channels.names) == []
     assert contacts(view) == ()
 
 
