@@ -5,7 +5,6 @@ from fnmatch import fnmatchcase
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.cluster.hierarchy import DisjointSet
 
 from pipeline.base.errors import ConfigError
 from pipeline.store import Episode, FeatureStore, episode_name
@@ -32,6 +31,8 @@ def episodes_by_group(
 
     Raises `ConfigError` where a pattern fits no episode.
     """
+    from scipy.cluster.hierarchy import DisjointSet  # a second, which a finished run does without
+
     episodes = [episode for episode in store.episodes if len(episode.ticks)]
     patterns = patterns or {}
     _check_patterns(patterns, episodes)
