@@ -100,7 +100,7 @@ def make_trainer(folder: Path, sizes: dict[str, int], device: str, quick: bool) 
     changed = {"device": device, "output": folder / "head", "logs": folder / "logs"}
     given = load_params(Path("params.yaml")).train_head.model_dump()
     params = TrainHeadParams.model_validate(given | changed | (SMALL if quick else {}))
-    split = split_by_episode(store, params.val_fraction, params.horizon)
+    split = split_by_episode(store, params.split, params.horizon)
     return Trainer(store, params, split, TrainingRun(params.output, "new", (), {}))
 
 

@@ -29,6 +29,7 @@ from pipeline.train.log import check_loggers
 from pipeline.train.loop import Trainer
 from pipeline.train.run import open_run
 from pipeline.train.split import split_by_episode
+from pipeline.train.tuned_episodes import refuse_tuned_episodes
 from pipeline.train.world import process_device, process_group
 
 
@@ -47,7 +48,8 @@ def main(params: Params) -> None:
                 return
             if head.check_store:
                 world.shared(lambda: check_trailers(store.path))
-            split = split_by_episode(store, head.val_fraction, head.horizon)
+            split = split_by_episode(store, head.split, head.horizon)
+            world.say(*refuse_tuned_episodes(store, split))
             trainer = Trainer(store, head, split, opened, source)
             world.say(*trainer.summary(), *source.summary())
             trainer.fit()

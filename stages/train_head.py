@@ -28,6 +28,7 @@ from pipeline.base.config import Params
 from pipeline.store import FeatureStore, build_lock, check_trailers
 from pipeline.train.run import finished_run, open_run
 from pipeline.train.split import split_by_episode
+from pipeline.train.tuned_episodes import refuse_tuned_episodes
 
 
 def main(params: Params) -> None:
@@ -57,7 +58,8 @@ def _train(params: Params) -> None:
                 return
             if head.check_store:
                 world.shared(lambda: check_trailers(store.path))
-            split = split_by_episode(store, head.val_fraction, head.horizon)
+            split = split_by_episode(store, head.split, head.horizon)
+            world.say(*refuse_tuned_episodes(store, split))
             trainer = Trainer(store, head, split, opened)
             world.say(*trainer.summary())
             trainer.fit()

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from pipeline.base.config import Params, Source, TrainHeadParams, VLMParams
+from pipeline.base.config import Params, Source, SplitParams, TrainHeadParams, VLMParams
 from pipeline.base.digests import ContentDigests
 from pipeline.base.errors import RecordingError
 from pipeline.data import Recording, open_recordings
@@ -415,8 +415,8 @@ class TestMistake8:
 
         shuffled = np.random.default_rng(0).permutation(store.ticks)
         assert shared(shuffled[20:], shuffled[:20])  # the old way
-        split = split_by_episode(store, 0.3)
-        assert len(split.held_out) and not shared(split.train, split.held_out)
+        split = split_by_episode(store, SplitParams(val=0, test=0.3))
+        assert len(split.test) and not shared(split.train, split.test)
         train, held_out = UnifiedVLADataset(store=store).split(0.3)
         assert held_out.indices and not shared(train.indices, held_out.indices)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch.utils.data import Dataset, Subset
 from tqdm import tqdm
 
-from pipeline.base.config import Source
+from pipeline.base.config import Source, SplitParams
 from pipeline.base.errors import ConfigError, RecordingError
 from pipeline.compat.batch import Sample, UnifiedBatch
 from pipeline.compat.cached import check_store, episodes_of_format, episodes_of_recordings
@@ -131,15 +131,17 @@ class UnifiedVLADataset(Dataset[Sample]):
         return {name: np.flatnonzero(of_item == name) for name in dict.fromkeys(names.tolist())}
 
     def split(self, val_fraction: float = 0.15) -> tuple[Subset[Sample], Subset[Sample]]:
-        """Items to train on and items held out: whole episodes, by `split_by_episode`.
+        """Items to train on and items held out: whole groups of episodes, by `split_by_episode`.
 
-        Over a store these are the sides that `stages.train_head` has. Over frames they are the
+        Over a store these are train and val of `stages.train_head` with `train_head.split` {val:
+        `val_fraction`, test: 0}. Over frames they are the
         same where sources and episodes have the names that they have in the store: the side
         follows from the hash of "source/id". Use `unified_collate_fn`.
         """
         keys = None if self._frames is None else first_keys(self._frames)
-        split = split_by_episode(self.store, val_fraction, self.windows.horizon, keys)
-        sides = (np.isin(self.ticks, side) for side in (split.train, split.held_out))
+        params = SplitParams(val=val_fraction, test=0)
+        split = split_by_episode(self.store, params, self.windows.horizon, keys)
+        sides = (np.isin(self.ticks, side) for side in (split.train, split.val))
         train, held_out = (Subset(self, np.flatnonzero(side).tolist()) for side in sides)
         return train, held_out
 

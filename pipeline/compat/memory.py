@@ -66,6 +66,7 @@ def _rows(episode: ReadEpisode) -> EpisodeRows:
     recording = episode.recording
     text = {name: getattr(recording, name) for name in ("id", "format", "instruction")}
     text |= {"path": str(recording.path), "content": "", "digest": ""}
+    text |= {} if recording.group is None else {"group": recording.group}
     readings, states = episode.readings, episode.states
     return EpisodeRows(episode.timeline, readings, states, recording.source, text)
 

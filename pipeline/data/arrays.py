@@ -181,5 +181,15 @@ def number(
     return float(value)
 
 
+def group_name(document: Mapping[str, Any], where: str) -> str | None:
+    """The `group` of a metadata object, None where it is absent, null or empty."""
+    value = document.get("group")
+    if value is None or value == "":
+        return None
+    if isinstance(value, bool) or not isinstance(value, str | int):
+        raise RecordingError(f"{where}: group must be a name or a whole number, found {value!r}")
+    return str(value)
+
+
 def _listed(names: Collection[str]) -> str:
     return ", ".join(names) or "nothing"

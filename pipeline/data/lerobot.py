@@ -92,6 +92,10 @@ class LeRobotRecording(FileRecording):
         self._layout = layout
         self._entry = entry
 
+    @property
+    def group(self) -> str | None:
+        return self._entry.group
+
     def listed_files(self) -> list[Path]:
         """The data file and the wanted views' videos, as `meta/` names them."""
         keys = [key for view, key in self._layout.views.items() if self._wants(view)]

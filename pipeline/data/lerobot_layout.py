@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipeline.base.errors import RecordingError
-from pipeline.data.arrays import number, read_json
+from pipeline.data.arrays import group_name, number, read_json
 from pipeline.data.reader import natural_key
 from pipeline.data.video import VideoSpan
 
@@ -38,6 +38,8 @@ class LeRobotEntry:
     """Whether other episodes' rows may stand in the same file."""
     videos: Mapping[str, VideoSpan]
     """By feature key."""
+    group: str | None
+    """Of the episodes that belong together, this project's extension."""
 
     @property
     def id(self) -> str:
@@ -192,6 +194,7 @@ def _entries_v2(root: Path, info: Mapping[str, Any]) -> Iterator[LeRobotEntry]:
                 key: VideoSpan(root / info["video_path"].format(video_key=key, **place))
                 for key in _video_keys(info)
             },
+            group=group_name(row, str(path)),
         )
 
 
@@ -215,6 +218,7 @@ def _entries_v3(root: Path, info: Mapping[str, Any], fps: float) -> Iterator[LeR
             ),
             shared=True,
             videos={key: _span_v3(root, info, row, key, fps) for key in keys},
+            group=group_name(row, str(folder)),
         )
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pipeline.base.config import Source
 from pipeline.base.errors import RecordingError
-from pipeline.data.arrays import member, read_npz
+from pipeline.data.arrays import group_name, member, read_json, read_npz
 from pipeline.data.insertion import (
     SENSOR,
     InsertionRecording,
@@ -21,6 +21,8 @@ from pipeline.data.recording import Stream, checked_stream
 
 _STATE_FILES = "robot_state_*.csv"
 _SENSOR_FILES = "sensor_data_*.npz"
+_METADATA = "metadata.json"
+"""Of which only `group` is read."""
 MARKER = f"{_STATE_FILES} and {_SENSOR_FILES}"
 
 
@@ -45,6 +47,11 @@ class RawRecording(InsertionRecording):
             )
         self._state_file = state_file
         self._sensor_file = self._only(_SENSOR_FILES)
+
+    @property
+    def group(self) -> str | None:
+        path = self.path / _METADATA
+        return group_name(read_json(path), str(path)) if path.is_file() else None
 
     @property
     def has_poses(self) -> bool:

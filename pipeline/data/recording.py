@@ -124,6 +124,14 @@ class Recording(ABC):
     def cameras(self) -> Mapping[str, CameraStream]:
         """The views that have at least one frame, by name."""
 
+    @property
+    def group(self) -> str | None:
+        """What the recording says it belongs to with others, such as an object or a day.
+
+        Training holds out whole groups. None where it says nothing.
+        """
+        return None
+
     def view_names(self) -> Sequence[str]:
         """Names of `cameras()`, where the format allows it without reading a numeric stream."""
         return list(self.cameras())

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pipeline.base.config import Source
 from pipeline.base.errors import RecordingError
-from pipeline.data.arrays import member, number, read_json, read_npz
+from pipeline.data.arrays import group_name, member, number, read_json, read_npz
 from pipeline.data.insertion import (
     SENSOR,
     InsertionRecording,
@@ -44,6 +44,10 @@ class WindowedRecording(InsertionRecording):
         self._start = self._number("start_time")
         self._robot_hz = self._number("robot_hz", positive=True)
         self._sensor_hz = self._number("sensor_hz", positive=True)
+
+    @property
+    def group(self) -> str | None:
+        return group_name(self._metadata, str(self._metadata_file))
 
     def state(self) -> Stream | None:
         path = robot_state_file(self.path)

@@ -15,7 +15,6 @@ from tqdm import tqdm
 from pipeline.base.observation import Observation
 from pipeline.evaluate.baselines import Baselines
 from pipeline.evaluate.figures import Figure, times
-from pipeline.evaluate.sides import groups_of
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.observation import VALIDITY, stream_of
 from pipeline.policy.policy import Policy
@@ -23,6 +22,7 @@ from pipeline.store import Batch, FeatureStore, episode_name
 from pipeline.train.batches import NO_LAGS, BatchIndices, Lags, Prefetch, Ticks, Windows
 from pipeline.train.predictions import FeedMaker, predict
 from pipeline.train.scores import Comparison, action_space, compare
+from pipeline.train.split import groups_of
 
 DELAYS_MS = (50, 100, 200)
 MOST_TICKS = 1000
@@ -172,7 +172,7 @@ def _knows_missing(checkpoint: PolicyCheckpoint, store: FeatureStore, stream: st
         return False
     readings = np.diff(store.array(f"episode/{stream}_start"))
     return any(
-        not readings[episode.index] and episode_name(episode) not in checkpoint.held_out_ticks
+        not readings[episode.index] and episode_name(episode) in checkpoint.split["train"]
         for episode in store.episodes
     )
 

@@ -1,11 +1,10 @@
 """A policy evaluated, and on what, so that two evaluations can be told to be of the same things."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from pipeline.base.config import EvaluateParams
@@ -16,14 +15,13 @@ from pipeline.evaluate.curves import TrainingCurves, read_curves
 from pipeline.evaluate.figures import Figure, mean_over_ticks
 from pipeline.evaluate.phases import phases_of
 from pipeline.evaluate.samples import SampledChunks
-from pipeline.evaluate.sides import groups_of, training_ticks
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.policy import Trainable
-from pipeline.store import FeatureStore, episode_name
+from pipeline.store import FeatureStore
 from pipeline.train.batches import Windows
 from pipeline.train.predictions import Predictions, predict
 from pipeline.train.scores import Comparison, action_space, compare
-from pipeline.train.split import find_held_out, source_of
+from pipeline.train.split import find_ticks, groups_of, source_of
 
 JUDGED = "judged.json"
 """Its name in the folder of an evaluation, beside metrics.json."""
@@ -61,7 +59,7 @@ def evaluate_checkpoint(
     """The policy of the checkpoint in `folder`, on its test ticks of a store it fits.
 
     `say` is told first what is evaluated on what. Raises `ConfigError` where more steps would be
-    executed than a chunk has, `CheckpointMismatch` as `find_held_out` does, and `NumericsError` as
+    executed than a chunk has, `CheckpointMismatch` as `find_ticks` does, and `NumericsError` as
     `predict`.
     """
     horizon = checkpoint.params.horizon
@@ -70,23 +68,22 @@ def evaluate_checkpoint(
             f"evaluate.execute {wanted.execute}: expected at most the {horizon} steps of a chunk "
             "(train_head.horizon)"
         )
-    names = checkpoint.held_out_ticks.keys()
-    ticks, checkpoint = find_held_out(store, checkpoint)
-    if renamed := names - checkpoint.held_out_ticks.keys():
+    names = checkpoint.split["test"].keys()
+    ticks, checkpoint = find_ticks(store, checkpoint, "test")
+    training, _ = find_ticks(store, checkpoint, "train")
+    if renamed := names - checkpoint.split["test"].keys():
         say(f"test episodes renamed since the training: {len(renamed)}, told by their content")
     policy = checkpoint.policy(device)
     judged = judged_document(checkpoint, policy, store, wanted)
     say(
         f"{folder} (step {checkpoint.step}) on {len(ticks)} test ticks of "
-        f"{len(checkpoint.held_out_ticks)} episode(s) in {store.path}, device {device}, "
+        f"{len(checkpoint.split['test'])} episode(s) in {store.path}, device {device}, "
         f"{judged['policy']['samples']} chunk(s) a tick"
     )
     features = checkpoint.normalization.features
-    baselines = Baselines(store, training_ticks(store, checkpoint), horizon, features)
-    space, groups = (
-        action_space(store, checkpoint.normalization),
-        groups_of(store, checkpoint, ticks),
-    )
+    baselines = Baselines(store, training, horizon, features)
+    space = action_space(store, checkpoint.normalization)
+    groups = groups_of(store, checkpoint, ticks)
     sampled = SampledChunks(space[-1])
     seen = (policy, store, ticks, Windows.of(checkpoint.params), wanted.batch_size)
     predictions = predict(*seen, progress=True, samples=wanted.samples, watch=sampled)
@@ -127,8 +124,6 @@ def judged_document(
     """
     params = checkpoint.params
     source = source_of(store)
-    first = {episode_name(e): np.array(e.ticks[:1]) for e in store.episodes if len(e.ticks)}
-    groups = {n: str(groups_of(store, checkpoint, first[n])[0]) for n in checkpoint.held_out_ticks}
     drawn = None
     if policy.stochastic:
         drawn = {"samples": wanted.samples, "batch_size": wanted.batch_size}
@@ -150,12 +145,8 @@ def judged_document(
             "horizon": params.horizon,
             "execute": wanted.execute,
             "test": {
-                name: {
-                    "ticks": list(ticks),
-                    "content": checkpoint.held_out_content[name],
-                    "group": groups[name],
-                }
-                for name, ticks in checkpoint.held_out_ticks.items()
+                name: asdict(part) | {"ticks": list(part.ticks)}
+                for name, part in checkpoint.split["test"].items()
             },
         },
     }

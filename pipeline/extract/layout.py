@@ -13,6 +13,7 @@ from pipeline.base.durable import free_bytes
 from pipeline.base.errors import DiskFull, NumericsError
 from pipeline.base.finite import first_non_finite
 from pipeline.base.format import size
+from pipeline.base.tuned_on import store_attributes
 from pipeline.data import Stream
 from pipeline.data.timeline import Timeline
 from pipeline.extract.plan import store_bytes
@@ -20,6 +21,7 @@ from pipeline.extract.survey import CheckedEpisode, Survey, embodiment_of
 from pipeline.store import SCHEMA, RowSource, Sizes, StoreBuild, arrays
 from pipeline.store.episodes import episode_arrays
 from pipeline.store.schema import ArraySpec
+from pipeline.vlm.checkpoint_folder import tuned_on
 from pipeline.vlm.feature_spec import FeatureSpec
 
 
@@ -149,4 +151,5 @@ def _attributes(checked: Sequence[CheckedEpisode], survey: Survey) -> dict[str, 
         "action_hz": data.action_hz,
         "vlm_reuse_count": data.vlm_reuse_count,
         "environment": [],
+        **store_attributes(tuned_on(survey.params.vlm)),
     }

@@ -212,7 +212,11 @@ def _surveyed(
         "instruction": recording.instruction,
         "content": content_digest(recording, digests.of),
     }
-    said = (text["id"], text["format"], text["instruction"], text["path"])
+    group = recording.group
+    said = [text["id"], text["format"], text["instruction"], text["path"]]
+    if group is not None:
+        said.append(group)
+        text["group"] = group
     decides = repr((data.action_hz, data.vlm_reuse_count, rotation))
     digest = joint_digest(text["content"], recording.source, *said, decides)
     return SurveyedEpisode(recording, text | {"digest": digest})

@@ -1,7 +1,8 @@
 """A policy on disk: `policy.safetensors` and a `policy.json` that says all it takes to use it.
 
 The JSON carries the feature spec of the store it was trained from, the streams with their names
-and units, the normalisation, the params and the ids of the episodes it has never seen. No pickle.
+and units, the normalisation, the params, and the episodes that it was trained on, chosen on and has
+never seen. No pickle.
 
 A kill at any instant leaves the previous checkpoint or the new one.
 """
@@ -12,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.durable import (
@@ -36,12 +37,27 @@ if TYPE_CHECKING:
     from pipeline.policy.observation import PolicyShape
     from pipeline.policy.policy import Policy
 
-FORMAT = 2
+FORMAT = 3
+"""3: three sides of the split; 2 had two, so that what is reported had chosen the checkpoint."""
 WEIGHTS, DOCUMENT = "policy.safetensors", "policy.json"
 _OF_THE_RUN = ("feed", "loggers", "scratch")
 """Params of a run that tell nothing of its policy; earlier versions had others of them."""
 CHECKPOINT = OutputKind("a checkpoint of a policy", lambda folder: (folder / DOCUMENT).is_file())
 SOURCE_KEYS = ("feature_spec", "streams", "action_hz", "vlm_reuse_count")
+Side = Literal["train", "val", "test"]
+SIDES: tuple[Side, ...] = ("train", "val", "test")
+
+
+@dataclass(frozen=True)
+class EpisodePart:
+    """The ticks of one episode on one side of a split."""
+
+    ticks: tuple[int, int]
+    """[first, stop), counted in the episode."""
+    content: str
+    """Digest of the episode's files."""
+    group: str
+    """Episodes of one group are on one side, but for a single one that is cut by time."""
 
 
 @dataclass(frozen=True)
@@ -53,10 +69,9 @@ class PolicyCheckpoint:
     normalization: Normalization
     source: Mapping[str, Any]
     """What the store was: `feature_spec`, `streams`, `action_hz`, `vlm_reuse_count`."""
-    held_out_ticks: Mapping[str, tuple[int, int]]
-    """`source/id` of each episode with held-out ticks -> [first, stop), counted in the episode."""
-    held_out_content: Mapping[str, str]
-    """`source/id` of each of these episodes -> digest of its files."""
+    split: Mapping[Side, Mapping[str, EpisodePart]]
+    """What it was trained on (`train`), what chose it (`val`) and what it has never seen (`test`),
+    by "source/id" of the episode."""
     step: int
     weights: Mapping[str, "Tensor"]
     metrics: Mapping[str, float] = field(default_factory=dict)
@@ -88,9 +103,10 @@ class PolicyCheckpoint:
             "shape": asdict(self.shape),
             **self.source,
             "instructions": list(self.instructions),
-            "held_out_episodes": list(self.held_out_ticks),
-            "held_out_ticks": {name: list(ticks) for name, ticks in self.held_out_ticks.items()},
-            "held_out_content": dict(self.held_out_content),
+            "split": {
+                side: {name: asdict(part) for name, part in self.split[side].items()}
+                for side in SIDES
+            },
             "weights_sha256": weights_sha256,
             "normalization": self.normalization.document(),
         }
@@ -153,11 +169,10 @@ def load_policy(folder: Path) -> PolicyCheckpoint:
             shape=replace(shape, action_groups=tuple(shape.action_groups)),
             normalization=Normalization.from_document(document["normalization"]),
             source={key: document[key] for key in SOURCE_KEYS},
-            held_out_ticks={
-                name: (int(first), int(stop))
-                for name, (first, stop) in document["held_out_ticks"].items()
+            split={
+                side: {name: _part(told) for name, told in document["split"][side].items()}
+                for side in SIDES
             },
-            held_out_content=dict(document["held_out_content"]),
             step=document["step"],
             metrics=document["metrics"],
             instructions=tuple(document.get("instructions", ())),
@@ -176,6 +191,11 @@ def check_policy(folder: Path) -> TrainHeadParams:
         return _params(document)
 
 
+def _part(told: Mapping[str, Any]) -> EpisodePart:
+    first, stop = told["ticks"]
+    return EpisodePart((int(first), int(stop)), told["content"], told["group"])
+
+
 def _params(document: Mapping[str, Any]) -> TrainHeadParams:
     given: Mapping[str, Any] = document["params"]["train_head"]
     return TrainHeadParams.model_validate(
@@ -192,8 +212,9 @@ def _description(folder: Path) -> Generator[dict[str, Any]]:
         _note_without_digest(path)
     if document.get("format") != FORMAT:
         raise CheckpointMismatch(
-            f"{path}: expected format {FORMAT}, found {document.get('format')!r}. "
-            "Train it again with this version."
+            f"{path}: expected format {FORMAT}, found {document.get('format')!r}. Checkpoints of "
+            "formats before 3 do not tell what chose them from what reports them. Train it again "
+            "with this version."
         )
     try:
         yield document

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pipeline.store.schema import STREAMS
 
 SAID = ("id", "path", "format", "instruction", "content", "digest")
-"""What `episode/text` says of each episode."""
+"""What `episode/text` says of each episode; beside it `group`, where the recording names one."""
 
 
 @dataclass(frozen=True)
@@ -36,11 +36,14 @@ class Episode:
     vl_rows: range
     readings: range
     states: range
+    group: str | None = None
+    """Of the episodes that the recordings say belong together; None where this one says nothing."""
 
     @property
     def text(self) -> bytes:
         """What `episode/text` says of it."""
-        return _text({name: getattr(self, name) for name in SAID})
+        group = {} if self.group is None else {"group": self.group}
+        return _text({name: getattr(self, name) for name in SAID} | group)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -54,7 +57,7 @@ def _text(said: Mapping[str, str]) -> bytes:
 
 
 def read_texts(arrays: Mapping[str, NDArray[Any]]) -> list[dict[str, Any]]:
-    """What `episode/text` says of each episode: the fields named in `SAID`."""
+    """What `episode/text` says of each episode: the fields named in `SAID`, perhaps `group`."""
     text = arrays["episode/text"].tobytes()
     return [json.loads(text[start:stop]) for start, stop in pairwise(arrays["episode/text_start"])]
 
@@ -91,7 +94,7 @@ class EpisodeRows:
     states: int
     source: str
     said: Mapping[str, str]
-    """The fields named in `SAID`."""
+    """The fields named in `SAID`, and `group` where the recording names one."""
 
     @property
     def text(self) -> bytes:

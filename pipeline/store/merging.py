@@ -22,6 +22,7 @@ from tqdm import tqdm
 
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import ConfigError, StoreMismatch
+from pipeline.base.tuned_on import joined, of_store, store_attributes
 from pipeline.store.chunks import check_row_checksums, check_trailers, read_rows
 from pipeline.store.episodes import Episode, index_arrays
 from pipeline.store.lock import build_lock
@@ -274,10 +275,11 @@ def _lay_out(build: StoreBuild, merged: MergedEpisodes, inodes: Sequence[Inode |
     for store, inode in zip(merged.stores, inodes, strict=True):
         refuse_replaced(store.path, inode)
     streams = {name: merged.having(name).streams[name] for name in ("sensor", "state")}
+    tuned = joined(of_store(store.attrs) for store in merged.stores)
     its_own = {"sources": merged.sources, "streams": first.streams | streams, "environment": []}
     attrs = {name: value for name, value in first.attrs.items() if name != METADATA_DIGEST}
     vl = zarr.open_group(first.path, path="vl", mode="r").attrs.asdict()
-    build.finish_layout(attrs | its_own, vl)
+    build.finish_layout(attrs | its_own | store_attributes(tuned), vl)
 
 
 def _copy_rows(build: StoreBuild, name: str, merged: MergedEpisodes, run: EpisodeRun) -> None:

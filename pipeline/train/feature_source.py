@@ -22,7 +22,7 @@ class FeatureSource:
     identity: Mapping[str, Any] = {}
     """JSON: what else decides the numbers of the run; empty where the params say it all."""
     eval_ticks: int | None = None
-    """Held-out ticks evaluated at most during training; None: the trainer's own limit."""
+    """Ticks of val evaluated at most during training; None: the trainer's own limit."""
 
     def __init__(self, store: FeatureStore, on_device: Collection[str] = (), *notes: str) -> None:
         self.store = store

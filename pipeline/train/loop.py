@@ -39,13 +39,13 @@ from pipeline.train.progress import Progress, describe_data, peak_memory_bytes
 from pipeline.train.run import TrainingRun, policy_shape
 from pipeline.train.sampling import Plan, StepPart
 from pipeline.train.scores import evaluate_policy
-from pipeline.train.split import Split, held_out_contents, held_out_ranges, source_of
+from pipeline.train.split import Split, source_of, split_parts
 from pipeline.train.statistics import fit_normalization
 from pipeline.train.world import World, deferred_interrupt, process_device
 
 LOG_EVERY = 10
 EVALUATION_TICKS = 1000
-"""Held-out ticks evaluated during training at most, evenly spaced; `stages.evaluate` takes all."""
+"""Ticks of val evaluated during training at most, evenly spaced; `stages.evaluate` takes all."""
 
 
 class Trainer:
@@ -74,11 +74,11 @@ class Trainer:
         self.source = source
         self.plan = Plan(store, params, split, self.world, run.section)
         self.step = 0
-        if params.early_stopping is not None and not len(split.held_out):
+        if params.early_stopping is not None and not len(split.val):
             raise ConfigError(
                 f"train_head.early_stopping is {params.early_stopping}, but nothing is held out "
-                f"that could stop getting better: train_head.val_fraction is "
-                f"{params.val_fraction:g}. Set it above 0, or train_head.early_stopping=null."
+                f"that could stop getting better: train_head.split.val is {params.split.val:g}. "
+                "Set it above 0, or train_head.early_stopping=null."
             )
         self.stopping = EarlyStopping(params.early_stopping)
         self.history = History()
@@ -257,7 +257,7 @@ class Trainer:
             best = not metrics or self.stopping.take(metrics["val/error"])
             if metrics and self.world.first:
                 tqdm.write(
-                    f"step {self.step}: train loss {self.history.last('loss'):.4f}, held-out error "
+                    f"step {self.step}: train loss {self.history.last('loss'):.4f}, val error "
                     f"{metrics['val/error']:.4f} of the training std"
                     f"{' (best so far)' if best else ''}"
                 )
@@ -265,12 +265,12 @@ class Trainer:
                 self.world.shared(lambda: self._save(self.run.best, metrics))
 
     def _measure(self, log: TrainingLog | None) -> dict[str, float]:
-        """The held-out metrics, written down; none where nothing is held out.
+        """The metrics on val, written down; none where that is empty. Test is never looked at.
 
         `val/error` in training standard deviations, `val/<group>` in the group's unit.
         """
         assert log is not None
-        ticks = evaluation_ticks(self.split.held_out, self.source.eval_ticks)
+        ticks = evaluation_ticks(self.split.val, self.source.eval_ticks)
         if not len(ticks):
             return {}
         windows = Windows.of(self.params)
@@ -333,15 +333,13 @@ class Trainer:
         self, folder: Path, metrics: Mapping[str, float], state: TrainerState | None = None
     ) -> None:
         """Put the averaged weights into a checkpoint folder. Raises `DiskFull`."""
-        ranges = held_out_ranges(self.store, self.split.held_out)
         checkpoint = PolicyCheckpoint(
             params=self.params,
             shape=self.shape,
             normalization=self.normalization,
             source=source_of(self.store),
             instructions=tuple(sorted({episode.instruction for episode in self.store.episodes})),
-            held_out_ticks=ranges,
-            held_out_content=held_out_contents(self.store, ranges),
+            split=split_parts(self.store, self.split),
             step=self.step,
             weights=self.source.policy_of(self.averaged).state_dict(),
             metrics=metrics,
@@ -392,7 +390,7 @@ class TerminalStop:
 
 @dataclass
 class EarlyStopping:
-    """The best held-out error so far and how many evaluations have come since."""
+    """The best error on val so far and how many evaluations have come since."""
 
     patience: int | None
     """Evaluations without a better one after which a run ends; None never ends it."""
@@ -413,8 +411,8 @@ class EarlyStopping:
         return self.patience is not None and self.stalled >= self.patience
 
 
-def evaluation_ticks(held_out: Ticks, limit: int | None) -> Ticks:
-    """The held-out ticks that evaluations of a run look at: as many as they may, evenly spaced."""
+def evaluation_ticks(val: Ticks, limit: int | None) -> Ticks:
+    """The ticks of val that evaluations of a run look at: as many as they may, evenly spaced."""
     limit = EVALUATION_TICKS if limit is None else limit
-    spread = np.linspace(0, len(held_out) - 1, min(len(held_out), limit)).round()
-    return held_out[spread.astype(np.int64)]
+    spread = np.linspace(0, len(val) - 1, min(len(val), limit)).round()
+    return val[spread.astype(np.int64)]

@@ -17,7 +17,7 @@ from pipeline.policy.observation import PolicyShape
 from pipeline.store import FeatureStore
 from pipeline.train.batches import Prefetch
 from pipeline.train.sampling import ticks_by_source
-from pipeline.train.split import Split
+from pipeline.train.split import Split, split_parts
 
 EVERY_S = 60.0
 """Between two lines where there is no terminal."""
@@ -133,19 +133,23 @@ def describe_data(
     Those are of what the store has and the training episodes have not: a source, a stream.
     """
     slots, dim = store.feature_shape
+    sides = split_parts(store, split).values()
+    groups = [len({part.group for part in parts.values()}) for parts in sides]
     lines = [
         f"store {store.path}: {len(store.episodes)} episodes, {store.ticks} ticks, "
         f"{slots} x {dim} features a VL row",
-        f"split: {len(split.train)} training ticks, {len(split.held_out)} held out "
-        f"of {len(split.held_out_episodes)} episode(s)",
+        f"split: {len(split.train)} training ticks, {len(split.val)} val, {len(split.test)} test "
+        f"of {' + '.join(map(str, groups))} groups",
     ]
+    if not len(split.test):
+        lines.append("split: nothing is test, so nothing is left for stages.evaluate to report on")
     if split.note:
         lines.append(f"split: {split.note}")
     lost: list[str] = []
     trained = ticks_by_source(store, split.train)
     for source, ticks in ticks_by_source(store, np.arange(store.ticks)).items():
         if len(ticks) and not len(trained[source]) and params.mixture.get(source, 1) > 0:
-            lost.append(f"source {source!r}: all of its episodes are held out")
+            lost.append(f"source {source!r}: none of its episodes is trained on")
     for stream, stored, known, switch in (
         ("sensor", store.sensor_channels, shape.sensor_channels, "sensor_enabled"),
         ("state", store.state_dim, shape.state_dim, "robot_state_enabled"),
@@ -158,8 +162,8 @@ def describe_data(
         elif not known:
             lost.append(f"{stream}: in the store, but absent from the training episodes")
     return lines + [
-        f"warning: {what}. Nothing is learnt of it. Episodes are held out by a hash, "
-        f"train_head.val_fraction {params.val_fraction:g} of them: set a smaller one (0 holds none "
-        "out), or extract more episodes with it"
+        f"warning: {what}. Nothing is learnt of it. Groups of episodes are held out by a hash, "
+        f"train_head.split val {params.split.val:g} and test {params.split.test:g} of them: set "
+        "smaller shares (0 holds none out) or another seed, or extract more episodes with it"
         for what in lost
     ]

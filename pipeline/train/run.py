@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
 RUN, BEST, LAST = "run.json", "best", "last"
 TRAINER_WEIGHTS, TRAINER_DOCUMENT = "trainer.safetensors", "trainer.json"
-TRAINER_VERSION = 3
+TRAINER_VERSION = 4
 """Raised with every change of code that changes the numbers of a run: part of its identity, so
 that no run goes on under code other than it began with."""
 FREE_PARAMS = {
@@ -84,7 +84,7 @@ class TrainingRun:
 
     @property
     def best(self) -> Path:
-        """The checkpoint with the lowest held-out error so far."""
+        """The checkpoint with the lowest error on val so far."""
         return self.part / BEST
 
     @property
@@ -290,8 +290,8 @@ class TrainedPolicy:
     """What its store was; None where its document is damaged."""
     recordings: Mapping[str, Any] | None = None
     """Of a run: which episodes and rows its store held."""
-    held_out: Mapping[str, str] | None = None
-    """Of a checkpoint alone: `source/id` of the held-out episodes -> digest of their files."""
+    test: frozenset[str] | None = None
+    """Of a checkpoint alone: digests of the files of its test episodes."""
     damage: str | None = None
 
     def depends_on(self, store: FeatureStore) -> str | None:
@@ -301,8 +301,8 @@ class TrainedPolicy:
         if self.recordings is not None:
             return "trained on it" if self.recordings == recordings_of(store) else None
         contents = {episode.content for episode in store.episodes}
-        if self.held_out is not None and contents.issuperset(self.held_out.values()):
-            return "can be evaluated on it, has its features and held-out episodes"
+        if self.test is not None and contents.issuperset(self.test):
+            return "can be evaluated on it, has its features and test episodes"
         return None
 
 
@@ -325,6 +325,7 @@ def _read_trained(folder: Path, path: Path) -> TrainedPolicy:
             source, recordings = document["source"], dict(document["decides"]["recordings"])
             return TrainedPolicy(folder, {key: source[key] for key in SOURCE_KEYS}, recordings)
         source = {key: document[key] for key in SOURCE_KEYS}
-        return TrainedPolicy(folder, source, held_out=dict(document["held_out_content"]))
+        test = frozenset(part["content"] for part in document["split"]["test"].values())
+        return TrainedPolicy(folder, source, test=test)
     except (CheckpointIncomplete, KeyError, TypeError, ValueError) as error:
         return TrainedPolicy(folder, damage=f"{path}: {error}")

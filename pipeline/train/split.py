@@ -1,137 +1,243 @@
-"""Which ticks are trained on and which are held out; a checkpoint's held-out ticks found again."""
+"""Which ticks are trained on, which choose the checkpoint and which are reported.
+
+And the sides of a checkpoint found again in a store.
+"""
 
 import hashlib
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain, pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.base.config import SplitParams
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import CheckpointMismatch, ConfigError, StoreMismatch
-from pipeline.policy.checkpoint import SOURCE_KEYS, PolicyCheckpoint
+from pipeline.policy.checkpoint import SIDES, SOURCE_KEYS, EpisodePart, PolicyCheckpoint, Side
 from pipeline.store import Episode, FeatureStore, episode_name
-
-_TAIL = 0.2
-"""What a single recording holds out of its ticks."""
+from pipeline.train.groups import episodes_by_group
 
 _SLACK_S = 1e-6
 """Two times that differ by less are one: seconds since 1970 in float64 are this coarse."""
 
+Groups = Mapping[str, Sequence[Episode]]
+Bounds = Mapping[Side, tuple[float, float]]
+
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Store-global ticks, ascending: trained on, and held out with the "source/id" they are of."""
+    """Store-global ticks, ascending: trained on, choosing the checkpoint, and reported."""
 
     train: NDArray[np.int64]
-    held_out: NDArray[np.int64]
-    held_out_episodes: tuple[str, ...]
+    val: NDArray[np.int64]
+    test: NDArray[np.int64]
+    groups: Mapping[str, str]
+    """"source/id" of each episode that has ticks -> its group."""
     note: str | None
     """What the reader of a metric has to know about this split, or None."""
 
 
 def split_by_episode(
     store: FeatureStore,
-    val_fraction: float,
+    params: SplitParams,
     horizon: int = 8,
     keys: NDArray[np.uint8] | None = None,
 ) -> Split:
-    """Whole episodes on either side, by a hash of "source/id".
+    """Whole groups of episodes on each side, by a hash of `params.seed` and the group's name.
 
-    Episodes whose first VL keys are equal are one recording in several formats and share a side,
-    by the hash of the first of their names. So an added episode moves none but other formats of
-    itself, save where a side would be empty: of two recordings one is held out, one trained on. And
-    of two or more recordings of a source one is trained on.
+    So an added episode moves none but those of its own group, save where a side would be empty: a
+    source of three or more groups has one on each side that is asked for, one of two has one to
+    train on, and all sources together have one on each side. `folds` deals the groups of each
+    source in the order of their hashes, so that each is in test in one fold; `val` is drawn from
+    the others.
 
-    A single recording is cut at one instant for all of its formats: the earliest at which the last
-    20 % of a format's ticks begin. Ticks from there on are held out; ticks before it whose chunk
-    of `horizon` actions is not over by then belong to neither side. Raises `ConfigError` where that
-    leaves nothing to train on, `StoreMismatch` where the store has no tick. `keys` (vl_row, 16)
-    stand in for the VL keys of a store that has none.
+    Of two groups one is test, and val is cut from the tail of the other. A single one is cut by
+    time into all three, at one instant for all of its episodes: those are then one recording in
+    several formats. Ticks whose chunk of `horizon` actions reaches into the next side belong to
+    none.
+
+    Raises `ConfigError` where that leaves nothing to train on, or there are fewer groups than
+    folds, and `StoreMismatch` where the store has no tick. `keys` (vl_row, 16) stand in for the VL
+    keys of a store that has none.
     """
-    recordings = episodes_by_recording(store, keys)
-    if not recordings:
+    groups = episodes_by_group(store, params.groups, keys)
+    if not groups:
         raise StoreMismatch(
             f"{store.path}: expected ticks to train on, found none. Look at data.sources and run "
             "stages.extract again."
         )
-    if val_fraction <= 0:
-        return Split(_ticks(store.episodes), _ticks([]), (), None)
-    if len(recordings) == 1:
-        return _split_tail(store, next(iter(recordings.values())), horizon)
-    ranks = {name: hash64(name) / 2**64 for name in recordings}
-    chosen = {name for name, rank in ranks.items() if rank < val_fraction}
-    notes: list[str] = []
-    part = f"val_fraction {val_fraction} of {len(ranks)} recordings"
-    if not chosen:
-        chosen = {min(ranks, key=lambda name: ranks[name])}
-        notes.append(f"{part} is none; one is held out")
-    elif len(chosen) == len(ranks):
-        chosen.remove(max(ranks, key=lambda name: ranks[name]))
-        notes.append(f"{part} is all; one is trained on")
-    by_source: dict[str, set[str]] = {}
-    for name, episodes in recordings.items():
-        for episode in episodes:
-            by_source.setdefault(episode.source, set()).add(name)
-    for source, names in sorted(by_source.items()):
-        if len(names) > 1 and names <= chosen:
-            chosen.remove(max(names, key=lambda name: ranks[name]))
-            notes.append(f"{part} is all of source {source!r}; one of it is trained on")
-    train = [e for name, episodes in recordings.items() if name not in chosen for e in episodes]
-    held_out = [e for name in chosen for e in recordings[name]]
-    return Split(_ticks(train), _ticks(held_out), _names(held_out), "; ".join(notes) or None)
-
-
-def episodes_by_recording(
-    store: FeatureStore, keys: NDArray[np.uint8] | None = None
-) -> dict[str, list[Episode]]:
-    """Episodes that have ticks, by the first name among those with the same first VL key.
-
-    Those are one recording in several formats: what is learnt from one is known of the others.
-    `keys` (vl_row, 16) stand in for the store's own.
-    """
-    keys = store.array("vl/key") if keys is None else keys
-    frame_time = store.array("vl/frame_time")
-    by_key: dict[bytes, list[Episode]] = {}
-    for episode in store.episodes:
-        if len(episode.ticks):
-            row = episode.vl_rows.start
-            # The key of a row without a frame says nothing but the instruction.
-            key = (
-                keys[row].tobytes()
-                if np.isfinite(frame_time[row]).any()
-                else episode_name(episode).encode()
-            )
-            by_key.setdefault(key, []).append(episode)
-    return {min(_names(episodes)): episodes for episodes in by_key.values()}
-
-
-def _split_tail(store: FeatureStore, episodes: list[Episode], horizon: int) -> Split:
-    named = f"a single recording ({', '.join(_names(episodes))})"
-    clocks = [_elapsed(store, episode) for episode in episodes]
-    begins = [clock[-n] for clock in clocks if (n := round(_TAIL * len(clock)))]
-    if not begins:
-        return Split(_ticks(episodes), _ticks([]), (), f"{named}, too short to hold ticks out")
-    train, held_out = [], []
-    usual = float(np.median(np.concatenate([np.diff(clock) for clock in clocks])))
-    for episode, clock in zip(episodes, clocks, strict=True):
-        trained, first = _sides(clock, min(begins), horizon, usual)
-        train.append(_ticks([episode])[:trained])
-        held_out.append(_ticks([episode])[first:])
-    if not any(map(len, train)):
-        raise ConfigError(
-            f"{named} of {', '.join(str(len(clock)) for clock in clocks)} ticks, its last "
-            f"{_TAIL:.0%} held out: expected an action chunk of train_head.horizon {horizon} ticks "
-            "before those, found none. Set a shorter train_head.horizon or "
-            "train_head.val_fraction=0, or add recordings to data.sources."
-        )
-    note = (
-        f"{named}: its last {_TAIL:.0%} of ticks are held out, "
-        "which says less than a recording never seen"
+    shares: dict[Side, float] = {"test": params.test, "val": params.val}
+    asked: dict[Side, float] = {side: share for side, share in shares.items() if share > 0}
+    ranks = _ranks(groups, f"{params.seed}")
+    test = _fold(groups, ranks, params)
+    if not test and len(groups) == len(asked) == 2:
+        test = {min(groups, key=lambda name: ranks[name])}
+    if test:
+        asked.pop("test", None)
+    rest = {name: group for name, group in groups.items() if name not in test}
+    if len(rest) == 1:
+        sides, notes = _cut_by_time(store, next(iter(rest.values())), asked, horizon)
+        notes = [f"of {len(groups)} groups {len(test)} is test", *notes] if test else notes
+    else:
+        ranks = ranks if params.folds is None else _ranks(rest, f"{params.seed}.{params.fold}")
+        bounds = _bounds(asked, of=len(rest) / len(groups))
+        side_of: dict[str, Side] = {name: _side(ranks[name], bounds) for name in rest}
+        notes = _repair(side_of, ranks, bounds, _quotas(groups, rest.keys(), tuple(bounds)))
+        sides = {
+            side: _ticks([e for name in rest if side_of[name] == side for e in rest[name]])
+            for side in bounds
+        }
+    if test:
+        sides["test"] = _ticks([e for name in test for e in groups[name]])
+    return Split(
+        *(sides.get(side, _ticks([])) for side in SIDES),
+        groups={episode_name(e): name for name, group in groups.items() for e in group},
+        note="; ".join(notes) or None,
     )
-    names = _names([e for e, ticks in zip(episodes, held_out, strict=True) if len(ticks)])
-    return Split(np.sort(np.concatenate(train)), np.sort(np.concatenate(held_out)), names, note)
+
+
+def _ranks(names: Iterable[str], seed: str) -> dict[str, float]:
+    return {name: hash64(f"{seed} {name}") / 2**64 for name in names}
+
+
+def _fold(groups: Groups, ranks: Mapping[str, float], params: SplitParams) -> set[str]:
+    """The groups that are test in this fold: those of each source are dealt in turn."""
+    if params.folds is None:
+        return set()
+    if params.folds > len(groups):
+        raise ConfigError(
+            f"train_head.split.folds is {params.folds}, but the store has {len(groups)} group(s) "
+            "of episodes, of which each is test in one fold. Set fewer folds, or folds null."
+        )
+    sources = {name: sorted({e.source for e in group}) for name, group in groups.items()}
+    dealt = sorted(groups, key=lambda name: (sources[name], ranks[name]))
+    return set(dealt[params.fold :: params.folds])
+
+
+def _bounds(shares: Mapping[Side, float], of: float) -> Bounds:
+    """Between which ranks a group is on which side, shares being of `of` times all groups."""
+    sides: tuple[Side, ...] = (*shares, "train")
+    edges = np.minimum(np.cumsum([0.0, *shares.values()]) / of, 1.0).tolist()
+    return dict(zip(sides, pairwise((*edges, 1.0)), strict=True))
+
+
+def _side(rank: float, bounds: Bounds) -> Side:
+    return next(side for side, (_, high) in bounds.items() if rank < high)
+
+
+@dataclass(frozen=True)
+class _Quota:
+    """Sides on each of which there has to be one of these groups."""
+
+    of: str
+    groups: frozenset[str]
+    sides: tuple[Side, ...]
+    weight: int
+    """Of a side that is missing, where not all quotas can be met."""
+
+    def cost(self, side_of: Mapping[str, Side]) -> int:
+        """The weight of what is missing."""
+        return self.weight * len(self.missing(side_of))
+
+    def missing(self, side_of: Mapping[str, Side]) -> set[Side]:
+        """The sides that have none of these groups."""
+        return set(self.sides) - {side_of[name] for name in self.groups}
+
+
+def _quotas(groups: Groups, drawn: Collection[str], sides: tuple[Side, ...]) -> Iterator[_Quota]:
+    """What of the groups drawn has to be on which side: of each source, then of all together."""
+    sources = sorted({episode.source for episode in chain(*groups.values())})
+    for source in sources:
+        own = {name for name, group in groups.items() if any(e.source == source for e in group)}
+        rest = frozenset(own.intersection(drawn))
+        if len(own) > 2 and len(rest) >= len(sides):
+            yield _Quota(f"source {source!r}", rest, sides, 1)
+        elif len(own) > 1 and rest:
+            yield _Quota(f"source {source!r}", rest, ("train",), 1)
+    yield _Quota("all sources", frozenset(drawn), sides, 3 * len(sources))
+
+
+def _repair(
+    side_of: dict[str, Side], ranks: Mapping[str, float], bounds: Bounds, quotas: Iterable[_Quota]
+) -> list[str]:
+    """Move a group to each side that has none of a quota; returns what was moved.
+
+    The one that leaves the least missing to this quota and those before it, of these the one whose
+    rank is nearest; none where no move leaves less.
+    """
+    notes: list[str] = []
+    before: list[_Quota] = []
+    for quota in quotas:
+        before.append(quota)
+        for side in sorted(quota.missing(side_of)):
+            low, high = bounds[side]
+            rise, _, name = min(
+                (
+                    _rise(side_of, name, side, before),
+                    max(low - ranks[name], ranks[name] - high),
+                    name,
+                )
+                for name in quota.groups
+            )
+            if rise < 0:
+                side_of[name] = side
+                notes.append(f"{side} had nothing of {quota.of}, {name} was moved there")
+    return notes
+
+
+def _rise(side_of: Mapping[str, Side], name: str, side: Side, quotas: Iterable[_Quota]) -> int:
+    """By how much the quotas cost more with this group on that side."""
+    moved: dict[str, Side] = {**side_of, name: side}
+    return sum(q.cost(moved) - q.cost(side_of) for q in quotas if name in q.groups)
+
+
+def _cut_by_time(
+    store: FeatureStore, episodes: Sequence[Episode], shares: Mapping[Side, float], horizon: int
+) -> tuple[dict[Side, NDArray[np.int64]], list[str]]:
+    """The sides of a single group, from its end: `shares` of its ticks, and what is before them.
+
+    A side begins at the earliest instant at which its share of an episode's ticks begins.
+    """
+    if not shares:
+        return {"train": _ticks(episodes)}, []
+    named = f"a single group ({', '.join(sorted(map(episode_name, episodes)))})"
+    clocks = [_elapsed(store, episode) for episode in episodes]
+    steps = np.concatenate([np.diff(clock) for clock in clocks])
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    stops = [len(clock) for clock in clocks]
+    sides: dict[Side, NDArray[np.int64]] = {}
+    notes: list[str] = []
+    for side, share in shares.items():
+        counts = [round(share * len(clock)) for clock in clocks]
+        if not any(counts):
+            notes.append(f"{named}, too short to hold ticks out as {side}")
+            continue
+        starts = [
+            clock[stop - n]
+            for clock, stop, n in zip(clocks, stops, counts, strict=True)
+            if 0 < n <= stop
+        ]
+        cut = min(starts, default=-np.inf)
+        edges = [_around(clock, cut, horizon, usual) for clock in clocks]
+        sides[side] = _ticks(
+            episodes, [(first, stop) for (_, first), stop in zip(edges, stops, strict=True)]
+        )
+        stops = [min(stop, done) for (done, _), stop in zip(edges, stops, strict=True)]
+        notes.append(f"{named}: {share:.0%} of its ticks, cut from its end, are {side}")
+    sides["train"] = _ticks(episodes, [(0, stop) for stop in stops])
+    if not len(sides["train"]):
+        raise ConfigError(
+            f"{named} of {', '.join(str(len(clock)) for clock in clocks)} ticks, of which the last "
+            f"are held out ({', '.join(f'{side} {share:.0%}' for side, share in shares.items())}): "
+            f"expected an action chunk of train_head.horizon {horizon} ticks before each side, "
+            "found none. Set a shorter train_head.horizon, train_head.split.val=0 or "
+            "train_head.split.test=0, or add recordings to data.sources."
+        )
+    if sides.keys() != {"train"}:
+        notes.append("that says less than a recording never seen")
+    return sides, notes
 
 
 def _elapsed(store: FeatureStore, episode: Episode) -> NDArray[np.float64]:
@@ -145,7 +251,7 @@ def _elapsed(store: FeatureStore, episode: Episode) -> NDArray[np.float64]:
     return time - (taken.max() if len(taken) else time[0])
 
 
-def _sides(
+def _around(
     clock: NDArray[np.float64], cut: float, horizon: int, usual_step: float
 ) -> tuple[int, int]:
     """How many leading ticks have chunks that end before the cut, and the first tick at it.
@@ -161,13 +267,15 @@ def _sides(
     return (done if done == len(clock) else max(0, done - (horizon - 1))), first
 
 
-def _ticks(episodes: Sequence[Episode]) -> NDArray[np.int64]:
-    ranges = [np.arange(e.ticks.start, e.ticks.stop, dtype=np.int64) for e in episodes]
-    return np.sort(np.concatenate(ranges)) if ranges else np.empty(0, np.int64)
-
-
-def _names(episodes: Sequence[Episode]) -> tuple[str, ...]:
-    return tuple(sorted(episode_name(episode) for episode in episodes))
+def _ticks(
+    episodes: Sequence[Episode], parts: Sequence[tuple[int, int]] | None = None
+) -> NDArray[np.int64]:
+    """The ticks of these episodes, or [first, stop) of each, counted in the episode; ascending."""
+    parts = [(0, len(episode.ticks)) for episode in episodes] if parts is None else parts
+    own = [
+        np.array(e.ticks[slice(*part)], np.int64) for e, part in zip(episodes, parts, strict=True)
+    ]
+    return np.sort(np.concatenate([np.empty(0, np.int64), *own]))
 
 
 def hash64(text: str) -> int:
@@ -195,76 +303,84 @@ def check_store(checkpoint: PolicyCheckpoint, store: FeatureStore) -> None:
         )
 
 
-def held_out_ranges(store: FeatureStore, ticks: NDArray[np.int64]) -> dict[str, tuple[int, int]]:
-    """The held-out ticks of each episode as `source/id` -> [first, stop), counted in the episode.
+def split_parts(store: FeatureStore, split: Split) -> dict[Side, dict[str, EpisodePart]]:
+    """What a checkpoint says of each side: its episodes by "source/id".
 
-    So a checkpoint says what it has not seen in a way that outlives episodes added before these.
+    In a way that outlives episodes that are added before these.
     """
-    ticks = np.sort(ticks)
+    return {side: _parts(store, getattr(split, side), split.groups) for side in SIDES}
+
+
+def _parts(
+    store: FeatureStore, ticks: NDArray[np.int64], groups: Mapping[str, str]
+) -> dict[str, EpisodePart]:
     edges = np.searchsorted(ticks, store.array("episode/tick_start"))
-    ranges = {}
+    parts = {}
     for index in np.flatnonzero(np.diff(edges)):
         episode, inside = store.episodes[index], ticks[edges[index] : edges[index + 1]]
-        first, stop = int(inside[0]), int(inside[-1]) + 1
-        assert len(inside) == stop - first, "held-out ticks of an episode lie side by side"
-        start = episode.ticks.start
-        ranges[episode_name(episode)] = (first - start, stop - start)
-    return ranges
+        name, start = episode_name(episode), episode.ticks.start
+        first, stop = int(inside[0]) - start, int(inside[-1]) + 1 - start
+        assert len(inside) == stop - first, "ticks of an episode on one side lie side by side"
+        parts[name] = EpisodePart((first, stop), episode.content, groups[name])
+    return parts
 
 
-def held_out_contents(store: FeatureStore, names: Collection[str]) -> dict[str, str]:
-    """The digest of the files of each of these episodes, by name."""
-    known = {episode_name(episode): episode.content for episode in store.episodes}
-    return {name: known[name] for name in names}
-
-
-def find_held_out(
-    store: FeatureStore, checkpoint: PolicyCheckpoint
+def find_ticks(
+    store: FeatureStore, checkpoint: PolicyCheckpoint, side: Side
 ) -> tuple[NDArray[np.int64], PolicyCheckpoint]:
-    """The store's held-out ticks, ascending, and the checkpoint with the store's names of them.
+    """The store's ticks of a side, ascending, and the checkpoint with the store's names of them.
 
     An episode whose source or folder was renamed since is told by the digest of its files. Raises
-    `CheckpointMismatch` where nothing is held out, or where the store lacks an episode, has a
-    shorter one of that name, or one made from other files.
+    `CheckpointMismatch` where the side has no episode, or where the store lacks one, has a shorter
+    one of that name, or one made from other files.
     """
-    ranges, contents = checkpoint.held_out_ticks, checkpoint.held_out_content
-    if not ranges:
+    parts = checkpoint.split[side]
+    if not parts:
         raise CheckpointMismatch(
-            "the checkpoint lists no held-out episode, so nothing is left to evaluate it on: it "
-            "was trained with train_head.val_fraction 0. Train with a fraction above 0."
+            f"the checkpoint lists no {side} episode, so there is nothing to look at: it was "
+            f"trained with train_head.split.{side} 0, or on too short a recording. Train with a "
+            "share above 0."
         )
     by_name = {episode_name(episode): episode for episode in store.episodes}
     renamed: dict[str, list[Episode]] = {}
     for name, episode in by_name.items():
-        if contents.get(name) != episode.content:
+        if name not in parts or parts[name].content != episode.content:
             renamed.setdefault(episode.content, []).append(episode)
-    held_out: list[tuple[Episode, tuple[int, int]]] = []
+    there: list[tuple[Episode, EpisodePart]] = []
     wrong: list[str] = []
-    for name, (first, stop) in ranges.items():
-        episode, content = by_name.get(name), contents.get(name)
-        same = episode is not None and episode.content == content
-        if not same and (elsewhere := renamed.get(content or "")):
+    for name, part in parts.items():
+        episode = by_name.get(name)
+        same = episode is not None and episode.content == part.content
+        if not same and (elsewhere := renamed.get(part.content)):
             episode = elsewhere.pop()
         if episode is None:
             wrong.append(f"{name} is missing")
-        elif len(episode.ticks) < stop:
+        elif len(episode.ticks) < part.ticks[1]:
             wrong.append(f"{name} is shorter")
-        elif episode.content != content:
+        elif episode.content != part.content:
             wrong.append(f"{name} is another recording, or the same one read otherwise since")
         else:
-            held_out.append((episode, (first, stop)))
+            there.append((episode, part))
     if wrong:
         raise CheckpointMismatch(
-            f"{store.path}: of the {len(ranges)} episodes that the checkpoint holds out, "
+            f"{store.path}: of the {len(parts)} {side} episodes of the checkpoint, "
             f"{len(wrong)} are not there as they were: {'; '.join(wrong[:5])}"
             f"{' …' if len(wrong) > 5 else ''}. Name the store it was trained from in "
             "evaluate.store, or train again."
         )
+    named = {episode_name(episode): part for episode, part in there}
     return (
-        np.unique(np.concatenate([np.array(e.ticks[slice(*part)]) for e, part in held_out])),
-        replace(
-            checkpoint,
-            held_out_ticks={episode_name(e): part for e, part in held_out},
-            held_out_content={episode_name(e): e.content for e, _ in held_out},
-        ),
+        _ticks([episode for episode, _ in there], [part.ticks for _, part in there]),
+        replace(checkpoint, split={**checkpoint.split, side: named}),
     )
+
+
+def groups_of(
+    store: FeatureStore, checkpoint: PolicyCheckpoint, ticks: NDArray[np.int64]
+) -> NDArray[np.str_]:
+    """(tick,) the group of the episode of each of these ticks, which `find_ticks` gave."""
+    parts = chain.from_iterable(side.values() for side in checkpoint.split.values())
+    # By content: a renamed episode keeps its group, and episodes of equal content share one.
+    group_of = {part.content: part.group for part in parts}
+    indices, place = np.unique(store.episode_of(ticks), return_inverse=True)
+    return np.array([group_of[store.episodes[index].content] for index in indices], str)[place]

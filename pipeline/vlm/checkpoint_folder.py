@@ -7,7 +7,9 @@ from typing import Any
 
 from safetensors import SafetensorError, safe_open
 
+from pipeline.base.config import VLMParams
 from pipeline.base.errors import VLMError
+from pipeline.base.tuned_on import TunedOn, joined, read_tuned_on
 
 _WANTED = ["*.json", "*.safetensors", "*.txt", "*.jinja"]
 """What is fetched from the hub: never a pickle."""
@@ -86,6 +88,17 @@ def _downloaded(checkpoint: str, revision: str | None, setting: str) -> Path:
         f"`hf download {checkpoint}` where there is network and set {setting} to the folder. "
         "`python -m stages.doctor` looks at the rest."
     ) from cause
+
+
+def tuned_on(vlm: VLMParams) -> TunedOn | None:
+    """What the model of `vlm` was tuned on; None where neither checkpoint nor adapter says it.
+
+    Raises `VLMError` where one is missing, `CheckpointIncomplete` where what it says is damaged.
+    """
+    folders = [resolve_checkpoint(vlm.checkpoint, vlm.revision)]
+    if vlm.adapter:
+        folders.append(resolve_checkpoint(vlm.adapter, setting="vlm.adapter"))
+    return joined(map(read_tuned_on, folders))
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch.utils.data import ConcatDataset, DataLoader
 
-from pipeline.base.config import Source, TrainHeadParams
+from pipeline.base.config import Source, SplitParams, TrainHeadParams
 from pipeline.base.errors import ConfigError, RecordingError, StoreIncomplete, StoreMismatch
 from pipeline.base.observation import Observation
 from pipeline.compat.unified import no_normalization
@@ -338,8 +338,8 @@ class TestSplit:
         for val_fraction in (0.0, 0.3, 0.5, 0.8):
             sides = [[side.indices for side in data.split(val_fraction)] for data in (live, cached)]
             assert sides[0] == sides[1]
-            trained = split_by_episode(extracted, val_fraction)
-            assert sides[1] == [trained.train.tolist(), trained.held_out.tolist()]
+            trained = split_by_episode(extracted, SplitParams(val=val_fraction, test=0))
+            assert sides[1] == [trained.train.tolist(), trained.val.tolist()]
 
     def test_nothing_is_written_into_the_store(
         self, recordings: Path, extracted: FeatureStore

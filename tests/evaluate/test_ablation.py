@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.base.config import TrainHeadParams
+from pipeline.base.config import SplitParams, TrainHeadParams
 from pipeline.evaluate.ablation import (
     AblationStudy,
     delays,
@@ -28,7 +28,7 @@ from pipeline.store import FeatureStore
 from pipeline.train.batches import BatchIndices, Lags, Windows
 from pipeline.train.predictions import Predictions
 from pipeline.train.run import policy_shape
-from pipeline.train.split import held_out_contents, held_out_ranges, source_of, split_by_episode
+from pipeline.train.split import source_of, split_by_episode, split_parts
 
 PARAMS = {
     "sensor_encoder": {"channels": [16], "layers": 0, "heads": 1, "output_dim": 16},
@@ -44,7 +44,7 @@ PARAMS = {
 def trained(store: FeatureStore, steps: int, **params: object) -> tuple[PolicyCheckpoint, Policy]:
     """A policy trained on the third action, which is the newest reading's first channel."""
     wanted = TrainHeadParams.model_validate(PARAMS | params)
-    split = split_by_episode(store, 0.3)
+    split = split_by_episode(store, SplitParams(val=0, test=0.3))
     action = store.array("tick/action")
     # Nothing but the sensor decides the action.
     action[:, [0, 1, 3]] = 0.5
@@ -70,14 +70,12 @@ def trained(store: FeatureStore, steps: int, **params: object) -> tuple[PolicyCh
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-    ranges = held_out_ranges(store, split.held_out)
     checkpoint = PolicyCheckpoint(
         params=wanted,
         shape=shape,
         normalization=normalization,
         source=source_of(store),
-        held_out_ticks=ranges,
-        held_out_content=held_out_contents(store, ranges),
+        split=split_parts(store, split),
         step=steps,
         weights=policy.state_dict(),
     )
@@ -85,11 +83,11 @@ def trained(store: FeatureStore, steps: int, **params: object) -> tuple[PolicyCh
 
 
 def rules(store: FeatureStore) -> Baselines:
-    return Baselines(store, split_by_episode(store, 0.3).train, 1, None)
+    return Baselines(store, split_by_episode(store, SplitParams(val=0, test=0.3)).train, 1, None)
 
 
 def held_out(store: FeatureStore) -> np.ndarray:
-    return split_by_episode(store, 0.3).held_out
+    return split_by_episode(store, SplitParams(val=0, test=0.3)).test
 
 
 @pytest.fixture(scope="module")

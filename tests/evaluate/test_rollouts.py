@@ -73,7 +73,7 @@ def made(model_type: str = "regression", **changed: Any) -> tuple[PolicyCheckpoi
     normal = replace(normal, action=action)
     torch.manual_seed(0)
     policy = Policy(params, shape, normal).eval()
-    held = {"held_out_ticks": {}, "held_out_content": {}, "step": 1, "weights": {}}
+    held = {"split": {"train": {}, "val": {}, "test": {}}, "step": 1, "weights": {}}
     checkpoint = PolicyCheckpoint(params, shape, normal, SOURCE, **held)
     return checkpoint, policy, Glance()
 

@@ -12,6 +12,7 @@ from pipeline.base.config import TrainHeadParams
 from pipeline.base.durable import read_document, write_document, write_with_digest
 from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch
 from pipeline.policy.checkpoint import (
+    EpisodePart,
     PolicyCheckpoint,
     find_policy,
     load_policy,
@@ -54,8 +55,11 @@ def checkpoint(store: FeatureStore) -> PolicyCheckpoint:
         shape=shape,
         normalization=normalization,
         source=source_of(store),
-        held_out_ticks={"left/episode_004": (0, 30), "right/episode_005": (24, 30)},
-        held_out_content={"left/episode_004": "0-4", "right/episode_005": "0-5"},
+        split={
+            "train": {"right/episode_005": EpisodePart((0, 20), "0-5", "right/episode_005")},
+            "val": {"right/episode_005": EpisodePart((24, 30), "0-5", "right/episode_005")},
+            "test": {"left/episode_004": EpisodePart((0, 30), "0-4", "elsewhere")},
+        },
         step=7,
         weights=Policy(PARAMS, shape, normalization).state_dict(),
         metrics={"val/error": 1 / 3},
@@ -70,8 +74,7 @@ def test_a_checkpoint_comes_back_to_the_bit(
     assert found.params == PARAMS
     assert found.shape == checkpoint.shape
     assert found.source == checkpoint.source
-    assert found.held_out_ticks == checkpoint.held_out_ticks
-    assert found.held_out_content == checkpoint.held_out_content
+    assert found.split == checkpoint.split
     assert (found.step, found.metrics) == (7, {"val/error": 1 / 3})
     for name, value in checkpoint.weights.items():
         assert torch.equal(found.weights[name], value), name
@@ -89,7 +92,8 @@ def test_its_description_is_what_serving_needs(
     assert document["action_hz"] == 10.0
     assert document["vlm_reuse_count"] == 3
     assert document["params"]["train_head"]["horizon"] == 3
-    assert document["held_out_episodes"] == ["left/episode_004", "right/episode_005"]
+    left = {"ticks": [0, 30], "content": "0-4", "group": "elsewhere"}
+    assert document["split"]["test"] == {"left/episode_004": left}
     assert document["normalization"]["action"]["count"] == 60
 
 
@@ -114,9 +118,10 @@ def test_a_folder_or_a_run_is_found(checkpoint: PolicyCheckpoint, tmp_path: Path
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"format": 99}, "expected format 2, found 99"),
+        ({"format": 99}, "expected format 3, found 99"),
+        ({"format": 2}, "do not tell what chose them from what reports them. Train it again"),
         ({"shape": None}, "not what a checkpoint's description must be"),
-        ({"held_out_ticks": {"left/a": 3}}, "not what a checkpoint's description must be"),
+        ({"split": {"train": {"left/a": 3}}}, "not what a checkpoint's description must be"),
         ({"params": {"train_head": {"model_type": "oracle"}}}, "model_type"),
         ({"normalization": {}}, "std and count of `action`"),
     ],
@@ -136,11 +141,11 @@ def _ten_times(document: dict[str, Any]) -> None:
     statistics["std"] = [10 * number for number in statistics["std"]]
 
 
-def _fewer_held_out(document: dict[str, Any]) -> None:
-    document["held_out_ticks"]["left/episode_004"] = [20, 30]
+def _fewer_test_ticks(document: dict[str, Any]) -> None:
+    document["split"]["test"]["left/episode_004"]["ticks"] = [20, 30]
 
 
-@pytest.mark.parametrize("alter", [_ten_times, _fewer_held_out])
+@pytest.mark.parametrize("alter", [_ten_times, _fewer_test_ticks])
 def test_an_altered_description_is_refused(
     checkpoint: PolicyCheckpoint, tmp_path: Path, alter: Callable[[dict[str, Any]], None]
 ) -> None:

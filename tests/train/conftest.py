@@ -67,7 +67,7 @@ def trainer() -> Callable[[FeatureStore, TrainHeadParams], Trainer]:
     """A trainer that begins anew or goes on with what lies at the params' output."""
 
     def make(store: FeatureStore, params: TrainHeadParams) -> Trainer:
-        split = split_by_episode(store, params.val_fraction, params.horizon)
+        split = split_by_episode(store, params.split, params.horizon)
         return Trainer(store, params, split, open_run(params, store))
 
     return make

@@ -43,8 +43,8 @@ def test_stopping_early_needs_something_held_out(
     store: FeatureStore, params: Make, trainer: Make
 ) -> None:
     with pytest.raises(ConfigError, match="early_stopping is 3, but nothing is held out") as caught:
-        trainer(store, params(early_stopping=3, val_fraction=0))
-    assert "train_head.val_fraction is 0. Set it above 0" in str(caught.value)
+        trainer(store, params(early_stopping=3, split={"val": 0}))
+    assert "train_head.split.val is 0. Set it above 0" in str(caught.value)
     assert not params().output.with_name("head.part").exists()
 
 

@@ -84,7 +84,7 @@ class AdaptedFront(FeatureSource):
 
 def make(store: FeatureStore, params: TrainHeadParams) -> Trainer:
     front = AdaptedFront(store)
-    split = split_by_episode(store, params.val_fraction, params.horizon)
+    split = split_by_episode(store, params.split, params.horizon)
     return Trainer(store, params, split, open_run(params, store, front.identity), front)
 
 

@@ -178,11 +178,12 @@ def test_it_learns_what_the_store_says(store: FeatureStore, params: Make, traine
 def test_without_held_out_episodes_the_best_is_the_newest(
     store: FeatureStore, params: Make, trainer: Make
 ) -> None:
-    done = trainer(store, params(val_fraction=0, max_steps=4, eval_every=2))
+    done = trainer(store, params(split={"val": 0, "test": 0}, max_steps=4, eval_every=2))
     done.fit()
     best = load_policy(done.run.output / "best")
     assert best.step == 4
-    assert best.held_out_ticks == {}
+    assert not best.split["val"]
+    assert not best.split["test"]
 
 
 @pytest.mark.parametrize("disabled", ["features_enabled", "sensor_enabled", "robot_state_enabled"])
@@ -342,7 +343,7 @@ def test_on_a_gpu_a_run_is_stopped_resumed_and_judged(
     comparison, _ = evaluate_policy(
         best.policy("cuda"),
         store,
-        resumed.split.held_out,
+        resumed.split.val,
         Windows.of(resumed.params),
         8,
         best.normalization,

@@ -43,7 +43,7 @@ from pipeline.train.loop import Trainer
 from pipeline.train.run import open_run
 
 store, params = FeatureStore.open(sys.argv[1]), TrainHeadParams.model_validate_json(sys.argv[2])
-split = split_by_episode(store, params.val_fraction, params.horizon)
+split = split_by_episode(store, params.split, params.horizon)
 done = Trainer(store, params, split, open_run(params, store))
 done.fit()
 print(json.dumps(done.history.tensor().tolist()))

@@ -25,7 +25,7 @@ def plan(store: FeatureStore, params: Make) -> Make:
 
     def make(world: World = ALONE, store: FeatureStore = store, **changed: Any) -> Plan:
         made = params(**changed)
-        return Plan(store, made, split_by_episode(store, 0.1, made.horizon), world)
+        return Plan(store, made, split_by_episode(store, made.split, made.horizon), world)
 
     return make
 
@@ -79,7 +79,7 @@ def test_fewer_ticks_than_parts_are_refused(store: FeatureStore, params: Make, p
     with pytest.raises(ConfigError, match=r"8 parts of a step \(4 process\(es\) x"):
         plan(World(0, 4), batch_size=7, grad_accumulation=2)
     made = params(batch_size=7, grad_accumulation=2)
-    split = split_by_episode(store, 0.1, made.horizon)
+    split = split_by_episode(store, made.split, made.horizon)
     with pytest.raises(ConfigError, match=r"^finetune\.batch_size is 7"):
         Plan(store, made, split, World(0, 4), "finetune")
 

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.store import FeatureStore
+from pipeline.base.config import SplitParams
+from pipeline.store import FeatureStore, episode_name
 from pipeline.train.batches import Prefetch
 from pipeline.train.log import speed_file
 from pipeline.train.progress import Progress, describe_data, peak_memory_bytes
@@ -161,8 +162,9 @@ def warnings(store: FeatureStore, params: Make) -> Callable[..., list[str]]:
 
     def found(train: np.ndarray, absent: dict[str, int] | None = None, **head: Any) -> list[str]:
         held_out = np.setdiff1d(np.arange(store.ticks), train)
+        named = {episode_name(episode): episode_name(episode) for episode in store.episodes}
         shape = policy_shape(store, fit_normalization(store, train))
-        split = Split(train, held_out, (), None)
+        split = Split(train, held_out, held_out[:0], named, None)
         lines = describe_data(store, replace(shape, **(absent or {})), params(**head), split)
         return [line for line in lines if line.startswith("warning: ")]
 
@@ -172,14 +174,14 @@ def warnings(store: FeatureStore, params: Make) -> Callable[..., list[str]]:
 def test_nothing_is_said_where_every_source_and_stream_is_trained_on(
     store: FeatureStore, warnings: Make
 ) -> None:
-    assert warnings(split_by_episode(store, 0.3).train) == []
+    assert warnings(split_by_episode(store, SplitParams(val=0.3)).train) == []
 
 
 def test_a_source_without_a_training_episode_is_named_with_the_way_out(warnings: Make) -> None:
     """Episodes of 30 ticks: left, right, left, …"""
-    (line,) = warnings(np.arange(30), val_fraction=0.4)
+    (line,) = warnings(np.arange(30), split={"val": 0.4})
     assert line.startswith("warning: source 'right'")
-    assert "train_head.val_fraction 0.4" in line
+    assert "train_head.split val 0.4 and test 0.15" in line
     assert warnings(np.arange(30), mixture={"right": 0.0}) == [], "the user wants it so"
 
 
@@ -189,7 +191,7 @@ def test_a_stream_that_no_training_episode_has_is_named(
     train, absent = np.arange(store.ticks), {"sensor_channels": 0}
     (line,) = warnings(train, absent)
     assert line.startswith("warning: sensor")
-    assert "train_head.val_fraction" in line
+    assert "train_head.split" in line
     assert warnings(train, absent, sensor_enabled=False) == []
 
 

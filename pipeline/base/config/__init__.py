@@ -29,6 +29,7 @@ from pipeline.base.config.stage_two import (
     Level,
     ModelType,
     RolloutParams,
+    SplitParams,
     TrainHeadParams,
     TuningParams,
 )

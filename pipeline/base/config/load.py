@@ -11,6 +11,13 @@ from pydantic import BaseModel, ValidationError
 from pipeline.base.config.sections import Params
 from pipeline.base.errors import ConfigError
 
+_REPLACED: dict[tuple[str, ...], str] = {
+    ("train_head", "val_fraction"): "is no longer a key, for episodes are split three ways. Write "
+    "train_head.split={val: 0.15, test: 0.15}: val chooses the checkpoint and stops early, test is "
+    "what stages.evaluate reports on"
+}
+"""Keys of earlier versions, and what takes their place."""
+
 
 def load_params(path: Path, overrides: Sequence[str] = ()) -> Params:
     """The params of a YAML file with `section.key=value` overrides laid over it.
@@ -81,6 +88,8 @@ def _all_problems(error: ValidationError, where: str) -> str:
 
 def _unknown_key(place: tuple[int | str, ...]) -> str:
     """The key that was likely meant, else all that may stand there."""
+    if (replaced := _REPLACED.get(tuple(map(str, place)))) is not None:
+        return replaced
     section: Any = Params
     for part in place[:-1]:
         if isinstance(part, str) and part in section.model_fields:

@@ -23,6 +23,47 @@ LoggerName = Literal["tensorboard", "wandb"]
 Weight = Annotated[float, Field(ge=0)]
 
 
+Share = Annotated[float, Field(ge=0, lt=1)]
+
+
+class SplitParams(Section):
+    """Which groups of episodes are trained on, choose the checkpoint and are reported.
+
+    Episodes of one group are never apart: one recording in several formats or encoded again, or
+    what the recordings or `groups` say.
+    """
+
+    seed: Seed = 0
+    """Another one draws other sides."""
+    val: Share = 0.15
+    """Share of groups that choose the checkpoint and stop early."""
+    test: Share = 0.15
+    """Share of groups that `stages.evaluate` reports on; nothing is ever chosen on them."""
+    folds: int | None = Field(default=None, ge=2)
+    """Deal the groups into as many folds, of which one is test, whatever `test` says: with little
+    data, train once a fold."""
+    fold: int = Field(default=0, ge=0)
+    """Which of the folds is test, from 0."""
+    groups: dict[str, tuple[str, ...]] = Field(default_factory=dict)
+    """Episodes that belong together, as of one object or one day: patterns of `<source>/<id>` by
+    the name of the group, such as `{monday: ["demo/2024-05-06*"]}`."""
+
+    @model_validator(mode="after")
+    def _leaves_training_episodes(self) -> "SplitParams":
+        test = self.test if self.folds is None else 1 / self.folds
+        if self.val + test >= 1:
+            raise ValueError(
+                f"val {self.val:g} and test {test:g} leave nothing to train on; they must add up "
+                "to less than 1"
+            )
+        if self.fold >= (self.folds or 1):
+            raise ValueError(
+                f"fold {self.fold} of folds {self.folds}: expected a fold from 0 that is smaller "
+                "than folds"
+            )
+        return self
+
+
 class TrainHeadParams(Section):
     """What is trained from the store, and how."""
 
@@ -90,8 +131,7 @@ class TrainHeadParams(Section):
         default_factory=dict
     )
     """Weight of each action group in the loss, 1 where not named."""
-    val_fraction: Fraction = 0.15
-    """Share of episodes held out."""
+    split: SplitParams = SplitParams()
     mixture: dict[str, Weight] = Field(default_factory=dict)
     """Weight of each tick of a source; 1 where not named.
 
@@ -100,7 +140,7 @@ class TrainHeadParams(Section):
     sizes.)
     """
     eval_every: int = Field(default=50, ge=1)
-    """Steps between evaluations on held-out ticks."""
+    """Steps between evaluations on the ticks of val."""
     eval_samples: int = Field(default=4, ge=1)
     """Chunks sampled a tick, over which the error of one is averaged; experts that do not sample
     give one."""
@@ -254,9 +294,9 @@ class FinetuneParams(Section):
     warmup_steps: int = Field(default=20, ge=0)
     """Steps of linear warm-up."""
     eval_every: int = Field(default=50, ge=1)
-    """Steps between evaluations on held-out ticks."""
+    """Steps between evaluations on the ticks of val."""
     eval_ticks: int = Field(default=100, ge=1)
-    """Held-out ticks judged in them at most: each costs a pass through the whole model."""
+    """Ticks of val judged in them at most: each costs a pass through the whole model."""
     checkpoint_every: int = Field(default=50, ge=1)
     """Steps between checkpoints."""
     decode_threads: int = Field(default=2, ge=1)

@@ -8,7 +8,7 @@ from sklearn.model_selection import GroupKFold
 
 from pipeline.base.errors import StoreMismatch
 from pipeline.store import FeatureStore
-from pipeline.train.split import episodes_by_recording
+from pipeline.train.groups import episodes_by_group
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ def fold_by_recording(
     share. Raises `StoreMismatch` where fewer than two recordings have such ticks, or too few.
     """
     recording = np.full(store.ticks, -1, np.int64)
-    for index, episodes in enumerate(episodes_by_recording(store).values()):
+    for index, episodes in enumerate(episodes_by_group(store).values()):
         for episode in episodes:
             stop = max(episode.ticks.start, episode.ticks.stop - horizon + 1)
             recording[episode.ticks.start : stop] = index

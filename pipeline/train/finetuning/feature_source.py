@@ -12,6 +12,7 @@ from pipeline.base.config import FinetuneParams, Params, TrainHeadParams
 from pipeline.base.digests import file_digest
 from pipeline.base.durable import read_document, write_with_digest
 from pipeline.base.errors import ConfigError
+from pipeline.base.tuned_on import TunedOn, joined, of_store, write_tuned_on
 from pipeline.policy.checkpoint import DOCUMENT
 from pipeline.policy.live_policy import LivePolicy
 from pipeline.policy.policy import Policy, Trainable
@@ -93,15 +94,19 @@ class LiveFeatures(FeatureSource):
         return LiveFeed(self.store, self._rows, plan, windows, device, threads)
 
     def save(self, folder: Path, module: Trainable) -> None:
-        """Write what the model has learned, and into `policy.json` whose features the policy takes.
+        """Write what the model has learned and on which episodes, and into `policy.json` whose
+        features the policy takes.
 
-        It is evaluated on a store that was extracted with this adapter or checkpoint, and refused
-        on the one whose ticks it was trained on. Raises `DiskFull`.
+        The policy is evaluated on a store that was extracted with this adapter or checkpoint, and
+        refused on the one whose ticks it was trained on. Raises `DiskFull`.
         """
         assert isinstance(module, LivePolicy)
         assert module.vlm is not None
-        module.vlm.save(folder / learned_name(self._finetune))
+        learned = folder / learned_name(self._finetune)
+        module.vlm.save(learned)
         document = read_document(folder / DOCUMENT)
+        before, own = of_store(self.store.attrs), TunedOn.of_split(document["split"])
+        write_tuned_on(learned, joined([before, own]) or own)
         document["feature_spec"] = self._tuned_spec(folder).attrs()
         write_with_digest(folder / DOCUMENT, document)
 

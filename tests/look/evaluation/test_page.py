@@ -26,12 +26,12 @@ from pipeline.look.page.writing import PAGE, write_report
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.normalization import ChannelStatistics, Normalization
 from pipeline.policy.policy import Policy
-from pipeline.store import FeatureStore
+from pipeline.store import FeatureStore, episode_name
 from pipeline.train.batches import Windows
 from pipeline.train.predictions import predict
 from pipeline.train.run import policy_shape
 from pipeline.train.scores import action_space, compare
-from pipeline.train.split import held_out_contents, held_out_ranges, source_of
+from pipeline.train.split import Split, source_of, split_parts
 
 Sound = Callable[[Path], None]
 PARAMS = TrainHeadParams.model_validate(
@@ -67,14 +67,13 @@ def judgement(
     shape = policy_shape(store, normalization)
     policy = Policy(PARAMS, shape, normalization).eval()
     ticks = np.arange(90, 180)
-    ranges = held_out_ranges(store, ticks)
+    names = {episode_name(episode): episode_name(episode) for episode in store.episodes}
     checkpoint = PolicyCheckpoint(
         params=PARAMS,
         shape=shape,
         normalization=normalization,
         source=source_of(store),
-        held_out_ticks=ranges,
-        held_out_content=held_out_contents(store, ranges),
+        split=split_parts(store, Split(ticks[:0], ticks[:0], ticks, names, None)),
         step=20,
         weights=policy.state_dict(),
     )

@@ -23,7 +23,7 @@ SMALL_HEAD: dict[str, Any] = {
     "horizon": 2,
     "lr": 3e-3,
     "ema_decay": 0.5,
-    "val_fraction": 0.3,
+    "split": {"seed": 11, "val": 0.3, "test": 0.2},
     "device": "cpu",
 }
 SMALL_TUNING: dict[str, Any] = {

@@ -12,7 +12,9 @@ from safetensors.torch import load_file
 from torch import nn
 
 from pipeline.base.config import Params
+from pipeline.base.digests import file_digest
 from pipeline.base.errors import CheckpointMismatch, ConfigError
+from pipeline.base.tuned_on import of_store, read_tuned_on
 from pipeline.extract import extract
 from pipeline.policy.checkpoint import find_policy, load_policy
 from pipeline.policy.live_policy import LivePolicy
@@ -22,7 +24,9 @@ from pipeline.train.finetuning import LiveFeatures, head_params, out_of_memory_n
 from pipeline.train.loop import Trainer
 from pipeline.train.run import open_run
 from pipeline.train.scores import evaluate_policy
-from pipeline.train.split import check_store, find_held_out, split_by_episode
+from pipeline.train.split import check_store, find_ticks, split_by_episode
+from pipeline.train.tuned_episodes import refuse_tuned_episodes
+from pipeline.vlm.feature_spec import feature_spec
 
 CPU = torch.device("cpu")
 
@@ -33,7 +37,7 @@ def trainer(params: Params) -> Trainer:
     head = head_params(params)
     front = LiveFeatures(store, params, CPU)
     run = open_run(head, store, front.identity)
-    return Trainer(store, head, split_by_episode(store, head.val_fraction, 2), run, front)
+    return Trainer(store, head, split_by_episode(store, head.split, 2), run, front)
 
 
 def learned(output: Path, which: str = "last") -> dict[str, torch.Tensor]:
@@ -82,6 +86,7 @@ def test_what_is_kept_is_the_averaged_model_that_was_judged(
     assert {path.name for path in (output / "best" / "adapter").iterdir()} == {
         "adapter_config.json",
         "adapter_model.safetensors",
+        "tuned_on.json",
     }
     document = given.model_dump(mode="json")
     document["vlm"]["adapter"] = str(output / "best" / "adapter")
@@ -89,6 +94,20 @@ def test_what_is_kept_is_the_averaged_model_that_was_judged(
     extract(Params.model_validate(document), say=lambda _: None)
     store, base = FeatureStore.open(tmp_path / "tuned.zarr"), made.store
     assert store.spec["digest"] != base.spec["digest"]
+    # What it was tuned on goes along with the features, and is no part of what they are.
+    tuned = read_tuned_on(output / "best" / "adapter")
+    assert tuned is not None
+    assert of_store(store.attrs) == tuned
+    assert of_store(base.attrs) is None
+    listed = load_policy(find_policy(output)).split
+    for side in ("train", "val"):
+        told = {part.episode: part.content for part in getattr(tuned, side)}
+        assert told == {name: part.content for name, part in listed[side].items()}
+    assert refuse_tuned_episodes(store, made.split) == []
+    (output / "best" / "adapter" / "tuned_on.json").unlink()
+    vlm = Params.model_validate(document).vlm
+    silent = feature_spec(vlm, store.spec["storage_dtype"], store.spec["views"], file_digest)
+    assert silent.digest == store.spec["digest"]
 
     ticks = np.arange(0, store.ticks, 4)
     averaged = made.averaged
@@ -107,7 +126,7 @@ def test_what_is_kept_is_the_averaged_model_that_was_judged(
     check_store(best, store)
     with pytest.raises(CheckpointMismatch, match=r"feature_spec\.adapter"):
         check_store(best, base)
-    ticks, _ = find_held_out(store, best)
+    ticks, _ = find_ticks(store, best, "val")
     comparison, _ = evaluate_policy(
         best.policy(), store, ticks, Windows.of(best.params), 64, best.normalization
     )

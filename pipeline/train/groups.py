@@ -1,0 +1,95 @@
+"""Which episodes are of one group: what is learnt from one of them is known of the others."""
+
+from collections.abc import Hashable, Iterator, Mapping, Sequence
+from fnmatch import fnmatchcase
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.cluster.hierarchy import DisjointSet
+
+from pipeline.base.errors import ConfigError
+from pipeline.store import Episode, FeatureStore, episode_name
+
+_TOLERANCE, _RESTING = 1e-3, 0.1
+"""By how much two equal actions may differ in a channel, as a share of its range in the episode.
+A channel that rests beside others varies by rounding alone: its range counts as at least a tenth of
+the widest."""
+
+
+def episodes_by_group(
+    store: FeatureStore,
+    patterns: Mapping[str, Sequence[str]] | None = None,
+    keys: NDArray[np.uint8] | None = None,
+) -> dict[str, list[Episode]]:
+    """Episodes that have ticks by group, which is named by the first "source/id" in it.
+
+    Of one group are episodes whose first VL keys, whose files or whose actions are equal, whose
+    recordings name the same group, and whose "source/id" `patterns` (shell wildcards by the name of
+    a group) put together; so are any that share a group with another. Actions are equal where those
+    of as many ticks agree within 0.1 % of their range: a copy that was encoded again, so that its
+    frames and the last digits of its numbers differ, is found. Actions that never change tell
+    nothing. `keys` (vl_row, 16) stand in for the store's own.
+
+    Raises `ConfigError` where a pattern fits no episode.
+    """
+    episodes = [episode for episode in store.episodes if len(episode.ticks)]
+    patterns = patterns or {}
+    _check_patterns(patterns, episodes)
+    keys = store.array("vl/key") if keys is None else keys
+    frame_time = store.array("vl/frame_time")
+    together, first = DisjointSet(range(len(episodes))), dict[Hashable, int]()
+    for index, episode in enumerate(episodes):
+        row = episode.vl_rows.start
+        # The key of a row without a frame says nothing but the instruction.
+        key = keys[row].tobytes() if np.isfinite(frame_time[row]).any() else b""
+        marks = [("key", key), ("content", episode.content), ("group", episode.group)]
+        marks += [("params", name) for name in _named(episode, patterns)]
+        for mark in (mark for mark in marks if mark[1]):
+            together.merge(first.setdefault(mark, index), index)
+    for one, other in _equal_actions(store.array("tick/action"), episodes):
+        together.merge(one, other)
+    groups = ([episodes[i] for i in sorted(members)] for members in together.subsets())
+    return dict(sorted((min(map(episode_name, group)), group) for group in groups))
+
+
+def _named(episode: Episode, patterns: Mapping[str, Sequence[str]]) -> Iterator[str]:
+    name = episode_name(episode)
+    for group, wanted in patterns.items():
+        if any(fnmatchcase(name, pattern) for pattern in wanted):
+            yield group
+
+
+def _check_patterns(patterns: Mapping[str, Sequence[str]], episodes: Sequence[Episode]) -> None:
+    names = [episode_name(episode) for episode in episodes]
+    for group, wanted in patterns.items():
+        for pattern in wanted:
+            if not any(fnmatchcase(name, pattern) for name in names):
+                raise ConfigError(
+                    f"train_head.split.groups.{group}: expected patterns of episodes of the store, "
+                    f"which are called {', '.join(names[:3])}{' …' if len(names) > 3 else ''}; "
+                    f"{pattern!r} fits none of {len(names)}."
+                )
+
+
+def _equal_actions(
+    action: NDArray[np.float32], episodes: Sequence[Episode]
+) -> Iterator[tuple[int, int]]:
+    """Pairs of places among the episodes whose actions (tick, action) are equal."""
+    by_length: dict[int, list[int]] = {}
+    for index, episode in enumerate(episodes):
+        by_length.setdefault(len(episode.ticks), []).append(index)
+    for places in by_length.values():
+        actions = [action[episodes[i].ticks.start : episodes[i].ticks.stop] for i in places]
+        ranges = np.stack([np.ptp(own, axis=0) for own in actions])
+        widest = ranges.max(axis=1, keepdims=True)
+        tolerance = _TOLERANCE * np.maximum(ranges, _RESTING * widest)
+        # Cheap to compare, and equal where the actions are.
+        outline = np.stack([[own[0], own.mean(axis=0, dtype=float), own[-1]] for own in actions])
+        moving = np.flatnonzero(widest[:, 0] > 0)
+        for at, one in enumerate(moving):
+            others = moving[at + 1 :]
+            allowed = np.maximum(tolerance[others], tolerance[one])
+            alike = (np.abs(outline[others] - outline[one]) <= allowed[:, None]).all(axis=(1, 2))
+            for other, within in zip(others[alike], allowed[alike], strict=True):
+                if np.allclose(actions[other], actions[one], rtol=0, atol=within):
+                    yield places[one], places[other]
