@@ -88,10 +88,10 @@ def test_a_table_a_file_and_a_picture(
     assert list(rows[0])[6:18:6] == ["overall_policy", "translation_mm_policy"]
     for row in rows:
         folder = experiments.parent / "reports" / row["experiment"]
-        overall = json.loads((folder / "metrics.json").read_text())["overall"]
-        assert float(row["overall_policy"]) == overall["policy"]
+        overall = json.loads((folder / "metrics.json").read_text())["chunk"]["overall"]
+        assert float(row["overall_policy"]) == overall["policy"]["value"]
         best = min(float(row[f"overall_{method}"]) for method in BASELINES)
-        assert overall["policy"] / best == pytest.approx(overall["relative"], rel=1e-4)
+        assert overall["best_baseline"]["value"] == pytest.approx(best, rel=1e-4)
         assert row["samples"] == ("1" if row["model_type"] == "regression" else "2")
     page = (output / "report.html").read_text()
     assert all(name in page for name in NAMES) and ">trained<" not in page
