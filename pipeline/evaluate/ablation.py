@@ -170,7 +170,7 @@ def _knows_missing(checkpoint: PolicyCheckpoint, store: FeatureStore, stream: st
         return False
     readings = np.diff(store.array(f"episode/{stream}_start"))
     return any(
-        not readings[episode.index] and episode_name(episode) not in checkpoint.split["test"]
+        not readings[episode.index] and episode_name(episode) in checkpoint.split["train"]
         for episode in store.episodes
     )
 

@@ -1,7 +1,7 @@
 """A policy evaluated, and on what, so that two evaluations can be told to be of the same things."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +70,7 @@ def evaluate_checkpoint(
         )
     names = checkpoint.split["test"].keys()
     ticks, checkpoint = find_ticks(store, checkpoint, "test")
-    trained, checkpoint = find_ticks(store, checkpoint, "train")
+    training, _ = find_ticks(store, checkpoint, "train")
     if renamed := names - checkpoint.split["test"].keys():
         say(f"test episodes renamed since the training: {len(renamed)}, told by their content")
     policy = checkpoint.policy(device)
@@ -81,11 +81,9 @@ def evaluate_checkpoint(
         f"{judged['policy']['samples']} chunk(s) a tick"
     )
     features = checkpoint.normalization.features
-    baselines = Baselines(store, trained, horizon, features)
-    space, groups = (
-        action_space(store, checkpoint.normalization),
-        groups_of(store, checkpoint, ticks),
-    )
+    baselines = Baselines(store, training, horizon, features)
+    space = action_space(store, checkpoint.normalization)
+    groups = groups_of(store, checkpoint, ticks)
     sampled = SampledChunks(space[-1])
     seen = (policy, store, ticks, Windows.of(checkpoint.params), wanted.batch_size)
     predictions = predict(*seen, progress=True, samples=wanted.samples, watch=sampled)
@@ -147,7 +145,7 @@ def judged_document(
             "horizon": params.horizon,
             "execute": wanted.execute,
             "test": {
-                name: {"ticks": list(part.ticks), "content": part.content, "group": part.group}
+                name: asdict(part) | {"ticks": list(part.ticks)}
                 for name, part in checkpoint.split["test"].items()
             },
         },

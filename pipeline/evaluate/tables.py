@@ -323,10 +323,8 @@ def _dimensions(comparison: Comparison) -> Table:
     rows: list[list[Any]] = []
     for index, (name, unit) in enumerate(zip(comparison.names, comparison.units, strict=True)):
         alone = ActionGroup(name, unit, (index,))
-        rmse = (comparison.scores[method].rmse[index] for method in METHODS)
-        rows.append([name, unit, *_cells(error(comparison, way, alone) for way in METHODS), *rmse])
-    heads = [*_intervals(f"{way}_mae" for way in METHODS), *(f"{way}_rmse" for way in METHODS)]
-    return Table(["dimension", "unit", *heads], rows)
+        rows.append([name, unit, *_cells(error(comparison, way, alone) for way in METHODS)])
+    return Table(["dimension", "unit", *_intervals(METHODS)], rows)
 
 
 def _horizon(comparison: Comparison) -> Table:

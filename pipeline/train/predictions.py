@@ -43,19 +43,16 @@ class Predictions:
     """Of a policy that samples, its first sample: what a robot would execute."""
     recorded: Actions
     valid: NDArray[np.bool_]
-    sampled: tuple[Actions, Actions] | None = None
-    """The absolute and the squared error of one sample, each the mean over independent samples;
-    None where these are the errors of `predicted`."""
+    sampled: Actions | None = None
+    """The absolute error of one sample, the mean over independent samples; None where it is that
+    of `predicted`."""
 
-    def errors(self) -> tuple[Actions, Actions]:
-        """Absolute and squared error of one chunk of the policy, (tick, horizon, action_dim)."""
-        return self.sampled or errors_of(self.predicted, self.recorded)
-
-
-def errors_of(acted: Actions, recorded: Actions) -> tuple[Actions, Actions]:
-    """Absolute and squared error of every entry; `acted` broadcasts."""
-    error = acted.astype(np.float64) - recorded
-    return np.abs(error).astype(np.float32), np.square(error).astype(np.float32)
+    @property
+    def error(self) -> Actions:
+        """The absolute error of one chunk of the policy, (tick, horizon, action_dim)."""
+        if self.sampled is not None:
+            return self.sampled
+        return np.abs(self.predicted - self.recorded)
 
 
 def predict(
@@ -84,7 +81,7 @@ def predict(
     # On the CPU, so that every device is given the same noise.
     generator = Generator().manual_seed(_SEED)
     plan = cut_batches(ticks, batch_size)
-    predicted, recorded, valid, absolute, squared = [], [], [], [], []
+    predicted, recorded, valid, sampled = [], [], [], []
     with (
         torch.inference_mode(),
         Prefetch(store, plan, windows, device) if feed is None else feed(plan) as batches,
@@ -102,9 +99,7 @@ def predict(
             for chunk in chunks:
                 _check_finite(store, at, chunk, "action of the policy")
             if len(chunks) > 1:
-                errors = [errors_of(chunk, recorded[-1]) for chunk in chunks]
-                absolute.append(np.mean([error for error, _ in errors], axis=0))
-                squared.append(np.mean([square for _, square in errors], axis=0))
+                sampled.append(np.abs(chunks - recorded[-1]).mean(axis=0))
             if watch is not None:
                 watch(chunks, recorded[-1], valid[-1])
             bar.update(len(at))
@@ -114,7 +109,7 @@ def predict(
         predicted=np.concatenate(predicted),
         recorded=np.concatenate(recorded),
         valid=np.concatenate(valid),
-        sampled=(np.concatenate(absolute), np.concatenate(squared)) if absolute else None,
+        sampled=np.concatenate(sampled) if sampled else None,
     )
 
 

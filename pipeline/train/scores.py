@@ -14,7 +14,7 @@ from pipeline.policy.observation import action_groups
 from pipeline.policy.policy import Trainable
 from pipeline.store import FeatureStore
 from pipeline.train.batches import Ticks, Windows
-from pipeline.train.predictions import Actions, FeedMaker, Predictions, errors_of, predict
+from pipeline.train.predictions import Actions, FeedMaker, Predictions, predict
 
 Errors = NDArray[np.float64]
 
@@ -48,17 +48,11 @@ class ActionErrors:
     cells: Cells
     absolute: Errors
     """(cell, horizon, action_dim)."""
-    squared: Errors
 
     @cached_property
     def mae(self) -> Errors:
         """(action_dim,) mean absolute error."""
         return _ratio(self.absolute.sum(axis=(0, 1)), self.cells.entries.sum())
-
-    @cached_property
-    def rmse(self) -> Errors:
-        """(action_dim,) root mean square error."""
-        return np.sqrt(_ratio(self.squared.sum(axis=(0, 1)), self.cells.entries.sum()))
 
     @cached_property
     def mae_horizon(self) -> Errors:
@@ -141,7 +135,7 @@ class Comparison:
         cells = Cells(*(values[here] for values in vars(self.cells).values()))
         cells = replace(cells, entries=cells.entries[:, steps])
         scores = {
-            name: ActionErrors(cells, score.absolute[here, steps], score.squared[here, steps])
+            name: ActionErrors(cells, score.absolute[here, steps])
             for name, score in self.scores.items()
         }
         return replace(self, cells=cells, scores=scores)
@@ -216,10 +210,6 @@ class Comparison:
         dimensions = self.varying()
         return errors[..., dimensions] / np.where(self.scale > 0, self.scale, 1)[dimensions]
 
-    def group_rmse(self, method: str, group: ActionGroup) -> float:
-        """Root mean square error of a group, in its unit."""
-        return float(np.sqrt(group.mean(self.scores[method].rmse ** 2)))
-
 
 def evaluate_policy(
     policy: Trainable,
@@ -285,12 +275,12 @@ def compare(
         ticks=np.bincount(place),
         entries=summed(valid, place),
     )
-    errors = {"policy": predictions.errors()} | {
-        name: errors_of(acted, predictions.recorded) for name, acted in others.items()
+    errors = {"policy": predictions.error} | {
+        name: np.abs(acted - predictions.recorded) for name, acted in others.items()
     }
     scores = {
-        name: ActionErrors(cells, *(summed(kind * valid[..., None], place) for kind in both))
-        for name, both in errors.items()
+        name: ActionErrors(cells, summed(error * valid[..., None], place))
+        for name, error in errors.items()
     }
     scale = np.asarray(scale, np.float64)
     return Comparison(tuple(names), tuple(units), tuple(groups), scale, cells, scores, execute)

@@ -83,7 +83,7 @@ def trained(store: FeatureStore, steps: int, **params: object) -> tuple[PolicyCh
 
 
 def rules(store: FeatureStore) -> Baselines:
-    return Baselines(store, split_by_episode(store, 0.3).train, 1, None)
+    return Baselines(store, split_by_episode(store, SplitParams(val=0, test=0.3)).train, 1, None)
 
 
 def held_out(store: FeatureStore) -> np.ndarray:

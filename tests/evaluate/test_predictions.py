@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.special import erf
 
 from pipeline.evaluate.ablation import feed_maker
 from pipeline.store import FeatureStore
@@ -55,12 +56,12 @@ def test_the_error_is_that_of_one_sample_with_the_noise_of_many(store: FeatureSt
     assert one.sampled is None
     assert 0.5 < one.predicted[:, 0, 0].std() < 1.5
     assert 0.5 < many.predicted[:, 0, 0].std() < 1.5, "the first sample, no mean"
-    absolute, squared = many.errors()
-    assert squared.mean() == pytest.approx(1 + np.square(many.recorded).mean(), rel=0.05)
-    spread = np.abs(absolute - np.abs(many.predicted - many.recorded))
-    assert spread.max() > 0.5
-    again = run(Noisy(), store, 400).errors()
-    assert np.array_equal(absolute, again[0])
+    here = many.recorded
+    # Of a normal distribution around 0 (the mean of a folded one), and not |recorded|.
+    expected = np.sqrt(2 / np.pi) * np.exp(-(here**2) / 2) + here * erf(here / np.sqrt(2))
+    assert many.error.mean() == pytest.approx(expected.mean(), rel=0.05)
+    assert np.abs(many.error - np.abs(many.predicted - here)).max() > 0.5
+    assert np.array_equal(many.error, run(Noisy(), store, 400).error)
 
 
 def test_the_noise_is_of_the_batch_so_that_its_size_decides_too(store: FeatureStore) -> None:

@@ -26,7 +26,7 @@ Compared = Callable[[Predictions], Comparison]
 def test_a_perfect_policy_has_no_error(recorded: Recorded, compared: Compared) -> None:
     comparison = compared(recorded(np.arange(60)))
     score = comparison.scores["policy"]
-    for errors in (score.mae, score.rmse, score.mae_horizon, score.mae_episode):
+    for errors in (score.mae, score.mae_horizon, score.mae_episode):
         assert np.array_equal(errors, np.zeros_like(errors))
     assert comparison.overall("policy") == 0
     assert rivalry(comparison).ratio == 0
@@ -50,11 +50,9 @@ def test_errors_worked_out_by_hand() -> None:
     score = found.scores["policy"]
     assert found.episodes == (2, 7)
     assert score.mae == pytest.approx([3, 20])
-    assert score.rmse == pytest.approx(np.sqrt([35 / 3, 1400 / 3]))
     assert score.mae_horizon == pytest.approx(np.array([[3, 20], [3, 20]]))
     assert score.mae_episode == pytest.approx(np.array([[2, 15], [5, 30]]))
     assert found.error("policy", groups[0]) == pytest.approx(11.5)
-    assert found.group_rmse("policy", groups[0]) == pytest.approx(np.sqrt(1435 / 6))
     assert found.overall("policy") == pytest.approx((3 / 2 + 20 / 10) / 2)
     assert found.executed.error("policy", groups[0]) == pytest.approx(11.5)
     assert found.part(steps=slice(1, 2)).error("policy") == pytest.approx((3 / 2 + 20 / 10) / 2)
@@ -88,7 +86,7 @@ def test_what_lies_beyond_an_episode_changes_no_score(seed: int, ticks: int, hor
         )
         found = compare(predictions, {}, "abc", ["", "", ""], groups, np.ones(3))
         scores.append(found.scores["policy"])
-    for name in ("mae", "rmse", "mae_horizon", "mae_episode"):
+    for name in ("mae", "mae_horizon", "mae_episode"):
         assert np.array_equal(getattr(scores[0], name), getattr(scores[1], name), equal_nan=True)
 
 

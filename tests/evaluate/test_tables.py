@@ -158,7 +158,7 @@ def test_files_hold_every_dimension_step_episode_and_tick(
         2 * 3,
         60,
     ]
-    assert float(rows["dimensions"][3]["policy_mae"]) == pytest.approx(0.5)
+    assert float(rows["dimensions"][3]["policy"]) == pytest.approx(0.5)
     assert float(rows["horizon"][6]["policy"]) == pytest.approx(0.2)
     assert rows["horizon"][6]["dimension"] == "dy"
     steps = [float(row["policy"]) for row in rows["steps"]]

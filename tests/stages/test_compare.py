@@ -77,7 +77,7 @@ def test_a_table_a_file_and_a_picture(
     assert [line.split()[-3] for line in lines[1:5]] == ["1", "1", "2", "2"]
     assert [line.split("  ")[0] for line in lines[5:8]] == [
         "baseline: zero",
-        "baseline: mean",
+        "baseline: median",
         "baseline: repeat last",
     ]
     output = experiments.parent / "comparison"
@@ -85,13 +85,13 @@ def test_a_table_a_file_and_a_picture(
     assert sorted(path.name for path in output.iterdir()) == names
     assert (output / "experiments.png").read_bytes().startswith(b"\x89PNG")
     rows = list(csv.DictReader((output / "experiments.csv").read_text().splitlines()))
-    assert list(rows[0])[6:12:4] == ["overall_policy", "translation_mm_policy"]
+    assert list(rows[0])[6:18:6] == ["overall_policy", "translation_mm_policy"]
     for row in rows:
         folder = experiments.parent / "reports" / row["experiment"]
-        overall = json.loads((folder / "metrics.json").read_text())["overall"]
-        assert float(row["overall_policy"]) == overall["policy"]
+        overall = json.loads((folder / "metrics.json").read_text())["chunk"]["overall"]
+        assert float(row["overall_policy"]) == overall["policy"]["value"]
         best = min(float(row[f"overall_{method}"]) for method in BASELINES)
-        assert overall["policy"] / best == pytest.approx(overall["relative"], rel=1e-4)
+        assert overall["best_baseline"]["value"] == pytest.approx(best, rel=1e-4)
         assert row["samples"] == ("1" if row["model_type"] == "regression" else "2")
     page = (output / "report.html").read_text()
     assert all(name in page for name in NAMES) and ">trained<" not in page
@@ -117,7 +117,7 @@ def test_another_store_or_other_ticks_are_refused_by_name(
     path = reports / "regression-gated" / JUDGED
     document = json.loads(path.read_text())
     document["on"]["action_hz"] = 5
-    next(iter(document["on"]["held_out"].values()))["ticks"] = [3, 30]
+    next(iter(document["on"]["test"].values()))["ticks"] = [3, 30]
     path.write_text(json.dumps(document))
     error = refused(reports, experiments, capsys)
     assert "5 (regression-gated)" in error

@@ -143,12 +143,11 @@ def _phases(comparison: Comparison) -> list[Block]:
 def _dimensions(evaluation: Evaluation) -> list[Block]:
     """Over the whole chunk."""
     comparison = evaluation.comparison
-    columns = ["dimension", "unit", *(tables.HEADINGS[method] for method in METHODS), "policy RMSE"]
-    scores = comparison.scores
-    errors = [*(scores[method].mae for method in METHODS), scores["policy"].rmse]
+    columns = ["dimension", "unit", *(tables.HEADINGS[method] for method in METHODS)]
+    errors = [comparison.scores[method].mae for method in METHODS]
     rows = list(zip(comparison.names, comparison.units, *errors, strict=True))
     return [
-        Table(columns, rows, caption="Mean absolute error by dimension, and the policy's RMSE."),
+        Table(columns, rows, caption="Mean absolute error by dimension."),
         _picture(plots.dimensions, comparison),
         _picture(plots.scatter, comparison, evaluation.predictions),
         _picture(plots.horizon, comparison, evaluation.store.action_hz),
