@@ -1,5 +1,9 @@
 """Put the evaluations of several experiments side by side, beside the baselines of all of them.
 
+What is executed first, then the whole chunk, with 95 % intervals: each experiment beside the best
+of them and beside the best baseline, and whether the difference is resolved. Policies whose
+trainings differ by train_head.seed alone are one row, with the spread over the seeds.
+
 Takes every folder of `compare.reports` that stages.evaluate wrote, and passes over what else lies
 there, such as the logs of a training. Writes report.html, experiments.csv and experiments.png into
 `compare.output`; the table with the training times as Markdown beside that folder, for DVC tracks
@@ -17,7 +21,14 @@ if __name__ == "__main__":  # here, for --help waits for no import below
 from pipeline.base.config import Params
 from pipeline.base.durable import disk_full_named, fresh
 from pipeline.base.ownership import REPORT, OutputKind, begins_with, claim, refuse_foreign
-from pipeline.evaluate.experiments import experiment_csv, experiment_table, read_experiments
+from pipeline.evaluate.experiments import (
+    SPANS,
+    best_experiment,
+    experiment_csv,
+    experiment_table,
+    read_experiments,
+)
+from pipeline.evaluate.figures import NO_INTERVAL
 from pipeline.look.evaluation.comparison import comparison_report
 from pipeline.look.page.writing import write_report
 
@@ -34,10 +45,14 @@ def main(params: Params) -> None:
     claim(output, REPORT)
     files = [experiment_csv(experiments).write_csv(output / "experiments.csv")]
     files += write_report(output, comparison_report(experiments))
-    table = experiment_table(experiments, trained=True)
+    tables = {span: experiment_table(experiments, span, trained=True) for span in SPANS}
     with disk_full_named(markdown):
-        fresh(markdown).write_text("\n".join(table.markdown()) + "\n", encoding="utf-8")
-    print("\n".join(table.text()))
-    best = min(experiments, key=lambda experiment: experiment.error)
-    print(f"lowest held-out error: {best.name}")
+        text = "\n".join(line for table in tables.values() for line in [*table.markdown(), ""])
+        fresh(markdown).write_text(text, encoding="utf-8")
+    for span, table in tables.items():
+        print("\n".join(table.text()))
+        best = best_experiment(experiments, span)
+        print(f"lowest test error of {SPANS[span]}: {best.name}\n")
+    if experiments[0].error("executed").low is None:
+        print(NO_INTERVAL)
     print(f"{', '.join(str(file) for file in [*files, markdown])}")

@@ -1,5 +1,6 @@
 """A policy evaluated, and on what, so that two evaluations can be told to be of the same things."""
 
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -20,8 +21,9 @@ from pipeline.policy.policy import Trainable
 from pipeline.store import FeatureStore
 from pipeline.train.batches import Windows
 from pipeline.train.predictions import Predictions, predict
+from pipeline.train.run import FREE_PARAMS
 from pipeline.train.scores import Comparison, action_space, compare
-from pipeline.train.split import find_ticks, groups_of, source_of
+from pipeline.train.split import find_ticks, groups_of, hash64, source_of
 
 JUDGED = "judged.json"
 """Its name in the folder of an evaluation, beside metrics.json."""
@@ -120,10 +122,13 @@ def judged_document(
     `on` is equal for all evaluations whose errors may stand in one table, whatever features the
     policies saw: which are better is a question to ask. `drawn` is equal for those
     of stochastic policies: the best of fewer samples errs more, and a batch shares its noise. It
-    is null for policies that do not sample.
+    is null for policies that do not sample. The `recipe` of a policy is equal for trainings that
+    differ by their seed alone.
     """
     params = checkpoint.params
     source = source_of(store)
+    decides = params.model_dump(mode="json", exclude=FREE_PARAMS | {"seed"})
+    recipe = [decides, source["feature_spec"]["digest"]]
     drawn = None
     if policy.stochastic:
         drawn = {"samples": wanted.samples, "batch_size": wanted.batch_size}
@@ -135,6 +140,8 @@ def judged_document(
             "parameters": sum(count for _, count in policy.parameter_table()),
             "samples": drawn["samples"] if drawn else 1,
             "logs": str(params.logs),
+            "seed": params.seed,
+            "recipe": f"{hash64(json.dumps(recipe, sort_keys=True)):016x}",
         },
         "drawn": drawn,
         "feature_spec": source["feature_spec"]["digest"],

@@ -2,12 +2,15 @@
 
 import csv
 import json
-import math
+import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, get_args
+
+import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.base.config import FusionStrategy, ModelType
 from pipeline.base.differences import describe, differences
@@ -15,14 +18,17 @@ from pipeline.base.errors import ConfigError
 from pipeline.base.table import Table
 from pipeline.evaluate.baselines import BASELINES, METHODS
 from pipeline.evaluate.evaluation import JUDGED
-from pipeline.evaluate.names import with_unit
-from pipeline.evaluate.tables import ERRORS, HEADINGS, OVERALL
+from pipeline.evaluate.figures import Figure
+from pipeline.evaluate.intervals import FEWEST_GROUPS, bootstrap_means
+from pipeline.evaluate.tables import GROUPS, HEADINGS
 from pipeline.train.log import speed_file
-from pipeline.train.scores import ActionGroup
 
-_OVERALL = (OVERALL, "training std")
+SPANS = {"executed": "what is executed", "overall": "the whole chunk"}
+"""What of a chunk an error is of: its name in `GROUPS`, and in words."""
 _SAME = 1e-4
 """Relative difference of two baselines that rounding on another machine explains."""
+_OF_FEATURES = "nearest_neighbour"
+"""The baseline that sees features, and so differs between stores of the same recordings."""
 _SHARED = {
     "on": ("on the same test ticks", "recordings"),
     "drawn": ("from as many samples and ticks a batch", "evaluate.samples and evaluate.batch_size"),
@@ -30,49 +36,61 @@ _SHARED = {
 """By key of `JUDGED`: how evaluations in one table are alike, and by what they become so."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Experiment:
-    """One evaluation, read back."""
+    """The evaluations, read back, of policies whose training differs by its seed alone."""
 
     name: str
     model_type: str
     fusion_strategy: str
-    step: int
+    recipe: str
+    """Equal where but the seed differs."""
+    seeds: tuple[int, ...]
     parameters: int
     samples: int
-    errors: Mapping[tuple[str, str], Mapping[str, float]]
-    """Name and unit of `OVERALL` and each action group -> error of the policy and each baseline."""
+    entries: Mapping[str, NDArray[np.float64]]
+    """Of each of `SPANS`: (group,) recorded actions that were judged."""
+    errors: Mapping[tuple[str, str], NDArray[np.float64]]
+    """Of each of `METHODS` in each of `SPANS`: (seed, group) mean absolute error [training std]."""
     training_s: float | None
-    """Time that its training took; None where its speed file is not there."""
+    """Time that a training took; None where its speed file is not there."""
 
-    @property
-    def overall(self) -> Mapping[str, float]:
-        """The overall errors [training std] of the policy and each baseline."""
-        return self.errors[_OVERALL]
+    def by_seed(self, span: str, method: str = "policy") -> NDArray[np.float64]:
+        """(seed,) errors over all groups [training std]."""
+        return np.average(self.errors[method, span], axis=1, weights=self.entries[span])
 
-    @property
-    def error(self) -> float:
-        """The policy's overall error."""
-        return self.overall["policy"]
+    def error(self, span: str, method: str = "policy") -> Figure:
+        """The mean over the seeds; its interval is over groups of recordings alone."""
+        return Figure.of(float(self.by_seed(span, method).mean()), self._draws(span, method))
 
-    @property
-    def relative(self) -> float | None:
-        """It, divided by that of the best baseline."""
-        best = min(self.overall[method] for method in BASELINES)
-        return self.error / best if best > 0 else None
+    def best_baseline(self, span: str) -> str:
+        """The baseline with the lowest error."""
+        return min(BASELINES, key=lambda method: self.by_seed(span, method).mean())
+
+    def minus(self, other: "Experiment", span: str, method: str = "policy") -> Figure:
+        """The policy's error less that of another experiment's method, by the paired bootstrap."""
+        value = self.by_seed(span).mean() - other.by_seed(span, method).mean()
+        own, others = self._draws(span, "policy"), other._draws(span, method)
+        return Figure.of(float(value), None if own is None or others is None else own - others)
+
+    def _draws(self, span: str, method: str) -> NDArray[np.float64] | None:
+        entries = self.entries[span][:, None]
+        sums = self.errors[method, span].mean(axis=0)[:, None] * entries
+        return bootstrap_means(sums, entries)[:, 0] if len(sums) >= FEWEST_GROUPS else None
 
 
 def read_experiments(reports: Path) -> tuple[Experiment, ...]:
     """The evaluations in the folders of `reports`, ordered by expert, fusion and name.
 
-    What else lies there, such as the logs of a training, is passed over. Raises `ConfigError`
-    where there is none, where one lacks a file or cannot be read, where they were not evaluated on
-    the same ticks, and where stochastic policies were not sampled alike.
+    Those whose trainings differ by the seed alone are one experiment. What else lies there, such
+    as the logs of a training, is passed over. Raises `ConfigError` where there is none, where one
+    lacks a file or cannot be read, where they were not evaluated on the same ticks, and where
+    stochastic policies were not sampled alike.
     """
     folders = [
         folder
         for folder in sorted(reports.glob("*"))
-        if any((folder / name).exists() for name in (JUDGED, ERRORS))
+        if any((folder / name).exists() for name in (JUDGED, GROUPS))
     ]
     if not folders:
         raise ConfigError(
@@ -95,71 +113,125 @@ def read_experiments(reports: Path) -> tuple[Experiment, ...]:
                 )
     for experiment, other in pairwise(experiments):
         _check_baselines(reports, experiment, other)
-    return tuple(sorted(experiments, key=_order))
+    of_recipe: dict[str, list[Experiment]] = {}
+    for experiment in experiments:
+        of_recipe.setdefault(experiment.recipe, []).append(experiment)
+    return tuple(sorted(map(_merged, of_recipe.values()), key=_order))
 
 
-def experiment_table(experiments: Sequence[Experiment], trained: bool = False) -> Table:
-    """An experiment a row, a baseline a row; mean absolute errors.
+def best_experiment(experiments: Sequence[Experiment], span: str) -> Experiment:
+    """The one with the lowest error."""
+    return min(experiments, key=lambda experiment: experiment.error(span).value)
 
-    `samples` are the chunks a tick whose mean was evaluated; `trained` adds the time that each
-    training took.
+
+def experiment_table(experiments: Sequence[Experiment], span: str, trained: bool = False) -> Table:
+    """An experiment a row, a baseline a row; mean absolute errors and differences with intervals.
+
+    `trained` adds the time that a training took. The baseline that sees features has the lowest
+    error that it has in any experiment.
     """
-    groups = list(experiments[0].errors)
-    own = ["policy / best", "expert", "fusion", "samples", "parameters", "trained [s]"]
+    best = best_experiment(experiments, span)
     rows: list[list[Any]] = []
     for experiment in experiments:
-        errors = (experiment.errors[group]["policy"] for group in groups)
-        kind = (experiment.model_type, experiment.fusion_strategy, experiment.samples)
-        rows.append([experiment.name, *errors, experiment.relative, *kind, experiment.parameters])
+        low, high = experiment.by_seed(span).min(), experiment.by_seed(span).max()
+        baseline = experiment.best_baseline(span)
+        own = experiment.minus(experiment, span, baseline)
         seconds = experiment.training_s
-        rows[-1].append(None if seconds is None else round(seconds))
+        rows.append(
+            [
+                *(experiment.name, len(experiment.seeds), experiment.error(span).text()),
+                f"{low:.3f} to {high:.3f}" if len(experiment.seeds) > 1 else None,
+                "it is" if experiment is best else _verdict(experiment.minus(best, span)),
+                f"{_verdict(own)} ({HEADINGS[baseline]})",
+                *(experiment.model_type, experiment.fusion_strategy, experiment.samples),
+                *(experiment.parameters, None if seconds is None else round(seconds)),
+            ]
+        )
     for method in BASELINES:
-        errors = (experiments[0].errors[group][method] for group in groups)
-        rows.append([f"baseline: {HEADINGS[method]}", *errors, None, "", "", None, None, None])
-    heads = ["experiment", *(with_unit(*group) for group in groups), *own]
+        error = min((one.error(span, method) for one in experiments), key=lambda e: e.value)
+        rows.append([f"baseline: {HEADINGS[method]}", None, error.text(), *[None] * 8])
+    heads = ["experiment", "seeds", f"{SPANS[span]} [training std]", "over seeds"]
+    heads += ["minus the best", "minus the best baseline"]
+    heads += ["expert", "fusion", "samples", "parameters", "trained [s]"]
     stop = len(heads) if trained else -1
     return Table(heads[:stop], [row[:stop] for row in rows])
 
 
 def experiment_csv(experiments: Sequence[Experiment]) -> Table:
     """For a file, without the time of training: what the clock says is never tracked."""
-    errors = {
-        f"{_key(group)}_{method}": (group, method)
-        for group in experiments[0].errors
-        for method in METHODS
-    }
-    own = ("model_type", "fusion_strategy", "step", "parameters", "samples")
-    rows = [
-        [
-            experiment.name,
-            *(getattr(experiment, key) for key in own),
-            *(experiment.errors[group][method] for group, method in errors.values()),
-        ]
-        for experiment in experiments
-    ]
-    return Table(["experiment", *own, *errors], rows)
+    own = ("model_type", "fusion_strategy", "parameters", "samples")
+    rows: list[dict[str, Any]] = []
+    for experiment in experiments:
+        row: dict[str, Any] = {"experiment": experiment.name}
+        row |= {key: getattr(experiment, key) for key in own}
+        row["seeds"] = " ".join(map(str, experiment.seeds))
+        for span in SPANS:
+            baseline = experiment.best_baseline(span)
+            best = best_experiment(experiments, span)
+            row |= _cells(span, experiment.error(span))
+            row[f"{span}_seed_min"] = experiment.by_seed(span).min()
+            row[f"{span}_seed_max"] = experiment.by_seed(span).max()
+            row |= _apart(f"{span}_minus_best", experiment.minus(best, span))
+            row[f"{span}_best_baseline"] = baseline
+            row |= _apart(f"{span}_minus_baseline", experiment.minus(experiment, span, baseline))
+            row |= {f"{span}_{way}": experiment.by_seed(span, way).mean() for way in BASELINES}
+        rows.append(row)
+    return Table(list(rows[0]), [list(row.values()) for row in rows])
 
 
-def _key(group: tuple[str, str]) -> str:
-    """A group of `errors` as one word of a file."""
-    return OVERALL if group == _OVERALL else ActionGroup(*group, ()).key
+def _verdict(apart: Figure) -> str:
+    """A difference, and whether it is resolved."""
+    words = {None: "", True: ": resolved", False: ": not resolved"}
+    return apart.text("+") + words[apart.resolved]
+
+
+def _cells(name: str, figure: Figure) -> dict[str, Any]:
+    return {name: figure.value, f"{name}_low": figure.low, f"{name}_high": figure.high}
+
+
+def _apart(name: str, apart: Figure) -> dict[str, Any]:
+    words = {None: None, True: "resolved", False: "not resolved"}
+    return {**_cells(name, apart), f"{name}_is": words[apart.resolved]}
+
+
+def _merged(seeds: Sequence[Experiment]) -> Experiment:
+    """One experiment of evaluations of one recipe, named as the first less its seed."""
+    first, *others = seeds
+    if not others:
+        return first
+    times = [one.training_s for one in seeds if one.training_s is not None]
+    return replace(
+        first,
+        name=re.sub(r"[-_]?(seed)?[-_]?\d+$", "", first.name) or first.name,
+        seeds=tuple(seed for one in seeds for seed in one.seeds),
+        errors={key: np.concatenate([one.errors[key] for one in seeds]) for key in first.errors},
+        training_s=float(np.mean(times)) if times else None,
+    )
 
 
 def _read_experiment(folder: Path) -> tuple[dict[str, Any], Experiment]:
-    """What `JUDGED` says, and the experiment."""
-    file = folder / ERRORS
+    """What `JUDGED` says, and the experiment of one seed."""
+    file = folder / GROUPS
     try:
-        rows = csv.DictReader(file.read_text(encoding="utf-8").splitlines())
-        errors = {
-            (row["group"], row["unit"]): {method: float(row[method]) for method in METHODS}
-            for row in rows
-        }
-        errors = {_OVERALL: errors.pop(_OVERALL), **errors}
+        rows = list(csv.DictReader(file.read_text(encoding="utf-8").splitlines()))
+
+        def column(name: str) -> NDArray[np.float64]:
+            return np.array([float(row[name]) for row in rows])
+
+        entries = {span: column(f"{span}_entries") for span in SPANS}
+        errors = {(way, span): column(f"{way}_{span}")[None] for way in METHODS for span in SPANS}
         file = folder / JUDGED
         document = json.loads(file.read_text(encoding="utf-8"))
-        policy = dict(document["policy"])
-        seconds = _training_seconds(Path(policy.pop("logs")))
-        experiment = Experiment(folder.name, errors=errors, training_s=seconds, **policy)
+        policy = document["policy"]
+        own = ("model_type", "fusion_strategy", "recipe", "parameters", "samples")
+        experiment = Experiment(
+            folder.name,
+            **{key: policy[key] for key in own},
+            seeds=(policy["seed"],),
+            entries=entries,
+            errors=errors,
+            training_s=_training_seconds(Path(policy["logs"])),
+        )
         return {key: document[key] for key in _SHARED}, experiment
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(
@@ -179,17 +251,18 @@ def _training_seconds(logs: Path) -> float | None:
 
 
 def _check_baselines(reports: Path, experiment: Experiment, other: Experiment) -> None:
-    for group, errors in experiment.errors.items():
-        for method in BASELINES:
-            error = other.errors.get(group, {}).get(method, math.nan)
-            if not math.isclose(errors[method], error, rel_tol=_SAME, abs_tol=1e-9):
-                raise ConfigError(
-                    f"compare.reports: expected the same baselines in all evaluations in "
-                    f"{reports}, found {method} ({_key(group)}) {errors[method]} in "
-                    f"{experiment.name} and {error} in {other.name}: they were trained on other "
-                    "recordings. Train and evaluate all of them on one store, or move those that "
-                    "do not belong away."
-                )
+    for (method, span), errors in experiment.errors.items():
+        if method in ("policy", _OF_FEATURES):
+            continue
+        others = other.errors[method, span]
+        if errors.shape != others.shape or not np.allclose(errors, others, rtol=_SAME, atol=1e-9):
+            found, there = experiment.by_seed(span, method)[0], other.by_seed(span, method)[0]
+            raise ConfigError(
+                f"compare.reports: expected the same baselines in all evaluations in {reports}, "
+                f"found {method} ({SPANS[span]}) {found:.6g} in {experiment.name} and {there:.6g} "
+                f"in {other.name}: they were trained on other recordings. Train and evaluate all "
+                "of them on one store, or move those that do not belong away."
+            )
 
 
 def _order(experiment: Experiment) -> tuple[int, int, str]:

@@ -46,6 +46,11 @@ class Figure:
         value, *words = (f"{number:{sign}.{decimals}f}" for number in (self.value, *ends))
         return f"{value} ({(' to ' if sign else '–').join(words)})" if words else value
 
+    @property
+    def resolved(self) -> bool | None:
+        """Of a difference: whether its interval leaves 0 out; None without one."""
+        return None if self.low is None or self.high is None else not self.low <= 0 <= self.high
+
 
 @dataclass(frozen=True)
 class Rivalry:
@@ -65,10 +70,11 @@ class Rivalry:
     @property
     def verdict(self) -> str:
         """`better`, `worse` or `not resolved`; without an interval, that there is none."""
-        low, high = self.difference.low, self.difference.high
-        if low is None or high is None:
+        if self.difference.resolved is None:
             return "no interval"
-        return "not resolved" if low <= 0 <= high else "better" if high < 0 else "worse"
+        if not self.difference.resolved:
+            return "not resolved"
+        return "better" if self.difference.value < 0 else "worse"
 
 
 def by_group(comparison: Comparison, values: NDArray[np.floating]) -> Errors:

@@ -32,24 +32,27 @@ def experiments(
     }
     path = folder / "params.yaml"
     path.write_text(yaml.safe_dump(document))
-    # Their own pages are not what is compared.
-    monkeypatch = pytest.MonkeyPatch()
-    monkeypatch.setattr(evaluate, "write_report", lambda *_: [])
     for name in NAMES:
         expert, fusion = name.split("-")
-        own = [
-            f"train_head.model_type={expert}",
-            f"train_head.fusion_strategy={fusion}",
-            f"train_head.output={folder / 'models' / name}",
-            f"train_head.logs={folder / 'logs' / name}",
-            f"evaluate.checkpoint={folder / 'models' / name}",
-            f"evaluate.output={folder / 'reports' / name}",
-        ]
-        arguments = ["--params", str(path), *(part for one in own for part in ("--set", one))]
-        assert run("", train_head.main, arguments) == 0
-        assert run("", evaluate.main, arguments) == 0
-    monkeypatch.undo()
+        options = [f"train_head.model_type={expert}", f"train_head.fusion_strategy={fusion}"]
+        assert evaluated(path, name, *options) == 0
     return path
+
+
+def evaluated(params: Path, name: str, *options: str) -> int:
+    """Train and evaluate an experiment of this name; its own page is not what is compared."""
+    folder = params.parent
+    own = [
+        *options,
+        f"train_head.output={folder / 'models' / name}",
+        f"train_head.logs={folder / 'logs' / name}",
+        f"evaluate.checkpoint={folder / 'models' / name}",
+        f"evaluate.output={folder / 'reports' / name}",
+    ]
+    arguments = ["--params", str(params), *(part for one in own for part in ("--set", one))]
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr(evaluate, "write_report", lambda *_: [])
+        return run("", train_head.main, arguments) or run("", evaluate.main, arguments)
 
 
 @pytest.fixture
@@ -66,38 +69,60 @@ def refused(reports: Path, experiments: Path, capsys: pytest.CaptureFixture[str]
     return error
 
 
-def test_a_table_a_file_and_a_picture(
+def test_a_table_for_each_span_a_file_and_a_picture(
     experiments: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run("", compare.main, ["--params", str(experiments)]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines[1:5]] == NAMES
-    assert lines[0].split()[-4:] == ["samples", "parameters", "trained", "[s]"]
-    assert "overall [training std]  translation [mm]  rotation [deg]  gripper" in lines[0]
-    assert [line.split()[-3] for line in lines[1:5]] == ["1", "1", "2", "2"]
-    assert [line.split("  ")[0] for line in lines[5:8]] == [
-        "baseline: zero",
-        "baseline: median",
-        "baseline: repeat last",
-    ]
+    height = 1 + len(NAMES) + len(BASELINES)
+    for at, span in ((0, "what is executed"), (height + 2, "the whole chunk")):
+        assert f"{span} [training std]" in lines[at]
+        assert lines[at].split()[-4:] == ["samples", "parameters", "trained", "[s]"]
+        assert [line.split()[0] for line in lines[at + 1 : at + 5]] == NAMES
+        assert all(line.startswith("baseline: ") for line in lines[at + 5 : at + height])
+        assert lines[at + height].startswith(f"lowest test error of {span}: ")
     output = experiments.parent / "comparison"
     names = ["experiments.csv", "experiments.png", "report.html"]
     assert sorted(path.name for path in output.iterdir()) == names
     assert (output / "experiments.png").read_bytes().startswith(b"\x89PNG")
     rows = list(csv.DictReader((output / "experiments.csv").read_text().splitlines()))
-    assert list(rows[0])[6:18:6] == ["overall_policy", "translation_mm_policy"]
     for row in rows:
         folder = experiments.parent / "reports" / row["experiment"]
-        overall = json.loads((folder / "metrics.json").read_text())["chunk"]["overall"]
-        assert float(row["overall_policy"]) == overall["policy"]["value"]
-        best = min(float(row[f"overall_{method}"]) for method in BASELINES)
-        assert overall["best_baseline"]["value"] == pytest.approx(best, rel=1e-4)
+        metrics = json.loads((folder / "metrics.json").read_text())
+        for span, scope in (("executed", "executed"), ("overall", "chunk")):
+            policy = metrics[scope]["overall"]["policy"]
+            for key, end in (("value", ""), ("low", "_low"), ("high", "_high")):
+                if key in policy:
+                    assert float(row[span + end]) == pytest.approx(policy[key], rel=1e-4)
+            best = min(float(row[f"{span}_{method}"]) for method in BASELINES)
+            assert float(row[f"{span}_{row[f'{span}_best_baseline']}"]) == best
+            gap = float(row[span]) - best
+            assert float(row[f"{span}_minus_baseline"]) == pytest.approx(gap, abs=1e-5)
         assert row["samples"] == ("1" if row["model_type"] == "regression" else "2")
+        assert row["seeds"] == "0"
     page = (output / "report.html").read_text()
     assert all(name in page for name in NAMES) and ">trained<" not in page
     markdown = (experiments.parent / "comparison.md").read_text().splitlines()
     assert markdown[1].startswith("| --- |")
-    assert len({line.count("|") for line in markdown}) == 1
+    assert len({line.count("|") for line in markdown if line}) == 1
+
+
+def test_seeds_become_one_row(experiments: Path) -> None:
+    """A training that differs by its seed alone has the same recipe."""
+    name, reports = "regression-concat-seed7", experiments.parent / "reports"
+    options = ["train_head.model_type=regression", "train_head.fusion_strategy=concat"]
+    assert evaluated(experiments, name, *options, "train_head.seed=7") == 0
+    found = {one.name: one for one in read_experiments(reports)}
+    assert sorted(found) == sorted(NAMES)
+    merged = found["regression-concat"]
+    assert merged.seeds == (0, 7)
+    for span, scope in (("executed", "executed"), ("overall", "chunk")):
+        of_seeds = []
+        for folder in ("regression-concat", name):
+            metrics = json.loads((reports / folder / "metrics.json").read_text())
+            of_seeds.append(metrics[scope]["overall"]["policy"]["value"])
+        assert merged.by_seed(span).tolist() == pytest.approx(of_seeds, rel=1e-4)
+    shutil.rmtree(reports / name)
 
 
 def test_the_training_time_is_read_from_beside_the_logs_and_not_tracked(experiments: Path) -> None:
@@ -144,18 +169,18 @@ def test_policies_that_were_sampled_otherwise_are_refused(
 def test_other_baselines_are_refused(
     reports: Path, experiments: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = reports / "regression-gated" / "errors.csv"
+    path = reports / "regression-gated" / "groups.csv"
     rows = list(csv.DictReader(path.read_text().splitlines()))
-    assert (rows[0]["group"], rows[0]["unit"]) == ("translation", "mm")
-    text = path.read_text().replace(rows[0]["median_action"], "7.5")
+    text = path.read_text().replace(rows[0]["median_action_overall"], "7.5")
     path.write_text(text)
     error = refused(reports, experiments, capsys)
-    assert "found median_action (translation_mm)" in error
+    assert "found median_action (the whole chunk)" in error
     assert "trained on other recordings" in error
 
 
 @pytest.mark.parametrize(
-    ("name", "torn"), [(JUDGED, "{"), (JUDGED, "{}"), ("errors.csv", "group,unit,policy\na,b,x\n")]
+    ("name", "torn"),
+    [(JUDGED, "{"), (JUDGED, "{}"), ("groups.csv", "group,policy_executed\na,x\n")],
 )
 def test_a_folder_that_is_no_evaluation_is_named(
     reports: Path, experiments: Path, capsys: pytest.CaptureFixture[str], name: str, torn: str

@@ -49,7 +49,13 @@ def test_a_ranking_files_and_pictures(params: Path, capsys: pytest.CaptureFixtur
     report = params.parent / "report"
     assert sorted(file.name for file in report.iterdir()) == FILES
     # The action's first two channels are those of slot 0, which is the mean.
-    assert lines[7].startswith("layer 3, mean")
+    assert [line.split("  ")[0] for line in lines[6:11]] == [
+        "mean action",
+        "past actions",
+        "past actions + state",
+        "past actions + state + sensor",
+        "layer 3, mean",
+    ]
     assert lines[-3].endswith("vlm: {layers: [3], norms: [true], pooling: [mean]}")
     assert "run stages.extract" in lines[-2]
     assert sum("View1 cell" in line for line in lines) == 4
@@ -61,7 +67,12 @@ def test_a_ranking_files_and_pictures(params: Path, capsys: pytest.CaptureFixtur
     assert [(one["pooling"], one["slots"]) for one in groups] == [("mean", "1"), ("grid", "4")]
     found = json.loads((report / "metrics.json").read_text())
     assert found["recommended"]["group"] == "layer 3, mean"
-    assert found["groups"]["layer 3, mean"]["beside"]["r2"] == float(groups[0]["r2_beside"])
+    beside = found["groups"]["layer 3, mean"]["beside"]
+    assert list(beside) == ["r2", "low", "high"]
+    assert beside["r2"] == float(groups[0]["r2_beside"])
+    assert float(groups[0]["gain_low"]) < float(groups[0]["gain"]) < float(groups[0]["gain_high"])
+    assert found["known"]["past actions + state + sensor"]["r2"] == float(groups[0]["r2_known"])
+    assert found["repeats"] == 3
 
     targets = list(csv.DictReader((report / "targets.csv").read_text().splitlines()))
     assert len(targets) == 2 * 2 * 5

@@ -64,7 +64,9 @@ class ProbeParams(Section):
     horizon: int = Field(default=8, ge=1)
     """Ticks of the action chunk that is read out."""
     folds: int = Field(default=5, ge=2)
-    """Groups of episodes, each held out once."""
+    """Groups of recordings, each held out once in each deal."""
+    repeats: int = Field(default=3, ge=1)
+    """Deals of the folds: what an interval covers beside the choice of recordings."""
     penalties: tuple[Annotated[float, Field(gt=0)], ...] = Field(
         default=(1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0), min_length=1
     )

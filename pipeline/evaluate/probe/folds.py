@@ -10,34 +10,49 @@ from pipeline.base.errors import StoreMismatch
 from pipeline.store import FeatureStore
 from pipeline.train.groups import episodes_by_group
 
+_PARTS = 4
+"""Parts of each fold, at most, that are dealt anew as one: what bounds time and memory."""
+
 
 @dataclass(frozen=True, eq=False)
 class ProbeFolds:
-    """The ticks that are read, ascending, and the fold that holds each out."""
+    """The ticks that are read, ascending, and the folds that hold them out, dealt several times."""
 
     ticks: NDArray[np.int64]
     """(tick,) store-global; the whole action chunk of each lies within its episode."""
-    fold: NDArray[np.int64]
-    """(tick,)"""
-    recordings: int
+    group: NDArray[np.int64]
+    """(tick,) the recording of each, counted from 0."""
+    deals: NDArray[np.int64]
+    """(repeat, group): the fold that holds a recording out in each deal."""
     notes: tuple[str, ...]
     """What the reader of a score has to know about the folds."""
 
     @property
     def count(self) -> int:
         """Number of folds."""
-        return int(self.fold.max()) + 1
+        return int(self.deals.max()) + 1
+
+    @property
+    def recordings(self) -> int:
+        """Number of groups."""
+        return self.deals.shape[1]
+
+    @property
+    def fold(self) -> NDArray[np.int64]:
+        """(repeat, tick)"""
+        return self.deals[:, self.group]
 
 
 def fold_by_recording(
-    store: FeatureStore, folds: int, horizon: int, max_ticks: int | None = None
+    store: FeatureStore, folds: int, horizon: int, max_ticks: int | None = None, repeats: int = 1
 ) -> ProbeFolds:
-    """Whole recordings in at most `folds` folds of about as many ticks.
+    """Whole recordings in at most `folds` folds of about as many ticks, dealt `repeats` times.
 
     Episodes that are one recording in several formats share a fold. Ticks whose chunk of `horizon`
     actions reaches beyond the episode's end are left out, so that all steps of the chunk are scored
     on the same ticks; of the others, `max_ticks` are read, evenly spread and so of each episode its
-    share. Raises `StoreMismatch` where fewer than two recordings have such ticks, or too few.
+    share. Recordings no more than folds are each held out alone: there is one deal. Raises
+    `StoreMismatch` where fewer than two recordings have such ticks, or too few.
     """
     recording = np.full(store.ticks, -1, np.int64)
     for index, episodes in enumerate(episodes_by_group(store).values()):
@@ -45,8 +60,7 @@ def fold_by_recording(
             stop = max(episode.ticks.start, episode.ticks.stop - horizon + 1)
             recording[episode.ticks.start : stop] = index
     ticks = np.flatnonzero(recording >= 0)
-    group = recording[ticks]
-    recordings = len(np.unique(group))
+    recordings = len(np.unique(recording[ticks]))
     if recordings < 2:
         raise StoreMismatch(
             f"{store.path}: expected at least two recordings of {horizon} ticks or more, of which "
@@ -55,20 +69,28 @@ def fold_by_recording(
         )
     count = min(folds, recordings)
     notes = _notes(store, recordings, folds, horizon)
-    fold = np.empty(len(ticks), np.int64)
-    for index, (_, held) in enumerate(GroupKFold(count).split(group, groups=group)):
-        fold[held] = index
     if max_ticks is not None and max_ticks < len(ticks):
-        read = np.linspace(0, len(ticks) - 1, max_ticks).round().astype(np.int64)
-        ticks, fold = ticks[read], fold[read]
+        ticks = ticks[np.linspace(0, len(ticks) - 1, max_ticks).round().astype(np.int64)]
         notes.append(f"{len(ticks)} of the ticks are read, evenly spread (probe.max_ticks)")
-    if len(np.unique(fold)) < count:
+    there, group = np.unique(recording[ticks], return_inverse=True)
+    if len(there) < count:
         raise StoreMismatch(
             f"{store.path}: too few ticks to hold recordings out in turn: one of {count} folds has "
             "none. Give a store with more or longer recordings, a larger probe.max_ticks or a "
             "smaller probe.horizon."
         )
-    return ProbeFolds(ticks, fold, recordings, tuple(notes))
+    deals = _deal(group, count, 1 if len(there) == count else repeats)
+    return ProbeFolds(ticks, group, deals, tuple(notes))
+
+
+def _deal(group: NDArray[np.int64], folds: int, repeats: int) -> NDArray[np.int64]:
+    """(repeat, group): as many parts of about as many ticks to each fold, by a fixed seed."""
+    part = np.empty(group.max() + 1, np.int64)
+    parts = min(_PARTS * folds, len(part))
+    for index, (_, held) in enumerate(GroupKFold(parts).split(group, groups=group)):
+        part[group[held]] = index
+    rng = np.random.default_rng(0)
+    return np.array([rng.permutation(np.arange(parts) % folds)[part] for _ in range(repeats)])
 
 
 def _notes(store: FeatureStore, recordings: int, folds: int, horizon: int) -> list[str]:

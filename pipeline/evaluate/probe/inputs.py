@@ -1,8 +1,8 @@
-"""What a regression reads at a tick: features of a row, and state and sensor before the tick."""
+"""What a regression reads at a tick: features of a row; actions, state and sensor before it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
@@ -17,14 +17,16 @@ from pipeline.store import FeatureStore, place
 
 Inputs = Float64[np.ndarray, "row _"]
 """What a regression reads or predicts at each VL row or tick."""
-Folds = Int64[np.ndarray, " row"]
-"""The fold that holds each row or tick out."""
+Folds = Int64[np.ndarray, "repeat row"]
+"""The fold that holds each row or tick out, in each deal."""
+PAST_ACTIONS = 2
+"""Actions before the tick that are known, as of the linear fit beside which policies stand."""
 WIDTH = 1024
 """Inputs at most that a slot makes, or several together."""
 STREAM_WIDTH = 64
 """Inputs at most of each summary of channels that share a unit."""
 LIMIT = 5.0
-"""Standard deviations from the mean, of any rows that a fold is trained on, that are kept."""
+"""Standard deviations from the mean, of any rows that are trained on in any deal, that are kept."""
 STILL = 0.1
 """What spreads less than this share of its spread over all folds, in rows that are trained on, is
 taken as constant."""
@@ -79,42 +81,59 @@ def read_slots(
                 f"{place(store, 'vl', int(rows[there][row]))}, slot {slot}, channel {channel}. "
                 "Run stages.verify to see what else is damaged."
             )
-        reduced = reduce(widen(values), fold[there], WIDTH // len(slots))
+        reduced = reduce(widen(values), fold[:, there], WIDTH // len(slots))
         inputs.append(np.zeros((len(rows), reduced.shape[1])))
         inputs[-1][there] = reduced
     return np.concatenate(inputs, axis=1), valid.max(axis=1)
 
 
+def past_actions(store: FeatureStore, ticks: Int64[np.ndarray, " row"], fold: Folds) -> Inputs:
+    """The actions of the `PAST_ACTIONS` ticks before each; of an episode's first ticks the mean.
+
+    Without them what a slot tells of the robot's own motion would count as knowledge of the scene.
+    """
+    action, start = store.array("tick/action"), store.array("episode/tick_start")
+    first = start[store.episode_of(ticks)]
+    inputs = np.zeros((len(ticks), PAST_ACTIONS, action.shape[1]))
+    for back in range(1, PAST_ACTIONS + 1):
+        there = ticks - back >= first
+        if there.any():
+            inputs[there, back - 1] = limit(
+                StandardScaler().fit_transform(action[ticks[there] - back].astype(np.float64)),
+                fold[:, there],
+            )
+    return inputs.reshape(len(ticks), -1)
+
+
 def summarize(
     store: FeatureStore,
+    stream: Literal["sensor", "state"],
     ticks: Int64[np.ndarray, " row"],
     fold: Folds,
-    sensor_window: int,
-    state_window: int,
+    window: int,
 ) -> Inputs:
     """The last, the mean and the spread of every channel over the window before each tick.
 
-    No column where the store has neither stream. Channels of one unit that are more than
+    No column where the store lacks the stream. Channels of one unit that are more than
     `STREAM_WIDTH`, as those of an A-scan, are projected on that many main directions of each
     summary, so a force beside them is not lost. Nothing is later than its tick; a tick without a
     reading has the mean of those with one, and a column that says so. `fold` is the fold that holds
     each tick out. Raises `NumericsError` on NaN or inf, naming the place.
     """
     inputs: list[Inputs] = [np.empty((len(ticks), 0))]
-    for stream, window in (("sensor", sensor_window), ("state", state_window)):
-        units: list[str] = store.streams[stream]["units"]
-        if not units:
-            continue
-        summaries, known = _summaries(store, stream, ticks, window)
-        if not known.any():
-            continue
-        channels_of = {unit: [i for i, u in enumerate(units) if u == unit] for unit in units}
-        for summary in summaries:
-            for channels in channels_of.values():
-                reduced = reduce(summary[known][:, channels], fold[known], STREAM_WIDTH)
-                inputs.append(np.zeros((len(ticks), reduced.shape[1])))
-                inputs[-1][known] = reduced
-        inputs.append(known[:, None].astype(np.float64))
+    units: list[str] = store.streams[stream]["units"]
+    if not units:
+        return inputs[0]
+    summaries, known = _summaries(store, stream, ticks, window)
+    if not known.any():
+        return inputs[0]
+    channels_of = {unit: [i for i, u in enumerate(units) if u == unit] for unit in units}
+    for summary in summaries:
+        for channels in channels_of.values():
+            reduced = reduce(summary[known][:, channels], fold[:, known], STREAM_WIDTH)
+            inputs.append(np.zeros((len(ticks), reduced.shape[1])))
+            inputs[-1][known] = reduced
+    inputs.append(known[:, None].astype(np.float64))
     return np.concatenate(inputs, axis=1)
 
 
@@ -168,13 +187,16 @@ def limit(columns: Inputs, fold: Folds) -> Inputs:
         min(max(z, max_f(m_f - LIMIT s_f)), min_f(m_f + LIMIT s_f))
 
     and 0 where some s_f < `STILL` s, or the limits cross: nothing can be learnt of it from other
-    recordings. This reads the inputs of all folds, which say nothing of any action.
+    recordings. f runs over the folds of all deals, so that the same inputs serve them all. This
+    reads the inputs of all folds, which say nothing of any action.
     """
-    held = np.unique(fold)
+    held = fold[:, None] == np.arange(fold.max() + 1)[:, None]
+    trained = 1.0 - held.reshape(-1, len(columns))
     # A slot in one fold only: no fold is trained on it without another.
-    trained = (columns[fold != one] if len(held) > 1 else columns for one in held)
-    moments = [(rows.mean(axis=0), rows.std(axis=0)) for rows in trained]
-    mean, spread = np.array(moments).transpose(1, 0, 2)
+    trained = trained[trained.any(axis=1)] if trained.any() else np.ones((1, len(columns)))
+    trained /= trained.sum(axis=1, keepdims=True)
+    mean = trained @ columns
+    spread = np.sqrt(np.maximum(trained @ columns**2 - mean**2, 0))
     lower = (mean - LIMIT * spread).max(axis=0)
     upper = (mean + LIMIT * spread).min(axis=0)
     kept = np.clip(columns, lower, np.maximum(lower, upper))

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import TypeAdapter
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
@@ -13,9 +14,10 @@ from tqdm import tqdm
 from pipeline.base.config import ProbeParams
 from pipeline.base.errors import NumericsError
 from pipeline.base.finite import first_non_finite
+from pipeline.evaluate.figures import Figure
 from pipeline.evaluate.probe.folds import ProbeFolds, fold_by_recording
-from pipeline.evaluate.probe.inputs import Inputs, SlotName, read_slots, summarize
-from pipeline.evaluate.probe.ridge import ProbeScore, cross_validate, standard_error
+from pipeline.evaluate.probe.inputs import Inputs, SlotName, past_actions, read_slots, summarize
+from pipeline.evaluate.probe.ridge import ProbeScore, cross_validate
 from pipeline.policy.normalization import fit_channels
 from pipeline.store import FeatureStore, place
 
@@ -36,13 +38,17 @@ class ProbeResult:
     valid_share: float
     """Of the ticks, those at which one of its slots is valid."""
     alone: ProbeScore
-    beside: ProbeScore | None
-    """With state + sensor; None where the store has neither."""
+    beside: ProbeScore
+    """With all that is known without features; what it is ranked by."""
 
-    @property
-    def best(self) -> ProbeScore:
-        """What it is ranked by: beside state + sensor, where there are any."""
-        return self.beside or self.alone
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What is known without features, as far as one more block of inputs, and how it predicts."""
+
+    name: str
+    inputs: int
+    score: ProbeScore
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,19 +59,20 @@ class ProbeStudy:
     action_names: tuple[str, ...]
     folds: ProbeFolds
     mean_action: ProbeScore
-    streams: ProbeScore | None
-    """State + sensor alone; None where the store has neither."""
-    stream_inputs: int
+    known: tuple[Known, ...]
+    """Past actions; with state; with sensor, as far as the store has them."""
     slots: tuple[ProbeResult, ...]
     """In the store's order."""
     groups: tuple[ProbeResult, ...]
 
-    def gain(self, result: ProbeResult) -> tuple[float, float] | tuple[None, None]:
-        """What a result adds to state + sensor, and the standard error of that by fold."""
-        if self.streams is None or result.beside is None:
-            return None, None
-        apart = result.beside.by_fold - self.streams.by_fold
-        return result.beside.mean - self.streams.mean, standard_error(apart)
+    @property
+    def baseline(self) -> Known:
+        """All that is known without features."""
+        return self.known[-1]
+
+    def gain(self, result: ProbeResult) -> Figure:
+        """What a result adds to the baseline."""
+        return result.beside.gain(self.baseline.score)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +80,7 @@ class Recommendation:
     """The choice of layer, norm and pooling that the evidence supports."""
 
     reading: Literal["beside", "alone"]
-    """What it rests on: `beside` state + sensor where a choice gains so, else `alone`."""
+    """What it rests on: `beside` what is known where a choice gains so, else `alone`."""
     best: ProbeResult
     """With the highest score of those that gain."""
     chosen: ProbeResult
@@ -86,16 +93,19 @@ class Recommendation:
 def probe(store: FeatureStore, params: ProbeParams) -> ProbeStudy:
     """Ridge regression from every slot of variant 0 to the action chunk, cross-validated.
 
-    Alone, and beside the last, mean and spread of the causal windows of state and sensor; each slot
-    by itself and each choice of layer, norm and pooling as a whole. Folds hold whole recordings, so
-    nothing that tells a recording from another helps. Each of `params.threads` threads has one slot
-    or one group in memory, which grows with `params.max_ticks`. The same store and params give the
+    Alone, and beside what is known without features: the actions of the ticks before, and the last,
+    mean and spread of the causal windows of state and sensor. Each of these blocks has a penalty of
+    its own, chosen in their order; each slot stands by itself and each choice of layer, norm and
+    pooling as a whole. Folds hold whole recordings, so nothing that tells a recording from another
+    helps, and are dealt `params.repeats` times. Each of `params.threads` threads has one slot or
+    one group in memory, which grows with `params.max_ticks`. The same store and params give the
     same bits, whatever the threads. A bar shows the progress on a terminal.
 
     Raises `StoreMismatch` where fewer than two recordings are long enough, and `NumericsError` on
     NaN or inf, naming the place.
     """
-    folds = fold_by_recording(store, params.folds, params.horizon, params.max_ticks)
+    action = _finite_actions(store)
+    folds = fold_by_recording(store, params.folds, params.horizon, params.max_ticks, params.repeats)
     slots, dim = store.feature_shape
     names = TypeAdapter(list[SlotName]).validate_python(store.attrs["slots"][:slots])
     singles = {(index,): name for index, name in enumerate(names)}
@@ -106,13 +116,18 @@ def probe(store: FeatureStore, params: ProbeParams) -> ProbeStudy:
     rows, first, of_tick = np.unique(
         store.array("tick/vl_row")[folds.ticks], return_index=True, return_inverse=True
     )
-    targets = _targets(store, folds, params.horizon)
+    fold, targets = folds.fold, _targets(action, folds, params.horizon)
 
-    def score(inputs: Inputs, known: Inputs | None = None, of_known: Sequence[float] = ()):
-        return cross_validate(inputs, targets, folds.fold, params.penalties, known, of_known)
+    penalties_of: list[tuple[Inputs, NDArray[np.float64]]] = []
+    known: list[Known] = []
+
+    def score(inputs: Inputs, beside: bool = False) -> ProbeScore:
+        return cross_validate(
+            inputs, targets, folds, params.penalties, penalties_of if beside else ()
+        )
 
     def result(own: tuple[int, ...]) -> ProbeResult:
-        inputs, valid = read_slots(store, rows, folds.fold[first], own)
+        inputs, valid = read_slots(store, rows, fold[:, first], own)
         inputs = inputs[of_tick]
         return ProbeResult(
             name=tasks[own],
@@ -121,14 +136,17 @@ def probe(store: FeatureStore, params: ProbeParams) -> ProbeStudy:
             inputs=inputs.shape[1],
             valid_share=float(valid[of_tick].mean()),
             alone=score(inputs),
-            beside=None if streams is None else score(inputs, known, streams.penalties),
+            beside=score(inputs, beside=True),
         )
 
     # A slot a thread, and linear algebra on that thread: the same bits, whatever the threads.
     with threadpool_limits(1, "blas"), ThreadPoolExecutor(params.threads) as pool:
-        known = summarize(store, folds.ticks, folds.fold, params.sensor_window, params.state_window)
-        mean_action = score(known[:, :0])
-        streams = score(known) if known.shape[1] else None
+        mean_action = score(np.empty((len(folds.ticks), 0)))
+        for name, block in _known_blocks(store, folds.ticks, fold, params):
+            before = known[-1] if known else Known("", 0, mean_action)
+            named = f"{before.name} + {name}" if known else name
+            known.append(Known(named, before.inputs + block.shape[1], score(block, beside=True)))
+            penalties_of.append((block, known[-1].score.penalties))
         tasks = groups | singles  # a group of one slot is that slot
         bar = tqdm(pool.map(result, tasks), "probing", len(tasks), leave=False, disable=None)
         results = {result.slots: result for result in bar}
@@ -137,15 +155,26 @@ def probe(store: FeatureStore, params: ProbeParams) -> ProbeStudy:
         action_names=tuple(store.streams["action"]["names"]),
         folds=folds,
         mean_action=mean_action,
-        streams=streams,
-        stream_inputs=known.shape[1],
+        known=tuple(known),
         slots=tuple(results[own] for own in singles),
         groups=tuple(results[own] for own in groups),
     )
 
 
-def _targets(store: FeatureStore, folds: ProbeFolds, horizon: int) -> Inputs:
-    """The action chunk (step x channel) at each tick, standardised over the whole store."""
+def _known_blocks(
+    store: FeatureStore, ticks: NDArray[np.int64], fold: NDArray[np.int64], params: ProbeParams
+) -> list[tuple[str, Inputs]]:
+    """Past actions, state and sensor at the ticks, as far as the store has them."""
+    blocks = [
+        ("past actions", past_actions(store, ticks, fold)),
+        ("state", summarize(store, "state", ticks, fold, params.state_window)),
+        ("sensor", summarize(store, "sensor", ticks, fold, params.sensor_window)),
+    ]
+    return [(name, block) for name, block in blocks if block.shape[1]]
+
+
+def _finite_actions(store: FeatureStore) -> NDArray[np.float32]:
+    """(tick, channel)"""
     action = store.array("tick/action")
     if bad := first_non_finite(action):
         name = store.streams["action"]["names"][bad[1]]
@@ -154,6 +183,11 @@ def _targets(store: FeatureStore, folds: ProbeFolds, horizon: int) -> Inputs:
             f"{place(store, 'tick', bad[0])}, channel {name!r}. Mend the recording and run "
             "stages.extract again."
         )
+    return action
+
+
+def _targets(action: NDArray[np.float32], folds: ProbeFolds, horizon: int) -> Inputs:
+    """The action chunk (step x channel) at each tick, standardised over the whole store."""
     statistics = fit_channels([action], "actions")
     chunks = action[folds.ticks[:, None] + np.arange(horizon)].astype(np.float64)
     return ((chunks - statistics.mean) / statistics.scale).reshape(len(chunks), -1)
@@ -161,28 +195,24 @@ def _targets(store: FeatureStore, folds: ProbeFolds, horizon: int) -> Inputs:
 
 def ranked(results: Sequence[ProbeResult]) -> list[ProbeResult]:
     """The best first."""
-    return sorted(results, key=lambda result: result.best.mean, reverse=True)
+    return sorted(results, key=lambda result: result.beside.mean, reverse=True)
 
 
 def recommend(study: ProbeStudy) -> Recommendation | None:
     """Among the groups that gain; None where none does.
 
     A group gains where it is better than what is known without features and than the mean action.
-    One is better than another where the mean over folds of their difference is above its standard
-    error (the one-standard-error rule of The Elements of Statistical Learning, section 7.10, on
-    differences by fold, as all face the same recordings), and their median above 0, so that it does
-    not rest on one strange fold. Two that gain are tied where the first is not better and the
-    second keeps half of its gain: a wide spread of few folds would tie anything.
+    One is better than another where the interval of the difference is above 0. Two that gain are
+    tied where the first is not better and the second keeps half of its gain: a wide interval of few
+    recordings would tie anything.
     """
-    for reading in ("beside", "alone"):
-        floor = [study.mean_action]
-        if reading == "beside" and study.streams is not None:
-            floor.append(study.streams)
-        read = ((group, getattr(group, reading)) for group in study.groups)
+    readings: tuple[Literal["beside", "alone"], ...] = ("beside", "alone")
+    for reading in readings:
+        floor = [study.mean_action, *([study.baseline.score] if reading == "beside" else [])]
         scores: dict[ProbeResult, ProbeScore] = {
             group: score
-            for group, score in read
-            if score is not None and all(_is_better(score, other) for other in floor)
+            for group in study.groups
+            if all(_is_better(score := getattr(group, reading), other) for other in floor)
         }
         if not scores:
             continue
@@ -203,7 +233,6 @@ def recommend(study: ProbeStudy) -> Recommendation | None:
 
 
 def _is_better(score: ProbeScore, other: ProbeScore) -> bool:
-    """Fold by fold, as `recommend` says."""
-    apart = score.by_fold - other.by_fold
-    ahead = score.mean - other.mean > max(standard_error(apart), _ROUNDING)
-    return bool(ahead and np.median(apart) > 0)
+    """Resolved, as `recommend` says."""
+    gain = score.gain(other)
+    return gain.value > _ROUNDING and bool(gain.resolved)

@@ -1,7 +1,6 @@
 """Results of a probe -> what is printed and what is written."""
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,14 +8,12 @@ import numpy as np
 
 from pipeline.base.durable import write_document
 from pipeline.base.table import Table
+from pipeline.evaluate.figures import Figure
 from pipeline.evaluate.names import rounded
-from pipeline.evaluate.probe.ridge import ProbeScore
 from pipeline.evaluate.probe.study import ProbeResult, ProbeStudy, ranked, recommend
 
 TOP = 12
 """Slots that are printed; the tables have all."""
-_Figures = tuple[float, float] | tuple[None, None]
-"""A score and its standard error over the folds, or none."""
 
 
 def write_tables(folder: Path, study: ProbeStudy) -> list[Path]:
@@ -46,17 +43,17 @@ def metrics(study: ProbeStudy) -> dict[str, Any]:
         "recordings": study.folds.recordings,
         "folds": study.folds.count,
         "horizon": study.horizon,
-        "mean_action": _document(_figures(study.mean_action)),
-    }
-    if study.streams is not None:
-        document["state_sensor"] = _document(_figures(study.streams))
-    document["groups"] = {
-        result.name.label: {
-            "alone": _document(_figures(result.alone)),
-            "beside": _document(_figures(result.beside)),
-            "gain": _document(study.gain(result)),
-        }
-        for result in ranked(study.groups)
+        "repeats": len(study.folds.deals),
+        "mean_action": _document(study.mean_action.r2),
+        "known": {known.name: _document(known.score.r2) for known in study.known},
+        "groups": {
+            result.name.label: {
+                "alone": _document(result.alone.r2),
+                "beside": _document(result.beside.r2),
+                "gain": _document(study.gain(result)),
+            }
+            for result in ranked(study.groups)
+        },
     }
     advised = recommend(study)
     if advised is not None:
@@ -72,23 +69,24 @@ def metrics(study: ProbeStudy) -> dict[str, Any]:
 def table(study: ProbeStudy) -> str:
     """The groups and the best slots, ranked, below the baselines."""
     baselines = [("mean action", 0, study.mean_action)]
-    if study.streams is not None:
-        baselines.append(("state + sensor, without features", study.stream_inputs, study.streams))
+    baselines += [(known.name, known.inputs, known.score) for known in study.known]
     rows: list[list[Any]] = [
-        [name, inputs, None, *_figures(score), *[None] * 4] for name, inputs, score in baselines
+        [name, inputs, None, score.r2.text("+"), None, None] for name, inputs, score in baselines
     ]
     single = [result for result in ranked(study.slots) if result.name != result.name.group]
     for result in [*ranked(study.groups), *single[:TOP]]:
         several = f" ({len(result.slots)} slots)" if len(result.slots) > 1 else ""
         rows.append([result.name.label + several, result.inputs, f"{result.valid_share:.0%}"])
-        rows[-1] += [*_figures(result.alone), *_figures(result.beside), *study.gain(result)]
-    heads = ["what is read", "inputs", "valid", "R2 alone", "+-", "R2 beside", "+-", "gain", "+-"]
+        figures = (result.alone.r2, result.beside.r2, study.gain(result))
+        rows[-1] += [figure.text("+") for figure in figures]
+    heads = ["what is read", "inputs", "valid", "R2 alone", "R2 beside", "gain"]
     lines = [
         f"R2 of the action chunk of {study.horizon} ticks on recordings that were held out, mean "
         "over channels and steps (1: exact, 0: no better than their mean)",
         f"{len(study.folds.ticks)} ticks of {study.folds.recordings} recordings in "
-        f"{study.folds.count} folds; +-: standard error over folds",
-        "beside: together with state + sensor; gain: what that adds to them, fold by fold",
+        f"{study.folds.count} folds, dealt {len(study.folds.deals)} times",
+        "in brackets 95 % intervals: recordings drawn anew, in each deal of the folds",
+        f"beside: together with {study.baseline.name}; gain: what that adds to them",
         *Table(heads, rows).text(),
         *study.folds.notes,
         "inputs fewer than channels are their main directions over all folds",
@@ -104,21 +102,21 @@ def advice(study: ProbeStudy) -> str:
     advised = recommend(study)
     if advised is None:
         return (
-            "no recommendation: no choice gains over state + sensor, nor alone over the mean "
-            "action, by more than one standard error and in most folds. So this store does not "
-            "show that a linear reader gains from features; more recordings may."
+            f"no recommendation: no choice gains over {study.baseline.name}, nor alone over the "
+            "mean action, with an interval above 0. So this store does not show that a linear "
+            "reader gains from features; more recordings may."
         )
     lines = []
-    if study.streams is not None and advised.reading == "alone":
+    if advised.reading == "alone":
         lines.append(
-            "features alone predict better than the mean action, but none gains beside state + "
-            "sensor: what follows rests on R2 alone."
+            "features alone predict better than the mean action, but none gains beside "
+            f"{study.baseline.name}: what follows rests on R2 alone."
         )
     if advised.tied:
         lines.append(
-            f"the best ({advised.best.name.label}) is not ahead of these by more than one standard "
-            f"error and in most folds: {'; '.join(tied.name.label for tied in advised.tied)}. Of "
-            "all of them the one with the fewest slots is recommended."
+            f"the best ({advised.best.name.label}) is ahead of these by a difference that is not "
+            f"resolved: {'; '.join(tied.name.label for tied in advised.tied)}. Of all of them the "
+            "one with the fewest slots is recommended."
         )
     name = advised.chosen.name
     lines.append(
@@ -136,7 +134,7 @@ def advice(study: ProbeStudy) -> str:
 def _row(study: ProbeStudy, result: ProbeResult) -> dict[str, Any]:
     """A line of groups.csv."""
     name = result.name
-    row = {
+    row: dict[str, Any] = {
         "layer": name.layer,
         "norm": json.dumps(name.norm),
         "pooling": name.pooling,
@@ -149,11 +147,11 @@ def _row(study: ProbeStudy, result: ProbeResult) -> dict[str, Any]:
     }
     scores = {"alone": result.alone, "beside": result.beside}
     for reading, score in scores.items():
-        row[f"r2_{reading}"], row[f"r2_{reading}_error"] = _figures(score)
-    row["r2_state_sensor"], _ = _figures(study.streams)
-    row["gain"], row["gain_error"] = study.gain(result)
+        row |= _columns(f"r2_{reading}", score.r2)
+    row["r2_known"] = study.baseline.score.mean
+    row |= _columns("gain", study.gain(result))
     for reading, score in scores.items():
-        row[f"penalty_{reading}"] = None if score is None else float(np.median(score.penalties))
+        row[f"penalty_{reading}"] = float(np.median(score.penalties))
     return row
 
 
@@ -163,18 +161,18 @@ def _target_rows(study: ProbeStudy) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     for result in ranked(study.groups):
         named = {head: _row(study, result)[head] for head in ("layer", "norm", "pooling")}
-        scores = {"alone": result.alone, "beside": result.beside, "state_sensor": study.streams}
+        scores = {"alone": result.alone, "beside": result.beside, "known": study.baseline.score}
         for index, (step, channel) in enumerate(targets):
             row = {**named, "step": step, "channel": channel}
             for reading, score in scores.items():
-                row[f"r2_{reading}"] = None if score is None else score.by_target[index]
+                row[f"r2_{reading}"] = score.by_target[index]
             rows.append(row)
     return rows
 
 
-def _figures(score: ProbeScore | None) -> _Figures:
-    return (None, None) if score is None else (score.mean, score.error)
+def _columns(name: str, figure: Figure) -> dict[str, float | None]:
+    return {name: figure.value, f"{name}_low": figure.low, f"{name}_high": figure.high}
 
 
-def _document(figures: Sequence[float | None]) -> dict[str, float]:
-    return rounded(dict(zip(("r2", "error"), figures, strict=True)))
+def _document(figure: Figure) -> dict[str, float]:
+    return rounded({"r2": figure.value, "low": figure.low, "high": figure.high})

@@ -3,28 +3,80 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import cycle
 
-from pipeline.evaluate.experiments import Experiment, experiment_table
+import numpy as np
+from matplotlib.figure import Figure
+
+from pipeline.evaluate.baselines import BASELINES
+from pipeline.evaluate.experiments import SPANS, Experiment, best_experiment, experiment_table
+from pipeline.evaluate.figures import NO_INTERVAL
 from pipeline.evaluate.tables import FOOTNOTE
-from pipeline.look.evaluation import pictures as plots
 from pipeline.look.page.blocks import Picture, Report, Section
+from pipeline.look.page.style import INK, LABELS, STYLES, finish, panels
 from pipeline.look.page.writing import sentence
+
+_EXPERTS = ("#0072B2", "#D55E00", "#56B4E9", "#F0E442", "#999999")
+"""In the order in which they come."""
+_READING = (
+    "Mean errors with 95 % intervals over groups of recordings, differences on the same groups. "
+    "The best is chosen on these ticks"
+)
 
 
 def comparison_report(experiments: Sequence[Experiment]) -> Report:
     """The page of these experiments, of which the first are no better than the last."""
-    best = min(experiments, key=lambda experiment: experiment.error)
-    table = replace(
-        experiment_table(experiments),
-        caption=f"Mean errors; samples are chunks whose mean was judged. {sentence(FOOTNOTE)}",
-        strong=frozenset({experiments.index(best)}),
+    tables = [
+        replace(
+            experiment_table(experiments, span),
+            caption=f"{_READING}. {sentence(FOOTNOTE)}",
+            strong=frozenset({experiments.index(best_experiment(experiments, span))}),
+        )
+        for span in SPANS
+    ]
+    caption = (
+        "Test error of each experiment, coloured by expert, with 95 % intervals; a dot is a seed, "
+        "the baselines are lines."
     )
-    caption = "Held-out error of each experiment, coloured by expert; the baselines are lines."
-    draw = partial(plots.comparison_of_experiments, experiments)
-    picture = Picture("experiments", caption, draw)
+    picture = Picture("experiments", caption, partial(comparison_of_experiments, experiments))
+    tiles = []
+    for span, words in SPANS.items():
+        best = best_experiment(experiments, span)
+        tiles.append((f"lowest error of {words} [training std]", best.error(span).text()))
+        tiles.append(("by", best.name))
+    summary = f"{len(experiments)} experiments judged on the same test ticks."
+    if experiments[0].error("executed").low is None:
+        summary += f" {sentence(NO_INTERVAL)}"
     return Report(
         title="Experiments side by side",
-        summary=f"{len(experiments)} policies judged on the same held-out ticks.",
-        tiles=(("lowest held-out error [training std]", f"{best.error:.3f}"), ("by", best.name)),
-        sections=(Section("Errors", (table, picture)),),
+        summary=summary,
+        tiles=tuple(tiles),
+        sections=(Section("Errors", (*tables, picture)),),
     )
+
+
+def comparison_of_experiments(experiments: Sequence[Experiment]) -> Figure:
+    """Errors of what is executed and of the whole chunk, with intervals, seeds and baselines."""
+    figure, axes = panels(11.0, 0.36 * len(experiments) + 2.8, 1, len(SPANS), sharey=True)
+    experts = [experiment.model_type for experiment in experiments]
+    colours = dict(zip(dict.fromkeys(experts), cycle(_EXPERTS), strict=False))
+    for axis, (span, words) in zip(axes, SPANS.items(), strict=True):
+        for place, (expert, experiment) in enumerate(zip(experts, experiments, strict=True)):
+            label = expert.replace("_", " ") if experts.index(expert) == place else ""
+            error = experiment.error(span)
+            axis.barh(place, error.value, 0.72, color=colours[expert], label=label)
+            if error.low is not None and error.high is not None:
+                axis.plot([error.low, error.high], [place, place], color=INK, lw=1.6, marker="|")
+            if len(experiment.seeds) > 1:
+                seeds = experiment.by_seed(span)
+                axis.plot(seeds, np.full(len(seeds), place), ls="", marker=".", ms=4, color=INK)
+        for method in BASELINES:
+            style = {key: STYLES[method][key] for key in ("color", "ls")}
+            value = min(one.error(span, method).value for one in experiments)
+            axis.axvline(value, lw=2, label=LABELS[method], **style)
+        axis.set(title=words, xlabel="mean absolute error [training std]")
+        axis.grid(axis="y", visible=False)
+    axes[0].set_yticks(range(len(experiments)), [experiment.name for experiment in experiments])
+    axes[0].invert_yaxis()
+    finish(figure, axes[0], 3, "Error on test ticks, from one store (left is better)")
+    return figure

@@ -19,7 +19,7 @@ _MAPS = 6
 _MAPS_A_ROW = 3
 _LEAST = -0.2
 """Of the axis of scores: how much worse than the mean action makes no difference."""
-_ALONE, _BESIDE = "#56B4E9", "#0072B2"
+_ALONE, _GAIN = "#56B4E9", "#0072B2"
 
 
 def write_probe_plots(folder: Path, study: ProbeStudy) -> list[Path]:
@@ -29,10 +29,10 @@ def write_probe_plots(folder: Path, study: ProbeStudy) -> list[Path]:
 
 
 def heat_map(study: ProbeStudy) -> Figure:
-    """R^2 of every slot: layers against what is pooled over, and the best maps of a view's cells.
+    """What every slot gains: layers against what is pooled over, the best maps of a view's cells.
 
-    Beside state + sensor, where the store has them. All take their colours from one scale, which
-    spans what is shown; what is more than 1 below its best has the darkest.
+    Over what is known without features. All take their colours from one scale, which spans what
+    is shown; what is more than 1 below its best has the darkest.
     """
     plain = [result for result in study.slots if result.name.cell is None]
     poolings = list({result.name.pooling: None for result in study.groups})
@@ -42,11 +42,12 @@ def heat_map(study: ProbeStudy) -> Figure:
     for result in study.slots:
         if result.name.cell is not None:
             maps[f"{_row(result.name)}, {result.name.view}"].append(result)
-    best = {title: max(result.best.mean for result in cells) for title, cells in maps.items()}
+    gains = {result: study.gain(result).value for result in (*study.groups, *study.slots)}
+    best = {title: max(gains[result] for result in cells) for title, cells in maps.items()}
     shown = sorted(maps, key=best.__getitem__, reverse=True)[:_MAPS]
     seen = [*named, *(result for title in shown for result in maps[title])]
-    values = [result.best.mean for result in seen]
-    limits = _limits(values if study.streams is None else [*values, study.streams.mean])
+    values = [gains[result] for result in seen]
+    limits = _limits([*values, 0.0])
 
     columns, lines = max(1, min(_MAPS_A_ROW, len(shown))), -(-len(shown) // _MAPS_A_ROW)
     kinds = list(dict.fromkeys(_column(result.name) for result in named))
@@ -57,24 +58,20 @@ def heat_map(study: ProbeStudy) -> Figure:
     overview = figure.add_subplot(places[0, :])
     # A group of one slot is that slot.
     cells = [(rows.index(_row(r.name)), kinds.index(_column(r.name))) for r in named]
-    image = draw_map(overview, _grid(cells, named), limits)
+    image = draw_map(overview, _grid(cells, [gains[r] for r in named]), limits)
     overview.set_xticks(range(len(kinds)), kinds)
     overview.set_yticks(range(len(rows)), rows)
     for index, title in enumerate(shown):
         axis = figure.add_subplot(places[1 + index // _MAPS_A_ROW, index % _MAPS_A_ROW])
         cells = [result.name.cell or (0, 0) for result in maps[title]]
-        draw_map(axis, _grid(cells, maps[title]), limits)
+        draw_map(axis, _grid(cells, [gains[result] for result in maps[title]]), limits)
         axis.set(xticks=[], yticks=[])
         axis.set_title(title, fontsize=9)
 
     extend = "min" if min(values) < limits[0] else "neither"
-    bar = figure.colorbar(image, ax=figure.axes, label="held-out R², alone", extend=extend)
-    if study.streams is not None:
-        alone = study.streams.mean
-        overview.set_title(f"state + sensor alone: {alone:.2f}", fontsize=9)
-        words = f"held-out R², beside state + sensor\n(line: state + sensor alone, {alone:.2f})"
-        bar.set_label(words)
-        bar.ax.axhline(max(alone, limits[0]), color="#D55E00", lw=2.5)
+    label = f"gain in held-out R² over\n{_known(study)}"
+    bar = figure.colorbar(image, ax=figure.axes, label=label, extend=extend)
+    bar.ax.axhline(max(0.0, limits[0]), color="#D55E00", lw=2.5)
     words = "Where a linear reader finds the action"
     if len(shown) < len(maps):
         words += f" (the {len(shown)} best of {len(maps)} maps of a view; all are in slots.csv)"
@@ -83,44 +80,48 @@ def heat_map(study: ProbeStudy) -> Figure:
 
 
 def bars(study: ProbeStudy) -> Figure:
-    """The choices of layer, norm and pooling, ranked, alone and beside state + sensor.
+    """The choices of layer, norm and pooling, ranked: R^2 alone, and the gain over what is known.
 
     A bar that would end left of the axis ends at an arrow and its number.
     """
     shown = ranked(study.groups)[:_BARS][::-1]
     figure, axis = panels(8.5, 2.4 + 0.55 * len(shown))
-    kinds = [("alone", _ALONE, [result.alone for result in shown])]
-    if study.streams is not None:
-        kinds.append(("beside state + sensor", _BESIDE, [result.best for result in shown]))
+    kinds = [
+        ("alone", _ALONE, [result.alone.r2 for result in shown]),
+        (f"gain over {_known(study)}", _GAIN, [study.gain(result) for result in shown]),
+    ]
     height = 0.76 / len(kinds)
     for number, (label, colour, scores) in enumerate(kinds):
         where = np.arange(len(shown)) + height * ((len(kinds) - 1) / 2 - number)
-        means, errors = [score.mean for score in scores], [score.error for score in scores]
+        means = np.array([score.value for score in scores])
+        low, high = np.array([(score.low, score.high) for score in scores], float).T
+        errors = np.maximum([means - low, high - means], 0)
         style = {"ecolor": INK, "capsize": 3, "lw": 1}
         axis.barh(where, means, height, xerr=errors, color=colour, label=label, error_kw=style)
         style = {"va": "center", "color": "white", "size": 8}
         for place, mean in zip(where, means, strict=True):
             if mean < _LEAST:
                 axis.text(_LEAST + 0.005, place, f"◀ {mean:.2f}", **style)
-    if study.streams is not None:
-        mean, label = study.streams.mean, "state + sensor alone"
-        label += f" ({mean:.2f}, left of the axis)" if mean < _LEAST else ""
-        axis.axvline(max(mean, _LEAST), color=INK, ls="--", lw=1.8, label=label)
     axis.axvline(0, color=INK, lw=1)
     low, high = axis.get_xlim()
     axis.set_xlim(max(low, _LEAST), min(max(high, 0.1), 1.0))
     axis.set_yticks(range(len(shown)), [_bar_name(result) for result in shown])
     axis.grid(axis="y", visible=False)
-    axis.set_xlabel("held-out R², mean over channels and steps (lines: standard error over folds)")
+    axis.set_xlabel("held-out R², mean over channels and steps (lines: 95 % intervals)")
     finish(figure, axis, 3, _title(study, "What each choice of features says of the action"))
     return figure
 
 
-def _grid(places: Sequence[tuple[int, int]], results: Sequence[ProbeResult]) -> NDArray[np.float64]:
-    """Scores at their (row, column); NaN where there is none."""
+def _known(study: ProbeStudy) -> str:
+    """What is known without features, and its score."""
+    return f"{study.baseline.name} ({study.baseline.score.mean:.2f})"
+
+
+def _grid(places: Sequence[tuple[int, int]], values: Sequence[float]) -> NDArray[np.float64]:
+    """Values at their (row, column); NaN where there is none."""
     grid = np.full(np.max(places, axis=0) + 1, np.nan)
-    for place, result in zip(places, results, strict=True):
-        grid[place] = result.best.mean
+    for place, value in zip(places, values, strict=True):
+        grid[place] = value
     return grid
 
 
@@ -147,5 +148,6 @@ def _bar_name(result: ProbeResult) -> str:
 def _title(study: ProbeStudy, words: str) -> str:
     return (
         f"{words}\nchunks of {study.horizon} ticks at {len(study.folds.ticks)} ticks of "
-        f"{study.folds.recordings} recordings, {study.folds.count} folds"
+        f"{study.folds.recordings} recordings, {study.folds.count} folds dealt "
+        f"{len(study.folds.deals)} times"
     )

@@ -3,7 +3,6 @@
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
-from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -13,9 +12,8 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from pipeline.evaluate.ablation import Ablated, AblationStudy
-from pipeline.evaluate.baselines import BASELINES, METHODS
+from pipeline.evaluate.baselines import METHODS
 from pipeline.evaluate.curves import TrainingCurves
-from pipeline.evaluate.experiments import Experiment
 from pipeline.evaluate.figures import best_baseline, error
 from pipeline.evaluate.names import with_unit
 from pipeline.evaluate.tables import ABLATION_FOOTNOTE, HEADINGS
@@ -59,8 +57,6 @@ _ABLATIONS = {
     "shuffled": "#D55E00",
     "delayed": "#999999",
 }
-_EXPERTS = ("#0072B2", "#D55E00", "#56B4E9", "#F0E442", "#999999")
-"""In the order in which they come."""
 
 
 def methods(comparison: Comparison) -> Figure:
@@ -341,28 +337,6 @@ def _whiskers(study: AblationStudy, ways: Sequence[Ablated]) -> dict[str, Any]:
     ]
     style = {"ecolor": INK, "error_kw": {"elinewidth": 1.4}}
     return {"yerr": np.transpose(ends), **style} if len(ends) == len(ways) else {}
-
-
-def comparison_of_experiments(experiments: Sequence[Experiment]) -> Figure:
-    """Held-out error of each experiment, coloured by expert, and the baselines as lines."""
-    figure, axis = panels(9.0, 0.36 * len(experiments) + 2.6)
-    experts = [experiment.model_type for experiment in experiments]
-    colours = dict(zip(dict.fromkeys(experts), cycle(_EXPERTS), strict=False))
-    for place, (expert, experiment) in enumerate(zip(experts, experiments, strict=True)):
-        label = expert.replace("_", " ") if experts.index(expert) == place else ""
-        axis.barh(place, experiment.error, 0.72, color=colours[expert], label=label)
-        # Beside the panel: at its bar's end a number would lie on the baselines that are near.
-        number = f"{experiment.error:.3f}"
-        axis.text(1.01, place, number, transform=axis.get_yaxis_transform(), va="center")
-    for method in BASELINES:
-        style = {key: STYLES[method][key] for key in ("color", "ls")}
-        axis.axvline(experiments[0].overall[method], lw=2, label=LABELS[method], **style)
-    axis.set_yticks(range(len(experiments)), [experiment.name for experiment in experiments])
-    axis.invert_yaxis()
-    axis.grid(axis="y", visible=False)
-    axis.set_xlabel("mean absolute error on held-out ticks [training std] (left is better)")
-    finish(figure, axis, 3, "Held-out error by expert and fusion, trained from one store")
-    return figure
 
 
 def _marked(method: str, **changed: Any) -> dict[str, Any]:

@@ -160,11 +160,14 @@ def draw_map(
     low, high = limits
     axis.grid(visible=False)
     image = axis.imshow(grid, colours, vmin=low, vmax=high, aspect="auto", interpolation="nearest")
+    decimals = 2 if high - low >= 0.1 else 3
     for (row, column), value in np.ndenumerate(grid) if numbered else ():
         if np.isfinite(value):
             light = np.dot(image.to_rgba(value)[:3], (0.3, 0.6, 0.1)) > 0.5
             ink = "#111111" if light else "#ffffff"
-            axis.text(column, row, f"{value:.2f}", ha="center", va="center", color=ink, size=8)
+            axis.text(
+                column, row, f"{value:z.{decimals}f}", ha="center", va="center", color=ink, size=8
+            )
     return image
 
 

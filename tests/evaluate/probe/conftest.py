@@ -9,7 +9,9 @@ import pytest
 import zarr
 from sklearn.linear_model import Ridge
 
+from pipeline.evaluate.probe.folds import ProbeFolds
 from pipeline.evaluate.probe.inputs import LIMIT, STILL
+from pipeline.evaluate.probe.ridge import ProbeScore
 from pipeline.store import FeatureStore
 
 
@@ -39,13 +41,16 @@ def renamed() -> Callable[..., FeatureStore]:
 
 @pytest.fixture
 def limited() -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """`limited(x, fold)`: inputs as they are read, each column by the formula itself."""
+    """`limited(x, fold)`: inputs as they are read, each column by the formula itself.
+
+    `fold` is (repeat, row).
+    """
 
     def limit(x: np.ndarray, fold: np.ndarray) -> np.ndarray:
         inputs = np.zeros(x.shape)
         for column in range(x.shape[1]):
             values = x[:, column]
-            trained = [values[fold != held] for held in np.unique(fold)]
+            trained = [values[deal != held] for deal in fold for held in np.unique(deal)]
             if min(rows.std() for rows in trained) <= STILL * values.std():
                 continue
             lower = max(rows.mean() - LIMIT * rows.std() for rows in trained)
@@ -60,7 +65,7 @@ def limited() -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
 
 @pytest.fixture
 def nested() -> Callable[..., tuple[np.ndarray, np.ndarray]]:
-    """`nested(x, y, fold, penalties)`: (fold, target) R^2 and the chosen penalties.
+    """`nested(x, y, fold, penalties)`: (fold, target) R^2 and the chosen penalties of one deal.
 
     By scikit-learn's Ridge on the rows themselves. `known` is the number of last columns that have
     the penalties `of_known` (fold,) instead: Ridge has one for all, so the columns are scaled.
@@ -95,3 +100,14 @@ def nested() -> Callable[..., tuple[np.ndarray, np.ndarray]]:
         return r2[chosen, held_out], np.array(penalties)[chosen]
 
     return score
+
+
+@pytest.fixture
+def r2_by_fold() -> Callable[..., np.ndarray]:
+    """`r2_by_fold(score, folds, repeat=0)`: (fold, target) R^2 of one deal."""
+
+    def by_fold(score: ProbeScore, folds: ProbeFolds, repeat: int = 0) -> np.ndarray:
+        held = folds.deals[repeat] == np.arange(folds.count)[:, None]
+        return 1 - held @ score.losses[repeat] / (held @ score.rows)[:, None]
+
+    return by_fold

@@ -15,7 +15,7 @@ def test_each_recording_is_in_one_fold_with_its_other_formats(store: FeatureStor
     store.array("vl/key")[40] = store.array("vl/key")[10]  # episode 4 is episode 1
     folds = fold_by_recording(store, 5, 8)
     episode = folds.ticks // 30
-    of = {int(one): set(folds.fold[episode == one].tolist()) for one in np.unique(episode)}
+    of = {int(one): set(folds.fold[0, episode == one].tolist()) for one in np.unique(episode)}
     assert all(len(several) == 1 for several in of.values())
     assert of[1] == of[4]
     assert folds.count == len(set.union(*of.values())) == 5
@@ -45,7 +45,7 @@ def test_two_recordings_are_two_folds(tiny_store: Callable[..., Path], tmp_path:
     store = FeatureStore.open(tiny_store(tmp_path, episodes=2))
     folds = fold_by_recording(store, 5, 8)
     assert "2 recordings make 2 folds, not 5" in folds.notes
-    assert len(set(zip(folds.fold.tolist(), (folds.ticks // 30).tolist(), strict=True))) == 2
+    assert len(set(zip(folds.fold[0].tolist(), (folds.ticks // 30).tolist(), strict=True))) == 2
 
 
 def test_one_recording_is_refused(tiny_store: Callable[..., Path], tmp_path: Path) -> None:
@@ -69,3 +69,31 @@ def test_a_limit_takes_ticks_evenly(store: FeatureStore) -> None:
 def test_too_few_ticks_for_every_fold_are_refused(store: FeatureStore) -> None:
     with pytest.raises(StoreMismatch, match=r"one of 5 folds.*larger probe.max_ticks"):
         fold_by_recording(store, 5, 8, max_ticks=4)
+
+
+def test_deals_differ_and_each_holds_every_recording_out_once(
+    tiny_store: Callable[..., Path], tmp_path: Path
+) -> None:
+    store = FeatureStore.open(tiny_store(tmp_path, episodes=12))
+    folds = fold_by_recording(store, 3, 8, repeats=4)
+    assert folds.deals.shape == (4, 12)
+    assert len(np.unique(folds.deals, axis=0)) == 4
+    assert len(set(zip(folds.group.tolist(), (folds.ticks // 30).tolist(), strict=True))) == 12
+    for deal in folds.deals:
+        assert np.bincount(deal).tolist() == [4, 4, 4]
+    again = fold_by_recording(store, 3, 8, repeats=4)
+    np.testing.assert_array_equal(again.deals, folds.deals)
+
+
+def test_many_recordings_are_dealt_in_parts(
+    tiny_store: Callable[..., Path], tmp_path: Path
+) -> None:
+    """So that time and memory do not grow with them."""
+    store = FeatureStore.open(tiny_store(tmp_path, episodes=40))
+    folds = fold_by_recording(store, 2, 8, repeats=9)
+    assert np.unique(folds.deals, axis=1).shape[1] <= 8
+    assert (np.abs(folds.fold.mean(axis=1) - 0.5) < 0.05).all()
+
+
+def test_recordings_that_are_folds_themselves_are_dealt_once(store: FeatureStore) -> None:
+    assert len(fold_by_recording(store, 6, 8, repeats=5).deals) == 1

@@ -1,72 +1,119 @@
 """Scores are those of scikit-learn's ridge regression on the rows."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from pipeline.base.errors import NumericsError
-from pipeline.evaluate.probe.ridge import cross_validate
+from pipeline.evaluate.figures import Figure
+from pipeline.evaluate.probe.folds import ProbeFolds
+from pipeline.evaluate.probe.ridge import cross_validate, estimate
 
 PENALTIES = (1e-3, 1e-1, 1.0, 30.0)
-Rows = tuple[np.ndarray, np.ndarray, np.ndarray]
+Rows = tuple[np.ndarray, np.ndarray, ProbeFolds]
 Nested = Callable[..., tuple[np.ndarray, np.ndarray]]
+ByFold = Callable[..., np.ndarray]
 
 
 @pytest.fixture
 def rows() -> Rows:
-    """Inputs (one of which never varies), targets (one of which never varies), and folds."""
+    """Inputs (one of which never varies), targets (one of which never varies), two deals."""
     rng = np.random.default_rng(0)
     x = rng.normal(0.3, 1, (200, 7))
     x[:, 5] = x[:, 0] + 1e-3 * rng.normal(size=200)
     x[:, 6] = 0.0
     y = x[:, :3] @ rng.normal(size=(3, 4)) + rng.normal(size=(200, 4)) * [0.1, 1, 3, 0.5]
     y[:, 3] = 0.0
-    return x, y, np.sort(rng.integers(0, 4, 200))
+    group = rng.integers(0, 12, 200)
+    deals = np.array([np.arange(12) % 4, np.arange(12) // 3])
+    return x, y, ProbeFolds(np.arange(200), group, deals, ())
 
 
-def test_scores_and_penalties_are_those_of_rows(rows: Rows, nested: Nested) -> None:
-    x, y, fold = rows
-    score = cross_validate(x, y, fold, PENALTIES)
-    r2, chosen = nested(x, y, fold, PENALTIES)
-    np.testing.assert_allclose(score.r2[:, :3], r2[:, :3], atol=1e-8)
-    assert np.isnan(score.r2[:, 3]).all()
-    np.testing.assert_array_equal(score.penalties, chosen)
-    assert score.rows.tolist() == np.bincount(fold).tolist()
-    pooled = (r2[:, :3] * np.bincount(fold)[:, None]).sum(0) / len(fold)
-    assert score.mean == pytest.approx(pooled.mean(), abs=1e-8)
-    by_fold = r2[:, :3].mean(1)
-    assert score.error == pytest.approx(by_fold.std(ddof=1) / 2, abs=1e-8)
+def test_scores_and_penalties_are_those_of_rows(
+    rows: Rows, nested: Nested, r2_by_fold: ByFold
+) -> None:
+    x, y, folds = rows
+    score = cross_validate(x, y, folds, PENALTIES)
+    means = []
+    for repeat, fold in enumerate(folds.fold):
+        r2, chosen = nested(x, y, fold, PENALTIES)
+        found = r2_by_fold(score, folds, repeat)
+        np.testing.assert_allclose(found[:, :3], r2[:, :3], atol=1e-8)
+        assert np.isnan(found[:, 3]).all()
+        np.testing.assert_array_equal(score.penalties[repeat], chosen)
+        means.append((r2[:, :3] * np.bincount(fold)[:, None]).sum(0) / len(fold))
+    assert score.rows.tolist() == np.bincount(folds.group).tolist()
+    np.testing.assert_allclose(score.by_target[:3], np.mean(means, axis=0), atol=1e-8)
+    assert score.mean == pytest.approx(np.mean(means), abs=1e-8)
 
 
-def test_what_is_known_keeps_its_own_penalties(rows: Rows, nested: Nested) -> None:
-    x, y, fold = rows
-    of_known = (1e-2, 1.0, 1.0, 30.0)
-    score = cross_validate(x[:, [1, 2]], y, fold, PENALTIES, x[:, [0, 3]], of_known)
-    r2, chosen = nested(x[:, [1, 2, 0, 3]], y, fold, PENALTIES, 2, of_known)
-    np.testing.assert_allclose(score.r2[:, :3], r2[:, :3], atol=1e-8)
-    np.testing.assert_array_equal(score.penalties, chosen)
+def test_each_known_block_keeps_its_own_penalties(
+    rows: Rows, nested: Nested, r2_by_fold: ByFold
+) -> None:
+    x, y, folds = rows
+    of_known = np.array([[1e-2, 1.0, 1.0, 30.0], [3.0, 1e-3, 0.1, 1.0]])
+    known = [(x[:, [0]], of_known), (x[:, [3, 4]], 2 * of_known)]
+    score = cross_validate(x[:, [1, 2]], y, folds, PENALTIES, known)
+    # One penalty for all that is known is the same, with the second block in other units.
+    x = np.hstack([x[:, [1, 2, 0]], x[:, [3, 4]] / np.sqrt(2)])
+    for repeat, fold in enumerate(folds.fold):
+        r2, chosen = nested(x, y, fold, PENALTIES, 3, of_known[repeat])
+        found = r2_by_fold(score, folds, repeat)
+        np.testing.assert_allclose(found[:, :3], r2[:, :3], atol=1e-8)
+        np.testing.assert_array_equal(score.penalties[repeat], chosen)
 
 
-def test_no_inputs_are_the_mean_of_the_others(rows: Rows) -> None:
-    _, y, fold = rows
-    score = cross_validate(np.empty((200, 0)), y, fold, PENALTIES)
+def test_no_inputs_are_the_mean_of_the_others(rows: Rows, r2_by_fold: ByFold) -> None:
+    _, y, folds = rows
+    score = cross_validate(np.empty((200, 0)), y, folds, PENALTIES)
     for held in range(4):
-        mean = y[fold != held].mean(0)
-        expected = 1 - ((y[fold == held] - mean) ** 2).mean(0)[:3] / y.var(0)[:3]
-        np.testing.assert_allclose(score.r2[held, :3], expected, atol=1e-10)
+        here = folds.fold[0] == held
+        mean = y[~here].mean(0)
+        expected = 1 - ((y[here] - mean) ** 2).mean(0)[:3] / y.var(0)[:3]
+        np.testing.assert_allclose(r2_by_fold(score, folds)[held, :3], expected, atol=1e-10)
     assert score.mean < 0
 
 
-def test_each_of_two_folds_chooses_the_penalty_of_the_other(rows: Rows, nested: Nested) -> None:
-    x, y, fold = rows
-    score = cross_validate(x, y, fold // 2, PENALTIES)
-    r2, chosen = nested(x, y, fold // 2, PENALTIES)
-    np.testing.assert_allclose(score.r2[:, :3], r2[:, :3], atol=1e-8)
-    np.testing.assert_array_equal(score.penalties, chosen)
+def test_each_of_two_folds_chooses_the_penalty_of_the_other(
+    rows: Rows, nested: Nested, r2_by_fold: ByFold
+) -> None:
+    x, y, folds = rows
+    folds = replace(folds, deals=folds.deals[1:] // 2)
+    score = cross_validate(x, y, folds, PENALTIES)
+    r2, chosen = nested(x, y, folds.fold[0], PENALTIES)
+    np.testing.assert_allclose(r2_by_fold(score, folds)[:, :3], r2[:, :3], atol=1e-8)
+    np.testing.assert_array_equal(score.penalties[0], chosen)
 
 
 def test_a_penalty_below_rounding_is_refused(rows: Rows) -> None:
-    x, y, fold = rows
-    with pytest.raises(NumericsError, match="1e-300 is too small"):
-        cross_validate(np.hstack([x, x]), y, fold, (1e-300,))
+    x, y, folds = rows
+    with pytest.raises(NumericsError, match="one is too small for 14 inputs"):
+        cross_validate(np.hstack([x, x]), y, folds, (1e-300,))
+
+
+def test_an_interval_covers_recordings_and_deals() -> None:
+    """What differs by recording widens it, and so does what differs by deal."""
+    rng = np.random.default_rng(0)
+    rows = np.full(40, 25.0)
+    by_recording = 25 * rng.normal(0.5, 0.2, (1, 40))
+    value, low, high = vars(estimate(by_recording, rows)).values()
+    error = by_recording.std() / 25 / np.sqrt(40)
+    assert value == pytest.approx(by_recording.mean() / 25)
+    assert (high - low) / 2 == pytest.approx(1.96 * error, rel=0.1)
+    deals = by_recording + 25 * np.array([[-0.3], [0.0], [0.3]])
+    again = estimate(deals, rows)
+    assert again.value == pytest.approx(value)
+    assert again.low == pytest.approx(value - 0.3 - 1.5 * error, abs=0.02)
+    assert again.high == pytest.approx(value + 0.3 + 1.5 * error, abs=0.02)
+
+
+def test_a_gain_is_paired_by_recording(rows: Rows) -> None:
+    x, y, folds = rows
+    known = cross_validate(x[:, [0]], y, folds, PENALTIES)
+    both = cross_validate(x[:, [0, 1]], y, folds, PENALTIES)
+    gain = both.gain(known)
+    assert gain.value == pytest.approx(both.mean - known.mean)
+    assert 0 < gain.low < gain.value < gain.high
+    assert known.gain(known) == Figure(0, 0, 0)

@@ -11,15 +11,13 @@ import pytest
 from pipeline.base.config import EvaluateParams, TrainHeadParams
 from pipeline.base.table import Table
 from pipeline.evaluate.ablation import evaluate_ablation
-from pipeline.evaluate.baselines import BASELINES, Baselines
+from pipeline.evaluate.baselines import Baselines
 from pipeline.evaluate.curves import TrainingCurve, TrainingCurves
 from pipeline.evaluate.episode_frames import EpisodeFrames
 from pipeline.evaluate.evaluation import Evaluation, judged_document
-from pipeline.evaluate.experiments import Experiment
 from pipeline.evaluate.figures import best_baseline, error, rivalry
 from pipeline.evaluate.tables import error_table
 from pipeline.look.evaluation import page as evaluation_page
-from pipeline.look.evaluation.comparison import comparison_report
 from pipeline.look.evaluation.page import evaluation_report
 from pipeline.look.page.blocks import Document, Picture, Report, Section
 from pipeline.look.page.writing import PAGE, write_report
@@ -215,27 +213,3 @@ def test_what_is_missing_is_said(judgement: Evaluation) -> None:
     assert training.words == "No training curves: gone."
     (streams,) = section(report, "Which streams are used").blocks
     assert streams.words.startswith("Not judged: `evaluate.modalities` is off")
-
-
-def test_experiments_are_one_page(tmp_path: Path, assert_page_is_sound: Sound) -> None:
-    rules = dict(zip(BASELINES, (0.5, 0.4, 0.45, 0.42, 0.6), strict=True))
-    experiments = [
-        Experiment(
-            f"{expert}-concat", expert, "concat", 10, 1000, 1,
-            {
-                ("overall", "training std"): {"policy": error, **rules},
-                ("translation", "mm"): {"policy": 0.1, **rules},
-            }, 7.0,
-        )
-        for expert, error in (("regression", 0.3), ("diffusion", 0.2))
-    ]  # fmt: skip
-    report = comparison_report(experiments)
-    (table,) = report.blocks(Table)
-    assert list(table.columns[-4:]) == ["expert", "fusion", "samples", "parameters"]
-    assert [row[-4] for row in table.rows[:2]] == ["regression", "diffusion"]
-    assert table.strong == {1}
-    assert table.columns[:3] == ["experiment", "overall [training std]", "translation [mm]"]
-    assert [row[1] for row in table.rows] == [0.3, 0.2, *rules.values()]
-    assert dict(report.tiles)["by"] == "diffusion-concat"
-    write_report(tmp_path, report)
-    assert_page_is_sound(tmp_path / PAGE)

@@ -14,11 +14,10 @@ from matplotlib.figure import Figure
 from pipeline.evaluate.ablation import Ablated, AblationStudy
 from pipeline.evaluate.baselines import BASELINES
 from pipeline.evaluate.curves import TrainingCurve, TrainingCurves
-from pipeline.evaluate.experiments import Experiment
 from pipeline.evaluate.probe.folds import ProbeFolds
 from pipeline.evaluate.probe.inputs import SlotName
 from pipeline.evaluate.probe.ridge import ProbeScore
-from pipeline.evaluate.probe.study import ProbeResult, ProbeStudy
+from pipeline.evaluate.probe.study import Known, ProbeResult, ProbeStudy
 from pipeline.look.evaluation import draw_probe as probe
 from pipeline.look.evaluation import pictures as plots
 from pipeline.look.page.style import write
@@ -341,59 +340,20 @@ def test_a_policy_without_error_is_drawn_too() -> None:
     assert heights(plots.modalities(studied(0.0, 1.0, 0.0, 2.0))) == [[1.0, 0.0], [2.0]]
 
 
-def compared(errors: dict[str, float], rules: dict[str, float]) -> list[Experiment]:
-    """Two experiments an expert."""
-    return [
-        Experiment(
-            f"{expert}-{fusion}", expert, fusion, 10, 100, 1,
-            {("overall", "training std"): {"policy": error, **rules}}, None,
-        )
-        for expert, error in errors.items()
-        for fusion in ("concat", "gated")
-    ]  # fmt: skip
-
-
-def test_experiments_are_bars_and_baselines_lines(tmp_path: Path) -> None:
-    rules = dict(zip(BASELINES, (3.0, 2.0, 1.0, 0.9, 1.1), strict=True))
-    experiments = compared({"regression": 0.3, "diffusion": 0.4}, rules)
-    figure = plots.comparison_of_experiments(experiments)
-    (axis,) = figure.axes
-    assert [patch.get_width() for patch in axis.patches] == [0.3, 0.3, 0.4, 0.4]
-    assert [line.get_xdata()[0] for line in axis.lines] == list(rules.values())
-    assert [label.get_text() for label in axis.get_yticklabels()] == [e.name for e in experiments]
-    assert [text.get_text() for text in axis.texts] == ["0.300", "0.300", "0.400", "0.400"]
-    (file,) = write(tmp_path, {"experiments.png": lambda: figure})
-    assert file.read_bytes().startswith(b"\x89PNG")
-
-
-def test_numbers_of_experiments_lie_on_nothing() -> None:
-    """Errors just short of a baseline, where a number at the bar's end would lie on its line."""
-    rules = dict(zip(BASELINES, (0.52, 0.46, 0.45, 0.47, 0.6), strict=True))
-    figure = plots.comparison_of_experiments(
-        compared({"regression": 0.44, "diffusion": 0.5}, rules)
-    )
-    figure.draw_without_rendering()
-    (axis,) = figure.axes
-    for text in axis.texts:
-        assert text.get_window_extent().x0 > axis.get_window_extent().x1
-        assert text.get_window_extent().x1 < figure.bbox.x1
-
-
 def score(mean: float, spread: float = 0.02) -> ProbeScore:
-    """Over three folds and two targets, of which one does not vary."""
-    by_fold = mean + spread * np.array([-1.0, 0.0, 1.0])
-    r2 = np.stack([by_fold, np.full(3, np.nan)], axis=1)
-    return ProbeScore(r2, np.full(3, 10.0), (1.0,) * 3)
+    """Of three recordings and two targets, of which one does not vary."""
+    r2 = mean + spread * np.array([-1.0, 0.0, 1.0])
+    losses = np.stack([10 * (1 - r2), np.full(3, np.nan)], axis=1)
+    return ProbeScore(losses[None], np.full(3, 10.0), np.ones((1, 3)))
 
 
-def found(name: SlotName, mean: float, slots: int = 1, streams: bool = True) -> ProbeResult:
+def found(name: SlotName, mean: float, slots: int = 1) -> ProbeResult:
     """Alone half as good as beside."""
-    beside = score(mean) if streams else None
     size = 8 * slots
-    return ProbeResult(name, tuple(range(slots)), size, size, 1.0, score(mean / 2), beside)
+    return ProbeResult(name, tuple(range(slots)), size, size, 1.0, score(mean / 2), score(mean))
 
 
-def probed(streams: bool = True, layers: int = 2) -> ProbeStudy:
+def probed(layers: int = 2) -> ProbeStudy:
     """Each layer has a mean, a mean a view and a grid of 2 x 2 cells a view."""
     slots, groups = [], []
     for layer in range(layers):
@@ -405,15 +365,14 @@ def probed(streams: bool = True, layers: int = 2) -> ProbeStudy:
                 place = (cell or (0, 0))[0] * 0.1 + (cell or (0, 0))[1] * 0.01
                 mean = 0.3 + 0.1 * layer + place
                 name = SlotName(layer, norm, pooling, view, cell)
-                slots.append(found(name, mean, streams=streams))
+                slots.append(found(name, mean))
             groups += [
-                found(SlotName(layer, norm, pooling), 0.5, count, streams)
+                found(SlotName(layer, norm, pooling), 0.5, count)
                 for pooling, count in (("mean", 1), ("view_mean", 2), ("grid", 8))
             ]
-    fold = np.arange(30) // 10
-    folds = ProbeFolds(np.arange(30), fold, 3, ())
-    known = score(0.2) if streams else None
-    return ProbeStudy(2, ("dx",), folds, score(-0.01), known, 5, tuple(slots), tuple(groups))
+    folds = ProbeFolds(np.arange(30), np.arange(30) // 10, np.arange(3)[None], ())
+    known = (Known("past actions", 10, score(0.1)), Known("past actions + state", 15, score(0.2)))
+    return ProbeStudy(2, ("dx",), folds, score(-0.01), known, tuple(slots), tuple(groups))
 
 
 def test_slots_are_a_map_over_layers_and_cells_a_map_a_view(tmp_path: Path) -> None:
@@ -427,8 +386,7 @@ def test_slots_are_a_map_over_layers_and_cells_a_map_a_view(tmp_path: Path) -> N
     ]
     columns = [label.get_text() for label in overview.get_xticklabels()]
     assert columns == ["mean", "view_mean", "view_mean\nA", "view_mean\nB", "grid"]
-    assert "beside state + sensor" in bar.get_ylabel()
-    assert "state + sensor alone, 0.20" in bar.get_ylabel()
+    assert "past actions + state (0.20)" in bar.get_ylabel()
     # Layer 1 is better than layer 0, of which two maps are left out.
     assert [axis.get_title() for axis in maps[:4]] == [
         "layer 1, A",
@@ -439,40 +397,33 @@ def test_slots_are_a_map_over_layers_and_cells_a_map_a_view(tmp_path: Path) -> N
     assert len(maps) == 6
     assert "the 6 best of 8 maps" in figure.get_suptitle()
     cells = maps[0].images[0].get_array()
-    np.testing.assert_allclose(cells, [[0.4, 0.41], [0.5, 0.51]])
-    assert {axis.images[0].get_clim() for axis in (overview, *maps)} == {(0.2, 0.51)}
-    assert bar.lines[-1].get_ydata()[0] == pytest.approx(0.2)
+    np.testing.assert_allclose(cells, [[0.2, 0.21], [0.3, 0.31]])
+    assert overview.images[0].get_clim() == pytest.approx((0.0, 0.31))
+    assert len({axis.images[0].get_clim() for axis in (overview, *maps)}) == 1
+    assert bar.lines[-1].get_ydata()[0] == 0
     files = probe.write_probe_plots(tmp_path, probed())
     assert [file.name for file in files] == ["probe.png", "probe_bars.png"]
     assert all(file.read_bytes().startswith(b"\x89PNG") for file in files)
 
 
-def test_choices_are_bars_in_order_with_the_spread_over_folds() -> None:
+def test_choices_are_bars_in_order_with_their_intervals() -> None:
     (axis,) = probe.bars(probed()).axes
     assert len(axis.patches) == 2 * 12
-    assert sorted({round(patch.get_width(), 9) for patch in axis.patches}) == [0.25, 0.5]
+    assert sorted({round(patch.get_width(), 9) for patch in axis.patches}) == [0.25, 0.3]
     labels = [text.get_text() for text in axis.get_yticklabels()]
     assert "layer 1\ngrid (8 slots)" in labels
-    lines = [
-        line.get_xdata()[0] for line in axis.lines if line.get_label() == "state + sensor alone"
-    ]
-    assert lines == pytest.approx([0.2])
+    (legend,) = axis.figure.legends
+    assert "gain over past actions + state (0.20)" in [text.get_text() for text in legend.texts]
 
 
 def test_what_is_far_below_the_mean_action_is_a_number_at_the_edge() -> None:
     study = probed()
     groups = [replace(study.groups[0], beside=score(-34.1, 20.0)), *study.groups[1:]]
-    study = replace(study, groups=tuple(groups), streams=score(-1109.4))
+    study = replace(study, groups=tuple(groups))
     (axis,) = probe.bars(study).axes
     assert axis.get_xlim()[0] == -0.2
     assert axis.get_xlim()[1] <= 1
-    assert [text.get_text() for text in axis.texts] == ["◀ -34.10"]
-    labels = [str(line.get_label()) for line in axis.lines]
-    assert "state + sensor alone (-1109.40, left of the axis)" in labels
-    overview, *maps, bar = probe.heat_map(study).axes
-    assert {axis.images[0].get_clim() for axis in (overview, *maps)} == {(-0.49, 0.51)}
-    assert bar.lines[-1].get_ydata()[0] == pytest.approx(-0.49)
-
-
-def test_without_streams_all_stands_alone(tmp_path: Path) -> None:
-    assert len(probe.write_probe_plots(tmp_path, probed(streams=False, layers=1))) == 2
+    assert [text.get_text() for text in axis.texts] == ["◀ -34.30"]
+    overview, *maps, _ = probe.heat_map(study).axes
+    assert overview.images[0].get_clim() == pytest.approx((-0.69, 0.31))
+    assert len({axis.images[0].get_clim() for axis in (overview, *maps)}) == 1

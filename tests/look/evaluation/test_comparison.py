@@ -1,0 +1,90 @@
+"""Experiments side by side are one page: a table for each span of the chunk, and one picture."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.base.table import Table
+from pipeline.evaluate.baselines import BASELINES
+from pipeline.evaluate.experiments import SPANS, Experiment
+from pipeline.look.evaluation.comparison import comparison_of_experiments, comparison_report
+from pipeline.look.page.writing import PAGE, write_report
+
+
+@pytest.fixture
+def experiments() -> list[Experiment]:
+    """Of two experts, the second with two seeds; diffusion errs less in the whole chunk alone."""
+    groups = np.linspace(-0.1, 0.1, 6)
+
+    def experiment(expert: str, executed: list[float], overall: list[float]) -> Experiment:
+        policy = {"executed": executed, "overall": overall}
+        errors = {("policy", span): np.add.outer(policy[span], groups) for span in SPANS}
+        rules = {
+            (way, span): np.full((len(executed), 6), 0.7) for way in BASELINES for span in SPANS
+        }
+        return Experiment(
+            name=f"{expert}-concat",
+            model_type=expert,
+            fusion_strategy="concat",
+            recipe=expert,
+            seeds=tuple(range(len(executed))),
+            parameters=1000,
+            samples=1,
+            entries={span: np.full(6, 10.0) for span in SPANS},
+            errors=errors | rules,
+            training_s=7.0,
+        )
+
+    return [
+        experiment("regression", [0.3], [0.5]),
+        experiment("diffusion", [0.4, 0.6], [0.35, 0.45]),
+    ]
+
+
+def test_experiments_are_one_page(
+    experiments: list[Experiment], tmp_path: Path, assert_page_is_sound: Callable[[Path], None]
+) -> None:
+    report = comparison_report(experiments)
+    executed, chunk = report.blocks(Table)
+    assert list(executed.columns[-4:]) == ["expert", "fusion", "samples", "parameters"]
+    assert executed.columns[2] == "what is executed [training std]"
+    assert chunk.columns[2] == "the whole chunk [training std]"
+    assert [row[1] for row in executed.rows[:2]] == [1, 2]
+    assert (executed.strong, chunk.strong) == ({0}, {1})
+    assert len(executed.rows) == 2 + len(BASELINES)
+    assert [tile[1] for tile in report.tiles][1::2] == ["regression-concat", "diffusion-concat"]
+    write_report(tmp_path, report)
+    assert_page_is_sound(tmp_path / PAGE)
+
+
+def test_bars_have_whiskers_and_seeds_are_dots(experiments: list[Experiment]) -> None:
+    figure = comparison_of_experiments(experiments)
+    executed, chunk = figure.axes
+    assert [patch.get_width() for patch in executed.patches] == pytest.approx([0.3, 0.5])
+    assert [patch.get_width() for patch in chunk.patches] == pytest.approx([0.5, 0.4])
+    whiskers = [line.get_xdata() for line in executed.lines if line.get_marker() == "|"]
+    assert len(whiskers) == 2
+    assert all(low < error < high for (low, high), error in zip(whiskers, (0.3, 0.5), strict=True))
+    (dots,) = (line.get_xdata() for line in executed.lines if line.get_marker() == ".")
+    assert dots == pytest.approx([0.4, 0.6])
+    rules = [line for line in executed.lines if line.get_marker() not in ("|", ".")]
+    assert len(rules) == len(BASELINES)
+    names = [label.get_text() for label in executed.get_yticklabels()]
+    assert names == [experiment.name for experiment in experiments]
+
+
+def test_one_group_is_drawn_without_whiskers_and_it_is_said(experiments: list[Experiment]) -> None:
+    first = experiments[0]
+    alone = Experiment(
+        **{
+            **vars(first),
+            "entries": {span: entries[:1] for span, entries in first.entries.items()},
+            "errors": {key: errors[:, :1] for key, errors in first.errors.items()},
+        }
+    )
+    assert "No intervals: they take at least two groups" in comparison_report([alone]).summary
+    assert "No intervals" not in comparison_report(experiments).summary
+    executed, _ = comparison_of_experiments([alone]).axes
+    assert not [line for line in executed.lines if line.get_marker() == "|"]
