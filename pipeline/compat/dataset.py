@@ -40,7 +40,8 @@ class UnifiedVLADataset(Dataset[Sample]):
     `build_timeline` and `FeatureStore.gather`. Of a store's variants items show 0, the plain
     frames; `stages.train_head` draws others too.
 
-    `horizon` is in ticks, the windows in readings, `action_hz` None takes recorded rows as ticks.
+    `horizon` is in ticks, the windows in readings, none of them older than `sensor_window_s` and
+    `state_window_s` (None: of any age); `action_hz` None takes recorded rows as ticks.
     `recordings`, open already, may stand in the place of `data`; what they are read with stays.
     `instruction` replaces what those of `data` say. Old and new recordings in one data set have
     actions of one kind, `action_rotation`; `auto` is rotvec where every recording has poses.
@@ -68,6 +69,8 @@ class UnifiedVLADataset(Dataset[Sample]):
         state_window_size: int = 100,
         action_hz: float | None = 10.0,
         *,
+        sensor_window_s: float | None = 0.1,
+        state_window_s: float | None = 1.0,
         instruction: str | None = None,
         views: Sequence[str] | None = None,
         action_rotation: Rotation = "auto",
@@ -78,7 +81,8 @@ class UnifiedVLADataset(Dataset[Sample]):
         for name, (value, kinds) in known.items():
             if value not in get_args(kinds):
                 raise ConfigError(f"{name}: expected one of {get_args(kinds)}, found {value!r}")
-        self.windows = Windows(horizon, sensor_window_size, state_window_size)
+        windows = (sensor_window_size, state_window_size, sensor_window_s, state_window_s)
+        self.windows = Windows(horizon, *windows)
         self.vlm_reuse_count, self.action_hz = vlm_reuse_count, action_hz
         self.action_rotation: Rotation = action_rotation
         self._sources = named_sources(() if data is None else data, format, instruction)

@@ -61,7 +61,15 @@ class TestPlainReaders:
         assert torch.equal(gathered.float(), bits)
 
 
-def reference(store: FeatureStore, tick: int, window: int, horizon: int, lag: int, lag_s: float):
+def reference(
+    store: FeatureStore,
+    tick: int,
+    window: int,
+    horizon: int,
+    lag: int,
+    lag_s: float,
+    window_s: float | None = None,
+):
     """What belongs to one tick, by the words of the contract."""
     episode = next(one for one in store.episodes if tick in one.ticks)
     row = max(int(store.array("tick/vl_row")[tick]) - lag, episode.vl_rows.start)
@@ -75,6 +83,11 @@ def reference(store: FeatureStore, tick: int, window: int, horizon: int, lag: in
     if not lag_s:
         seen = list(range(episode.readings.start, store.array("tick/sensor_end")[tick]))
     seen = seen[-window:]
+    if window_s is not None:
+        seen = [reading for reading in seen if now - clock[reading] <= window_s + 1e-6]
+    ages = np.zeros(window)
+    if seen:
+        ages[-len(seen) :] = now - clock[seen]
     values = np.zeros((window, store.sensor_channels), np.float32)
     if seen:
         values[-len(seen) :] = store.array("sensor/values")[seen]
@@ -82,7 +95,9 @@ def reference(store: FeatureStore, tick: int, window: int, horizon: int, lag: in
     return {
         "features": store.array("vl/features")[row],
         "feature_age": now - np.nanmax(store.array("vl/frame_time")[row]),
+        "view_age": now - store.array("vl/frame_time")[row],
         "sensor": values,
+        "sensor_age": ages,
         "sensor_valid": len(seen),
         "action": store.array("tick/action")[ahead],
         "action_valid": [tick + step < episode.ticks.stop for step in range(horizon)],
@@ -98,13 +113,34 @@ class TestGather:
         horizon = data.draw(st.integers(1, 12))
         lag = data.draw(st.integers(0, 12))
         lag_s = data.draw(st.sampled_from([0.0, 0.013, 0.21, 5.0]))
+        window_s = data.draw(st.sampled_from([None, 1e-9, 0.05, 0.3, 9.0]))
         batch = store.gather(
-            ticks, horizon, window, 7, feature_lag=lag, sensor_lag_s=lag_s, state_lag_s=lag_s
+            ticks,
+            horizon,
+            window,
+            7,
+            feature_lag=lag,
+            sensor_lag_s=lag_s,
+            state_lag_s=lag_s,
+            sensor_window_s=window_s,
         )
         for index, tick in enumerate(ticks):
-            for name, value in reference(store, tick, window, horizon, lag, lag_s).items():
+            wanted = reference(store, tick, window, horizon, lag, lag_s, window_s)
+            for name, value in wanted.items():
                 found = getattr(batch, name)[index].numpy()
-                assert np.allclose(found, value, atol=1e-6), (name, tick)
+                assert np.allclose(found, value, atol=1e-6, equal_nan=True), (name, tick)
+
+    def test_a_lag_may_be_that_of_each_sample(self, store):
+        ticks, rows, late_s = [20, 50, 100], np.array([0, 2, 9]), np.array([0.0, 0.1, 0.03])
+        together = store.gather(ticks, feature_lag=rows, sensor_lag_s=late_s, state_lag_s=late_s)
+        for index, tick in enumerate(ticks):
+            lag_s = float(late_s[index])
+            alone = store.gather([tick], 8, 65, 100, int(rows[index]), lag_s, lag_s)
+            for name, value in vars(alone).items():
+                found = getattr(together, name)[index]
+                torch.testing.assert_close(found, value[0], rtol=0, atol=0, equal_nan=True)
+        with pytest.raises(ValueError, match="a lag goes back in time"):
+            store.gather(ticks, sensor_lag_s=-late_s)
 
     def test_the_age_of_a_feature_is_known_without_a_batch(self, store):
         ticks = np.array([0, 2, 31, 179])

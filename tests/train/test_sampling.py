@@ -1,10 +1,20 @@
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import ConfigError
-from pipeline.train.sampling import TickSampler
+from pipeline.store import FeatureStore
+from pipeline.train.batches import Prefetch, Windows
+from pipeline.train.sampling import Plan, TickSampler
+from pipeline.train.split import split_by_episode
+from pipeline.train.world import World
 
 
 def sources(sizes: list[int]) -> dict[str, np.ndarray]:
@@ -99,3 +109,27 @@ class TestTickSampler:
         """A change of the order would make a resumed run another run."""
         batch = TickSampler(sources([6, 4]), {"s1": 2.0}, 7, 5).batch(3)
         assert batch.tolist() == [4, 1, 2, 9, 6, 8, 7]
+
+
+def test_each_sample_has_a_lag_of_its_own_and_the_same_after_a_stop(
+    tiny_store: Callable[..., Path], tmp_path: Path
+) -> None:
+    store = FeatureStore.open(tiny_store(tmp_path))
+    params = TrainHeadParams(batch_size=64, feature_lag=2, sensor_lag_s=0.3)
+    split = split_by_episode(store, params.split)
+    plan = Plan(store, params, split, World())
+    parts = [plan.step(step)[0] for step in range(20)]
+    rows = np.concatenate([part.lags.features for part in parts])
+    late_s = np.concatenate([part.lags.sensor_s for part in parts])
+    assert np.bincount(rows) == pytest.approx([len(rows) / 3] * 3, rel=0.15)
+    assert 0 <= late_s.min() < 0.01
+    assert 0.29 < late_s.max() <= 0.3
+    again = Plan(store, params, split, World()).step(7)[0]
+    assert np.array_equal(again.lags.features, parts[7].lags.features)
+    assert np.array_equal(again.lags.sensor_s, parts[7].lags.sensor_s)
+    # What a policy sees is so late: the next batch of a feed is that of the plan.
+    with Prefetch(store, [parts[7]], Windows.of(params), torch.device("cpu")) as batches:
+        _, batch = next(batches)
+        newest = store.gather(parts[7].ticks, **asdict(Windows.of(params)))
+        assert ((batch.feature_age - newest.feature_age)[rows[448:512] > 0] > 0).any()
+        assert not torch.equal(batch.sensor, newest.sensor)

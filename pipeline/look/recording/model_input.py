@@ -18,6 +18,7 @@ from tqdm import tqdm
 from pipeline.base.config import Params, VLMParams
 from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.base.errors import PipelineError, RecordingError
+from pipeline.base.observation import CLOCK_SLACK_S
 from pipeline.base.ownership import LEDGER_SUFFIX as LEDGER
 from pipeline.base.table import Table
 from pipeline.look.page.blocks import Block, Document, Text, TokenRun, Tokens
@@ -84,6 +85,8 @@ def cut_samples(view: EpisodeView, params: Params) -> list[Sample]:
     errors = [issue.message for issue in view.issues if issue.severity == "error"]
     if line is None or errors:
         raise RecordingError(errors[0])
+    head = params.train_head
+    oldest_s = {"sensor": head.sensor_reach_s or np.inf, "state": head.state_window_s or np.inf}
     last = len(line.time) - 1
     inner = np.random.default_rng(params.inspect.seed).permutation(np.arange(1, last))
     ticks = np.unique([0, last, *inner][: params.inspect.samples]).tolist()
@@ -94,11 +97,12 @@ def cut_samples(view: EpisodeView, params: Params) -> list[Sample]:
     streams = {"sensor": (view.sensor, line.sensor_end), "state": (view.state, line.state_end)}
     samples: list[Sample] = []
     for place, tick in enumerate(ticks):
-        windows = {
-            name: stream.values[max(0, ends[tick] - lengths[name]) : ends[tick]].copy()
-            for name, (stream, ends) in streams.items()
-            if stream is not None
-        }
+        windows: dict[str, NDArray[Any]] = {}
+        for name, (stream, ends) in streams.items():
+            if stream is not None:
+                seen = slice(max(0, ends[tick] - lengths[name]), ends[tick])
+                since_s = line.time[tick] - stream.time[seen]
+                windows[name] = stream.values[seen][since_s <= oldest_s[name] + CLOCK_SLACK_S]
         windows["action"] = line.action[tick : tick + lengths["action"]]
         samples.append(Sample(tick, {name: row[place] for name, row in frames.items()}, windows))
     return samples
