@@ -204,7 +204,8 @@ class Gatherer:
         end = self._arrays[f"tick/{stream}_end"][tick]
         now, clock = self._arrays["tick/time"][tick], self._arrays[f"{stream}/time"]
         if np.any(lag_s):
-            end = _first_after(clock, first, end, now - lag_s)
+            late = _first_after(clock, first, end, now - lag_s)
+            end = np.where(np.equal(lag_s, 0), end, late)
         window, counts = getattr(batch, stream).shape[1], getattr(batch, f"{stream}_valid").numpy()
         valid = np.minimum(end - first, window, out=counts)
         ages = getattr(batch, f"{stream}_age").numpy()
