@@ -46,8 +46,8 @@ def episodes_by_group(
             together.merge(first.setdefault(mark, index), index)
     for name, index in _fitting(patterns or {}, [episode_name(episode) for episode in episodes]):
         together.merge(first.setdefault(("params", name), index), index)
-    for one, other in _equal_actions(store.array("tick/action"), episodes):
-        together.merge(one, other)
+    for pair in _equal_actions(store.array("tick/action"), episodes):
+        together.merge(*pair)
     groups = ([episodes[i] for i in sorted(members)] for members in together.subsets())
     return dict(sorted((min(map(episode_name, group)), group) for group in groups))
 
@@ -83,10 +83,10 @@ def _equal_actions(
         # Cheap to compare, and equal where the actions are.
         outline = np.stack([[own[0], own.mean(axis=0, dtype=float), own[-1]] for own in actions])
         moving = np.flatnonzero((widest[:, 0] > 0) & (widest[:, 0] < np.inf))
-        for at, one in enumerate(moving):
-            others = moving[at + 1 :]
-            allowed = np.maximum(tolerance[others], tolerance[one])
-            alike = (np.abs(outline[others] - outline[one]) <= allowed[:, None]).all(axis=(1, 2))
+        for rank, own in enumerate(moving):
+            others = moving[rank + 1 :]
+            allowed = np.maximum(tolerance[others], tolerance[own])
+            alike = (np.abs(outline[others] - outline[own]) <= allowed[:, None]).all(axis=(1, 2))
             for other, within in zip(others[alike], allowed[alike], strict=True):
-                if np.allclose(actions[other], actions[one], rtol=0, atol=within):
-                    yield places[one], places[other]
+                if np.allclose(actions[other], actions[own], rtol=0, atol=within):
+                    yield places[own], places[other]
