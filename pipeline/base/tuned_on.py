@@ -20,7 +20,7 @@ class TunedPart(Section):
     """Ticks of one episode that a model has seen."""
 
     episode: str
-    """"source/id" """
+    """As "source/id"."""
     ticks: tuple[int, int]
     """[first, stop), counted in the episode."""
     content: str
@@ -46,12 +46,12 @@ class TunedOn(Section):
 
 def joined(several: Iterable[TunedOn | None]) -> TunedOn | None:
     """What a model was tuned on one after the other; None where nothing is known."""
-    known = [one for one in several if one is not None]
+    known = [tuned for tuned in several if tuned is not None]
     if not known:
         return None
     return TunedOn(
-        train=tuple(dict.fromkeys(part for one in known for part in one.train)),
-        val=tuple(dict.fromkeys(part for one in known for part in one.val)),
+        train=tuple(dict.fromkeys(part for tuned in known for part in tuned.train)),
+        val=tuple(dict.fromkeys(part for tuned in known for part in tuned.val)),
     )
 
 
@@ -71,8 +71,8 @@ def read_tuned_on(folder: Path) -> TunedOn | None:
 
 def of_store(attributes: Mapping[str, Any]) -> TunedOn | None:
     """What the model of a store with these attributes was tuned on; None where it does not say."""
-    said = attributes.get(_ATTRIBUTE)
-    return None if said is None else TunedOn.model_validate(said)
+    document = attributes.get(_ATTRIBUTE)
+    return None if document is None else TunedOn.model_validate(document)
 
 
 def store_attributes(tuned: TunedOn | None) -> dict[str, Any]:

@@ -13,6 +13,7 @@ import pytest
 import zarr
 
 from pipeline.base.errors import ConfigError, StoreIncomplete, StoreLocked, StoreMismatch
+from pipeline.base.tuned_on import TunedOn, TunedPart, of_store, store_attributes
 from pipeline.extract.repair import carry_rows, copy_layout, put_in_place
 from pipeline.store import FeatureStore, StoreBuild, build_lock, check_trailers
 from pipeline.store.merging import merge
@@ -181,6 +182,21 @@ def test_rows_keep_the_environment_they_were_computed_in(tiny_store: Make, tmp_p
         {"rows": [60, 85], "torch": "old"},
         {"rows": [85, 120], "torch": "test"},
     ]
+
+
+def test_what_the_model_was_tuned_on_is_that_of_both(tiny_store: Make, tmp_path: Path) -> None:
+    parts = [
+        TunedPart(episode=f"lab/{n}", ticks=(0, 9), content=str(n), group=f"lab/{n}")
+        for n in range(3)
+    ]
+    told = TunedOn(train=(parts[0],), val=(parts[1],)), TunedOn(train=(parts[0], parts[2]))
+    paths = [tiny_store(tmp_path, name=name, seed=n) for n, name in enumerate(("one", "two"))]
+    for path, tuned in zip(paths, told, strict=True):
+        zarr.open_group(path, mode="r+").attrs.update(store_attributes(tuned))
+        note_metadata(path)
+    merge(paths, tmp_path / "both.zarr")
+    merged = of_store(FeatureStore.open(tmp_path / "both.zarr").attrs)
+    assert merged == TunedOn(train=(parts[0], parts[2]), val=(parts[1],))
 
 
 def test_whole_chunks_of_the_first_are_linked(
