@@ -1,8 +1,9 @@
 """Train a policy head from the store alone: no image, no vision-language model.
 
 Reads train_head.store (extract.store where null). Writes the best and the last checkpoint to
-train_head.output and curves to train_head.logs; while it runs, `dvc plots show` draws them. Some
-episodes are held out to evaluate it on.
+train_head.output and curves to train_head.logs; while it runs, `dvc plots show` draws them.
+train_head.split says which groups of episodes choose the checkpoint (val) and which are left for
+stages.evaluate (test).
 
   python -m stages.train_head                                      what params.yaml says
   python -m stages.train_head --set train_head.model_type=diffusion    or regression, flow_matching

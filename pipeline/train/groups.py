@@ -5,7 +5,6 @@ from fnmatch import fnmatchcase
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.cluster.hierarchy import DisjointSet
 
 from pipeline.base.errors import ConfigError
 from pipeline.store import Episode, FeatureStore, episode_name
@@ -32,9 +31,9 @@ def episodes_by_group(
 
     Raises `ConfigError` where a pattern fits no episode.
     """
+    from scipy.cluster.hierarchy import DisjointSet  # a second, which a finished run does without
+
     episodes = [episode for episode in store.episodes if len(episode.ticks)]
-    patterns = patterns or {}
-    _check_patterns(patterns, episodes)
     keys = store.array("vl/key") if keys is None else keys
     frame_time = store.array("vl/frame_time")
     together, first = DisjointSet(range(len(episodes))), dict[Hashable, int]()
@@ -43,32 +42,30 @@ def episodes_by_group(
         # The key of a row without a frame says nothing but the instruction.
         key = keys[row].tobytes() if np.isfinite(frame_time[row]).any() else b""
         marks = [("key", key), ("content", episode.content), ("group", episode.group)]
-        marks += [("params", name) for name in _named(episode, patterns)]
         for mark in (mark for mark in marks if mark[1]):
             together.merge(first.setdefault(mark, index), index)
+    for name, index in _fitting(patterns or {}, [episode_name(episode) for episode in episodes]):
+        together.merge(first.setdefault(("params", name), index), index)
     for one, other in _equal_actions(store.array("tick/action"), episodes):
         together.merge(one, other)
     groups = ([episodes[i] for i in sorted(members)] for members in together.subsets())
     return dict(sorted((min(map(episode_name, group)), group) for group in groups))
 
 
-def _named(episode: Episode, patterns: Mapping[str, Sequence[str]]) -> Iterator[str]:
-    name = episode_name(episode)
-    for group, wanted in patterns.items():
-        if any(fnmatchcase(name, pattern) for pattern in wanted):
-            yield group
-
-
-def _check_patterns(patterns: Mapping[str, Sequence[str]], episodes: Sequence[Episode]) -> None:
-    names = [episode_name(episode) for episode in episodes]
+def _fitting(
+    patterns: Mapping[str, Sequence[str]], names: Sequence[str]
+) -> Iterator[tuple[str, int]]:
+    """Each group with the places of the names that its patterns fit."""
     for group, wanted in patterns.items():
         for pattern in wanted:
-            if not any(fnmatchcase(name, pattern) for name in names):
+            places = [i for i, name in enumerate(names) if fnmatchcase(name, pattern)]
+            if not places:
                 raise ConfigError(
                     f"train_head.split.groups.{group}: expected patterns of episodes of the store, "
                     f"which are called {', '.join(names[:3])}{' …' if len(names) > 3 else ''}; "
                     f"{pattern!r} fits none of {len(names)}."
                 )
+            yield from ((group, place) for place in places)
 
 
 def _equal_actions(
@@ -85,7 +82,7 @@ def _equal_actions(
         tolerance = _TOLERANCE * np.maximum(ranges, _RESTING * widest)
         # Cheap to compare, and equal where the actions are.
         outline = np.stack([[own[0], own.mean(axis=0, dtype=float), own[-1]] for own in actions])
-        moving = np.flatnonzero(widest[:, 0] > 0)
+        moving = np.flatnonzero((widest[:, 0] > 0) & (widest[:, 0] < np.inf))
         for at, one in enumerate(moving):
             others = moving[at + 1 :]
             allowed = np.maximum(tolerance[others], tolerance[one])

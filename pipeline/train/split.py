@@ -19,6 +19,9 @@ from pipeline.policy.checkpoint import SIDES, SOURCE_KEYS, EpisodePart, PolicyCh
 from pipeline.store import Episode, FeatureStore, episode_name
 from pipeline.train.groups import episodes_by_group
 
+_SHOWN = 5
+"""Groups that a note lists as moved."""
+
 _SLACK_S = 1e-6
 """Two times that differ by less are one: seconds since 1970 in float64 are this coarse."""
 
@@ -83,7 +86,10 @@ def split_by_episode(
     else:
         ranks = ranks if params.folds is None else _ranks(rest, f"{params.seed}.{params.fold}")
         bounds = _bounds(asked, of=len(rest) / len(groups))
-        side_of: dict[str, Side] = {name: _side(ranks[name], bounds) for name in rest}
+        side_of: dict[str, Side] = {
+            name: next(side for side, (_, high) in bounds.items() if ranks[name] < high)
+            for name in rest
+        }
         notes = _repair(side_of, ranks, bounds, _quotas(groups, rest.keys(), tuple(bounds)))
         sides = {
             side: _ticks([e for name in rest if side_of[name] == side for e in rest[name]])
@@ -123,10 +129,6 @@ def _bounds(shares: Mapping[Side, float], of: float) -> Bounds:
     return dict(zip(sides, pairwise((*edges, 1.0)), strict=True))
 
 
-def _side(rank: float, bounds: Bounds) -> Side:
-    return next(side for side, (_, high) in bounds.items() if rank < high)
-
-
 @dataclass(frozen=True)
 class _Quota:
     """Sides on each of which there has to be one of these groups."""
@@ -136,10 +138,6 @@ class _Quota:
     sides: tuple[Side, ...]
     weight: int
     """Of a side that is missing, where not all quotas can be met."""
-
-    def cost(self, side_of: Mapping[str, Side]) -> int:
-        """The weight of what is missing."""
-        return self.weight * len(self.missing(side_of))
 
     def missing(self, side_of: Mapping[str, Side]) -> set[Side]:
         """The sides that have none of these groups."""
@@ -173,24 +171,25 @@ def _repair(
         before.append(quota)
         for side in sorted(quota.missing(side_of)):
             low, high = bounds[side]
-            rise, _, name = min(
-                (
-                    _rise(side_of, name, side, before),
-                    max(low - ranks[name], ranks[name] - high),
-                    name,
-                )
-                for name in quota.groups
+            change, _, name = min(
+                (_change(side_of, n, side, before), max(low - ranks[n], ranks[n] - high), n)
+                for n in quota.groups
             )
-            if rise < 0:
+            if change < 0:
                 side_of[name] = side
                 notes.append(f"{side} had nothing of {quota.of}, {name} was moved there")
-    return notes
+    more = [f"and {len(notes) - _SHOWN} more"] if len(notes) > _SHOWN else []
+    return [*notes[:_SHOWN], *more]
 
 
-def _rise(side_of: Mapping[str, Side], name: str, side: Side, quotas: Iterable[_Quota]) -> int:
-    """By how much the quotas cost more with this group on that side."""
+def _change(side_of: Mapping[str, Side], name: str, side: Side, quotas: Iterable[_Quota]) -> int:
+    """The weight of what the quotas miss with this group on that side, less what they miss now."""
     moved: dict[str, Side] = {**side_of, name: side}
-    return sum(q.cost(moved) - q.cost(side_of) for q in quotas if name in q.groups)
+    return sum(
+        q.weight * (len(q.missing(moved)) - len(q.missing(side_of)))
+        for q in quotas
+        if name in q.groups
+    )
 
 
 def _cut_by_time(

@@ -567,6 +567,19 @@ def test_stale_global_indices_do_not_matter(tmp_path, write):
     np.testing.assert_array_equal(opened(root).recordings[2].state().values, good)
 
 
+def test_episodes_name_their_groups(root, write):
+    assert [recording.group for recording in opened(root).recordings] == [None] * 3
+    groups = ["monday", None, 7]
+    if (path := root / "meta/episodes.jsonl").exists():
+        rows = [json.loads(line) for line in path.read_text().splitlines()]
+        write.jsonl(path, [row | {"group": g} for row, g in zip(rows, groups, strict=True)])
+    else:
+        path = root / "meta/episodes/chunk-000/file-000.parquet"
+        table = pq.ParquetFile(path).read()
+        pq.write_table(table.append_column("group", pa.array(["monday", None, "7"])), path)
+    assert [recording.group for recording in opened(root).recordings] == ["monday", None, "7"]
+
+
 def test_row_counts_that_disagree_with_meta_are_named(root, write):
     if (root / "meta/episodes.jsonl").exists():
         rows = [{"episode_index": i, "tasks": ["pick"], "length": 8} for i in range(3)]

@@ -1,5 +1,6 @@
 """Finding the episodes of the params' sources."""
 
+import json
 import os
 from pathlib import Path
 
@@ -99,6 +100,26 @@ def test_raw_beside_a_metadata_file_can_be_asked_for(root):
     (root / "raw/Red_point/e9/metadata.json").write_text("{}")
     opened = open_recordings([Source(name="s", path="raw/Red_point", format="raw")], root)
     assert [r.format for r in opened.recordings] == ["raw"]
+
+
+@pytest.mark.parametrize("format", ["raw", "new"])
+def test_a_recording_names_its_group(root, format):
+    def group():
+        place = folder.relative_to(root).as_posix()
+        source = Source(name="s", path=place, format=format)
+        (recording,) = open_recordings([source], root).recordings
+        return recording.group
+
+    marker = {"raw": "robot_state_*.csv", "new": "metadata.json"}[format]
+    folder = next((root / format).rglob(marker)).parent
+    path = folder / "metadata.json"
+    document = json.loads(path.read_text()) if path.is_file() else {}
+    assert group() is None
+    path.write_text(json.dumps(document | {"group": "monday"}))
+    assert group() == "monday"
+    path.write_text(json.dumps(document | {"group": ["monday"]}))
+    with pytest.raises(RecordingError, match=r"metadata\.json: group must be a name"):
+        group()
 
 
 def test_a_root_that_is_not_there_is_named_itself(tmp_path):

@@ -62,7 +62,7 @@ class TestParamsPage:
         (entry,) = re.findall(r"^`vlm\.layers`.*\n:   .*$", page, re.MULTILINE)
         assert "list of (whole number), at least 1; default `[-1]`" in entry
         assert "Decoder layers whose output is taken" in entry
-        assert "`train_head.split.val`{ #train_head.split.val } number, from 0 to 1;" in page
+        assert "`train_head.drop_state`{ #train_head.drop_state } number, from 0 to 1;" in page
         assert "`data.sources[].name`{ #data.sources.name } text, not empty; **has to" in page
 
     def test_lists_them_in_place_of_what_the_file_says_instead(self, page):

@@ -1,5 +1,6 @@
 """One extraction: what it writes, what it takes over, what it refuses."""
 
+import json
 import os
 import shutil
 import subprocess
@@ -284,6 +285,18 @@ class TestWhatItTakesOver:
         assert run(params)[0] is None
 
     @pytest.mark.usefixtures("extracted")
+    def test_a_group_is_kept_and_stores_without_one_are_as_before(self, params, recordings):
+        text = FeatureStore.open(params.extract.store).array("episode/text").tobytes()
+        assert b"group" not in text
+        path = next(recordings.rglob("metadata.json"))
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"group": "monday"}))
+        run(params)
+        store = FeatureStore.open(params.extract.store)
+        told = {Path(episode.path).name: episode.group for episode in store.episodes}
+        assert told.pop(path.parent.name) == "monday"
+        assert told
+        assert not any(told.values())
+
     def test_a_changed_file_is_noticed(self, params, recordings):
         run(params)  # notes what the files hold
         path = recordings / "Touch_dot/episode_1/robot_states.npz"

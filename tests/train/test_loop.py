@@ -186,6 +186,36 @@ def test_without_held_out_episodes_the_best_is_the_newest(
     assert not best.split["test"]
 
 
+def test_nothing_in_training_looks_at_test(
+    tiny_store: Make, params: Make, trainer: Make, tmp_path: Path
+) -> None:
+    """Other features, actions and readings in the test episodes change no bit of what is kept."""
+    kept: list[dict[str, Any]] = []
+    for name in ("plain", "spoilt"):
+        store = FeatureStore.open(tiny_store(tmp_path / name))
+        given = {"split": {"val": 0.3, "test": 0.3}, "early_stopping": 2}
+        folders = {"output": tmp_path / name / "head", "logs": tmp_path / name / "logs"}
+        done = trainer(store, params(max_steps=24, **given, **folders))
+        for episode in {store.episodes[i] for i in store.episode_of(done.split.test)}:
+            for array, rows in (
+                ("tick/action", episode.ticks),
+                ("vl/features", episode.vl_rows),
+                ("sensor/values", episode.readings),
+                ("state/values", episode.states),
+            ):
+                if name == "spoilt":
+                    store.array(array)[rows.start : rows.stop] += 1e6
+        assert len(done.split.val)
+        assert len(done.split.test)
+        done.fit()
+        kept.append({which: load_policy(done.run.output / which) for which in ("best", "last")})
+    for which, plain in kept[0].items():
+        spoilt = kept[1][which]
+        assert (spoilt.step, spoilt.metrics) == (plain.step, plain.metrics)
+        assert spoilt.normalization.document() == plain.normalization.document()
+        assert all(torch.equal(spoilt.weights[name], plain.weights[name]) for name in plain.weights)
+
+
 @pytest.mark.parametrize("disabled", ["features_enabled", "sensor_enabled", "robot_state_enabled"])
 def test_any_stream_may_be_left_out(
     store: FeatureStore, params: Make, trainer: Make, disabled: str
