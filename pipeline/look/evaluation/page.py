@@ -62,7 +62,7 @@ def evaluation_report(evaluation: Evaluation, rollout: str = "") -> Report:
             f"{policy['step']}, {policy['parameters']:,} parameters, judged on "
             f"{comparison.ticks:,} test ticks of {len(comparison.episodes)} episode(s) of "
             f"{evaluation.store.path.name}, {policy['samples']} chunk(s) a tick."
-            f"{_beaten(comparison)}{f' {sentence(still)}' if still else ''}"
+            f"{f' {sentence(still)}' if still else ''}"
         ),
         tiles=_tiles(comparison),
         sections=(
@@ -83,25 +83,13 @@ def _picture(draw: Callable[..., Figure], *shown: object) -> Picture:
     return Picture(draw.__name__, _CAPTIONS[draw.__name__], partial(draw, *shown))
 
 
-def _beaten(comparison: Comparison) -> str:
-    """A sentence on the figures in which a baseline is better, beyond what chance explains."""
-    worse = [
-        f"{scope} {group.name if group else 'overall'} ({rivals.ratio:.2f} times the best's error)"
-        for scope, part in tables.scopes(comparison).items()
-        for group in (*part.varying_groups(), None)
-        if (rivals := rivalry(part, group)).verdict in ("worse", "no interval")
-        and rivals.ratio is not None
-        and round(rivals.ratio, 2) > 1
-    ]
-    return f" A baseline is better in: {', '.join(worse)}." if worse else ""
-
-
 def _tiles(comparison: Comparison) -> list[tuple[str, str]]:
     tiles: list[tuple[str, str]] = []
     for scope, part in (("executed", comparison.executed), ("chunk", comparison)):
         rivals = rivalry(part)
         best = tables.HEADINGS[rivals.best]
-        tiles.append((f"{scope}: overall error [training std]", rivals.policy.text()))
+        value, _, ends = rivals.policy.text().partition(" ")
+        tiles.append((f"{scope}: overall error [training std] {ends}", value))
         label = f"{scope}: {rivals.difference.text('+')} beside the best baseline ({best})"
         tiles.append((label, rivals.verdict))
     rivals = rivalry(comparison.without_low_variance())

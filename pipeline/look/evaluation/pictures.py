@@ -47,7 +47,7 @@ _NUMBERED_STEPS = 16
 _POLICY = STYLES["policy"]["color"]
 _CURVES = {
     "train/loss": ("training loss", PALETTE[0]),
-    "val/error": ("held-out error [training std]", PALETTE[5]),
+    "val/error": ("val error [training std]", PALETTE[5]),
     "lr": ("learning rate", PALETTE[2]),
 }
 """TrainingCurve -> what its axis says, and its colour."""
@@ -274,7 +274,7 @@ def _plot_next_actions(
 
 
 def curves(logged: TrainingCurves, step: int) -> Figure:
-    """Loss, held-out error and learning rate over the steps; a line marks the step judged here."""
+    """Loss, val error and learning rate over the steps; a line marks the step judged here."""
     shown = [name for name in _CURVES if name in logged.curves] or sorted(logged.curves)[:3]
     size = max(4.2 * len(shown), 8.4), 3.4
     figure, (axes,) = panels(*size, 1, len(shown), squeeze=False, sharex=True)

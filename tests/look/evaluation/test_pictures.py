@@ -199,6 +199,18 @@ def test_errors_by_dimension_and_step_are_in_training_deviations() -> None:
     )
 
 
+def test_methods_are_bars_with_whiskers_and_steps_have_bands_where_groups_are_two() -> None:
+    for episodes in (1, 4):
+        comparison, *_ = evaluated(episodes)
+        executed, chunk = plots.methods(comparison).axes
+        assert len(executed.patches) == len(chunk.patches) == 1 + len(BASELINES)
+        assert chunk.patches[0].get_width() == pytest.approx(comparison.overall("policy"))
+        assert len(chunk.lines) == (1 + len(BASELINES)) * (episodes > 1)
+        (axis,) = plots.horizon(comparison, 10.0).axes
+        bands = [path for band in axis.collections for path in band.get_paths()]
+        assert bool(bands) == (episodes > 1)
+
+
 def test_curves_mark_the_step_that_was_judged() -> None:
     steps = np.array([10, 20, 30])
     logged = {
