@@ -16,7 +16,7 @@ from sklearn.random_projection import SparseRandomProjection
 from pipeline.base.bfloat16 import widen
 from pipeline.policy.normalization import ChannelStatistics
 from pipeline.store import FeatureStore
-from pipeline.train.batches import Ticks
+from pipeline.train.batches import Ticks, evenly
 from pipeline.train.predictions import Actions
 
 BASELINES = ("zero_action", "median_action", "repeat_last", "linear_fit", "nearest_neighbour")
@@ -44,7 +44,7 @@ class Baselines:
     ) -> None:
         self._store, self._horizon = store, horizon
         self._median = np.median(store.array("tick/action")[ticks], axis=0)
-        fitted = spread(ticks, _FITTED)
+        fitted = evenly(ticks, _FITTED)
         chunks, valid = recorded_chunks(store, fitted, horizon)
         past = self._past(fitted)
         self._linear = np.stack(
@@ -53,7 +53,7 @@ class Baselines:
                 for step in range(horizon)
             ]
         )
-        self._neighbours = Neighbours(store, spread(ticks, NEIGHBOURS), features)
+        self._neighbours = Neighbours(store, evenly(ticks, NEIGHBOURS), features)
 
     def act(self, ticks: Ticks) -> dict[str, Actions]:
         """What each of `BASELINES` does at these ticks: (tick, horizon or 1, action_dim).
@@ -155,11 +155,6 @@ class Neighbours:
             scaled = (values - statistics.mean) / statistics.scale
             flat = np.where(valid[..., None], scaled, 0.0).reshape(len(some), -1)
             yield flat if self._projection is None else self._projection.transform(flat)
-
-
-def spread(ticks: Ticks, most: int) -> Ticks:
-    """All of these ticks, or as many as are allowed, evenly spaced."""
-    return ticks[np.linspace(0, len(ticks) - 1, min(len(ticks), most)).round().astype(np.int64)]
 
 
 def recorded_chunks(

@@ -106,8 +106,3 @@ def test_a_stream_that_is_missing_leaves_the_other_or_the_median(
         assert np.array_equal(found["nearest_neighbour"], recorded_chunks(store, TRAIN, 2)[0])
     else:
         assert np.array_equal(found["nearest_neighbour"], found["median_action"])
-
-
-def test_no_more_ticks_than_asked_for_and_evenly() -> None:
-    assert rules.spread(np.arange(10), 3).tolist() == [0, 4, 9]
-    assert rules.spread(np.arange(3), 10).tolist() == [0, 1, 2]
