@@ -289,18 +289,24 @@ def test_more_steps_than_a_chunk_has_are_not_executed(
 
 
 @pytest.mark.parametrize(
-    ("override", "linked"),
+    ("environment", "checkpoint", "linked"),
     [
-        ("{environment: phantom}", True),
-        ("{environment: null}", False),
-        ("{environment: phantom, checkpoint: models/another}", False),
+        ("phantom", "null", True),
+        ("null", "null", False),
+        ("phantom", "models/another", False),
     ],
 )
 def test_the_rollouts_of_this_policy_are_linked_though_they_come_later(
-    trained: Path, tmp_path: Path, reports: list[Report], override: str, linked: bool
+    trained: Path,
+    tmp_path: Path,
+    reports: list[Report],
+    environment: str,
+    checkpoint: str,
+    linked: bool,
 ) -> None:
-    rollouts = f"rollout={override[:-1]}, output: {tmp_path / 'rollout'}}}"
-    told = arguments(trained, tmp_path / "report", rollouts)
+    rollout = {"environment": environment, "checkpoint": checkpoint, "output": tmp_path / "rollout"}
+    overrides = [f"rollout.{key}={value}" for key, value in rollout.items()]
+    told = arguments(trained, tmp_path / "report", *overrides)
     assert run("", evaluate.main, told) == 0
     pages = {text.page for text in reports[0].blocks(Text)} - {""}
     assert pages == ({"../rollout/report.html"} if linked else set())
