@@ -7,6 +7,7 @@ recording that looked most alike. A policy that is no better than it has learnt 
 from collections.abc import Iterator
 
 import numpy as np
+import torch
 from jaxtyping import Float64
 from numpy.typing import NDArray
 from sklearn.neighbors import NearestNeighbors
@@ -15,6 +16,7 @@ from sklearn.random_projection import SparseRandomProjection
 
 from pipeline.base.bfloat16 import widen
 from pipeline.policy.normalization import ChannelStatistics
+from pipeline.policy.state_channels import Kind, channel_kinds, expand
 from pipeline.store import FeatureStore
 from pipeline.train.batches import Ticks, evenly
 from pipeline.train.predictions import Actions
@@ -96,15 +98,18 @@ class Baselines:
 class Neighbours:
     """Training ticks by their newest state reading and the features of their VL row.
 
-    Both are z-scored; wide features are projected at random (Achlioptas 2003), which keeps
-    distances. Each part is then scaled to the same mean square length, so that both weigh equally.
-    A tick that lacks a part has its mean, which is zero.
+    Of angles the sine and the cosine count. Both are z-scored; wide features are projected at
+    random (Achlioptas 2003), which keeps distances. Each part is then scaled to the same mean
+    square length, so that both weigh equally. A tick that lacks a part has its mean, which is zero.
     """
 
     def __init__(
         self, store: FeatureStore, ticks: Ticks, features: ChannelStatistics | None
     ) -> None:
         self._store, self._ticks, self._statistics = store, ticks, features
+        kinds = channel_kinds(store.streams["state"]["names"], store.streams["state"]["units"])
+        # Relative to itself, as policies take it, a reading's rotation would be none.
+        self._kinds: list[Kind] = ["deg" if kind == "rotation" else kind for kind in kinds]
         states, known = self._newest_states(ticks)
         self._scaler = StandardScaler().fit(states[known]) if states[known].size else None
         width = 0 if features is None else features.mean.size
@@ -138,13 +143,13 @@ class Neighbours:
         return parts
 
     def _newest_states(self, ticks: Ticks) -> tuple[Values, NDArray[np.bool_]]:
-        """(tick, channel), zeros without a reading, and where there is one."""
+        """(tick, expanded channel), of zeros without a reading, and where there is one."""
         values = self._store.array("state/values")
         end = self._store.array("tick/state_end")[ticks]
         known = end > self._store.array("episode/state_start")[self._store.episode_of(ticks)]
-        states = np.zeros((len(ticks), values.shape[1]))
+        states = np.zeros((len(ticks), values.shape[1]), np.float32)
         states[known] = values[end[known] - 1]
-        return states, known
+        return expand(torch.from_numpy(states)[:, None], self._kinds)[:, 0].double().numpy(), known
 
     def _features(self, rows: NDArray[np.int64], statistics: ChannelStatistics) -> Iterator[Values]:
         """Those of these VL rows, of the plain frames, z-scored and projected, block by block."""
