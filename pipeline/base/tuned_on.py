@@ -16,16 +16,22 @@ _ATTRIBUTE = "tuned_on"
 """Of a store, where its model says it."""
 
 
-class TunedPart(Section):
-    """Ticks of one episode that a model has seen."""
+class EpisodePart(Section):
+    """The ticks of one episode on one side of a split."""
 
-    episode: str
-    """As "source/id"."""
     ticks: tuple[int, int]
     """[first, stop), counted in the episode."""
     content: str
     """Digest of the episode's files."""
     group: str
+    """Episodes of one group are on one side, but for a single one that is cut by time."""
+
+
+class TunedPart(EpisodePart):
+    """Those that a model has seen."""
+
+    episode: str
+    """As "source/id"."""
 
 
 class TunedOn(Section):

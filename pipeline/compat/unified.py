@@ -15,9 +15,10 @@ from torch import Tensor, nn
 
 from pipeline.base.config import FusionStrategy, ModelType, TrainHeadParams, TuningParams, VLMParams
 from pipeline.base.errors import ObservationError
+from pipeline.base.observation import Observation
 from pipeline.policy.live_policy import LivePolicy
 from pipeline.policy.normalization import ChannelStatistics, Normalization
-from pipeline.policy.observation import AGES, VALIDITY, LiveObservation, PolicyShape, check_axes
+from pipeline.policy.observation import VALIDITY, LiveObservation, PolicyShape, check_axes
 from pipeline.policy.policy import Policy
 from pipeline.vlm.feature_spec import feature_shape
 
@@ -41,7 +42,6 @@ _SEED_PARTS: Mapping[str, Mapping[str, Any]] = {
 }
 """Of the parts this class has always had, where params.yaml has leaner defaults."""
 
-_FEATURE_AGES = ("feature_age", "view_age")
 _ACTION_GROUPS = ("translation",) * 3 + ("rotation",) * 3 + ("gripper",)
 
 
@@ -186,7 +186,7 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
         **validity: Any,
     ) -> LiveObservation:
         """The observation of what `forward` takes; equal frames and text share a row."""
-        if unknown := set(validity) - {*VALIDITY.values(), *AGES.values(), *_FEATURE_AGES}:
+        if unknown := validity.keys() - (Observation.__dataclass_fields__.keys() - VALIDITY.keys()):
             raise TypeError(f"unexpected arguments: {', '.join(sorted(unknown))}")
         rows: list[PreparedRow] = []
         row_of = [] if images is None else [-1] * len(images)

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -152,7 +152,7 @@ def judged_document(
             "horizon": params.horizon,
             "execute": wanted.execute,
             "test": {
-                name: asdict(part) | {"ticks": list(part.ticks)}
+                name: part.model_dump(mode="json")
                 for name, part in checkpoint.split["test"].items()
             },
         },

@@ -30,6 +30,7 @@ from pipeline.base.durable import (
 )
 from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch, PipelineError
 from pipeline.base.ownership import OutputKind
+from pipeline.base.tuned_on import EpisodePart
 from pipeline.policy.normalization import Normalization
 
 # torch takes over a second to import, and what only asks whether a training is finished needs none.
@@ -49,18 +50,6 @@ CHECKPOINT = OutputKind("a checkpoint of a policy", lambda folder: (folder / DOC
 SOURCE_KEYS = ("feature_spec", "streams", "action_hz", "vlm_reuse_count")
 Side = Literal["train", "val", "test"]
 SIDES: tuple[Side, ...] = ("train", "val", "test")
-
-
-@dataclass(frozen=True)
-class EpisodePart:
-    """The ticks of one episode on one side of a split."""
-
-    ticks: tuple[int, int]
-    """[first, stop), counted in the episode."""
-    content: str
-    """Digest of the episode's files."""
-    group: str
-    """Episodes of one group are on one side, but for a single one that is cut by time."""
 
 
 @dataclass(frozen=True)
@@ -117,8 +106,8 @@ class PolicyCheckpoint:
             **self.source,
             "instructions": list(self.instructions),
             "split": {
-                side: {name: asdict(part) for name, part in self.split[side].items()}
-                for side in SIDES
+                side: {name: part.model_dump(mode="json") for name, part in parts.items()}
+                for side, parts in self.split.items()
             },
             "weights_sha256": weights_sha256,
             "normalization": self.normalization.document(),
@@ -187,7 +176,10 @@ def load_policy(folder: Path) -> PolicyCheckpoint:
             normalization=Normalization.from_document(document["normalization"]),
             source={key: document[key] for key in SOURCE_KEYS},
             split={
-                side: {name: _part(told) for name, told in document["split"][side].items()}
+                side: {
+                    name: EpisodePart.model_validate(part)
+                    for name, part in document["split"][side].items()
+                }
                 for side in SIDES
             },
             step=document["step"],
@@ -206,11 +198,6 @@ def check_policy(folder: Path) -> TrainHeadParams:
         check_digest(folder / WEIGHTS, document["weights_sha256"])
         Normalization.from_document(document["normalization"])
         return _params(document)
-
-
-def _part(told: Mapping[str, Any]) -> EpisodePart:
-    first, stop = told["ticks"]
-    return EpisodePart((int(first), int(stop)), told["content"], told["group"])
 
 
 def _params(document: Mapping[str, Any]) -> TrainHeadParams:

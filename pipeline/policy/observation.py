@@ -75,7 +75,7 @@ class PolicyShape:
             "action": (self.action_dim,),
         }
 
-    def stream_axes(self, params: TrainHeadParams) -> dict[str, Axes]:
+    def stream_axes(self) -> dict[str, Axes]:
         """The axes behind the batch of each field of an `Observation` of this shape."""
         return {
             "features": {"slot": self.slots, "dim": self.feature_dim},
@@ -133,7 +133,7 @@ def build_observation(
     index = torch.tensor(row_of, dtype=torch.int64, device=device)
     # The number of elements and not len, which a scalar lacks; its shape is refused all the same.
     count = given[first].shape[:1].numel() if first in given else len(index)
-    axes = shape.stream_axes(params)
+    axes = shape.stream_axes()
     lengths = {"sensor": params.sensor_window, "state": params.state_window}
     for stream in lengths & given.keys():
         if given[stream].ndim == 3:

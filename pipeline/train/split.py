@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from pipeline.base.config import SplitParams
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import CheckpointMismatch, ConfigError, StoreMismatch
-from pipeline.policy.checkpoint import SIDES, SOURCE_KEYS, EpisodePart, PolicyCheckpoint, Side
+from pipeline.base.tuned_on import EpisodePart
+from pipeline.policy.checkpoint import SIDES, SOURCE_KEYS, PolicyCheckpoint, Side
 from pipeline.store import Episode, FeatureStore, episode_name
 from pipeline.train.groups import episodes_by_group
 
@@ -320,7 +321,7 @@ def _parts(
         name, start = episode_name(episode), episode.ticks.start
         first, stop = int(inside[0]) - start, int(inside[-1]) + 1 - start
         assert len(inside) == stop - first, "ticks of an episode on one side lie side by side"
-        parts[name] = EpisodePart((first, stop), episode.content, groups[name])
+        parts[name] = EpisodePart(ticks=(first, stop), content=episode.content, group=groups[name])
     return parts
 
 

@@ -3,8 +3,7 @@
 from collections.abc import Iterable, Mapping
 
 from pipeline.base.errors import ConfigError
-from pipeline.base.tuned_on import TunedPart, of_store
-from pipeline.policy.checkpoint import EpisodePart
+from pipeline.base.tuned_on import EpisodePart, TunedPart, of_store
 from pipeline.store import FeatureStore
 from pipeline.train.split import Split, split_parts
 

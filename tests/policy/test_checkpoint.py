@@ -11,8 +11,8 @@ import torch
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.durable import read_document, write_document, write_with_digest
 from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch
+from pipeline.base.tuned_on import EpisodePart
 from pipeline.policy.checkpoint import (
-    EpisodePart,
     PolicyCheckpoint,
     find_policy,
     load_policy,
@@ -47,6 +47,10 @@ def store(
     return FeatureStore.open(tiny_store(tmp_path_factory.mktemp("checkpoint")))
 
 
+def part(first: int, stop: int, content: str, group: str) -> EpisodePart:
+    return EpisodePart(ticks=(first, stop), content=content, group=group)
+
+
 @pytest.fixture
 def checkpoint(store: FeatureStore) -> PolicyCheckpoint:
     normalization = fit_normalization(store, torch.arange(60).numpy(), WINDOWS)
@@ -58,9 +62,9 @@ def checkpoint(store: FeatureStore) -> PolicyCheckpoint:
         normalization=normalization,
         source=source_of(store),
         split={
-            "train": {"right/episode_005": EpisodePart((0, 20), "0-5", "right/episode_005")},
-            "val": {"right/episode_005": EpisodePart((24, 30), "0-5", "right/episode_005")},
-            "test": {"left/episode_004": EpisodePart((0, 30), "0-4", "elsewhere")},
+            "train": {"right/episode_005": part(0, 20, "0-5", "right/episode_005")},
+            "val": {"right/episode_005": part(24, 30, "0-5", "right/episode_005")},
+            "test": {"left/episode_004": part(0, 30, "0-4", "elsewhere")},
         },
         step=7,
         weights=Policy(PARAMS, shape, normalization).state_dict(),

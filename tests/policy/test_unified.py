@@ -439,7 +439,7 @@ def trained(demo_checkpoint: Path, small_params: Callable[..., TrainHeadParams])
         source = {"feature_spec": json.loads(json.dumps(spec.attrs()))}
         weights = fresh.state_dict()
         return PolicyCheckpoint(
-            fresh.params, shape, no_normalization(shape), source, {}, {}, 1, weights
+            fresh.params, shape, no_normalization(shape), source, {}, 1, weights
         ).policy()
 
     return policy

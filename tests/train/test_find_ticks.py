@@ -10,7 +10,8 @@ import pytest
 
 from pipeline.base.config import SplitParams
 from pipeline.base.errors import CheckpointMismatch
-from pipeline.policy.checkpoint import SIDES, EpisodePart
+from pipeline.base.tuned_on import EpisodePart
+from pipeline.policy.checkpoint import SIDES
 from pipeline.store import FeatureStore
 from pipeline.train.split import find_ticks, groups_of, split_by_episode, split_parts
 
@@ -27,7 +28,9 @@ class Listed:
 def parts(**told: tuple[int, int, str]) -> Parts:
     """Of `left_000=(first, stop, content)` and the like."""
     return {
-        name.replace("_", "/episode_", 1): EpisodePart((first, stop), content, f"group of {name}")
+        name.replace("_", "/episode_", 1): EpisodePart(
+            ticks=(first, stop), content=content, group=f"group of {name}"
+        )
         for name, (first, stop, content) in told.items()
     }
 

@@ -12,8 +12,9 @@ from pipeline.evaluate.baselines import BASELINES
 from pipeline.evaluate.experiments import SPANS, Experiment, best_experiment, experiment_table
 from pipeline.evaluate.figures import NO_INTERVAL
 from pipeline.evaluate.tables import FOOTNOTE
+from pipeline.look.evaluation.pictures import LABELS, STYLES
 from pipeline.look.page.blocks import Picture, Report, Section
-from pipeline.look.page.style import INK, LABELS, STYLES, finish, panels
+from pipeline.look.page.style import INK, finish, panels
 from pipeline.look.page.writing import sentence
 
 _EXPERTS = ("#0072B2", "#D55E00", "#56B4E9", "#F0E442", "#999999")

@@ -20,9 +20,7 @@ from pipeline.evaluate.tables import ABLATION_FOOTNOTE, HEADINGS
 from pipeline.look.page.style import (
     GRID,
     INK,
-    LABELS,
     PALETTE,
-    STYLES,
     canvas,
     draw_frame,
     draw_map,
@@ -35,6 +33,17 @@ from pipeline.store import Episode, FeatureStore, episode_name
 from pipeline.train.predictions import Predictions
 from pipeline.train.scores import ActionGroup, Comparison
 
+LABELS = {way: f"baseline: {words}" for way, words in HEADINGS.items()} | {"policy": "policy"}
+"""What legends say of each method."""
+STYLES: dict[str, dict[str, Any]] = {
+    "policy": {"color": "#0072B2", "marker": "o", "ls": "-", "zorder": 5, "lw": 2.4, "ms": 6.5},
+    # An open, larger square stays visible where the median action is next to no motion.
+    "zero_action": {"color": "#E69F00", "marker": "s", "ls": "--", "fillstyle": "none", "ms": 8.5},
+    "median_action": {"color": "#009E73", "marker": "^", "ls": "-."},
+    "repeat_last": {"color": "#CC79A7", "marker": "D", "ls": ":"},
+    "linear_fit": {"color": "#D55E00", "marker": "v", "ls": "-."},
+    "nearest_neighbour": {"color": "#56B4E9", "marker": "P", "ls": "--"},
+}
 SCATTER_POINTS = 4000
 EPISODE_LINES = 40
 _TITLE_WIDTH = 34

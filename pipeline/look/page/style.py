@@ -25,23 +25,6 @@ from numpy.typing import NDArray
 
 from pipeline.base.durable import disk_full_named, fresh
 
-LABELS = {
-    "policy": "policy",
-    "zero_action": "baseline: zero action",
-    "median_action": "baseline: median training action",
-    "repeat_last": "baseline: repeat the last action",
-    "linear_fit": "baseline: linear fit on two past actions",
-    "nearest_neighbour": "baseline: nearest neighbour",
-}
-STYLES: dict[str, dict[str, Any]] = {
-    "policy": {"color": "#0072B2", "marker": "o", "ls": "-", "zorder": 5, "lw": 2.4, "ms": 6.5},
-    # An open, larger square stays visible where the median action is next to no motion.
-    "zero_action": {"color": "#E69F00", "marker": "s", "ls": "--", "fillstyle": "none", "ms": 8.5},
-    "median_action": {"color": "#009E73", "marker": "^", "ls": "-."},
-    "repeat_last": {"color": "#CC79A7", "marker": "D", "ls": ":"},
-    "linear_fit": {"color": "#D55E00", "marker": "v", "ls": "-."},
-    "nearest_neighbour": {"color": "#56B4E9", "marker": "P", "ls": "--"},
-}
 INK = "#333333"
 """Text, axes, and whatever else is black on white paper."""
 GRID = "#dddddd"

@@ -341,7 +341,7 @@ def test_what_each_stream_is_worth_stands_beside_intact_and_best_baseline(tmp_pa
     assert heights(figure) == [[2.0, 1.5], [4.0]]
     for axis in figure.axes:
         assert [line.get_ydata()[0] for line in axis.lines] == [1.0, 6.0]
-    assert "median training action" in figure.legends[0].get_texts()[1].get_text()
+    assert "best baseline: median" in figure.legends[0].get_texts()[1].get_text()
     assert "4 test ticks, 4 chunk(s) a tick" in figure.get_suptitle()
     assert "zeroed: every value at its training mean" in figure.legends[0].get_title().get_text()
     (file,) = write(tmp_path, {"modalities.png": lambda: figure})
