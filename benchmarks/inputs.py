@@ -6,7 +6,8 @@ Run where params.yaml and the demo's store are, after `dvc repro`. Each variant 
 trains the head of params.yaml with each of `seeds` seeds, judges it on the test episodes and rolls
 it out; what is done already in FOLDER is not done again. Errors are averaged over the seeds and
 compared with the policy as it is by the paired bootstrap over groups of recordings; successes of
-all seeds are counted together (Wilson's interval), their episodes are the same ones.
+all seeds are counted together (Wilson's interval), their episodes are the same ones. Where lateness
+is the question, the model also takes `latency-ms`.
 
 The last line is JSON: for each variant both errors in training std, their differences from the
 policy as it is, and the success rates.
@@ -42,6 +43,13 @@ class Variant:
 
     params: tuple[str, ...] = ()
     patches: Mapping[str, Any] = field(default_factory=dict)
+    late: bool = False
+    """Whether to roll it out with a slow model too."""
+
+    @property
+    def rollouts(self) -> tuple[str, ...]:
+        """The folders of its rollouts."""
+        return ("rollout", "late") if self.late else ("rollout",)
 
 
 def _plain(names: Any, units: Any) -> tuple[str, ...]:
@@ -53,7 +61,7 @@ def _no_age(encoder: Any, age_s: torch.Tensor) -> torch.Tensor:
 
 
 VARIANTS = {
-    "as it is": Variant(),
+    "as it is": Variant(late=True),
     "readings by their order": Variant(
         ("train_head.sensor_window_s=null", "train_head.state_window_s=null")
     ),
@@ -70,7 +78,9 @@ VARIANTS = {
             "pipeline.policy.normalization._LEAST_SPREAD": 0.0,
         }
     ),
-    "late in training": Variant(("train_head.feature_lag=1", "train_head.sensor_lag_s=0.05")),
+    "late in training": Variant(
+        ("train_head.feature_lag=1", "train_head.sensor_lag_s=0.05"), late=True
+    ),
 }
 
 
@@ -89,7 +99,8 @@ def main() -> None:
         return
     jobs = [(name, seed) for seed in range(wanted.seeds) for name in wanted.only]
     for name, seed in tqdm(jobs, "inputs", unit="policy", disable=None):
-        if not (_folder(wanted.out, name, seed) / "late" / "metrics.json").exists():
+        last = _folder(wanted.out, name, seed) / VARIANTS[name].rollouts[-1]
+        if not (last / "metrics.json").exists():
             # A process each: what is patched for one is never seen by another.
             own = ["--out", str(wanted.out), "--latency-ms", str(wanted.latency_ms)]
             command = [sys.executable, "-m", "benchmarks.inputs", *own, "--one", name, str(seed)]
@@ -106,11 +117,14 @@ def _work(variant: Variant, seed: int, folder: Path, latency_ms: float) -> None:
     """Train, evaluate and roll out, on time and late."""
     from stages import evaluate, rollout, train_head
 
+    late = [f"rollout.latency_ms={latency_ms}"]
     steps: list[tuple[Callable[..., None], list[str]]] = [
         (train_head.main, []),
         (evaluate.main, []),
-        (rollout.main, []),
-        (rollout.main, [f"rollout.latency_ms={latency_ms}", f"rollout.output={folder / 'late'}"]),
+    ]
+    steps += [
+        (rollout.main, [f"rollout.output={folder / kind}", *(late if kind == "late" else [])])
+        for kind in variant.rollouts
     ]
     common = [
         *variant.params,
@@ -119,7 +133,6 @@ def _work(variant: Variant, seed: int, folder: Path, latency_ms: float) -> None:
         f"train_head.logs={folder / 'logs'}",
         f"evaluate.output={folder / 'report'}",
         "evaluate.modalities=false",
-        f"rollout.output={folder / 'rollout'}",
         "rollout.ablations=false",
     ]
     with ExitStack() as patched:
@@ -137,7 +150,7 @@ def _row(out: Path, name: str, seeds: int) -> dict[str, Any]:
     for place, figure in enumerate(FIGURES):
         row[figure] = _figure(own[:, place], counts[:, place])
         row[f"{figure}_difference"] = _figure((own - base)[:, place], counts[:, place])
-    for kind in ("rollout", "late"):
+    for kind in VARIANTS[name].rollouts:
         row[f"success_{kind}"] = _success(out, name, seeds, kind)
     return row
 

@@ -123,11 +123,12 @@ def judged_document(
     policies saw: which are better is a question to ask. `drawn` is equal for those
     of stochastic policies: the best of fewer samples errs more, and a batch shares its noise. It
     is null for policies that do not sample. The `recipe` of a policy is equal for trainings that
-    differ by their seed alone.
+    differ by their seed or their fold alone.
     """
     params = checkpoint.params
     source = source_of(store)
-    decides = params.model_dump(mode="json", exclude=FREE_PARAMS | {"seed"})
+    left_out = dict.fromkeys(FREE_PARAMS | {"seed"}, True) | {"split": {"fold"}}
+    decides = params.model_dump(mode="json", exclude=left_out)
     recipe = [decides, source["feature_spec"]["digest"]]
     drawn = None
     if policy.stochastic:

@@ -5,9 +5,9 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +30,7 @@ _SAME = 1e-4
 _OF_FEATURES = "nearest_neighbour"
 """The baseline that sees features, and so differs between stores of the same recordings."""
 _SHARED = {
-    "on": ("on the same test ticks", "recordings"),
+    "on": ("on the same test ticks, all folds together,", "recordings and folds"),
     "drawn": ("from as many samples and ticks a batch", "evaluate.samples and evaluate.batch_size"),
 }
 """By key of `JUDGED`: how evaluations in one table are alike, and by what they become so."""
@@ -38,22 +38,26 @@ _SHARED = {
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """The evaluations, read back, of policies whose training differs by its seed alone."""
+    """The evaluations, read back, of policies whose training differs by its seed or fold alone."""
 
     name: str
     model_type: str
     fusion_strategy: str
     recipe: str
-    """Equal where but the seed differs."""
+    """Equal where but the seed or the fold differs."""
     seeds: tuple[int, ...]
     parameters: int
     samples: int
+    groups: tuple[str, ...]
+    """Of test recordings, in order; those of all folds."""
     entries: Mapping[str, NDArray[np.float64]]
     """Of each of `SPANS`: (group,) recorded actions that were judged."""
     errors: Mapping[tuple[str, str], NDArray[np.float64]]
     """Of each of `METHODS` in each of `SPANS`: (seed, group) mean absolute error [training std]."""
     training_s: float | None
     """Time that a training took; None where its speed file is not there."""
+    folds: int = 1
+    """Evaluations that are test for other groups each, and taken together."""
 
     def by_seed(self, span: str, method: str = "policy") -> NDArray[np.float64]:
         """(seed,) errors over all groups [training std]."""
@@ -79,13 +83,17 @@ class Experiment:
         return bootstrap_means(sums, entries)[:, 0] if len(sums) >= FEWEST_GROUPS else None
 
 
+Evaluated: TypeAlias = tuple[Mapping[str, Any], Experiment]
+"""What `JUDGED` says by key of `_SHARED`, and what is compared."""
+
+
 def read_experiments(reports: Path) -> tuple[Experiment, ...]:
     """The evaluations in the folders of `reports`, ordered by expert, fusion and name.
 
-    Those whose trainings differ by the seed alone are one experiment. What else lies there, such
-    as the logs of a training, is passed over. Raises `ConfigError` where there is none, where one
-    lacks a file or cannot be read, where they were not evaluated on the same ticks, and where
-    stochastic policies were not sampled alike.
+    Those whose trainings differ by the seed or the fold alone are one experiment. What else lies
+    there, such as the logs of a training, is passed over. Raises `ConfigError` where there is none,
+    where one lacks a file or cannot be read, where they were not evaluated on the same ticks (all
+    folds together), and where stochastic policies were not sampled alike.
     """
     folders = [
         folder
@@ -98,7 +106,11 @@ def read_experiments(reports: Path) -> tuple[Experiment, ...]:
             f"{JUDGED}, found none. Run stages.evaluate for each with its own evaluate.output "
             "there, or dvc repro experiments/dvc.yaml."
         )
-    documents, experiments = zip(*(_read_experiment(folder) for folder in folders), strict=True)
+    runs: dict[tuple[Any, ...], list[Evaluated]] = {}
+    for document, experiment in map(_read_experiment, folders):
+        runs.setdefault((experiment.recipe, *experiment.seeds), []).append((document, experiment))
+    pooled = chain.from_iterable(map(_pooled, runs.values()))
+    documents, experiments = zip(*pooled, strict=True)
     for key, (alike, remedy) in _SHARED.items():
         pairs = zip(experiments, documents, strict=True)
         shared = [(one.name, document[key]) for one, document in pairs if document[key] is not None]
@@ -108,8 +120,8 @@ def read_experiments(reports: Path) -> tuple[Experiment, ...]:
                 raise ConfigError(
                     f"compare.reports: expected evaluations {alike} in {reports}, but:\n"
                     + "\n".join(lines)
-                    + f"\nEvaluate all of them with one {remedy}, or move those that do not belong "
-                    "away."
+                    + f"\nEvaluate all of them with the same {remedy}, or move those that do not "
+                    "belong away."
                 )
     for experiment, other in pairwise(experiments):
         _check_baselines(reports, experiment, other)
@@ -139,7 +151,8 @@ def experiment_table(experiments: Sequence[Experiment], span: str, trained: bool
         seconds = experiment.training_s
         rows.append(
             [
-                *(experiment.name, len(experiment.seeds), experiment.error(span).text()),
+                *(experiment.name, len(experiment.seeds), experiment.folds),
+                experiment.error(span).text(),
                 f"{low:.3f} to {high:.3f}" if len(experiment.seeds) > 1 else None,
                 "it is" if experiment is best else _verdict(experiment.minus(best, span)),
                 f"{_verdict(own)} ({HEADINGS[baseline]})",
@@ -149,8 +162,8 @@ def experiment_table(experiments: Sequence[Experiment], span: str, trained: bool
         )
     for method in BASELINES:
         error = min((one.error(span, method) for one in experiments), key=lambda e: e.value)
-        rows.append([f"baseline: {HEADINGS[method]}", None, error.text(), *[None] * 8])
-    heads = ["experiment", "seeds", f"{SPANS[span]} [training std]", "over seeds"]
+        rows.append([f"baseline: {HEADINGS[method]}", None, None, error.text(), *[None] * 8])
+    heads = ["experiment", "seeds", "folds", f"{SPANS[span]} [training std]", "over seeds"]
     heads += ["minus the best", "minus the best baseline"]
     heads += ["expert", "fusion", "samples", "parameters", "trained [s]"]
     stop = len(heads) if trained else -1
@@ -165,6 +178,7 @@ def experiment_csv(experiments: Sequence[Experiment]) -> Table:
         row: dict[str, Any] = {"experiment": experiment.name}
         row |= {key: getattr(experiment, key) for key in own}
         row["seeds"] = " ".join(map(str, experiment.seeds))
+        row["folds"] = experiment.folds
         for span in SPANS:
             baseline = experiment.best_baseline(span)
             best = best_experiment(experiments, span)
@@ -188,23 +202,59 @@ def _apart(name: str, apart: Figure) -> dict[str, Any]:
     return {**apart.columns(name), f"{name}_is": apart.verdict}
 
 
+def _pooled(run: Sequence[Evaluated]) -> Sequence[Evaluated]:
+    """One evaluation of the folds of one training, whose test groups stand side by side.
+
+    As they are where some test group is in two of them: then they are no folds.
+    """
+    (document, first), *others = run
+    groups = np.array([group for _, one in run for group in one.groups])
+    if not others or len(set(groups)) < len(groups):
+        return run
+    order = np.argsort(groups)
+
+    def together(parts: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+        return np.concatenate(parts, axis=-1)[..., order]
+
+    test = {name: part for document, _ in run for name, part in document["on"]["test"].items()}
+    experiment = replace(
+        first,
+        name=_less_number(first.name),
+        groups=tuple(groups[order].tolist()),
+        entries={span: together([one.entries[span] for _, one in run]) for span in SPANS},
+        errors={key: together([one.errors[key] for _, one in run]) for key in first.errors},
+        training_s=_mean_time([one for _, one in run]),
+        folds=len(run),
+    )
+    return [({**document, "on": document["on"] | {"test": test}}, experiment)]
+
+
 def _merged(seeds: Sequence[Experiment]) -> Experiment:
     """One experiment of evaluations of one recipe, named as the first less its seed."""
     first, *others = seeds
     if not others:
         return first
-    times = [one.training_s for one in seeds if one.training_s is not None]
     return replace(
         first,
-        name=re.sub(r"[-_]?(seed)?[-_]?\d+$", "", first.name) or first.name,
+        name=_less_number(first.name),
         seeds=tuple(seed for one in seeds for seed in one.seeds),
         errors={key: np.concatenate([one.errors[key] for one in seeds]) for key in first.errors},
-        training_s=float(np.mean(times)) if times else None,
+        training_s=_mean_time(seeds),
     )
 
 
-def _read_experiment(folder: Path) -> tuple[dict[str, Any], Experiment]:
-    """What `JUDGED` says, and the experiment of one seed."""
+def _less_number(name: str) -> str:
+    """A folder's name without the seed and the fold at its end."""
+    return re.sub(r"([-_]?(seed|fold)[-_]?\d+)+$|[-_]?\d+$", "", name) or name
+
+
+def _mean_time(experiments: Sequence[Experiment]) -> float | None:
+    times = [one.training_s for one in experiments if one.training_s is not None]
+    return float(np.mean(times)) if times else None
+
+
+def _read_experiment(folder: Path) -> Evaluated:
+    """What `JUDGED` says, and the experiment of one seed and fold."""
     file = folder / GROUPS
     try:
         rows = list(csv.DictReader(file.read_text(encoding="utf-8").splitlines()))
@@ -222,6 +272,7 @@ def _read_experiment(folder: Path) -> tuple[dict[str, Any], Experiment]:
             folder.name,
             **{key: policy[key] for key in own},
             seeds=(policy["seed"],),
+            groups=tuple(row["group"] for row in rows),
             entries=entries,
             errors=errors,
             training_s=_training_seconds(Path(policy["logs"])),

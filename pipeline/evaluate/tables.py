@@ -23,6 +23,7 @@ from pipeline.evaluate.figures import (
     rivalry,
     sums_by_group,
 )
+from pipeline.evaluate.intervals import FEWEST_GROUPS
 from pipeline.evaluate.names import rounded, with_unit
 from pipeline.evaluate.phases import PHASE_RULE, PHASES
 from pipeline.evaluate.samples import BEST, ENERGY, MEAN
@@ -66,10 +67,18 @@ def scopes(comparison: Comparison) -> dict[str, Comparison]:
 
 
 def titles(comparison: Comparison) -> tuple[str, str]:
-    """What is executed and the whole chunk in words."""
+    """What is executed and the whole chunk in words, and whether their figures have intervals."""
     horizon = comparison.cells.entries.shape[1]
     steps = "step 0" if comparison.execute == 1 else f"the first {comparison.execute} steps"
-    return f"what is executed, {steps} of {horizon}", f"the whole chunk of {horizon} step(s)"
+    ends = "with 95 % intervals" if _has_intervals(comparison) else "without intervals"
+    return (
+        f"what is executed, {steps} of {horizon}, {ends}",
+        f"the whole chunk of {horizon} step(s), {ends}",
+    )
+
+
+def _has_intervals(comparison: Comparison) -> bool:
+    return len(np.unique(comparison.cells.group)) >= FEWEST_GROUPS
 
 
 def metrics(comparison: Comparison, energy: Figure | None = None) -> dict[str, Any]:
@@ -186,7 +195,7 @@ def still_dimensions(comparison: Comparison) -> str:
 
 def verdicts(comparison: Comparison) -> str:
     """Whether policy and best baseline differ overall, in each scope."""
-    if len(np.unique(comparison.cells.group)) < 2:
+    if not _has_intervals(comparison):
         return NO_INTERVAL
     words: list[str] = []
     for scope, part in scopes(comparison).items():
@@ -210,7 +219,7 @@ def error_text(comparison: Comparison, energy: Figure | None = None) -> str:
     """The errors of what is executed, then of the chunk; samples, verdicts, phases below them."""
     lines: list[str] = []
     for title, part in zip(titles(comparison), (comparison.executed, comparison), strict=True):
-        lines += [f"{title}, with 95 % intervals:", *error_table(part).text(), ""]
+        lines += [f"{title}:", *error_table(part).text(), ""]
     lines += [FOOTNOTE, samples_text(comparison, energy), verdicts(comparison)]
     lines += [still] if (still := still_dimensions(comparison)) else []
     if by_phase(comparison):

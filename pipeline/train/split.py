@@ -338,8 +338,8 @@ def find_ticks(
     if not parts:
         raise CheckpointMismatch(
             f"the checkpoint lists no {side} episode, so there is nothing to look at: it was "
-            f"trained with train_head.split.{side} 0, or on too short a recording. Train with a "
-            "share above 0."
+            f"trained with train_head.split.{side} 0, or on too short a recording. Train again "
+            f"with train_head.split.{side} above 0."
         )
     by_name = {episode_name(episode): episode for episode in store.episodes}
     renamed: dict[str, list[Episode]] = {}

@@ -30,18 +30,25 @@ HARD = np.linspace(0.2, 0.6, 12)
 def written(tmp_path: Path) -> Written:
     """`written(name, executed, seed=0, ...)`: an evaluation by hand; a chunk errs twice as much.
 
-    Group k has k + 1 executed entries and 8 times as many in all.
+    Group k, from `first` on, has k + 1 executed entries and 8 times as many in all.
     """
 
     def write(
-        name: str, executed: np.ndarray, seed: int = 0, recipe: str | None = None, **judged: Any
+        name: str,
+        executed: np.ndarray,
+        seed: int = 0,
+        recipe: str | None = None,
+        first: int = 0,
+        **judged: Any,
     ) -> Path:
         folder = tmp_path / "reports" / name
         folder.mkdir(parents=True)
+        places = range(first, first + len(executed))
+        names = [f"demo/{k:02}" for k in places]
         rules = {way: 0.3 + 0.1 * place for place, way in enumerate(BASELINES)}
-        columns: dict[str, list[Any]] = {"group": [f"demo/{k}" for k in range(len(executed))]}
+        columns: dict[str, list[Any]] = {"group": names}
         for span, times in (("executed", 1), ("overall", 2)):
-            entries = (1 if times == 1 else 8) * np.arange(1, len(executed) + 1)
+            entries = (1 if times == 1 else 8) * (np.array(places) + 1)
             columns[f"{span}_entries"] = entries.tolist()
             errors = {"policy": executed} | {w: np.full(len(executed), e) for w, e in rules.items()}
             columns |= {f"{way}_{span}": (times * errors[way]).tolist() for way in METHODS}
@@ -56,7 +63,8 @@ def written(tmp_path: Path) -> Written:
             "seed": seed,
             "recipe": recipe or name,
         }
-        document = {"policy": policy, "drawn": None, "on": {"horizon": 8}} | judged
+        on = {"horizon": 8, "test": dict.fromkeys(names, "its digest")}
+        document = {"policy": policy, "drawn": None, "on": on} | judged
         (folder / JUDGED).write_text(json.dumps(document))
         return folder.parent
 
@@ -124,12 +132,51 @@ def test_seeds_are_one_row_with_their_spread(written: Written) -> None:
     assert (apart.value, apart.low, apart.high) == pytest.approx((0.01, 0.01, 0.01), abs=1e-5)
     table = experiment_table([concat, gated], "executed")
     assert [row[1] for row in table.rows[:2]] == [1, 3]
-    assert [row[3] for row in table.rows[:2]] == [None, f"{base - 0.03:.3f} to {base + 0.06:.3f}"]
+    assert [row[4] for row in table.rows[:2]] == [None, f"{base - 0.03:.3f} to {base + 0.06:.3f}"]
     file = experiment_csv([concat, gated])
     row = dict(zip(file.columns, file.rows[1], strict=True))
     assert row["seeds"] == "0 1 2"
     assert row["executed_seed_min"] == pytest.approx(base - 0.03, abs=1e-5)
     assert row["executed_seed_max"] == pytest.approx(base + 0.06, abs=1e-5)
+
+
+def test_folds_are_one_evaluation_of_all_their_groups(written: Written) -> None:
+    for seed in (0, 1):
+        for fold in (2, 0, 1):
+            places = slice(4 * fold, 4 * fold + 4)
+            errors, name = HARD[places] + 0.1 * seed, f"few-seed{seed}-fold{fold}"
+            written(name, errors, seed=seed, recipe="few", first=4 * fold)
+    reports = written("whole", HARD)
+    few, whole = read_experiments(reports)
+    assert (few.name, few.seeds, few.folds, whole.folds) == ("few", (0, 1), 3, 1)
+    assert few.groups == whole.groups
+    for span, times in (("executed", 1), ("overall", 2)):
+        base = whole.error(span).value
+        np.testing.assert_allclose(few.by_seed(span), [base, base + 0.1 * times], rtol=1e-5)
+        apart = few.minus(whole, span)
+        # The groups are paired over all folds: the difference is the same in each.
+        assert (apart.low, apart.high) == pytest.approx((0.05 * times, 0.05 * times), abs=1e-5)
+    table = experiment_table([few, whole], "executed")
+    assert [row[:3] for row in table.rows[:2]] == [["few", 2, 3], ["whole", 1, 1]]
+    file = experiment_csv([few, whole])
+    assert [row[list(file.columns).index("folds")] for row in file.rows] == [3, 1]
+
+
+def test_a_fold_that_is_missing_is_refused(written: Written) -> None:
+    written("few-fold0", HARD[:4], recipe="few")
+    written("few-fold1", HARD[4:8], recipe="few", first=4)
+    reports = written("whole", HARD)
+    with pytest.raises(
+        ConfigError, match=r"same test ticks, all folds .*\n.*demo/08: null \(few\)"
+    ):
+        read_experiments(reports)
+
+
+def test_overlapping_tests_are_no_folds(written: Written) -> None:
+    written("a", HARD[:4], recipe="a")
+    reports = written("b", HARD[3:8], recipe="a", first=3)
+    with pytest.raises(ConfigError, match="same test ticks"):
+        read_experiments(reports)
 
 
 def test_one_group_has_no_interval(written: Written) -> None:
@@ -138,13 +185,14 @@ def test_one_group_has_no_interval(written: Written) -> None:
     a, b = read_experiments(reports)
     assert b.minus(a, "executed") == Figure(pytest.approx(0.1))
     table = experiment_table([a, b], "executed")
-    assert table.rows[1][4] == "+0.100"
+    assert table.rows[1][5] == "+0.100"
 
 
 @pytest.mark.parametrize("groups", [11, 12])
 def test_other_baselines_are_refused(written: Written, groups: int) -> None:
-    reports = written("a", HARD)
-    written("b", HARD[:groups])
+    on = {"horizon": 8, "test": {}}
+    reports = written("a", HARD, on=on)
+    written("b", HARD[:groups], on=on)
     if groups == 12:
         file = reports / "b" / GROUPS
         file.write_text(file.read_text().replace(",0.3,", ",0.31,"))
@@ -166,4 +214,4 @@ def test_the_neighbour_in_other_features_is_another(written: Written) -> None:
         "zero_action",
         "nearest_neighbour",
     )
-    assert experiment_table([a, b], "executed").rows[-1][2].startswith("0.100")
+    assert experiment_table([a, b], "executed").rows[-1][3].startswith("0.100")

@@ -286,7 +286,7 @@ class TestSides:
             ({"val": 0.5, "test": 0.5}, "leave nothing to train on"),
             ({"val": 0.5, "folds": 2}, "leave nothing to train on"),
             ({"folds": 5, "fold": 5}, "fold 5 of folds 5"),
-            ({"fold": 1}, "fold 1 of folds None"),
+            ({"fold": 1}, "fold 1 without folds"),
             ({"folds": 1}, "greater than or equal to 2"),
             ({"val": -0.1}, "greater than or equal to 0"),
         ],

@@ -56,6 +56,10 @@ class SplitParams(Section):
                 f"val {self.val:g} and test {test:g} leave nothing to train on; they must add up "
                 "to less than 1"
             )
+        if self.folds is None and self.fold:
+            raise ValueError(
+                f"fold {self.fold} without folds: expected a number of folds, of which it is test"
+            )
         if self.fold >= (self.folds or 1):
             raise ValueError(
                 f"fold {self.fold} of folds {self.folds}: expected a fold from 0 that is smaller "

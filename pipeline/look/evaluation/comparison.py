@@ -45,7 +45,10 @@ def comparison_report(experiments: Sequence[Experiment]) -> Report:
         best = best_experiment(experiments, span)
         tiles.append((f"lowest error of {words} [training std]", best.error(span).text()))
         tiles.append(("by", best.name))
-    summary = f"{len(experiments)} experiments judged on the same test ticks."
+    summary = (
+        f"{len(experiments)} experiment(s) judged on the same test ticks, of "
+        f"{len(experiments[0].groups)} group(s) of recordings."
+    )
     if experiments[0].error("executed").low is None:
         summary += f" {sentence(NO_INTERVAL)}"
     return Report(

@@ -32,12 +32,12 @@ _PAIRED = (
 )
 _CAPTIONS = {
     "methods": "Overall error of policy and baselines, of what is executed and of the whole chunk, "
-    "with 95 % intervals.",
+    "with 95 % intervals where there are two groups of test recordings or more.",
     "dimensions": "Mean absolute error of policy and baselines by dimension, of those that vary, "
     "over the whole chunk.",
     "scatter": "Predicted against recorded next action at the test ticks.",
     "horizon": "Mean absolute error of policy and baselines by how far ahead an action lies; the "
-    "bands of the policy and of the best baseline are 95 % intervals.",
+    "bands of the policy and of the best baseline, where there are some, are 95 % intervals.",
     "dimension_horizon": "The policy's error by dimension and step [training std].",
     "episodes": "Mean absolute error of policy and baselines in each test episode.",
     "timeline": "Every action dimension over the episodes of lowest and highest error.",
@@ -95,7 +95,7 @@ def _tiles(comparison: Comparison) -> list[tuple[str, str]]:
     rivals = rivalry(comparison.without_low_variance())
     if comparison.low_variance() and rivals.ratio is not None:
         best = tables.HEADINGS[rivals.best]
-        label = f"chunk: of the best baseline's, without what hardly moves ({best})"
+        label = f"chunk: share of the best baseline's error, without what hardly moves ({best})"
         tiles.append((label, f"{100 * rivals.ratio:.0f} %"))
     return [*tiles, ("test episodes", f"{len(comparison.episodes)}")]
 
@@ -105,7 +105,7 @@ def _executed(comparison: Comparison, rollout: str) -> list[Block]:
     errors = tables.error_table(comparison.executed)
     success = "Whether the task succeeds, recorded ticks do not tell: the rollouts do."
     return [
-        Text(f"{sentence(title)} With 95 % intervals over groups of test recordings."),
+        Text(f"{sentence(title)} {sentence(tables.verdicts(comparison))}"),
         replace(errors, caption=sentence(tables.FOOTNOTE)),
         _picture(plots.methods, comparison),
         Text(success, rollout),
@@ -115,9 +115,8 @@ def _executed(comparison: Comparison, rollout: str) -> list[Block]:
 def _chunk(evaluation: Evaluation) -> list[Block]:
     comparison = evaluation.comparison
     _, title = tables.titles(comparison)
-    caption = f"{sentence(title)} With 95 % intervals."
     return [
-        replace(tables.error_table(comparison), caption=caption),
+        replace(tables.error_table(comparison), caption=sentence(title)),
         Text(sentence(tables.samples_text(comparison, evaluation.energy))),
         replace(tables.difference_table(comparison), caption=_PAIRED),
     ]

@@ -82,7 +82,7 @@ def methods(comparison: Comparison) -> Figure:
         axis.grid(axis="y", visible=False)
     axes[0].set_yticks(range(len(METHODS)), [HEADINGS[method] for method in METHODS])
     axes[0].invert_yaxis()
-    figure.suptitle("Overall error on test ticks, with 95 % intervals (left is better)")
+    figure.suptitle("Overall error on test ticks (left is better)")
     return figure
 
 

@@ -32,6 +32,7 @@ def experiments() -> list[Experiment]:
             seeds=tuple(range(len(executed))),
             parameters=1000,
             samples=1,
+            groups=tuple(f"demo/{k}" for k in range(6)),
             entries={span: np.full(6, 10.0) for span in SPANS},
             errors=errors | rules,
             training_s=7.0,
@@ -49,9 +50,9 @@ def test_experiments_are_one_page(
     report = comparison_report(experiments)
     executed, chunk = report.blocks(Table)
     assert list(executed.columns[-4:]) == ["expert", "fusion", "samples", "parameters"]
-    assert executed.columns[2] == "what is executed [training std]"
-    assert chunk.columns[2] == "the whole chunk [training std]"
-    assert [row[1] for row in executed.rows[:2]] == [1, 2]
+    assert executed.columns[3] == "what is executed [training std]"
+    assert chunk.columns[3] == "the whole chunk [training std]"
+    assert [row[1:3] for row in executed.rows[:2]] == [[1, 1], [2, 1]]
     assert (executed.strong, chunk.strong) == ({0}, {1})
     assert len(executed.rows) == 2 + len(BASELINES)
     assert [tile[1] for tile in report.tiles][1::2] == ["regression-concat", "diffusion-concat"]

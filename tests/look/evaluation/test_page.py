@@ -148,7 +148,7 @@ def test_dimensions_that_hardly_move_stand_at_the_top(judgement: Evaluation) -> 
     said = {label.split(" (")[0]: value for label, value in report.tiles}
     share = rivalry(still.without_low_variance()).ratio
     assert share is not None and share != rivalry(still).ratio
-    label = "chunk: of the best baseline's, without what hardly moves"
+    label = "chunk: share of the best baseline's error, without what hardly moves"
     assert said[label] == f"{100 * share:.0f} %"
     report = evaluation_report(judgement)
     assert "ardly mov" not in f"{report.summary} {report.tiles}"
