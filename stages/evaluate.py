@@ -39,7 +39,7 @@ def main(params: Params) -> None:
     evaluation = evaluate_checkpoint(
         folder, checkpoint, store, params.evaluate, device, params.data.root, say
     )
-    files = _write(params.evaluate.output, evaluation, params.rollout.output / PAGE)
+    files = _write(params.evaluate.output, evaluation, _rollouts_page(params))
     print(error_text(evaluation.comparison, evaluation.energy))
     if evaluation.study is not None:
         print(f"\n{ablation_text(evaluation.study)}")
@@ -58,11 +58,21 @@ def _store_for(checkpoint: PolicyCheckpoint, params: Params) -> FeatureStore:
     return store
 
 
-def _write(folder: Path, evaluation: Evaluation, rollout: Path) -> list[Path]:
-    """The tables, the page with its pictures, and what was evaluated; returns their paths.
+def _rollouts_page(params: Params) -> str:
+    """Where stages.rollout puts the page of this policy, seen from here; empty where it does not.
 
-    The page links to that of the rollouts, where there is one.
+    By the params alone: dvc repro runs it after this stage.
     """
+    judged, rolled_out = (
+        section.checkpoint or params.train_head.output
+        for section in (params.evaluate, params.rollout)
+    )
+    page = os.path.relpath(params.rollout.output / PAGE, params.evaluate.output)
+    return page if judged == rolled_out and params.rollout.environment else ""
+
+
+def _write(folder: Path, evaluation: Evaluation, rollouts: str) -> list[Path]:
+    """The tables, the page with its pictures, and what was evaluated; returns their paths."""
     claim(folder, REPORT)
     files = write_tables(
         folder,
@@ -73,5 +83,5 @@ def _write(folder: Path, evaluation: Evaluation, rollout: Path) -> list[Path]:
         evaluation.energy,
     )
     write_document(folder / JUDGED, evaluation.judged)
-    link = os.path.relpath(rollout, folder) if rollout.exists() else ""
-    return [*files, folder / JUDGED, *write_report(folder, evaluation_report(evaluation, link))]
+    report = evaluation_report(evaluation, rollouts)
+    return [*files, folder / JUDGED, *write_report(folder, report)]

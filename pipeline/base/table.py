@@ -4,7 +4,7 @@ import csv
 import io
 import math
 import numbers
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -41,6 +41,12 @@ class Table:
     caption: str = ""
     strong: frozenset[int] = field(default_factory=frozenset[int])
     """Rows that stand out in a page."""
+
+    @classmethod
+    def of(cls, rows: Iterable[Mapping[str, Any]]) -> "Table":
+        """Of rows that say the same heads each, one of them at least."""
+        rows = list(rows)
+        return cls(list(rows[0]), [list(row.values()) for row in rows])
 
     def __post_init__(self) -> None:
         for index, row in enumerate(self.rows):

@@ -1,11 +1,10 @@
 """When a tool touches something, by the force alone.
 
-At the start the needle is clear, so the median force of
-the first `_REST_S` is rest; the noise is what the force does from reading to reading and within
-that time. The force, smoothed by a running median, is in contact from where it leaves rest by
-`_ENTER` times its noise until it is back within `_LEAVE` times: hysteresis, as in O. H. Schmitt,
-"A thermionic trigger", Journal of Scientific Instruments 15(1), 1938. A force in newtons has to
-leave rest by `_LEAST_N` at least.
+At the start the needle is clear, so the median force of the first `_REST_S` is rest; the noise is
+what the force does from reading to reading and within that time. The force, smoothed by a running
+median, is in contact from where it leaves rest by `_ENTER` times its noise until it is back within
+`_LEAVE` times: hysteresis, as in O. H. Schmitt, "A thermionic trigger", Journal of Scientific
+Instruments 15(1), 1938. A force in newtons has to leave rest by `_LEAST_N` at least.
 
 Its limits: a recording that begins in contact shows only what presses harder or less; a sensor that
 drifts by more than the threshold makes a contact seem to begin early, or to last when the needle

@@ -19,7 +19,15 @@ from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.observation import VALIDITY, stream_of
 from pipeline.policy.policy import Policy
 from pipeline.store import Batch, FeatureStore, episode_name
-from pipeline.train.batches import NO_LAGS, BatchIndices, Lags, Prefetch, Ticks, Windows
+from pipeline.train.batches import (
+    NO_LAGS,
+    BatchIndices,
+    Lags,
+    Prefetch,
+    Ticks,
+    Windows,
+    evenly,
+)
 from pipeline.train.predictions import FeedMaker, predict
 from pipeline.train.scores import Comparison, action_space, compare
 from pipeline.train.split import groups_of
@@ -97,8 +105,7 @@ def evaluate_ablation(
         f"intact is not the error above: {left_out} of {len(ticks)} test ticks are left "
         "out, so near their episode's start that a delay would reach beyond it"
     ] * (left_out > 0)
-    count = min(len(settled), MOST_TICKS)
-    ticks = settled[np.linspace(0, len(settled) - 1, count).round().astype(np.int64)]
+    ticks = evenly(settled, MOST_TICKS)
     windows, device = Windows.of(checkpoint.params), next(policy.parameters()).device
     ways: list[tuple[str, str, FeedMaker | None]] = [("", "intact", None)]
     for stream in (stream for stream in FIELDS if stream in policy.encoders):
@@ -108,6 +115,7 @@ def evaluate_ablation(
             ways.append((stream, how, feed_maker(store, windows, device, alter=alter)))
         for how, lags in delays(store, stream).items():
             ways.append((stream, how, feed_maker(store, windows, device, lags)))
+        notes += _emptied(windows, stream)
     seen = (store, ticks, windows, batch_size, False, samples)
     others, groups = baselines.act(ticks), groups_of(store, checkpoint, ticks)
     space = action_space(store, checkpoint.normalization)
@@ -244,6 +252,17 @@ def delays(store: FeatureStore, stream: str) -> dict[str, Lags]:
     row_ms = _row_ms(store)
     rows = sorted({max(1, round(ms / row_ms)) for ms in DELAYS_MS})
     return {f"delayed {count * row_ms:.0f} ms": Lags(features=count) for count in rows}
+
+
+def _emptied(windows: Windows, stream: str) -> list[str]:
+    """The delays beyond the seconds that a stream's window reaches back."""
+    oldest_s = vars(windows).get(f"{stream}_window_s") or np.inf
+    return [
+        f"{stream} delayed {ms} ms: older than its window of {1000 * oldest_s:.0f} ms, so the "
+        "policy sees nothing of it"
+        for ms in DELAYS_MS
+        if ms / 1000 > oldest_s
+    ]
 
 
 def _row_ms(store: FeatureStore) -> float:

@@ -7,6 +7,7 @@ recording that looked most alike. A policy that is no better than it has learnt 
 from collections.abc import Iterator
 
 import numpy as np
+import torch
 from jaxtyping import Float64
 from numpy.typing import NDArray
 from sklearn.neighbors import NearestNeighbors
@@ -15,8 +16,9 @@ from sklearn.random_projection import SparseRandomProjection
 
 from pipeline.base.bfloat16 import widen
 from pipeline.policy.normalization import ChannelStatistics
+from pipeline.policy.state_channels import Kind, channel_kinds, expand
 from pipeline.store import FeatureStore
-from pipeline.train.batches import Ticks
+from pipeline.train.batches import Ticks, evenly
 from pipeline.train.predictions import Actions
 
 BASELINES = ("zero_action", "median_action", "repeat_last", "linear_fit", "nearest_neighbour")
@@ -44,7 +46,7 @@ class Baselines:
     ) -> None:
         self._store, self._horizon = store, horizon
         self._median = np.median(store.array("tick/action")[ticks], axis=0)
-        fitted = spread(ticks, _FITTED)
+        fitted = evenly(ticks, _FITTED)
         chunks, valid = recorded_chunks(store, fitted, horizon)
         past = self._past(fitted)
         self._linear = np.stack(
@@ -53,7 +55,7 @@ class Baselines:
                 for step in range(horizon)
             ]
         )
-        self._neighbours = Neighbours(store, spread(ticks, NEIGHBOURS), features)
+        self._neighbours = Neighbours(store, evenly(ticks, NEIGHBOURS), features)
 
     def act(self, ticks: Ticks) -> dict[str, Actions]:
         """What each of `BASELINES` does at these ticks: (tick, horizon or 1, action_dim).
@@ -96,15 +98,18 @@ class Baselines:
 class Neighbours:
     """Training ticks by their newest state reading and the features of their VL row.
 
-    Both are z-scored; wide features are projected at random (Achlioptas 2003), which keeps
-    distances. Each part is then scaled to the same mean square length, so that both weigh equally.
-    A tick that lacks a part has its mean, which is zero.
+    Of angles the sine and the cosine count. Both are z-scored; wide features are projected at
+    random (Achlioptas 2003), which keeps distances. Each part is then scaled to the same mean
+    square length, so that both weigh equally. A tick that lacks a part has its mean, which is zero.
     """
 
     def __init__(
         self, store: FeatureStore, ticks: Ticks, features: ChannelStatistics | None
     ) -> None:
         self._store, self._ticks, self._statistics = store, ticks, features
+        kinds = channel_kinds(store.streams["state"]["names"], store.streams["state"]["units"])
+        # Relative to itself, as policies take it, a reading's rotation would be none.
+        self._kinds: list[Kind] = ["deg" if kind == "rotation" else kind for kind in kinds]
         states, known = self._newest_states(ticks)
         self._scaler = StandardScaler().fit(states[known]) if states[known].size else None
         width = 0 if features is None else features.mean.size
@@ -138,13 +143,13 @@ class Neighbours:
         return parts
 
     def _newest_states(self, ticks: Ticks) -> tuple[Values, NDArray[np.bool_]]:
-        """(tick, channel), zeros without a reading, and where there is one."""
+        """(tick, expanded channel), of zeros without a reading, and where there is one."""
         values = self._store.array("state/values")
         end = self._store.array("tick/state_end")[ticks]
         known = end > self._store.array("episode/state_start")[self._store.episode_of(ticks)]
-        states = np.zeros((len(ticks), values.shape[1]))
+        states = np.zeros((len(ticks), values.shape[1]), np.float32)
         states[known] = values[end[known] - 1]
-        return states, known
+        return expand(torch.from_numpy(states)[:, None], self._kinds)[:, 0].double().numpy(), known
 
     def _features(self, rows: NDArray[np.int64], statistics: ChannelStatistics) -> Iterator[Values]:
         """Those of these VL rows, of the plain frames, z-scored and projected, block by block."""
@@ -155,11 +160,6 @@ class Neighbours:
             scaled = (values - statistics.mean) / statistics.scale
             flat = np.where(valid[..., None], scaled, 0.0).reshape(len(some), -1)
             yield flat if self._projection is None else self._projection.transform(flat)
-
-
-def spread(ticks: Ticks, most: int) -> Ticks:
-    """All of these ticks, or as many as are allowed, evenly spaced."""
-    return ticks[np.linspace(0, len(ticks) - 1, min(len(ticks), most)).round().astype(np.int64)]
 
 
 def recorded_chunks(

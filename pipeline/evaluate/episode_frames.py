@@ -16,7 +16,7 @@ from pipeline.base.errors import RecordingError
 from pipeline.data import Recording, content_digest, open_recording
 from pipeline.data.row_range import RowRange
 from pipeline.store import Episode, FeatureStore
-from pipeline.train.batches import Ticks
+from pipeline.train.batches import Ticks, evenly
 
 Frame = NDArray[np.uint8]
 
@@ -39,9 +39,7 @@ def shown_ticks(store: FeatureStore, ticks: Ticks, count: int) -> Ticks:
     rows = store.array("tick/vl_row")[ticks]
     before = store.array("tick/vl_row")[np.maximum(ticks - 1, 0)]
     fresh = ticks[(rows != before) | (ticks == 0)]
-    among = fresh if len(fresh) else ticks
-    count = min(count, len(among))
-    return among[np.linspace(0, len(among) - 1, count).round().astype(np.int64)]
+    return evenly(fresh if len(fresh) else ticks, count)
 
 
 def read_episode_frames(

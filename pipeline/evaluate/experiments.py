@@ -182,7 +182,7 @@ def experiment_csv(experiments: Sequence[Experiment]) -> Table:
         for span in SPANS:
             baseline = experiment.best_baseline(span)
             best = best_experiment(experiments, span)
-            row |= _cells(span, experiment.error(span))
+            row |= experiment.error(span).columns(span)
             row[f"{span}_seed_min"] = experiment.by_seed(span).min()
             row[f"{span}_seed_max"] = experiment.by_seed(span).max()
             row |= _apart(f"{span}_minus_best", experiment.minus(best, span))
@@ -190,22 +190,16 @@ def experiment_csv(experiments: Sequence[Experiment]) -> Table:
             row |= _apart(f"{span}_minus_baseline", experiment.minus(experiment, span, baseline))
             row |= {f"{span}_{way}": experiment.by_seed(span, way).mean() for way in BASELINES}
         rows.append(row)
-    return Table(list(rows[0]), [list(row.values()) for row in rows])
+    return Table.of(rows)
 
 
 def _verdict(apart: Figure) -> str:
     """A difference, and whether it is resolved."""
-    words = {None: "", True: ": resolved", False: ": not resolved"}
-    return apart.text("+") + words[apart.resolved]
-
-
-def _cells(name: str, figure: Figure) -> dict[str, Any]:
-    return {name: figure.value, f"{name}_low": figure.low, f"{name}_high": figure.high}
+    return f"{apart.text('+')}: {apart.verdict}" if apart.verdict else apart.text("+")
 
 
 def _apart(name: str, apart: Figure) -> dict[str, Any]:
-    words = {None: None, True: "resolved", False: "not resolved"}
-    return {**_cells(name, apart), f"{name}_is": words[apart.resolved]}
+    return {**apart.columns(name), f"{name}_is": apart.verdict}
 
 
 def _pooled(run: Sequence[Evaluated]) -> Sequence[Evaluated]:

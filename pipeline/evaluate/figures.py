@@ -51,6 +51,15 @@ class Figure:
         """Of a difference: whether its interval leaves 0 out; None without one."""
         return None if self.low is None or self.high is None else not self.low <= 0 <= self.high
 
+    @property
+    def verdict(self) -> str:
+        """`resolved` in a word or two; empty without an interval."""
+        return {None: "", True: "resolved", False: "not resolved"}[self.resolved]
+
+    def columns(self, name: str) -> dict[str, float | None]:
+        """As columns of a table."""
+        return {name: self.value, f"{name}_low": self.low, f"{name}_high": self.high}
+
 
 @dataclass(frozen=True)
 class Rivalry:

@@ -1,6 +1,6 @@
 """Figures -> what is printed, what DVC shows, what others plot."""
 
-from collections.abc import Iterable
+from dataclasses import astuple
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -296,22 +296,23 @@ def write_tables(
     return [folder / METRICS, *(files[name].write_csv(folder / name) for name in files)]
 
 
-def _intervals(methods: Iterable[str]) -> list[str]:
-    """The heads of `_cells`."""
-    return [head for name in methods for head in (name, f"{name}_low", f"{name}_high")]
+def _errors(comparison: Comparison, group: ActionGroup | None = None) -> dict[str, Any]:
+    """The columns of all methods, of a group or overall."""
+    return {
+        head: value
+        for method in METHODS
+        for head, value in error(comparison, method, group).columns(method).items()
+    }
 
 
-def _cells(figures: Iterable[Figure]) -> list[float | None]:
-    """Value, low and high of each figure."""
-    return [cell for figure in figures for cell in (figure.value, figure.low, figure.high)]
+def _named(group: ActionGroup | None) -> dict[str, Any]:
+    name, unit = (OVERALL, _STD) if group is None else (group.name, group.unit)
+    return {"group": name, "unit": unit}
 
 
 def _group_errors(comparison: Comparison) -> Table:
-    rows: list[list[Any]] = []
-    for group in (*comparison.groups, None):
-        name = (OVERALL, _STD) if group is None else (group.name, group.unit)
-        rows.append([*name, *_cells(error(comparison, way, group) for way in METHODS)])
-    return Table(["group", "unit", *_intervals(METHODS)], rows)
+    groups = (*comparison.groups, None)
+    return Table.of(_named(group) | _errors(comparison, group) for group in groups)
 
 
 def _recording_groups(comparison: Comparison) -> Table:
@@ -329,11 +330,10 @@ def _recording_groups(comparison: Comparison) -> Table:
 
 def _dimensions(comparison: Comparison) -> Table:
     """Over the whole chunk."""
-    rows: list[list[Any]] = []
-    for index, (name, unit) in enumerate(zip(comparison.names, comparison.units, strict=True)):
-        alone = ActionGroup(name, unit, (index,))
-        rows.append([name, unit, *_cells(error(comparison, way, alone) for way in METHODS)])
-    return Table(["dimension", "unit", *_intervals(METHODS)], rows)
+    return Table.of(
+        {"dimension": name, "unit": unit} | _errors(comparison, ActionGroup(name, unit, (index,)))
+        for index, (name, unit) in enumerate(zip(comparison.names, comparison.units, strict=True))
+    )
 
 
 def _horizon(comparison: Comparison) -> Table:
@@ -348,11 +348,10 @@ def _horizon(comparison: Comparison) -> Table:
 
 def _steps(comparison: Comparison) -> Table:
     """The overall error [training std] by steps ahead."""
-    rows: list[list[Any]] = []
-    for step in range(comparison.cells.entries.shape[1]):
-        part = comparison.part(steps=slice(step, step + 1))
-        rows.append([step, *_cells(error(part, way) for way in METHODS)])
-    return Table(["steps_ahead", *_intervals(METHODS)], rows)
+    return Table.of(
+        {"steps_ahead": step} | _errors(comparison.part(steps=slice(step, step + 1)))
+        for step in range(comparison.cells.entries.shape[1])
+    )
 
 
 def _episodes(comparison: Comparison, store: FeatureStore) -> Table:
@@ -386,10 +385,9 @@ def _ablation_errors(study: AblationStudy | None) -> Table:
         best = best_baseline(study.intact)
         for way in study.ablated:
             for group in (*study.intact.groups, None):
-                name = (OVERALL, _STD) if group is None else (group.name, group.unit)
                 intact = (study.intact.error(method, group) for method in ("policy", best))
-                error = way.comparison.error("policy", group)
-                rows.append([way.stream, way.how, *name, error, *intact])
+                own = way.comparison.error("policy", group)
+                rows.append([way.stream, way.how, *_named(group).values(), own, *intact])
     errors = ("error", "intact_error", "best_baseline_error")
     return Table(["stream", "how", "group", "unit", *errors], rows)
 
@@ -399,6 +397,8 @@ def _streams(study: AblationStudy | None) -> Table:
     rows: list[list[Any]] = []
     if study is not None:
         for way in study.ablated:
-            figures = study.times_intact(way) or Figure(np.nan), error(way.comparison, "policy")
-            rows.append([f"{way.stream} {way.how}", *_cells(figures)])
-    return Table(["spoilt", *_intervals(["times_intact", "overall_error"])], rows)
+            times = study.times_intact(way) or Figure(np.nan)
+            own = error(way.comparison, "policy")
+            rows.append([f"{way.stream} {way.how}", *astuple(times), *astuple(own)])
+    heads = (Figure(np.nan).columns(name) for name in ("times_intact", "overall_error"))
+    return Table(["spoilt", *chain(*heads)], rows)

@@ -64,6 +64,11 @@ def cut_batches(ticks: Ticks, batch_size: int) -> list[BatchIndices]:
     ]
 
 
+def evenly(ticks: Ticks, most: int) -> Ticks:
+    """All of these ticks, or as many as are allowed, evenly spaced."""
+    return ticks[np.linspace(0, len(ticks) - 1, min(len(ticks), most)).round().astype(np.int64)]
+
+
 @dataclass(frozen=True)
 class Windows:
     """How much of each stream a sample sees: ticks, most readings, and seconds before the tick.

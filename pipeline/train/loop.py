@@ -6,7 +6,6 @@ from functools import partial
 from itertools import islice
 from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -22,7 +21,7 @@ from pipeline.policy.cost import describe_cost
 from pipeline.policy.observation import action_groups
 from pipeline.policy.policy import Policy, Trainable
 from pipeline.store import Batch, FeatureStore
-from pipeline.train.batches import BatchIndices, Ticks, Windows, choose_feed
+from pipeline.train.batches import BatchIndices, Windows, choose_feed, evenly
 from pipeline.train.checkpoints import TrainerState, load_weights, read_last, write_trainer
 from pipeline.train.feature_source import FeatureSource
 from pipeline.train.log import History, Row, TrainingLog, open_log
@@ -273,7 +272,7 @@ class Trainer:
         `val/error` in training standard deviations, `val/<group>` in the group's unit.
         """
         assert log is not None
-        ticks = evaluation_ticks(self.split.val, self.source.eval_ticks)
+        ticks = evenly(self.split.val, self.source.eval_ticks or EVALUATION_TICKS)
         if not len(ticks):
             return {}
         windows = Windows.of(self.params)
@@ -412,10 +411,3 @@ class EarlyStopping:
     def exhausted(self) -> bool:
         """Whether the run ends here."""
         return self.patience is not None and self.stalled >= self.patience
-
-
-def evaluation_ticks(val: Ticks, limit: int | None) -> Ticks:
-    """The ticks of val that evaluations of a run look at: as many as they may, evenly spaced."""
-    limit = EVALUATION_TICKS if limit is None else limit
-    spread = np.linspace(0, len(val) - 1, min(len(val), limit)).round()
-    return val[spread.astype(np.int64)]

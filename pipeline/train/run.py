@@ -293,8 +293,9 @@ class TrainedPolicy:
     """What its store was; None where its document is damaged."""
     recordings: Mapping[str, Any] | None = None
     """Of a run: which episodes and rows its store held."""
-    test: frozenset[str] | None = None
-    """Of a checkpoint alone: digests of the files of its test episodes."""
+    episodes: frozenset[str] | None = None
+    """Of a checkpoint alone: digests of the files of its training and test episodes; None where it
+    has no test."""
     damage: str | None = None
 
     def depends_on(self, store: FeatureStore) -> str | None:
@@ -304,8 +305,8 @@ class TrainedPolicy:
         if self.recordings is not None:
             return "trained on it" if self.recordings == recordings_of(store) else None
         contents = {episode.content for episode in store.episodes}
-        if self.test is not None and contents.issuperset(self.test):
-            return "can be evaluated on it, has its features and test episodes"
+        if self.episodes is not None and contents.issuperset(self.episodes):
+            return "can be evaluated on it, has its features, training and test episodes"
         return None
 
 
@@ -328,7 +329,8 @@ def _read_trained(folder: Path, path: Path) -> TrainedPolicy:
             source, recordings = document["source"], dict(document["decides"]["recordings"])
             return TrainedPolicy(folder, {key: source[key] for key in SOURCE_KEYS}, recordings)
         source = {key: document[key] for key in SOURCE_KEYS}
-        test = frozenset(part["content"] for part in document["split"]["test"].values())
-        return TrainedPolicy(folder, source, test=test)
+        train, test = (document["split"][side].values() for side in ("train", "test"))
+        episodes = frozenset(part["content"] for part in (*train, *test)) if test else None
+        return TrainedPolicy(folder, source, episodes=episodes)
     except (CheckpointIncomplete, KeyError, TypeError, ValueError) as error:
         return TrainedPolicy(folder, damage=f"{path}: {error}")

@@ -19,7 +19,7 @@ from pipeline.policy.attention import right_aligned
 from pipeline.policy.normalization import Block, ChannelStatistics, Normalization, fit_channels
 from pipeline.policy.state_channels import channel_kinds, expand, expanded_names
 from pipeline.store import FeatureStore, place
-from pipeline.train.batches import Ticks, Windows
+from pipeline.train.batches import Ticks, Windows, evenly
 
 CHUNK_BYTES = 64 * 2**20
 _STATE_TICKS = 16_384
@@ -79,15 +79,15 @@ def _fit_state(store: FeatureStore, ticks: Ticks, windows: Windows) -> ChannelSt
         return None
     channels = _channels(store, "state")
     kinds = channel_kinds(**channels)
-    evenly = np.linspace(0, len(ticks) - 1, min(len(ticks), _STATE_TICKS)).round().astype(np.int64)
+    some = evenly(ticks, _STATE_TICKS)
     seen = replace(windows, horizon=1, sensor_window=1)
 
-    def read(some: Ticks) -> NDArray[np.float32]:
-        batch = store.gather(some, **asdict(seen))
+    def read(part: Ticks) -> NDArray[np.float32]:
+        batch = store.gather(part, **asdict(seen))
         real = right_aligned(batch.state_valid, batch.state.shape[1])
         return expand(batch.state, kinds)[real].numpy()
 
-    parts = np.array_split(ticks[evenly], -(-len(evenly) // _AT_ONCE))
+    parts = np.array_split(some, -(-len(some) // _AT_ONCE))
     what = "training readings of state"
     blocks = (block for part in parts if len(block := read(part)))
     if (first := next(blocks, None)) is None:

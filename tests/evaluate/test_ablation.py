@@ -175,7 +175,9 @@ def test_missing_is_judged_where_training_dropped_the_stream(
     first, *others = found.notes
     left_out = len(held_out(store)) - found.intact.ticks
     assert first.startswith(f"intact is not the error above: {left_out} of {len(held_out(store))}")
-    assert [note.split(":")[0] for note in others] == ["features missing", "features delayed"]
+    told = ["sensor delayed 200 ms", "features missing", "features delayed"]
+    assert [note.split(":")[0] for note in others] == told
+    assert "older than its window of 100 ms" in others[0]
 
 
 def test_one_held_out_episode_has_nobody_to_be_shuffled_with(

@@ -92,6 +92,20 @@ def test_state_and_features_both_decide_who_is_near(
     assert by_features is not None and row[by_features] == row[near]
 
 
+def test_an_angle_is_near_where_it_is_written_a_turn_further(
+    tiny_store: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = FeatureStore.open(tiny_store(tmp_path))
+    pose = {"names": ["pose_a", "pose_b", "pose_r", "joint_1"], "units": ["deg"] * 4}
+    monkeypatch.setattr(FeatureStore, "streams", store.streams | {"state": pose})
+    newest = store.array("tick/state_end") - 1
+    store.array("state/values")[newest] = np.linspace(-170, 150, 180)[:, None]
+    store.array("state/values")[newest[0]] = [100 + 360, 100, 100 - 360, 100]
+    nearest = rules.Neighbours(store, TRAIN, None).nearest(np.array([0]))
+    at = np.abs(store.array("state/values")[newest[TRAIN], 0] - 100)
+    assert nearest is not None and nearest[0] == TRAIN[at.argmin()]
+
+
 @pytest.mark.parametrize("state_dim", [0, 4])
 def test_a_stream_that_is_missing_leaves_the_other_or_the_median(
     tiny_store: Callable[..., Path], tmp_path: Path, state_dim: int
@@ -106,8 +120,3 @@ def test_a_stream_that_is_missing_leaves_the_other_or_the_median(
         assert np.array_equal(found["nearest_neighbour"], recorded_chunks(store, TRAIN, 2)[0])
     else:
         assert np.array_equal(found["nearest_neighbour"], found["median_action"])
-
-
-def test_no_more_ticks_than_asked_for_and_evenly() -> None:
-    assert rules.spread(np.arange(10), 3).tolist() == [0, 4, 9]
-    assert rules.spread(np.arange(3), 10).tolist() == [0, 1, 2]

@@ -1,10 +1,17 @@
 """Windows of the newest readings, and what a policy is given of them."""
 
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.robot.memory import ReadingWindow, RobotMemory, SeenFeatures, WindowSize
+from pipeline.store import FeatureStore
+from pipeline.train.batches import Windows
 
 
 @given(st.integers(1, 12), st.lists(st.integers(0, 20), max_size=12))
@@ -67,3 +74,43 @@ def test_an_observation_is_a_copy_with_the_true_ages() -> None:
     assert second["state_valid"] == 2
     memory.sense(sensed(0.5, sensor=np.full((3, 2), 9, np.float32)))
     assert second["sensor"].max() == 1
+
+
+@pytest.mark.parametrize("oldest_s", [None, 0.03, 0.05, 0.5])
+def test_a_robot_sees_what_training_sees_of_the_same_readings(
+    tiny_store: Callable[..., Path], tmp_path: Path, oldest_s: float | None
+) -> None:
+    """At every tick of an episode that is felt reading by reading; a window is as old as a whole
+    number of readings, but for rounding."""
+    store = FeatureStore.open(tiny_store(tmp_path))
+    store.array("tick/time")[:] += 0.1  # of the map in memory alone: no reading is of the future
+    windows = Windows(4, 6, 5, oldest_s, oldest_s)
+    memory = RobotMemory(
+        WindowSize(windows.sensor_window, store.sensor_channels, oldest_s),
+        WindowSize(windows.state_window, store.state_dim, oldest_s),
+    )
+    episode, row = store.episodes[1], store.array("tick/vl_row")
+    felt = {"sensor": episode.readings.start, "state": episode.states.start}
+    counts: set[int] = set()
+    for tick in episode.ticks:
+        now_s = store.array("tick/time")[tick]
+        for stream, start in felt.items():
+            felt[stream] = int(store.array(f"tick/{stream}_end")[tick])
+            for reading in range(start, felt[stream]):
+                once = slice(reading, reading + 1)
+                values = store.array(f"{stream}/values")[once]
+                time_s = store.array(f"{stream}/time")[once]
+                memory.sense({"time": time_s, stream: values, f"{stream}_time": time_s})
+        memory.sense({"time": np.array([now_s])})
+        trained = store.gather([tick], **asdict(windows))
+        memory.features = SeenFeatures(
+            trained.features[0].numpy(),
+            trained.slot_valid[0].numpy(),
+            store.array("vl/frame_time")[row[tick]],
+        )
+        seen = memory.observation()
+        assert seen.keys() | {"action", "action_valid"} == vars(trained).keys()
+        for name, value in seen.items():
+            np.testing.assert_array_equal(value, vars(trained)[name][0].numpy(), err_msg=name)
+        counts.add(int(seen["state_valid"]))
+    assert counts == {None: {4, 5}, 0.03: {1}, 0.05: {2}, 0.5: {4, 5}}[oldest_s]

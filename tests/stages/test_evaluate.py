@@ -42,7 +42,8 @@ def trained(
     """A params.yaml whose head is trained."""
     folder = tmp_path_factory.mktemp("evaluate")
     judged = {"checkpoint": str(folder / "head"), "output": str(folder / "report")}
-    document = quick_params(folder) | {"evaluate": judged}
+    alone = {"environment": None}  # no page of rollouts, to which the way would differ
+    document = quick_params(folder) | {"evaluate": judged, "rollout": alone}
     # The last episode is test, and the tail of the others val.
     document["train_head"]["split"] = {"groups": {"rest": ["*_00[0-4]"]}}
     path = folder / "params.yaml"
@@ -287,14 +288,28 @@ def test_more_steps_than_a_chunk_has_are_not_executed(
     assert "evaluate.execute 9: expected at most the 8 steps" in capsys.readouterr().err
 
 
-def test_the_rollouts_of_before_are_linked(
-    trained: Path, tmp_path: Path, reports: list[Report]
+@pytest.mark.parametrize(
+    ("environment", "checkpoint", "linked"),
+    [
+        ("phantom", "null", True),
+        ("null", "null", False),
+        ("phantom", "models/another", False),
+    ],
+)
+def test_the_rollouts_of_this_policy_are_linked_though_they_come_later(
+    trained: Path,
+    tmp_path: Path,
+    reports: list[Report],
+    environment: str,
+    checkpoint: str,
+    linked: bool,
 ) -> None:
-    (tmp_path / "rollout").mkdir()
-    (tmp_path / "rollout/report.html").write_text("")
-    told = arguments(trained, tmp_path / "report", f"rollout.output={tmp_path / 'rollout'}")
+    rollout = {"environment": environment, "checkpoint": checkpoint, "output": tmp_path / "rollout"}
+    overrides = [f"rollout.{key}={value}" for key, value in rollout.items()]
+    told = arguments(trained, tmp_path / "report", *overrides)
     assert run("", evaluate.main, told) == 0
-    assert "../rollout/report.html" in {text.page for text in reports[0].blocks(Text)}
+    pages = {text.page for text in reports[0].blocks(Text)} - {""}
+    assert pages == ({"../rollout/report.html"} if linked else set())
 
 
 @pytest.mark.parametrize("stage", [train_head, evaluate])

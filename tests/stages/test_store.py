@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from pipeline.store import FeatureStore
+from pipeline.train.run import find_trained
 from stages import store as stage
 from stages import train_head
 from stages.command import run
@@ -75,6 +76,11 @@ def test_list_names_what_was_trained_on_a_store(
     assert f"{tmp_path}/models/head: trained on it" in of_first
     assert f"{tmp_path}/models/lone: can be evaluated on it" in of_first
     assert "models" not in of_second
+    lone = next(policy for policy in find_trained([tmp_path / "models"]) if policy.episodes)
+    store = FeatureStore.open(stores / "one.zarr")
+    fewer = tiny_store(tmp_path / "fewer", name="one", episodes=5)
+    assert lone.depends_on(store)
+    assert lone.depends_on(FeatureStore.open(fewer)) is None
     assert "spec tiny-spe: 3 slots x 8 in float32" in said.out
     assert "prompt {instruction}" in said.out
     assert "broken/run.json" in said.err

@@ -12,7 +12,7 @@ import zarr
 
 from pipeline.base.config import TrainHeadParams
 from pipeline.store import Batch, FeatureStore
-from pipeline.train.batches import BatchIndices, Lags, Prefetch, Windows, cut_batches
+from pipeline.train.batches import BatchIndices, Lags, Prefetch, Windows, cut_batches, evenly
 
 CPU = torch.device("cpu")
 WINDOWS = Windows(horizon=4, sensor_window=6, state_window=5)
@@ -174,6 +174,13 @@ def test_a_disabled_encoder_costs_a_single_reading() -> None:
     params = TrainHeadParams(sensor_enabled=False, sensor_window=650, state_window=10)
     assert Windows.of(params) == Windows(8, 1, 10, 0.1, 1.0)
     assert Windows.of(TrainHeadParams(robot_state_enabled=False)).state_window == 1
+
+
+def test_no_more_ticks_than_asked_for_and_evenly() -> None:
+    assert evenly(np.arange(10), 3).tolist() == [0, 4, 9]
+    assert evenly(np.arange(5000), 3).tolist() == [0, 2500, 4999]
+    assert evenly(np.arange(3), 10).tolist() == [0, 1, 2]
+    assert evenly(np.arange(0), 10).tolist() == []
 
 
 @pytest.mark.gpu

@@ -4,13 +4,12 @@ import csv
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import pytest
 
 from pipeline.base.errors import ConfigError
 from pipeline.policy.checkpoint import load_policy
 from pipeline.store import FeatureStore
-from pipeline.train.loop import EVALUATION_TICKS, EarlyStopping, Trainer, evaluation_ticks
+from pipeline.train.loop import EarlyStopping, Trainer
 
 Make = Callable[..., Any]
 
@@ -28,15 +27,6 @@ def test_it_counts_since_the_best() -> None:
     stopping.take(1.5)
     assert stopping.exhausted
     assert not EarlyStopping(None, 1.0, stalled=10**6).exhausted
-
-
-def test_ticks_of_an_evaluation_are_spread_and_limited() -> None:
-    ticks = np.arange(5000)
-    found = evaluation_ticks(ticks, None)
-    assert (len(found), found[0], found[-1]) == (EVALUATION_TICKS, 0, 4999)
-    assert evaluation_ticks(ticks, 3).tolist() == [0, 2500, 4999]
-    assert evaluation_ticks(ticks[:2], 3).tolist() == [0, 1]
-    assert evaluation_ticks(ticks[:0], 3).tolist() == []
 
 
 def test_stopping_early_needs_something_held_out(

@@ -20,7 +20,7 @@ class DemoParams(Section):
     """Folder of the four sets of recordings."""
     checkpoint: Path = Path("models/demo_vlm")
     """Folder of a small Qwen2.5-VL with random weights."""
-    episodes: int = Field(default=12, ge=2)
+    episodes: int = Field(default=36, ge=2)
     """Episodes a format."""
     seed: Seed = 0
     """Of the simulation and of the checkpoint's weights."""

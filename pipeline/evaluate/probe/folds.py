@@ -8,6 +8,7 @@ from sklearn.model_selection import GroupKFold
 
 from pipeline.base.errors import StoreMismatch
 from pipeline.store import FeatureStore
+from pipeline.train.batches import evenly
 from pipeline.train.groups import episodes_by_group
 
 _PARTS = 4
@@ -70,7 +71,7 @@ def fold_by_recording(
     count = min(folds, recordings)
     notes = _notes(store, recordings, folds, horizon)
     if max_ticks is not None and max_ticks < len(ticks):
-        ticks = ticks[np.linspace(0, len(ticks) - 1, max_ticks).round().astype(np.int64)]
+        ticks = evenly(ticks, max_ticks)
         notes.append(f"{len(ticks)} of the ticks are read, evenly spread (probe.max_ticks)")
     there, group = np.unique(recording[ticks], return_inverse=True)
     if len(there) < count:

@@ -31,8 +31,7 @@ def write_tables(folder: Path, study: ProbeStudy) -> list[Path]:
     write_document(folder / "metrics.json", metrics(study))
     files = [folder / "metrics.json"]
     for name, rows in tables.items():
-        table = Table(list(rows[0]), [list(row.values()) for row in rows])
-        files.append(table.write_csv(folder / name))
+        files.append(Table.of(rows).write_csv(folder / name))
     return files
 
 
@@ -147,9 +146,9 @@ def _row(study: ProbeStudy, result: ProbeResult) -> dict[str, Any]:
     }
     scores = {"alone": result.alone, "beside": result.beside}
     for reading, score in scores.items():
-        row |= _columns(f"r2_{reading}", score.r2)
+        row |= score.r2.columns(f"r2_{reading}")
     row["r2_known"] = study.baseline.score.mean
-    row |= _columns("gain", study.gain(result))
+    row |= study.gain(result).columns("gain")
     for reading, score in scores.items():
         row[f"penalty_{reading}"] = float(np.median(score.penalties))
     return row
@@ -168,10 +167,6 @@ def _target_rows(study: ProbeStudy) -> list[dict[str, Any]]:
                 row[f"r2_{reading}"] = score.by_target[index]
             rows.append(row)
     return rows
-
-
-def _columns(name: str, figure: Figure) -> dict[str, float | None]:
-    return {name: figure.value, f"{name}_low": figure.low, f"{name}_high": figure.high}
 
 
 def _document(figure: Figure) -> dict[str, float]:
