@@ -2,7 +2,8 @@
 
 What is executed first, then the whole chunk, with 95 % intervals: each experiment beside the best
 of them and beside the best baseline, and whether the difference is resolved. Policies whose
-trainings differ by train_head.seed alone are one row, with the spread over the seeds.
+trainings differ by train_head.seed alone are one row, with the spread over the seeds; so are those
+that differ by train_head.split.fold alone, with the test groups of all folds.
 
 Takes every folder of `compare.reports` that stages.evaluate wrote, and passes over what else lies
 there, such as the logs of a training. Writes report.html, experiments.csv and experiments.png into

@@ -82,6 +82,8 @@ def evaluate_checkpoint(
         f"{len(checkpoint.split['test'])} episode(s) in {store.path}, device {device}, "
         f"{judged['policy']['samples']} chunk(s) a tick"
     )
+    if note := trained_on_too(checkpoint):
+        say(f"warning: {note}")
     features = checkpoint.normalization.features
     baselines = Baselines(store, training, horizon, features)
     space = action_space(store, checkpoint.normalization)
@@ -108,6 +110,17 @@ def evaluate_checkpoint(
         judged=judged,
         curves=read_curves(checkpoint),
         recordings=recordings,
+    )
+
+
+def trained_on_too(checkpoint: PolicyCheckpoint) -> str:
+    """That test ticks are of episodes which were trained on before them; empty where none are."""
+    both = checkpoint.split["test"].keys() & checkpoint.split["train"].keys()
+    return (
+        f"{len(both)} test episode(s) were cut by time and trained on before that: "
+        "this says less than recordings never seen"
+        if both
+        else ""
     )
 
 

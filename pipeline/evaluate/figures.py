@@ -14,7 +14,7 @@ from pipeline.evaluate.intervals import FEWEST_GROUPS, bootstrap_means, interval
 from pipeline.train.scores import ActionGroup, Comparison, Errors, summed
 
 Draws = NDArray[np.float64]
-NO_INTERVAL = "no intervals: they take at least two groups of test recordings"
+NO_INTERVAL = "intervals take at least two groups of test recordings"
 
 
 @dataclass(frozen=True)

@@ -125,6 +125,19 @@ def test_seeds_become_one_row(experiments: Path) -> None:
     shutil.rmtree(reports / name)
 
 
+def test_folds_become_one_row_of_all_groups(experiments: Path) -> None:
+    reports = experiments.parent / "reports/folds"
+    for fold in (0, 1):
+        options = ["train_head.split.folds=2", f"train_head.split.fold={fold}"]
+        assert evaluated(experiments, f"folds/concat-fold{fold}", *options) == 0
+    (pooled,) = read_experiments(reports)
+    assert (pooled.name, pooled.folds, pooled.seeds) == ("concat", 2, (0,))
+    documents = [json.loads(path.read_text()) for path in sorted(reports.glob(f"*/{JUDGED}"))]
+    tested = [part["group"] for one in documents for part in one["on"]["test"].values()]
+    assert pooled.groups == tuple(sorted(set(tested)))
+    shutil.rmtree(reports)
+
+
 def test_the_training_time_is_read_from_beside_the_logs_and_not_tracked(experiments: Path) -> None:
     reports = experiments.parent / "reports"
     for one in read_experiments(reports):
@@ -160,7 +173,7 @@ def test_policies_that_were_sampled_otherwise_are_refused(
     path.write_text(json.dumps(document))
     error = refused(reports, experiments, capsys)
     assert f"{key}: {value} (diffusion-concat), {found} (flow_matching-none)" in error
-    assert "with one evaluate.samples and evaluate.batch_size" in error
+    assert "with the same evaluate.samples and evaluate.batch_size" in error
     shutil.rmtree(path.parent)
     # What does not sample stands beside any.
     assert len(read_experiments(reports)) == 3

@@ -12,7 +12,7 @@ from pipeline.evaluate import tables
 from pipeline.evaluate.ablation import AblationStudy
 from pipeline.evaluate.baselines import METHODS
 from pipeline.evaluate.episode_frames import read_episode_frames, shown_ticks
-from pipeline.evaluate.evaluation import Evaluation
+from pipeline.evaluate.evaluation import Evaluation, trained_on_too
 from pipeline.evaluate.figures import best_baseline, rivalry
 from pipeline.look.evaluation import pictures as plots
 from pipeline.look.page.blocks import Block, Document, Picture, Report, Section, Text
@@ -55,6 +55,7 @@ def evaluation_report(evaluation: Evaluation, rollout: str = "") -> Report:
     comparison, policy = evaluation.comparison, evaluation.judged["policy"]
     # The overall error counts dimensions that hardly move like the others.
     still = tables.still_dimensions(comparison)
+    notes = [note for note in (trained_on_too(evaluation.checkpoint), still) if note]
     return Report(
         title=f"Evaluation of {evaluation.name}",
         summary=(
@@ -62,7 +63,7 @@ def evaluation_report(evaluation: Evaluation, rollout: str = "") -> Report:
             f"{policy['step']}, {policy['parameters']:,} parameters, judged on "
             f"{comparison.ticks:,} test ticks of {len(comparison.episodes)} episode(s) of "
             f"{evaluation.store.path.name}, {policy['samples']} chunk(s) a tick."
-            f"{f' {sentence(still)}' if still else ''}"
+            f"{''.join(f' {sentence(note)}' for note in notes)}"
         ),
         tiles=_tiles(comparison),
         sections=(

@@ -154,6 +154,17 @@ def test_dimensions_that_hardly_move_stand_at_the_top(judgement: Evaluation) -> 
     assert "ardly mov" not in f"{report.summary} {report.tiles}"
 
 
+def test_episodes_that_were_trained_on_before_stand_at_the_top(judgement: Evaluation) -> None:
+    test = judgement.checkpoint.split["test"]
+    checkpoint = replace(judgement.checkpoint, split={"train": test, "val": {}, "test": test})
+    report = evaluation_report(replace(judgement, checkpoint=checkpoint))
+    assert report.summary.endswith(
+        "3 test episode(s) were cut by time and trained on before "
+        "that: this says less than recordings never seen."
+    )
+    assert "trained on" not in evaluation_report(judgement).summary
+
+
 def test_params_spec_and_what_was_judged_are_there(judgement: Evaluation) -> None:
     trained, spec, source, judged = evaluation_report(judgement).blocks(Document)
     assert trained.content["horizon"] == 4
