@@ -106,8 +106,9 @@ def test_a_head_is_trained_and_judged(cr5, run, shared_data, folder):
     assert "sensor: absent from the store" in said
     run("evaluate", "v21", data)
     metrics = json.loads((folder / "v21/evaluate/metrics.json").read_text())
-    assert metrics["held_out"]["episodes"] >= 1
-    assert np.isfinite([metrics["overall"]["policy"], metrics["overall"]["relative"]]).all()
+    assert metrics["test"]["episodes"] >= 1
+    for figures in (metrics["executed"]["overall"], metrics["chunk"]["overall"]):
+        assert np.isfinite([figures["policy"]["value"], figures["difference"]["value"]]).all()
 
 
 def test_three_insertion_formats_share_a_store(run, shared_data, folder):

@@ -28,11 +28,10 @@ def run_unchecked(name: str, params: Path, options: Sequence[str], told: Connect
 def fill(disk: Path, leave: int) -> Path:
     """Write a file that leaves so many bytes free."""
     ballast = disk / "ballast"
-    with ballast.open("wb") as file:
+    with ballast.open("wb", buffering=0) as file:
         try:
             while True:
-                file.write(bytes(2**16))
-                file.flush()
+                file.write(bytes(2**12))
         except OSError:
             pass
     size = ballast.stat().st_size

@@ -160,7 +160,7 @@ def test_it_tunes_and_says_how_to_go_on_and_that_works(
     assert run("", evaluate.main, ["--params", params, *training.split(), *options]) == 0
     found = json.loads((report / "metrics.json").read_text())
     best = json.loads((tmp_path / "tuned" / "best" / "policy.json").read_text())
-    assert found["overall"]["policy"] > 0
+    assert found["chunk"]["overall"]["policy"]["value"] > 0
     assert [len(best["split"][side]) for side in ("train", "val", "test")] == [1, 1, 1]
 
     other = ["--set", "train_head.split.seed=2", "--set", f"train_head.output={tmp_path / 'other'}"]

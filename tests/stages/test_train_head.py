@@ -135,11 +135,12 @@ def test_it_trains_evaluates_and_then_has_nothing_to_do(
     assert run("", evaluate.main, ["--params", str(params)]) == 0
     said = capsys.readouterr().out
     assert "overall [training std]" in said
-    assert "12 held-out ticks of 1 episode(s)" in said
+    assert "12 test ticks of 1 episode(s)" in said
     report = tmp_path / "params/report"
     found = json.loads((report / "metrics.json").read_text())
     best = json.loads((tmp_path / "params/head/best/policy.json").read_text())
-    assert found["overall"]["policy"] != best["metrics"]["val/error"], "val chose, test reports"
+    error = found["chunk"]["overall"]["policy"]["value"]
+    assert error != best["metrics"]["val/error"], "val chose, test reports"
     assert {"timeline.png", "scatter.png", "horizon.png", "episodes.png"} <= set(os.listdir(report))
 
 

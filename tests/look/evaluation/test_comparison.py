@@ -81,11 +81,13 @@ def test_one_group_is_drawn_without_whiskers_and_it_is_said(experiments: list[Ex
     alone = Experiment(
         **{
             **vars(first),
+            "groups": first.groups[:1],
             "entries": {span: entries[:1] for span, entries in first.entries.items()},
             "errors": {key: errors[:, :1] for key, errors in first.errors.items()},
         }
     )
-    assert "No intervals: they take at least two groups" in comparison_report([alone]).summary
-    assert "No intervals" not in comparison_report(experiments).summary
+    said = "of 1 group(s) of recordings. Intervals take at least two groups"
+    assert said in comparison_report([alone]).summary
+    assert "Intervals take" not in comparison_report(experiments).summary
     executed, _ = comparison_of_experiments([alone]).axes
     assert not [line for line in executed.lines if line.get_marker() == "|"]

@@ -1,6 +1,6 @@
 """What each rule of how a policy takes its inputs is worth: errors and closed-loop success without.
 
-    python -m benchmarks.inputs --out FOLDER [--seeds N] [--only NAME ...] [--latency-ms MS]
+    python -m experiments.inputs --out FOLDER [--seeds N] [--only NAME ...] [--latency-ms MS]
 
 Run where params.yaml and the demo's store are, after `dvc repro`. Each variant takes one rule away,
 trains the head of params.yaml with each of `seeds` seeds, judges it on the test episodes and rolls
@@ -86,7 +86,7 @@ VARIANTS = {
 
 def main() -> None:
     """Run what is not done, and print the line."""
-    parser = ArgumentParser("benchmarks.inputs", description="What each rule of inputs is worth.")
+    parser = ArgumentParser("experiments.inputs", description="What each rule of inputs is worth.")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--only", nargs="*", choices=[*VARIANTS], default=[*VARIANTS])
@@ -103,7 +103,7 @@ def main() -> None:
         if not (last / "metrics.json").exists():
             # A process each: what is patched for one is never seen by another.
             own = ["--out", str(wanted.out), "--latency-ms", str(wanted.latency_ms)]
-            command = [sys.executable, "-m", "benchmarks.inputs", *own, "--one", name, str(seed)]
+            command = [sys.executable, "-m", "experiments.inputs", *own, "--one", name, str(seed)]
             run(command, check=True, stdout=sys.stderr)
     rows = {name: _row(wanted.out, name, wanted.seeds) for name in wanted.only}
     print(json.dumps({"seeds": wanted.seeds, "latency_ms": wanted.latency_ms, "variants": rows}))
