@@ -62,13 +62,14 @@ def test_a_picture_opens_large_and_goes_back(every_page: Path, browser_page) -> 
     large = page.locator("dialog[open] svg").bounding_box()
     assert large["width"] > small["width"]
     page.keyboard.press("Escape")
+    # Each is waited for: a browser opens and closes in its own time.
+    page.locator("dialog[open]").wait_for(state="detached")
     assert page.locator("#picture-one svg").bounding_box()["width"] == small["width"]
-    assert page.locator("dialog[open]").count() == 0
     for key in ("Enter", " "):
         page.get_by_role("button", name="Enlarge: A sine").press(key)
-        assert page.locator("dialog[open] svg").count() == 1
+        page.locator("dialog[open] svg").wait_for()
         page.keyboard.press("Escape")
-        assert page.locator("dialog[open]").count() == 0
+        page.locator("dialog[open]").wait_for(state="detached")
 
 
 # A browser hands over what it stored in its own time: here the test is what keeps it.
