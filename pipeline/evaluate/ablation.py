@@ -134,14 +134,15 @@ def feed_maker(
     store: FeatureStore,
     windows: Windows,
     device: torch.device,
-    lags: Lags | None = None,
+    lags: Lags = NO_LAGS,
     alter: Alter | None = None,
 ) -> FeedMaker:
     """Feeds of this store in which streams come late or are altered, once, before anyone looks."""
 
     @contextmanager
     def make(plan: Sequence[BatchIndices]) -> Generator[Iterator[tuple[BatchIndices, Batch]]]:
-        with Prefetch(store, plan, windows, device, lags=lags) as batches:
+        late = [replace(indices, lags=lags) for indices in plan]
+        with Prefetch(store, late, windows, device) as batches:
             yield (
                 (indices, batch if alter is None else alter(indices, batch))
                 for indices, batch in batches

@@ -63,12 +63,8 @@ class SampledChunks:
         recorded: Float[np.ndarray, "horizon action_dim"],
         valid: Bool[np.ndarray, " horizon"],
     ) -> float:
-        counted = self._per_std > 0
-        samples, truth = (
-            (values[..., valid, :] * self._per_std)[..., counted].reshape(
-                -1, valid.sum() * counted.sum()
-            )
-            for values in (chunks, recorded)
-        )
+        # What does not count is zero in all of them, and adds to no distance.
+        samples = (chunks[:, valid] * self._per_std).reshape(len(chunks), -1)
+        truth = (recorded[valid] * self._per_std).reshape(1, -1)
         distance = cdist(samples, truth).mean() - pdist(samples).mean() / 2
-        return float(distance / np.sqrt(truth.size))
+        return float(distance / np.sqrt(valid.sum() * np.count_nonzero(self._per_std)))

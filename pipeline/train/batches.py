@@ -192,9 +192,9 @@ class Prefetch(Iterator[tuple[BatchIndices, Batch]]):
     out of `next` at the batch it belongs to. Use as a context manager, or call `close`. The thread
     does not survive a fork: a forked process reads from the same store with a `Prefetch` it makes.
 
-    `lags` replaces those of the plan. What `resident` holds of the store is gathered on its device,
-    into fresh memory; on CUDA when the batch is handed out, in the order of the consumer's stream.
-    The rest of the store is read into memory in the background, as far as it fits.
+    What `resident` holds of the store is gathered on its device, into fresh memory; on CUDA when
+    the batch is handed out, in the order of the consumer's stream. The rest of the store is read
+    into memory in the background, as far as it fits.
     """
 
     def __init__(
@@ -204,14 +204,13 @@ class Prefetch(Iterator[tuple[BatchIndices, Batch]]):
         windows: Windows,
         device: torch.device,
         buffers: int = 2,
-        lags: Lags | None = None,
         resident: DeviceStore | None = None,
     ) -> None:
         assert buffers >= 2, "one buffer in use, one being filled"
         self.waited_s = 0.0
         """Time that the consumer has spent waiting for data."""
         self._store, self._device, self._resident = store, device, resident
-        self._windows, self._lags = astuple(windows), lags
+        self._windows = astuple(windows)
         self._on_device = frozenset[str]() if resident is None else resident.fields
         self._plan = self._warmed(plan)
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="prefetch")
@@ -274,7 +273,7 @@ class Prefetch(Iterator[tuple[BatchIndices, Batch]]):
             lengths = self._windows[:3]
             empty = self._store.gatherer.empty_batch(count, *lengths, but=self._on_device)
             buffer.batch = empty.pin() if self._device.type == "cuda" else empty.touch()
-        late = self._lags or indices.lags
+        late = indices.lags
         lags = (late.features, late.sensor_s, late.state_s)
         batch, selection = self._store.select(
             indices.ticks, self._windows, lags, buffer.batch, indices.variants

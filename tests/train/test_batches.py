@@ -3,6 +3,7 @@
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -72,8 +73,8 @@ def test_draws_are_the_ticks_in_order_and_the_plain_frames() -> None:
 
 
 def test_lags_are_those_of_gather(store: FeatureStore) -> None:
-    wanted = plan(store, 2)
-    with Prefetch(store, wanted, WINDOWS, CPU, lags=Lags(2, 0.1, 0.2)) as batches:
+    wanted = [replace(indices, lags=Lags(2, 0.1, 0.2)) for indices in plan(store, 2)]
+    with Prefetch(store, wanted, WINDOWS, CPU) as batches:
         for draw, batch in batches:
             late = fresh(store, draw, feature_lag=2, sensor_lag_s=0.1, state_lag_s=0.2)
             assert equal(batch, late)

@@ -1,6 +1,7 @@
 """What lives on a device is gathered there to the same bits as from the map; what does is said."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -38,9 +39,10 @@ def test_batches_are_those_of_the_map(
     wanted = [*draw_plan(any_store, 6), *cut_batches(np.arange(any_store.ticks), 32)]
     resident = DeviceStore(any_store, fields, CPU)
     for late in (Lags(), lags):
+        asked = [replace(indices, lags=late) for indices in wanted]
         with (
-            Prefetch(any_store, wanted, windows, CPU, lags=late) as mapped,
-            Prefetch(any_store, wanted, windows, CPU, lags=late, resident=resident) as device,
+            Prefetch(any_store, asked, windows, CPU) as mapped,
+            Prefetch(any_store, asked, windows, CPU, resident=resident) as device,
         ):
             for (draw, expected), (found, batch) in zip(mapped, device, strict=True):
                 assert found is draw
