@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from scipy.stats import binomtest
 from tqdm import tqdm
 
-from pipeline.base.config import RolloutParams
+from pipeline.base.config import RolloutAblation, RolloutParams
 from pipeline.base.errors import CheckpointMismatch, ConfigError
 from pipeline.base.table import Table
 from pipeline.policy.checkpoint import PolicyCheckpoint
+from pipeline.policy.observation import moving_channels
 from pipeline.policy.policy import Policy
 from pipeline.robot.chunking import Executor, check_chunking
 from pipeline.robot.features import LiveFeatures
@@ -177,19 +178,22 @@ def roll_out(
         wanted,
         instruction_of(checkpoint),
     )
-    off = [stream for stream in ("sensor", "features") if stream in policy.encoders]
-    streams = (None, *(off if wanted.ablations and len(policy.encoders) > 1 else ()))
+    looked_at = wanted.ablations if len(policy.encoders) > 1 else ()
+    ablations: Sequence[RolloutAblation | None] = (
+        None,
+        *(name for name in looked_at if name.split()[0] in policy.encoders),
+    )
     seeds = range(wanted.seed, wanted.seed + wanted.episodes)
     groups = [seeds[at : at + SIDE_BY_SIDE] for at in range(0, len(seeds), SIDE_BY_SIDE)]
     episodes: list[RolloutEpisode] = []
-    total = (1 + len(streams)) * len(seeds)
+    total = (1 + len(ablations)) * len(seeds)
     with tqdm(total=total, unit="episode", disable=None) as bar:
-        for stream in streams:
-            controller = f"{stream} off" if stream else POLICY
+        for ablation in ablations:
+            controller = ablation or POLICY
             bar.set_description(controller)
             for group in groups:
                 robots = [driver.begin(seed) for seed in group]
-                stops = driver.drive(robots, group, stream, bar.update)
+                stops = driver.drive(robots, group, ablation, bar.update)
                 episodes += [
                     _episode(controller, wanted.level, seed, robot.insertion, stop)
                     for seed, robot, stop in zip(group, robots, stops, strict=True)
@@ -273,17 +277,19 @@ class _Driver:
         self,
         robots: Sequence[InsertionEnvironment],
         seeds: Sequence[int],
-        off: str | None,
+        ablation: RolloutAblation | None,
         ended: Callable[[], Any],
     ) -> list[str | None]:
         """Run the policy on all robots at once to their ends; why each stopped safely, or None.
 
-        `off` names a stream that tells the policy nothing. `ended` is called for each that ends.
-        A robot draws from a generator of its own seed, so that it does as it would alone.
+        `ended` is called for each that ends. A robot draws from a generator of its own seed, so
+        that it does as it would alone.
         """
         wanted, policy = self.wanted, self.policy
         reuse = self.checkpoint.source["vlm_reuse_count"]
-        timing = LoopTiming(reuse, wanted.latency_ms / 1000, wanted.execute, wanted.chunking)
+        moving = moving_channels(self.checkpoint.source["streams"]["action"])
+        latency_s = wanted.latency_ms / 1000
+        timing = LoopTiming(reuse, latency_s, wanted.execute, wanted.chunking, moving)
         asks = self.features is not None
         loops = [ControlLoop(policy.params, policy.shape, timing, asks) for _ in robots]
         generators = [torch.Generator().manual_seed(seed) for seed in seeds]
@@ -291,10 +297,13 @@ class _Driver:
         for loop, robot in zip(loops, robots, strict=True):
             loop.sense(robot.readings())
         active = list(range(len(robots)))
+        first: dict[ControlLoop, NDArray[Any]] = {}
         while active:
             self._look([(robots[i], loops[i]) for i in active if loops[i].frames_due])
             due = [i for i in active if loops[i].chunk_due]
-            chunks = self._chunks([loops[i] for i in due], [generators[i] for i in due], off)
+            asking = [loops[i] for i in due]
+            streams = self._streams(asking, ablation, first)
+            chunks = self._chunks(asking, [generators[i] for i in due], streams)
             for i, chunk in zip(due, chunks, strict=True):
                 try:
                     loops[i].plan(chunk)
@@ -323,18 +332,36 @@ class _Driver:
             times = np.array([time for time, _ in views.values()])
             loop.see(SeenFeatures(row, real, times))
 
+    def _streams(
+        self,
+        loops: Sequence[ControlLoop],
+        ablation: RolloutAblation | None,
+        first: dict[ControlLoop, NDArray[Any]],
+    ) -> dict[str, NDArray[Any]]:
+        """What robots that ask for a chunk observe, one below the other; `first` is kept for them.
+
+        An ablation spoils the values of a stream, not its ages and not what of it is valid.
+        """
+        fields = [loop.memory.observation() for loop in loops]
+        if ablation is not None:
+            name, how = ablation.split()
+            mean = self.checkpoint.typical(name).astype(np.float32)
+            for loop, own in zip(loops, fields, strict=True):
+                told = own[name] if how == "frozen" else np.broadcast_to(mean, own[name].shape)
+                own[name] = first.setdefault(loop, told)
+        names = fields[0] if fields else ()
+        return {name: np.stack([own[name] for own in fields]) for name in names}
+
     def _chunks(
-        self, loops: Sequence[ControlLoop], generators: Sequence[torch.Generator], off: str | None
+        self,
+        loops: Sequence[ControlLoop],
+        generators: Sequence[torch.Generator],
+        streams: Mapping[str, NDArray[Any]],
     ) -> NDArray[np.float32]:
         """The head's chunks (loop, horizon, action) for robots that ask for one."""
         if not loops:
             return np.zeros((0, 0, 0), np.float32)
         guides = [loop.executor.begin() for loop in loops]
-        fields = [loop.memory.observation() for loop in loops]
-        streams = {name: np.stack([own[name] for own in fields]) for name in fields[0]}
-        if off is not None:  # every value at its training mean, as in an evaluation
-            mean = self.checkpoint.typical(off).astype(np.float32)
-            streams[off] = np.broadcast_to(mean, streams[off].shape).copy()
         observation = self.policy.observe(streams)
         guide = stack_guides(guides, observation.features.device)
         return self.policy.act(observation, generators, guide).cpu().numpy()

@@ -103,6 +103,16 @@ def action_groups(names: Sequence[str], units: Sequence[str]) -> tuple[str, ...]
     )
 
 
+def moving_channels(action: Mapping[str, Any]) -> tuple[bool, ...]:
+    """Which channels of a store's `streams["action"]` say how far to move, not where to be.
+
+    Deltas and velocities, save a gripper's, which is a position in every format.
+    """
+    moves = action["kind"] != "absolute"
+    groups = action_groups(action["names"], action["units"])
+    return tuple(moves and group != "gripper" for group in groups)
+
+
 def stream_of(field: str) -> str:
     """The stream that a field of an observation is about."""
     if field in ("slot_valid", "feature_age", "view_age"):

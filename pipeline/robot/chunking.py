@@ -33,17 +33,36 @@ class PlanGuide:
     weight: Steps
 
 
+@dataclass(frozen=True)
+class _Chunk:
+    """A chunk as it came, and what it wants of each tick from `start` on: where the robot is to be
+    sent, in channels that move from where it was sent when the executor began."""
+
+    start: int
+    steps: Steps
+    wanted: NDArray[np.float64]
+
+
 class Executor:
     """Plays the action chunks of one robot, a step a call of `next_action`.
 
     `none` plays the newest chunk, `temporal` averages all chunks that reach a tick (`ensemble`),
     `rtc` plays the newest chunk and guides the next one by it (real-time chunking, Black et al.
     2025). A chunk's first step belongs to the tick of its observation, which `begin` marks; the
-    steps played until `plan` hands it in are skipped, as counted. Raises `ConfigError` where
-    `execute`, the steps from one observation to the next, is not within the horizon.
+    steps played until `plan` hands it in are skipped, as counted.
+
+    Channels that `moving` (action,) marks say how far to move: a chunk then means the places that
+    its steps add up to from where the robot was sent at its observation, whichever chunk sent it
+    on since. Places are what is averaged, and an action leads from where the robot was sent last
+    to the next. None marks no channel: every one says where to be.
+
+    Raises `ConfigError` where `execute`, the steps from one observation to the next, is not within
+    the horizon.
     """
 
-    def __init__(self, chunking: Chunking, execute: int, horizon: int) -> None:
+    def __init__(
+        self, chunking: Chunking, execute: int, horizon: int, moving: ArrayLike | None = None
+    ) -> None:
         if not 1 <= execute <= horizon:
             raise ConfigError(
                 f"rollout.execute: expected 1 to {horizon}, the steps of a chunk "
@@ -51,13 +70,16 @@ class Executor:
             )
         self.chunking: Chunking = chunking
         self.execute, self.horizon = execute, horizon
+        self._moving = np.asarray(False if moving is None else moving)
         self.reset()
 
     def reset(self) -> None:
         """Forget all chunks and counts, for the next episode."""
         self._tick = 0
         self._begun: int | None = None
-        self._chunks: list[tuple[int, Steps]] = []
+        self._chunks: list[_Chunk] = []
+        self._sent: NDArray[np.float64] | float = 0.0
+        self._sent_at_begin = self._sent
         self._delays: deque[int] = deque(maxlen=DELAYS)
 
     @property
@@ -69,18 +91,18 @@ class Executor:
         """
         if self._begun is not None:
             return False
-        return not self._chunks or self._tick - self._chunks[-1][0] >= self.execute
+        return not self._chunks or self._tick - self._chunks[-1].start >= self.execute
 
     def begin(self) -> PlanGuide | None:
         """Mark this tick as that of the next chunk's observation, also in place of an earlier mark.
 
         Returns what a policy is to continue: None but for `rtc` with a plan that reaches further.
         """
-        self._begun = self._tick
+        self._begun, self._sent_at_begin = self._tick, self._sent
         if self.chunking != "rtc" or not self._chunks:
             return None
-        start, chunk = self._chunks[-1]
-        played = self._tick - start
+        chunk = self._chunks[-1].steps
+        played = self._tick - self._chunks[-1].start
         left = chunk[played:]
         overlap = self.horizon - max(played, self.execute)
         if overlap <= 0:
@@ -96,7 +118,9 @@ class Executor:
         assert steps.ndim == 2, steps.shape
         assert len(steps) == self.horizon, (len(steps), self.horizon)
         self._delays.append(self._tick - self._begun)
-        self._chunks.append((self._begun, steps))
+        places = self._sent_at_begin + np.cumsum(steps, axis=0, dtype=np.float64)
+        wanted = np.where(self._moving, places, steps)
+        self._chunks.append(_Chunk(self._begun, steps, wanted))
         self._begun = None
 
     def next_action(self) -> Steps:
@@ -104,21 +128,24 @@ class Executor:
 
         There must be a chunk that reaches it: `plan` comes in time, or the caller stops the robot.
         """
-        self._chunks = [(s, c) for s, c in self._chunks if self._tick - s < self.horizon]
+        self._chunks = [c for c in self._chunks if self._tick - c.start < self.horizon]
         assert self._chunks, f"no action at tick {self._tick}: no chunk came in time"
-        predicted = np.stack([chunk[self._tick - start] for start, chunk in self._chunks])
+        wanted = np.stack([chunk.wanted[self._tick - chunk.start] for chunk in self._chunks])
         self._tick += 1
-        return ensemble(predicted) if self.chunking == "temporal" else predicted[-1]
+        place = ensemble(wanted) if self.chunking == "temporal" else wanted[-1]
+        action = place - np.where(self._moving, self._sent, 0.0)
+        self._sent = np.where(self._moving, place, 0.0)
+        return action.astype(np.float32)
 
 
-def ensemble(predicted: Steps) -> Steps:
-    """The mean action (action,) of predictions (prediction, action) for a tick, oldest first.
+def ensemble(predicted: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The mean (action,) of predictions (prediction, action) for a tick, oldest first.
 
     Weights exp(-m i), i = 0 the oldest (Zhao et al. 2023, "Learning Fine-Grained Bimanual
     Manipulation with Low-Cost Hardware", Algorithm 2).
     """
     weights = np.exp(-ENSEMBLE_DECAY * np.arange(len(predicted)))
-    return np.average(predicted, axis=0, weights=weights).astype(np.float32)
+    return np.average(predicted, axis=0, weights=weights)
 
 
 def soft_mask(horizon: int, delay: int, overlap: int) -> Steps:

@@ -31,6 +31,8 @@ class LoopTiming:
     latency_s: float
     execute: int
     chunking: Chunking
+    moving: tuple[bool, ...] | None = None
+    """`moving_channels` of the action; None: none."""
 
 
 class ControlLoop:
@@ -43,7 +45,7 @@ class ControlLoop:
             WindowSize(params.sensor_window, shape.sensor_channels, params.sensor_reach_s),
             WindowSize(params.state_window, shape.state_dim, params.state_window_s),
         )
-        self.executor = Executor(timing.chunking, timing.execute, params.horizon)
+        self.executor = Executor(timing.chunking, timing.execute, params.horizon, timing.moving)
         self._timing, self._uses_features = timing, uses_features
         self._still = np.zeros(shape.action_dim)
         self._tick, self._pass_began = -1, -timing.reuse

@@ -18,7 +18,7 @@ from pipeline.base.errors import ConfigError, NumericsError
 from pipeline.base.format import duration, size
 from pipeline.policy.checkpoint import PolicyCheckpoint, save_policy
 from pipeline.policy.cost import describe_cost
-from pipeline.policy.observation import action_groups
+from pipeline.policy.observation import moving_channels
 from pipeline.policy.policy import Policy, Trainable
 from pipeline.store import Batch, FeatureStore
 from pipeline.train.batches import BatchIndices, Windows, choose_feed, evenly
@@ -368,16 +368,12 @@ class Trainer:
 class TerminalStop:
     """The action chunk beyond an episode's end, as something to learn instead of to leave out.
 
-    A robot that is to stand still moves by zero: so deltas and velocities become 0, save a
-    gripper's, which is a position in every format and keeps its last value. Absolute actions
-    repeat the last one.
+    A robot that is to stand still moves by zero: so deltas and velocities become 0. Where to be, as
+    a gripper's position, repeats the last one.
     """
 
     def __init__(self, store: FeatureStore, device: torch.device) -> None:
-        action = store.streams["action"]
-        absolute = action["kind"] == "absolute"
-        kept = [absolute or g == "gripper" for g in action_groups(action["names"], action["units"])]
-        self._kept = torch.tensor(kept, device=device)
+        self._kept = ~torch.tensor(moving_channels(store.streams["action"]), device=device)
 
     def extend(
         self, action: Float[Tensor, "batch horizon action"], valid: Bool[Tensor, "batch horizon"]

@@ -55,7 +55,7 @@ def split_by_episode(
     source of three or more groups has one on each side that is asked for, one of two has one to
     train on, and all sources together have one on each side. `folds` deals the groups of each
     source in the order of their hashes, so that each is in test in one fold; `val` is drawn from
-    the others.
+    the others. `train` leaves out all groups to train on but so many, the first by their hashes.
 
     Of two groups one is test, and val is cut from the tail of the other. A single one is cut by
     time into all three, at one instant for all of its episodes: those are then one recording in
@@ -92,8 +92,11 @@ def split_by_episode(
             for name in rest
         }
         notes = _repair(side_of, ranks, bounds, _quotas(groups, rest.keys(), tuple(bounds)))
+        trained = sorted((n for n in rest if side_of[n] == "train"), key=lambda n: ranks[n])
+        for name in trained[params.train :] if params.train is not None else ():
+            del side_of[name]
         sides = {
-            side: _ticks([e for name in rest if side_of[name] == side for e in rest[name]])
+            side: _ticks([e for name in rest if side_of.get(name) == side for e in rest[name]])
             for side in bounds
         }
     if test:

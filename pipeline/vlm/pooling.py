@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pipeline.vlm.preparation import TokenLayout
-from pipeline.vlm.slots import GRID_CELLS, Slot
+from pipeline.vlm.slots import Slot
 
 
 @lru_cache(maxsize=64)
@@ -54,13 +54,13 @@ def _view_tokens(slot: Slot, layout: TokenLayout) -> NDArray[np.int64]:
     rows, columns = layout.grid
     tokens = start + np.arange(rows * columns).reshape(rows, columns)
     if slot.cell is not None:
-        tokens = tokens[_extent(slot.cell[0], rows), _extent(slot.cell[1], columns)]
+        tokens = tokens[tuple(map(_extent, slot.cell, layout.grid, slot.grid))]
     return tokens.reshape(-1)
 
 
-def _extent(cell: int, size: int) -> slice:
-    """Tokens of one cell along one axis, as torch's adaptive average pooling cuts them."""
-    return slice(floor(cell * size / GRID_CELLS), ceil((cell + 1) * size / GRID_CELLS))
+def _extent(cell: int, size: int, cells: int) -> slice:
+    """Tokens of one of the cells along one axis, as torch's adaptive average pooling cuts them."""
+    return slice(floor(cell * size / cells), ceil((cell + 1) * size / cells))
 
 
 def batch_weights(

@@ -2,13 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 from pipeline.base.config import Pooling, VLMParams
 from pipeline.base.errors import VLMError
-
-GRID_CELLS = 4
-"""Rows, and columns, of the cells of the `grid` pooling."""
 
 
 @dataclass(frozen=True)
@@ -22,10 +20,16 @@ class Slot:
     view: str | None = None
     cell: tuple[int, int] | None = None
     """Row and column in the `grid` of a view."""
+    grid: tuple[int, int] = (4, 4)
+    """Rows and columns that a view is cut into, where it is."""
 
     def document(self) -> dict[str, Any]:
-        """The slot as JSON-able values, without what does not apply."""
+        """The slot as JSON-able values, without what does not apply.
+
+        All cells together tell the grid, so it is not named.
+        """
         document = {name: value for name, value in vars(self).items() if value is not None}
+        del document["grid"]
         return document | ({"cell": list(self.cell)} if self.cell else {})
 
 
@@ -42,7 +46,7 @@ def slots_of(vlm: VLMParams, layers: int, views: Sequence[str]) -> tuple[Slot, .
         for layer in _resolved_layers(vlm.layers, layers)
         for norm in vlm.norms
         for pooling in vlm.pooling
-        for slot in _slots_of(layer, norm, pooling, views)
+        for slot in _slots_of(layer, norm, pooling, views, vlm.grid)
     )
     if not slots:
         raise VLMError(
@@ -51,12 +55,14 @@ def slots_of(vlm: VLMParams, layers: int, views: Sequence[str]) -> tuple[Slot, .
     return slots
 
 
-def _slots_of(layer: int, norm: bool, pooling: Pooling, views: Sequence[str]) -> list[Slot]:
+def _slots_of(
+    layer: int, norm: bool, pooling: Pooling, views: Sequence[str], grid: tuple[int, int]
+) -> list[Slot]:
     if pooling == "view_mean":
         return [Slot(layer, norm, pooling, view) for view in views]
     if pooling == "grid":
-        cells = [(row, column) for row in range(GRID_CELLS) for column in range(GRID_CELLS)]
-        return [Slot(layer, norm, pooling, view, cell) for view in views for cell in cells]
+        cells = list(product(range(grid[0]), range(grid[1])))
+        return [Slot(layer, norm, pooling, view, cell, grid) for view in views for cell in cells]
     return [Slot(layer, norm, pooling)]
 
 

@@ -123,7 +123,7 @@ def test_every_controller_meets_the_same_episodes(rollouts: Rollouts) -> None:
 @pytest.mark.parametrize("model_type", ["regression", "flow_matching", "diffusion"])
 @pytest.mark.parametrize("chunking", ["none", "temporal", "rtc"])
 def test_same_seeds_same_figures(model_type: str, chunking: str) -> None:
-    settings = {"chunking": chunking, "execute": 2, "ablations": False, "episodes": 2}
+    settings = {"chunking": chunking, "execute": 2, "ablations": (), "episodes": 2}
     if chunking == "rtc" and model_type == "regression":
         with pytest.raises(ConfigError, match=r"rollout\.chunking"):
             rolled(made(model_type), **settings)
@@ -136,7 +136,7 @@ def test_same_seeds_same_figures(model_type: str, chunking: str) -> None:
 @pytest.mark.parametrize("chunking", ["none", "rtc"])
 def test_an_episode_is_the_same_alone_as_among_others(chunking: str) -> None:
     """So that one that failed can be looked at again by its seed."""
-    settings = {"chunking": chunking, "execute": 2, "ablations": False}
+    settings = {"chunking": chunking, "execute": 2, "ablations": ()}
     among = rolled(made("flow_matching"), **settings, episodes=3)
     alone = rolled(made("flow_matching"), **settings, episodes=1, seed=78)
     there, here = among.of("policy")[1], alone.of("policy")[0]
@@ -156,7 +156,7 @@ def test_real_time_chunking_gives_the_policy_what_is_left_of_its_plan(
         return chunks[-1]
 
     monkeypatch.setattr(parts[1], "act", watched)
-    rolled(parts, chunking="rtc", execute=2, ablations=False, episodes=1)
+    rolled(parts, chunking="rtc", execute=2, ablations=(), episodes=1)
     assert guides[0] is None and len(guides) > 3
     for guide, before in zip(guides[1:], chunks, strict=False):
         torch.testing.assert_close(guide.chunk[:, :2], before[:, 2:])
@@ -165,7 +165,7 @@ def test_real_time_chunking_gives_the_policy_what_is_left_of_its_plan(
 
 def test_robots_share_a_pass_of_the_model_and_are_told_the_task() -> None:
     parts = made()
-    fresh = rolled(parts, ablations=False)
+    fresh = rolled(parts, ablations=())
     glance = parts[2]
     assert len(glance.passes[0]) == 3
     longest = max(episode.ticks for episode in fresh.of("policy"))
@@ -183,7 +183,7 @@ def test_the_model_sees_only_the_views_that_the_policy_was_trained_on() -> None:
     checkpoint, policy, glance = made(views=2)
     streams = {"action": ACTION, "views": ["View2", "View5"]}
     fewer = replace(checkpoint, source=SOURCE | {"streams": streams})
-    rolled((fewer, policy, glance), episodes=1, ablations=False)
+    rolled((fewer, policy, glance), episodes=1, ablations=())
     assert {tuple(views) for frames in glance.passes for views in frames} == {("View2", "View5")}
 
 
@@ -197,7 +197,7 @@ def test_what_the_policy_sees_is_as_old_as_it_says(monkeypatch: pytest.MonkeyPat
             return observe(streams)
 
         monkeypatch.setattr(parts[1], "observe", watched)
-        rolled(parts, ablations=False, episodes=1, latency_ms=latency)
+        rolled(parts, ablations=(), episodes=1, latency_ms=latency)
         # Cameras run at 10 Hz, passes begin every third tick or when the model is free.
         assert latency / 1000 < min(ages) and max(ages) < latency / 1000 + 0.33 + latency / 1000
         assert np.ptp(ages) > 0.15
@@ -228,6 +228,38 @@ def test_a_stream_that_is_off_says_nothing(stream: str, monkeypatch: pytest.Monk
     assert len({tuple(seen["feature_age"]) for seen in silent}) > 3
 
 
+@pytest.mark.parametrize("stream", ["sensor", "features", "state"])
+def test_a_frozen_stream_tells_what_it_told_first(
+    stream: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parts = made()
+    given: list[dict[str, np.ndarray]] = []
+    observe = parts[1].observe
+
+    def watched(streams: Any) -> Any:
+        given.append({name: np.array(value) for name, value in streams.items()})
+        return observe(streams)
+
+    monkeypatch.setattr(parts[1], "observe", watched)
+    rollouts = rolled(parts, episodes=2, ablations=(f"{stream} frozen",))
+    assert rollouts.controllers == ("policy", f"{stream} frozen", "expert")
+    ticks = max(episode.ticks for episode in rollouts.of("policy"))
+    frozen = given[ticks:]
+    assert len(frozen) > 5
+    for robots in frozen:
+        now = robots[stream]
+        assert any((now[0] == first).all() for first in frozen[0][stream])
+        assert len(now) == 1 or not (now[0] == now[1]).all()
+    other = {"sensor": "state"}.get(stream, "sensor")
+    assert not (frozen[0][other][0] == frozen[5][other][0]).all()
+
+
+def test_streams_that_a_policy_lacks_are_passed_over() -> None:
+    parts = made(features_enabled=False)
+    rollouts = rolled(parts, episodes=1, ablations=("features off", "state off"))
+    assert rollouts.controllers == ("policy", "state off", "expert")
+
+
 def test_an_action_that_is_no_number_stops_its_robot_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     parts = made()
     act, calls = parts[1].act, []
@@ -240,7 +272,7 @@ def test_an_action_that_is_no_number_stops_its_robot_alone(monkeypatch: pytest.M
         return chunks
 
     monkeypatch.setattr(parts[1], "act", broken)
-    rollouts = rolled(parts, ablations=False)
+    rollouts = rolled(parts, ablations=())
     reasons = [episode.reason for episode in rollouts.of("policy")]
     assert reasons[1] == "safe stop: the policy's action is not a number"
     assert not any(reason.startswith("safe stop") for reason in (reasons[0], reasons[2]))
@@ -263,7 +295,7 @@ def test_a_policy_without_a_stream_runs(lacking: str) -> None:
 def test_instructions_are_those_that_the_policy_was_trained_on() -> None:
     checkpoint, policy, glance = made()
     told = replace(checkpoint, instructions=("Go there",))
-    rollouts = rolled((told, policy, glance), episodes=1, ablations=False)
+    rollouts = rolled((told, policy, glance), episodes=1, ablations=())
     assert glance.instructions == {"Go there"} == {rollouts.settings["instruction"]}
     several = replace(checkpoint, instructions=("Go there", "Stay"))
     with pytest.raises(ConfigError, match="'Go there', 'Stay'"):

@@ -195,9 +195,78 @@ class TestTemporal:
                 assert executor.next_action().tolist() == [tick, tick]
 
     def test_the_oldest_weighs_most(self) -> None:
-        mean = ensemble(np.array([[1.0], [0.0], [0.0]], np.float32))
+        mean = ensemble(np.array([[1.0], [0.0], [0.0]]))
         assert mean[0] > 1 / 3
-        assert ensemble(np.array([[7.0]], np.float32)) == [7.0]
+        assert ensemble(np.array([[7.0]])) == [7.0]
+
+
+class TestMoving:
+    """Channels that say how far to move: what counts is where a chunk leads to."""
+
+    @staticmethod
+    def executor(chunking: Chunking = "none", execute: int = 1) -> Executor:
+        return Executor(chunking, execute, HORIZON, [True, False])
+
+    @staticmethod
+    def deltas(step: float, place: float = 7.0) -> np.ndarray:
+        return np.tile(np.array([step, place], np.float32), (HORIZON, 1))
+
+    @given(st.data(), st.sampled_from(["none", "rtc"]), st.integers(1, HORIZON))
+    def test_a_chunk_in_time_is_played_as_it_is(
+        self, data: st.DataObject, chunking: Chunking, execute: int
+    ) -> None:
+        executor, steps = self.executor(chunking, execute), st.floats(-3, 3, width=32)
+        for _ in range(4):
+            chunk = np.array([[data.draw(steps), 7.0] for _ in range(HORIZON)], np.float32)
+            executor.begin()
+            executor.plan(chunk)
+            played = np.stack([executor.next_action() for _ in range(execute)])
+            np.testing.assert_allclose(played, chunk[:execute], atol=1e-6)
+
+    def test_a_late_chunk_leads_to_where_it_meant_to(self) -> None:
+        """What an older chunk moved meanwhile is not moved again."""
+        executor = self.executor()
+        executor.begin()
+        executor.plan(self.deltas(1.0))
+        executor.next_action()
+        executor.begin()
+        assert [executor.next_action()[0] for _ in range(3)] == [1, 1, 1]
+        executor.plan(self.deltas(-2.0, place=9.0))
+        # Its fourth step ends 8 below where it was asked for; the robot was sent 3 above that.
+        assert executor.next_action().tolist() == [-11, 9]
+        assert executor.next_action().tolist() == [-2, 9]
+
+    def test_ensembles_average_places(self) -> None:
+        executor = self.executor("temporal")
+        sent, plans = 0.0, []
+        for step in (1.0, -1.0, 0.5, 0.0):
+            executor.begin()
+            executor.plan(self.deltas(step))
+            plans.append(sent + step * np.arange(1, HORIZON + 1))
+            now = [plan[len(plans) - 1 - begun] for begun, plan in enumerate(plans)]
+            place = np.average(now, weights=np.exp(-0.01 * np.arange(len(now))))
+            action = executor.next_action()
+            assert action.tolist() == pytest.approx([place - sent, 7.0])
+            sent = place
+
+    def test_plans_that_agree_move_as_each_of_them(self) -> None:
+        """Deltas of other ticks do not: averaged, a robot that slows down never arrives."""
+        executor, sent = self.executor("temporal"), 0.0
+        for tick in range(30):
+            places = 1 - 0.5 ** (1 + tick + np.arange(HORIZON))
+            chunk = np.diff(places, prepend=sent)[:, None] * [1, 0]
+            executor.begin()
+            executor.plan(chunk)
+            sent += float(executor.next_action()[0])
+            assert sent == pytest.approx(places[0])
+
+    def test_reset_forgets_where_the_robot_was_sent(self) -> None:
+        executor = self.executor("temporal")
+        for _ in range(2):
+            executor.reset()
+            executor.begin()
+            executor.plan(self.deltas(1.0))
+            assert executor.next_action().tolist() == [1, 7]
 
 
 class TestGuide:

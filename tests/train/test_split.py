@@ -267,6 +267,19 @@ class TestSides:
         split = drawn(FakeStore([6] * 3), val=0.01, test=0.01)
         assert "test had nothing of source 's', " in str(split.note)
 
+    @pytest.mark.parametrize("train", [1, 5, 10_000])
+    def test_fewer_are_trained_on_and_no_other_side_changes(self, train: int) -> None:
+        store = FakeStore([10] * 40)
+        whole, part = drawn(store), drawn(store, train=train)
+        assert part.test.tolist() == whole.test.tolist()
+        assert part.val.tolist() == whole.val.tolist()
+        sides, before = sides_of(store, part), sides_of(store, whole)
+        kept = {name for name, side in sides.items() if side == "train"}
+        all_of_them = {name for name, side in before.items() if side == "train"}
+        assert kept <= all_of_them and len(kept) == min(train, len(all_of_them))
+        more = sides_of(store, drawn(store, train=train + 1))
+        assert kept <= {name for name, side in more.items() if side == "train"}
+
     def test_nothing_is_held_out_at_zero(self) -> None:
         for lengths in ([6], [6, 6], [6] * 5):
             split = drawn(FakeStore(lengths), val=0, test=0)

@@ -1,23 +1,34 @@
 """Weights of a pooling are those of the mean that it stands for."""
 
+import numpy as np
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.base.config import VLMParams
 from pipeline.vlm.pooling import batch_weights, pool, token_weights
 from pipeline.vlm.preparation import TokenLayout
-from pipeline.vlm.slots import Slot
-
-CELLS = tuple(Slot(0, True, "grid", "View1", (r, c)) for r in range(4) for c in range(4))
+from pipeline.vlm.slots import Slot, slots_of
 
 
-@given(rows=st.integers(1, 14), columns=st.integers(1, 24), start=st.integers(0, 5))
-def test_grid_is_adaptive_average_pooling(rows: int, columns: int, start: int) -> None:
+
+@given(
+    grid=st.tuples(st.integers(1, 9), st.integers(1, 9)),
+    rows=st.integers(1, 14),
+    columns=st.integers(1, 24),
+    start=st.integers(0, 5),
+)
+def test_grid_is_adaptive_average_pooling(
+    grid: tuple[int, int], rows: int, columns: int, start: int
+) -> None:
+    vlm = VLMParams(checkpoint="any", pooling=("grid",), grid=grid)
+    slots = slots_of(vlm, 1, ["View1"])
+    assert [slot.cell for slot in slots] == list(np.ndindex(*grid))
     layout = TokenLayout(start + rows * columns + 3, (("View1", start),), (rows, columns))
     tokens = torch.randn(layout.length, 5, generator=torch.Generator().manual_seed(0))
-    cells = torch.tensor(token_weights(CELLS, layout)) @ tokens
+    cells = torch.tensor(token_weights(slots, layout)) @ tokens
     plane = tokens[start : start + rows * columns].T.reshape(5, rows, columns)
-    expected = torch.nn.functional.adaptive_avg_pool2d(plane, 4).flatten(1).T
+    expected = torch.nn.functional.adaptive_avg_pool2d(plane, grid).flatten(1).T
     torch.testing.assert_close(cells, expected, atol=1e-5, rtol=1e-5)
 
 

@@ -28,6 +28,7 @@ from pipeline.base.config.stage_two import (
     FusionStrategy,
     Level,
     ModelType,
+    RolloutAblation,
     RolloutParams,
     SplitParams,
     TrainHeadParams,

@@ -116,7 +116,10 @@ class VLMParams(Section):
     norms: tuple[bool, ...] = Field(default=(True,), min_length=1)
     """Whether the model's final norm is applied to what a layer gives; both may be asked for."""
     pooling: tuple[Pooling, ...] = Field(default=("mean", "grid"), min_length=1)
-    """Over which tokens: all, of images, of text, of each view, of 4 x 4 cells a view, the last."""
+    """Over which tokens: all, of images, of text, of each view, of the cells of a grid over each
+    view, the last."""
+    grid: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] = (4, 4)
+    """Rows and columns of that grid."""
     variants: int = Field(default=1, ge=1)
     """Views of each row that are encoded and stored: the frames as they are, and variants - 1
     augmented ones, among which training samples. Costs as many times the time and space."""

@@ -19,6 +19,9 @@ ModelType = Literal["regression", "diffusion", "flow_matching"]
 FusionStrategy = Literal["concat", "cross_attention", "gated", "none"]
 Level = Literal["depth", "full", "moved"]
 Chunking = Literal["none", "temporal", "rtc"]
+RolloutAblation = Literal[
+    "sensor off", "features off", "state off", "sensor frozen", "features frozen", "state frozen"
+]
 LoggerName = Literal["tensorboard", "wandb"]
 Weight = Annotated[float, Field(ge=0)]
 
@@ -39,6 +42,9 @@ class SplitParams(Section):
     """Share of groups that choose the checkpoint and stop early."""
     test: Share = 0.15
     """Share of groups that `stages.evaluate` reports on; nothing is ever chosen on them."""
+    train: int | None = Field(default=None, ge=1)
+    """Train on at most so many groups, drawn by the same hash, and leave the others out: what would
+    more recordings bring?"""
     folds: int | None = Field(default=None, ge=2)
     """Deal the groups into as many folds, of which one is test, whatever `test` says: with little
     data, train once a fold."""
@@ -258,8 +264,9 @@ class RolloutParams(Section):
     latency_ms: float = Field(default=0.0, ge=0)
     """What a pass of the model takes, in simulated time: its features are so much older. The head
     answers at once."""
-    ablations: bool = True
-    """Also run the policy without the sensor, and without features."""
+    ablations: tuple[RolloutAblation, ...] = ("sensor off", "features off")
+    """Also run the policy with a stream spoilt. off: every value at its training mean. frozen: what
+    the stream told first, as if it were new. What a policy does not look at is passed over."""
     device: str = "auto"
     """auto, cpu, cuda or cuda:N."""
     output: Path = Path("reports/rollout")

@@ -1,0 +1,251 @@
+"""What makes a policy insert the needle: tables of closed-loop success, each from one command.
+
+    python -m experiments.closed_loop TABLE --out FOLDER [--seeds N] [--episodes N] [--jobs N]
+
+Run where params.yaml and the demo's store are, after `dvc repro`. A table is of recipes (what is
+set in training, or replaced in the code) and of the ways in which their policies are rolled out.
+Each recipe is trained with each of `seeds` seeds, judged on the test episodes, and rolled out in
+`episodes` episodes a seed, others for each seed and the same ones for all recipes. What is done
+already in FOLDER is not done again, so a command that was stopped goes on, and tables share
+policies.
+
+`worth` trains nothing: it draws success against errors on recordings, a point a policy of FOLDER.
+
+The last line is JSON: of each row success with Wilson's interval over the rollouts of all seeds,
+and the errors in training std over all seeds and their differences from the policy as it is
+(intervals: paired bootstrap over groups of recordings).
+"""
+
+import csv
+import json
+import os
+import sys
+from argparse import ArgumentParser, Namespace
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from itertools import product
+from pathlib import Path
+from subprocess import run
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import binomtest, spearmanr
+from tqdm import tqdm
+
+from experiments.recipes import (
+    AS_IT_IS,
+    ON_TIME,
+    RECIPES,
+    ROLLOUTS,
+    STORES,
+    TABLES,
+    Table,
+    store_settings,
+)
+from pipeline.base.config import load_params
+from pipeline.evaluate.intervals import bootstrap_means, interval
+from pipeline.evaluate.rollouts import EXPERT, POLICY
+
+FIGURES = ("executed", "overall")
+FIRST_SEED = 3_000_000
+"""Of the rollouts; each seed of training has a thousand of its own."""
+
+
+def main() -> None:
+    """Run what is not done, and print the table."""
+    parser = ArgumentParser("experiments.closed_loop", description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("table", choices=[*TABLES, "worth"])
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--seeds", type=int, default=2)
+    parser.add_argument("--episodes", type=int, default=100)
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--one", nargs=2, metavar=("RECIPE", "SEED"))
+    wanted = parser.parse_args()
+    if wanted.one:
+        name, seed = wanted.one
+        return _work(wanted, name, int(seed), TABLES[wanted.table].rollouts)
+    if wanted.table == "worth":
+        return _draw_worth(wanted.out)
+    table = TABLES[wanted.table]
+    _prepare_stores(wanted.out, table)
+    jobs = [(name, seed) for seed in range(wanted.seeds) for name in table.recipes]
+    with ThreadPoolExecutor(wanted.jobs) as pool:
+        begun = [pool.submit(_run_apart, wanted, name, seed) for name, seed in jobs]
+        for job in tqdm(begun, wanted.table, unit="policy", disable=None):
+            job.result()
+    rows = {
+        label: row
+        for name in table.recipes
+        for rollout in table.rollouts
+        for label, row in _rows(wanted, name, rollout)
+    }
+    for label, row in rows.items():
+        print(f"{label:<44}", *(f"{key} {value}" for key, value in row.items()))
+    settings = {"seeds": wanted.seeds, "episodes_a_seed": wanted.episodes, "from": FIRST_SEED}
+    print(json.dumps({"table": wanted.table, **settings, "rows": rows}))
+    return None
+
+
+def _prepare_stores(out: Path, table: Table) -> None:
+    """Make the recordings, models and stores that recipes need beside the demo's."""
+    for name in dict.fromkeys(RECIPES[recipe].store for recipe in table.recipes):
+        for stage, settings in STORES[name].steps:
+            command = [sys.executable, "-m", f"stages.{stage}"]
+            told = [part for text in settings for part in ("--set", text.format(out=out))]
+            run([*command, *told], check=True, stdout=sys.stderr)
+
+
+def _run_apart(wanted: Namespace, name: str, seed: int) -> None:
+    """A process a policy: what is replaced for one is never seen by another."""
+    folder = _folder(wanted.out, name, seed)
+    done = (folder / rollout / "metrics.json" for rollout in TABLES[wanted.table].rollouts)
+    if all(path.exists() for path in done):
+        return
+    threads = {"OMP_NUM_THREADS": str(max(1, (os.cpu_count() or 1) // wanted.jobs))}
+    own = ["--out", str(wanted.out), "--episodes", str(wanted.episodes)]
+    command = [sys.executable, "-m", "experiments.closed_loop", wanted.table, *own]
+    run(
+        [*command, "--one", name, str(seed)],
+        check=True,
+        stdout=sys.stderr,
+        env=os.environ | threads,
+    )
+
+
+def _folder(out: Path, name: str, seed: int) -> Path:
+    return out / f"{name.replace(' ', '-').replace(',', '')}-{seed}"
+
+
+def _work(wanted: Namespace, name: str, seed: int, rollouts: tuple[str, ...]) -> None:
+    """Train and evaluate a recipe, and roll it out in each way that has not been done."""
+    from stages import evaluate, rollout, train_head
+
+    recipe, folder = RECIPES[name], _folder(wanted.out, name, seed)
+    common = [
+        *store_settings(recipe, wanted.out),
+        *recipe.params,
+        f"train_head.seed={seed}",
+        f"train_head.output={folder / 'model'}",
+        f"train_head.logs={folder / 'logs'}",
+        f"evaluate.output={folder / 'report'}",
+        "evaluate.modalities=false",
+        "rollout.ablations=[]",
+        f"rollout.seed={FIRST_SEED + 1000 * seed}",
+        f"rollout.episodes={wanted.episodes}",
+    ]
+    with ExitStack() as patched:
+        for place, value in recipe.patches.items():
+            patched.enter_context(patch(place, value))
+        train_head.main(load_params(Path("params.yaml"), common))
+        if not (folder / "report" / "metrics.json").exists():
+            evaluate.main(load_params(Path("params.yaml"), common))
+        for way in rollouts:
+            if not (folder / way / "metrics.json").exists():
+                told = [*common, *ROLLOUTS[way], f"rollout.output={folder / way}"]
+                rollout.main(load_params(Path("params.yaml"), told))
+
+
+def _rows(
+    wanted: Namespace, name: str, rollout: str
+) -> Iterator[tuple[str, dict[str, list[float]]]]:
+    """A row for each controller of a rollout: success, median miss and, on time, errors."""
+    folders = [_folder(wanted.out, name, seed) for seed in range(wanted.seeds)]
+    episodes: dict[str, list[dict[str, str]]] = {}
+    for folder, file in product(folders, ("episodes.csv", "beside.csv")):
+        for row in _table(folder / rollout / file):
+            episodes.setdefault(row.get("controller", POLICY), []).append(row)
+    if wanted.table != "levels":
+        del episodes[EXPERT]
+    for controller, ended in episodes.items():
+        miss = float(np.median([float(row["lateral_mm"]) for row in ended]))
+        figures = {"success": _success(ended), "lateral_mm": [round(miss, 3)]}
+        if controller == POLICY and rollout == ON_TIME:
+            figures |= _errors_beside(wanted, folders)
+        others = [] if controller == POLICY else [controller]
+        yield " | ".join([name, rollout, *others]), figures
+
+
+def _errors_beside(wanted: Namespace, folders: list[Path]) -> dict[str, list[float]]:
+    """Both errors, and where the test ticks are the same, less those of the policy as it is."""
+    own, counts = _errors(folders)
+    base = [_folder(wanted.out, AS_IT_IS, seed) for seed in range(wanted.seeds)]
+    known = all((folder / "report" / "groups.csv").exists() for folder in base)
+    before, same = _errors(base) if known else (own, np.zeros(0))
+    figures: dict[str, list[float]] = {}
+    for place, figure in enumerate(FIGURES):
+        figures[figure] = _figure(own[:, place], counts[:, place])
+        if np.array_equal(same, counts):
+            figures[f"{figure}_difference"] = _figure((own - before)[:, place], counts[:, place])
+    return figures
+
+
+def _errors(folders: list[Path]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Errors (group, figure) averaged over the seeds, and how many entries stand behind each."""
+    errors: list[NDArray[Any]] = []
+    counts = np.zeros(0)
+    for folder in folders:
+        rows = sorted(_table(folder / "report" / "groups.csv"), key=lambda row: row["group"])
+        errors.append(np.array([[float(row[f"policy_{f}"]) for f in FIGURES] for row in rows]))
+        counts = np.array([[float(row[f"{f}_entries"]) for f in FIGURES] for row in rows])
+    return np.mean(errors, axis=0), counts
+
+
+def _table(path: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
+
+
+def _figure(errors: NDArray[Any], counts: NDArray[Any]) -> list[float]:
+    sums, entries = (errors * counts)[:, None], counts[:, None]
+    low, high = interval(bootstrap_means(sums, entries))
+    value = float(sums.sum() / entries.sum())
+    return [round(float(number), 4) for number in (value, low[0], high[0])]
+
+
+def _success(episodes: list[dict[str, str]]) -> list[float]:
+    inserted = sum(row["success"] == "True" for row in episodes)
+    edges = binomtest(inserted, len(episodes)).proportion_ci(method="wilson")
+    return [round(number, 3) for number in (inserted / len(episodes), edges.low, edges.high)]
+
+
+def _policies(out: Path) -> Iterator[tuple[str, dict[str, float]]]:
+    """Of each policy in a folder that was rolled out on time: its recipe, success and errors."""
+    for metrics in sorted(out.glob(f"*/{ON_TIME}/metrics.json")):
+        folder = metrics.parents[1]
+        errors, counts = _errors([folder])
+        values = dict(zip(FIGURES, np.average(errors, axis=0, weights=counts), strict=True))
+        success = _success(_table(folder / ON_TIME / "episodes.csv"))[0]
+        yield folder.name.rpartition("-")[0], {"success": success, **values}
+
+
+def _draw_worth(out: Path) -> None:
+    """Success against the error of what is executed and of the chunk, with rank correlations."""
+    from pipeline.look.page import style
+
+    names, values = zip(*_policies(out), strict=True)
+    success = [value["success"] for value in values]
+    words = {"executed": "of what is executed", "overall": "of the whole chunk"}
+    axes = {}
+
+    def draw() -> Any:
+        figure, panels = style.panels(9.0, 4.6, 1, 2, sharey=True)
+        for axis, name in zip(panels.ravel(), FIGURES, strict=True):
+            errors = [value[name] for value in values]
+            told: Any = spearmanr(errors, success)
+            axes[name] = [round(float(told.statistic), 3), round(float(told.pvalue), 5)]
+            axis.scatter(errors, 100 * np.array(success), color=style.PALETTE[0])
+            axis.set(xlabel=f"error {words[name]} [training std]", ylabel="inserted [%]")
+            axis.set_title(f"rank correlation {told.statistic:+.2f} over {len(errors)} policies")
+        figure.suptitle("What an error on recordings says of success")
+        return figure
+
+    (picture,) = style.write(out, {"worth.png": draw})
+    print(picture)
+    points = [{"recipe": name, **value} for name, value in zip(names, values, strict=True)]
+    print(json.dumps({"table": "worth", "rank_correlation": axes, "policies": points}))
+
+
+if __name__ == "__main__":
+    main()

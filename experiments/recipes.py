@@ -1,0 +1,230 @@
+"""What `experiments.closed_loop` trains and rolls out."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, get_args
+
+import torch
+
+from pipeline.base.config import RolloutAblation
+from pipeline.base.observation import Observation
+from pipeline.policy import state_channels
+from pipeline.policy.policy import Policy
+
+AS_IT_IS, ON_TIME = "as it is", "on time"
+
+
+@dataclass(frozen=True)
+class Store:
+    """The stages that make a store, with what is set for them, and what is set to train on it.
+
+    `{out}` stands for the folder of the experiments.
+    """
+
+    steps: tuple[tuple[str, tuple[str, ...]], ...] = ()
+    settings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Params that are set, and names of the code with what stands there instead."""
+
+    params: tuple[str, ...] = ()
+    patches: Mapping[str, Any] = field(default_factory=dict)
+    store: str = "demo"
+
+
+@dataclass(frozen=True)
+class Table:
+    """Which policies, and how each is rolled out."""
+
+    recipes: tuple[str, ...]
+    rollouts: tuple[str, ...] = (ON_TIME,)
+
+
+def store_settings(recipe: Recipe, out: Path) -> list[str]:
+    """What is set so that a recipe's policy is trained on its store, with its model."""
+    return [text.format(out=out) for text in STORES[recipe.store].settings]
+
+
+_MANY = (
+    "demo.recordings={out}/many",
+    "demo.episodes=107",
+    "data.root={out}/many",
+    "extract.store={out}/many.zarr",
+)
+_TUNED = ("vlm.adapter={out}/tuned/best/adapter", "extract.store={out}/tuned.zarr")
+_TUNING = ("finetune.output={out}/tuned", "finetune.logs={out}/tuned-logs")
+_LARGE = (
+    "vlm.image_resize_height=224",
+    "vlm.image_resize_width=392",
+    "extract.store={out}/large.zarr",
+)
+
+STORES = {
+    "demo": Store(),
+    # 428 recordings, of which about 300 are trained on.
+    "many": Store((("demo", _MANY), ("extract", _MANY)), _MANY),
+    "tuned": Store((("finetune", _TUNING), ("extract", _TUNED)), _TUNED),
+    "large": Store((("extract", _LARGE),), _LARGE),
+}
+
+ROLLOUTS: dict[str, tuple[str, ...]] = {
+    ON_TIME: (),
+    "depth": ("rollout.level=depth",),
+    "moved": ("rollout.level=moved",),
+    "temporal": ("rollout.chunking=temporal",),
+    "rtc": ("rollout.chunking=rtc", "rollout.execute=3"),
+    "1 tick late": ("rollout.latency_ms=100",),
+    "3 ticks late": ("rollout.latency_ms=300",),
+    "6 ticks late": ("rollout.latency_ms=600",),
+    **{f"{steps} steps": (f"rollout.execute={steps}",) for steps in (2, 3, 4, 6, 8)},
+    "spoilt": (f"rollout.ablations={json.dumps(get_args(RolloutAblation))}",),
+}
+
+
+def _plain(names: Any, units: Any) -> tuple[str, ...]:
+    return ("plain",) * len(names)
+
+
+def _no_age(encoder: Any, age_s: torch.Tensor) -> torch.Tensor:
+    return age_s.new_zeros(len(age_s), encoder.network[-1].out_features)
+
+
+_expand, _expanded_names = state_channels.expand, state_channels.expanded_names
+
+
+def _with_motion(values: torch.Tensor, kinds: Sequence[str]) -> torch.Tensor:
+    """The expanded states, and each channel less what it is now: how the robot has moved."""
+    degree = values.new_tensor([math.pi / 180 if kind == "deg" else 1.0 for kind in kinds])
+    moved = (values - values[:, -1:]) * degree
+    angle = torch.tensor([kind != "plain" for kind in kinds])
+    return torch.cat([_expand(values, kinds), torch.where(angle, moved.sin(), moved)], dim=-1)  # type: ignore[arg-type]
+
+
+def _with_motion_names(names: Sequence[str], kinds: Sequence[str]) -> list[str]:
+    return [*_expanded_names(names, kinds), *(f"{name}_moved" for name in names)]  # type: ignore[arg-type]
+
+
+_MOTION = {
+    "pipeline.policy.policy.expand": _with_motion,
+    "pipeline.train.statistics.expand": _with_motion,
+    "pipeline.policy.observation.expanded_names": _with_motion_names,
+    "pipeline.train.statistics.expanded_names": _with_motion_names,
+}
+_LATE = ("train_head.feature_lag=2",)
+_LONGER = ("train_head.max_steps=2000", "train_head.eval_every=200")
+
+
+def _motion(observation: Observation) -> torch.Tensor:
+    """What the arm did in the last 0.1 s as an action (batch, 1, 7): translation alone, in mm."""
+    before = (observation.state_age - observation.state_age[:, -1:] - 0.1).abs().argmin(dim=1)
+    rows = torch.arange(len(before))
+    moved = observation.state[rows, -1, 6:9] - observation.state[rows, before, 6:9]
+    moved = moved * (observation.state_valid > 1).unsqueeze(-1)
+    return torch.nn.functional.pad(moved, (0, 4)).unsqueeze(1)
+
+
+def _residual_loss(policy: Policy, observation: Observation, action: Any, *rest: Any) -> Any:
+    return _loss(policy, observation, action - _motion(observation), *rest)
+
+
+def _residual_sample(policy: Policy, observation: Observation, *rest: Any) -> Any:
+    return _sample(policy, observation, *rest) + _motion(observation)
+
+
+_loss, _sample = Policy.loss, Policy.sample
+_RESIDUAL = {
+    "pipeline.policy.policy.Policy.loss": _residual_loss,
+    "pipeline.policy.policy.Policy.sample": _residual_sample,
+}
+
+RECIPES = {
+    AS_IT_IS: Recipe(),
+    # experts and fusions
+    "diffusion": Recipe(("train_head.model_type=diffusion",)),
+    "flow matching": Recipe(("train_head.model_type=flow_matching",)),
+    "cross attention": Recipe(("train_head.fusion_strategy=cross_attention",)),
+    "gated": Recipe(("train_head.fusion_strategy=gated",)),
+    "no fusion": Recipe(("train_head.fusion_strategy=none",)),
+    # inputs
+    "no features": Recipe(("train_head.features_enabled=false",)),
+    "no sensor": Recipe(("train_head.sensor_enabled=false",)),
+    "no state": Recipe(("train_head.robot_state_enabled=false",)),
+    "readings by their order": Recipe(
+        ("train_head.sensor_window_s=null", "train_head.state_window_s=null")
+    ),
+    "angles as numbers": Recipe(
+        patches={
+            "pipeline.policy.state_channels.channel_kinds": _plain,
+            "pipeline.train.statistics.channel_kinds": _plain,
+        }
+    ),
+    "no ages": Recipe(patches={"pipeline.policy.ages.AgeEncoder.forward": _no_age}),
+    "no bounds, no floor": Recipe(
+        patches={
+            "pipeline.policy.policy._LARGEST": 1e9,
+            "pipeline.policy.normalization._LEAST_SPREAD": 0.0,
+        }
+    ),
+    "own motion seen": Recipe(patches=_MOTION),
+    "own motion seen, dropped": Recipe(("train_head.drop_state=0.5",), _MOTION),
+    # how it learns
+    "four times as long": Recipe(_LONGER),
+    "late in training": Recipe(_LATE),
+    "late and longer in training": Recipe((*_LATE, *_LONGER)),
+    "not averaged": Recipe(("train_head.ema_decay=0.0",)),
+    "horizon 4": Recipe(("train_head.horizon=4",)),
+    "horizon 16": Recipe(("train_head.horizon=16",)),
+    "residual over own motion": Recipe(patches=_RESIDUAL),
+    # how much it has seen
+    **{
+        f"{count} demonstrations": Recipe((f"train_head.split.train={count}",), store="many")
+        for count in (10, 30, 100, 300)
+    },
+    # what sees
+    "tuned model": Recipe(store="tuned"),
+    "larger images": Recipe(store="large"),
+    "best": Recipe(("train_head.max_steps=1500", "train_head.eval_every=100"), store="many"),
+}
+
+_LATER = (ON_TIME, "1 tick late", "3 ticks late", "6 ticks late")
+TABLES = {
+    "experts": Table(
+        (AS_IT_IS, "diffusion", "flow matching", "cross attention", "gated", "no fusion")
+    ),
+    "inputs": Table(
+        (
+            AS_IT_IS,
+            "no features",
+            "no sensor",
+            "no state",
+            "own motion seen",
+            "own motion seen, dropped",
+            "residual over own motion",
+        )
+    ),
+    "rules": Table(
+        (
+            AS_IT_IS,
+            "readings by their order",
+            "angles as numbers",
+            "no ages",
+            "no bounds, no floor",
+            "late in training",
+        )
+    ),
+    "spoilt": Table((AS_IT_IS,), ("spoilt",)),
+    "levels": Table((AS_IT_IS, "best"), (ON_TIME, "depth", "moved")),
+    "latency": Table((AS_IT_IS, "late in training", "late and longer in training"), _LATER),
+    "chunking": Table((AS_IT_IS,), (ON_TIME, *(f"{n} steps" for n in (2, 3, 4, 6, 8)), "temporal")),
+    "guided": Table(("flow matching",), (ON_TIME, "3 steps", "temporal", "rtc")),
+    "demonstrations": Table(tuple(f"{count} demonstrations" for count in (10, 30, 100, 300))),
+    "model": Table((AS_IT_IS, "tuned model", "larger images")),
+    "learning": Table(
+        (AS_IT_IS, "horizon 4", "horizon 16", "not averaged", "four times as long", "best")
+    ),
+}
