@@ -72,6 +72,7 @@ STORES = {
     "large": Store((("extract", _LARGE),), _LARGE),
 }
 
+# {folder} stands for that of the policy.
 ROLLOUTS: dict[str, tuple[str, ...]] = {
     ON_TIME: (),
     "depth": ("rollout.level=depth",),
@@ -81,7 +82,10 @@ ROLLOUTS: dict[str, tuple[str, ...]] = {
     "1 tick late": ("rollout.latency_ms=100",),
     "3 ticks late": ("rollout.latency_ms=300",),
     "6 ticks late": ("rollout.latency_ms=600",),
+    "3 ticks late, 3 steps": ("rollout.latency_ms=300", "rollout.execute=3"),
+    "6 ticks late, 6 steps": ("rollout.latency_ms=600", "rollout.execute=6"),
     **{f"{steps} steps": (f"rollout.execute={steps}",) for steps in (2, 3, 4, 6, 8)},
+    "last weights": ("rollout.checkpoint={folder}/model/last",),
     "spoilt": (f"rollout.ablations={json.dumps(get_args(RolloutAblation))}",),
 }
 
@@ -175,9 +179,7 @@ RECIPES = {
     # how it learns
     "four times as long": Recipe(_LONGER),
     "late in training": Recipe(_LATE),
-    "late and longer in training": Recipe((*_LATE, *_LONGER)),
     "not averaged": Recipe(("train_head.ema_decay=0.0",)),
-    "horizon 4": Recipe(("train_head.horizon=4",)),
     "horizon 16": Recipe(("train_head.horizon=16",)),
     "residual over own motion": Recipe(patches=_RESIDUAL),
     # how much it has seen
@@ -191,7 +193,7 @@ RECIPES = {
     "best": Recipe(("train_head.max_steps=1500", "train_head.eval_every=100"), store="many"),
 }
 
-_LATER = (ON_TIME, "1 tick late", "3 ticks late", "6 ticks late")
+_LATER = (ON_TIME, *(way for way in ROLLOUTS if "late" in way))
 TABLES = {
     "experts": Table(
         (AS_IT_IS, "diffusion", "flow matching", "cross attention", "gated", "no fusion")
@@ -218,13 +220,12 @@ TABLES = {
         )
     ),
     "spoilt": Table((AS_IT_IS,), ("spoilt",)),
+    "checkpoint": Table((AS_IT_IS,), (ON_TIME, "last weights")),
     "levels": Table((AS_IT_IS, "best"), (ON_TIME, "depth", "moved")),
-    "latency": Table((AS_IT_IS, "late in training", "late and longer in training"), _LATER),
+    "latency": Table((AS_IT_IS, "late in training"), _LATER),
     "chunking": Table((AS_IT_IS,), (ON_TIME, *(f"{n} steps" for n in (2, 3, 4, 6, 8)), "temporal")),
     "guided": Table(("flow matching",), (ON_TIME, "3 steps", "temporal", "rtc")),
     "demonstrations": Table(tuple(f"{count} demonstrations" for count in (10, 30, 100, 300))),
     "model": Table((AS_IT_IS, "tuned model", "larger images")),
-    "learning": Table(
-        (AS_IT_IS, "horizon 4", "horizon 16", "not averaged", "four times as long", "best")
-    ),
+    "learning": Table((AS_IT_IS, "horizon 16", "not averaged", "four times as long", "best")),
 }

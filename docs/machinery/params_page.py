@@ -76,6 +76,8 @@ def words(schema: Schema, definitions: Schema) -> str:
         return _either([_code(value) for value in schema["enum"]])
     if "anyOf" in schema:
         return _either([words(one, definitions) for one in schema["anyOf"]])
+    if "prefixItems" in schema:
+        return f"list of ({'), ('.join(words(one, definitions) for one in schema['prefixItems'])})"
     if schema["type"] == "array":
         least = f", at least {schema['minItems']}" if schema.get("minItems") else ""
         each = words(schema["items"], definitions)

@@ -1,0 +1,106 @@
+"""The experiments that the documentation's tables come from."""
+
+import json
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+
+from experiments import closed_loop, sight
+from experiments.recipes import RECIPES, ROLLOUTS, STORES, TABLES, store_settings
+from pipeline.base.config import load_params
+
+PARAMS = Path(__file__).parents[1] / "params.yaml"
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_what_a_table_names_can_be_run(name: str, tmp_path: Path) -> None:
+    table = TABLES[name]
+    for recipe in (RECIPES[name] for name in table.recipes):
+        told = [*store_settings(recipe, tmp_path), *recipe.params]
+        steps = [text.format(out=tmp_path) for _, s in STORES[recipe.store].steps for text in s]
+        load_params(PARAMS, steps)
+        for rollout in table.rollouts:
+            said = [text.format(folder=tmp_path) for text in ROLLOUTS[rollout]]
+            load_params(PARAMS, [*told, *said])
+        with ExitStack() as patched:
+            for place, value in recipe.patches.items():
+                patched.enter_context(patch(place, value))
+
+
+@pytest.fixture
+def done(tmp_path: Path) -> Path:
+    """A folder in which all of a table has been done: policies with errors 0.1, 0.2, …"""
+    rng = np.random.default_rng(0)
+    for place, name in enumerate(TABLES["experts"].recipes):
+        for seed in range(2):
+            folder = tmp_path / f"{name.replace(' ', '-')}-{seed}"
+            (folder / "report").mkdir(parents=True)
+            (folder / "on time").mkdir()
+            error = 0.1 * (place + 1)
+            groups = [f"g{n},{error},{2 * error},10,80" for n in range(5)]
+            heads = "group,policy_executed,policy_overall,executed_entries,overall_entries"
+            (folder / "report" / "groups.csv").write_text("\n".join([heads, *groups]))
+            (folder / "on time" / "metrics.json").write_text("{}")
+            ended = [f"{rng.random() > error},{error}" for _ in range(50)]
+            episodes = "\n".join(["success,lateral_mm", *ended])
+            (folder / "on time" / "episodes.csv").write_text(episodes)
+            beside = "controller,success,lateral_mm\nexpert,True,0.1\n"
+            (folder / "on time" / "beside.csv").write_text(beside)
+    return tmp_path
+
+
+def run(monkeypatch: pytest.MonkeyPatch, capsys: Any, *arguments: str) -> dict[str, Any]:
+    """The last line that the command prints; nothing may be trained."""
+
+    def never(*_: Any, **__: Any) -> None:
+        raise AssertionError("all is done already")
+
+    monkeypatch.setattr(closed_loop, "run", never)
+    monkeypatch.setattr("sys.argv", ["closed_loop", *arguments])
+    closed_loop.main()
+    return json.loads(capsys.readouterr().out.splitlines()[-1])
+
+
+def test_a_finished_table_is_told_from_its_files(
+    done: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    rows = run(monkeypatch, capsys, "experts", "--out", str(done))["rows"]
+    assert [label.partition(" | ")[0] for label in rows] == list(TABLES["experts"].recipes)
+    row = rows["diffusion | on time"]
+    assert row["executed"] == pytest.approx([0.2, 0.2, 0.2])
+    assert row["overall_difference"] == pytest.approx([0.2, 0.2, 0.2])
+    rate, low, high = row["success"]
+    assert low < rate < high and high - low == pytest.approx(0.16, abs=0.02)  # of 100, at 0.8
+
+
+def test_worth_ranks_success_against_errors(
+    done: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    told = run(monkeypatch, capsys, "worth", "--out", str(done))
+    assert (done / "worth.png").read_bytes().startswith(b"\x89PNG")
+    assert len(told["policies"]) == 12
+    for correlation, chance in told["rank_correlation"].values():
+        assert correlation < -0.8 and chance < 0.01
+
+
+def test_sight_errs_by_what_features_do_not_tell() -> None:
+    rng = np.random.default_rng(0)
+    offset = rng.uniform(-4, 4, (600, 2))
+    noisy = offset + 0.3 * rng.standard_normal(offset.shape)
+    features = np.stack([noisy @ rng.normal(size=(2, 6)) for _ in range(3)], axis=1)
+    told = sight._told(features.astype(np.float32), offset, np.arange(600) // 10)
+    assert told["sigma_mm"] == pytest.approx([0.3, 0.3], abs=0.03) and told["slots"] == 3
+    blind = sight._told(rng.normal(size=(600, 1, 4)).astype(np.float32), offset, np.arange(600))
+    assert blind["sigma_mm"] == pytest.approx([2.3, 2.3], abs=0.15)
+
+
+def test_sight_looks_until_the_needle_is_inside() -> None:
+    frames, offset_mm, episode = sight._look(2)
+    assert len(frames) == len(offset_mm) == len(episode) and set(episode) == {0, 1}
+    missed = np.hypot(*offset_mm.T)
+    assert missed.max() > 2.0
+    assert all(missed[episode == number][-1] < 1.0 for number in (0, 1))
