@@ -301,9 +301,8 @@ class _Driver:
         while active:
             self._look([(robots[i], loops[i]) for i in active if loops[i].frames_due])
             due = [i for i in active if loops[i].chunk_due]
-            asking = [loops[i] for i in due]
-            streams = self._streams(asking, ablation, first)
-            chunks = self._chunks(asking, [generators[i] for i in due], streams)
+            asking = [(loops[i], generators[i]) for i in due]
+            chunks = self._chunks(asking, ablation, first) if due else ()
             for i, chunk in zip(due, chunks, strict=True):
                 try:
                     loops[i].plan(chunk)
@@ -332,16 +331,19 @@ class _Driver:
             times = np.array([time for time, _ in views.values()])
             loop.see(SeenFeatures(row, real, times))
 
-    def _streams(
+    def _chunks(
         self,
-        loops: Sequence[ControlLoop],
+        asking: Sequence[tuple[ControlLoop, torch.Generator]],
         ablation: RolloutAblation | None,
         first: dict[ControlLoop, NDArray[Any]],
-    ) -> dict[str, NDArray[Any]]:
-        """What robots that ask for a chunk observe, one below the other; `first` is kept for them.
+    ) -> NDArray[np.float32]:
+        """The head's chunks (loop, horizon, action) for robots that ask for one.
 
-        An ablation spoils the values of a stream, not its ages and not what of it is valid.
+        An ablation spoils the values of a stream, not its ages and not what of it is valid; what
+        each robot is told first is kept in `first`.
         """
+        loops, generators = zip(*asking, strict=True)
+        guides = [loop.executor.begin() for loop in loops]
         fields = [loop.memory.observation() for loop in loops]
         if ablation is not None:
             name, how = ablation.split()
@@ -349,19 +351,7 @@ class _Driver:
             for loop, own in zip(loops, fields, strict=True):
                 told = own[name] if how == "frozen" else np.broadcast_to(mean, own[name].shape)
                 own[name] = first.setdefault(loop, told)
-        names = fields[0] if fields else ()
-        return {name: np.stack([own[name] for own in fields]) for name in names}
-
-    def _chunks(
-        self,
-        loops: Sequence[ControlLoop],
-        generators: Sequence[torch.Generator],
-        streams: Mapping[str, NDArray[Any]],
-    ) -> NDArray[np.float32]:
-        """The head's chunks (loop, horizon, action) for robots that ask for one."""
-        if not loops:
-            return np.zeros((0, 0, 0), np.float32)
-        guides = [loop.executor.begin() for loop in loops]
+        streams = {name: np.stack([own[name] for own in fields]) for name in fields[0]}
         observation = self.policy.observe(streams)
         guide = stack_guides(guides, observation.features.device)
         return self.policy.act(observation, generators, guide).cpu().numpy()
