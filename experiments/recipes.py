@@ -178,6 +178,7 @@ RECIPES = {
     "own motion seen, dropped": Recipe(("train_head.drop_state=0.5",), _MOTION),
     # how it learns
     "four times as long": Recipe(_LONGER),
+    "flow matching, four times as long": Recipe((*_LONGER, "train_head.model_type=flow_matching")),
     "late in training": Recipe(_LATE),
     "not averaged": Recipe(("train_head.ema_decay=0.0",)),
     "horizon 16": Recipe(("train_head.horizon=16",)),
@@ -190,7 +191,6 @@ RECIPES = {
     # what sees
     "tuned model": Recipe(store="tuned"),
     "larger images": Recipe(store="large"),
-    "best": Recipe(("train_head.max_steps=1500", "train_head.eval_every=100"), store="many"),
 }
 
 _LATER = (ON_TIME, *(way for way in ROLLOUTS if "late" in way))
@@ -201,12 +201,12 @@ TABLES = {
     "inputs": Table(
         (
             AS_IT_IS,
-            "no features",
-            "no sensor",
-            "no state",
             "own motion seen",
             "own motion seen, dropped",
             "residual over own motion",
+            "no state",
+            "no sensor",
+            "no features",
         )
     ),
     "rules": Table(
@@ -221,11 +221,12 @@ TABLES = {
     ),
     "spoilt": Table((AS_IT_IS,), ("spoilt",)),
     "checkpoint": Table((AS_IT_IS,), (ON_TIME, "last weights")),
-    "levels": Table((AS_IT_IS, "best"), (ON_TIME, "depth", "moved")),
+    "levels": Table((AS_IT_IS, "300 demonstrations"), (ON_TIME, "depth", "moved")),
     "latency": Table((AS_IT_IS, "late in training"), _LATER),
     "chunking": Table((AS_IT_IS,), (ON_TIME, *(f"{n} steps" for n in (2, 3, 4, 6, 8)), "temporal")),
     "guided": Table(("flow matching",), (ON_TIME, "3 steps", "temporal", "rtc")),
     "demonstrations": Table(tuple(f"{count} demonstrations" for count in (10, 30, 100, 300))),
     "model": Table((AS_IT_IS, "tuned model", "larger images")),
-    "learning": Table((AS_IT_IS, "horizon 16", "not averaged", "four times as long", "best")),
+    "learning": Table((AS_IT_IS, "horizon 16", "not averaged")),
+    "longer": Table(("four times as long", "flow matching, four times as long")),
 }
