@@ -7,7 +7,7 @@ set in training, or replaced in the code) and of the ways in which their policie
 Each recipe is trained with each of `seeds` seeds, judged on the test episodes, and rolled out in
 `episodes` episodes a seed, others for each seed and the same ones for all recipes. What is done
 already in FOLDER is not done again, so a command that was stopped goes on, and tables share
-policies.
+policies; rollouts of another number of episodes are done again.
 
 `worth` trains nothing: it draws success against errors on recordings, a point a policy of FOLDER.
 
@@ -70,6 +70,7 @@ def main() -> None:
     if wanted.table == "worth":
         return _draw_worth(wanted.out)
     table = TABLES[wanted.table]
+    _refuse_other_params(wanted.out)
     _prepare_stores(wanted.out, table)
     jobs = [(name, seed) for seed in range(wanted.seeds) for name in table.recipes]
     with ThreadPoolExecutor(wanted.jobs) as pool:
@@ -89,6 +90,16 @@ def main() -> None:
     return None
 
 
+def _refuse_other_params(out: Path) -> None:
+    """What is in the folder is of the params that were there when it was begun."""
+    params, kept = Path("params.yaml").read_text(encoding="utf-8"), out / "params.yaml"
+    out.mkdir(parents=True, exist_ok=True)
+    if not kept.exists():
+        kept.write_text(params, encoding="utf-8")
+    if kept.read_text(encoding="utf-8") != params:
+        raise SystemExit(f"{kept}: other params than those here. Name another folder with --out.")
+
+
 def _prepare_stores(out: Path, table: Table) -> None:
     """Make the recordings, models and stores that recipes need beside the demo's."""
     for name in dict.fromkeys(RECIPES[recipe].store for recipe in table.recipes):
@@ -101,8 +112,7 @@ def _prepare_stores(out: Path, table: Table) -> None:
 def _run_apart(wanted: Namespace, name: str, seed: int) -> None:
     """A process a policy: what is replaced for one is never seen by another."""
     folder = _folder(wanted.out, name, seed)
-    done = (folder / rollout / "metrics.json" for rollout in TABLES[wanted.table].rollouts)
-    if all(path.exists() for path in done):
+    if all(_is_done(wanted, folder / way) for way in TABLES[wanted.table].rollouts):
         return
     threads = {"OMP_NUM_THREADS": str(max(1, (os.cpu_count() or 1) // wanted.jobs))}
     own = ["--out", str(wanted.out), "--episodes", str(wanted.episodes)]
@@ -113,6 +123,14 @@ def _run_apart(wanted: Namespace, name: str, seed: int) -> None:
         stdout=sys.stderr,
         env=os.environ | threads,
     )
+
+
+def _is_done(wanted: Namespace, rollout: Path) -> bool:
+    """Whether a rollout of as many episodes is there."""
+    if not (rollout / "metrics.json").exists():
+        return False
+    settings = json.loads((rollout / "settings.json").read_text(encoding="utf-8"))
+    return settings["episodes"] == wanted.episodes
 
 
 def _folder(out: Path, name: str, seed: int) -> Path:
@@ -146,7 +164,7 @@ def _work(wanted: Namespace, name: str, seed: int, rollouts: tuple[str, ...]) ->
         if not (folder / "report" / "metrics.json").exists():
             evaluate.main(load_params(Path("params.yaml"), common))
         for way in rollouts:
-            if not (folder / way / "metrics.json").exists():
+            if not _is_done(wanted, folder / way):
                 said = [text.format(folder=folder) for text in ROLLOUTS[way]]
                 told = [*common, *said, f"rollout.output={folder / way}"]
                 rollout.main(load_params(Path("params.yaml"), told))

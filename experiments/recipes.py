@@ -199,16 +199,9 @@ TABLES = {
         (AS_IT_IS, "diffusion", "flow matching", "cross attention", "gated", "no fusion")
     ),
     "inputs": Table(
-        (
-            AS_IT_IS,
-            "own motion seen",
-            "own motion seen, dropped",
-            "residual over own motion",
-            "no state",
-            "no sensor",
-            "no features",
-        )
+        (AS_IT_IS, "own motion seen", "own motion seen, dropped", "residual over own motion")
     ),
+    "streams": Table((AS_IT_IS, "no state", "no sensor", "no features")),
     "rules": Table(
         (
             AS_IT_IS,

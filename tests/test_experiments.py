@@ -45,6 +45,7 @@ def done(tmp_path: Path) -> Path:
             heads = "group,policy_executed,policy_overall,executed_entries,overall_entries"
             (folder / "report" / "groups.csv").write_text("\n".join([heads, *groups]))
             (folder / "on time" / "metrics.json").write_text("{}")
+            (folder / "on time" / "settings.json").write_text('{"episodes": 50}')
             ended = [f"{rng.random() > error},{error}" for _ in range(50)]
             episodes = "\n".join(["success,lateral_mm", *ended])
             (folder / "on time" / "episodes.csv").write_text(episodes)
@@ -68,13 +69,29 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: Any, *arguments: str) -> dict[s
 def test_a_finished_table_is_told_from_its_files(
     done: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ) -> None:
-    rows = run(monkeypatch, capsys, "experts", "--out", str(done))["rows"]
+    rows = run(monkeypatch, capsys, "experts", "--out", str(done), "--episodes", "50")["rows"]
     assert [label.partition(" | ")[0] for label in rows] == list(TABLES["experts"].recipes)
     row = rows["diffusion | on time"]
     assert row["executed"] == pytest.approx([0.2, 0.2, 0.2])
     assert row["overall_difference"] == pytest.approx([0.2, 0.2, 0.2])
     rate, low, high = row["success"]
     assert low < rate < high and high - low == pytest.approx(0.16, abs=0.02)  # of 100, at 0.8
+
+
+def test_other_params_want_another_folder(
+    done: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    run(monkeypatch, capsys, "experts", "--out", str(done), "--episodes", "50")
+    (done / "params.yaml").write_text("data: {}")
+    with pytest.raises(SystemExit, match="Name another folder"):
+        run(monkeypatch, capsys, "experts", "--out", str(done), "--episodes", "50")
+
+
+def test_more_episodes_are_rolled_out_again(
+    done: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    with pytest.raises(AssertionError, match="all is done already"):
+        run(monkeypatch, capsys, "experts", "--out", str(done), "--episodes", "60")
 
 
 def test_worth_ranks_success_against_errors(
