@@ -11,7 +11,6 @@ from pipeline.vlm.preparation import TokenLayout
 from pipeline.vlm.slots import Slot, slots_of
 
 
-
 @given(
     grid=st.tuples(st.integers(1, 9), st.integers(1, 9)),
     rows=st.integers(1, 14),
