@@ -219,7 +219,8 @@ TABLES = {
     "chunking": Table((AS_IT_IS,), (ON_TIME, *(f"{n} steps" for n in (2, 3, 4, 6, 8)), "temporal")),
     "guided": Table(("flow matching",), (ON_TIME, "3 steps", "temporal", "rtc")),
     "demonstrations": Table(tuple(f"{count} demonstrations" for count in (10, 30, 100, 300))),
-    "model": Table((AS_IT_IS, "tuned model", "larger images")),
+    "model": Table((AS_IT_IS, "tuned model")),
+    "images": Table((AS_IT_IS, "larger images")),
     "learning": Table((AS_IT_IS, "horizon 16", "not averaged")),
     "longer": Table(("four times as long", "flow matching, four times as long")),
 }
