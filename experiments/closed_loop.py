@@ -21,8 +21,8 @@ import json
 import os
 import sys
 from argparse import ArgumentParser, Namespace
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import ExitStack
 from itertools import product
 from pathlib import Path
@@ -50,6 +50,12 @@ from pipeline.evaluate.intervals import bootstrap_means, interval
 from pipeline.evaluate.rollouts import EXPERT, POLICY
 
 FIGURES = ("executed", "overall")
+_AS_IT_IS = (
+    *(f"{key}=null" for key in ("train_head.store", "evaluate.store", "evaluate.checkpoint")),
+    *("rollout.checkpoint=null", "rollout.environment=phantom", "rollout.level=full"),
+    *("rollout.execute=1", "rollout.chunking=none", "rollout.latency_ms=0"),
+)
+"""What a recipe or a rollout takes for granted, whatever params.yaml says."""
 FIRST_SEED = 3_000_000
 """Of the rollouts; each seed of training has a thousand of its own."""
 
@@ -66,17 +72,26 @@ def main() -> None:
     wanted = parser.parse_args()
     if wanted.one:
         name, seed = wanted.one
-        return _work(wanted, name, int(seed), TABLES[wanted.table].rollouts)
-    if wanted.table == "worth":
-        return _draw_worth(wanted.out)
-    table = TABLES[wanted.table]
-    _refuse_other_params(wanted.out)
-    _prepare_stores(wanted.out, table)
+        _work(wanted, name, int(seed), TABLES[wanted.table].rollouts)
+    elif wanted.table == "worth":
+        _draw_worth(wanted.out)
+    else:
+        _refuse_other_params(wanted.out)
+        _make_table(wanted, TABLES[wanted.table])
+
+
+def _make_table(wanted: Namespace, table: Table) -> None:
     jobs = [(name, seed) for seed in range(wanted.seeds) for name in table.recipes]
-    with ThreadPoolExecutor(wanted.jobs) as pool:
+    jobs = [job for job in jobs if not _all_done(wanted, *job)]
+    _prepare_stores(wanted.out, dict.fromkeys(RECIPES[name].store for name, _ in jobs))
+    pool = ThreadPoolExecutor(wanted.jobs)
+    try:
         begun = [pool.submit(_run_apart, wanted, name, seed) for name, seed in jobs]
-        for job in tqdm(begun, wanted.table, unit="policy", disable=None):
+        waiting = as_completed(begun)
+        for job in tqdm(waiting, wanted.table, len(begun), unit="policy", disable=None):
             job.result()
+    finally:  # what is under way may end, nothing more begins
+        pool.shutdown(cancel_futures=True)
     rows = {
         label: row
         for name in table.recipes
@@ -87,7 +102,6 @@ def main() -> None:
         print(f"{label:<44}", *(f"{key} {value}" for key, value in row.items()))
     settings = {"seeds": wanted.seeds, "episodes_a_seed": wanted.episodes, "from": FIRST_SEED}
     print(json.dumps({"table": wanted.table, **settings, "rows": rows}))
-    return None
 
 
 def _refuse_other_params(out: Path) -> None:
@@ -100,9 +114,9 @@ def _refuse_other_params(out: Path) -> None:
         raise SystemExit(f"{kept}: other params than those here. Name another folder with --out.")
 
 
-def _prepare_stores(out: Path, table: Table) -> None:
+def _prepare_stores(out: Path, names: Iterable[str]) -> None:
     """Make the recordings, models and stores that recipes need beside the demo's."""
-    for name in dict.fromkeys(RECIPES[recipe].store for recipe in table.recipes):
+    for name in names:
         for stage, settings in STORES[name].steps:
             command = [sys.executable, "-m", f"stages.{stage}"]
             told = [part for text in settings for part in ("--set", text.format(out=out))]
@@ -111,9 +125,6 @@ def _prepare_stores(out: Path, table: Table) -> None:
 
 def _run_apart(wanted: Namespace, name: str, seed: int) -> None:
     """A process a policy: what is replaced for one is never seen by another."""
-    folder = _folder(wanted.out, name, seed)
-    if all(_is_done(wanted, folder / way) for way in TABLES[wanted.table].rollouts):
-        return
     threads = {"OMP_NUM_THREADS": str(max(1, (os.cpu_count() or 1) // wanted.jobs))}
     own = ["--out", str(wanted.out), "--episodes", str(wanted.episodes)]
     command = [sys.executable, "-m", "experiments.closed_loop", wanted.table, *own]
@@ -125,12 +136,16 @@ def _run_apart(wanted: Namespace, name: str, seed: int) -> None:
     )
 
 
+def _all_done(wanted: Namespace, name: str, seed: int) -> bool:
+    folder = _folder(wanted.out, name, seed)
+    return all(_is_done(wanted, folder / way) for way in TABLES[wanted.table].rollouts)
+
+
 def _is_done(wanted: Namespace, rollout: Path) -> bool:
-    """Whether a rollout of as many episodes is there."""
-    if not (rollout / "metrics.json").exists():
-        return False
-    settings = json.loads((rollout / "settings.json").read_text(encoding="utf-8"))
-    return settings["episodes"] == wanted.episodes
+    """Whether a rollout of as many episodes of each controller is there, whole."""
+    episodes = _episodes([rollout])
+    complete = all(len(rows) == wanted.episodes for rows in episodes.values())
+    return complete and {POLICY, EXPERT} <= episodes.keys()
 
 
 def _folder(out: Path, name: str, seed: int) -> Path:
@@ -143,6 +158,7 @@ def _work(wanted: Namespace, name: str, seed: int, rollouts: tuple[str, ...]) ->
 
     recipe, folder = RECIPES[name], _folder(wanted.out, name, seed)
     common = [
+        *_AS_IT_IS,
         *store_settings(recipe, wanted.out),
         *recipe.params,
         f"train_head.seed={seed}",
@@ -160,8 +176,12 @@ def _work(wanted: Namespace, name: str, seed: int, rollouts: tuple[str, ...]) ->
         patched.enter_context(patch("stages.rollout.write_report", lambda *_: []))
         for place, value in recipe.patches.items():
             patched.enter_context(patch(place, value))
+        run_file = folder / "model" / "run.json"
+        before = run_file.read_bytes() if run_file.exists() else b""
         train_head.main(load_params(Path("params.yaml"), common))
-        if not (folder / "report" / "metrics.json").exists():
+        if before and run_file.read_bytes() != before:
+            raise SystemExit(f"{folder}: was of another store or code. Remove it, and run again.")
+        if not (folder / "report" / "judged.json").exists():  # written last
             evaluate.main(load_params(Path("params.yaml"), common))
         for way in rollouts:
             if not _is_done(wanted, folder / way):
@@ -175,10 +195,7 @@ def _rows(
 ) -> Iterator[tuple[str, dict[str, list[float]]]]:
     """A row for each controller of a rollout: success, median miss and, on time, errors."""
     folders = [_folder(wanted.out, name, seed) for seed in range(wanted.seeds)]
-    episodes: dict[str, list[dict[str, str]]] = {}
-    for folder, file in product(folders, ("episodes.csv", "beside.csv")):
-        for row in _table(folder / rollout / file):
-            episodes.setdefault(row.get("controller", POLICY), []).append(row)
+    episodes = _episodes([folder / rollout for folder in folders])
     if wanted.table != "levels":
         del episodes[EXPERT]
     for controller, ended in episodes.items():
@@ -188,6 +205,15 @@ def _rows(
             figures |= _errors_beside(wanted, folders)
         others = [] if controller == POLICY else [controller]
         yield " | ".join([name, rollout, *others]), figures
+
+
+def _episodes(rollouts: list[Path]) -> dict[str, list[dict[str, str]]]:
+    """Rows of all episodes of several rollouts, by controller."""
+    episodes: dict[str, list[dict[str, str]]] = {}
+    for rollout, file in product(rollouts, ("episodes.csv", "beside.csv")):
+        for row in _table(rollout / file) if (rollout / file).exists() else ():
+            episodes.setdefault(row.get("controller", POLICY), []).append(row)
+    return episodes
 
 
 def _errors_beside(wanted: Namespace, folders: list[Path]) -> dict[str, list[float]]:
@@ -229,44 +255,53 @@ def _figure(errors: NDArray[Any], counts: NDArray[Any]) -> list[float]:
 def _success(episodes: list[dict[str, str]]) -> list[float]:
     inserted = sum(row["success"] == "True" for row in episodes)
     edges = binomtest(inserted, len(episodes)).proportion_ci(method="wilson")
-    return [round(number, 3) for number in (inserted / len(episodes), edges.low, edges.high)]
+    values = (inserted / len(episodes), edges.low, edges.high)
+    return [round(float(number), 3) for number in values]
 
 
-def _policies(out: Path) -> Iterator[tuple[str, dict[str, float]]]:
-    """Of each policy in a folder that was rolled out on time: its recipe, success and errors."""
-    for metrics in sorted(out.glob(f"*/{ON_TIME}/metrics.json")):
-        folder = metrics.parents[1]
-        errors, counts = _errors([folder])
-        values = dict(zip(FIGURES, np.average(errors, axis=0, weights=counts), strict=True))
-        success = _success(_table(folder / ON_TIME / "episodes.csv"))[0]
-        yield folder.name.rpartition("-")[0], {"success": success, **values}
+def _policies(out: Path) -> Iterator[dict[str, Any]]:
+    """Of each policy in a folder that was rolled out on time: recipe, store, success and errors."""
+    for name, recipe in RECIPES.items():
+        for folder in sorted(out.glob(f"{_folder(Path(), name, 0).name[:-1]}[0-9]")):
+            if not (folder / ON_TIME / "beside.csv").exists():
+                continue
+            errors, counts = _errors([folder])
+            values = dict(zip(FIGURES, np.average(errors, axis=0, weights=counts), strict=True))
+            success = _success(_episodes([folder / ON_TIME])[POLICY])[0]
+            yield {"recipe": name, "store": recipe.store, "success": success, **values}
 
 
 def _draw_worth(out: Path) -> None:
-    """Success against the error of what is executed and of the chunk, with rank correlations."""
+    """Success against the error of what is executed and of the chunk, with rank correlations.
+
+    These are of the policies that were judged on the demo's test recordings; those of other
+    recordings, whose unit is another, stand beside them in grey.
+    """
     from pipeline.look.page import style
 
-    names, values = zip(*_policies(out), strict=True)
-    success = [value["success"] for value in values]
+    policies = list(_policies(out))
+    own = [policy for policy in policies if policy["store"] != "many"]
+    if len(own) < 3:
+        raise SystemExit(f"{out}: expected three policies at least, found {len(own)}: make a table")
+    success = [policy["success"] for policy in own]
+    ranks: dict[str, Any] = {name: spearmanr([p[name] for p in own], success) for name in FIGURES}
     words = {"executed": "of what is executed", "overall": "of the whole chunk"}
-    axes = {}
 
     def draw() -> Any:
         figure, panels = style.panels(9.0, 4.6, 1, 2, sharey=True)
         for axis, name in zip(panels.ravel(), FIGURES, strict=True):
-            errors = [value[name] for value in values]
-            told: Any = spearmanr(errors, success)
-            axes[name] = [round(float(told.statistic), 3), round(float(told.pvalue), 5)]
-            axis.scatter(errors, 100 * np.array(success), color=style.PALETTE[0])
+            for policy in policies:
+                colour = style.PALETTE[0] if policy in own else "#999999"
+                axis.scatter(policy[name], 100 * policy["success"], color=colour)
             axis.set(xlabel=f"error {words[name]} [training std]", ylabel="inserted [%]")
-            axis.set_title(f"rank correlation {told.statistic:+.2f} over {len(errors)} policies")
-        figure.suptitle("What an error on recordings says of success")
+            axis.set_title(f"rank correlation {ranks[name].statistic:+.2f}, {len(own)} policies")
+        figure.suptitle("What an error on recordings says of success (grey: on other recordings)")
         return figure
 
     (picture,) = style.write(out, {"worth.png": draw})
     print(picture)
-    points = [{"recipe": name, **value} for name, value in zip(names, values, strict=True)]
-    print(json.dumps({"table": "worth", "rank_correlation": axes, "policies": points}))
+    told = {name: round(float(rank.statistic), 3) for name, rank in ranks.items()}
+    print(json.dumps({"table": "worth", "rank_correlation": told, "policies": policies}))
 
 
 if __name__ == "__main__":

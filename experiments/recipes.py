@@ -52,17 +52,15 @@ def store_settings(recipe: Recipe, out: Path) -> list[str]:
 
 _MANY = (
     "demo.recordings={out}/many",
+    "demo.checkpoint={out}/many_vlm",  # written beside it, and not used
     "demo.episodes=107",
     "data.root={out}/many",
     "extract.store={out}/many.zarr",
 )
 _TUNED = ("vlm.adapter={out}/tuned/best/adapter", "extract.store={out}/tuned.zarr")
 _TUNING = ("finetune.output={out}/tuned", "finetune.logs={out}/tuned-logs")
-_LARGE = (
-    "vlm.image_resize_height=224",
-    "vlm.image_resize_width=392",
-    "extract.store={out}/large.zarr",
-)
+LARGE_IMAGES = ("vlm.image_resize_height=224", "vlm.image_resize_width=392")
+_LARGE = (*LARGE_IMAGES, "extract.store={out}/large.zarr")
 
 STORES = {
     "demo": Store(),
@@ -103,9 +101,9 @@ _expand, _expanded_names = state_channels.expand, state_channels.expanded_names
 
 def _with_motion(values: torch.Tensor, kinds: Sequence[str]) -> torch.Tensor:
     """The expanded states, and each channel less what it is now: how the robot has moved."""
-    degree = values.new_tensor([math.pi / 180 if kind == "deg" else 1.0 for kind in kinds])
-    moved = (values - values[:, -1:]) * degree
-    angle = torch.tensor([kind != "plain" for kind in kinds])
+    unit = {"deg": math.pi / 180, "rotation": math.pi / 180}
+    moved = (values - values[:, -1:]) * values.new_tensor([unit.get(kind, 1.0) for kind in kinds])
+    angle = torch.tensor([kind != "plain" for kind in kinds], device=values.device)
     return torch.cat([_expand(values, kinds), torch.where(angle, moved.sin(), moved)], dim=-1)  # type: ignore[arg-type]
 
 
@@ -163,8 +161,9 @@ RECIPES = {
     ),
     "angles as numbers": Recipe(
         patches={
-            "pipeline.policy.state_channels.channel_kinds": _plain,
+            # First where it was imported to: an import that comes later must not see the patch.
             "pipeline.train.statistics.channel_kinds": _plain,
+            "pipeline.policy.state_channels.channel_kinds": _plain,
         }
     ),
     "no ages": Recipe(patches={"pipeline.policy.ages.AgeEncoder.forward": _no_age}),
@@ -180,6 +179,9 @@ RECIPES = {
     "four times as long": Recipe(_LONGER),
     "flow matching, four times as long": Recipe((*_LONGER, "train_head.model_type=flow_matching")),
     "late in training": Recipe(_LATE),
+    "somewhat late in training": Recipe(
+        ("train_head.feature_lag=1", "train_head.sensor_lag_s=0.05")
+    ),
     "not averaged": Recipe(("train_head.ema_decay=0.0",)),
     "horizon 16": Recipe(("train_head.horizon=16",)),
     "residual over own motion": Recipe(patches=_RESIDUAL),
@@ -209,7 +211,7 @@ TABLES = {
             "angles as numbers",
             "no ages",
             "no bounds, no floor",
-            "late in training",
+            "somewhat late in training",
         )
     ),
     "spoilt": Table((AS_IT_IS,), ("spoilt",)),

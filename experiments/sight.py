@@ -25,6 +25,7 @@ from sklearn.linear_model import RidgeCV
 from sklearn.model_selection import GroupKFold
 from tqdm import tqdm
 
+from experiments.recipes import LARGE_IMAGES
 from pipeline.base.config import load_params
 from pipeline.base.device import resolve_device
 from pipeline.robot.features import LiveFeatures
@@ -35,7 +36,6 @@ from pipeline.vlm.live import live_spec
 
 FIRST_SEED = 4_000_000
 NEAR_MM = 2.0
-_LARGE = ("vlm.image_resize_height=224", "vlm.image_resize_width=392")
 VARIANTS: dict[str, tuple[str, ...]] = {
     "as it is": (),
     "mean alone": ("vlm.pooling=[mean]",),
@@ -43,9 +43,9 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "every token of the images": ("vlm.grid=[4,6]",),
     "without the final norm": ("vlm.norms=[false]",),
     "the first layer": ("vlm.layers=[0]",),
-    "224 x 392": _LARGE,
-    "224 x 392, grid 8 x 8": (*_LARGE, "vlm.grid=[8,8]"),
-    "224 x 392, every token": (*_LARGE, "vlm.grid=[8,14]"),
+    "224 x 392": LARGE_IMAGES,
+    "224 x 392, grid 8 x 8": (*LARGE_IMAGES, "vlm.grid=[8,8]"),
+    "224 x 392, every token": (*LARGE_IMAGES, "vlm.grid=[8,14]"),
 }
 
 Frames = dict[str, NDArray[np.uint8]]

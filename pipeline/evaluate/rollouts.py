@@ -19,7 +19,7 @@ from pipeline.base.config import RolloutAblation, RolloutParams
 from pipeline.base.errors import CheckpointMismatch, ConfigError
 from pipeline.base.table import Table
 from pipeline.policy.checkpoint import PolicyCheckpoint
-from pipeline.policy.observation import moving_channels
+from pipeline.policy.observation import moving_channels, stream_of
 from pipeline.policy.policy import Policy
 from pipeline.robot.chunking import Executor, check_chunking
 from pipeline.robot.features import LiveFeatures
@@ -53,7 +53,7 @@ class RolloutEpisode:
     """
 
     controller: str
-    """`POLICY`, `EXPERT` (the demonstrator), or the policy with a stream off."""
+    """`POLICY`, `EXPERT` (the demonstrator), or the ablation that the policy ran under."""
     seed: int
     level: str
     success: bool
@@ -178,10 +178,14 @@ def roll_out(
         wanted,
         instruction_of(checkpoint),
     )
-    looked_at = wanted.ablations if len(policy.encoders) > 1 else ()
+    alone = len(policy.encoders) == 1
     ablations: Sequence[RolloutAblation | None] = (
         None,
-        *(name for name in looked_at if name.split()[0] in policy.encoders),
+        *(
+            name
+            for name in dict.fromkeys(wanted.ablations)
+            if name.split()[0] in policy.encoders and not (alone and name.endswith("off"))
+        ),
     )
     seeds = range(wanted.seed, wanted.seed + wanted.episodes)
     groups = [seeds[at : at + SIDE_BY_SIDE] for at in range(0, len(seeds), SIDE_BY_SIDE)]
@@ -297,7 +301,7 @@ class _Driver:
         for loop, robot in zip(loops, robots, strict=True):
             loop.sense(robot.readings())
         active = list(range(len(robots)))
-        first: dict[ControlLoop, NDArray[Any]] = {}
+        first: dict[ControlLoop, dict[str, NDArray[Any]]] = {}
         while active:
             self._look([(robots[i], loops[i]) for i in active if loops[i].frames_due])
             due = [i for i in active if loops[i].chunk_due]
@@ -335,12 +339,12 @@ class _Driver:
         self,
         asking: Sequence[tuple[ControlLoop, torch.Generator]],
         ablation: RolloutAblation | None,
-        first: dict[ControlLoop, NDArray[Any]],
+        first: dict[ControlLoop, dict[str, NDArray[Any]]],
     ) -> NDArray[np.float32]:
         """The head's chunks (loop, horizon, action) for robots that ask for one.
 
-        An ablation spoils the values of a stream, not its ages and not what of it is valid; what
-        each robot is told first is kept in `first`.
+        A stream that is off has its true ages and gaps; one that is frozen is all as it was first,
+        which is kept for each robot in `first`.
         """
         loops, generators = zip(*asking, strict=True)
         guides = [loop.executor.begin() for loop in loops]
@@ -349,8 +353,11 @@ class _Driver:
             name, how = ablation.split()
             mean = self.checkpoint.typical(name).astype(np.float32)
             for loop, own in zip(loops, fields, strict=True):
-                told = own[name] if how == "frozen" else np.broadcast_to(mean, own[name].shape)
-                own[name] = first.setdefault(loop, told)
+                if how == "off":
+                    own[name] = np.broadcast_to(mean, own[name].shape)
+                else:
+                    now = {key: value for key, value in own.items() if stream_of(key) == name}
+                    own |= first.setdefault(loop, now)
         streams = {name: np.stack([own[name] for own in fields]) for name in fields[0]}
         observation = self.policy.observe(streams)
         guide = stack_guides(guides, observation.features.device)

@@ -35,8 +35,11 @@ class PlanGuide:
 
 @dataclass(frozen=True)
 class _Chunk:
-    """A chunk as it came, and what it wants of each tick from `start` on: where the robot is to be
-    sent, in channels that move from where it was sent when the executor began."""
+    """A chunk of which step 0 belongs to tick `start`.
+
+    `wanted` (horizon, action): of channels that move, the place after each step, counted from where
+    the robot was when the executor began; of others, the step itself.
+    """
 
     start: int
     steps: Steps
@@ -51,10 +54,12 @@ class Executor:
     2025). A chunk's first step belongs to the tick of its observation, which `begin` marks; the
     steps played until `plan` hands it in are skipped, as counted.
 
-    Channels that `moving` (action,) marks say how far to move: a chunk then means the places that
-    its steps add up to from where the robot was sent at its observation, whichever chunk sent it
-    on since. Places are what is averaged, and an action leads from where the robot was sent last
-    to the next. None marks no channel: every one says where to be.
+    Channels that `moving` (action,) marks say how far to move. A chunk then means the places that
+    its steps add up to, from where the robot had been sent when its observation was made. Places
+    are what is averaged, and an action leads from the last place to the next. So what an older
+    chunk moved in between is not moved again, but the first action of a late chunk may be as long
+    as several steps: limits are the caller's. Rotations are added as vectors, which holds for small
+    ones. None marks no channel: each says where to be.
 
     Raises `ConfigError` where `execute`, the steps from one observation to the next, is not within
     the horizon.
@@ -101,9 +106,12 @@ class Executor:
         self._begun, self._sent_at_begin = self._tick, self._sent
         if self.chunking != "rtc" or not self._chunks:
             return None
-        chunk = self._chunks[-1].steps
-        played = self._tick - self._chunks[-1].start
+        newest = self._chunks[-1]
+        played, chunk = self._tick - newest.start, newest.steps
         left = chunk[played:]
+        if played < self.horizon:
+            sent = np.broadcast_to(self._sent, (1, chunk.shape[1]))
+            left = np.where(self._moving, np.diff(newest.wanted[played:], 1, 0, sent), left)
         overlap = self.horizon - max(played, self.execute)
         if overlap <= 0:
             return None

@@ -31,8 +31,8 @@ class LoopTiming:
     latency_s: float
     execute: int
     chunking: Chunking
-    moving: tuple[bool, ...] | None = None
-    """`moving_channels` of the action; None: none."""
+    moving: tuple[bool, ...]
+    """`moving_channels` of the action."""
 
 
 class ControlLoop:

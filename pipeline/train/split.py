@@ -55,7 +55,8 @@ def split_by_episode(
     source of three or more groups has one on each side that is asked for, one of two has one to
     train on, and all sources together have one on each side. `folds` deals the groups of each
     source in the order of their hashes, so that each is in test in one fold; `val` is drawn from
-    the others. `train` leaves out all groups to train on but so many, the first by their hashes.
+    the others. `train` leaves out all groups to train on but so many, the first by their hashes,
+    which may leave a source with none.
 
     Of two groups one is test, and val is cut from the tail of the other. A single one is cut by
     time into all three, at one instant for all of its episodes: those are then one recording in

@@ -21,7 +21,7 @@ class Slot:
     cell: tuple[int, int] | None = None
     """Row and column in the `grid` of a view."""
     grid: tuple[int, int] = (4, 4)
-    """Rows and columns that a view is cut into, where it is."""
+    """Rows and columns that the view of a cell is cut into."""
 
     def document(self) -> dict[str, Any]:
         """The slot as JSON-able values, without what does not apply.

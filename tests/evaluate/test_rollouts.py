@@ -12,7 +12,7 @@ from pipeline.base.errors import CheckpointMismatch, ConfigError
 from pipeline.compat.unified import no_normalization
 from pipeline.evaluate.rollouts import RolloutEpisode, Rollouts, SuccessRate, roll_out
 from pipeline.policy.checkpoint import PolicyCheckpoint
-from pipeline.policy.observation import PolicyShape
+from pipeline.policy.observation import PolicyShape, stream_of
 from pipeline.policy.policy import Policy
 from pipeline.simulation.environment import InsertionEnvironment
 from pipeline.simulation.insertion import MAX_TICKS, NeedleInsertion
@@ -247,11 +247,36 @@ def test_a_frozen_stream_tells_what_it_told_first(
     frozen = given[ticks:]
     assert len(frozen) > 5
     for robots in frozen:
-        now = robots[stream]
-        assert any((now[0] == first).all() for first in frozen[0][stream])
-        assert len(now) == 1 or not (now[0] == now[1]).all()
+        for name in (key for key in robots if stream_of(key) == stream):
+            now = robots[name]
+            assert any(np.array_equal(now[0], first) for first in frozen[0][name]), name
+        assert len(now) == 1 or not (robots[stream][0] == robots[stream][1]).all()
     other = {"sensor": "state"}.get(stream, "sensor")
     assert not (frozen[0][other][0] == frozen[5][other][0]).all()
+
+
+def test_an_ensemble_leads_to_the_mean_of_the_places(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a policy that always wants to move by one step, and of one whose steps change."""
+    parts = made()
+    sent: list[np.ndarray] = []
+    step = InsertionEnvironment.step
+
+    def watched(robot: Any, action: np.ndarray) -> Any:
+        sent.append(action.copy())
+        return step(robot, action)
+
+    def act(*_: Any) -> torch.Tensor:
+        chunk = torch.zeros(1, 4, 7)
+        chunk[..., 0] = 0.1 if len(sent) % 2 else -0.1
+        return chunk
+
+    monkeypatch.setattr(parts[1], "act", act)
+    monkeypatch.setattr(InsertionEnvironment, "step", watched)
+    rolled(parts, ablations=(), episodes=1, chunking="temporal")
+    # Places: -0.1, then the mean of -0.2 (the first chunk) and -0.1 + 0.1 (the second).
+    weights = np.exp([0, -0.01])
+    second = np.average([-0.2, 0.0], weights=weights) + 0.1
+    assert [action[0] for action in sent[:2]] == pytest.approx([-0.1, second], abs=1e-6)
 
 
 def test_streams_that_a_policy_lacks_are_passed_over() -> None:

@@ -10,7 +10,7 @@ from pipeline.base.errors import CheckpointMismatch, ConfigError
 from pipeline.policy.cost import describe_cost, flop_table
 from pipeline.policy.guidance import Guide
 from pipeline.policy.normalization import Normalization
-from pipeline.policy.observation import PolicyShape, action_groups
+from pipeline.policy.observation import PolicyShape, action_groups, moving_channels
 from pipeline.policy.policy import Policy, Trainable, drop_streams
 from pipeline.policy.window_encoders import SensorEncoder
 
@@ -338,6 +338,13 @@ def test_statistics_of_another_shape_are_refused(
         Policy(small_params(), wider, normalization)
     with pytest.raises(CheckpointMismatch, match=r"state: .* found None"):
         Policy(small_params(), shape, replace(normalization, state=None))
+
+
+@pytest.mark.parametrize("kind", ["delta", "velocity", "absolute"])
+def test_all_but_positions_say_how_far_to_move(kind: str) -> None:
+    action = {"kind": kind, "names": ["dx", "gripper", "rx"], "units": ["mm", "", "deg"]}
+    moves = kind != "absolute"
+    assert moving_channels(action) == (moves, False, moves)
 
 
 def test_action_groups_go_by_name_and_unit() -> None:

@@ -236,6 +236,20 @@ class TestMoving:
         assert executor.next_action().tolist() == [-11, 9]
         assert executor.next_action().tolist() == [-2, 9]
 
+    def test_a_guide_is_what_will_be_played(self) -> None:
+        executor = self.executor("rtc")
+        executor.begin()
+        executor.plan(self.deltas(1.0))
+        executor.next_action()
+        executor.begin()
+        for _ in range(3):
+            executor.next_action()
+        executor.plan(self.deltas(-2.0, place=9.0))
+        guide = executor.begin()
+        assert guide is not None
+        assert guide.chunk[:2].tolist() == [[-11, 9], [-2, 9]]
+        assert executor.next_action().tolist() == [-11, 9]
+
     def test_ensembles_average_places(self) -> None:
         executor = self.executor("temporal")
         sent, plans = 0.0, []

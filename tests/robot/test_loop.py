@@ -14,7 +14,9 @@ PARAMS = TrainHeadParams(horizon=HORIZON, sensor_window=3, state_window=2)
 
 
 def make_loop(latency_s: float = 0.0, execute: int = 1, uses_features: bool = True) -> ControlLoop:
-    return ControlLoop(PARAMS, SHAPE, LoopTiming(3, latency_s, execute, "none"), uses_features)
+    return ControlLoop(
+        PARAMS, SHAPE, LoopTiming(3, latency_s, execute, "none", (False, False)), uses_features
+    )
 
 
 def seen(time_s: float) -> SeenFeatures:

@@ -265,8 +265,9 @@ class RolloutParams(Section):
     """What a pass of the model takes, in simulated time: its features are so much older. The head
     answers at once."""
     ablations: tuple[RolloutAblation, ...] = ("sensor off", "features off")
-    """Also run the policy with a stream spoilt. off: every value at its training mean. frozen: what
-    the stream told first, as if it were new. What a policy does not look at is passed over."""
+    """Also run the policy with a stream spoilt. off: every value at its training mean. frozen: all
+    as the stream was first, as if it were new. What a policy does not look at is passed over, and
+    so is `off` of the only stream that it looks at. [] for none."""
     device: str = "auto"
     """auto, cpu, cuda or cuda:N."""
     output: Path = Path("reports/rollout")

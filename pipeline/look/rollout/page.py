@@ -29,7 +29,8 @@ _SUCCESS = (
 )
 _CONTROLLERS = (
     "The demonstrator is the rule that made the training data, and sees what the simulation hides. "
-    "With a stream off, the same policy acts without it. All of them meet the same episodes."
+    "With a stream off, the same policy sees its training mean; with one frozen, for ever what it "
+    "saw first. All of them meet the same episodes."
 )
 _ENDINGS = "Every episode of each controller by how it ended; grey, those that succeeded."
 
