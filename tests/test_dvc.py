@@ -58,6 +58,9 @@ class Project:
                 "PATH": os.pathsep.join(paths),
                 "PYTHONPATH": str(self.folder),
                 "DVC_NO_ANALYTICS": "1",
+                # What it remembers of files goes by path, inode and time of change, which a folder
+                # of an earlier run of the tests may have had too.
+                "DVC_SITE_CACHE_DIR": str(self.folder.with_name(f"{self.folder.name}_dvc")),
             },
         )
         assert done.returncode == 0, done.stdout + done.stderr
