@@ -32,7 +32,7 @@ from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import binomtest, spearmanr
+from scipy.stats import spearmanr
 from tqdm import tqdm
 
 from experiments.recipes import (
@@ -47,7 +47,7 @@ from experiments.recipes import (
 )
 from pipeline.base.config import load_params
 from pipeline.evaluate.intervals import bootstrap_means, interval
-from pipeline.evaluate.rollouts import EXPERT, POLICY
+from pipeline.evaluate.rollouts import EXPERT, POLICY, SuccessRate
 
 FIGURES = ("executed", "overall")
 _AS_IT_IS = (
@@ -253,10 +253,8 @@ def _figure(errors: NDArray[Any], counts: NDArray[Any]) -> list[float]:
 
 
 def _success(episodes: list[dict[str, str]]) -> list[float]:
-    inserted = sum(row["success"] == "True" for row in episodes)
-    edges = binomtest(inserted, len(episodes)).proportion_ci(method="wilson")
-    values = (inserted / len(episodes), edges.low, edges.high)
-    return [round(float(number), 3) for number in values]
+    rate = SuccessRate.counted(sum(row["success"] == "True" for row in episodes), len(episodes))
+    return [round(number, 3) for number in (rate.rate, rate.low, rate.high)]
 
 
 def _policies(out: Path) -> Iterator[dict[str, Any]]:

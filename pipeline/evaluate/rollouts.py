@@ -81,10 +81,13 @@ class SuccessRate:
     @classmethod
     def of(cls, episodes: Sequence[RolloutEpisode]) -> "SuccessRate":
         """That of these episodes, at least one."""
-        successes = sum(episode.success for episode in episodes)
-        interval = binomtest(successes, len(episodes)).proportion_ci(method="wilson")
-        rate = successes / len(episodes)
-        return cls(rate, float(interval.low), float(interval.high), len(episodes))
+        return cls.counted(sum(episode.success for episode in episodes), len(episodes))
+
+    @classmethod
+    def counted(cls, successes: int, episodes: int) -> "SuccessRate":
+        """That of so many successes in `episodes`, at least one."""
+        interval = binomtest(successes, episodes).proportion_ci(method="wilson")
+        return cls(successes / episodes, float(interval.low), float(interval.high), episodes)
 
     def __str__(self) -> str:
         return f"{self.rate:.0%} ({self.low:.0%} to {self.high:.0%})"
