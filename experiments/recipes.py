@@ -70,6 +70,9 @@ STORES = {
     "large": Store((("extract", _LARGE),), _LARGE),
 }
 
+LATE = {f"{ticks} tick{'s' * (ticks > 1)} late": ticks for ticks in (1, 2, 3, 4, 6, 8, 10)}
+"""Ways to roll out with a late model, and how many ticks of 0.1 s a pass takes."""
+
 # {folder} stands for that of the policy.
 ROLLOUTS: dict[str, tuple[str, ...]] = {
     ON_TIME: (),
@@ -77,9 +80,7 @@ ROLLOUTS: dict[str, tuple[str, ...]] = {
     "moved": ("rollout.level=moved",),
     "temporal": ("rollout.chunking=temporal",),
     "rtc": ("rollout.chunking=rtc", "rollout.execute=3"),
-    "1 tick late": ("rollout.latency_ms=100",),
-    "3 ticks late": ("rollout.latency_ms=300",),
-    "6 ticks late": ("rollout.latency_ms=600",),
+    **{late: (f"rollout.latency_ms={ticks * 100}",) for late, ticks in LATE.items()},
     "3 ticks late, 3 steps": ("rollout.latency_ms=300", "rollout.execute=3"),
     "6 ticks late, 6 steps": ("rollout.latency_ms=600", "rollout.execute=6"),
     **{f"{steps} steps": (f"rollout.execute={steps}",) for steps in (2, 3, 4, 6, 8)},
