@@ -77,4 +77,4 @@ def _prove(params: Params) -> None:
     checkpoint, device = load_policy(folder), resolve_device(params.extract.device)
     trained, say = checkpoint.source["feature_spec"], partial(print, flush=True)
     say(f"{folder} (step {checkpoint.step}): {len(checkpoint.golden)} golden rows, {device}")
-    print(prove(checkpoint, LiveFeatures(params.vlm, trained, str(device)), say))
+    prove(checkpoint, LiveFeatures(params.vlm, trained, str(device)), say)

@@ -178,7 +178,7 @@ def roll_out(
     Executor(wanted.chunking, wanted.execute, policy.params.horizon)
     features = load_features() if "features" in policy.encoders else None
     if features is not None:
-        say(str(prove(checkpoint, features, say)))
+        prove(checkpoint, features, say)
     driver = _Driver(
         checkpoint,
         policy,

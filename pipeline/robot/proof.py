@@ -34,8 +34,6 @@ class Proof:
     """That follows from the dtypes in which the features were computed and stored."""
 
     def __str__(self) -> str:
-        if not self.rows:
-            return "no golden rows: the feature spec alone was compared"
         return (
             f"{self.rows} golden rows computed again: the largest deviation is {self.largest:.1e} "
             f"of a slot's root mean square ({self.slot}), {self.tolerance:.0e} is tolerated"
@@ -62,9 +60,9 @@ def prove(
 ) -> Proof:
     """Compute the checkpoint's golden rows as frames of a robot are, and compare.
 
-    Raises `CheckpointMismatch` beyond the tolerance, which names the slots, their deviation, the
-    entries of the feature spec that differ, and both prompts where these do. `say` is warned where
-    a checkpoint carries no golden rows.
+    Raises `CheckpointMismatch` beyond the tolerance, which names slots, deviations, the entries of
+    the feature spec that differ, and both prompts where they do. `say` is told what came of it, and
+    warned where a checkpoint carries no golden rows.
     """
     spec = checkpoint.source["feature_spec"]
     tolerance = tolerance_of(spec) if checkpoint.golden else 0.0
@@ -80,7 +78,9 @@ def prove(
         raise CheckpointMismatch("\n".join(_refusal(spec, features, rows, tolerance)))
     worst = max(rows, key=lambda row: row.apart.relative.max())
     slot = slot_name(spec["slots"][worst.apart.worst])
-    return Proof(len(rows), float(worst.apart.relative.max()), slot, tolerance)
+    proof = Proof(len(rows), float(worst.apart.relative.max()), slot, tolerance)
+    say(str(proof))
+    return proof
 
 
 def _recomputed(row: GoldenRow, features: LiveFeatures) -> _Recomputed:
