@@ -36,6 +36,8 @@ class StopKind(StrEnum):
     POLICY = "the policy failed"
     CONNECTION = "connection lost"
     ROBOT = "the robot's code failed"
+    RECORDER = "the recorder failed"
+    LOOP = "the loop failed"
 
 
 class SafeStop(Exception):

@@ -9,7 +9,7 @@ their keys; `load` reads the file.
 # ruff: noqa: F401
 # pyright: reportUnusedImport=false
 
-from pipeline.base.config.load import load_params
+from pipeline.base.config.load import load_params, load_section
 from pipeline.base.config.policy import DiffusionParams, FlowMatchingParams, SensorEncoderParams
 from pipeline.base.config.sections import Params, described_keys
 from pipeline.base.config.stage_one import (
