@@ -7,57 +7,17 @@ those of the workspace and of force on what is measured, each tick before anythi
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from pipeline.base.channels import action_groups
-from pipeline.base.config import load_section
-from pipeline.base.config.section import Section
+from pipeline.base.config import LimitsFile, MotionLimit, load_section
 from pipeline.base.errors import ConfigError
 from pipeline.robot.loop import SafeStop, StopKind
 
 Vector = NDArray[np.float64]
-Most = dict[str, Annotated[float, Field(gt=0)]]
-
-
-class MotionLimit(Section):
-    """How large a motion may be, and what becomes of a larger one."""
-
-    most: Most
-    """By `translation` or `rotation`, the length of these channels together, or by the name of an
-    action's channel, its size."""
-    on_exceed: Literal["stop", "clip"] = "stop"
-    """stop: a safe stop. clip: the longest that is allowed is sent, in the same direction."""
-
-
-class Workspace(Section):
-    """Where the robot may be."""
-
-    box: dict[str, tuple[float, float]]
-    """Lowest and highest reading by the name of a state's channel."""
-
-
-class Force(Section):
-    """How hard the robot may press."""
-
-    most: Most
-    """Largest size of a reading by the name of a sensor's channel."""
-
-
-class LimitsFile(Section):
-    """The content of a limits file; what is not given is not limited."""
-
-    step: MotionLimit | None = None
-    """Of one action, in the units of the action."""
-    speed: MotionLimit | None = None
-    """Units per s."""
-    acceleration: MotionLimit | None = None
-    """Units per s²."""
-    workspace: Workspace | None = None
-    force: Force | None = None
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.base.observation import CLOCK_SLACK_S
+from pipeline.base.clock import CLOCK_SLACK_S
 
 
 @dataclass(frozen=True)
