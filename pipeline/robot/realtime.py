@@ -231,7 +231,7 @@ class _Run:
         self.chunk_shape = (meta["horizon"], meta["action_dim"])
         self.views = tuple(meta["streams"]["views"]) if meta["uses_features"] else ()
         timing = LoopTiming(
-            meta["vlm_reuse_count"],
+            max(1, round(meta["vlm_reuse_count"] * self.hz / meta["action_hz"])),
             settings.execute,
             settings.chunking,
             meta["horizon"],
