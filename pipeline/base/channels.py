@@ -14,6 +14,10 @@ STILL = 0.01
 _ALIKE = 3
 """Moving channels alike, from which what is usual for them is known."""
 _SHOWN = 4
+_GROUP_BY_UNIT = dict.fromkeys(("m", "cm", "mm"), "translation") | {
+    "deg": "rotation",
+    "rad": "rotation",
+}
 
 
 def unnumbered(name: str) -> str:
@@ -29,6 +33,17 @@ def named(names: Sequence[str], columns: Sequence[int]) -> str:
     said = [first if first == last else f"{first}–{last}" for first, last in ends]
     more = f" and {len(said) - _SHOWN} more" if len(said) > _SHOWN + 1 else ""
     return ", ".join(said[:_SHOWN] if more else said) + more
+
+
+def action_groups(names: Sequence[str], units: Sequence[str]) -> tuple[str, ...]:
+    """The loss group of each action channel, by its name (gripper) and then by its unit.
+
+    Lengths are translation and angles rotation; velocities and unnamed quantities are other.
+    """
+    return tuple(
+        "gripper" if "gripper" in name.lower() else _GROUP_BY_UNIT.get(unit.lower(), "other")
+        for name, unit in zip(names, units, strict=True)
+    )
 
 
 def hardly_moving(

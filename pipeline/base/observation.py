@@ -5,9 +5,6 @@ from dataclasses import dataclass
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-CLOCK_SLACK_S = 1e-6
-"""A reading that is older than a window by less is in it: clocks are rounded."""
-
 
 @dataclass
 class Observation:

@@ -6,8 +6,8 @@ No format that is read marks phases by itself. In contact is what `pipeline.data
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.base.channels import action_groups
 from pipeline.data.contact import contact_spans, force_columns
-from pipeline.policy.observation import action_groups
 from pipeline.store import Episode, FeatureStore
 from pipeline.train.batches import Ticks
 

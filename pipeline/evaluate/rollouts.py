@@ -6,7 +6,7 @@ Wilson intervals. The same seeds give the same figures, bit for bit on one machi
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
@@ -25,7 +25,7 @@ from pipeline.robot.chunking import Executor, check_chunking
 from pipeline.robot.features import LiveFeatures
 from pipeline.robot.guides import stack_guides
 from pipeline.robot.loop import ControlLoop, LoopTiming, SafeStop
-from pipeline.robot.memory import SeenFeatures
+from pipeline.robot.memory import RobotMemory, SeenFeatures, WindowSize
 from pipeline.robot.proof import prove
 from pipeline.simulation.environment import InsertionEnvironment
 from pipeline.simulation.insertion import INSERTED, TICK_HZ, EpisodeTrace, NeedleInsertion
@@ -267,6 +267,37 @@ def instruction_of(checkpoint: PolicyCheckpoint) -> str:
     )
 
 
+@dataclass
+class _Robot:
+    """One environment with its loop, and what is remembered of it."""
+
+    environment: InsertionEnvironment
+    loop: ControlLoop
+    memory: RobotMemory
+    generator: torch.Generator
+    under_way: tuple[float, SeenFeatures] | None = None
+    """When the pass of the model ends that has begun, and what it gives."""
+    first: dict[str, NDArray[Any]] = field(default_factory=dict[str, NDArray[Any]])
+    """What a frozen stream was first."""
+
+    def sense(self, readings: Mapping[str, NDArray[Any]]) -> None:
+        """Begin a tick; features whose pass has ended by now become the newest."""
+        self.loop.begin_tick()
+        self.memory.sense(readings)
+        self._take_features()
+
+    def see(self, seen: SeenFeatures, latency_s: float) -> None:
+        """The answer of a pass that begins now; it is ready `latency_s` from now."""
+        self.loop.pass_began()
+        self.under_way = self.memory.time_s + latency_s, seen
+        self._take_features()
+
+    def _take_features(self) -> None:
+        if self.under_way is not None and self.memory.time_s >= self.under_way[0] - 1e-9:
+            self.memory.features, self.under_way = self.under_way[1], None
+            self.loop.pass_ended()
+
+
 @dataclass(frozen=True)
 class _Driver:
     """Drives a policy's robots; `features` is the model that it asks, None where it asks none."""
@@ -287,7 +318,7 @@ class _Driver:
 
     def drive(
         self,
-        robots: Sequence[InsertionEnvironment],
+        environments: Sequence[InsertionEnvironment],
         seeds: Sequence[int],
         ablation: RolloutAblation | None,
         ended: Callable[[], Any],
@@ -297,78 +328,90 @@ class _Driver:
         `ended` is called for each that ends. A robot draws from a generator of its own seed, so
         that it does as it would alone.
         """
-        wanted, policy = self.wanted, self.policy
-        reuse = self.checkpoint.source["vlm_reuse_count"]
-        moving = moving_channels(self.checkpoint.source["streams"]["action"])
-        latency_s = wanted.latency_ms / 1000
-        timing = LoopTiming(reuse, latency_s, wanted.execute, wanted.chunking, moving)
-        asks = self.features is not None
-        loops = [ControlLoop(policy.params, policy.shape, timing, asks) for _ in robots]
-        generators = [torch.Generator().manual_seed(seed) for seed in seeds]
+        robots = [self._robot(*pair) for pair in zip(environments, seeds, strict=True)]
         stops: list[str | None] = [None] * len(robots)
-        for loop, robot in zip(loops, robots, strict=True):
-            loop.sense(robot.readings())
+        for robot in robots:
+            robot.sense(robot.environment.readings())
         active = list(range(len(robots)))
-        first: dict[ControlLoop, dict[str, NDArray[Any]]] = {}
+        still = np.zeros(self.policy.shape.action_dim)
         while active:
-            self._look([(robots[i], loops[i]) for i in active if loops[i].frames_due])
-            due = [i for i in active if loops[i].chunk_due]
-            asking = [(loops[i], generators[i]) for i in due]
-            chunks = self._chunks(asking, ablation, first) if due else ()
+            self._look([robots[i] for i in active if robots[i].loop.frames_due])
+            due = [i for i in active if self._sees(robots[i]) and robots[i].loop.chunk_due]
+            chunks = self._chunks([robots[i] for i in due], ablation) if due else ()
             for i, chunk in zip(due, chunks, strict=True):
                 try:
-                    loops[i].plan(chunk)
+                    robots[i].loop.plan(chunk)
                 except SafeStop as stop:
                     stops[i] = f"safe stop: {stop}"
             for i in active:
                 if stops[i] is None:
-                    loops[i].sense(robots[i].step(loops[i].action())[0])
-            going = [i for i in active if stops[i] is None and not robots[i].insertion.finished]
+                    action = robots[i].loop.action()
+                    doing = still if action is None else action
+                    robots[i].sense(robots[i].environment.step(doing)[0])
+            going = [
+                i for i in active if stops[i] is None and not environments[i].insertion.finished
+            ]
             for _ in range(len(active) - len(going)):
                 ended()
             active = going
         return stops
 
-    def _look(self, due: Sequence[tuple[InsertionEnvironment, ControlLoop]]) -> None:
+    def _robot(self, environment: InsertionEnvironment, seed: int) -> _Robot:
+        """The loop and the memory of a robot whose episode begins."""
+        params, shape, wanted = self.policy.params, self.policy.shape, self.wanted
+        source = self.checkpoint.source
+        moving = moving_channels(source["streams"]["action"])
+        timing = LoopTiming(
+            source["vlm_reuse_count"], wanted.execute, wanted.chunking, params.horizon, moving
+        )
+        memory = RobotMemory(
+            WindowSize(params.sensor_window, shape.sensor_channels, params.sensor_reach_s),
+            WindowSize(params.state_window, shape.state_dim, params.state_window_s),
+        )
+        loop = ControlLoop(timing, uses_features=self.features is not None)
+        return _Robot(environment, loop, memory, torch.Generator().manual_seed(seed))
+
+    def _sees(self, robot: _Robot) -> bool:
+        """Whether the head can be asked: the first features are there, or it looks at none."""
+        return self.features is None or robot.memory.features is not None
+
+    def _look(self, due: Sequence[_Robot]) -> None:
         """Begin a pass of the model for all whose frames are due."""
         if not due or self.features is None:
             return
         trained = self.checkpoint.source["streams"]["views"]
-        shots = [robot.frames() for robot, _ in due]
+        shots = [robot.environment.frames() for robot in due]
         taken = [{view: views[view] for view in trained} for views in shots]
         frames = [{view: frame for view, (_, frame) in views.items()} for views in taken]
         features, valid = self.features(frames, self.instruction)
         rows = zip(features.numpy(), valid.numpy(), strict=True)
-        for (_, loop), views, (row, real) in zip(due, taken, rows, strict=True):
+        for robot, views, (row, real) in zip(due, taken, rows, strict=True):
             times = np.array([time for time, _ in views.values()])
-            loop.see(SeenFeatures(row, real, times))
+            robot.see(SeenFeatures(row, real, times), self.wanted.latency_ms / 1000)
 
     def _chunks(
-        self,
-        asking: Sequence[tuple[ControlLoop, torch.Generator]],
-        ablation: RolloutAblation | None,
-        first: dict[ControlLoop, dict[str, NDArray[Any]]],
+        self, asking: Sequence[_Robot], ablation: RolloutAblation | None
     ) -> NDArray[np.float32]:
-        """The head's chunks (loop, horizon, action) for robots that ask for one.
+        """The head's chunks (robot, horizon, action) for robots that ask for one.
 
-        A stream that is off has its true ages and gaps; one that is frozen is all as it was first,
-        which is kept for each robot in `first`.
+        A stream that is off has its true ages and gaps; one that is frozen is all as it was first.
         """
-        loops, generators = zip(*asking, strict=True)
-        guides = [loop.executor.begin() for loop in loops]
-        fields = [loop.memory.observation() for loop in loops]
+        guides = [robot.loop.ask() for robot in asking]
+        fields = [robot.memory.observation() for robot in asking]
         if ablation is not None:
             name, how = ablation.split()
             mean = self.checkpoint.typical(name).astype(np.float32)
-            for loop, own in zip(loops, fields, strict=True):
+            for robot, own in zip(asking, fields, strict=True):
                 if how == "off":
                     own[name] = np.broadcast_to(mean, own[name].shape)
                 else:
                     now = {key: value for key, value in own.items() if stream_of(key) == name}
-                    own |= first.setdefault(loop, now)
+                    robot.first = robot.first or now
+                    own |= robot.first
         streams = {name: np.stack([own[name] for own in fields]) for name in fields[0]}
         observation = self.policy.observe(streams)
         guide = stack_guides(guides, observation.features.device)
+        generators = [robot.generator for robot in asking]
         return self.policy.act(observation, generators, guide).cpu().numpy()
 
 

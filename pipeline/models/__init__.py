@@ -7,6 +7,7 @@ bring a vision-language model, and training from a store needs none.
 from importlib import import_module
 from typing import Any
 
+from pipeline.base.channels import action_groups
 from pipeline.base.observation import Observation
 from pipeline.policy.cost import describe_cost, flop_table
 from pipeline.policy.denoiser import Denoiser
@@ -23,7 +24,7 @@ from pipeline.policy.fusion import (
     build_fusion,
 )
 from pipeline.policy.noise_schedule import NoiseSchedule
-from pipeline.policy.observation import PolicyShape, action_groups
+from pipeline.policy.observation import PolicyShape
 from pipeline.policy.policy import Normalizer, Policy, Trainable
 from pipeline.policy.regression import RegressionActionExpert
 from pipeline.policy.window_encoders import (

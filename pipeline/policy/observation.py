@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from pipeline.base.channels import action_groups
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import ObservationError
 from pipeline.base.observation import Observation
@@ -20,11 +21,6 @@ what of it is real: (batch, slot) bool of the features, else (batch,) counts."""
 
 AGES = {"sensor": "sensor_age", "state": "state_age"}
 """The field with the ages of a stream's readings."""
-
-_GROUP_BY_UNIT = dict.fromkeys(("m", "cm", "mm"), "translation") | {
-    "deg": "rotation",
-    "rad": "rotation",
-}
 
 Axes = Mapping[str, int | None]
 """Names and sizes of a tensor's axes; None is any size above 0."""
@@ -90,17 +86,6 @@ class PolicyShape:
             "state_valid": {},
             "state_age": {"window": None},
         }
-
-
-def action_groups(names: Sequence[str], units: Sequence[str]) -> tuple[str, ...]:
-    """The loss group of each action channel, by its name (gripper) and then by its unit.
-
-    Lengths are translation and angles rotation; velocities and unnamed quantities are other.
-    """
-    return tuple(
-        "gripper" if "gripper" in name.lower() else _GROUP_BY_UNIT.get(unit.lower(), "other")
-        for name, unit in zip(names, units, strict=True)
-    )
 
 
 def moving_channels(action: Mapping[str, Any]) -> tuple[bool, ...]:

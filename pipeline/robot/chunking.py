@@ -84,7 +84,7 @@ class Executor:
         self._begun: int | None = None
         self._chunks: list[_Chunk] = []
         self._sent: NDArray[np.float64] | float = 0.0
-        self._sent_at_begin = self._sent
+        self._sent_before = self._sent_at_begin = self._sent
         self._delays: deque[int] = deque(maxlen=DELAYS)
 
     @property
@@ -97,6 +97,16 @@ class Executor:
         if self._begun is not None:
             return False
         return not self._chunks or self._tick - self._chunks[-1].start >= self.execute
+
+    @property
+    def planned(self) -> bool:
+        """Whether a chunk has ever come."""
+        return bool(self._chunks)
+
+    @property
+    def reaches(self) -> bool:
+        """Whether a chunk has a step for this tick."""
+        return any(self._tick - chunk.start < self.horizon for chunk in self._chunks)
 
     def begin(self) -> PlanGuide | None:
         """Mark this tick as that of the next chunk's observation, also in place of an earlier mark.
@@ -136,14 +146,23 @@ class Executor:
 
         There must be a chunk that reaches it: `plan` comes in time, or the caller stops the robot.
         """
+        assert self.reaches, f"no action at tick {self._tick}: no chunk came in time"
         self._chunks = [c for c in self._chunks if self._tick - c.start < self.horizon]
-        assert self._chunks, f"no action at tick {self._tick}: no chunk came in time"
         wanted = np.stack([chunk.wanted[self._tick - chunk.start] for chunk in self._chunks])
         self._tick += 1
         place = ensemble(wanted) if self.chunking == "temporal" else wanted[-1]
         action = place - np.where(self._moving, self._sent, 0.0)
-        self._sent = np.where(self._moving, place, 0.0)
+        self._sent_before, self._sent = self._sent, np.where(self._moving, place, 0.0)
         return action.astype(np.float32)
+
+    def sent(self, action: ArrayLike) -> None:
+        """Tell what was really sent, (action,), in place of what `next_action` gave last.
+
+        A moving channel's next action then leads from where the robot was really sent to the next
+        place of the plan, so what was cut off is made up for as soon as limits allow, unless a
+        newer chunk says otherwise: it counts from where the robot had really been sent, too.
+        """
+        self._sent = np.where(self._moving, self._sent_before + np.asarray(action), 0.0)
 
 
 def ensemble(predicted: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,96 +1,122 @@
-"""One robot's control loop: it says what is due, and takes what came of it.
+"""One robot's control loop: it says what is due, and counts what came of it. Numpy only.
 
-Its clock is the time that the readings bring, simulated or real, so that a rollout and a robot run
-the same loop. In each tick whoever drives it asks, in this order: `sense`, then `frames_due` (and
-begins a pass of the model, whose answer is handed to `see`), then `chunk_due` (and hands the head's
-chunk to `plan`), then `action`.
+It has no clock but its ticks, so that a rollout and a robot in real time run the same loop. In each
+tick whoever drives it calls, in this order: `begin_tick`; where `frames_due`, `pass_began`, and
+`pass_ended` once features of these frames are there; where `chunk_due`, `ask`, and `plan` with the
+chunk that was answered, at once or ticks later; then `action`.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.base.config import Chunking, TrainHeadParams
-from pipeline.policy.observation import PolicyShape
-from pipeline.robot.chunking import Executor
-from pipeline.robot.memory import RobotMemory, SeenFeatures, WindowSize
+from pipeline.base.config import Chunking
+from pipeline.robot.chunking import Executor, PlanGuide
+
+
+class StopKind(StrEnum):
+    """Why a robot stands still."""
+
+    ENDED = "the robot ended the run"
+    TIME = "time is up"
+    BY_HAND = "stopped by hand"
+    NO_CHUNK = "no chunk in time"
+    OLD_FEATURES = "features too old"
+    CAMERA = "camera missing or late"
+    STALLED = "readings stalled"
+    NOT_A_NUMBER = "not a number"
+    LIMIT = "action beyond limits"
+    FORCE = "too much force"
+    WORKSPACE = "outside the workspace"
+    CLOCK = "clock"
+    MISSED = "missed ticks"
+    HUNG = "the loop hangs"
+    POLICY = "the policy failed"
+    CONNECTION = "connection lost"
+    ROBOT = "the robot's code failed"
+    RECORDER = "the recorder failed"
+    LOOP = "the loop failed"
 
 
 class SafeStop(Exception):
     """The robot is to stand still from here on; the message is the reason."""
 
+    def __init__(self, kind: StopKind, reason: str) -> None:
+        super().__init__(reason)
+        self.kind = kind
+
 
 @dataclass(frozen=True)
 class LoopTiming:
-    """How often what is done: `reuse` ticks between passes of the model, `latency_s` of a pass."""
+    """How often what is done: `reuse` ticks between passes of the model."""
 
     reuse: int
-    latency_s: float
     execute: int
     chunking: Chunking
+    horizon: int
     moving: tuple[bool, ...]
     """`moving_channels` of the action."""
 
 
 class ControlLoop:
-    """The loop of a policy of these params and widths; `uses_features` where it needs the model."""
+    """The loop of a policy; `uses_features` where it needs the model."""
 
-    def __init__(
-        self, params: TrainHeadParams, shape: PolicyShape, timing: LoopTiming, uses_features: bool
-    ) -> None:
-        self.memory = RobotMemory(
-            WindowSize(params.sensor_window, shape.sensor_channels, params.sensor_reach_s),
-            WindowSize(params.state_window, shape.state_dim, params.state_window_s),
-        )
-        self.executor = Executor(timing.chunking, timing.execute, params.horizon, timing.moving)
-        self._timing, self._uses_features = timing, uses_features
-        self._still = np.zeros(shape.action_dim)
-        self._tick, self._pass_began = -1, -timing.reuse
-        self._under_way: tuple[float, SeenFeatures] | None = None
+    def __init__(self, timing: LoopTiming, uses_features: bool) -> None:
+        self.executor = Executor(timing.chunking, timing.execute, timing.horizon, timing.moving)
+        self._reuse, self._uses_features = timing.reuse, uses_features
+        self.reset()
 
-    def sense(self, readings: Mapping[str, NDArray[Any]]) -> None:
-        """Begin a tick with the readings since the last; `RobotMemory.sense` says which.
+    def reset(self) -> None:
+        """Forget all, for the next episode."""
+        self.executor.reset()
+        self._tick, self._pass_began = -1, -self._reuse
+        self._under_way = False
 
-        Features whose pass has ended by now become the newest.
-        """
+    def begin_tick(self) -> None:
+        """Begin a tick: what is due is asked anew."""
         self._tick += 1
-        self.memory.sense(readings)
-        self._take_features()
 
     @property
     def frames_due(self) -> bool:
         """Whether the model is free, and the newest pass began `reuse` ticks ago or earlier."""
-        waited = self._tick - self._pass_began >= self._timing.reuse
-        return self._uses_features and self._under_way is None and waited
+        waited = self._tick - self._pass_began >= self._reuse
+        return self._uses_features and not self._under_way and waited
 
-    def see(self, seen: SeenFeatures) -> None:
-        """The answer of a pass that begins now; it is ready `latency_s` from now."""
-        self._pass_began = self._tick
-        self._under_way = self.memory.time_s + self._timing.latency_s, seen
-        self._take_features()
+    def pass_began(self) -> None:
+        """The model looks at frames of this tick."""
+        self._pass_began, self._under_way = self._tick, True
+
+    def pass_ended(self) -> None:
+        """The features of the pass that began last are there."""
+        self._under_way = False
 
     @property
     def chunk_due(self) -> bool:
-        """Whether the head is to be asked; not before the first features are there."""
-        return self._ready and self.executor.due
+        """Whether the next chunk is to be asked for; never between `ask` and `plan`."""
+        return self.executor.due
+
+    def ask(self) -> PlanGuide | None:
+        """The chunk that is due is asked for with what is known now; what it is to continue."""
+        return self.executor.begin()
 
     def plan(self, chunk: NDArray[np.float32]) -> None:
-        """Take the head's chunk (horizon, action), in physical units."""
+        """Take the chunk (horizon, action) that `ask` was for, in physical units.
+
+        Raises `SafeStop` for one that is not all numbers.
+        """
         if not np.isfinite(chunk).all():
-            raise SafeStop("the policy's action is not a number")
+            raise SafeStop(StopKind.NOT_A_NUMBER, "the policy's action is not a number")
         self.executor.plan(chunk)
 
-    def action(self) -> NDArray[np.float64]:
-        """What the robot is to do in this tick: stand still until the first features are there."""
-        return self.executor.next_action().astype(np.float64) if self._ready else self._still
+    def action(self) -> NDArray[np.float64] | None:
+        """What the robot is to do in this tick; None, stand still, until the first chunk is there.
 
-    @property
-    def _ready(self) -> bool:
-        return self.memory.features is not None or not self._uses_features
-
-    def _take_features(self) -> None:
-        if self._under_way is not None and self.memory.time_s >= self._under_way[0] - 1e-9:
-            self.memory.features, self._under_way = self._under_way[1], None
+        Raises `SafeStop` where the plan is used up before the next chunk has come.
+        """
+        if not self.executor.planned:
+            return None
+        if not self.executor.reaches:
+            raise SafeStop(StopKind.NO_CHUNK, "the plan is used up, and no chunk came in time")
+        return self.executor.next_action().astype(np.float64)

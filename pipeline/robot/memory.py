@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.base.observation import CLOCK_SLACK_S
+from pipeline.base.clock import CLOCK_SLACK_S
 
 
 @dataclass(frozen=True)
@@ -24,12 +24,12 @@ class ReadingWindow:
 
     def __init__(self, size: WindowSize) -> None:
         self.values = np.zeros((size.readings, size.channels), np.float32)
-        self._time_s = np.full(size.readings, -np.inf)
+        self.time_s = np.full(size.readings, -np.inf)
         self._oldest_s = np.inf if size.oldest_s is None else size.oldest_s + CLOCK_SLACK_S
 
     def append(self, readings: NDArray[np.float32], time_s: NDArray[np.float64]) -> None:
         """Take the readings (reading, channel) that follow, and the times (reading,) of them."""
-        for buffer, following in ((self.values, readings), (self._time_s, time_s)):
+        for buffer, following in ((self.values, readings), (self.time_s, time_s)):
             newest = following[-len(buffer) :]
             kept = len(buffer) - len(newest)
             buffer[:kept] = buffer[len(newest) :]
@@ -37,7 +37,7 @@ class ReadingWindow:
 
     def at(self, now_s: float) -> tuple[NDArray[np.float32], int, NDArray[np.float32]]:
         """The readings, how many of them are real, the last ones, and their ages in s."""
-        age_s = now_s - self._time_s
+        age_s = now_s - self.time_s
         real = np.isfinite(age_s) & (age_s <= self._oldest_s)
         ages = np.where(real, age_s, 0).astype(np.float32)
         return self.values * real[:, None], int(real.sum()), ages

@@ -15,6 +15,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
+from pipeline.base.channels import action_groups
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.differences import differences
 from pipeline.base.durable import (
@@ -269,7 +270,7 @@ def policy_shape(store: FeatureStore, normalization: Normalization) -> "PolicySh
 
     A stream without statistics is absent from what the policy is trained on, so it has width 0.
     """
-    from pipeline.policy.observation import PolicyShape, action_groups
+    from pipeline.policy.observation import PolicyShape
     from pipeline.policy.state_channels import channel_kinds
 
     action, state = store.streams["action"], store.streams["state"]

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.base.channels import hardly_moving
+from pipeline.base.channels import action_groups, hardly_moving
 from pipeline.policy.normalization import Normalization
-from pipeline.policy.observation import action_groups
 from pipeline.policy.policy import Trainable
 from pipeline.store import FeatureStore
 from pipeline.train.batches import Ticks, Windows

@@ -10,7 +10,7 @@ from pipeline.base.errors import CheckpointMismatch, ConfigError
 from pipeline.policy.cost import describe_cost, flop_table
 from pipeline.policy.guidance import Guide
 from pipeline.policy.normalization import Normalization
-from pipeline.policy.observation import PolicyShape, action_groups, moving_channels
+from pipeline.policy.observation import PolicyShape, moving_channels
 from pipeline.policy.policy import Policy, Trainable, drop_streams
 from pipeline.policy.window_encoders import SensorEncoder
 
@@ -345,14 +345,6 @@ def test_all_but_positions_say_how_far_to_move(kind: str) -> None:
     action = {"kind": kind, "names": ["dx", "gripper", "rx"], "units": ["mm", "", "deg"]}
     moves = kind != "absolute"
     assert moving_channels(action) == (moves, False, moves)
-
-
-def test_action_groups_go_by_name_and_unit() -> None:
-    names = ["dx", "dalpha", "joint1_velocity", "gripper", "Gripper_width", "mystery", "twist"]
-    units = ["mm", "deg", "rad/s", "", "m", "", "mm/s"]
-    assert action_groups(names, units) == (
-        "translation", "rotation", "other", "gripper", "gripper", "other", "other"
-    )  # fmt: skip
 
 
 def test_wrong_shapes_are_caught_by_the_annotations(

@@ -386,6 +386,38 @@ class TestStack:
         assert stack_guides([None, None], torch.device("cpu")) is None
 
 
+class TestSent:
+    """What a robot was sent in place of what the executor gave."""
+
+    def test_what_was_cut_off_is_made_up_for(self) -> None:
+        executor = Executor("none", 3, 4, (True, True))
+        executor.begin()
+        executor.plan(np.ones((4, 2), np.float32))
+        assert executor.next_action().tolist() == [1, 1]
+        executor.sent([0.25, 1])
+        assert executor.next_action().tolist() == [1.75, 1]
+        executor.sent([1, 1])
+        assert executor.next_action().tolist() == [1.75, 1]
+
+    def test_a_newer_chunk_counts_from_where_the_robot_was_really_sent(self) -> None:
+        executor = Executor("none", 1, 4, (True, True))
+        executor.begin()
+        executor.plan(np.ones((4, 2), np.float32))
+        executor.next_action()
+        executor.sent([0.25, 0.25])
+        executor.begin()
+        executor.plan(np.ones((4, 2), np.float32))
+        assert executor.next_action().tolist() == [1, 1]
+
+    def test_channels_that_say_where_to_be_have_nothing_to_make_up_for(self) -> None:
+        executor = Executor("none", 3, 4, (True, False))
+        executor.begin()
+        executor.plan(np.array([[1, 5], [1, 6], [1, 7], [1, 8]], np.float32))
+        executor.next_action()
+        executor.sent([0.5, 2])
+        assert executor.next_action().tolist() == [1.5, 6]
+
+
 def test_a_policy_that_draws_nothing_cannot_be_guided() -> None:
     with pytest.raises(ConfigError, match=r"rollout\.chunking: .*found rtc"):
         check_chunking("rtc", stochastic=False)

@@ -4,12 +4,13 @@ Every section is a frozen model that forbids unknown keys, so that a misspelt ke
 not a default; all errors are reported at once. `stage_one` has the sections of the demo, the data,
 extraction and looking, `stage_two` those of training, tuning and evaluation, `policy` those of the
 policy's parts, `stores` those of what is done with stores; `sections` has them all and describes
-their keys; `load` reads the file.
+their keys; `limits` has what stands in a file of its own; `load` reads files.
 """
 # ruff: noqa: F401
 # pyright: reportUnusedImport=false
 
-from pipeline.base.config.load import load_params
+from pipeline.base.config.limits import LimitsFile, MotionLimit
+from pipeline.base.config.load import load_params, load_section
 from pipeline.base.config.policy import DiffusionParams, FlowMatchingParams, SensorEncoderParams
 from pipeline.base.config.sections import Params, described_keys
 from pipeline.base.config.stage_one import (

@@ -1,15 +1,18 @@
-"""Read params.yaml: the only place that reads YAML."""
+"""Read params.yaml and other YAML of sections: the only place that reads YAML."""
 
 from collections.abc import Sequence
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ValidationError
 
+from pipeline.base.config.section import Section
 from pipeline.base.config.sections import Params
 from pipeline.base.errors import ConfigError
+
+_Section = TypeVar("_Section", bound=Section)
 
 _REPLACED: dict[tuple[str, ...], str] = {
     ("train_head", "val_fraction"): "is no longer a key, for episodes are split three ways. Write "
@@ -24,23 +27,39 @@ def load_params(path: Path, overrides: Sequence[str] = ()) -> Params:
 
     A value is YAML, so `[1, 2]`, `null` and JSON work. Raises `ConfigError` with every problem.
     """
-    try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ConfigError(
-            f"{path}: no such file. Run from the project's root or pass --params FILE."
-        ) from None
-    except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
-        raise ConfigError(f"{path}: cannot be read as YAML: {error}") from None
-    if not isinstance(document, dict):
-        raise ConfigError(f"{path}: expected sections such as `data:`, found {document!r}")
+    hint = "Run from the project's root or pass --params FILE."
+    document = _read(path, hint)
     for override in overrides:
         _lay_over(document, override)
     try:
         return Params.model_validate(document)
     except ValidationError as error:
         where = f"{path} with what --set lays over it" if overrides else str(path)
-        raise ConfigError(_all_problems(error, where)) from None
+        raise ConfigError(_all_problems(error, where, Params)) from None
+
+
+def load_section(path: Path, section: type[_Section]) -> _Section:
+    """A section that stands in a YAML file of its own.
+
+    Raises `ConfigError` with every problem, by file and key.
+    """
+    try:
+        return section.model_validate(_read(path, "Say where it is."))
+    except ValidationError as error:
+        raise ConfigError(_all_problems(error, str(path), section)) from None
+
+
+def _read(path: Path, hint: str) -> dict[str, Any]:
+    """The keys of a YAML file; `hint` is what to do where there is none."""
+    try:
+        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file. {hint}") from None
+    except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
+        raise ConfigError(f"{path}: cannot be read as YAML: {error}") from None
+    if not isinstance(document, dict):
+        raise ConfigError(f"{path}: expected sections such as `data:`, found {document!r}")
+    return document
 
 
 def _lay_over(document: dict[str, Any], override: str) -> None:
@@ -69,13 +88,13 @@ def _lay_over(document: dict[str, Any], override: str) -> None:
     node[keys[-1]] = value
 
 
-def _all_problems(error: ValidationError, where: str) -> str:
+def _all_problems(error: ValidationError, where: str, root: type[BaseModel]) -> str:
     lines = [f"{where}: {error.error_count()} problem(s)"]
     for problem in error.errors():
-        place = ".".join(str(part) for part in problem["loc"]) or "params"
+        place = ".".join(str(part) for part in problem["loc"]) or root.__name__.lower()
         match problem["type"]:
             case "extra_forbidden":
-                said = _unknown_key(problem["loc"])
+                said = _unknown_key(problem["loc"], root)
             case "tuple_type":
                 said = f"expected a list, such as [{problem['input']}]"
             case _:
@@ -86,11 +105,11 @@ def _all_problems(error: ValidationError, where: str) -> str:
     return "\n".join(lines)
 
 
-def _unknown_key(place: tuple[int | str, ...]) -> str:
+def _unknown_key(place: tuple[int | str, ...], root: type[BaseModel]) -> str:
     """The key that was likely meant, else all that may stand there."""
     if (replaced := _REPLACED.get(tuple(map(str, place)))) is not None:
         return replaced
-    section: Any = Params
+    section: Any = root
     for part in place[:-1]:
         if isinstance(part, str) and part in section.model_fields:
             section = _section_in(section.model_fields[part].annotation)

@@ -15,10 +15,10 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from pipeline.base.clock import CLOCK_SLACK_S
 from pipeline.base.config import Params, VLMParams
 from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.base.errors import PipelineError, RecordingError
-from pipeline.base.observation import CLOCK_SLACK_S
 from pipeline.base.ownership import LEDGER_SUFFIX as LEDGER
 from pipeline.base.table import Table
 from pipeline.look.page.blocks import Block, Document, Text, TokenRun, Tokens

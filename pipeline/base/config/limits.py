@@ -1,0 +1,46 @@
+"""The content of a file of limits, which keep a robot from harm (`pipeline.robot.limits`)."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from pipeline.base.config.section import Section
+
+Most = dict[str, Annotated[float, Field(gt=0)]]
+
+
+class MotionLimit(Section):
+    """How large a motion may be, and what becomes of a larger one."""
+
+    most: Most
+    """By `translation` or `rotation`, the length of these channels together, or by the name of an
+    action's channel, its size."""
+    on_exceed: Literal["stop", "clip"] = "stop"
+    """stop: a safe stop. clip: the longest that is allowed is sent, in the same direction."""
+
+
+class Workspace(Section):
+    """Where the robot may be."""
+
+    box: dict[str, tuple[float, float]]
+    """Lowest and highest reading by the name of a state's channel."""
+
+
+class Force(Section):
+    """How hard the robot may press."""
+
+    most: Most
+    """Largest size of a reading by the name of a sensor's channel."""
+
+
+class LimitsFile(Section):
+    """The content of a limits file; what is not given is not limited."""
+
+    step: MotionLimit | None = None
+    """Of one action, in the units of the action."""
+    speed: MotionLimit | None = None
+    """Units per s."""
+    acceleration: MotionLimit | None = None
+    """Units per s²."""
+    workspace: Workspace | None = None
+    force: Force | None = None

@@ -1,0 +1,190 @@
+"""How far, how fast, where and how hard a robot may go, from a YAML file. Numpy only.
+
+Limits of motion (`step`, `speed`, `acceleration`) are kept on what is sent, before it is sent;
+those of the workspace and of force on what is measured, each tick before anything is sent.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.base.channels import action_groups
+from pipeline.base.config import LimitsFile, MotionLimit, load_section
+from pipeline.base.errors import ConfigError
+from pipeline.robot.loop import SafeStop, StopKind
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class _Bound:
+    """The most that some channels may move together within a tick, of one kind of limit."""
+
+    kind: str
+    name: str
+    channels: list[int]
+    most: float
+    per_tick: float
+    """`most` as a motion in a tick, of an acceleration as its change from tick to tick."""
+    clips: bool
+
+
+@dataclass(frozen=True)
+class _Range:
+    """Between which values a channel's readings stay."""
+
+    stream: str
+    name: str
+    channel: int
+    low: float
+    high: float
+
+
+class Limits:
+    """The limits of a file for a robot of this metadata, and what was sent last.
+
+    `hz` is how many actions a second are sent. Raises `ConfigError` for a channel that the robot
+    has not, and for a motion limit on a channel that says where to be and that the state has not:
+    how far its first action leads could not be told.
+    """
+
+    def __init__(self, file: LimitsFile, metadata: Mapping[str, Any], hz: float) -> None:
+        self._streams: Mapping[str, Any] = metadata["streams"]
+        action = self._streams["action"]
+        self._names = list(action["names"])
+        self._absolute = ~np.asarray(metadata["moving"], np.bool_)
+        self._per_tick = 1 / hz if action["kind"] == "velocity" else 1.0
+        self._state_of = [self._place("state", name) for name in self._names]
+        self.clipped = 0
+        """Ticks in which less was sent than was wanted."""
+        rates = {"step": 1.0, "speed": hz, "acceleration": hz * hz}
+        self._bounds = [
+            bound
+            for kind, rate in rates.items()
+            if (limit := getattr(file, kind)) is not None
+            for bound in self._motion(kind, limit, rate)
+        ]
+        box = file.workspace.box if file.workspace else {}
+        force = file.force.most if file.force else {}
+        self._ranges = [
+            self._range("state", f"workspace.box.{name}", name, *low_high)
+            for name, low_high in box.items()
+        ] + [
+            self._range("sensor", f"force.most.{name}", name, -most, most)
+            for name, most in force.items()
+        ]
+        self.reset()
+
+    @classmethod
+    def read(cls, path: Path, metadata: Mapping[str, Any], hz: float) -> "Limits":
+        """Those of a YAML file. Raises `ConfigError` that names file and key."""
+        try:
+            return cls(load_section(path, LimitsFile), metadata, hz)
+        except ConfigError as error:
+            said = str(error)
+            raise ConfigError(said if said.startswith(str(path)) else f"{path}: {said}") from None
+
+    def reset(self) -> None:
+        """The robot stands still, where its next reading says."""
+        self._reference: Vector | None = None
+        self._moved = np.zeros(len(self._names))
+
+    def check(self, observed: Mapping[str, NDArray[Any]]) -> None:
+        """Raise `SafeStop` for readings outside the workspace or of too much force."""
+        for bound in self._ranges:
+            readings = observed.get(bound.stream)
+            if readings is None or not len(readings):
+                continue
+            values = readings[:, bound.channel]
+            low, high = float(values.min()), float(values.max())
+            if low < bound.low or high > bound.high:
+                kind = StopKind.WORKSPACE if bound.stream == "state" else StopKind.FORCE
+                found = low if low < bound.low else high
+                within = f"{bound.low:g} to {bound.high:g}"
+                raise SafeStop(kind, f"{bound.name} measured at {found:g}, allowed are {within}")
+        if self._reference is None and len(observed.get("state", ())):
+            newest = observed["state"][-1]
+            held = [np.nan if at is None else float(newest[at]) for at in self._state_of]
+            self._reference = np.array(held)
+
+    def allow(self, action: Vector) -> Vector:
+        """What of an action (action,) may be sent; this very array where all of it may.
+
+        Raises `SafeStop` for a motion beyond a limit that stops.
+        """
+        absolute = self._absolute
+        at = np.full(len(action), np.nan) if self._reference is None else self._reference
+        wanted = np.where(absolute, action - at, action * self._per_tick)
+        moved = wanted
+        for bound in self._bounds:
+            moved = self._bounded(moved, bound)
+        if moved is not wanted:
+            self.clipped += 1
+            sent = np.where(absolute, at + moved, moved / self._per_tick)
+            action = np.where(np.isnan(sent), action, sent)
+        self._moved, self._reference = moved, np.where(absolute, action, at)
+        return action
+
+    def stood_still(self) -> None:
+        """Nothing was sent for a tick or more."""
+        self._moved = np.zeros(len(self._names))
+
+    def _bounded(self, moved: Vector, bound: _Bound) -> Vector:
+        before = self._moved if bound.kind == "acceleration" else np.zeros_like(moved)
+        change = (moved - before)[bound.channels]
+        length = float(np.linalg.norm(change))
+        if np.isnan(length):
+            raise SafeStop(StopKind.STALLED, f"no reading says where {bound.name} begins")
+        if not length > bound.per_tick * (1 + 1e-6):
+            return moved
+        if not bound.clips:
+            found = bound.most * length / bound.per_tick
+            raise SafeStop(
+                StopKind.LIMIT,
+                f"{bound.kind} of {bound.name} would be {found:.4g}, at most {bound.most:g}",
+            )
+        clipped = moved.copy()
+        clipped[bound.channels] = before[bound.channels] + change * (bound.per_tick / length)
+        return clipped
+
+    def _motion(self, kind: str, limit: MotionLimit, rate: float) -> list[_Bound]:
+        action = self._streams["action"]
+        groups = action_groups(self._names, action["units"])
+        bounds: list[_Bound] = []
+        for name, most in limit.most.items():
+            channels = [i for i, group in enumerate(groups) if group == name]
+            if name not in ("translation", "rotation"):
+                channels = [i for i, own in enumerate(self._names) if own == name]
+            where = f"{kind}.most.{name}"
+            if not channels:
+                known = ["translation", "rotation", *self._names]
+                raise ConfigError(
+                    f"{where}: the action has no such channel; it has {', '.join(known)}"
+                )
+            for i in channels:
+                if self._absolute[i] and self._state_of[i] is None:
+                    raise ConfigError(
+                        f"{where}: {self._names[i]} says where to be, and the state has no channel "
+                        "of that name that says where it is. Limit it by workspace.box, or name "
+                        "the state's channels as the action's."
+                    )
+            clips = limit.on_exceed == "clip"
+            bounds.append(_Bound(kind, name, channels, most, most / rate, clips))
+        return bounds
+
+    def _range(self, stream: str, where: str, name: str, low: float, high: float) -> _Range:
+        channel = self._place(stream, name)
+        if channel is None:
+            known = ", ".join((self._streams.get(stream) or {}).get("names", ())[:12]) or "none"
+            raise ConfigError(f"{where}: the {stream} has no such channel; it has {known} …")
+        if low >= high:
+            raise ConfigError(f"{where}: expected the lowest and the highest, found {low}, {high}")
+        return _Range(stream, name, channel, low, high)
+
+    def _place(self, stream: str, name: str) -> int | None:
+        names = list((self._streams.get(stream) or {}).get("names", ()))
+        return names.index(name) if name in names else None

@@ -1,0 +1,662 @@
+"""The control loop in real time: a tick at each deadline, a policy that is never waited for.
+
+Deadline k is start + k / hz on the monotonic clock, so nothing drifts. Times of readings and frames
+stay on the robot's clock; its offset to ours is declared or measured, and watched. Whatever goes
+wrong ends in `Robot.stop` with a `StopKind` and a reason. Numpy only.
+"""
+
+import gc
+import math
+import threading
+import time
+import traceback
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.base.config import Chunking
+from pipeline.robot.limits import Limits
+from pipeline.robot.loop import ControlLoop, LoopTiming, SafeStop, StopKind
+from pipeline.robot.memory import ReadingWindow, WindowSize
+from pipeline.robot.timings import Ring, Timings
+
+Frames = Mapping[str, tuple[float, NDArray[np.uint8]]]
+
+TICK_PARTS = ("late", "observe", "check", "plan", "frames", "ask", "act", "record")
+"""late: from the deadline to the tick's begin; the others in the order of a tick."""
+LATE, OBSERVE, CHECK, PLAN, FRAMES, ASK, ACT, RECORD = range(len(TICK_PARTS))
+ANSWER_PARTS = ("answer", "infer_ms", "vlm_ms", "head_ms", "wait_ms")
+"""answer: from the question to its answer; the others as the answer's `server_timing` says."""
+_BLAMED = {OBSERVE: "observe", FRAMES: "frames", ACT: "act"}
+_FIRST_OBSERVATIONS = 10
+"""Of which the quickest one tells the offset of the robot's clock."""
+_MISSED_KEPT = 4096
+
+
+class Robot(Protocol):
+    """What moves, and what it measures."""
+
+    def observe(self) -> Mapping[str, Any]:
+        """`state`, `state_time`, `sensor`, `sensor_time`: the readings since the last call; `time`
+        (1,), its clock now, s. `reset` true where a new episode has begun since; `ended`, a text,
+        where there is no more to do, and why."""
+        ...
+
+    def frames(self) -> Frames:
+        """The newest frame of each camera: when it was taken, s, and RGB."""
+        ...
+
+    def act(self, action: NDArray[np.float64]) -> object:
+        """Carry out one action, in the units of the policy's metadata."""
+        ...
+
+    def stop(self, reason: str) -> object:
+        """Stand still, now and until told otherwise; another thread may call it, and twice."""
+        ...
+
+
+class Decides(Protocol):
+    """A policy with its memory, in this process or behind a wire."""
+
+    @property
+    def metadata(self) -> Mapping[str, Any]:
+        """What it takes and gives."""
+        ...
+
+    def infer(self, observation: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Its answer; raises `ConnectionError` where there is nobody to answer any more."""
+        ...
+
+
+class Recorder(Protocol):
+    """Keeps what happened; cheap, for it is called in the loop."""
+
+    def tick(self, observed: Mapping[str, Any], action: NDArray[Any] | None) -> object:
+        """What was observed in a tick and what was sent."""
+        ...
+
+    def frames(self, frames: Frames) -> object:
+        """Frames that the policy was asked with."""
+        ...
+
+    def answer(self, answer: Mapping[str, Any]) -> object:
+        """An answer of the policy."""
+        ...
+
+    def finish(self, reason: str) -> Path:
+        """The finished recording."""
+        ...
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """How a robot is run, and what is still good."""
+
+    instruction: str
+    hz: float | None = None
+    """Ticks a second; the policy's `action_hz` where None."""
+    execute: int = 1
+    chunking: Chunking = "none"
+    seconds: float | None = None
+    """How long; None: until something ends it."""
+    seed: int | None = None
+    """Of what the policy draws."""
+    clock_offset_s: float | None = None
+    """The robot's clock less `time.monotonic()`; None: the quickest of the first observations tells
+    it."""
+    clock_drift_s: float = 0.1
+    """How far the robot's clock may leave its offset, and a reading lie in the future."""
+    first_answer_s: float = 60.0
+    """How long the first chunk may take."""
+    old_features_s: float = 2.0
+    """From the newest frame that the features have seen."""
+    old_frame_s: float = 0.5
+    stalled_s: float = 0.5
+    """How long a stream may bring no new reading."""
+    watch: tuple[str, ...] | None = None
+    """Streams that must bring readings; None: all that the policy was trained on."""
+    missed_in_a_row: int = 5
+    """Ticks left out without one in time between them, from which the robot stops."""
+    hung_s: float = 0.5
+    """How long a tick may take, at least two and a half of them, before a watchdog stops it."""
+    spin_s: float = 0.0
+    """How long before a deadline to stop sleeping and look at the clock all the time."""
+    kept_ticks: int = 65536
+    """Of how many of the newest ticks timings and actions are kept."""
+
+
+@dataclass(frozen=True)
+class MissedTick:
+    """A tick that ended after its deadline."""
+
+    tick: int
+    late_ms: float
+    """After the deadline of the next tick."""
+    part: str
+    """Which took the most time."""
+    left_out: int
+    """Ticks after it that were not run."""
+
+
+@dataclass(frozen=True)
+class RunReport:
+    """How a run went and why it ended."""
+
+    kind: StopKind
+    reason: str
+    hz: float
+    ticks: int
+    """That were run."""
+    left_out: int
+    """Ticks that were not run, for one before them took too long."""
+    missed: tuple[MissedTick, ...]
+    """The newest 4,096 at most; `missed_ticks` counts all."""
+    missed_ticks: int
+    answers: int
+    dropped_readings: int
+    """Older than all that a policy's window holds, in the time between two questions."""
+    clipped: int
+    """Ticks in which limits let less through than was wanted."""
+    clock_offset_s: float
+    tick_timings: Timings
+    answer_timings: Timings
+    actions: NDArray[np.float64]
+    """(tick, 2 + action): the tick's number, the robot's time, and what was sent, of the newest."""
+    recording: Path | None
+    traceback: str
+    """Of what raised; empty where nothing did."""
+
+    def document(self) -> dict[str, Any]:
+        """All but the actions, as JSON takes it."""
+        plain = ("hz", "ticks", "left_out", "missed_ticks", "answers", "dropped_readings")
+        return {
+            "kind": self.kind.value,
+            "reason": self.reason,
+            **{name: getattr(self, name) for name in (*plain, "clipped", "clock_offset_s")},
+            "missed": [asdict(tick) for tick in self.missed],
+            "tick_ms": self.tick_timings.document(),
+            "answer_ms": self.answer_timings.document(),
+        }
+
+
+def run_robot(
+    robot: Robot,
+    policy: Decides,
+    settings: RunSettings,
+    limits: Limits | None = None,
+    recorder: Recorder | None = None,
+) -> RunReport:
+    """Run a robot until something ends it; `robot.stop` has then been called, whatever it was.
+
+    Raises `ConfigError` before the first observation where settings do not fit the policy.
+    """
+    run = _Run(robot, policy, settings, limits, recorder)
+    kind, reason, trace = StopKind.LOOP, "the process ends", ""
+    try:
+        with _quiet():
+            run.go()
+    except SafeStop as stop:
+        kind, reason = stop.kind, str(stop)
+    except KeyboardInterrupt:
+        kind, reason = StopKind.BY_HAND, "stopped by hand (Ctrl-C)"
+    except Exception as error:
+        (kind, reason), trace = run.blame(error), traceback.format_exc()
+    finally:
+        robot.stop(reason)
+        run.close()
+    recording = recorder.finish(reason) if recorder else None
+    return run.report(kind, reason, recording, trace)
+
+
+class _Run:
+    """One run: what is known between its ticks, in buffers that stay."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        policy: Decides,
+        settings: RunSettings,
+        limits: Limits | None,
+        recorder: Recorder | None,
+    ) -> None:
+        self.robot, self.settings, self.limits, self.recorder = robot, settings, limits, recorder
+        meta = policy.metadata
+        self.hz = float(settings.hz or meta["action_hz"])
+        self.chunk_shape = (meta["horizon"], meta["action_dim"])
+        self.views = tuple(meta["streams"]["views"]) if meta["uses_features"] else ()
+        timing = LoopTiming(
+            max(1, round(meta["vlm_reuse_count"] * self.hz / meta["action_hz"])),
+            settings.execute,
+            settings.chunking,
+            meta["horizon"],
+            tuple(meta["moving"]),
+        )
+        self.loop = ControlLoop(timing, meta["uses_features"])
+        self.asker = _Asker(policy)
+        self.watchdog = _Watchdog(robot, max(settings.hung_s, 2.5 / self.hz))
+        streams = {name: (meta["streams"].get(name) or {}).get("names", ()) for name in _STREAMS}
+        self.pending = {
+            name: _Pending(max(4 * meta[f"{name}_window"], 64), len(names))
+            for name, names in streams.items()
+            if names
+        }
+        self.watched = tuple(self.pending) if settings.watch is None else settings.watch
+        self.clock = _RobotClock(settings)
+        self.tick_timings = Timings((*TICK_PARTS, "tick"), settings.kept_ticks)
+        self.answer_timings = Timings(ANSWER_PARTS, settings.kept_ticks)
+        self.actions = Ring(settings.kept_ticks, 2 + meta["action_dim"])
+        self.missed = Ring(_MISSED_KEPT, 4)
+        self.row, self.answer_row = np.zeros(len(TICK_PARTS) + 1), np.zeros(len(ANSWER_PARTS))
+        self.doing, self.since, self.in_a_row, self.left_out = LATE, 0.0, 0, 0
+        self.new_episode()
+
+    def go(self) -> None:
+        """Tick after tick, until a `SafeStop`."""
+        period, start, tick = 1 / self.hz, time.monotonic(), 0
+        self.watchdog.start()
+        while True:
+            deadline = start + tick * period
+            _wait(deadline, self.settings.spin_s)
+            self.row[:] = 0
+            self.doing, self.since = LATE, deadline
+            if self.settings.seconds is not None and tick >= self.settings.seconds * self.hz:
+                raise SafeStop(StopKind.TIME, f"{self.settings.seconds:g} s are over")
+            self.tick(tick)
+            self.mark(LATE)
+            ended = self.since
+            self.row[-1] = self.row[1:-1].sum()
+            self.tick_timings.note(1000 * self.row)
+            following = tick + 1
+            if ended > deadline + period:
+                following = max(following, math.ceil((ended - start) * self.hz))
+                self.note_missed(tick, ended - deadline - period, following - tick - 1)
+            else:
+                self.in_a_row = 0
+            tick = following
+
+    def tick(self, tick: int) -> None:
+        """Observe, take an answer, ask, act; what has been done so far stays done if one raises."""
+        self.mark(OBSERVE)
+        observed = self.robot.observe()
+        self.mark(CHECK)
+        if observed.get("reset"):
+            self.new_episode()
+        self.check(observed)
+        if ended := observed.get("ended"):
+            raise SafeStop(StopKind.ENDED, str(ended))
+        self.loop.begin_tick()
+        self.mark(PLAN)
+        self.take_answer()
+        if self.loop.chunk_due and not self.asker.busy:
+            self.ask()
+        self.mark(PLAN)
+        action = self.decide()
+        self.watchdog.check()
+        self.mark(ACT)
+        if action is not None:
+            self.robot.act(action)
+            self.actions.note((tick, self.now_s, *action))
+        self.mark(RECORD)
+        if self.recorder is not None:
+            self.recorder.tick(observed, action)
+        self.watchdog.beat()
+        self.watchdog.check()
+
+    def mark(self, part: int) -> None:
+        """What follows is this part: the one before it ends here."""
+        now = time.monotonic()
+        self.row[self.doing] += now - self.since
+        self.doing, self.since = part, now
+
+    def new_episode(self) -> None:
+        """Forget all of the last one; an answer that is still to come is of the last one, too."""
+        self.loop.reset()
+        self.reset: bool | int = True if self.settings.seed is None else self.settings.seed
+        self.asked_first_s: float | None = None
+        self.frames_s = self.features_s = -math.inf
+        self.asker.stale = self.asker.busy
+        for pending in self.pending.values():
+            pending.forget()
+        if self.limits is not None:
+            self.limits.reset()
+
+    def check(self, observed: Mapping[str, Any]) -> None:
+        """Take the readings. Raises `SafeStop` for what is no longer good of them."""
+        self.now_s = float(observed["time"][0])
+        self.clock.check(self.now_s)
+        latest = self.now_s + self.settings.clock_drift_s
+        for name, pending in self.pending.items():
+            if len(observed.get(f"{name}_time", ())):
+                pending.take_in(name, observed[name], observed[f"{name}_time"], latest)
+            elif pending.newest_s is None:
+                pending.newest_s = self.now_s
+            if name in self.watched:
+                silent_s = self.clock.now_s() - (pending.newest_s or 0.0)
+                if silent_s > self.settings.stalled_s:
+                    raise SafeStop(StopKind.STALLED, f"{name}: no new reading for {silent_s:.2f} s")
+        if self.limits is not None:
+            self.limits.check(observed)
+
+    def take_answer(self) -> None:
+        """Plan what was answered, where an answer has come."""
+        answer = self.asker.take()
+        now, first_s = time.monotonic(), self.settings.first_answer_s
+        if answer is None:
+            waited = now - self.asked_first_s if self.asked_first_s is not None else 0.0
+            if not self.loop.executor.planned and waited > first_s:
+                raise SafeStop(StopKind.NO_CHUNK, f"no first chunk within {first_s:g} s")
+            return
+        self.note_answer(answer)
+        if self.asker.stale:
+            self.asker.stale = False
+            return
+        if answer.get("feature_age_s") is not None:
+            self.features_s = self.asked_s - float(answer["feature_age_s"])
+            if self.features_s >= self.frames_s - 1e-3:
+                self.loop.pass_ended()
+        chunk = np.asarray(answer["actions"], np.float32)
+        if chunk.shape != self.chunk_shape:
+            said = f"expected a chunk {self.chunk_shape}, found {chunk.shape}"
+            raise SafeStop(StopKind.POLICY, said)
+        self.loop.plan(chunk)
+
+    def note_answer(self, answer: Mapping[str, Any]) -> None:
+        """Its timings, and for the recording all of it."""
+        told: Mapping[str, Any] = answer.get("server_timing") or {}
+        self.answer_row[0] = 1000 * self.asker.took_s
+        for column, part in enumerate(ANSWER_PARTS[1:], 1):
+            self.answer_row[column] = told.get(part, math.nan)
+        self.answer_timings.note(self.answer_row)
+        if self.recorder is not None:
+            self.mark(RECORD)
+            self.recorder.answer(answer)
+            self.mark(PLAN)
+
+    def ask(self) -> None:
+        """Ask with the readings since the last question, and frames where they are due."""
+        question: dict[str, Any] = {"time": np.array([self.now_s])}
+        if self.now_s - self.frames_s > self.settings.old_features_s / 2:
+            self.loop.pass_ended()  # Nothing says so, but a pass may have been passed over.
+        if self.loop.frames_due:
+            question |= self.look()
+        self.mark(ASK)
+        for name, pending in self.pending.items():
+            if pending.count:
+                question[name], question[f"{name}_time"] = pending.hand_over()
+        question["prompt"] = self.settings.instruction
+        if self.reset is not False:
+            question["reset"], self.reset = self.reset, False
+        if (guide := self.loop.ask()) is not None:
+            question |= {"guide/chunk": guide.chunk, "guide/weight": guide.weight}
+        self.asked_s = self.now_s
+        if self.asked_first_s is None:
+            self.asked_first_s = time.monotonic()
+        self.asker.ask(question)
+
+    def look(self) -> dict[str, Any]:
+        """The newest frames of the views that the policy knows."""
+        self.mark(FRAMES)
+        frames, question = self.robot.frames(), dict[str, Any]()
+        for view in self.views:
+            if view not in frames:
+                raise SafeStop(StopKind.CAMERA, f"{view}: the robot gives no frame")
+            taken_s, frame = frames[view]
+            age_s = self.now_s - taken_s
+            if not -self.settings.clock_drift_s <= age_s <= self.settings.old_frame_s:
+                raise SafeStop(StopKind.CAMERA, f"{view}: the newest frame is {age_s:.2f} s old")
+            question |= {f"images/{view}": frame, f"images_time/{view}": np.array([taken_s])}
+        if self.recorder is not None:
+            self.mark(RECORD)
+            self.recorder.frames({view: frames[view] for view in self.views})
+        self.frames_s = max(frames[view][0] for view in self.views)
+        self.loop.pass_began()
+        return question
+
+    def decide(self) -> NDArray[np.float64] | None:
+        """What to do in this tick; None, stand still, until the first chunk is there."""
+        action = self.loop.action()
+        if action is None:
+            return None
+        age_s = self.now_s - self.features_s if self.views else 0.0
+        if age_s > self.settings.old_features_s:
+            raise SafeStop(StopKind.OLD_FEATURES, f"the newest features are {age_s:.2f} s old")
+        if self.limits is None:
+            return action
+        allowed = self.limits.allow(action)
+        if allowed is not action:
+            self.loop.executor.sent(allowed)
+        return allowed
+
+    def note_missed(self, tick: int, late_s: float, left_out: int) -> None:
+        """Raises `SafeStop` where too many are left out in a row of a robot that moves."""
+        part = int(self.row[:-1].argmax())
+        self.missed.note((tick, 1000 * late_s, part, left_out))
+        self.left_out += left_out
+        self.in_a_row += left_out
+        if self.limits is not None:
+            self.limits.stood_still()
+        if self.in_a_row >= self.settings.missed_in_a_row and self.loop.executor.planned:
+            said = f"{self.in_a_row} ticks in a row, most of the last in {TICK_PARTS[part]!r}"
+            raise SafeStop(StopKind.MISSED, said)
+
+    def blame(self, error: Exception) -> tuple[StopKind, str]:
+        """Whose error it is, by what was being done."""
+        said = f"{type(error).__name__}: {error}"
+        if self.doing in _BLAMED:
+            return StopKind.ROBOT, f"the robot's {_BLAMED[self.doing]} failed: {said}"
+        kind = StopKind.RECORDER if self.doing == RECORD else StopKind.LOOP
+        return kind, f"{kind.value}: {said}"
+
+    def close(self) -> None:
+        """End its threads; the policy may finish an answer that nobody waits for."""
+        self.watchdog.close()
+        self.asker.close()
+
+    def report(self, kind: StopKind, reason: str, recording: Path | None, trace: str) -> RunReport:
+        """What is told of it."""
+        return RunReport(
+            kind=kind,
+            reason=reason,
+            hz=self.hz,
+            ticks=self.tick_timings.ring.count,
+            left_out=self.left_out,
+            missed=tuple(
+                MissedTick(int(tick), late_ms, TICK_PARTS[int(part)], int(left_out))
+                for tick, late_ms, part, left_out in self.missed.rows().tolist()
+            ),
+            missed_ticks=self.missed.count,
+            answers=self.answer_timings.ring.count,
+            dropped_readings=sum(pending.dropped for pending in self.pending.values()),
+            clipped=self.limits.clipped if self.limits else 0,
+            clock_offset_s=self.clock.offset_s,
+            tick_timings=self.tick_timings,
+            answer_timings=self.answer_timings,
+            actions=self.actions.rows(),
+            recording=recording,
+            traceback=trace,
+        )
+
+
+_STREAMS = ("sensor", "state")
+
+
+class _Pending:
+    """The readings of a stream since the last question: the newest, where there are too many."""
+
+    def __init__(self, readings: int, channels: int) -> None:
+        self._window = ReadingWindow(WindowSize(readings, channels, None))
+        self.dropped = 0
+        self.forget()
+
+    def forget(self) -> None:
+        """None is pending, and none was ever seen."""
+        self.count, self.newest_s = 0, None
+
+    count: int
+    newest_s: float | None
+
+    def take_in(
+        self, name: str, values: NDArray[Any], time_s: NDArray[Any], latest_s: float
+    ) -> None:
+        """Raises `SafeStop` for readings that are no numbers, of the future, or not in order."""
+        if values.shape != (len(time_s), self._window.values.shape[1]):
+            wanted = (len(time_s), self._window.values.shape[1])
+            raise SafeStop(StopKind.ROBOT, f"{name}: expected {wanted}, found {values.shape}")
+        if not (np.isfinite(values).all() and np.isfinite(time_s).all()):
+            raise SafeStop(StopKind.NOT_A_NUMBER, f"{name}: a reading or its time is not a number")
+        before = -math.inf if self.newest_s is None else self.newest_s
+        if time_s[0] < before or (np.diff(time_s) < 0).any():
+            raise SafeStop(StopKind.CLOCK, f"{name}: a reading is older than the one before it")
+        if time_s[-1] > latest_s:
+            ahead = time_s[-1] - latest_s
+            raise SafeStop(StopKind.CLOCK, f"{name}: a reading is of the future, by {ahead:.3f} s")
+        self.newest_s = float(time_s[-1])
+        self._window.append(values, time_s)
+        room = len(self._window.values)
+        self.dropped += max(0, self.count + len(values) - room)
+        self.count = min(self.count + len(values), room)
+
+    def hand_over(self) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+        """Copies of the pending readings and their times, which then are no longer pending."""
+        window, count = self._window, self.count
+        self.count = 0
+        return window.values[-count:].copy(), window.time_s[-count:].copy()
+
+
+class _RobotClock:
+    """The robot's clock beside ours."""
+
+    def __init__(self, settings: RunSettings) -> None:
+        self._declared, self._drift_s = settings.clock_offset_s, settings.clock_drift_s
+        self.offset_s = -math.inf if self._declared is None else self._declared
+        self._seen = 0
+
+    def now_s(self) -> float:
+        """What the robot's clock says now, if it has kept its offset."""
+        return time.monotonic() + self.offset_s
+
+    def check(self, told_s: float) -> None:
+        """Compare what the robot tells. Raises `SafeStop` where the clocks have parted."""
+        offset = told_s - time.monotonic()
+        self._seen += 1
+        if self._declared is None and self._seen <= _FIRST_OBSERVATIONS:
+            # What took the least time to come here is the least behind.
+            self.offset_s = max(self.offset_s, offset)
+        if not abs(offset - self.offset_s) <= self._drift_s:
+            said = f"the robot's clock is {offset - self.offset_s:+.3f} s from where it was"
+            raise SafeStop(StopKind.CLOCK, said)
+
+
+class _Asker:
+    """Asks the policy on a thread of its own, one question at a time."""
+
+    def __init__(self, policy: Decides) -> None:
+        self._policy = policy
+        self._questions: SimpleQueue[Mapping[str, Any] | None] = SimpleQueue()
+        self._answers: SimpleQueue[tuple[float, Mapping[str, Any] | Exception]] = SimpleQueue()
+        self.busy = self.stale = False
+        self.took_s = 0.0
+        self._thread = threading.Thread(target=self._serve, name="policy", daemon=True)
+        self._thread.start()
+
+    def ask(self, question: Mapping[str, Any]) -> None:
+        """Put a question, where none is being answered."""
+        self.busy = True
+        self._questions.put(question)
+
+    def take(self) -> Mapping[str, Any] | None:
+        """The answer where it has come. Raises `SafeStop` where the policy failed."""
+        try:
+            self.took_s, answer = self._answers.get_nowait()
+        except Empty:
+            return None
+        self.busy = False
+        if not isinstance(answer, Exception):
+            return answer
+        lost = isinstance(answer, ConnectionError)
+        kind = StopKind.CONNECTION if lost else StopKind.POLICY
+        raise SafeStop(kind, f"{kind.value}: {type(answer).__name__}: {answer}") from answer
+
+    def close(self) -> None:
+        """Ask no more; an answer that takes long is left alone."""
+        self._questions.put(None)
+        self._thread.join(timeout=5.0)
+
+    def _serve(self) -> None:
+        while (question := self._questions.get()) is not None:
+            began = time.monotonic()
+            try:
+                answer = self._policy.infer(question)
+            except Exception as error:
+                answer = error
+            self._answers.put((time.monotonic() - began, answer))
+
+
+class _Watchdog:
+    """Stops the robot where the loop makes no tick any more.
+
+    It counts its own looks and not seconds, so that a process that was stopped as a whole, and
+    goes on, is not taken for a loop that hangs.
+    """
+
+    LOOKS = 5
+
+    def __init__(self, robot: Robot, hung_s: float) -> None:
+        self._robot, self._hung_s = robot, hung_s
+        self._beats = 0
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
+        self.reason = ""
+
+    def start(self) -> None:
+        """Begin to look."""
+        self._thread.start()
+
+    def beat(self) -> None:
+        """A tick has ended."""
+        self._beats += 1
+
+    def check(self) -> None:
+        """Raise `SafeStop` where it has stopped the robot."""
+        if self.reason:
+            raise SafeStop(StopKind.HUNG, self.reason)
+
+    def close(self) -> None:
+        """Look no more."""
+        self._closed.set()
+
+    def _watch(self) -> None:
+        looks, seen = 0, -1
+        while not self._closed.wait(self._hung_s / self.LOOKS):
+            looks, seen = (0 if self._beats != seen else looks + 1), self._beats
+            if looks == self.LOOKS and not self.reason:
+                self.reason = f"no tick has ended for {self._hung_s:g} s"
+                self._robot.stop(self.reason)
+
+
+def _wait(until_s: float, spin_s: float) -> None:
+    """Sleep until shortly before a time of the monotonic clock, then look at it all the time."""
+    while (left := until_s - time.monotonic()) > 0:
+        if left > spin_s:
+            time.sleep(left - spin_s)
+
+
+@contextmanager
+def _quiet() -> Generator[None]:
+    """No garbage is collected meanwhile: the loop makes none that counting does not free."""
+    gc.collect()
+    gc.freeze()
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
+        if enabled:
+            gc.enable()

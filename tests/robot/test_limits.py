@@ -1,0 +1,175 @@
+"""Limits from a file: what is refused, what stops the robot, and what is cut off."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.base.config import LimitsFile
+from pipeline.base.errors import ConfigError
+from pipeline.data.insertion import SENSOR, STATE
+from pipeline.robot.limits import Limits
+from pipeline.robot.loop import SafeStop, StopKind
+from pipeline.simulation.insertion import NeedleInsertion
+
+ACTION = ["dx", "dy", "dz", "rx", "ry", "rz", "gripper"]
+PHANTOM: dict[str, Any] = {
+    "streams": {
+        "action": {"names": ACTION, "units": ["mm"] * 3 + ["deg"] * 3 + [""], "kind": "delta"},
+        "state": {"names": list(STATE.names), "units": list(STATE.units)},
+        "sensor": {"names": list(SENSOR.names), "units": list(SENSOR.units)},
+    },
+    "moving": [True] * 6 + [False],
+}
+JOINTS: dict[str, Any] = {
+    "streams": {
+        "action": {"names": ["a", "b"], "units": ["deg", "deg"], "kind": "absolute"},
+        "state": {"names": ["b", "a"], "units": ["deg", "deg"]},
+        "sensor": None,
+    },
+    "moving": [False, False],
+}
+HZ = 10.0
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "limits.yaml"
+
+
+def limits(metadata: dict[str, Any] = PHANTOM, **file: Any) -> Limits:
+    return Limits(LimitsFile.model_validate(file), metadata, HZ)
+
+
+def moved(*values: float) -> np.ndarray:
+    return np.array([*values, *[0.0] * (6 - len(values)), 1.0])
+
+
+def test_what_is_within_its_limits_is_sent_as_it_is() -> None:
+    own = limits(step={"most": {"translation": 1.0}}, speed={"most": {"dz": 5.0}})
+    action = moved(0.6, 0.6, 0.4)
+    assert own.allow(action) is action
+    assert own.clipped == 0
+
+
+@pytest.mark.parametrize(
+    ("file", "action", "said"),
+    [
+        ({"step": {"most": {"translation": 1.0}}}, moved(0.8, 0.8), "step of translation.*1.131"),
+        ({"step": {"most": {"dy": 1.0}}}, moved(0.0, -1.5), "step of dy would be 1.5, at most 1"),
+        ({"speed": {"most": {"rotation": 5.0}}}, moved(0, 0, 0, 0.6), "speed of rotation.* 6,"),
+        ({"acceleration": {"most": {"dx": 50.0}}}, moved(0.6), "acceleration of dx would be 60"),
+    ],
+)
+def test_a_motion_beyond_a_limit_stops(file: dict[str, Any], action: Any, said: str) -> None:
+    with pytest.raises(SafeStop, match=said) as stop:
+        limits(**file).allow(action)
+    assert stop.value.kind == StopKind.LIMIT
+
+
+def test_a_group_is_cut_in_its_direction_and_other_channels_are_left_alone() -> None:
+    own = limits(speed={"most": {"translation": 5.0}, "on_exceed": "clip"})
+    sent = own.allow(moved(0.6, 0.8, 0.0, 9.0))
+    np.testing.assert_allclose(sent, moved(0.3, 0.4, 0.0, 9.0))
+    assert own.clipped == 1
+
+
+def test_an_acceleration_is_counted_from_what_was_really_sent() -> None:
+    own = limits(acceleration={"most": {"dx": 20.0}, "on_exceed": "clip"})
+    wanted = moved(1.0)
+    assert [round(own.allow(wanted)[0], 9) for _ in range(6)] == [0.2, 0.4, 0.6, 0.8, 1.0, 1.0]
+    own.stood_still()
+    assert own.allow(wanted)[0] == pytest.approx(0.2)
+    own.reset()
+    assert own.allow(-wanted)[0] == pytest.approx(-0.2)
+
+
+def test_what_is_clipped_to_one_limit_is_judged_by_the_next() -> None:
+    both = {"speed": {"most": {"dx": 5.0}, "on_exceed": "clip"}}
+    assert limits(**both, acceleration={"most": {"dx": 51}}).allow(moved(0.9))[0] == 0.5
+    with pytest.raises(SafeStop, match="acceleration of dx would be 50"):
+        limits(**both, acceleration={"most": {"dx": 49}}).allow(moved(0.9))
+
+
+def test_channels_that_say_where_to_be_are_judged_by_where_the_robot_is() -> None:
+    own = limits(JOINTS, step={"most": {"a": 2.0}, "on_exceed": "clip"})
+    own.check({"state": np.array([[0.0, 9.0], [50.0, 10.0]], np.float32)})  # b, a
+    np.testing.assert_allclose(own.allow(np.array([15.0, 99.0])), [12.0, 99.0])
+    np.testing.assert_allclose(own.allow(np.array([15.0, 99.0])), [14.0, 99.0])
+    np.testing.assert_allclose(own.allow(np.array([15.0, 99.0])), [15.0, 99.0])
+
+
+def test_without_a_reading_of_where_the_robot_is_it_stands_still() -> None:
+    own = limits(JOINTS, step={"most": {"a": 2.0}})
+    with pytest.raises(SafeStop, match="no reading says where a begins"):
+        own.allow(np.array([1.0, 1.0]))
+
+
+def test_a_velocity_is_a_speed() -> None:
+    action = {"names": ["vx"], "units": ["mm/s"], "kind": "velocity"}
+    velocity = {"streams": {"action": action, "state": None, "sensor": None}, "moving": [True]}
+    speed = limits(velocity, speed={"most": {"vx": 5.0}, "on_exceed": "clip"})
+    assert speed.allow(np.array([7.0])) == pytest.approx(5.0)
+    step = limits(velocity, step={"most": {"vx": 0.4}, "on_exceed": "clip"})
+    assert step.allow(np.array([7.0])) == pytest.approx(4.0)
+
+
+@pytest.mark.parametrize(
+    ("stream", "channel", "value", "kind"),
+    [
+        ("sensor", 0, 2.1, StopKind.FORCE),
+        ("sensor", 0, -2.1, StopKind.FORCE),
+        ("state", 6, 200.0, StopKind.WORKSPACE),
+        ("state", 8, 200.0, StopKind.WORKSPACE),
+    ],
+)
+def test_the_examples_limits_of_what_is_measured_stop_the_phantom(
+    stream: str, channel: int, value: float, kind: StopKind
+) -> None:
+    insertion = NeedleInsertion()
+    first = insertion.reset(3)
+    observed = {"state": first.state.copy(), "sensor": first.sensor.copy()}
+    own = Limits.read(EXAMPLE, PHANTOM, HZ)
+    own.check(observed)
+    observed[stream][4, channel] = value
+    with pytest.raises(SafeStop, match=f"measured at {value:g}") as stop:
+        own.check(observed)
+    assert stop.value.kind == kind
+
+
+def test_demonstrations_keep_to_the_example() -> None:
+    for seed, level in ((5, "full"), (6, "moved")):
+        own, insertion = Limits.read(EXAMPLE, PHANTOM, HZ), NeedleInsertion()
+        insertion.reset(seed, level)
+        while not insertion.finished:
+            action = insertion.expert_action()
+            assert own.allow(action) is action
+            seen = insertion.step(action)
+            own.check({"state": seen.state, "sensor": seen.sensor})
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("sped: {most: {dx: 1}}", "sped: unknown key; did you mean speed?"),
+        ("speed: {most: {dx: -1}}", "speed.most.dx: Input should be greater than 0"),
+        ("speed: {most: {dq: 1}}", "speed.most.dq: the action has no such channel; it has trans"),
+        ("force: {most: {torque: 1}}", "force.most.torque: the sensor has no such channel; it has"),
+        ("workspace: {box: {dx: [0, 1]}}", "workspace.box.dx: the state has no such channel"),
+        ("workspace: {box: {pose_x: [2, 1]}}", "workspace.box.pose_x: expected the lowest and"),
+        ("force: {most: {force: 1}, on_exceed: clip}", "force.on_exceed: unknown key"),
+        ("speed: {most: {gripper: 1}}", "gripper says where to be, and the state has no channel"),
+        ("[1]", "expected sections"),
+    ],
+)
+def test_what_a_file_gets_wrong_is_told_by_file_and_key(
+    tmp_path: Path, text: str, said: str
+) -> None:
+    path = tmp_path / "limits.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=re.escape(said)) as error:
+        Limits.read(path, PHANTOM, HZ)
+    assert str(path) in str(error.value)
+
+
+def test_a_file_that_is_not_there_is_told(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"none\.yaml: no such file"):
+        Limits.read(tmp_path / "none.yaml", PHANTOM, HZ)

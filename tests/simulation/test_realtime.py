@@ -1,0 +1,103 @@
+"""The simulated arm in real time: its clock keeps pace with ours at any rate."""
+
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from pipeline.simulation.environment import InsertionEnvironment
+from pipeline.simulation.insertion import INSERTED
+from pipeline.simulation.realtime import SimulatedRobot
+from pipeline.simulation.rendering import VIEWS
+
+STILL = np.zeros(7)
+
+
+@pytest.fixture(params=[10.0, 50.0])
+def robot(request: pytest.FixtureRequest) -> Iterator[SimulatedRobot]:
+    made = SimulatedRobot(hz=request.param, seed=3)
+    yield made
+    made.close()
+
+
+def hz_of(robot: SimulatedRobot) -> float:
+    return robot._hz
+
+
+def test_an_action_is_a_tick_and_tells_the_readings_of_the_simulation(
+    robot: SimulatedRobot,
+) -> None:
+    environment = InsertionEnvironment(cameras=False)
+    readings, _ = environment.reset(seed=3)
+    for tick in range(3):
+        observed = robot.observe()
+        assert observed["time"][0] == pytest.approx(tick / hz_of(robot))
+        np.testing.assert_array_equal(observed["state"], readings["state"])
+        np.testing.assert_array_equal(observed["sensor"], readings["sensor"])
+        assert observed["state_time"][-1] == pytest.approx(observed["time"][0])
+        # Ten readings a tick, whatever a tick takes.
+        assert np.diff(observed["state_time"]) == pytest.approx(0.1 / hz_of(robot))
+        action = np.array([0.1 * tick, 0, -0.1, 0, 0, 0, 1])
+        robot.act(action)
+        readings, *_ = environment.step(action)
+
+
+def test_ticks_without_an_action_pass_all_the_same(robot: SimulatedRobot) -> None:
+    first = robot.observe()
+    time.sleep(2.2 / hz_of(robot))
+    later = robot.observe()
+    ticks = round((later["time"][0] - first["time"][0]) * hz_of(robot))
+    assert ticks >= 2 and len(later["state"]) == 10 * ticks
+
+
+def test_frames_follow_and_say_when_they_were_taken(robot: SimulatedRobot) -> None:
+    first = robot.frames()
+    assert set(first) == set(VIEWS)
+    for _ in range(4):
+        robot.observe()
+        robot.act(STILL)
+    until = time.monotonic() + 10
+    while robot.frames() == first or robot.frames()["View1"][0] <= first["View1"][0]:
+        assert time.monotonic() < until
+        time.sleep(0.005)
+    now = robot.observe()["time"][0]
+    assert all(taken <= now + 1e-9 for taken, _ in robot.frames().values())
+
+
+def finish(robot: SimulatedRobot) -> None:
+    while not robot._environment.insertion.finished:
+        robot.act(robot._environment.insertion.expert_action())
+
+
+def test_the_end_of_an_episode_ends_the_run(robot: SimulatedRobot) -> None:
+    robot.observe()
+    finish(robot)
+    robot.act(STILL)
+    assert robot.outcomes == [INSERTED]
+    assert robot.observe()["ended"] == INSERTED
+
+
+def test_the_next_episode_begins_where_asked_for_and_the_clock_goes_on() -> None:
+    robot = SimulatedRobot(hz=1000.0, seed=3, again=True)
+    try:
+        robot.observe()
+        finish(robot)
+        clock = robot._steps / 1000
+        again = robot.observe()
+        assert again["reset"] is True and "ended" not in again
+        assert again["time"][0] >= clock and again["state_time"][-1] <= again["time"][0] + 1e-9
+        second = InsertionEnvironment(cameras=False)
+        readings, _ = second.reset(seed=4)
+        np.testing.assert_array_equal(again["state"][:10], readings["state"])
+        assert "reset" not in robot.observe()
+    finally:
+        robot.close()
+
+
+def test_a_robot_that_was_stopped_does_not_move(robot: SimulatedRobot) -> None:
+    robot.observe()
+    robot.stop("by hand")
+    robot.act(np.array([1.0, 0, 0, 0, 0, 0, 1]))
+    assert robot.stopped == "by hand" and robot.outcomes == []
+    assert robot._environment.insertion.time_s == pytest.approx(0.1)
