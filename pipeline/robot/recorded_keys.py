@@ -46,9 +46,7 @@ def compare_keys(recording: str | Path, store: FeatureStore) -> KeyComparison:
     root = Path(recording).resolve()
     path = root / "features" / f"{EPISODE}.npz"
     if not path.is_file():
-        raise RecordingError(
-            f"{root}: expected a run's recording, found no {path.name} of features"
-        )
+        raise RecordingError(f"{root}: expected a recorded run, found no features/{path.name}")
     keys = member(read_npz(path, ("key",)), ("key",), path)
     episodes = [e for e in store.episodes if f"/{root}".endswith(f"/{e.path.lstrip('/')}")]
     if len(episodes) != 1:

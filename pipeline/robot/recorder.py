@@ -157,11 +157,14 @@ class RunRecorder:
         self._queue.put((work, size))
 
     def _write(self) -> None:
-        """The thread: what is put is written in this order, until something fails."""
+        """The thread: what is put is written in this order, until something cannot be."""
+        whole = True
         for work, size in iter(self._queue.get, None):
-            if self._error is None:
+            if whole:
+                whole = False
                 with self._unharmed():
                     work()
+                    whole = True
             self._written_bytes += size
 
     def _write_frame(self, number: int, image: NDArray[np.uint8], row: Log) -> None:
