@@ -14,7 +14,6 @@ Times are seconds since the first row; `run.json` says when that was on the robo
 """
 
 import re
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -25,12 +24,14 @@ from numpy.typing import NDArray
 from pipeline.base.durable import sync, write_document
 from pipeline.base.errors import RecordingError
 from pipeline.base.finite import non_finite
+from pipeline.base.ownership import OutputKind, begin_folder, remove_folder, unmark
 from pipeline.data.arrays import read_json
 from pipeline.data.lerobot import ACTION, STATE
 from pipeline.data.lerobot_writer import write_data_set, write_sidecar
 
 RUN: Final = "run.json"
 READINGS: Final = ("state", "sensor")
+_RUN: Final = OutputKind("a run on a robot", lambda folder: (folder / RUN).is_file())
 
 Log = NDArray[Any]
 
@@ -89,18 +90,30 @@ def finish_recording(part: Path, end: Mapping[str, Any]) -> Path:
             f"without: there is nothing to make a recording of. Look into {RUN}, and remove {part}"
         )
     root = part / ".recording"  # what begins with a dot is not searched for recordings
-    shutil.rmtree(root, ignore_errors=True)
-    root.mkdir()
+    begin_folder(root, _RUN)
     left_out = _write_readings(root, run, logs, float(rows["time"][0]))
     counts = {"ticks": len(logs["tick"]), "rows": len(rows), "readings_left_out": left_out}
     write_document(root / RUN, {**run, **end, **counts, "start_s": float(rows["time"][0])})
     _write_rows(root, part, run, logs, rows)
+    unmark(root)
     for file in root.rglob("*"):
         sync(file)
     target = part.with_suffix("")
     root.rename(target)
-    shutil.rmtree(part)
+    remove_folder(part, _RUN)
     return target
+
+
+def describe_run(recording: Path) -> str | None:
+    """What a recorded run says of itself, in a sentence; None for what is none."""
+    if not (recording / RUN).is_file():
+        return None
+    run = read_json(recording / RUN)
+    dropped = f", {count} images dropped" if (count := run.get("dropped_images")) else ""
+    return (
+        f"Recorded on a robot: {run['rows']} of {run['ticks']} ticks have an action{dropped}; it "
+        f"ended: {run['reason']}."
+    )
 
 
 def _read(part: Path, name: str, kind: "np.dtype[Any]") -> Log:

@@ -1,6 +1,7 @@
 """A robot's recording through a kill and a full disk: what was recorded until then is not lost."""
 
 import itertools
+import shutil
 import signal
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -98,6 +99,7 @@ def test_a_recovery_that_is_killed_begins_anew(tmp_path: Path) -> None:
     begun = recorder.part / ".recording" / "meta"
     begun.mkdir(parents=True)
     (begun / "info.json").write_text("{}")
+    shutil.copy(recorder.part / "run.json", begun.parent)
     with pytest.raises(RecordingError, match="none with an episode in it"):
         opened(tmp_path)
     with (recorder.part / "tick.bin").open("ab") as log:
