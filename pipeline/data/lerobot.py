@@ -1,14 +1,16 @@
 """LeRobot data sets v2.0, v2.1 and v3.0: state and action from parquet, frames from video.
 
-Rows and frames pair by number; the `timestamp` column is the clock, as `lerobot_clock` reads it. A
-high-rate sensor has no home in LeRobot: this project's sidecar is `sensor/episode_000003.npz`.
+Rows and frames pair by number; the `timestamp` column is the clock, as `lerobot_clock` reads it.
+What has no home in LeRobot lies in this project's sidecars, beside the data set's own folders:
+`sensor/episode_000003.npz` a high-rate sensor, `state/…` states that are faster than the rows,
+`frames/…` when the images in the rows were captured.
 """
 
 import json
 import re
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pyarrow as pa
@@ -36,7 +38,10 @@ from pipeline.data.video import VideoClip
 MARKER = "meta/info.json"
 STATE = "observation.state"
 ACTION = "action"
+KIND = "kind"
+"""Under which key the feature of the actions says of which kind they are: this project's."""
 _DESCRIBING = ("dtype", "names", "units")
+_SIDECARS = ("sensor", "state", "frames")
 _DELTA = re.compile(r"delta.*|d(x|y|z|a|b|r|rx|ry|rz|alpha|beta|gamma|roll|pitch|yaw)")
 
 
@@ -104,8 +109,8 @@ class LeRobotRecording(FileRecording):
 
     def files(self) -> list[Path]:
         _, *videos = self.listed_files()
-        sidecar = [self._sidecar] if self._sidecar.is_file() else []
-        return sorted({find_rows(self._layout, self._entry).path, *videos, *sidecar})
+        sidecars = [path for name in _SIDECARS if (path := self._sidecar(name)) is not None]
+        return sorted({find_rows(self._layout, self._entry).path, *videos, *sidecars})
 
     def identity(self) -> str:
         """What `meta/info.json` decides, and where the shared files of v3.0 hold the episode.
@@ -119,6 +124,8 @@ class LeRobotRecording(FileRecording):
         described = json.dumps(
             {"fps": self._layout.fps, "features": features}, sort_keys=True, separators=(",", ":")
         )
+        if (kind := self._layout.features.get(ACTION, {}).get(KIND)) is not None:
+            described += f" {KIND}={kind}"
         self._check_spans()
         where, table = self._numbers(())
         if not np.array_equal(self._clock(where, table), stored_clock(table, where)):
@@ -135,6 +142,8 @@ class LeRobotRecording(FileRecording):
         return [*(name for name in (STATE, ACTION) if name in self._layout.features), *kept]
 
     def state(self) -> Stream | None:
+        if (path := self._sidecar("state")) is not None:
+            return _sidecar_stream(path)
         return self._stream(STATE) if STATE in self._layout.features else None
 
     def action(self) -> RecordedAction:
@@ -145,22 +154,19 @@ class LeRobotRecording(FileRecording):
             )
         stream = self._stream(ACTION)
         told = self._overrides.action_kind
-        kind = action_kind(stream.channels.names) if told == "auto" else told
+        kind = self._action_kind(stream.channels.names) if told == "auto" else told
         return RecordedAction(stream.channels, stream.time, stream.values, kind, self._layout.fps)
 
     def sensor(self) -> Stream | None:
-        path = self._sidecar
-        if not path.is_file():
-            return None
-        members = read_npz(path, ("timestamps", "values"), text=("names", "units"))
-        values = member(members, ("values",), path)
-        if values.ndim != 2:
-            raise RecordingError(f"{path}: expected values (N, channel), found {values.shape}")
-        channels = _sidecar_channels(members, values.shape[1], path)
-        return checked_stream(channels, member(members, ("timestamps",), path), values, str(path))
+        path = self._sidecar("sensor")
+        return None if path is None else _sidecar_stream(path)
 
     def nominal(self) -> Nominal:
-        clocks = ["state", "action", *(f"view {view}" for view in self.all_views())]
+        clocks = ["action"]
+        if self._sidecar("state") is None:
+            clocks.append("state")
+        if self._sidecar("frames") is None:
+            clocks += [f"view {view}" for view in self.all_views()]
         mistakes = self._misplaced_rows()
         return Nominal(dict.fromkeys(clocks, self._layout.fps), where=MARKER, mistakes=mistakes)
 
@@ -207,12 +213,31 @@ class LeRobotRecording(FileRecording):
         time = self._clock(*self._numbers())
         rows = find_rows(self._layout, self._entry)
         videos, fps = self._entry.videos, self._layout.fps
+        captured = self._captured([view for view, key in wanted.items() if key not in videos])
         return {
             view: VideoClip(view, time, videos[key], fps)
             if key in videos
-            else ParquetCamera(view, time, rows, key)
+            else ParquetCamera(view, time, rows, key, captured.get(view))
             for view, key in sorted(wanted.items())
         }
+
+    def _captured(self, views: Sequence[str]) -> Mapping[str, NDArray[np.float64]]:
+        """Of the views that the sidecar knows: (row,) s when each row's image was captured."""
+        path = self._sidecar("frames")
+        return {} if path is None or not views else read_npz(path, views)
+
+    def _action_kind(self, names: Sequence[str]) -> ActionKind:
+        """What the feature says itself, else what its channels' names say."""
+        kind = self._layout.features[ACTION].get(KIND)
+        if kind is None:
+            return action_kind(names)
+        if kind not in get_args(ActionKind):
+            raise RecordingError(
+                f"{self.path / MARKER}, {ACTION!r}: expected {KIND} to be one of "
+                f"{', '.join(get_args(ActionKind))}, found {kind!r}. Correct it, or set the "
+                "source's action_kind"
+            )
+        return kind
 
     def _stream(self, name: str) -> Stream:
         where, table = self._numbers()
@@ -243,10 +268,11 @@ class LeRobotRecording(FileRecording):
         check_numbers(table, rows, self._entry)
         return f"{rows.path}, {self._entry.id}", table
 
-    @property
-    def _sidecar(self) -> Path:
+    def _sidecar(self, name: str) -> Path | None:
+        """The episode's file of that name, where there is one."""
         # Not `self.id`, before which parent folders may stand.
-        return self.path / "sensor" / f"{self._entry.id}.npz"
+        path = self.path / name / f"{self._entry.id}.npz"
+        return path if path.is_file() else None
 
 
 def action_kind(names: Sequence[str]) -> ActionKind:
@@ -255,6 +281,16 @@ def action_kind(names: Sequence[str]) -> ActionKind:
     if any("vel" in name for name in lower):
         return "velocity"
     return "delta" if any(_DELTA.fullmatch(name) for name in lower) else "absolute"
+
+
+def _sidecar_stream(path: Path) -> Stream:
+    """The stream of a file with `timestamps` and `values`, and perhaps `names` and `units`."""
+    members = read_npz(path, ("timestamps", "values"), text=("names", "units"))
+    values = member(members, ("values",), path)
+    if values.ndim != 2:
+        raise RecordingError(f"{path}: expected values (N, channel), found {values.shape}")
+    channels = _sidecar_channels(members, values.shape[1], path)
+    return checked_stream(channels, member(members, ("timestamps",), path), values, str(path))
 
 
 def _column(table: pa.Table, name: str, where: str) -> pa.ChunkedArray:
@@ -299,7 +335,8 @@ def _sidecar_channels(members: Mapping[str, NDArray[Any]], width: int, path: Pat
     elif width == len(SENSOR.names):
         names, default = SENSOR.names, SENSOR.units
     else:
-        names, default = tuple(f"sensor_{channel}" for channel in range(width)), ("",) * width
+        stream = path.parent.name
+        names, default = tuple(f"{stream}_{channel}" for channel in range(width)), ("",) * width
     units = tuple(map(str, members["units"])) if "units" in members else default
     if len(names) != width or len(units) != width:
         raise RecordingError(

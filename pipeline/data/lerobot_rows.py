@@ -15,10 +15,12 @@ from pipeline.base.errors import RecordingError
 from pipeline.data.jpeg import check_image, read_image
 from pipeline.data.lerobot_layout import LeRobotEntry, LeRobotLayout
 from pipeline.data.reader import natural_key
-from pipeline.data.recording import CameraStream
+from pipeline.data.recording import CameraStream, check_clock
 
 _IMAGE_ROWS = 8
 """Rows of encoded images held at a time."""
+_SAME_S = 1e-9
+"""By which sums of steps in float64 may differ and be the same time."""
 
 
 @dataclass(frozen=True)
@@ -65,28 +67,61 @@ class ParquetCamera(CameraStream):
     """A view whose frames are encoded images in the rows."""
 
     def __init__(
-        self, view: str, time: NDArray[np.float64], rows: ParquetRows, column: str
+        self,
+        view: str,
+        time: NDArray[np.float64],
+        rows: ParquetRows,
+        column: str,
+        captured: NDArray[np.float64] | None = None,
     ) -> None:
+        """`time` and `captured` (row,) s: when rows were recorded, and their images captured.
+
+        Without `captured`, each row has a frame of its own time. With it, rows whose images have
+        one time show one frame, which stands until the next. Raises `RecordingError` where there
+        are more or fewer of these times than rows, where they fall, or lie after their rows.
+        """
         self.view = view
-        self.time = time
         self._rows = rows
         self._column = column
+        self._clock = time
+        own = time if captured is None else np.asarray(captured, np.float64)
+        if own.shape != time.shape:
+            raise RecordingError(
+                f"{rows.path}: {len(time)} rows, but times {own.shape} of the images of {view!r} "
+                "in the sidecar frames/: they must agree"
+            )
+        check_clock(own, f"{rows.path}, the times of the images of {view!r}")
+        if (late := np.flatnonzero(own > time + _SAME_S)).size:
+            row = int(late[0])
+            raise RecordingError(
+                f"{rows.path}: the image of {view!r} in row {row} was captured at {own[row]:.6f} s "
+                f"by the sidecar frames/, after its row at {time[row]:.6f} s: mend its times"
+            )
+        self._row = np.flatnonzero(np.diff(own, prepend=-np.inf))
+        self.time = own[self._row]
+
+    @property
+    def covered(self) -> NDArray[np.float64]:
+        return self._clock
 
     def check(self, indices: Sequence[int]) -> None:
-        for index, image in self._rows.images(self._column, sorted(set(indices))):
-            check_image(image, self._where(index))
+        for row, image in self._rows.images(self._column, self._rows_of(sorted(set(indices)))):
+            check_image(image, self._where(row))
 
     def read(self, indices: Sequence[int]) -> Iterator[NDArray[np.uint8]]:
-        wanted = list(indices)
+        wanted = self._rows_of(indices)
         place = 0
-        for index, image in self._rows.images(self._column, sorted(set(wanted))):
-            frame = read_image(image, self._where(index))
-            while place < len(wanted) and wanted[place] == index:
+        for row, image in self._rows.images(self._column, sorted(set(wanted))):
+            frame = read_image(image, self._where(row))
+            while place < len(wanted) and wanted[place] == row:
                 yield frame
                 place += 1
 
-    def _where(self, index: int) -> str:
-        return f"{self._rows.path}, column {self._column!r}, row {self._rows.start + index}"
+    def _rows_of(self, indices: Sequence[int]) -> list[int]:
+        return self._row[np.asarray(indices, np.int64)].tolist()
+
+    def _where(self, row: int) -> str:
+        return f"{self._rows.path}, column {self._column!r}, row {self._rows.start + row}"
 
 
 def find_rows(layout: LeRobotLayout, entry: LeRobotEntry) -> ParquetRows:

@@ -78,6 +78,14 @@ class CameraStream(ABC):
     view: str
     time: NDArray[np.float64]
 
+    @property
+    def covered(self) -> NDArray[np.float64]:
+        """A clock from whose first to whose last entry the view is there, s; else `time`.
+
+        Of a recording that was given a frame now and then, the last stands until the end.
+        """
+        return self.time
+
     @abstractmethod
     def check(self, indices: Sequence[int]) -> NDArray[np.uint8] | None:
         """Raise `RecordingError` naming the first of these frames that cannot be decoded.

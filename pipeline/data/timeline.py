@@ -85,7 +85,7 @@ def build_timeline(
     `ConfigError` when pose-derived actions are asked for without a rate.
     """
     cameras = recording.cameras()
-    clocks = {f"view {view}": camera.time for view, camera in cameras.items()}
+    clocks = {f"view {view}": camera.covered for view, camera in cameras.items()}
     streams = {"sensor": sensor, "state": state}
     clocks |= {name: stream.time for name, stream in streams.items() if stream}
     recorded = recording.action()

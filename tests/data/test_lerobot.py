@@ -365,6 +365,80 @@ def test_the_sidecar_is_the_sensor(root, truth):
         opened(root).recordings[0].sensor()
 
 
+def test_states_faster_than_the_rows_stand_in_a_sidecar(root):
+    before = opened(root).recordings[0]
+    assert before.nominal().rates_hz.keys() == {"state", "action", "view top"}
+    time, values = np.arange(-3, 60) / 100, np.ones((63, 2), np.float32)
+    (root / "state").mkdir()
+    path = root / "state" / "episode_000000.npz"
+    np.savez(path, timestamps=time, values=values, names=["a", "b"], units=["deg", "mm"])
+    recording, other = opened(root).recordings[:2]
+    state = recording.state()
+    np.testing.assert_array_equal(state.time, time)
+    np.testing.assert_array_equal(state.values, values)
+    assert (state.channels.names, state.channels.units) == (("a", "b"), ("deg", "mm"))
+    assert path in recording.files() and path not in other.files()
+    assert "state" not in recording.nominal().rates_hz and "state" in other.nominal().rates_hz
+    assert len(other.state().time) == LENGTHS[1]
+    np.savez(path, timestamps=time, values=values)
+    assert opened(root).recordings[0].state().channels.names == ("state_0", "state_1")
+
+
+@pytest.fixture
+def captured(tmp_path, write):
+    """`captured(*times)`: a recording whose sidecar says so of the images in its seven rows."""
+    root = write.lerobot(tmp_path / "set", "v3.0", image=True)
+    (root / "frames").mkdir()
+
+    def of(*times: float):
+        np.savez(root / "frames" / "episode_000000.npz", top=np.array(times, np.float64))
+        return opened(root).recordings[0]
+
+    return of
+
+
+def test_rows_whose_images_were_captured_at_one_time_show_one_frame(captured):
+    recording = captured(-0.04, -0.04, 0.15, 0.15, 0.15, 0.45, 0.45)
+    assert "view top" not in recording.nominal().rates_hz
+    assert any(file.parent.name == "frames" for file in recording.files())
+    camera = recording.cameras()["top"]
+    assert camera.time.tolist() == [-0.04, 0.15, 0.45]
+    line = build_timeline(recording, None, 2, "rotvec", recording.state())
+    assert len(line.time) == 7, "the last frame stands until the last row"
+    assert line.frames["top"].tolist() == [0, 1, 1, 2]
+    assert line.frame_time["top"].tolist() == [-0.04, 0.15, 0.15, 0.45]
+    shown = shades(camera.read([0, 1, 1, 2]))
+    assert shown == [shown[0], shown[1], shown[1], shown[3]] and len({*shown}) == 3
+    camera.check([0, 2])
+
+
+def test_a_sidecar_of_frames_that_does_not_fit_is_refused(captured):
+    for times, said in (
+        ((0.0, 0.1), "7 rows, but times"),
+        ((0, 0.1, 0.2, 0.1, 0.4, 0.5, 0.6), "backwards at row 3"),
+        ((0, 0.1, 0.25, 0.3, 0.4, 0.5, 0.6), "in row 2 was captured at 0.250000 s"),
+    ):
+        with pytest.raises(RecordingError, match=said):
+            captured(*times).cameras()
+
+
+def test_the_kind_of_the_actions_may_stand_beside_their_names(root):
+    info = root / "meta" / "info.json"
+    document = json.loads(info.read_text())
+    plain = opened(root).recordings[0]
+    assert plain.action().kind == "absolute"
+    document["features"]["action"]["kind"] = "delta"
+    info.write_text(json.dumps(document))
+    told = opened(root).recordings[0]
+    assert told.action().kind == "delta"
+    assert told.identity().replace(" kind=delta", "") == plain.identity() != told.identity()
+    assert opened(root, action_kind="velocity").recordings[0].action().kind == "velocity"
+    document["features"]["action"]["kind"] = "sideways"
+    info.write_text(json.dumps(document))
+    with pytest.raises(RecordingError, match="absolute, velocity, delta, found 'sideways'"):
+        opened(root).recordings[0].action()
+
+
 @pytest.mark.parametrize("version", VERSIONS)
 def test_a_set_says_the_same_beside_a_twin(tmp_path, write, truth, version):
     """Whose episodes take their parents' names: neither sensor nor digest goes by them."""

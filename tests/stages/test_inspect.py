@@ -4,12 +4,14 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import zarr
 
 from pipeline.base.issue import Issue
 from pipeline.look.page.blocks import Issues, Report, Section
 from pipeline.look.page.style import RC
+from pipeline.robot.recorder import RunRecorder
 from stages import inspect
 from stages.command import run
 
@@ -164,3 +166,19 @@ def test_the_summary_says_one_place_and_what_was_found_there() -> None:
         "warning: gap: sensor · 4 episodes, the first e0 1.00–2.00 s",
         "    found 0",
     ]
+
+
+def test_a_run_on_a_robot_says_how_it_went(looked: Callable[..., int], tmp_path: Path) -> None:
+    streams = {"action": {"names": ["a"], "units": ["mm"], "kind": "absolute"}, "views": []}
+    spec = {"feature_spec": {"digest": "d"}, "feature_spec_digest": "d"}
+    recorder = RunRecorder(tmp_path / "runs", {"streams": streams, "action_hz": 10.0} | spec, "Go")
+    for tick in range(5):
+        recorder.tick({"time": np.array([tick / 10])}, None if tick == 0 else [tick])
+    recorder.finish("safe stop: no answer for 0.5 s")
+    assert looked(tmp_path / "runs") == 0
+    (page,) = tmp_path.rglob("report.html")
+    said = "4 of 5 ticks have an action; it ended: safe stop: no answer for 0.5 s."
+    assert f"Recorded on a robot: {said}" in page.read_text()
+    (tmp_path / "no.zarr").mkdir()
+    assert looked(tmp_path / "runs", "--set", "extract.store=no.zarr") == 0
+    assert "Its features were compared with no store" in page.read_text()

@@ -3,8 +3,10 @@
 import re
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
+from pathlib import Path
 
 from pipeline.base.config import Params
+from pipeline.base.errors import PipelineError
 from pipeline.base.format import duration
 from pipeline.base.table import Table
 from pipeline.data import Opened
@@ -16,6 +18,9 @@ from pipeline.look.recording.frames import camera_blocks
 from pipeline.look.recording.model_input import prompt_blocks, sample_blocks
 from pipeline.look.recording.overview import RecordingsOverview, survey_recordings, worst_first
 from pipeline.look.recording.streams import motion_blocks, sensor_blocks
+from pipeline.robot.recorded_keys import compare_keys
+from pipeline.robot.run_recording import describe_run
+from pipeline.store import FeatureStore
 
 _TOPICS = {
     "Camera views": camera_blocks,
@@ -120,7 +125,7 @@ def _episode_section(
     """Everything of one episode."""
     summary = overview.summaries[index]
     words = f"`{summary.path}`, format {summary.format}: “{summary.instruction or '–'}”"
-    blocks: list[Block] = [Text(words)]
+    blocks: list[Block] = [Text(words), *_run(view.recording.path, params.extract.store)]
     if len(overview.summaries) > 1:
         blocks.append(Issues(summary.issues, "Nothing looks wrong in this episode."))
     several = len({summary.source for summary in overview.summaries}) > 1
@@ -129,3 +134,15 @@ def _episode_section(
     absent = Text(f"This episode has nothing of this.{''.join(errors)}")
     parts = {topic: blocks_of(view, draw, params) for topic, blocks_of in _TOPICS.items()}
     return Section(title, blocks, [Section(topic, parts[topic] or [absent]) for topic in parts])
+
+
+def _run(recording: Path, store: Path) -> list[Block]:
+    """Of a run on a robot, how it went, and whether the store of the params has its features."""
+    if (said := describe_run(recording)) is None:
+        return []
+    if store.is_dir():
+        try:
+            said += f" In {store}, {compare_keys(recording, FeatureStore.open(store))}."
+        except PipelineError as error:
+            said += f" Its features were compared with no store: {error}"
+    return [Text(said)]

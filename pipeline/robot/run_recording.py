@@ -1,0 +1,179 @@
+"""The logs of a run on a robot, and the LeRobot data set of one episode that becomes of them.
+
+While a robot runs, its recorder appends to plain logs in `run_000003.part`, which a kill can only
+cut off: `<log>.bin`, rows of the types of `log_types`, and a PNG a frame. `finish_recording` makes
+`run_000003` of them, a LeRobot v3.0 data set with this project's sidecars:
+
+    data, meta             a row a tick in which an action was sent, images without loss
+    state, sensor          every reading, at the rate that it came
+    frames                 when each row's images were captured
+    features               which features each action was decided on: `row_key` and age
+    run.json               the policy's metadata, the settings, and how the run ended
+
+Times are seconds since the first row; `run.json` says when that was on the robot's clock.
+"""
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.base.durable import sync, write_document
+from pipeline.base.errors import RecordingError
+from pipeline.base.finite import non_finite
+from pipeline.base.ownership import OutputKind, begin_folder, remove_folder, unmark
+from pipeline.data.arrays import read_json
+from pipeline.data.lerobot import ACTION, STATE
+from pipeline.data.lerobot_writer import write_data_set, write_sidecar
+
+RUN: Final = "run.json"
+READINGS: Final = ("state", "sensor")
+_RUN: Final = OutputKind("a run on a robot", lambda folder: (folder / RUN).is_file())
+
+Log = NDArray[Any]
+
+
+def log_types(metadata: Mapping[str, Any]) -> "dict[str, np.dtype[Any]]":
+    """The rows of each log of a policy with this metadata, by the log's name.
+
+    `tick`: its `time` (s, the robot's clock), whether an action was sent (`acted`), how many state
+    readings had come (`states`), by view the number of the newest `frame` (-1: none), and of the
+    newest answer its number (`answer`, 0: none), `key` and `age_s`.
+    """
+    streams = metadata["streams"]
+    widths = {name: len(streams.get(name, {}).get("names", ())) for name in READINGS}
+    rows: dict[str, list[Any]] = {
+        name: [("time", "f8"), ("values", "f4", (width,))]
+        for name, width in widths.items()
+        if width
+    }
+    action, views = len(streams["action"]["names"]), len(streams["views"])
+    rows["tick"] = [("time", "f8"), ("acted", "?"), ("action", "f4", (action,)), ("states", "i8")]
+    rows["tick"] += [("frame", "i4", (views,)), ("answer", "i8"), ("key", "u1", (16,))]
+    rows["tick"] += [("age_s", "f4")]
+    rows["frame"] = [("time", "f8"), ("shape", "i4", (3,))]
+    return {name: np.dtype(fields) for name, fields in rows.items()}
+
+
+def begin_part(folder: Path, document: Mapping[str, Any]) -> Path:
+    """A new folder `run_NNNNNN.part` in `folder`, numbered after all runs there."""
+    folder.mkdir(parents=True, exist_ok=True)
+    found = (re.match(r"run_(\d+)", path.name) for path in folder.iterdir())
+    number = max((int(match[1]) for match in found if match), default=-1) + 1
+    part = folder / f"run_{number:06d}.part"
+    (part / "frames").mkdir(parents=True)
+    write_document(part / RUN, document)
+    return part
+
+
+def frame_path(part: Path, number: int) -> Path:
+    """Where a run's frame of this number lies while it runs."""
+    return part / "frames" / f"{number:06d}.png"
+
+
+def finish_recording(part: Path, end: Mapping[str, Any]) -> Path:
+    """Make the recording of a run's logs, in place of them; returns where it is.
+
+    `end` is what `run.json` says of the end. Until all is written the logs are kept and nothing
+    looks like a recording. Raises `RecordingError` where no action was sent.
+    """
+    run = read_json(part / RUN)
+    logs = dict.fromkeys(READINGS, np.zeros(0))
+    logs |= {name: _read(part, name, kind) for name, kind in log_types(run["metadata"]).items()}
+    rows = _rows(logs)
+    if not len(rows):
+        raise RecordingError(
+            f"{part}: expected a tick with an action in it, found {len(logs['tick'])} ticks "
+            f"without: there is nothing to make a recording of. Look into {RUN}, and remove {part}"
+        )
+    root = part / ".recording"  # what begins with a dot is not searched for recordings
+    begin_folder(root, _RUN)
+    left_out = _write_readings(root, run, logs, float(rows["time"][0]))
+    counts = {"ticks": len(logs["tick"]), "rows": len(rows), "readings_left_out": left_out}
+    write_document(root / RUN, {**run, **end, **counts, "start_s": float(rows["time"][0])})
+    _write_rows(root, part, run, logs, rows)
+    unmark(root)
+    for file in root.rglob("*"):
+        sync(file)
+    target = part.with_suffix("")
+    root.rename(target)
+    remove_folder(part, _RUN)
+    return target
+
+
+def describe_run(recording: Path) -> str | None:
+    """What a recorded run says of itself, in a sentence; None for what is none."""
+    if not (recording / RUN).is_file():
+        return None
+    run = read_json(recording / RUN)
+    dropped = f", {count} images dropped" if (count := run.get("dropped_images")) else ""
+    return (
+        f"Recorded on a robot: {run['rows']} of {run['ticks']} ticks have an action{dropped}; it "
+        f"ended: {run['reason']}."
+    )
+
+
+def _read(part: Path, name: str, kind: "np.dtype[Any]") -> Log:
+    """A log's whole rows: one that a kill or a full disk cut off is left out."""
+    path = part / f"{name}.bin"
+    rows = path.stat().st_size // kind.itemsize if path.exists() else 0
+    return np.memmap(path, kind, "r", shape=(rows,)) if rows else np.zeros(0, kind)
+
+
+def _rows(logs: Mapping[str, Log]) -> Log:
+    """The ticks that become rows: an action was sent, and all streams of the run had begun."""
+    ticks = logs["tick"]
+    seen = (ticks["frame"] >= 0).any(axis=0)
+    begun = (ticks["frame"][:, seen] >= 0).all(axis=1)
+    if len(logs["state"]):
+        begun &= ticks["states"] > 0
+    return ticks[ticks["acted"] & begun]
+
+
+def _write_readings(
+    root: Path, run: Mapping[str, Any], logs: Mapping[str, Log], start_s: float
+) -> dict[str, int]:
+    """The sidecars of readings; how many were no numbers, which a reader would refuse."""
+    left_out: dict[str, int] = {}
+    for name in READINGS:
+        if len(log := logs[name]):
+            bad = np.flatnonzero(non_finite(log["values"]).any(axis=1))
+            left_out[name] = len(bad)
+            kept = np.delete(log, bad) if len(bad) else log
+            channels = run["metadata"]["streams"][name]
+            told = {key: np.array(channels[key], str) for key in ("names", "units")}
+            times = kept["time"] - start_s
+            write_sidecar(root, name, timestamps=times, values=kept["values"], **told)
+    return left_out
+
+
+def _write_rows(
+    root: Path, part: Path, run: Mapping[str, Any], logs: Mapping[str, Log], rows: Log
+) -> None:
+    metadata, start, shown = run["metadata"], rows["time"][0], logs["frame"]
+    streams: Mapping[str, Any] = metadata["streams"]
+    views = dict(zip(streams["views"], rows["frame"].T, strict=True))
+    views = {view: number for view, number in views.items() if number[0] >= 0}
+    columns = {ACTION: rows["action"], "timestamp": rows["time"] - start}
+    features = {ACTION: streams["action"]}
+    if len(logs["state"]):
+        columns[STATE] = logs["state"]["values"][rows["states"] - 1]
+        features[STATE] = streams["state"]
+    images: dict[str, list[Path]] = {}
+    captured: dict[str, NDArray[np.float64]] = {}
+    for view, number in views.items():
+        key = f"observation.images.{view}"
+        images[key] = [frame_path(part, each) for each in number.tolist()]
+        features[key] = {"shape": shown["shape"][number[0]].tolist()}
+        # A camera may take a frame between the beginning of a tick and the question for it.
+        came = rows["time"][np.searchsorted(number, number)]
+        captured[view] = np.minimum(shown["time"][number], came) - start
+    if captured:
+        write_sidecar(root, "frames", **captured)
+    digest = np.array([str(metadata.get("feature_spec_digest", ""))])
+    told = {name: rows[name] for name in ("answer", "key", "age_s")}
+    write_sidecar(root, "features", **told, feature_spec_digest=digest)
+    write_data_set(root, columns, images, features, run["instruction"], metadata["action_hz"])

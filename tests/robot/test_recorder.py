@@ -1,0 +1,400 @@
+"""What a robot did is what a recording of it says, to the reading, the pixel and the key."""
+
+import json
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pipeline.base.config import Params, Source
+from pipeline.base.digests import file_digest
+from pipeline.base.errors import RecordingError, StoreMismatch
+from pipeline.data import Recording, open_recordings
+from pipeline.data.insertion import SENSOR, STATE
+from pipeline.extract import extract
+from pipeline.robot import recorder as recorder_module
+from pipeline.robot.recorded_keys import compare_keys
+from pipeline.robot.recorder import RunRecorder, encode_png, recover
+from pipeline.simulation.environment import InsertionEnvironment
+from pipeline.simulation.insertion_formats import INSTRUCTION
+from pipeline.simulation.rendering import VIEWS
+from pipeline.store import FeatureStore
+from pipeline.vlm.feature_spec import FeatureSpec, feature_spec, row_key
+from pipeline.vlm.preparation import Preparer
+
+REUSE = 3
+Frames = Mapping[str, tuple[float, np.ndarray]]
+
+
+def metadata_of(**changed: Any) -> dict[str, Any]:
+    """What a policy for the phantom says of itself, as far as a recorder reads it."""
+    action = {"names": ["dx", "dy", "dz", "rx", "ry", "rz", "gripper"], "kind": "delta"}
+    streams: dict[str, Any] = {
+        "action": action | {"units": ["mm"] * 3 + ["deg"] * 3 + [""]},
+        "state": {"names": list(STATE.names), "units": list(STATE.units)},
+        "sensor": {"names": list(SENSOR.names), "units": list(SENSOR.units)},
+        "views": list(VIEWS),
+    }
+    spec = {"digest": "d", "prompt": "p"}
+    told = {"action_hz": 10.0, "feature_spec": spec, "feature_spec_digest": "d"}
+    return told | {"streams": streams | changed}
+
+
+@dataclass
+class Driven:
+    """What the loop of one run saw and sent, kept beside the recorder."""
+
+    recorder: RunRecorder
+    time: list[float] = field(default_factory=list)
+    sent: list[np.ndarray] = field(default_factory=list)
+    readings: dict[str, list[np.ndarray]] = field(default_factory=dict)
+    looked: list[tuple[int, Frames, bytes]] = field(default_factory=list)
+
+
+def drive(
+    folder: Path,
+    metadata: Mapping[str, Any],
+    key_of: Callable[[Frames], bytes],
+    *,
+    late: int = 0,
+    ticks: int | None = None,
+) -> Driven:
+    """The demonstrator's episode; answers come `late` ticks after their frames, actions with them.
+
+    Every third tick is looked at.
+    """
+    environment = InsertionEnvironment("full", cameras=False)
+    observed, _ = environment.reset(seed=11)
+    driven = Driven(RunRecorder(folder, metadata, INSTRUCTION, {"execute": 1}))
+    recorder, tick = driven.recorder, 0
+    while not environment.insertion.finished and tick != ticks:
+        if tick % REUSE == 0:
+            frames = environment.frames()
+            recorder.frames(frames)
+            driven.looked.append((tick, frames, key_of(frames)))
+        for looked_at, _, key in driven.looked:
+            if looked_at + late == tick:
+                said = {"feature_key": np.frombuffer(key, np.uint8), "feature_age_s": 0.05 + late}
+                recorder.answer(said)
+        action = environment.insertion.expert_action() if tick >= late else None
+        recorder.tick(observed, action)
+        for name in ("state", "state_time", "sensor", "sensor_time"):
+            driven.readings.setdefault(name, []).append(observed[name])
+        if action is not None:
+            driven.sent.append(action.astype(np.float32))
+            driven.time.append(float(observed["time"][0]))
+        observed = environment.step(np.zeros(7) if action is None else action)[0]
+        tick += 1
+    return driven
+
+
+def no_key(frames: Frames) -> bytes:
+    return bytes(16)
+
+
+def opened(folder: Path) -> Recording:
+    (recording,) = open_recordings([Source(name="runs", path=str(folder))], folder).recordings
+    return recording
+
+
+@pytest.fixture(scope="module")
+def vlm(demo_checkpoint: Path) -> dict[str, Any]:
+    size = {"image_resize_height": 56, "image_resize_width": 56}
+    return {"checkpoint": str(demo_checkpoint), "dtype": "float32", "pooling": ["mean"], **size}
+
+
+def params_of(vlm: Mapping[str, Any], folder: Path) -> Params:
+    sources = [{"name": "runs", "path": "runs"}]
+    data = {"root": str(folder), "sources": sources, "vlm_reuse_count": REUSE}
+    document = {"data": data, "vlm": vlm, "extract": {"store": str(folder / "runs.zarr")}}
+    return Params.model_validate(document)
+
+
+@pytest.fixture(scope="module")
+def live(vlm: dict[str, Any], tmp_path_factory: pytest.TempPathFactory):
+    """The spec of the features, and what a robot's key of frames is."""
+    params = params_of(vlm, tmp_path_factory.mktemp("live"))
+    spec = feature_spec(params.vlm, "float32", VIEWS, file_digest)
+    preparer = Preparer(params.vlm, spec)
+
+    def key_of(frames: Frames) -> bytes:
+        seen = {view: image for view, (_, image) in frames.items()}
+        return row_key(spec, preparer.render(INSTRUCTION, list(seen)), seen)
+
+    return spec, key_of
+
+
+def told(spec: FeatureSpec) -> dict[str, Any]:
+    return metadata_of() | {"feature_spec": spec.attrs(), "feature_spec_digest": spec.digest}
+
+
+@pytest.fixture(scope="module")
+def run(vlm: dict[str, Any], live, tmp_path_factory: pytest.TempPathFactory):
+    """A whole run, its recording, and the store that is extracted from it."""
+    spec, key_of = live
+    folder = tmp_path_factory.mktemp("run")
+    driven = drive(folder / "runs", told(spec), key_of)
+    path = driven.recorder.finish("inserted", {"tick_ms": {"p50": 1.5}})
+    extract(params_of(vlm, folder), say=lambda _: None)
+    return driven, path, FeatureStore.open(folder / "runs.zarr")
+
+
+def test_a_run_comes_back_as_it_was(run) -> None:
+    driven, path, _ = run
+    recording = opened(path)
+    action, start = recording.action(), driven.time[0]
+    assert action is not None and action.kind == "delta"
+    np.testing.assert_array_equal(action.values, np.stack(driven.sent))
+    np.testing.assert_array_equal(action.time, np.array(driven.time) - start)
+    for name, stream in (("state", recording.state()), ("sensor", recording.sensor())):
+        assert stream is not None
+        values, times = (np.concatenate(driven.readings[key]) for key in (name, f"{name}_time"))
+        np.testing.assert_array_equal(stream.values, values.astype(np.float32))
+        np.testing.assert_array_equal(stream.time, times - start)
+    for view, camera in recording.cameras().items():
+        shots = [frames[view] for _, frames, _ in driven.looked]
+        np.testing.assert_array_equal(camera.time, np.array([time for time, _ in shots]) - start)
+        read = camera.read(range(len(shots)))
+        for (_, shot), frame in zip(shots, read, strict=True):
+            np.testing.assert_array_equal(frame, shot)
+    assert (recording.instruction, sorted(recording.cameras())) == (INSTRUCTION, list(VIEWS))
+
+
+def test_a_store_of_a_run_has_its_actions_its_clocks_and_the_robots_keys(run) -> None:
+    driven, path, store = run
+    start = driven.time[0]
+    np.testing.assert_array_equal(store.array("tick/action"), np.stack(driven.sent))
+    np.testing.assert_allclose(store.array("tick/time"), np.array(driven.time) - start, atol=1e-9)
+    keys = [key for _, _, key in driven.looked]
+    assert [row.tobytes() for row in store.array("vl/key")] == keys
+    captured = [[frames[view][0] - start for view in VIEWS] for _, frames, _ in driven.looked]
+    np.testing.assert_array_equal(store.array("vl/frame_time"), captured)
+    assert len(np.concatenate(driven.readings["state"])) == len(store.array("state/values"))
+    same = compare_keys(path, store)
+    assert (same.rows, len(same.missing), same.differs) == (len(keys), 0, ())
+    assert str(same) == f"{len(keys)} of {len(keys)} VL rows have a key of the robot's"
+
+
+def test_the_run_says_how_it_was_and_ended(run) -> None:
+    driven, path, _ = run
+    said = json.loads((path / "run.json").read_text())
+    assert (said["reason"], said["settings"]) == ("inserted", {"execute": 1})
+    assert said["timings"] == {"tick_ms": {"p50": 1.5}}
+    assert said["rows"] == said["ticks"] == len(driven.sent)
+    assert (said["start_s"], said["dropped_images"]) == (driven.time[0], 0)
+    assert not list(path.parent.glob("*.part"))
+    with np.load(path / "features" / "episode_000000.npz") as features:
+        assert features["key"].shape == (len(driven.sent), 16)
+        assert features["answer"].tolist() == [1 + k // REUSE for k in range(len(driven.sent))]
+        assert features["age_s"][0] == np.float32(0.05)
+        assert features["feature_spec_digest"] == [said["metadata"]["feature_spec_digest"]]
+
+
+def test_keys_that_the_robot_did_not_have_are_named(live, vlm, tmp_path: Path) -> None:
+    spec, key_of = live
+    looks: list[bytes] = []
+
+    def forgetful(frames: Frames) -> bytes:
+        looks.append(key_of(frames))
+        return bytes(16) if len(looks) == 3 else looks[-1]
+
+    path = drive(tmp_path / "runs", told(spec), forgetful, ticks=14).recorder.finish("done")
+    extract(params_of(vlm, tmp_path), say=lambda _: None)
+    store = FeatureStore.open(tmp_path / "runs.zarr")
+    compared = compare_keys(path, store)
+    assert compared.missing.tolist() == [2]
+    assert str(compared) == "4 of 5 VL rows have a key of the robot's; not: 2 (0.60 s)"
+    document = json.loads((path / "run.json").read_text())
+    document["metadata"]["feature_spec"] |= {"digest": "other", "prompt": "other"}
+    (path / "run.json").write_text(json.dumps(document))
+    assert 'the feature specs differ: prompt: "other" ->' in str(compare_keys(path, store))
+    elsewhere = path.rename(tmp_path / "moved")
+    with pytest.raises(StoreMismatch, match="found 0 of 1 at such a path"):
+        compare_keys(elsewhere, store)
+    with pytest.raises(RecordingError, match="expected a recorded run"):
+        compare_keys(tmp_path, store)
+
+
+def test_late_answers_leave_out_the_ticks_before_the_first_action(live, vlm, tmp_path) -> None:
+    spec, key_of = live
+    driven = drive(tmp_path / "runs", told(spec), key_of, late=2, ticks=12)
+    path = driven.recorder.finish("done")
+    extract(params_of(vlm, tmp_path), say=lambda _: None)
+    store = FeatureStore.open(tmp_path / "runs.zarr")
+    assert store.ticks == len(driven.sent) == 10
+    np.testing.assert_array_equal(store.array("tick/action"), np.stack(driven.sent))
+    assert compare_keys(path, store).missing.tolist() == []
+    assert len(store.array("state/time")) == 120
+
+
+@pytest.mark.parametrize("stream", ["state", "sensor"])
+def test_a_stream_that_the_policy_lacks_is_not_recorded(tmp_path: Path, stream: str) -> None:
+    metadata = metadata_of(**{stream: {"names": [], "units": []}})
+    path = drive(tmp_path, metadata, no_key, ticks=5).recorder.finish("done")
+    recording = opened(path)
+    streams = {"state": recording.state(), "sensor": recording.sensor()}
+    assert [name for name, found in streams.items() if found is None] == [stream]
+
+
+def observed_at(tick: int, **readings: Any) -> dict[str, Any]:
+    return {"time": np.array([5 + tick / 10]), **readings}
+
+
+def image_of(shade: int) -> np.ndarray:
+    return np.full((6, 8, 3), shade, np.uint8)
+
+
+def test_a_policy_without_any_stream_is_recorded_by_its_actions(tmp_path: Path) -> None:
+    none: dict[str, Any] = {"names": [], "units": []}
+    recorder = RunRecorder(tmp_path, metadata_of(state=none, sensor=none, views=[]), "Push")
+    for tick in range(4):
+        recorder.tick(observed_at(tick), np.full(7, tick))
+    recording = opened(recorder.finish("done"))
+    action = recording.action()
+    assert action is not None and action.values[:, 0].tolist() == [0, 1, 2, 3]
+    assert recording.state() is None and not recording.cameras()
+
+
+def test_a_view_that_never_came_is_missing(tmp_path: Path) -> None:
+    recorder = RunRecorder(tmp_path, metadata_of(), "Push")
+    for tick in range(4):
+        recorder.frames({VIEWS[1]: (5 + tick / 10, image_of(tick)), "Side": (5.0, image_of(9))})
+        recorder.tick(observed_at(tick), np.zeros(7))
+    cameras = opened(recorder.finish("done")).cameras()
+    assert list(cameras) == [VIEWS[1]]
+    assert [frame[0, 0, 0] for frame in cameras[VIEWS[1]].read(range(4))] == [0, 1, 2, 3]
+
+
+def test_rows_begin_when_all_streams_have(tmp_path: Path) -> None:
+    recorder = RunRecorder(tmp_path, metadata_of(), "Push")
+    for tick in range(6):
+        state = {"state": np.ones((1, 12)), "state_time": np.array([5 + tick / 10])}
+        if tick == 3:
+            recorder.frames({"View1": (5.3, image_of(7))})
+        recorder.tick(observed_at(tick, **(state if tick else {})), np.full(7, tick))
+    path = recorder.finish("done")
+    action = opened(path).action()
+    assert action is not None and action.values[:, 0].tolist() == [3, 4, 5]
+    assert json.loads((path / "run.json").read_text())["start_s"] == 5.3
+
+
+def test_a_frame_is_no_newer_than_the_tick_that_it_came_with(tmp_path: Path) -> None:
+    recorder = RunRecorder(tmp_path, metadata_of(), "Push")
+    for tick in range(4):
+        if tick % 2 == 0:
+            recorder.frames({"View1": (5.004 + tick / 10, image_of(tick))})
+        recorder.frames({"View1": (5.0, image_of(99))})  # an older one, which is passed over
+        recorder.tick(observed_at(tick), np.zeros(7))
+    camera = opened(recorder.finish("done")).cameras()["View1"]
+    np.testing.assert_allclose(camera.time, [0, 0.2])
+    assert [frame[0, 0, 0] for frame in camera.read([0, 1, 1])] == [0, 2, 2]
+
+
+def test_equal_images_are_stored_once(tmp_path: Path) -> None:
+    sizes: list[int] = []
+    noise = np.random.default_rng(0).integers(0, 256, (80, 100, 3), np.uint8)
+    for looks in (range(0, 50, 50), range(50)):
+        recorder = RunRecorder(tmp_path, metadata_of(), "Push")
+        for tick in range(50):
+            if tick in looks:
+                recorder.frames({"View1": (5 + tick / 10, np.roll(noise, tick))})
+            recorder.tick(observed_at(tick), np.zeros(7))
+        (data,) = recorder.finish("done").glob("data/*/*.parquet")
+        sizes.append(data.stat().st_size)
+    assert sizes[0] < 1.5 * noise.nbytes < 40 * noise.nbytes < sizes[1]
+
+
+def test_readings_that_are_no_numbers_are_left_out_and_counted(tmp_path: Path) -> None:
+    recorder = RunRecorder(tmp_path, metadata_of(), "Push")
+    state = np.arange(48, dtype=np.float32).reshape(4, 12)
+    state[1, 3], state[2, 0] = np.nan, np.inf
+    times = {"state_time": 5 + np.arange(4) / 100}
+    recorder.tick(observed_at(1, state=state, **times), np.zeros(7))
+    path = recorder.finish("safe stop: the state is not a number")
+    found = opened(path).state()
+    assert found is not None
+    np.testing.assert_array_equal(found.values, state[[0, 3]])
+    said = json.loads((path / "run.json").read_text())
+    assert said["readings_left_out"] == {"state": 2}
+
+
+def test_images_that_find_no_room_are_dropped_and_counted(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(recorder_module, "MOST_IMAGE_BYTES", 2 * image_of(0).nbytes + 1)
+    go = threading.Event()
+
+    def slow(image: np.ndarray) -> bytes:
+        go.wait()
+        return encode_png(image)
+
+    monkeypatch.setattr(recorder_module, "encode_png", slow)
+    none: dict[str, Any] = {"names": [], "units": []}
+    metadata = metadata_of(state=none, sensor=none, views=["View1"])
+    recorder = RunRecorder(tmp_path, metadata, "Push")
+    recorder.frames({"View1": (5.0, image_of(0))})
+    recorder.tick(observed_at(0), np.zeros(7))
+    for tick in range(1, 5):
+        recorder.frames({"View1": (5 + tick / 10, image_of(tick))})
+        recorder.tick(observed_at(tick), np.zeros(7))
+    go.set()
+    camera = opened(path := recorder.finish("done")).cameras()["View1"]
+    said = json.loads((path / "run.json").read_text())
+    assert (said["rows"], said["dropped_images"]) == (5, 4)
+    assert [frame[0, 0, 0] for frame in camera.read(range(len(camera.time)))] == [0]
+    np.testing.assert_allclose(camera.time, [0.0])
+
+
+def test_a_disk_that_does_not_keep_up_fails_the_recording_not_the_run(
+    tmp_path: Path, monkeypatch
+) -> None:
+    monkeypatch.setattr(recorder_module, "MOST_BYTES", 100)
+    recorder = RunRecorder(tmp_path, metadata_of(), "Push")
+    for tick in range(3):
+        recorder.tick(observed_at(tick), np.zeros(7))
+        recorder.tick(observed_at(tick, state=np.ones((9, 12)), state_time=np.ones(9)), None)
+    assert recorder.failed is not None and "does not keep up" in recorder.failed
+    with pytest.raises(RecordingError, match="does not keep up"):
+        recorder.finish("done")
+
+
+def test_what_the_loop_gives_wrongly_fails_the_recording_not_the_run(tmp_path: Path) -> None:
+    recorder = RunRecorder(tmp_path, metadata_of(), "Push")
+    recorder.tick(observed_at(0), np.zeros(7))
+    recorder.tick(observed_at(1), np.zeros(3))
+    recorder.tick({}, np.zeros(7))
+    recorder.frames({"View1": (5.0, image_of(0)[0])})
+    recorder.answer({"feature_key": np.zeros(5)})
+    assert recorder.failed is not None and "shape" in recorder.failed
+    with pytest.raises(RecordingError, match=r"run_000000\.part: the recording of this run is not"):
+        recorder.finish("done")
+    assert recover(recorder.part).name == "run_000000"
+
+
+def test_a_run_without_an_action_is_no_recording(tmp_path: Path) -> None:
+    recorder = RunRecorder(tmp_path, metadata_of(), "Push")
+    recorder.tick(observed_at(0), None)
+    with pytest.raises(RecordingError, match="found 1 ticks without"):
+        recorder.finish("safe stop: no features")
+    assert recorder.part.is_dir()
+
+
+def test_runs_are_numbered_after_those_there(tmp_path: Path) -> None:
+    for name in ("run_000007", "run_000009.part", "else"):
+        (tmp_path / name).mkdir()
+    recorder = RunRecorder(tmp_path, metadata_of(), "Push")
+    recorder.tick(observed_at(0), np.zeros(7))
+    assert recorder.finish("done") == tmp_path / "run_000010"
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 3), (37, 51, 3), (480, 640, 3)])
+def test_a_png_has_the_very_pixels(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    image = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
+    file = tmp_path / "frame.png"
+    file.write_bytes(encode_png(image))
+    with Image.open(file) as read:
+        assert read.mode == "RGB"
+        np.testing.assert_array_equal(np.asarray(read), image)
