@@ -9,7 +9,8 @@ Each recipe is trained with each of `seeds` seeds, judged on the test episodes, 
 already in FOLDER is not done again, so a command that was stopped goes on, and tables share
 policies; rollouts of another number of episodes are done again.
 
-`worth` trains nothing: it draws success against errors on recordings, a point a policy of FOLDER.
+`worth` and `staleness` run nothing. They draw what is in FOLDER: success against errors on
+recordings, a point a policy; and success against what a pass of the model takes (table `latency`).
 
 The last line is JSON: of each row success with Wilson's interval over the rollouts of all seeds,
 and the errors in training std over all seeds and their differences from the policy as it is
@@ -37,6 +38,7 @@ from tqdm import tqdm
 
 from experiments.recipes import (
     AS_IT_IS,
+    LATE,
     ON_TIME,
     RECIPES,
     ROLLOUTS,
@@ -63,7 +65,7 @@ FIRST_SEED = 3_000_000
 def main() -> None:
     """Run what is not done, and print the table."""
     parser = ArgumentParser("experiments.closed_loop", description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("table", choices=[*TABLES, "worth"])
+    parser.add_argument("table", choices=[*TABLES, "worth", "staleness"])
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--episodes", type=int, default=100)
@@ -75,6 +77,8 @@ def main() -> None:
         _work(wanted, name, int(seed), TABLES[wanted.table].rollouts)
     elif wanted.table == "worth":
         _draw_worth(wanted.out)
+    elif wanted.table == "staleness":
+        _draw_staleness(wanted)
     else:
         _refuse_other_params(wanted.out)
         _make_table(wanted, TABLES[wanted.table])
@@ -300,6 +304,34 @@ def _draw_worth(out: Path) -> None:
     print(picture)
     told = {name: round(float(rank.statistic), 3) for name, rank in ranks.items()}
     print(json.dumps({"table": "worth", "rank_correlation": told, "policies": policies}))
+
+
+def _draw_staleness(wanted: Namespace) -> None:
+    """Success with its interval against the latency of the model, a curve a recipe."""
+    from pipeline.look.page import style
+
+    curves: dict[str, dict[int, list[float]]] = {}
+    for name in TABLES["latency"].recipes:
+        folders = [_folder(wanted.out, name, seed) for seed in range(wanted.seeds)]
+        for way, ticks in {ON_TIME: 0, **LATE}.items():
+            if episodes := _episodes([folder / way for folder in folders]).get(POLICY):
+                curves.setdefault(name, {})[100 * ticks] = _success(episodes)
+    if not curves:
+        raise SystemExit(f"{wanted.out}: nothing to draw. Make the table `latency` there first.")
+
+    def draw() -> Any:
+        figure, panels = style.panels(7.5, 4.2, 1, 1)
+        for colour, (name, curve) in zip(style.PALETTE, curves.items(), strict=False):
+            rate, low, high = 100 * np.array([*curve.values()]).T
+            panels.plot([*curve], rate, "o-", color=colour, label=name)
+            panels.fill_between([*curve], low, high, color=colour, alpha=0.2, linewidth=0)
+        panels.set(xlabel="what a pass of the model takes [ms]", ylabel="inserted [%]")
+        panels.legend()
+        return figure
+
+    (picture,) = style.write(wanted.out, {"staleness.png": draw})
+    print(picture)
+    print(json.dumps({"table": "staleness", "by_latency_ms": curves}))
 
 
 if __name__ == "__main__":

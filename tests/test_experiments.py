@@ -120,6 +120,25 @@ def test_worth_of_too_few_policies_says_what_to_do(
         run(monkeypatch, capsys, "worth", "--out", str(tmp_path))
 
 
+def test_staleness_draws_success_against_latency(
+    done: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    late = done / "as-it-is-0" / "4 ticks late"
+    late.mkdir()
+    (late / "episodes.csv").write_text("success,lateral_mm\nTrue,0.1\nFalse,3")
+    told = run(monkeypatch, capsys, "staleness", "--out", str(done))["by_latency_ms"]
+    assert (done / "staleness.png").read_bytes().startswith(b"\x89PNG")
+    assert list(told["as it is"]) == ["0", "400"]
+    assert told["as it is"]["400"][0] == 0.5
+
+
+def test_staleness_of_nothing_says_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    with pytest.raises(SystemExit, match="Make the table `latency`"):
+        run(monkeypatch, capsys, "staleness", "--out", str(tmp_path))
+
+
 def test_a_rollout_that_was_cut_off_is_done_again(
     done: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ) -> None:
