@@ -9,6 +9,7 @@ beside.csv (those of the others), settings.json and a page (report.html) into `r
   python -m stages.rollout                                     50 episodes at level full
   python -m stages.rollout --set rollout.level=moved           the target is pushed meanwhile
   python -m stages.rollout --set rollout.chunking=temporal     another way to play chunks
+  python -m stages.rollout --set rollout.server=ws://127.0.0.1:8000   what stages.serve answers
 """
 
 from stages.command import run
@@ -16,17 +17,21 @@ from stages.command import run
 if __name__ == "__main__":  # here, for --help waits for no import below
     raise SystemExit(run(__doc__ or "", "stages.rollout", sections=("rollout",)))
 
+import os
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from pipeline.base.config import Params
+from pipeline.base.config import Params, RolloutParams
 from pipeline.base.device import resolve_device
 from pipeline.base.durable import write_document
 from pipeline.base.ownership import REPORT, begin_folder, claim, refuse_foreign
 from pipeline.evaluate.rollouts import Rollouts, roll_out
+from pipeline.evaluate.served_rollouts import roll_out_served
 from pipeline.look.page.writing import write_report
 from pipeline.look.rollout.page import rollout_report
 from pipeline.policy.checkpoint import find_policy, load_policy
+from pipeline.robot.client import PolicyClient
 from pipeline.robot.features import LiveFeatures
 
 
@@ -39,17 +44,32 @@ def main(params: Params) -> None:
         write_document(wanted.output / "metrics.json", {"success": {}})
         print("nothing is rolled out, as rollout.environment is null")
         return
-    folder = wanted.checkpoint or params.train_head.output
-    checkpoint = load_policy(find_policy(folder))
-    device, say = resolve_device(wanted.device), partial(print, flush=True)
-    load = partial(LiveFeatures, params.vlm, checkpoint.source["feature_spec"], str(device))
-    print(f"{folder} (step {checkpoint.step}), level {wanted.level}, device {device}", flush=True)
-    policy = checkpoint.policy(device)
-    rollouts = roll_out(checkpoint, str(folder), policy, load, wanted, say)
+    say = partial(print, flush=True)
+    rollouts = _served(wanted, say) if wanted.server else _here(params, say)
     files = _write(wanted.output, rollouts)
     for line in rollouts.summary().text():
         print(line)
     print(f"{wanted.output}: {', '.join(file.name for file in files)}")
+
+
+def _here(params: Params, say: Callable[[str], None]) -> Rollouts:
+    """Those of a checkpoint, with the model in this process."""
+    wanted = params.rollout
+    folder = wanted.checkpoint or params.train_head.output
+    checkpoint = load_policy(find_policy(folder))
+    device = resolve_device(wanted.device)
+    load = partial(LiveFeatures, params.vlm, checkpoint.source["feature_spec"], str(device))
+    say(f"{folder} (step {checkpoint.step}), level {wanted.level}, device {device}")
+    return roll_out(checkpoint, str(folder), checkpoint.policy(device), load, wanted, say)
+
+
+def _served(wanted: RolloutParams, say: Callable[[str], None]) -> Rollouts:
+    """Those of the policy that `rollout.server` serves."""
+    assert wanted.server is not None
+    with PolicyClient(wanted.server, token=os.environ.get("VLA_SERVE_TOKEN")) as server:
+        told = server.metadata
+        say(f"{wanted.server}: {told['checkpoint']} (step {told['step']}), level {wanted.level}")
+        return roll_out_served(server, wanted, say)
 
 
 def _write(folder: Path, rollouts: Rollouts) -> list[Path]:

@@ -7,7 +7,7 @@ Wilson intervals. The same seeds give the same figures, bit for bit on one machi
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.stats import binomtest
 from tqdm import tqdm
 
-from pipeline.base.config import RolloutAblation, RolloutParams
+from pipeline.base.config import Level, RolloutAblation, RolloutParams
 from pipeline.base.errors import CheckpointMismatch, ConfigError
 from pipeline.base.table import Table
 from pipeline.policy.checkpoint import PolicyCheckpoint
@@ -173,7 +173,9 @@ def roll_out(
     expert cannot do and for more steps than a chunk has. Before the first episode the model proves
     that it gives the policy's features, as `prove` does.
     """
-    refuse_other_robot(checkpoint)
+    shape = checkpoint.shape
+    widths = {"action": shape.action_dim, "state": shape.state_dim, "sensor": shape.sensor_channels}
+    refuse_other_robot(checkpoint.source, widths)
     check_chunking(wanted.chunking, policy.stochastic)
     Executor(wanted.chunking, wanted.execute, policy.params.horizon)
     features = load_features() if "features" in policy.encoders else None
@@ -184,17 +186,51 @@ def roll_out(
         policy,
         features,
         wanted,
-        instruction_of(checkpoint),
+        instruction_of(checkpoint.instructions),
     )
     alone = len(policy.encoders) == 1
-    ablations: Sequence[RolloutAblation | None] = (
-        None,
-        *(
-            name
-            for name in dict.fromkeys(wanted.ablations)
-            if name.split()[0] in policy.encoders and not (alone and name.endswith("off"))
-        ),
-    )
+    ablations = [
+        name
+        for name in dict.fromkeys(wanted.ablations)
+        if name.split()[0] in policy.encoders and not (alone and name.endswith("off"))
+    ]
+    settings = {"checkpoint": name, "step": checkpoint.step}
+    settings |= {"model_type": policy.params.model_type, "instruction": driver.instruction}
+    return run_episodes(driver, [None, *ablations], wanted, settings, say)
+
+
+class Driver(Protocol):
+    """Whoever lets a policy control robots: here, or on a server."""
+
+    def begin(self, seed: int) -> InsertionEnvironment:
+        """The phantom at the beginning of an episode."""
+        ...
+
+    def drive(
+        self,
+        environments: Sequence[InsertionEnvironment],
+        seeds: Sequence[int],
+        ablation: RolloutAblation | None,
+        ended: Callable[[], Any],
+    ) -> list[str | None]:
+        """Run the policy on all robots to their ends; why each stopped safely, or None.
+
+        `ended` is called for each that ends.
+        """
+        ...
+
+
+def run_episodes(
+    driver: Driver,
+    ablations: Sequence[RolloutAblation | None],
+    wanted: RolloutParams,
+    settings: Mapping[str, Any],
+    say: Callable[[str], None],
+) -> Rollouts:
+    """Episodes of the policy under each of `ablations`, None for none, and of the demonstrator.
+
+    `settings` tell of the policy, its `checkpoint` among them.
+    """
     seeds = range(wanted.seed, wanted.seed + wanted.episodes)
     groups = [seeds[at : at + SIDE_BY_SIDE] for at in range(0, len(seeds), SIDE_BY_SIDE)]
     episodes: list[RolloutEpisode] = []
@@ -219,22 +255,31 @@ def roll_out(
                 insertion.step(insertion.expert_action())
             episodes.append(_episode(EXPERT, wanted.level, seed, insertion, None))
             bar.update()
-    settings = wanted.model_dump(mode="json", exclude={"checkpoint", "output", "device"})
-    settings |= {"checkpoint": name, "step": checkpoint.step}
-    settings |= {"model_type": policy.params.model_type, "instruction": driver.instruction}
-    return Rollouts(name, settings, tuple(episodes))
+    told = wanted.model_dump(mode="json", exclude={"checkpoint", "output", "device"})
+    return Rollouts(settings["checkpoint"], told | dict(settings), tuple(episodes))
 
 
-def refuse_other_robot(checkpoint: PolicyCheckpoint) -> None:
-    """Raise `CheckpointMismatch` where the phantom has not what a policy was trained on."""
-    source, shape = checkpoint.source, checkpoint.shape
+def begin_episode(source: Mapping[str, Any], level: Level, seed: int) -> InsertionEnvironment:
+    """The phantom at the beginning of an episode, with actions as a policy's `source` has them."""
+    rotation = "rotvec" if "rx" in source["streams"]["action"]["names"] else "euler_delta"
+    robot = InsertionEnvironment(level, rotation, cameras=False)
+    robot.reset(seed=seed)
+    return robot
+
+
+def refuse_other_robot(source: Mapping[str, Any], widths: Mapping[str, int]) -> None:
+    """Raise `CheckpointMismatch` where the phantom has not what a policy was trained on.
+
+    `source` has `streams` and `action_hz`; `widths` are those of action, state and sensor, 0 of a
+    stream that the policy does not look at.
+    """
     views = tuple(source["streams"]["views"])
     checked = {
         "views": (views, VIEWS, set(views) <= set(VIEWS)),
         "action": (source["streams"]["action"]["kind"], "delta", None),
-        "action channels": (shape.action_dim, 7, None),
-        "state channels": (shape.state_dim, 12, shape.state_dim in (0, 12)),
-        "sensor channels": (shape.sensor_channels, 1026, shape.sensor_channels in (0, 1026)),
+        "action channels": (widths["action"], 7, None),
+        "state channels": (widths["state"], 12, widths["state"] in (0, 12)),
+        "sensor channels": (widths["sensor"], 1026, widths["sensor"] in (0, 1026)),
         "action_hz": (source["action_hz"], TICK_HZ, None),
     }
     differs = [
@@ -250,12 +295,11 @@ def refuse_other_robot(checkpoint: PolicyCheckpoint) -> None:
         )
 
 
-def instruction_of(checkpoint: PolicyCheckpoint) -> str:
+def instruction_of(trained: Sequence[str]) -> str:
     """What the robot is told: the phantom's task, or else the only words the policy was trained on.
 
     Raises `ConfigError` where it was trained on several others.
     """
-    trained = checkpoint.instructions
     if not trained or INSTRUCTION in trained:
         return INSTRUCTION
     if len(trained) == 1:
@@ -310,11 +354,7 @@ class _Driver:
 
     def begin(self, seed: int) -> InsertionEnvironment:
         """The phantom at the beginning of an episode."""
-        names = self.checkpoint.source["streams"]["action"]["names"]
-        rotation = "rotvec" if "rx" in names else "euler_delta"
-        robot = InsertionEnvironment(self.wanted.level, rotation, cameras=False)
-        robot.reset(seed=seed)
-        return robot
+        return begin_episode(self.checkpoint.source, self.wanted.level, seed)
 
     def drive(
         self,

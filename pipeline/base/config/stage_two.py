@@ -268,6 +268,10 @@ class RolloutParams(Section):
     """Also run the policy with a stream spoilt. off: every value at its training mean. frozen: all
     as the stream was first, as if it were new. What a policy does not look at is passed over, and
     so is `off` of the only stream that it looks at. [] for none."""
+    server: str | None = None
+    """The address of a running `stages.serve`, such as ws://127.0.0.1:8000, whose policy is rolled
+    out over the wire in place of `checkpoint`; its token, if it asks for one, is in the environment
+    as VLA_SERVE_TOKEN."""
     device: str = "auto"
     """auto, cpu, cuda or cuda:N."""
     output: Path = Path("reports/rollout")
