@@ -1,5 +1,7 @@
 """A policy of the phantom with a stand-in for its model, served in this process."""
 
+import socket
+import threading
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -8,11 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.base.config import TrainHeadParams
+from pipeline.base.config import ServeParams, TrainHeadParams
 from pipeline.compat.unified import no_normalization
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.observation import PolicyShape
 from pipeline.policy.policy import Policy
+from pipeline.robot.server import PolicyServer, listen
 from pipeline.robot.session import ServedPolicy
 from pipeline.simulation.insertion_formats import INSTRUCTION
 from pipeline.simulation.rendering import VIEWS
@@ -143,3 +146,29 @@ def observe() -> Callable[..., dict[str, Any]]:
         return {name: own for name, own in (fields | changed).items() if own is not None}
 
     return made
+
+
+@pytest.fixture
+def serving() -> Any:
+    """`serving(served, token=None, key=value, ...)`: a server of it in a thread, which ends
+    with the test; the keys are those of the section `serve`."""
+    running: list[tuple[PolicyServer, threading.Thread, socket.socket]] = []
+
+    def start(served: Any, token: str | None = None, **changed: Any) -> PolicyServer:
+        params = ServeParams.model_validate({"port": 0} | changed)
+        bound = listen(params)
+        server = PolicyServer(served, params, token, bound, served.said.append)
+        up = threading.Event()
+        thread = threading.Thread(target=server.run, args=(up.set,))
+        thread.start()
+        running.append((server, thread, bound))
+        assert up.wait(20)
+        return server
+
+    yield start
+    for server, thread, bound in running:
+        if thread.is_alive():
+            server.stop()
+        thread.join(20)
+        assert not thread.is_alive()
+        bound.close()
