@@ -9,7 +9,6 @@ from numpy import ndarray
 from torch import Tensor
 
 from pipeline.base.config import TuningParams, VLMParams
-from pipeline.vlm.feature_spec import row_key
 from pipeline.vlm.live import LiveVLM, live_spec
 from pipeline.vlm.preparation import Preparer
 
@@ -40,10 +39,3 @@ class LiveFeatures:
         batches = [self._model(rows[at : at + _ROWS]) for at in range(0, len(rows), _ROWS)]
         features, valid = zip(*batches, strict=True)
         return torch.cat(features).cpu(), torch.cat(valid).cpu()
-
-    def key(
-        self, frames: Mapping[str, "UInt8[ndarray, 'height width 3']"], instruction: str
-    ) -> bytes:
-        """The row key of these frames: a store that has this row has it by this key."""
-        prompt = self._preparer.render(instruction, tuple(frames))
-        return row_key(self._model.spec, prompt, frames)

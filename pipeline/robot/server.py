@@ -17,6 +17,7 @@ import threading
 import traceback
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from http import HTTPStatus
 from itertools import count
 from time import perf_counter
@@ -125,7 +126,8 @@ class PolicyServer:
 
     def stop(self) -> None:
         """Have `run` end, from any thread, once it has begun: what is under way is answered."""
-        self._stop()
+        with suppress(RuntimeError):  # it has ended
+            self._stop()
 
     async def _run(self, started: Callable[[], None]) -> bool:
         loop, ended, signals = asyncio.get_running_loop(), asyncio.Event(), list[int]()

@@ -20,9 +20,11 @@ from pipeline.policy.checkpoint import PolicyCheckpoint, find_policy, load_polic
 from pipeline.policy.observation import moving_channels
 from pipeline.policy.policy import Policy
 from pipeline.robot.features import LiveFeatures
+from pipeline.robot.first_look import FirstLook
 from pipeline.robot.guides import stack_guides
 from pipeline.robot.memory import RobotMemory, SeenFeatures, WindowSize
 from pipeline.robot.observation import ObservationReader, RobotObservation
+from pipeline.robot.proof import prove
 
 PROTOCOL = 1
 """Of observations, answers and metadata."""
@@ -90,8 +92,6 @@ class ServedPolicy:
         Raises `CheckpointMismatch` where the model gives other features, `CheckpointIncomplete` as
         `find_policy`, and `VLMError` as `LiveVLM.load`.
         """
-        from pipeline.robot.proof import FirstLook, prove
-
         checkpoint = load_policy(find_policy(folder))
         target = resolve_device(device)
         policy = checkpoint.policy(target)
