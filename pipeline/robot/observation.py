@@ -11,8 +11,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.base.clock import CLOCK_SLACK_S
 from pipeline.base.errors import ObservationError
-from pipeline.base.observation import CLOCK_SLACK_S
 from pipeline.robot.chunking import PlanGuide
 
 LONGEST_PROMPT: Final = 1000
