@@ -1,0 +1,74 @@
+"""Rollouts over the wire are those in process, and what cannot be the same is refused."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+
+from pipeline.base.config import RolloutParams
+from pipeline.base.errors import CheckpointMismatch, ConfigError
+from pipeline.evaluate.rollouts import Rollouts, roll_out
+from pipeline.evaluate.served_rollouts import roll_out_served
+from pipeline.robot.client import PolicyClient
+
+Served = Callable[..., Any]
+
+
+def over_the_wire(served: Any, serving: Served, **changed: Any) -> Rollouts:
+    wanted = RolloutParams.model_validate({"episodes": 1, "seed": 77} | changed)
+    with PolicyClient(f"ws://{serving(served).address}") as client:
+        return roll_out_served(client, wanted)
+
+
+@pytest.mark.parametrize(
+    ("model_type", "changed"),
+    [
+        ("regression", {}),
+        ("regression", {"chunking": "temporal"}),
+        ("regression", {"level": "moved", "seed": 78}),
+        ("flow_matching", {}),
+        ("flow_matching", {"chunking": "rtc"}),
+        ("diffusion", {}),
+    ],
+)
+def test_the_same_seed_gives_the_same_episode_bit_for_bit(
+    model_type: str, changed: dict[str, Any], served_policy: Served, serving: Served
+) -> None:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        served = served_policy(model_type)
+        wired = over_the_wire(served, serving, **changed)
+        alone = RolloutParams.model_validate({"episodes": 1, "seed": 77, "ablations": []} | changed)
+        load: Any = lambda: served.glance  # noqa: E731
+        here = roll_out(served.checkpoint, "models/head", served.policy, load, alone)
+    finally:
+        torch.set_num_threads(threads)
+    assert wired.document() == here.document()
+    for policy in (True, False):
+        assert wired.table(policy).csv() == here.table(policy).csv()
+    for name, values in vars(here.episodes[0].trace).items():
+        assert (getattr(wired.episodes[0].trace, name) == values).all(), name
+
+
+def test_several_steps_of_a_chunk_are_played_between_two_questions(
+    served_policy: Served, serving: Served
+) -> None:
+    served = served_policy()
+    wired = over_the_wire(served, serving, execute=4)
+    ticks = wired.of("policy")[0].ticks
+    # Frames go along with every question then: more than `vlm_reuse_count` ticks lie between.
+    assert len(served.glance.passes) == -(-ticks // 4)
+
+
+def test_a_latency_is_not_simulated_over_the_wire(served_policy: Served, serving: Served) -> None:
+    with pytest.raises(ConfigError, match="without rollout.server to simulate it"):
+        over_the_wire(served_policy(), serving, latency_ms=300)
+
+
+def test_another_robots_server_is_refused(served_policy: Served, serving: Served) -> None:
+    served = served_policy()
+    served.metadata = served.metadata | {"action_hz": 30.0}
+    with pytest.raises(CheckpointMismatch, match="action_hz 30.0, of the phantom 10"):
+        over_the_wire(served, serving)
