@@ -12,9 +12,10 @@ from pipeline.simulation.environment import InsertionEnvironment
 
 def main(url: str = "ws://127.0.0.1:8000", seed: int = 1_000_000) -> None:
     """One episode: observe, ask for a chunk, do its first step, until it ends."""
-    arm = InsertionEnvironment(level="full")
-    readings, info = arm.reset(seed=seed)
     with PolicyClient(url) as client:
+        names = client.metadata["streams"]["action"]["names"]
+        arm = InsertionEnvironment("full", "rotvec" if "rx" in names else "euler_delta")
+        readings, info = arm.reset(seed=seed)
         executor = Executor("none", 1, client.metadata["horizon"], client.metadata["moving"])
         client.reset(seed)
         ended = False

@@ -115,7 +115,7 @@ class PolicyServer:
         self._numbers, self._answering = count(1), 0
         self._idle: set[ServerConnection] = set()
         self._stopping = False
-        self._stop: Callable[[], None] = lambda: None
+        self._stop: Callable[[], object] = lambda: None
 
     def run(self, started: Callable[[], None] = lambda: None) -> bool:
         """Serve; whether a signal ended it. `started` is called once connections are taken."""

@@ -98,7 +98,9 @@ class ServedPolicy:
         features = None
         if "features" in policy.encoders:
             features = LiveFeatures(vlm, checkpoint.source["feature_spec"], str(target))
-            say(str(prove(checkpoint, features, say)))
+            proof = prove(checkpoint, features, say)
+            if proof.rows:
+                say(str(proof))
         return cls(checkpoint, policy, features, str(folder), FirstLook(checkpoint), say)
 
     def session(self, fresh: bool = True, seed: int = 0) -> "Session":
