@@ -4,8 +4,9 @@
 
 Run where params.yaml is. What is right: the first frames and states of every recorded episode of
 `data` and of simulated episodes at each level (with --moments: those of many moments of each
-recording, and of no simulation), as they are and under other lamps. What is wrong: the same with views exchanged in every way, red
-and blue exchanged in all views or in one, states in radians or metres, and in other orders.
+recording, and of no simulation), as they are and under other lamps. What is wrong: the same with
+views exchanged in every way, red and blue exchanged in all views or in one, states in radians or
+metres, and in other orders.
 
 The last line is JSON: of each reading how many were refused, and how many there were.
 """

@@ -118,7 +118,7 @@ def _better(seen: Palette, own: Sequence[Palette], other: Sequence[Palette]) -> 
     )
     as_other = _apart(seen, other)
     clearly = as_other < CLEARLY * _apart(seen, own)
-    return told_apart and clearly and as_other <= _ALIKE * max(other_left)
+    return told_apart and clearly and as_other <= _ALIKE * max(_LEAST, *other_left)
 
 
 def _but(kind: Sequence[Palette], left_out: Palette) -> list[Palette]:
