@@ -3,9 +3,10 @@
     python -m experiments.first_look CHECKPOINT [--episodes N] [--moments]
 
 Run where params.yaml is. What is right: the first frames and states of every recorded episode of
-`data` (with --moments: those of many moments of each), and of simulated episodes at each level
-where the recordings are the demo's. What is wrong: the same with views exchanged in every way, red
-and blue exchanged in all views or in one, states in radians or metres, and in other orders.
+`data` and of simulated episodes at each level (with --moments: those of many moments of each
+recording, and of no simulation), as they are and under other lamps. What is wrong: the same with
+views exchanged in every way, red and blue exchanged in all views or in one, states in radians or
+metres, and in other orders.
 
 The last line is JSON: of each reading how many were refused, and how many there were.
 """
@@ -33,6 +34,13 @@ from pipeline.simulation.environment import InsertionEnvironment
 FIRST_SEED = 2_000_000
 MOMENTS = 40
 """Of a recording that are looked at, evenly spread."""
+LAMPS = {
+    "half as bright": (0.5, 0.5, 0.5),
+    "a third brighter": (1.33, 1.33, 1.33),
+    "warmer lamp": (1.2, 1.0, 0.8),
+    "colder lamp": (0.8, 1.0, 1.2),
+}
+"""Gains of red, green and blue under which what is right stays right."""
 
 Frames = dict[str, NDArray[np.uint8]]
 State = NDArray[np.floating[Any]] | None
@@ -44,7 +52,7 @@ def main() -> None:
     parser = ArgumentParser("experiments.first_look", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("--episodes", type=int, default=200, help="simulated, of each level")
-    parser.add_argument("--moments", action="store_true", help="many of each recording, no demo")
+    parser.add_argument("--moments", action="store_true", help="many of each recording")
     wanted = parser.parse_args()
     checkpoint = load_policy(find_policy(wanted.checkpoint))
     look, counts, refused = FirstLook(checkpoint), Counter[str](), Counter[str]()
@@ -93,6 +101,9 @@ def _readings(
 ) -> Iterator[Seen]:
     """The right reading, then every wrong one."""
     yield f"right ({where})", frames, state
+    for lamp, gain in LAMPS.items():
+        lit = {v: (frame * np.array(gain)).clip(0, 255).astype("u1") for v, frame in frames.items()}
+        yield f"right, {lamp}", lit, state
     views = sorted(frames)
     for order in permutations(views):
         if moved := [v for v, shown in zip(views, order, strict=True) if v != shown]:

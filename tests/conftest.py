@@ -61,7 +61,9 @@ from pipeline.simulation.insertion_formats import write_raw
 from pipeline.simulation.recorder import simulate_episode
 from pipeline.store import SCHEMA, FeatureStore, Sizes, StoreBuild, arrays, schema
 from pipeline.store.chunks import ChunkFiles, row_checksums
+from pipeline.store.golden import GoldenFrames, write_golden
 from pipeline.store.metadata import note_metadata
+from pipeline.store.paths import read_attributes
 from pipeline.store.schema import read_specs
 from pipeline.vlm.demo_checkpoint import write_demo_checkpoint
 
@@ -120,6 +122,33 @@ def tiny_store(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
         return Path(shutil.copytree(originals[key], folder / f"{name}.zarr"))
 
     return copied
+
+
+@pytest.fixture(scope="session")
+def tiny_golden(
+    tiny_store: Callable[..., Path], reseal: Callable[[Path], None]
+) -> Callable[..., Path]:
+    """`tiny_golden(folder, rows=(0, 7), ...)`: a `tiny_store` whose rows `rows` are golden."""
+
+    def made(folder: Path, rows: tuple[int, ...] = (0, 7), **changed: Any) -> Path:
+        path, rng = tiny_store(folder, **changed), np.random.default_rng(len(rows))
+        frames = [{"View1": rng.integers(0, 256, (6, 8, 3), np.uint8)} for _ in rows]
+        golden = [
+            GoldenFrames(row, "say: touch the dot", views)
+            for row, views in zip(rows, frames, strict=True)
+        ]
+        spec = read_attributes(path)["feature_spec"] | {"views": ["View1"]}
+        note_metadata(path, read_attributes(path) | {"feature_spec": spec})
+        count = read_specs(path)["vl/key"].shape[0]
+        keys = np.memmap(path / "vl/key/c/0/0", np.uint8, "r+", shape=(count, 16))
+        for one in golden:
+            keys[one.row] = np.frombuffer(one.key(spec), np.uint8)
+        keys.flush()
+        write_golden(path, golden)
+        reseal(path)
+        return path
+
+    return made
 
 
 @pytest.fixture(scope="session")

@@ -30,6 +30,8 @@ ONLY_IN = {
     "matplotlib": {"look"},
     "jinja2": {"look"},
     "gymnasium": {"simulation"},
+    "websockets": {"robot"},
+    "msgpack": {"robot"},
 }
 WITHOUT_TORCH = {"data"}
 STAGE_ONE = {"vlm", "data", "extract", "simulation"}

@@ -4,4 +4,8 @@ chunking.py, guides.py   how action chunks are played, and how the next continue
 memory.py                the newest readings and features of one robot, as a policy takes them
 features.py              frames -> features, by the very model that the policy was trained on
 loop.py                  one robot's loop, on whichever clock its readings bring
+observation.py           what a robot says, checked
+session.py               a served policy, and what it remembers of each robot
+server.py, status.py     it is served over a websocket, and a page shows how it goes
+wire.py, client.py       the messages, and the client; no torch
 """

@@ -23,15 +23,18 @@ from pipeline.policy.state_channels import expand
 Palette = NDArray[np.float64]
 Frames = Mapping[str, NDArray[np.uint8]]
 
-_PIXELS = (16, 12)
+_PIXELS = (64, 48)
 """Width and height that frames are shrunk to."""
 CLEARLY = 0.5
 """A wrong reading is refused where what is left unexplained is less than this share of what the
 right one leaves; `python -m experiments.first_look` measures it."""
+_LEAST = 2.0
+"""Grey levels, by which golden frames must be apart for two readings to be told apart at all."""
 _ALIKE = 3.0
 """And at most this many times what is left between the golden frames of a view."""
-_FAR, _NEAR = 10.0, 4.0
-"""Training standard deviations: a reading beyond the first is strange, within the other is not."""
+_STRANGE, _UNIT_FITS, _ORDER_FITS = 10.0, 8.0, 4.0
+"""Training standard deviations: beyond the first a reading is strange, within the others a reading
+in another unit or order fits. Right ones of the demo reach 7.7; of orders there are many."""
 _MOST_VIEWS = 6
 """Beyond, only exchanges of two views are tried."""
 _UNITS = {
@@ -75,8 +78,9 @@ class FirstLook:
         """Refuse an exchange of views in which every view fits another's golden frames better."""
         told = {view: _light(pixels) for view, pixels in seen.items()}
         golden = {view: [_light(one) for one in self._golden[view]] for view in told}
+        fits = {(v, w): _better(told[v], golden[v], golden[w]) for v, w in permutations(told, 2)}
         for reading in _exchanges(tuple(told)):
-            if all(_better(told[v], golden[v], golden[w]) for v, w in reading.items()):
+            if all(fits[pair] for pair in reading.items()):
                 shows = ", ".join(f"images/{v} shows {w}" for v, w in reading.items())
                 raise ObservationError(
                     f"views are exchanged: {shows}, going by the frames that the policy was "
@@ -109,10 +113,12 @@ def _better(seen: Palette, own: Sequence[Palette], other: Sequence[Palette]) -> 
         return False
     own_left, other_left = ([_apart(one, _but(kind, one)) for one in kind] for kind in (own, other))
     across = [_apart(one, other) for one in own] + [_apart(one, own) for one in other]
-    told_apart = (np.array(own_left + other_left) <= CLEARLY * np.array(across)).all()
+    told_apart = min(across) >= _LEAST and all(
+        left <= CLEARLY * apart for left, apart in zip(own_left + other_left, across, strict=True)
+    )
     as_other = _apart(seen, other)
     clearly = as_other < CLEARLY * _apart(seen, own)
-    return bool(told_apart and clearly and as_other <= _ALIKE * max(other_left))
+    return told_apart and clearly and as_other <= _ALIKE * max(_LEAST, *other_left)
 
 
 def _but(kind: Sequence[Palette], left_out: Palette) -> list[Palette]:
@@ -120,8 +126,11 @@ def _but(kind: Sequence[Palette], left_out: Palette) -> list[Palette]:
 
 
 def _apart(palette: Palette, kind: Sequence[Palette]) -> float:
-    """How far a palette is from the nearest of a kind: earth mover's distance, in grey levels."""
-    return min(float(np.abs(palette - one).mean()) for one in kind)
+    """How far a palette is from the nearest of a kind: root mean square, in grey levels.
+
+    Squares, so that what is small and of strong colour counts.
+    """
+    return min(float(np.sqrt(np.square(palette - one).mean())) for one in kind)
 
 
 def _exchanges(views: tuple[str, ...]) -> list[dict[str, str]]:
@@ -170,7 +179,7 @@ class _StateLook:
     def check(self, reading: NDArray[np.float64]) -> None:
         """Refuse a reading (channel,) that another unit, or another order, explains."""
         away = self._away(reading[None])[0]
-        strange = np.flatnonzero(away > _FAR)
+        strange = np.flatnonzero(away > _STRANGE)
         if not len(strange):
             return
         far = ", ".join(f"{self._names[c]} {reading[c]:.4g} ({away[c]:.0f})" for c in strange[:6])
@@ -178,7 +187,7 @@ class _StateLook:
         for unit, (name, factor) in ((u, way) for u in _UNITS for way in _UNITS[u]):
             of_unit = np.array([one == unit for one in self._units])
             scaled = np.where(of_unit, reading * factor, reading)
-            if of_unit[strange].all() and (self._away(scaled[None]) <= _NEAR).all():
+            if of_unit[strange].all() and (self._away(scaled[None]) <= _UNIT_FITS).all():
                 raise ObservationError(
                     f"{found}. Read as {name}, they fit: send {unit}, {factor:.6g} times as much."
                 )
@@ -195,8 +204,8 @@ class _StateLook:
     def _order(self, reading: NDArray[np.float64]) -> dict[int, int] | None:
         """Channel -> the place that its value came in, those that moved; None where none fits."""
         taken_as = self._away(np.repeat(reading[:, None], len(reading), axis=1))
-        places, channels = linear_sum_assignment(np.minimum(taken_as, _FAR) ** 2)
-        if not (taken_as[places, channels] <= _NEAR).all():
+        places, channels = linear_sum_assignment(np.minimum(taken_as, _STRANGE) ** 2)
+        if not (taken_as[places, channels] <= _ORDER_FITS).all():
             return None
         pairs = zip(channels.tolist(), places.tolist(), strict=True)
         return {channel: place for channel, place in pairs if channel != place}

@@ -74,7 +74,7 @@ def prove(
         )
         return Proof(0, 0.0, "", tolerance)
     rows = [_recomputed(row, features) for row in checkpoint.golden]
-    if any(row.refused(tolerance) for row in rows):
+    if any(row.refused(tolerance) or row.prompt != row.row.prompt for row in rows):
         raise CheckpointMismatch("\n".join(_refusal(spec, features, rows, tolerance)))
     worst = max(rows, key=lambda row: row.apart.relative.max())
     slot = slot_name(spec["slots"][worst.apart.worst])
@@ -98,17 +98,15 @@ def _refusal(
     beyond = [(row, slots) for row in rows if (slots := row.refused(tolerance))]
     lines = [
         f"{len(beyond)} of {len(rows)} golden rows are not the features that the policy was "
-        f"trained on. Computed again by the live model, slots deviate by more than {tolerance:.0e} "
-        "of their root mean square:"
+        f"trained on: computed again by the live model, slots deviate by more than {tolerance:.0e} "
+        "of their root mean square"
     ]
     for row, slots in beyond:
         shown = (_said(spec, row, slot) for slot in slots[:_SHOWN])
         more = f" and {len(slots) - _SHOWN} more" if len(slots) > _SHOWN else ""
         lines.append(f"  {row.row.instruction!r}: {', '.join(shown)}{more}")
-    for row, _ in beyond:
-        if row.prompt != row.row.prompt:
-            lines += [f"prompt, trained: {row.row.prompt!r}", f"prompt, live:    {row.prompt!r}"]
-            break
+    if (other := next((row for row in rows if row.prompt != row.row.prompt), None)) is not None:
+        lines += [f"prompt, trained: {other.row.prompt!r}", f"prompt, live:    {other.prompt!r}"]
     differing = live_differences(spec, features.spec.document)
     lines += [f"feature spec, {line} (trained -> live)" for line in differing] or [
         "The feature specs agree in every entry: so the weights in memory, the code that prepares "

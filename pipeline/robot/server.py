@@ -17,7 +17,8 @@ import threading
 import traceback
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import ExitStack, suppress
+from functools import partial
 from http import HTTPStatus
 from itertools import count
 from time import perf_counter
@@ -38,7 +39,7 @@ from pipeline.robot.status import ServerStatus, page
 TOKEN_VARIABLE: Final = "VLA_SERVE_TOKEN"
 CLOSING_S: Final = 30.0
 """How long an observation under way may keep the server from closing."""
-_GOING_AWAY, _TEXT, _BROKEN, _REFUSED, _FAILED, _FULL = 1001, 1003, 1007, 1008, 1011, 1013
+_GOING_AWAY, _TEXT, _BROKEN, _REFUSED, _FAILED = 1001, 1003, 1007, 1008, 1011
 _SHARED: Final = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
 
 
@@ -53,20 +54,18 @@ def read_token(params: ServeParams) -> str | None:
         try:
             token = params.token_file.read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(
-                f"{place}: expected a file with a token, found none: {error}"
-            ) from None
-    if token is None and not _is_loopback(params.host):
+            raise ConfigError(f"{place}: expected a token, found no such file: {error}") from None
+    if token is not None:
+        token = token.strip()
+        if not token or not token.isascii():
+            raise ConfigError(f"{place}: expected a token of ASCII characters, found none")
+    elif not _is_loopback(params.host):
         raise ConfigError(
             f"serve.host: {params.host} can be reached by other machines, so a token is expected, "
             "found none. Write one (openssl rand -hex 32) into a file that only you can read, name "
             f"it as serve.token_file or set {TOKEN_VARIABLE}, and give robots the same"
         )
-    if token is not None and not token.strip().isascii():
-        raise ConfigError(f"{place}: expected a token of ASCII characters, found others")
-    if token is not None and not token.strip():
-        raise ConfigError(f"{place}: expected a token, found an empty one")
-    return token and token.strip()
+    return token
 
 
 def listen(params: ServeParams) -> socket.socket:
@@ -74,23 +73,21 @@ def listen(params: ServeParams) -> socket.socket:
 
     Raises `ConfigError` where the address is not this machine's, or is taken.
     """
-    place = f"{params.host}:{params.port}"
-    try:
-        known = socket.getaddrinfo(params.host, params.port, type=socket.SOCK_STREAM)
-        family, kind, protocol, _, address = min(known, key=lambda entry: entry[0])
-        bound = socket.socket(family, kind, protocol)
-    except OSError as error:
-        raise ConfigError(f"serve.host: {place} cannot be listened on: {error}") from None
-    try:
-        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        bound.bind(address)
-    except OSError as error:
-        bound.close()
-        raise ConfigError(
-            f"serve.port: {place} cannot be listened on: {error.strerror}. Stop what "
-            "listens there, or choose another port (0 takes a free one)"
-        ) from None
-    return bound
+    with ExitStack() as undo:
+        try:
+            known = socket.getaddrinfo(params.host, params.port, type=socket.SOCK_STREAM)
+            family, kind, protocol, _, address = min(known, key=lambda entry: entry[0])
+            bound = undo.enter_context(socket.socket(family, kind, protocol))
+            bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            bound.bind(address)
+        except OSError as error:
+            raise ConfigError(
+                f"serve.port: {params.host}:{params.port} cannot be listened on: {error.strerror}. "
+                "Give an address of this machine as serve.host, and a port that is free (0 takes "
+                "one)"
+            ) from None
+        undo.pop_all()
+        return bound
 
 
 class PolicyServer:
@@ -110,12 +107,12 @@ class PolicyServer:
         host, port = bound.getsockname()[:2]
         self.address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
         self.status = ServerStatus(served.metadata)
-        # A thread a robot, for each has at most one observation under way, and one for the page.
-        self._threads = ThreadPoolExecutor(params.max_connections + 1, "robot")
+        # A thread a robot, for each has at most one observation under way.
+        self._threads = ThreadPoolExecutor(params.max_connections, "robot")
         self._numbers, self._answering = count(1), 0
         self._idle: set[ServerConnection] = set()
         self._stopping = False
-        self._stop: Callable[[], None] = lambda: None
+        self._stop: Callable[[], object] = lambda: None
 
     def run(self, started: Callable[[], None] = lambda: None) -> bool:
         """Serve; whether a signal ended it. `started` is called once connections are taken."""
@@ -217,15 +214,12 @@ class PolicyServer:
             return "refused: expected a message of bytes (msgpack), found a text", _TEXT
         busy = self._answering >= self._params.max_waiting
         self._answering += 1
-        loop = asyncio.get_running_loop()
+        think = partial(self._think, number, message, session, busy)
         try:
-            return await loop.run_in_executor(
-                self._threads, self._think, number, message, session, busy
-            ), None
-        except WireError as error:
-            return f"refused: {_line(error)}", _BROKEN
-        except ObservationError as error:
-            return f"refused: {_line(error)}", _REFUSED
+            return await asyncio.get_running_loop().run_in_executor(self._threads, think), None
+        except (WireError, ObservationError) as error:
+            code = _BROKEN if isinstance(error, WireError) else _REFUSED
+            return f"refused: {_line(error)}", code
         except PipelineError as error:
             return f"error: {_line(error)}", _FAILED
         except Exception as error:
@@ -237,8 +231,7 @@ class PolicyServer:
     def _think(self, number: int, message: bytes, session: Session, busy: bool) -> str | bytes:
         """The answer to a message, in a thread of its own."""
         began = perf_counter()
-        given = wire.unpack(message, self._params.max_message_mb * 2**20)
-        observation = session.take(given)
+        observation = session.take(wire.unpack(message, self._params.max_message_mb * 2**20))
         if busy:
             self.status.busy += 1
             return (
@@ -253,25 +246,25 @@ class PolicyServer:
         sent = answer if key is None else answer | {"feature_key": key.tobytes()}
         return wire.pack(sent)
 
-    async def _respond(self, connection: ServerConnection, request: Request) -> Response | None:
+    async def _respond(self, _: ServerConnection, request: Request) -> Response | None:
         """The answer to a request by HTTP; None where it opens a websocket."""
         path = urlsplit(request.path).path
         if path == "/healthz":
             return _response(HTTPStatus.OK, "OK\n")
         if (refusal := self._refusal(request)) is not None:
             return refusal
-        opens = "websocket" in request.headers.get("Upgrade", "").lower()
-        if path == "/" and opens:
-            return self._full(connection)
-        if path == "/":
+        opens = _header(request.headers, "Upgrade").lower() == "websocket"
+        if path == "/" and not opens:
             text, policy = page()
             shown = {"Content-Type": "text/html; charset=utf-8", "Content-Security-Policy": policy}
             return _response(HTTPStatus.OK, text, shown)
+        if not self._authorized(request.headers):
+            said = "expected the header Authorization: Api-Key <token>, with the server's token\n"
+            return _response(HTTPStatus.UNAUTHORIZED, said, {"WWW-Authenticate": "Api-Key"})
+        if path == "/":
+            return self._full()
         if path == "/status.json":
-            if not self._authorized(request.headers):
-                return _unauthorized()
-            loop = asyncio.get_running_loop()
-            text = await loop.run_in_executor(self._threads, self.status.json)
+            text = await asyncio.to_thread(self.status.json)
             return _response(HTTPStatus.OK, text, {"Content-Type": "application/json"})
         return _response(HTTPStatus.NOT_FOUND, "not here: /, /healthz, /status.json\n")
 
@@ -288,17 +281,13 @@ class PolicyServer:
             return _response(HTTPStatus.FORBIDDEN, "without a token only localhost is served\n")
         return None
 
-    def _full(self, connection: ServerConnection) -> Response | None:
-        """Why a websocket is not opened; None where it is."""
-        assert connection.request is not None
-        if not self._authorized(connection.request.headers):
-            return _unauthorized()
-        if len(self.status.robots) >= self._params.max_connections:
-            most = (
-                f"busy: {self._params.max_connections} robots are connected (serve.max_connections)"
-            )
-            return _response(HTTPStatus.SERVICE_UNAVAILABLE, f"{most}\n")
-        return None
+    def _full(self) -> Response | None:
+        """Why no more websockets are opened; None where they are."""
+        most = self._params.max_connections
+        if len(self.status.robots) < most:
+            return None
+        said = f"busy: {most} robots are connected (serve.max_connections)\n"
+        return _response(HTTPStatus.SERVICE_UNAVAILABLE, said)
 
     def _authorized(self, headers: Headers) -> bool:
         given = _header(headers, "Authorization").encode()
@@ -316,11 +305,6 @@ def _response(status: HTTPStatus, text: str, headers: Mapping[str, str] | None =
     all_headers = {"Content-Type": "text/plain; charset=utf-8", **_SHARED, **(headers or {})}
     all_headers |= {"Content-Length": str(len(body)), "Connection": "close"}
     return Response(status.value, status.phrase, Headers(all_headers), body)
-
-
-def _unauthorized() -> Response:
-    said = "expected the header Authorization: Api-Key <token>, with the server's token\n"
-    return _response(HTTPStatus.UNAUTHORIZED, said, {"WWW-Authenticate": "Api-Key"})
 
 
 async def _leave(connection: ServerConnection) -> None:

@@ -7,7 +7,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -31,14 +31,6 @@ PROTOCOL = 1
 
 Frames = Mapping[str, NDArray[np.uint8]]
 Answer = dict[str, Any]
-
-
-class Look(Protocol):
-    """What looks at a robot before it moves (`pipeline.robot.proof.FirstLook`)."""
-
-    def check(self, frames: Frames, state: NDArray[np.float32] | None) -> None:
-        """Raise `ObservationError` where this is not the robot that the policy was trained on."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -72,7 +64,7 @@ class ServedPolicy:
         policy: Policy,
         features: LiveFeatures | None,
         name: str = "",
-        look: Look | None = None,
+        look: FirstLook | None = None,
         say: Callable[[str], None] = print,
     ) -> None:
         """`features` is the model where the policy looks at features, and has been proved."""

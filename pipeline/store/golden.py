@@ -81,7 +81,7 @@ def golden_issues(
         try:
             _read(root, attributes, number, key)
         except StoreIncomplete as error:
-            yield Issue("error", "golden row", str(error), stream=GOLDEN)
+            yield Issue(severity="error", kind="golden row", message=str(error), stream=GOLDEN)
 
 
 def golden_files(root: Path, attributes: Mapping[str, Any]) -> set[Path]:

@@ -246,6 +246,8 @@ class TestStore:
         assert report is not None
         assert report.computed == report.rows == len(here.array("vl/time"))
         assert_same(params.extract.store, here)
+        golden = FeatureStore.open(params.extract.store).golden
+        assert [row.key for row in golden] == [row.key for row in here.golden]
         times, processes = workers.computed()
         assert set(times.values()) == {1}
         assert len(processes) == 2

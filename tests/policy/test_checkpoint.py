@@ -2,9 +2,11 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -14,6 +16,7 @@ from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch
 from pipeline.base.tuned_on import EpisodePart
 from pipeline.policy.checkpoint import (
     PolicyCheckpoint,
+    check_policy,
     find_policy,
     load_policy,
     save_policy,
@@ -195,3 +198,42 @@ def test_missing_weights_are_named(checkpoint: PolicyCheckpoint, tmp_path: Path)
     (tmp_path / "best/policy.safetensors").unlink()
     with pytest.raises(CheckpointIncomplete, match=r"policy\.safetensors.*no such file"):
         load_policy(tmp_path / "best")
+
+
+class TestGoldenRows:
+    @pytest.fixture
+    def golden(self, checkpoint, tiny_golden, tmp_path) -> PolicyCheckpoint:
+        store = FeatureStore.open(tiny_golden(tmp_path, name="golden"))
+        return replace(checkpoint, source=source_of(store), golden=store.golden)
+
+    def test_they_come_back_to_the_bit(self, golden, tmp_path):
+        save_policy(tmp_path / "best", golden)
+        loaded = load_policy(tmp_path / "best").golden
+        assert len(loaded) == 2
+        for before, after in zip(golden.golden, loaded, strict=True):
+            assert (before.key, before.prompt) == (after.key, after.prompt)
+            assert before.instruction == after.instruction
+            assert np.array_equal(before.features, after.features)
+            assert np.array_equal(before.slot_valid, after.slot_valid)
+            assert {*before.frames} == {*after.frames} == {"View1"}
+            assert np.array_equal(before.frames["View1"], after.frames["View1"])
+            assert after.frames["View1"].dtype == np.uint8
+
+    def test_a_checkpoint_without_them_loads(self, checkpoint, tmp_path):
+        save_policy(tmp_path / "best", checkpoint)
+        assert "golden" not in json.loads((tmp_path / "best/policy.json").read_text())
+        assert not (tmp_path / "best/golden.safetensors").exists()
+        assert load_policy(tmp_path / "best").golden == ()
+
+    @pytest.mark.parametrize("harm", ["altered", "gone"])
+    def test_damage_is_named(self, golden, tmp_path, harm):
+        save_policy(tmp_path / "best", golden)
+        path = tmp_path / "best/golden.safetensors"
+        content = bytearray(path.read_bytes())
+        content[-1] ^= 1
+        path.unlink()
+        if harm == "altered":
+            path.write_bytes(content)
+        for read in (load_policy, check_policy):
+            with pytest.raises(CheckpointIncomplete, match=r"golden\.safetensors: .*damaged"):
+                read(tmp_path / "best")

@@ -1,24 +1,32 @@
-"""A policy of the phantom with a stand-in for its model, served in this process."""
+"""A head trained on a recorded episode; and a policy of the phantom, a stand-in for its model and a
+server in this process."""
 
 import socket
 import threading
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from pipeline.base.config import ServeParams, TrainHeadParams
+from pipeline.base.config import Params, ServeParams, TrainHeadParams
 from pipeline.compat.unified import no_normalization
-from pipeline.policy.checkpoint import PolicyCheckpoint
+from pipeline.extract.run import extract
+from pipeline.policy.checkpoint import PolicyCheckpoint, find_policy, load_policy
 from pipeline.policy.observation import PolicyShape
 from pipeline.policy.policy import Policy
 from pipeline.robot.server import PolicyServer, listen
 from pipeline.robot.session import ServedPolicy
-from pipeline.simulation.insertion_formats import INSTRUCTION
+from pipeline.simulation.insertion_formats import INSTRUCTION, write_raw
+from pipeline.simulation.recorder import simulate_episode
 from pipeline.simulation.rendering import VIEWS
+from pipeline.store import FeatureStore
+from pipeline.train.loop import Trainer
+from pipeline.train.run import open_run
+from pipeline.train.split import split_by_episode
 
 SLOTS, DIM = 2, 4
 GROUPS = ("translation",) * 3 + ("rotation",) * 3 + ("gripper",)
@@ -172,3 +180,45 @@ def serving() -> Any:
         thread.join(20)
         assert not thread.is_alive()
         bound.close()
+
+
+@pytest.fixture(scope="package")
+def params(
+    tmp_path_factory: pytest.TempPathFactory,
+    demo_checkpoint: Path,
+    tiny_head: Callable[..., dict[str, Any]],
+) -> Params:
+    """Params of one recorded episode, whose store is extracted."""
+    root = tmp_path_factory.mktemp("live")
+    write_raw(root / "raw" / "Red_point", simulate_episode(5, 1.7e9))
+    vlm = {
+        "checkpoint": str(demo_checkpoint),
+        "image_resize_height": 56,
+        "image_resize_width": 84,
+        "dtype": "float32",
+        "pooling": ["mean", "grid"],
+    }
+    document = {
+        "data": {"root": str(root), "sources": [{"name": "raw", "path": "raw"}]},
+        "vlm": vlm,
+        "extract": {"store": str(root / "store.zarr")},
+        "train_head": tiny_head(root),
+    }
+    params = Params.model_validate(document)
+    extract(params, say=lambda _: None)
+    return params
+
+
+@pytest.fixture(scope="package")
+def head(params: Params) -> Path:
+    """The output of a training of a few steps."""
+    wanted, store = params.train_head, FeatureStore.open(params.extract.store)
+    split = split_by_episode(store, wanted.split, wanted.horizon)
+    Trainer(store, wanted, split, open_run(wanted, store)).fit()
+    return wanted.output
+
+
+@pytest.fixture(scope="package")
+def checkpoint(head: Path) -> PolicyCheckpoint:
+    """The policy of that training."""
+    return load_policy(find_policy(head))

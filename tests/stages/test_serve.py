@@ -111,7 +111,7 @@ def observe_phantom() -> dict[str, Any]:
     [
         (["serve.checkpoint=nowhere"], "expected a checkpoint"),
         (["serve.host=0.0.0.0"], "serve.host: 0.0.0.0 can be reached by other machines"),
-        (["serve.token_file=nowhere.txt"], "serve.token_file: nowhere.txt: expected a file"),
+        (["serve.token_file=nowhere.txt"], "serve.token_file: nowhere.txt: expected a token"),
         (["serve.port=70000"], "serve.port"),
         (["serve.max_connections=0"], "serve.max_connections"),
         (["vlm.image_resize_width=112"], "the policy was trained on other features"),

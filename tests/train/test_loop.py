@@ -16,7 +16,7 @@ import torch
 
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.durable import read_document
-from pipeline.base.errors import NumericsError
+from pipeline.base.errors import NumericsError, StoreIncomplete
 from pipeline.policy.checkpoint import load_policy
 from pipeline.store import FeatureStore
 from pipeline.train.batches import Windows
@@ -379,3 +379,24 @@ def test_on_a_gpu_a_run_is_stopped_resumed_and_judged(
         best.normalization,
     )
     assert comparison.overall("policy") == pytest.approx(best.metrics["val/error"], rel=1e-3)
+
+
+class TestGoldenRows:
+    def test_both_checkpoints_carry_those_of_the_store(
+        self, tiny_golden, params, trainer, tmp_path
+    ):
+        store = FeatureStore.open(tiny_golden(tmp_path))
+        done = trainer(store, params(max_steps=5))
+        done.fit()
+        for name in ("best", "last"):
+            carried = load_policy(done.run.output / name).golden
+            assert [row.key for row in carried] == [row.key for row in store.golden]
+            assert np.array_equal(carried[1].features, store.golden[1].features)
+
+    def test_a_damaged_one_stops_a_training_before_it_begins(
+        self, tiny_golden, params, trainer, tmp_path
+    ):
+        store = FeatureStore.open(tiny_golden(tmp_path))
+        (store.path / "golden/1/View1/c/0/0/0").unlink()
+        with pytest.raises(StoreIncomplete, match="golden frames and prompt of VL row 7"):
+            trainer(store, params(max_steps=5))

@@ -299,7 +299,7 @@ class ServeParams(Section):
     """Of what a policy draws for a robot that sends no seed."""
     max_connections: int = Field(default=8, ge=1)
     """Robots at a time."""
-    max_waiting: int = Field(default=4, ge=1)
+    max_waiting: int = Field(default=8, ge=1)
     """Observations that are answered or wait at a time; who sends one more is told: busy."""
     max_message_mb: int = Field(default=64, ge=1, le=1024)
     """Of one observation, in MiB."""

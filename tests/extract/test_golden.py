@@ -1,0 +1,156 @@
+"""Extraction keeps golden rows: fresh, resumed, taken over and repaired builds alike."""
+
+import filecmp
+import shutil
+
+import numpy as np
+import pytest
+import zarr
+from PIL import Image
+
+from pipeline.base.config import Params
+from pipeline.data.row_range import RowRange
+from pipeline.extract import extract
+from pipeline.extract.repair import repair
+from pipeline.store import FeatureStore, StoreBuild
+from pipeline.store.golden import GOLDEN
+from pipeline.store.verification import verify
+from pipeline.vlm.preparation import Preparer
+from pipeline.vlm.qwen import FrozenVLM
+
+
+def quiet(line: str) -> None:
+    """What is said is not looked at."""
+
+
+def assert_golden(params: Params) -> FeatureStore:
+    """The store has four golden rows of both views that give their keys, and is sound."""
+    store = FeatureStore.open(params.extract.store)
+    assert [[*golden.frames] for golden in store.golden] == [["View1", "View2"]] * 4
+    rows = [entry["row"] for entry in store.attrs[GOLDEN]]
+    full = np.flatnonzero(np.isfinite(store.array("vl/frame_time")).all(axis=1))
+    assert (rows[0], rows[-1]) == (full[0], full[-1])
+    checked = verify(store.path, threads=1)
+    assert checked.sound, checked.lines()
+    return store
+
+
+def without_model(*args: object, **kwargs: object) -> None:
+    raise AssertionError("nothing needs the model")
+
+
+class TestBuilds:
+    def test_a_fresh_build(self, params, extracted):
+        store = assert_golden(params)
+        preparer, golden = Preparer(params.vlm, _Views()), store.golden[0]
+        assert golden.instruction == store.episodes[_episode(store, 0)].instruction
+        assert golden.prompt == preparer.render(golden.instruction, [*golden.frames])
+
+    def test_every_file_opens_in_plain_zarr_without_a_warning(self, params, extracted):
+        group = zarr.open_group(params.extract.store, mode="r")
+        names = [name for name, _ in group.members(max_depth=None)]
+        assert {f"golden/{n}/View{view}" for n in range(4) for view in (1, 2)} <= {*names}
+
+    def test_the_same_input_gives_the_same_bytes(self, params, changed, extracted, tmp_path):
+        other = changed(extract={"store": str(tmp_path / "other.zarr")})
+        extract(other, quiet)
+        places = [params.extract.store / GOLDEN, other.extract.store / GOLDEN]
+        files = [path.relative_to(places[0]) for path in places[0].rglob("*") if path.is_file()]
+        assert len(files) == 1 + 4 + 8 * 2
+        assert filecmp.cmpfiles(*places, [*map(str, files)], shallow=False)[0] == [*map(str, files)]
+
+    def test_of_rows_that_are_taken_over_those_four_alone_are_decoded(
+        self, params, changed, extracted, monkeypatch
+    ):
+        decoded: list[int] = []
+        real = RowRange.read
+
+        def read(self):
+            decoded.extend(self.rows.tolist())
+            return real(self)
+
+        monkeypatch.setattr(FrozenVLM, "load", without_model)
+        monkeypatch.setattr(RowRange, "read", read)
+        report = extract(changed(extract={"sensor_dtype": "float16"}), quiet)
+        assert report is not None and report.taken == report.rows
+        store = assert_golden(params)
+        assert decoded == [entry["row"] for entry in store.attrs[GOLDEN]]
+
+    def test_an_earlier_stores_rows_get_theirs(self, params, changed, extracted):
+        shutil.rmtree(params.extract.store / GOLDEN)
+        group = zarr.open_group(params.extract.store, mode="r+")
+        del group.attrs[GOLDEN]
+        assert FeatureStore.open(params.extract.store).golden == ()
+        extract(changed(extract={"sensor_dtype": "float16"}), quiet)
+        assert_golden(params)
+
+    def test_pixels_that_are_decoded_otherwise_today_are_left_out_and_said(
+        self, params, changed, extracted, monkeypatch
+    ):
+        real = Image.Image.convert
+        monkeypatch.setattr(
+            Image.Image,
+            "convert",
+            lambda *args, **kw: real(*args, **kw).point(lambda value: min(255, value + 8)),
+        )
+        said: list[str] = []
+        extract(changed(extract={"sensor_dtype": "float16"}), said.append)
+        assert any(line.startswith("4 golden row(s) left out: decoded today") for line in said)
+        store = FeatureStore.open(params.extract.store)
+        assert store.golden == ()
+        assert store.attrs[GOLDEN] == []
+        assert verify(store.path, threads=1).sound
+
+
+class TestKills:
+    @pytest.mark.parametrize("frames", [0, 3, 8])
+    def test_a_kill_while_they_are_written(self, params, monkeypatch, frames):
+        """With so many frames written; 8 is after the last, before sealing."""
+        written = iter(range(100))
+        from pipeline.store import golden
+
+        real = golden._write_frame
+
+        def killed(*args):
+            if next(written) == frames:
+                raise KeyboardInterrupt
+            real(*args)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(golden, "_write_frame", killed)
+            patch.setattr(StoreBuild, "seal", _raise)
+            with pytest.raises(KeyboardInterrupt):
+                extract(params, quiet)
+        assert not params.extract.store.exists()
+        monkeypatch.setattr(FrozenVLM, "load", without_model)
+        extract(params, quiet)
+        assert_golden(params)
+
+
+def test_a_repair_writes_them_anew(params, extracted, monkeypatch):
+    store = params.extract.store
+    before = FeatureStore.open(store).golden
+    (store / "golden/2/View1/c/0/0/0").write_bytes(b"rot")
+    checked = verify(store, threads=1)
+    assert [issue.kind for issue in checked.issues] == ["golden row"]
+    repair(checked, params, quiet)
+    monkeypatch.setattr(FrozenVLM, "load", without_model)
+    extract(params, quiet)
+    after = assert_golden(params).golden
+    assert [golden.key for golden in after] == [golden.key for golden in before]
+
+
+class _Views:
+    """As much of a spec as rendering a prompt needs."""
+
+    views = ("View1", "View2")
+    variants = 1
+
+
+def _raise(*args: object, **kwargs: object) -> None:
+    raise KeyboardInterrupt
+
+
+def _episode(store: FeatureStore, number: int) -> int:
+    row = store.attrs[GOLDEN][number]["row"]
+    return next(episode.index for episode in store.episodes if row in episode.vl_rows)

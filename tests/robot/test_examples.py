@@ -1,0 +1,32 @@
+"""Each example runs, and is as short as it says."""
+
+import runpy
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.simulation.insertion import MAX_TICKS
+
+ROOT = Path(__file__).resolve().parents[2]
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+MOST_LINES = 40
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
+def test_an_example_is_short(example: Path) -> None:
+    assert len(example.read_text(encoding="utf-8").splitlines()) <= MOST_LINES
+
+
+def test_the_simulated_arm_runs_over_the_wire(
+    served_policy: Callable[..., Any],
+    serving: Callable[..., Any],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    server = serving(served_policy())
+    main = runpy.run_path(str(ROOT / "examples" / "simulated_arm.py"))["main"]
+    main(f"ws://{server.address}", 78)
+    lines = capsys.readouterr().out.splitlines()
+    assert 20 < len(lines) <= MAX_TICKS and "features 0." in lines[0]
+    assert lines[-1] != "inserted"  # a policy of random weights

@@ -1,0 +1,182 @@
+"""Golden rows in a store: read back, proven, named where damaged, carried by merge and archive."""
+
+import filecmp
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+
+from pipeline.base.errors import StoreIncomplete
+from pipeline.base.golden import MOST_GOLDEN, row_key, spread
+from pipeline.store import FeatureStore, StoreBuild, part_path
+from pipeline.store.archive import archive, restore
+from pipeline.store.golden import GOLDEN, GoldenFrames
+from pipeline.store.merging import merge
+from pipeline.store.schema import read_specs
+from pipeline.store.verification import verify
+
+
+@pytest.fixture
+def store(tiny_golden: Callable[..., Path], tmp_path: Path) -> Path:
+    return tiny_golden(tmp_path)
+
+
+def files(root: Path) -> set[Path]:
+    return {path.relative_to(root) for path in root.rglob("*") if path.is_file()}
+
+
+class TestSound:
+    def test_a_row_comes_back_with_its_features_and_proves_its_key(self, store):
+        opened = FeatureStore.open(store)
+        assert len(opened.golden) == 2
+        for row, golden in zip((0, 7), opened.golden, strict=True):
+            assert golden.key == opened.array("vl/key")[row].tobytes()
+            assert golden.key == row_key("tiny-spec", ["View1"], golden.prompt, golden.frames)
+            assert golden.instruction == "touch the dot"
+            assert np.array_equal(golden.features, opened.array("vl/features")[row])
+            assert golden.slot_valid.all()
+            assert golden.frames["View1"].shape == (6, 8, 3)
+
+    def test_features_are_those_of_the_plain_frames_in_float32(self, tiny_golden, tmp_path):
+        opened = FeatureStore.open(tiny_golden(tmp_path, dtype="bfloat16"))
+        (golden, _), bits = opened.golden, opened.array("vl/features")[0]
+        assert golden.features.dtype == np.float32
+        assert np.array_equal((golden.features.view(np.uint32) >> 16).astype(np.uint16), bits)
+
+    def test_plain_zarr_reads_them(self, store):
+        frame = zarr.open_group(store, mode="r")["golden/1/View1"][:]
+        assert np.array_equal(frame, FeatureStore.open(store).golden[1].frames["View1"])
+
+    def test_the_whole_store_is_sound(self, store):
+        checked = verify(store, threads=1)
+        assert checked.sound, checked.lines()
+
+    def test_an_earlier_store_has_none_and_is_sound(self, tiny_store, tmp_path):
+        path = tiny_store(tmp_path)
+        assert FeatureStore.open(path).golden == ()
+        assert verify(path, threads=1).sound
+
+    def test_a_black_frame_is_kept_too(self, store):
+        black = GoldenFrames(0, "p", {"View1": np.zeros((4, 4, 3), np.uint8)})
+        build = StoreBuild(store.with_name("copy.zarr"), read_specs(store), "plan")
+        shutil.copytree(store, build.part)
+        build.write_golden([black])  # which is no frame of that row, and so left out
+        assert zarr.open_group(build.part, mode="r").attrs[GOLDEN] == []
+        build.files("vl/key").write(
+            0, np.frombuffer(black.key({"digest": "tiny-spec", "views": ["View1"]}), "u1")[None]
+        )
+        assert build.write_golden([black]) == 0
+        assert (build.part / "golden/0/View1/c/0/0/0").exists()
+        build.close()
+
+
+class TestDamage:
+    @pytest.mark.parametrize(
+        ("file", "said"),
+        [
+            ("golden/1/View1/c/0/0/0", "golden/1/View1: golden frame of VL row 7 cannot be read"),
+            ("golden/1/View1/zarr.json", "golden/1/View1: golden frame of VL row 7 cannot be read"),
+        ],
+    )
+    def test_a_flipped_bit_is_named(self, store, file, said):
+        content = bytearray((store / file).read_bytes())
+        content[3] ^= 64
+        (store / file).write_bytes(content)
+        self.assert_named(store, said)
+
+    def test_a_frame_that_is_gone_is_named(self, store):
+        (store / "golden/0/View1/c/0/0/0").unlink()
+        self.assert_named(store, "golden/0: golden frames and prompt of VL row 0 do not give the")
+
+    def test_a_row_that_is_gone_is_named(self, store):
+        shutil.rmtree(store / "golden/1")
+        self.assert_named(store, "golden/1/View1: golden frame of VL row 7 cannot be read")
+
+    def test_another_prompt_is_named(self, store, reseal):
+        group = zarr.open_group(store, mode="r+")
+        group.attrs[GOLDEN] = [{**entry, "prompt": "other"} for entry in group.attrs[GOLDEN]]
+        reseal(store)
+        self.assert_named(store, "golden/0: golden frames and prompt of VL row 0 do not give the")
+
+    def assert_named(self, store: Path, said: str) -> None:
+        checked = verify(store, threads=1)
+        assert said in checked.lines()[0]
+        assert {issue.kind for issue in checked.issues} == {"golden row"}
+        assert "--repair" in checked.advice()
+        with pytest.raises(StoreIncomplete, match="golden"):
+            _ = FeatureStore.open(store).golden
+        with pytest.raises(StoreIncomplete, match="golden"):
+            archive(store, store.with_name("copy.archive.zarr"), 1, 1)
+
+    def test_a_file_beside_them_is_strange(self, store):
+        (store / "golden/7").mkdir()
+        (store / "golden/7/mine").write_text("?")
+        (issue,) = verify(store, threads=1).issues
+        assert issue.kind == "strange file"
+
+
+class TestOtherStores:
+    def test_an_archive_gives_them_back_to_the_byte(self, store, tmp_path):
+        archive(store, tmp_path / "a.archive.zarr", 1, 1)
+        assert np.array_equal(
+            zarr.open_group(tmp_path / "a.archive.zarr", mode="r")["golden/0/View1"][:],
+            FeatureStore.open(store).golden[0].frames["View1"],
+        )
+        restore(tmp_path / "a.archive.zarr", tmp_path / "back.zarr", 1)
+        assert files(tmp_path / "back.zarr") == files(store)
+        same = filecmp.cmpfiles(store, tmp_path / "back.zarr", map(str, files(store)), False)
+        assert not same[1] and not same[2]
+        assert archive(store, tmp_path / "a.archive.zarr", 1, 1) is None, "it is there already"
+
+    def test_a_damaged_golden_row_of_an_archive_is_named(self, store, tmp_path):
+        archive(store, tmp_path / "a.archive.zarr", 1, 1)
+        chunk = tmp_path / "a.archive.zarr/golden/0/View1/c/0/0/0"
+        chunk.write_bytes(b"other")
+        with pytest.raises(StoreIncomplete, match="a golden frame is another one"):
+            restore(tmp_path / "a.archive.zarr", tmp_path / "back.zarr", 1)
+        chunk.unlink()
+        with pytest.raises(StoreIncomplete, match="no such file"):
+            restore(tmp_path / "a.archive.zarr", tmp_path / "back.zarr", 1)
+        assert (
+            not (tmp_path / "back.zarr").exists() and not part_path(tmp_path / "back.zarr").exists()
+        )
+
+    def test_a_merge_takes_some_of_all(self, tiny_golden, tmp_path):
+        inputs = [
+            tiny_golden(tmp_path, name="a", seed=1, rows=(1, 20, 40, 59)),
+            tiny_golden(tmp_path, name="b", seed=2, rows=(5, 50)),
+        ]
+        merge(inputs, tmp_path / "both.zarr")
+        merged = FeatureStore.open(tmp_path / "both.zarr")
+        assert [entry["row"] for entry in merged.attrs[GOLDEN]] == [1, 40, 59, 110]
+        assert verify(merged.path, threads=1).sound
+        before = FeatureStore.open(inputs[1]).golden[1]
+        after = merged.golden[3]
+        assert after.key == before.key
+        assert np.array_equal(after.features, before.features)
+
+    def test_a_merge_with_an_earlier_store_takes_those_that_there_are(
+        self, tiny_golden, tiny_store, tmp_path, reseal
+    ):
+        inputs = [tiny_golden(tmp_path, name="a", rows=()), tiny_golden(tmp_path, name="b", seed=3)]
+        merge(inputs, tmp_path / "both.zarr")
+        rows = [entry["row"] for entry in FeatureStore.open(tmp_path / "both.zarr").attrs[GOLDEN]]
+        assert rows == [60, 67]
+
+    def test_a_merge_refuses_a_damaged_one(self, store, tiny_golden, tmp_path):
+        other = tiny_golden(tmp_path, name="other", seed=4)
+        (store / "golden/0/View1/c/0/0/0").write_bytes(b"")
+        with pytest.raises(StoreIncomplete, match="golden frame of VL row 0 cannot be read"):
+            merge([store, other], tmp_path / "both.zarr")
+
+
+def test_rows_are_spread_over_those_with_the_most_views():
+    views = np.array([1] * 5 + [2] * 9)
+    chosen = spread(np.arange(14), views)
+    assert chosen.tolist() == [5, 8, 10, 13]
+    assert len(chosen) == MOST_GOLDEN
+    assert spread(np.arange(2), np.array([3, 3])).tolist() == [0, 1]
+    assert spread(np.arange(0), np.zeros(0, np.int64)).tolist() == []
