@@ -54,7 +54,7 @@ class Shorthand:
     value: str | None = None
     """What the value is called in the help; None for an option that takes none and means true."""
     nargs: str | None = None
-    """As argparse has it; `"*"` makes a list."""
+    """As argparse has it; `"*"` makes a list, `"?"` an option whose value may be left out: true."""
 
     @property
     def destination(self) -> str:
@@ -67,7 +67,10 @@ class Shorthand:
         if self.value is None:
             parser.add_argument(self.name, action="store_const", const=True, help=said)
         else:
-            parser.add_argument(self.name, metavar=self.value, nargs=self.nargs, help=said)
+            left_out: dict[str, Any] = {"const": True} if self.nargs == "?" else {}
+            parser.add_argument(
+                self.name, metavar=self.value, nargs=self.nargs, help=said, **left_out
+            )
 
     def override(self, options: argparse.Namespace) -> list[str]:
         """The `section.key=value` it stands for, if it was given."""

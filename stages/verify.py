@@ -7,6 +7,9 @@ where the store is sound; 2 with everything that is wrong and what to run next.
   python -m stages.verify --reextract 100   also compute 100 random rows again and compare them
   python -m stages.verify --repair          begin a new build without what is damaged, which
                                             stages.extract then completes
+  python -m stages.verify --checkpoint      no store: prove that the model of vlm gives the features
+                                            that the head of train_head.output was trained on
+  python -m stages.verify --checkpoint DIR  of another head
 
 The store itself is never written to.
 """
@@ -16,6 +19,13 @@ from stages.command import Shorthand, run
 SHORTHANDS = (
     Shorthand("--reextract", "verify.reextract", "random rows to compute again", value="N"),
     Shorthand("--repair", "verify.repair", "begin a new build without what is damaged"),
+    Shorthand(
+        "--checkpoint",
+        "verify.checkpoint",
+        "prove a checkpoint's golden rows instead",
+        "FOLDER",
+        "?",
+    ),
 )
 
 if __name__ == "__main__":  # here, for --help waits for no import below
@@ -23,15 +33,24 @@ if __name__ == "__main__":  # here, for --help waits for no import below
         run(__doc__ or "", "stages.verify", shorthands=SHORTHANDS, sections=("verify",))
     )
 
+from functools import partial
+
 from pipeline.base.config import Params
+from pipeline.base.device import resolve_device
 from pipeline.base.errors import NumericsError, StoreIncomplete
 from pipeline.extract.reextract import reextract
 from pipeline.extract.repair import repair
+from pipeline.policy.checkpoint import find_policy, load_policy
+from pipeline.robot.features import LiveFeatures
+from pipeline.robot.proof import prove
 from pipeline.store.verification import verify
 
 
 def main(params: Params) -> None:
     """Check, and repair or compute rows again where asked to; raises where something is wrong."""
+    if params.verify.checkpoint:
+        _prove(params)
+        return
     store = params.verify.store or params.extract.store
     checked = verify(store, params.verify.threads, params.verify.workers)
     print(checked.summary())
@@ -49,3 +68,13 @@ def main(params: Params) -> None:
         if computed.beyond:
             lines = [f"{store}: rows are not what they would be today:", *computed.refusals()]
             raise NumericsError("\n".join(lines))
+
+
+def _prove(params: Params) -> None:
+    """Compute the golden rows of the checkpoint again, as serving it would."""
+    named = params.verify.checkpoint
+    folder = find_policy(params.train_head.output if named in (None, True) else named)
+    checkpoint, device = load_policy(folder), resolve_device(params.extract.device)
+    trained, say = checkpoint.source["feature_spec"], partial(print, flush=True)
+    say(f"{folder} (step {checkpoint.step}): {len(checkpoint.golden)} golden rows, {device}")
+    prove(checkpoint, LiveFeatures(params.vlm, trained, str(device)), say)

@@ -56,3 +56,15 @@ class CheckpointMismatch(PipelineError, ValueError):
 
 class CheckpointIncomplete(PipelineError, RuntimeError):
     """A policy checkpoint is missing, unfinished or damaged."""
+
+
+class WireError(PipelineError, ValueError):
+    """A message between robot and server is not what it must be."""
+
+
+class ServerError(PipelineError, ConnectionError):
+    """A policy server cannot be reached, refuses the connection, or is gone."""
+
+
+class ServerBusy(ServerError):
+    """A policy server has more observations waiting than it takes; the connection stays."""

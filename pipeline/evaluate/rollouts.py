@@ -26,6 +26,7 @@ from pipeline.robot.features import LiveFeatures
 from pipeline.robot.guides import stack_guides
 from pipeline.robot.loop import ControlLoop, LoopTiming, SafeStop
 from pipeline.robot.memory import RobotMemory, SeenFeatures, WindowSize
+from pipeline.robot.proof import prove
 from pipeline.simulation.environment import InsertionEnvironment
 from pipeline.simulation.insertion import INSERTED, TICK_HZ, EpisodeTrace, NeedleInsertion
 from pipeline.simulation.insertion_formats import INSTRUCTION
@@ -169,15 +170,19 @@ def roll_out(
     `load_features` is called where the policy looks at features, once all that can be refused
     without it is known to be good. Raises `CheckpointMismatch` where the phantom has not what the
     policy was trained on, `ConfigError` for an instruction that it was not, for chunking that its
-    expert cannot do and for more steps than a chunk has.
+    expert cannot do and for more steps than a chunk has. Before the first episode the model proves
+    that it gives the policy's features, as `prove` does.
     """
     refuse_other_robot(checkpoint)
     check_chunking(wanted.chunking, policy.stochastic)
     Executor(wanted.chunking, wanted.execute, policy.params.horizon)
+    features = load_features() if "features" in policy.encoders else None
+    if features is not None:
+        prove(checkpoint, features, say)
     driver = _Driver(
         checkpoint,
         policy,
-        load_features() if "features" in policy.encoders else None,
+        features,
         wanted,
         instruction_of(checkpoint),
     )

@@ -23,19 +23,9 @@ from pipeline.extract.survey import survey
 from pipeline.store import FEATURES, FeatureStore
 from pipeline.store.verification import capped
 from pipeline.store.writer import environment_runs
+from pipeline.vlm.deviation import slot_deviations, tolerance_of
 from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.qwen import FrozenVLM
-
-# Largest deviation of a number, relative to the root mean square of its slot, by the coarser of
-# compute and storage dtype.
-#
-# Measured with the demo checkpoint on a CPU, against batches of 8 on one thread: batches of 1 and
-# 3, two threads and eager attention move a number of 16 rows x 49 slots x 128 by at most 7e-6 in
-# float32, 0.012 in float16 and 0.070 in bfloat16 (two of its steps after four layers). Deeper
-# models gather more, so a few times that is allowed, and in float32, where nothing is lost by it,
-# a hundred times, for GPUs sum in other orders. What is wrong in earnest is far beyond: another
-# frame, prompt or weight moves numbers by about their own size.
-TOLERANCES = {"float32": 1e-3, "float16": 5e-2, "bfloat16": 3e-1}
 
 
 @dataclass(frozen=True)
@@ -123,8 +113,7 @@ def reextract(path: Path, params: Params, say: Callable[[str], None]) -> Reextra
     today = {episode.digest: episode.recording for episode in surveyed.episodes}
     known = [episode for episode in store.episodes if episode.digest in today]
     unchecked = tuple(episode.id for episode in store.episodes if episode.digest not in today)
-    dtypes = (store.spec["compute_dtype"], store.spec["storage_dtype"])
-    tolerance = options.tolerance or max(TOLERANCES[dtype] for dtype in dtypes)
+    tolerance = options.tolerance or tolerance_of(store.spec)
     stored = np.array([row for episode in known for row in episode.vl_rows], np.int64)
     drawn = np.random.default_rng(options.seed)
     rows = np.sort(drawn.choice(stored, min(options.reextract, len(stored)), replace=False))
@@ -156,15 +145,8 @@ def reextract(path: Path, params: Params, say: Callable[[str], None]) -> Reextra
 
 def _compare(store: FeatureStore, row: ReadyRow, features: NDArray[Any]) -> Deviation:
     """The stored row against the features (variant x slot, dim) of today, both as stored."""
-    numbers, today = (
-        widen(values).astype(np.float64) for values in (store.array(FEATURES)[row.row], features)
-    )
-    apart = np.abs(today - numbers).max(axis=-1)
-    rms = np.sqrt(np.mean(numbers**2, axis=-1))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        relative = np.where(apart == 0, 0.0, apart / rms)  # a slot of zeros may stay one
-    slot = int(np.argmax(np.nan_to_num(relative, nan=np.inf)))
+    apart = slot_deviations(widen(store.array(FEATURES)[row.row]), widen(features))
+    slot = apart.worst
     same_pixels = store.array("vl/key")[row.row].tobytes() == row.key
-    return Deviation(
-        row.row, float(apart.max()), float(relative[slot]), slot, same_pixels, row.where
-    )
+    absolute, relative = float(apart.absolute.max()), float(apart.relative[slot])
+    return Deviation(row.row, absolute, relative, slot, same_pixels, row.where)

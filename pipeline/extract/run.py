@@ -11,6 +11,7 @@ from pipeline.base.device import resolve_device
 from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.data.timeline import rate_notes
 from pipeline.extract.engine import ExtractionReport, fill
+from pipeline.extract.golden import keep_golden
 from pipeline.extract.layout import build_arrays, check_space, lay_out
 from pipeline.extract.plan import Say, StorePlaces, count_known, plan_lines, row_sources
 from pipeline.extract.survey import (
@@ -81,6 +82,7 @@ def _resume(
         if surveyed.params.extract.plan:
             return None
         report = fill(build, surveyed, row_sources(places.known, surveyed), digests, missing)
+        keep_golden(build, surveyed, say)
     places.put_in_place(build, surveyed, say)
     return report
 
@@ -117,6 +119,7 @@ def _begin(
         known = row_sources(places.known, surveyed)
         lay_out(build, checked, surveyed, known)
         report = fill(build, surveyed, known, digests, rows)
+        keep_golden(build, surveyed, say)
     places.put_in_place(build, surveyed, say)
     return report
 

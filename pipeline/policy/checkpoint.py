@@ -2,13 +2,14 @@
 
 The JSON carries the feature spec of the store it was trained from, the streams with their names
 and units, the normalisation, the params, and the episodes that it was trained on, chosen on and has
-never seen. No pickle.
+never seen. `golden.safetensors` holds the frames and features of the store's golden rows, where it
+has any, by which a live model proves that it gives these features. No pickle.
 
 A kill at any instant leaves the previous checkpoint or the new one.
 """
 
 import sys
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache
@@ -29,6 +30,7 @@ from pipeline.base.durable import (
     write_with_digest,
 )
 from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch, PipelineError
+from pipeline.base.golden import GoldenRow, row_key
 from pipeline.base.ownership import OutputKind
 from pipeline.base.tuned_on import EpisodePart
 from pipeline.policy.normalization import Normalization
@@ -43,7 +45,8 @@ if TYPE_CHECKING:
 
 FORMAT = 3
 """3: three sides of the split; 2 had two, so that what is reported had chosen the checkpoint."""
-WEIGHTS, DOCUMENT = "policy.safetensors", "policy.json"
+WEIGHTS, DOCUMENT, GOLDEN = "policy.safetensors", "policy.json", "golden.safetensors"
+_FRAMES = "frames/"
 _OF_THE_RUN = ("feed", "loggers", "scratch")
 """Params of a run that tell nothing of its policy; earlier versions had others of them."""
 CHECKPOINT = OutputKind("a checkpoint of a policy", lambda folder: (folder / DOCUMENT).is_file())
@@ -69,6 +72,8 @@ class PolicyCheckpoint:
     metrics: Mapping[str, float] = field(default_factory=dict)
     instructions: tuple[str, ...] = ()
     """What the store's episodes were told; empty where an earlier version wrote the checkpoint."""
+    golden: tuple[GoldenRow, ...] = ()
+    """Empty where the store has none, or an earlier version wrote the checkpoint."""
 
     def policy(self, device: "torch.device | str" = "cpu") -> "Policy":
         """The policy with these weights, in evaluation mode; it knows its feature spec."""
@@ -95,8 +100,10 @@ class PolicyCheckpoint:
             return statistics.mean
         return np.array(typical_state(statistics.mean.tolist(), self.shape.kinds))
 
-    def document(self, weights_sha256: str) -> dict[str, Any]:
-        """The content of `policy.json`."""
+    def document(self, weights_sha256: str, golden_sha256: str | None = None) -> dict[str, Any]:
+        """The content of `policy.json`; the digests are those of the files beside it."""
+        said = [{"instruction": row.instruction, "prompt": row.prompt} for row in self.golden]
+        golden = {"golden": {"sha256": golden_sha256, "rows": said}} if said else {}
         return {
             "format": FORMAT,
             "step": self.step,
@@ -111,6 +118,7 @@ class PolicyCheckpoint:
             },
             "weights_sha256": weights_sha256,
             "normalization": self.normalization.document(),
+            **golden,
         }
 
 
@@ -123,8 +131,10 @@ def save_policy(
     """
 
     def write(temporary: Path) -> None:
-        digest = write_tensors(temporary / WEIGHTS, checkpoint.weights)
-        write_with_digest(temporary / DOCUMENT, checkpoint.document(digest))
+        digests = [write_tensors(temporary / WEIGHTS, checkpoint.weights)]
+        if checkpoint.golden:
+            digests.append(write_tensors(temporary / GOLDEN, _golden_tensors(checkpoint.golden)))
+        write_with_digest(temporary / DOCUMENT, checkpoint.document(*digests))
         beside(temporary)
 
     replace_folder(folder, write, CHECKPOINT)
@@ -186,6 +196,7 @@ def load_policy(folder: Path) -> PolicyCheckpoint:
             metrics=document["metrics"],
             instructions=tuple(document.get("instructions", ())),
             weights=read_tensors(folder / WEIGHTS, document["weights_sha256"]),
+            golden=_read_golden(folder, document),
         )
 
 
@@ -196,8 +207,47 @@ def check_policy(folder: Path) -> TrainHeadParams:
     """
     with _description(folder) as document:
         check_digest(folder / WEIGHTS, document["weights_sha256"])
+        if "golden" in document:
+            check_digest(folder / GOLDEN, document["golden"]["sha256"])
         Normalization.from_document(document["normalization"])
         return _params(document)
+
+
+def _golden_tensors(rows: Sequence[GoldenRow]) -> "dict[str, Tensor]":
+    """`<n>/features`, `<n>/slot_valid` and `<n>/frames/<view>` of each row n."""
+    import torch
+
+    return {
+        f"{number}/{name}": torch.from_numpy(np.array(values))
+        for number, row in enumerate(rows)
+        for name, values in {
+            "features": row.features,
+            "slot_valid": row.slot_valid,
+            **{f"{_FRAMES}{view}": frame for view, frame in row.frames.items()},
+        }.items()
+    }
+
+
+def _read_golden(folder: Path, document: Mapping[str, Any]) -> tuple[GoldenRow, ...]:
+    """The golden rows; their keys are those under the feature spec of the document."""
+    if "golden" not in document:
+        return ()
+    spec, rows = document["feature_spec"], list[GoldenRow]()
+    tensors = read_tensors(folder / GOLDEN, document["golden"]["sha256"])
+    for number, said in enumerate(document["golden"]["rows"]):
+        own = {
+            name.removeprefix(f"{number}/"): tensor.numpy()
+            for name, tensor in tensors.items()
+            if name.startswith(f"{number}/")
+        }
+        frames = {n.removeprefix(_FRAMES): own[n] for n in own if n.startswith(_FRAMES)}
+        key = row_key(spec["digest"], spec["views"], said["prompt"], frames)
+        rows.append(
+            GoldenRow(
+                key, **said, frames=frames, features=own["features"], slot_valid=own["slot_valid"]
+            )
+        )
+    return tuple(rows)
 
 
 def _params(document: Mapping[str, Any]) -> TrainHeadParams:

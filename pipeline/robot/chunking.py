@@ -5,12 +5,16 @@ Numpy only; `pipeline.robot.guides` makes tensors of guides.
 
 from collections import deque
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.base.config import Chunking
 from pipeline.base.errors import ConfigError
+
+# The robot's computer needs no pydantic.
+if TYPE_CHECKING:
+    from pipeline.base.config import Chunking
 
 Steps = NDArray[np.float32]
 
@@ -66,14 +70,14 @@ class Executor:
     """
 
     def __init__(
-        self, chunking: Chunking, execute: int, horizon: int, moving: ArrayLike | None = None
+        self, chunking: "Chunking", execute: int, horizon: int, moving: ArrayLike | None = None
     ) -> None:
         if not 1 <= execute <= horizon:
             raise ConfigError(
                 f"rollout.execute: expected 1 to {horizon}, the steps of a chunk "
                 f"(train_head.horizon), found {execute}"
             )
-        self.chunking: Chunking = chunking
+        self.chunking: "Chunking" = chunking
         self.execute, self.horizon = execute, horizon
         self._moving = np.asarray(False if moving is None else moving)
         self.reset()
@@ -188,7 +192,7 @@ def soft_mask(horizon: int, delay: int, overlap: int) -> Steps:
     return np.where(step < delay, 1, np.where(step < overlap, falling, 0)).astype(np.float32)
 
 
-def check_chunking(chunking: Chunking, stochastic: bool) -> None:
+def check_chunking(chunking: "Chunking", stochastic: bool) -> None:
     """Raise `ConfigError` where a policy cannot be guided: one that draws nothing."""
     if chunking == "rtc" and not stochastic:
         raise ConfigError(

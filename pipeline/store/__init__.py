@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.store.chunks import check_trailers
 from pipeline.store.episodes import Episode
+from pipeline.store.golden import GoldenFrames
 from pipeline.store.lock import build_lock
 from pipeline.store.paths import part_path, read_plan, recover
 from pipeline.store.reader import FeatureStore, episode_name, place
@@ -28,6 +29,7 @@ __all__ = [
     "Batch",
     "Episode",
     "FeatureStore",
+    "GoldenFrames",
     "RowSource",
     "Sizes",
     "StoreBuild",

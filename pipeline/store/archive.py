@@ -13,6 +13,7 @@ store to the byte. The manifest is written last: a folder that has one is a comp
 import hashlib
 import json
 import math
+import shutil
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
@@ -33,12 +34,21 @@ from pipeline.base.durable import disk_full_named, put_in_place, sync
 from pipeline.base.errors import StoreIncomplete, StoreMismatch
 from pipeline.base.ownership import OutputKind, begin_folder, remove_folder
 from pipeline.store.chunks import check_row_checksums, check_trailers, read_rows
+from pipeline.store.golden import GOLDEN, read_golden
 from pipeline.store.lock import build_lock
 from pipeline.store.metadata import ATTRIBUTE as METADATA_DIGEST
 from pipeline.store.paths import STORE, inode_of, part_path, read_plan, recover, refuse_replaced
 from pipeline.store.reader import FeatureStore
 from pipeline.store.repair_hints import extract_command, gc_command
-from pipeline.store.schema import CHECKSUMS, FEATURES, GROUPS, ArraySpec, chunk_paths, read_specs
+from pipeline.store.schema import (
+    CHECKSUMS,
+    FEATURES,
+    GROUPS,
+    KEYS,
+    ArraySpec,
+    chunk_paths,
+    read_specs,
+)
 from pipeline.store.writer import StoreBuild, sync_folders
 
 _SCHEMA = 1
@@ -73,6 +83,9 @@ class Manifest(BaseModel, frozen=True):
     metadata: dict[str, str]
     """Every `zarr.json` of the store, as text, by its path."""
     arrays: dict[str, ArchivedArray]
+    golden: dict[str, str] = {}
+    """The digest of each chunk file of the store's golden rows, by its path in it; copied as it is.
+    """
 
     @property
     def plan(self) -> str | None:
@@ -129,7 +142,7 @@ def archive(store: Path, output: Path, level: int, threads: int) -> Manifest | N
     Raises `StoreIncomplete` naming the file where the store is not finished or is damaged,
     `StoreMismatch` where something else lies at `output`, `StoreLocked` and `DiskFull`.
     """
-    FeatureStore.open(store)  # says what is wrong with something that is no finished store
+    opened = FeatureStore.open(store)  # says what is wrong with what is no finished store
     with build_lock(output):
         if output.exists():
             if is_archive(output) and _holds(read_manifest(output), store):
@@ -139,6 +152,7 @@ def archive(store: Path, output: Path, level: int, threads: int) -> Manifest | N
                 "away, or name another place with archive.output."
             )
         check_trailers(store)
+        read_golden(store, opened.attrs, opened.array(KEYS))
         with _begun(output, ARCHIVE, threads) as part:
             manifest = _write(store, part, level)
         put_in_place(part, output, ARCHIVE)
@@ -195,8 +209,10 @@ def _write(store: Path, part: Path, level: int) -> Manifest:
         arrays = {
             name: _write_array(store, part, spec, level, progress) for name, spec in specs.items()
         }
+    golden = _golden_digests(store)
+    _copy_golden(store, part, golden)
     refuse_replaced(store, inode)
-    manifest = Manifest(metadata=metadata, arrays=arrays)
+    manifest = Manifest(metadata=metadata, arrays=arrays, golden=golden)
     document = {"schema": _SCHEMA, **manifest.model_dump(mode="json")}
     document["digest"] = _digest_of(document)
     zarr.open_group(part, mode="r+").attrs.put({**of_groups[""], _MANIFEST: document})
@@ -250,6 +266,7 @@ def _rebuild(manifest: Manifest, archive: Path, target: Path, part: Path) -> Non
                     progress.update(len(rows) * spec.row_bytes)
                 build.files(name).write_trailers()
                 _check_rebuilt(part, spec, record, shards)
+        _copy_golden(archive, part, manifest.golden)
         build.finish()
         # With the root's attributes, which hold the plan, it is what an extraction would go on
         # with, or an earlier one have left, and so nothing that another restoration may remove.
@@ -344,7 +361,35 @@ def _holds(manifest: Manifest, store: Path) -> bool:
         trailers = {name: _trailers(store, spec) for name, spec in read_specs(store).items()}
     except (OSError, IndexError):
         return False
-    return trailers == {name: array.crc32c for name, array in manifest.arrays.items()}
+    same = trailers == {name: array.crc32c for name, array in manifest.arrays.items()}
+    return same and _golden_digests(store) == manifest.golden
+
+
+def _golden_digests(store: Path) -> dict[str, str]:
+    """The digest of each chunk file of a store's golden rows, by its path in it."""
+    paths = sorted(path for path in (store / GOLDEN).rglob("*") if path.is_file())
+    chunks = (path for path in paths if path.name != _ZARR_JSON)
+    return {path.relative_to(store).as_posix(): file_digest(path) for path in chunks}
+
+
+def _copy_golden(root: Path, to: Path, digests: Mapping[str, str]) -> None:
+    """Copy the chunk files of golden rows, and their metadata where they are not there yet.
+
+    Raises `StoreIncomplete` where one is missing or not the one that has its digest.
+    """
+    for name in digests:
+        (to / name).parent.mkdir(parents=True, exist_ok=True)
+        if not (root / name).exists():
+            raise _damaged(root / name, "no such file")
+        shutil.copyfile(root / name, to / name)
+        if file_digest(to / name) != digests[name]:
+            raise _damaged(root / name, "a golden frame is another one than was written")
+        sync(to / name)
+    for path in (root / GOLDEN).rglob(_ZARR_JSON):
+        place = to / path.relative_to(root)
+        if not place.exists():
+            place.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, place)
 
 
 def _trailers(store: Path, spec: ArraySpec) -> tuple[int, ...]:

@@ -22,9 +22,11 @@ from tqdm import tqdm
 
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import ConfigError, StoreMismatch
+from pipeline.base.golden import spread
 from pipeline.base.tuned_on import joined, of_store, store_attributes
 from pipeline.store.chunks import check_row_checksums, check_trailers, read_rows
 from pipeline.store.episodes import Episode, index_arrays
+from pipeline.store.golden import GOLDEN, GoldenFrames, read_golden
 from pipeline.store.lock import build_lock
 from pipeline.store.metadata import ATTRIBUTE as METADATA_DIGEST
 from pipeline.store.metadata import check_metadata
@@ -57,6 +59,8 @@ _COPIED = [
 _COUNTED = {stored.counted_by: stream for stream, stored in STREAMS.items()}
 """Array of positions -> the stream among whose rows they are."""
 _BLOCK_BYTES = 32 * 2**20
+_NOT_TAKEN = (METADATA_DIGEST, GOLDEN)
+"""Attributes of an input's root that would be false of the merged store."""
 
 
 @dataclass
@@ -180,6 +184,7 @@ def merge(inputs: Sequence[Path], output: Path) -> MergedEpisodes | None:
             else:
                 _lay_out(build, merged, inodes)
             _fill(build, merged)
+            build.write_golden(_golden(merged))
             build.seal()
     return merged
 
@@ -277,7 +282,7 @@ def _lay_out(build: StoreBuild, merged: MergedEpisodes, inodes: Sequence[Inode |
     streams = {name: merged.having(name).streams[name] for name in ("sensor", "state")}
     tuned = joined(of_store(store.attrs) for store in merged.stores)
     its_own = {"sources": merged.sources, "streams": first.streams | streams, "environment": []}
-    attrs = {name: value for name, value in first.attrs.items() if name != METADATA_DIGEST}
+    attrs = {name: value for name, value in first.attrs.items() if name not in _NOT_TAKEN}
     vl = zarr.open_group(first.path, path="vl", mode="r").attrs.asdict()
     build.finish_layout(attrs | its_own | store_attributes(tuned), vl)
 
@@ -325,3 +330,19 @@ def _fill(build: StoreBuild, merged: MergedEpisodes) -> None:
                     keys = [key.tobytes() for key in store.array(KEYS)[start:stop]]
                     build.commit(range(start + shift, stop + shift), values, keys, number)
                     progress.update(len(block))
+
+
+def _golden(merged: MergedEpisodes) -> list[GoldenFrames]:
+    """Golden rows of the merged store, chosen among those of the inputs and proven once more."""
+    inputs = {
+        store.path: read_golden(store.path, store.attrs, store.array(KEYS))
+        for store in merged.stores
+    }
+    given = [
+        replace(golden, row=golden.row + merged.shift(run, "vl"))
+        for run in merged.runs
+        for golden in inputs[run.store.path]
+        if golden.row in run.rows("vl")
+    ]
+    views = np.array([len(golden.frames) for golden in given], np.int64)
+    return [given[place] for place in spread(np.arange(len(given)), views)]

@@ -14,12 +14,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.base.bfloat16 import widen
 from pipeline.base.errors import StoreIncomplete
+from pipeline.base.golden import GoldenRow
 from pipeline.store.episodes import Episode, episode_of, read_episodes
+from pipeline.store.golden import GoldenFrames, read_golden
 from pipeline.store.mapping import map_flat
 from pipeline.store.paths import read_attributes
 from pipeline.store.repair_hints import mend
-from pipeline.store.schema import STREAMS, TRAILER_BYTES, ArraySpec, chunk_paths, read_specs
+from pipeline.store.schema import (
+    FEATURES,
+    KEYS,
+    STREAMS,
+    TRAILER_BYTES,
+    ArraySpec,
+    chunk_paths,
+    read_specs,
+)
 
 if TYPE_CHECKING:
     from pipeline.store.batch import Batch
@@ -121,6 +132,27 @@ class FeatureStore:
     def state_dim(self) -> int:
         """Channels of the robot state, 0 where the store has none."""
         return int(self._arrays["state/values"].shape[1])
+
+    @cached_property
+    def golden(self) -> tuple[GoldenRow, ...]:
+        """The golden rows with their features; none where an earlier version wrote the store.
+
+        Raises `StoreIncomplete` where the frames of one do not give its key.
+        """
+        proven = read_golden(self.path, self.attrs, self._arrays[KEYS])
+        return tuple(self._golden_row(frames) for frames in proven)
+
+    def _golden_row(self, golden: GoldenFrames) -> GoldenRow:
+        row, slots = golden.row, self.feature_shape[0]
+        episode = next(episode for episode in self.episodes if row in episode.vl_rows)
+        return GoldenRow(
+            key=self._arrays[KEYS][row].tobytes(),
+            instruction=episode.instruction,
+            prompt=golden.prompt,
+            frames=golden.frames,
+            features=widen(self._arrays[FEATURES][row, :slots]).astype(np.float32),
+            slot_valid=self._arrays["vl/slot_valid"][row, :slots].astype(np.bool_),
+        )
 
     @cached_property
     def episodes(self) -> tuple[Episode, ...]:

@@ -7,7 +7,7 @@ build stores: the trailers prove that they hold what was written.
 
 import os
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
@@ -26,6 +26,7 @@ from pipeline.base.finite import non_finite
 from pipeline.base.format import size
 from pipeline.base.issue import Issue
 from pipeline.store.chunks import find_damage, read_chunk, read_rows, row_checksums
+from pipeline.store.golden import golden_files, golden_issues
 from pipeline.store.metadata import metadata_damage
 from pipeline.store.paths import Inode, inode_of, read_attributes, read_plan, refuse_replaced
 from pipeline.store.reader import FeatureStore, map_array, place
@@ -35,6 +36,7 @@ from pipeline.store.schema import (
     CHECKSUMS,
     FEATURES,
     GROUPS,
+    KEYS,
     ROW_MULTIPLE,
     STREAMS,
     ArraySpec,
@@ -169,7 +171,8 @@ def verify(path: Path, threads: int, workers: int | str = 0) -> Verification:
         maps = {name: map_array(path, specs[name]) for name in names}
         store = FeatureStore(path, attributes, maps)
     issues += [issue for report in reports for issue in _issues(report, specs[report.array], store)]
-    issues += strange_files(path, specs)
+    issues += golden_issues(path, attributes, specs.get(KEYS))
+    issues += strange_files(path, specs, golden_files(path, attributes))
     refuse_replaced(path, inode)
     bad_rows = [report.rows.start + np.flatnonzero(report.faults) for report in reports]
     return Verification(
@@ -253,9 +256,11 @@ def capped(lines: Sequence[str], kind: str) -> list[str]:
     return [*lines[:MOST_LINES], *([f"and {more} more {kind}"] if more > 0 else [])]
 
 
-def strange_files(root: Path, specs: Mapping[str, ArraySpec]) -> Iterator[Issue]:
-    """Files that have no place in a store."""
-    expected = {root / place / "zarr.json" for place in ("", *GROUPS, *ARRAY_NAMES)}
+def strange_files(
+    root: Path, specs: Mapping[str, ArraySpec], golden: Collection[Path] = ()
+) -> Iterator[Issue]:
+    """Files that have no place in a store; `golden` are those of its golden rows."""
+    expected = {*golden} | {root / place / "zarr.json" for place in ("", *GROUPS, *ARRAY_NAMES)}
     expected |= {path for spec in specs.values() for path in chunk_paths(root, spec)}
     unjudged = tuple(str(root / name) + "/" for name in ARRAY_NAMES if name not in specs)
     files = (Path(folder) / file for folder, _, names in os.walk(root) for file in names)

@@ -13,7 +13,7 @@ ranges of rows in the store's attributes.
 
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from pipeline.base.durable import disk_full_named, put_in_place, sync
 from pipeline.base.errors import StoreIncomplete
 from pipeline.base.ownership import begin_folder
 from pipeline.store.chunks import ChunkFiles, find_damage, read_chunk, read_rows, row_checksums
+from pipeline.store.golden import GoldenFrames, write_golden
 from pipeline.store.metadata import metadata_damage, note_metadata
 from pipeline.store.paths import STORE, part_path
 from pipeline.store.schema import CHECKSUMS, FEATURES, INCREMENTAL, KEYS, ArraySpec, chunk_path
@@ -225,6 +226,21 @@ class StoreBuild:
         self.files(KEYS).sync()
         for run in runs:
             self.files(CHECKSUMS).write(int(rows[run[0]]), checksums[run])
+
+    def write_golden(self, rows: Iterable[GoldenFrames]) -> int:
+        """Keep the golden rows that give the key of their row; returns how many do not.
+
+        For a build whose rows are all there. Raises `DiskFull`.
+        """
+        attributes, files = zarr.open_group(self.part, mode="r").attrs.asdict(), self.files(KEYS)
+        given = list(rows)
+        proven = [
+            golden
+            for golden in given
+            if golden.key(attributes["feature_spec"]) == files.read(golden.row, 1).tobytes()
+        ]
+        write_golden(self.part, proven)
+        return len(given) - len(proven)
 
     def seal(self, *, keep: bool = False) -> None:
         """Check every row, write the trailers and put the store in its place.

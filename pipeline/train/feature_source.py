@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 
+from pipeline.base.golden import GoldenRow
 from pipeline.policy.policy import Policy, Trainable
 from pipeline.store import FeatureStore
 from pipeline.train.batches import BatchIndices, DeviceStore, Prefetch, Windows
@@ -30,6 +31,14 @@ class FeatureSource:
         """What to say of it, as lines for the user."""
         self._on_device = on_device
         self._resident: DeviceStore | None = None
+
+    @property
+    def golden(self) -> tuple[GoldenRow, ...]:
+        """What a checkpoint carries to prove a live model by: the store's golden rows.
+
+        Raises `StoreIncomplete` where one is damaged.
+        """
+        return self.store.golden
 
     def attach(self, policy: Policy) -> Trainable:
         """The module that is trained; it holds the policy."""

@@ -72,6 +72,7 @@ class Trainer:
         if source is None:
             source = FeatureSource(store, *choose_feed(params.feed, store, self.device))
         self.source = source
+        self.golden = source.golden  # now: a damaged one stops a run before it begins
         self.plan = Plan(store, params, split, self.world, run.section)
         self.step = 0
         if params.early_stopping is not None and not len(split.val):
@@ -345,6 +346,7 @@ class Trainer:
             step=self.step,
             weights=self.source.policy_of(self.averaged).state_dict(),
             metrics=metrics,
+            golden=self.golden,
         )
 
         def write_beside(temporary: Path) -> None:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.base import golden
 from pipeline.base.config import VLMParams
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import VLMError
@@ -167,15 +168,7 @@ def row_key(spec: FeatureSpec, prompt: str, frames: Mapping[str, NDArray[np.uint
 
     `frames` are (height, width, 3) RGB as decoded, before any resize; a missing view is left out.
     """
-    digest = hashlib.blake2b(digest_size=16)
-    for text in (spec.digest, prompt):
-        _add(digest, text.encode())
-    for view in spec.views:
-        if view in frames:
-            frame = np.ascontiguousarray(frames[view])
-            _add(digest, f"{view} {frame.shape} {frame.dtype}".encode())
-            digest.update(frame.data)
-    return digest.digest()
+    return golden.row_key(spec.digest, spec.views, prompt, frames)
 
 
 def live_differences(trained: Mapping[str, Any], live: Mapping[str, Any]) -> list[str]:
@@ -219,9 +212,3 @@ def _files_digest(files: Sequence[Path], digest_file: Callable[[Path], str]) -> 
 def _digest(document: Any) -> str:
     canonical = json.dumps(document, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
     return hashlib.blake2b(canonical.encode(), digest_size=16).hexdigest()
-
-
-def _add(digest: "hashlib.blake2b", part: bytes) -> None:
-    # Lengths in between: moving a character from one part to the next is another key.
-    digest.update(len(part).to_bytes(8, "little"))
-    digest.update(part)

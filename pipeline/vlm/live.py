@@ -29,6 +29,19 @@ def live_spec(vlm: VLMParams, views: Sequence[str]) -> FeatureSpec:
     return feature_spec(vlm, "float32", views, file_digest)
 
 
+def refuse_other_features(vlm: VLMParams, trained: Mapping[str, Any], live: FeatureSpec) -> None:
+    """Raise `CheckpointMismatch` where features of the spec `trained` are not those of `live`.
+
+    It names each entry that differs, as `live_differences` has it. No weight is needed for it.
+    """
+    if lines := live_differences(trained, live.document):
+        raise CheckpointMismatch(
+            f"{vlm.checkpoint}: the policy was trained on other features than this model "
+            "gives (trained -> live):\n  " + "\n  ".join(lines) + "\nLoad the model with the "
+            "vlm params and views of the policy's store, or train on this model's features."
+        )
+
+
 class LiveVLM(nn.Module):
     """A Qwen2.5-VL that computes the features of `spec` from prepared rows, and may learn.
 
@@ -111,14 +124,9 @@ class LiveVLM(nn.Module):
     def refuse_other_features(self, trained: Mapping[str, Any]) -> None:
         """Raise `CheckpointMismatch` where features of the spec `trained` are not what this gives.
 
-        As `live_differences` has it.
+        As `refuse_other_features`.
         """
-        if lines := live_differences(trained, self.spec.document):
-            raise CheckpointMismatch(
-                f"{self.vlm.checkpoint}: the policy was trained on other features than this model "
-                "gives (trained -> live):\n  " + "\n  ".join(lines) + "\nLoad the model with the "
-                "vlm params and views of the policy's store, or train on this model's features."
-            )
+        refuse_other_features(self.vlm, trained, self.spec)
 
     def check_shape(self, slots: int, feature_dim: int) -> None:
         """Raise `VLMError` where a policy was built for another number or width of features."""

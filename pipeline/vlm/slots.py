@@ -1,6 +1,6 @@
 """The slots of a row: which pooled vectors it holds, and in which order."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -71,6 +71,13 @@ def slot_documents(slots: Sequence[Slot], variants: int) -> list[dict[str, Any]]
     if variants == 1:
         return [slot.document() for slot in slots]
     return [slot.document() | {"variant": v} for v in range(variants) for slot in slots]
+
+
+def slot_name(document: Mapping[str, Any]) -> str:
+    """A slot of any variant, as a spec describes it, in a few words."""
+    cell = ",".join(map(str, document.get("cell") or ()))
+    layer = f"layer {document['layer']}{'' if document['norm'] else ' no norm'}"
+    return " ".join(filter(None, (layer, document["pooling"], document.get("view"), cell)))
 
 
 def _resolved_layers(layers: Sequence[int], count: int) -> tuple[int, ...]:

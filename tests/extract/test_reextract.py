@@ -11,8 +11,9 @@ from PIL import Image
 from pipeline.base.config import Params
 from pipeline.base.errors import StoreMismatch
 from pipeline.extract import extract
-from pipeline.extract.reextract import TOLERANCES, Deviation, Reextraction, reextract
+from pipeline.extract.reextract import Deviation, Reextraction, reextract
 from pipeline.store.schema import chunk_paths, read_spec
+from pipeline.vlm.deviation import TOLERANCES
 
 
 def quiet(line: str) -> None:

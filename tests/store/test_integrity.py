@@ -385,7 +385,7 @@ class TestOtherThings:
             verify(tmp_path / "copy.zarr", threads=1)
 
     def test_another_store_in_its_place_meanwhile(self, store, monkeypatch):
-        def replaced(root, specs):
+        def replaced(root, specs, golden):
             store.rename(store.with_name("before.zarr"))
             shutil.copytree(store.with_name("before.zarr"), store)
             return []

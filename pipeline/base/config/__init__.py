@@ -31,6 +31,7 @@ from pipeline.base.config.stage_two import (
     ModelType,
     RolloutAblation,
     RolloutParams,
+    ServeParams,
     SplitParams,
     TrainHeadParams,
     TuningParams,

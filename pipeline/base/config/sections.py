@@ -21,6 +21,7 @@ from pipeline.base.config.stage_two import (
     EvaluateParams,
     FinetuneParams,
     RolloutParams,
+    ServeParams,
     TrainHeadParams,
 )
 from pipeline.base.config.stores import ArchiveParams, ProbeParams, StoresParams, VerifyParams
@@ -36,6 +37,7 @@ class Params(Section):
     train_head: TrainHeadParams = TrainHeadParams()
     evaluate: EvaluateParams = EvaluateParams()
     rollout: RolloutParams = RolloutParams()
+    serve: ServeParams = ServeParams()
     finetune: FinetuneParams = FinetuneParams()
     compare: CompareParams = CompareParams()
     verify: VerifyParams = VerifyParams()

@@ -274,6 +274,35 @@ class RolloutParams(Section):
     """Folder of metrics, table and page."""
 
 
+class ServeParams(Section):
+    """How a policy is served to robots."""
+
+    checkpoint: Path | None = None
+    """A training run's folder, or one checkpoint in it; `train_head.output` where null."""
+    host: str = "127.0.0.1"
+    """Address to listen on. Any but this machine's own (127.0.0.1, ::1) needs a token."""
+    port: int = Field(default=8000, ge=0, le=65535)
+    """0 picks a free one and prints it."""
+    token_file: Path | None = None
+    """File with the token that robots must send; the environment variable VLA_SERVE_TOKEN where
+    null, and no token where that is not set either."""
+    fresh: bool = True
+    """A chunk waits for the features of the frames that came with its observation. false: it takes
+    the newest there are, and the model looks meanwhile."""
+    device: str = "auto"
+    """auto, cpu, cuda or cuda:N."""
+    seed: Seed = 0
+    """Of what a policy draws for a robot that sends no seed."""
+    max_connections: int = Field(default=8, ge=1)
+    """Robots at a time."""
+    max_waiting: int = Field(default=4, ge=1)
+    """Observations that are answered or wait at a time; who sends one more is told: busy."""
+    max_message_mb: int = Field(default=64, ge=1, le=1024)
+    """Of one observation, in MiB."""
+    idle_s: float = Field(default=600.0, gt=0)
+    """A connection without a whole message for so long is closed."""
+
+
 class CompareParams(Section):
     """Which evaluations stand side by side in one table."""
 

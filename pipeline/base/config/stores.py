@@ -35,6 +35,9 @@ class VerifyParams(Section):
     """Of the choice of rows."""
     repair: bool = False
     """Begin a new build without what is damaged, for stages.extract to complete."""
+    checkpoint: Path | Literal[True] | None = None
+    """Prove in place of checking a store that the model of `vlm` gives the features that this
+    checkpoint was trained on; true: that of `train_head.output`."""
     threads: int = Field(default=4, ge=1)
     """That read and check at a time in this process."""
     workers: Workers = 0

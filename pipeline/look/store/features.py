@@ -5,10 +5,9 @@ plain frames are looked at.
 """
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 from matplotlib.colors import LinearSegmentedColormap
@@ -28,6 +27,7 @@ from pipeline.look.store.episodes import EpisodeCoverage, mark_sources
 from pipeline.store import FEATURES, FeatureStore, place
 from pipeline.store.chunks import row_checksums
 from pipeline.store.repair_hints import mend
+from pipeline.vlm.slots import slot_name
 
 DEAD = 1e-3
 """Spread of a slot's numbers, beside their size, below which it says nothing."""
@@ -117,20 +117,13 @@ def look_at_features(store: FeatureStore, sampled: SampledRows) -> FeatureNorms:
         for episode in np.unique(sampled.episode[valid]):
             within[episode, slot] = _variation(values[valid & (sampled.episode == episode)])
     # Variants repeat the names.
-    names = tuple(_slot_name(document) for document in store.attrs["slots"][:slots])
+    names = tuple(slot_name(document) for document in store.attrs["slots"][:slots])
     return FeatureNorms(sampled, names, norm, variation, within, broken)
 
 
 def read_slot(store: FeatureStore, rows: NDArray[np.int64], slot: int) -> NDArray[np.float32]:
     """(row, dim) of one slot of the plain frames, whatever dtype it is stored in."""
     return widen(store.array(FEATURES)[rows, slot]).astype(np.float32, copy=False)
-
-
-def _slot_name(document: Mapping[str, Any]) -> str:
-    """A slot of any variant, in a few words."""
-    cell = ",".join(map(str, document.get("cell") or ()))
-    layer = f"layer {document['layer']}{'' if document['norm'] else ' no norm'}"
-    return " ".join(filter(None, (layer, document["pooling"], document.get("view"), cell)))
 
 
 def _variation(values: NDArray[np.float32]) -> float:

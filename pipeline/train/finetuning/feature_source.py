@@ -12,6 +12,7 @@ from pipeline.base.config import FinetuneParams, Params, TrainHeadParams
 from pipeline.base.digests import file_digest
 from pipeline.base.durable import read_document, write_with_digest
 from pipeline.base.errors import ConfigError
+from pipeline.base.golden import GoldenRow
 from pipeline.base.tuned_on import TunedOn, joined, of_store, write_tuned_on
 from pipeline.policy.checkpoint import DOCUMENT
 from pipeline.policy.live_policy import LivePolicy
@@ -68,6 +69,14 @@ class LiveFeatures(FeatureSource):
             "lr": params.finetune.lr,
             "eval_ticks": self.eval_ticks,
         }
+
+    @property
+    def golden(self) -> tuple[GoldenRow, ...]:
+        """None: the store's are features of the model before it learned.
+
+        The head that is trained on the tuned model's own store carries that store's.
+        """
+        return ()
 
     def attach(self, policy: Policy) -> Trainable:
         """The policy with the model in front."""

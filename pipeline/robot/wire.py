@@ -1,0 +1,149 @@
+"""Messages between robot and server: msgpack with numpy arrays, as openpi-client writes them.
+
+Nothing of a message is ever run or unpickled, and all of it is bounded: whatever is wrong with one
+is a `WireError`. Needs numpy and msgpack alone.
+"""
+
+import math
+import re
+from collections.abc import Mapping
+from typing import Any, Final
+
+import msgpack
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.base.errors import WireError
+
+MAX_BYTES: Final = 64 * 2**20
+"""Of a message, unless a caller says otherwise."""
+MAX_DEPTH: Final = 12
+MAX_ENTRIES: Final = 20_000
+"""Of all lists and maps of a message together."""
+MAX_TEXT: Final = 1_000_000
+MAX_RANK: Final = 8
+
+_DTYPE = re.compile(r"[<>|](b1|[iu][1248]|f[248])")
+"""Booleans and plain numbers, as `dtype.str` names them."""
+
+
+def pack(message: Any) -> bytes:
+    """The bytes of a message of maps, lists, texts, numbers and numpy arrays.
+
+    Raises `WireError` for what is none of them, and for arrays of other than plain numbers.
+    """
+    try:
+        packed = msgpack.packb(message, default=_described)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise WireError(f"a message cannot be sent: {error}") from None
+    assert isinstance(packed, bytes)
+    return packed
+
+
+def unpack(data: bytes, max_bytes: int = MAX_BYTES) -> Any:
+    """The message of these bytes; its arrays are copies in the byte order of this machine.
+
+    Raises `WireError` for what is no such message, for one that goes beyond the bounds of this
+    module, and for arrays of other than plain numbers or of another size than they say.
+    """
+    if len(data) > max_bytes:
+        raise WireError(f"expected a message of at most {max_bytes} bytes, found {len(data)}")
+    reader = _Reader()
+    try:
+        message = msgpack.unpackb(
+            data,
+            object_hook=reader.mapping,
+            list_hook=reader.sequence,
+            max_str_len=MAX_TEXT,
+            max_bin_len=max_bytes,
+            max_array_len=MAX_ENTRIES,
+            max_map_len=MAX_ENTRIES,
+            max_ext_len=0,
+        )
+    except WireError:
+        raise
+    except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException) as error:
+        said = str(error) or type(error).__name__
+        raise WireError(f"expected a message in msgpack, found none: {said:.200}") from None
+    _check_depth(message, MAX_DEPTH)
+    return message
+
+
+class _Reader:
+    """Reads the maps and lists of one message, innermost first, and counts what they hold."""
+
+    def __init__(self) -> None:
+        self._entries = 0
+
+    def mapping(self, value: dict[Any, Any]) -> Any:
+        """The array or number that a map describes, else the map."""
+        self._count(value)
+        if b"__ndarray__" in value:
+            return _array(value)
+        return _number(value) if b"__npgeneric__" in value else value
+
+    def sequence(self, value: list[Any]) -> list[Any]:
+        """The list, once it is counted."""
+        self._count(value)
+        return value
+
+    def _count(self, value: dict[Any, Any] | list[Any]) -> None:
+        self._entries += 1 + len(value)
+        if self._entries > MAX_ENTRIES:
+            raise WireError(f"expected a message of at most {MAX_ENTRIES} entries, found more")
+
+
+def _described(value: Any) -> Any:
+    """What msgpack writes for a numpy array or number."""
+    if not isinstance(value, np.ndarray | np.generic):
+        raise TypeError(f"expected maps, lists, texts, numbers or arrays, found {type(value)}")
+    if not _DTYPE.fullmatch(value.dtype.str):
+        raise TypeError(f"expected numbers of at most 64 bits, found dtype {value.dtype}")
+    if isinstance(value, np.generic):
+        return {b"__npgeneric__": True, b"data": value.item(), b"dtype": value.dtype.str}
+    return {
+        b"__ndarray__": True,
+        b"data": value.tobytes(),
+        b"dtype": value.dtype.str,
+        b"shape": value.shape,
+    }
+
+
+def _array(said: Mapping[Any, Any]) -> NDArray[Any]:
+    dtype, shape, data = _dtype(said), said.get(b"shape"), said.get(b"data")
+    whole = isinstance(shape, list) and all(type(size) is int and size >= 0 for size in shape)
+    if not isinstance(shape, list) or not whole or len(shape) > MAX_RANK:
+        raise WireError(f"expected the shape of an array, found {shape!r:.80}")
+    if not isinstance(data, bytes):
+        raise WireError(f"expected the bytes of an array, found {type(data).__name__}")
+    if len(data) != (size := math.prod(shape) * dtype.itemsize):
+        raise WireError(
+            f"expected {size} bytes for an array of shape {shape!r:.80} of {dtype}, "
+            f"found {len(data)}"
+        )
+    plain = np.ndarray(shape, dtype, buffer=data)
+    return plain.astype(dtype.newbyteorder("="))
+
+
+def _number(said: Mapping[Any, Any]) -> Any:
+    value, dtype = said.get(b"data"), _dtype(said)
+    if not isinstance(value, bool | int | float):
+        raise WireError(f"expected a number, found {type(value).__name__}")
+    with np.errstate(over="ignore"):
+        return dtype.type(value)
+
+
+def _dtype(said: Mapping[Any, Any]) -> np.dtype[Any]:
+    name = said.get(b"dtype")
+    if not isinstance(name, str) or not _DTYPE.fullmatch(name):
+        raise WireError(f"expected the dtype of plain numbers such as '<f4', found {name!r:.80}")
+    return np.dtype(name)
+
+
+def _check_depth(value: Any, left: int) -> None:
+    if not isinstance(value, dict | list):
+        return
+    if left == 0:
+        raise WireError(f"expected a message of at most {MAX_DEPTH} levels, found a deeper one")
+    for inner in value.values() if isinstance(value, dict) else value:
+        _check_depth(inner, left - 1)

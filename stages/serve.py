@@ -1,0 +1,48 @@
+"""Serve a trained policy to robots over a websocket, as openpi's clients speak it.
+
+Takes what stages.train_head wrote to train_head.output, or serve.checkpoint if it is given, and
+the model of vlm.checkpoint, which must give the features that the policy was trained on: that is
+proved before the first connection is taken. Listens on this machine alone unless serve.host says
+otherwise, which needs a token (serve.token_file or VLA_SERVE_TOKEN). A page at the same address
+shows latencies, ages, frames and actions; /healthz says OK. Ctrl-C answers what is under way and
+stops.
+
+  python -m stages.serve                                    at ws://127.0.0.1:8000
+  python -m stages.serve --set serve.port=0                 at a free port, which is printed
+  python -m stages.serve --set serve.host=0.0.0.0 --set serve.token_file=token.txt
+
+Next: pipeline.robot.client on the robot's computer, or openpi-client
+"""
+
+from stages.command import run
+
+if __name__ == "__main__":  # here, for --help waits for no import below
+    raise SystemExit(run(__doc__ or "", "stages.serve", sections=("serve",)))
+
+from contextlib import closing
+from functools import partial
+
+from pipeline.base.config import Params
+from pipeline.robot.server import PolicyServer, listen, read_token
+from pipeline.robot.session import ServedPolicy
+
+
+def main(params: Params) -> None:
+    """Serve the checkpoint that `serve` names, else what `train_head` wrote."""
+    wanted, say = params.serve, partial(print, flush=True)
+    token = read_token(wanted)
+    folder = wanted.checkpoint or params.train_head.output
+    with closing(listen(wanted)) as bound:
+        served = ServedPolicy.load(folder, params.vlm, wanted.device, say)
+        with closing(served):
+            server = PolicyServer(served, wanted, token, bound, say)
+            about = served.metadata
+            say(
+                f"{folder} (step {about['step']}): {about['model_type']}, chunks of "
+                f"{about['horizon']} actions at {about['action_hz']:g} Hz"
+            )
+            asked = "robots send the token" if token else "no token is asked for"
+            said = f"serving ws://{server.address} ({asked}); status: http://{server.address}"
+            stopped = server.run(partial(say, said))
+    if stopped:
+        raise KeyboardInterrupt

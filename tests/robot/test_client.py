@@ -1,0 +1,174 @@
+"""The client says clearly what is wrong, and needs three packages."""
+
+import os
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.base.errors import CheckpointMismatch, ObservationError, ServerError
+from pipeline.robot.client import PolicyClient, refuse_other_robot
+
+ROOT = Path(__file__).resolve().parents[2]
+Observe = Callable[..., dict[str, Any]]
+
+LIGHT = """
+import sys
+
+class Refuse:
+    def find_spec(self, name, path=None, target=None):
+        allowed = {"numpy", "msgpack", "websockets", "pipeline"} | sys.stdlib_module_names
+        if name.partition(".")[0] not in allowed:
+            raise ImportError(f"{name} is not on the robot's computer")
+
+sys.meta_path.insert(0, Refuse())
+from pipeline.robot.chunking import Executor
+from pipeline.robot.client import PolicyClient
+print(sorted({name.partition(".")[0] for name in sys.modules} & {"numpy", "msgpack", "websockets"}))
+"""
+
+
+def test_it_needs_numpy_msgpack_and_websockets_alone() -> None:
+    """And so does the executor, which plays what it gets."""
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", LIGHT],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "['msgpack', 'numpy', 'websockets']\n"
+
+
+def test_a_reset_goes_with_the_next_observation(
+    served_policy: Callable[..., Any], serving: Callable[..., Any], observe: Observe
+) -> None:
+    with PolicyClient(f"ws://{serving(served_policy('flow_matching')).address}") as client:
+        client.reset(5)
+        first = [client.infer(observe(tick))["actions"] for tick in (0, 1)]
+        client.reset(5)
+        np.testing.assert_array_equal(client.infer(observe(0))["actions"], first[0])
+        np.testing.assert_array_equal(client.infer(observe(1))["actions"], first[1])
+        client.reset()
+        assert not np.array_equal(client.infer(observe(0))["actions"], first[0])
+
+
+def test_a_refused_observation_says_why_and_the_client_can_begin_again(
+    served_policy: Callable[..., Any], serving: Callable[..., Any], observe: Observe
+) -> None:
+    with PolicyClient(f"ws://{serving(served_policy()).address}") as client:
+        with pytest.raises(ObservationError, match=r"^sensors: expected one of.*mean sensor"):
+            client.infer(observe(0, sensors=np.zeros(3)))
+        with pytest.raises(ServerError, match="not connected; call reconnect"):
+            client.infer(observe(0))
+        client.reconnect()
+        assert client.infer(observe(0))["actions"].shape == (4, 7)
+
+
+def test_nobody_listens() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+    with pytest.raises(ServerError, match=r"nobody serves a policy there.*Start python -m stages"):
+        PolicyClient(f"ws://127.0.0.1:{port}")
+    with pytest.raises(ServerError, match="nobody serves a policy there"):
+        PolicyClient("ws://no.such.invalid:1")
+
+
+def test_something_else_listens() -> None:
+    """It takes the connection and says nothing."""
+    with (
+        socket.create_server(("127.0.0.1", 0)) as silent,
+        pytest.raises(ServerError, match=r"expected a connection within 0\.2 s"),
+    ):
+        PolicyClient(f"ws://127.0.0.1:{silent.getsockname()[1]}", timeout_s=0.2)
+
+
+def test_a_late_answer_is_never_taken_for_the_next(
+    served_policy: Callable[..., Any], serving: Callable[..., Any], observe: Observe
+) -> None:
+    served = served_policy()
+    go = threading.Event()
+    served.glance.before = lambda: go.wait(20)
+    with PolicyClient(f"ws://{serving(served).address}", timeout_s=0.3) as client:
+        with pytest.raises(ServerError, match=r"expected an answer within 0\.3 s"):
+            client.infer(observe(0))
+        go.set()
+        client.reconnect()
+        assert client.infer(observe(7))["feature_age_s"] == pytest.approx(0, abs=1e-6)
+
+
+def test_a_lost_connection_says_that_the_memory_is_gone(
+    served_policy: Callable[..., Any], serving: Callable[..., Any], observe: Observe
+) -> None:
+    server = serving(served_policy())
+    with PolicyClient(f"ws://{server.address}") as client:
+        client.infer(observe(0))
+        server.stop()
+        with pytest.raises(ServerError, match=r"the server is stopping.*with it what the server"):
+            for tick in range(1, 1000):
+                client.infer(observe(tick))
+
+
+METADATA = {
+    "streams": {
+        "state": {"names": ["a", "b", "c"], "units": ["deg", "deg", "mm"]},
+        "sensor": {"names": [], "units": []},
+        "action": {"names": ["dx", "dy"], "units": ["mm", "mm"], "kind": "delta"},
+        "views": ["View1", "View2"],
+    },
+    "action_hz": 10.0,
+}
+
+
+@pytest.mark.parametrize(
+    ("robot", "said"),
+    [
+        ({"state": ["b", "a", "c"]}, r"state: channel 0 trained 'a', .* 'b' \(the same in another"),
+        ({"state": ["a", "b", "d"]}, "state: channel 2 trained 'c', the robot's 'd'$"),
+        ({"state": ["a", "b"]}, "state: trained on 3 channels, the robot has 2"),
+        ({"state_units": ["deg", "rad", "mm"]}, "state_units: channel 1 trained 'deg', .* 'rad'"),
+        ({"action_units": ["m", "m"]}, "action_units: channel 0 trained 'mm', the robot's 'm'"),
+        ({"action": ["dy", "dx"]}, "action: channel 0 trained 'dx', the robot's 'dy'"),
+        ({"action_kind": "absolute"}, "action_kind: trained 'delta', the robot's 'absolute'"),
+        ({"sensor": ["s"]}, "sensor: trained on 0 channels, the robot has 1"),
+        ({"views": ["View2"]}, "views: trained on View1, View2, the robot has no View1"),
+        ({"action_hz": 30}, r"action_hz: trained 10\.0, the robot's 30"),
+        ({"camera": ["View1"]}, "the robot's description: expected state, .*, found camera"),
+    ],
+)
+def test_another_robot_is_refused_with_both_sides_named(robot: dict[str, Any], said: str) -> None:
+    with pytest.raises(CheckpointMismatch, match=said):
+        refuse_other_robot(robot, METADATA)
+
+
+def test_the_policys_own_robot_is_not_refused() -> None:
+    refuse_other_robot({}, METADATA)
+    refuse_other_robot(
+        {
+            "state": ("a", "b", "c"),
+            "state_units": ["deg", "deg", "mm"],
+            "sensor": [],
+            "action": ["dx", "dy"],
+            "action_units": ["mm", "mm"],
+            "action_kind": "delta",
+            "views": ["View2", "View1", "View7"],
+            "action_hz": 10,
+        },
+        METADATA,
+    )
+
+
+def test_another_robot_is_refused_before_it_says_anything(
+    served_policy: Callable[..., Any], serving: Callable[..., Any]
+) -> None:
+    server = serving(served_policy())
+    with pytest.raises(CheckpointMismatch, match="action_hz"):
+        PolicyClient(f"ws://{server.address}", robot={"action_hz": 30.0})
+    assert server.status.json().count('"answered": 0') == 1

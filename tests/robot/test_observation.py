@@ -1,0 +1,133 @@
+"""What a robot says is checked; a refusal names the field, what was expected and what was found."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.base.errors import ObservationError
+from pipeline.robot.observation import ObservationReader
+from pipeline.simulation.rendering import VIEWS
+
+Observe = Callable[..., dict[str, Any]]
+
+METADATA = {
+    "streams": {
+        "views": list(VIEWS),
+        "state": {"names": ["j"] * 12},
+        "sensor": {"names": ["s"] * 1026},
+    },
+    "horizon": 4,
+    "action_dim": 7,
+    "stochastic": True,
+}
+
+
+def changed(array: np.ndarray, place: tuple[int, ...], value: float) -> np.ndarray:
+    array = array.copy()
+    array[place] = value
+    return array
+
+
+@pytest.fixture
+def reader() -> ObservationReader:
+    return ObservationReader(METADATA)
+
+
+def test_what_is_whole_is_read(reader: ObservationReader, observe: Observe) -> None:
+    given = observe(0, reset=np.int64(3), prompt="go", **{"images_time/View5": np.float32(0.05)})
+    given["state"] = given["state"].astype(">f8")
+    given["time"] = 0.1
+    guide = {"guide/chunk": np.zeros((4, 7)), "guide/weight": [1, 0.5, 0, 0]}
+    read = reader.read(given | guide)
+    assert (read.reset, read.seed, read.prompt, read.time_s) == (True, 3, "go", 0.1)
+    assert read.readings["state"].dtype == np.float32 and read.readings["time"].shape == (1,)
+    assert tuple(read.frames) == VIEWS and read.guide is not None
+    np.testing.assert_allclose(read.frame_time_s, [0.1, 0.1, 0.05])
+
+
+def test_whatever_is_missing_is_missing(reader: ObservationReader) -> None:
+    read = reader.read({"time": np.array([1.0])})
+    assert set(read.readings) == {"time"} and read.frames == {} and read.guide is None
+    assert np.isnan(read.frame_time_s).all() and (read.reset, read.seed) == (False, None)
+
+
+FRAME = np.zeros((4, 4, 3), np.uint8)
+STATE, STATE_TIME = np.zeros((10, 12)), np.arange(1, 11) / 100
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"observation/state": STATE}, "observation/state: expected one of time, .*found a field"),
+        ({"states": STATE}, "did you mean state?"),
+        ({"images/left": FRAME}, "images/left: expected one of .*images/View1"),
+        ({"time": None}, "time: expected the robot's clock"),
+        ({"time": "now"}, "time: expected numbers, found str"),
+        ({"time": np.zeros(2)}, r"time: expected shape \(1\), found \(2,\)"),
+        ({"time": np.nan}, "time: expected finite numbers, found nan"),
+        ({"state": None}, "state: expected it beside state_time"),
+        ({"state_time": None}, "state_time: expected it beside state"),
+        ({"state": np.zeros((10, 11))}, r"state: expected shape \(reading, 12\), found \(10, 11\)"),
+        ({"state": np.zeros(12)}, r"found \(12,\)"),
+        ({"state": [[1], [2, 3]]}, "state: expected numbers, found list"),
+        ({"state": STATE.astype(str)}, "state: expected numbers"),
+        ({"state": STATE.astype(complex)}, "state: expected numbers"),
+        ({"state": STATE.astype(object)}, "state: expected numbers"),
+        ({"state": changed(STATE, (3, 2), np.nan)}, r"found nan at \[3, 2\]"),
+        ({"state": changed(STATE, (0, 0), 1e300)}, r"found inf at \[0, 0\]"),
+        ({"state_time": STATE_TIME[:9]}, r"state_time: expected shape \(10\), found \(9,\)"),
+        ({"state_time": STATE_TIME[::-1]}, "state_time: expected ascending times"),
+        ({"state_time": STATE_TIME + 1}, "state_time: expected at most 0.1 s"),
+        ({"images/View1": FRAME[..., :2]}, "images/View1: expected RGB"),
+        ({"images/View1": FRAME[..., 0]}, "images/View1: expected RGB"),
+        ({"images/View1": FRAME[:0]}, r"found shape \(0, 4, 3\)"),
+        ({"images/View1": FRAME.astype(np.float32)}, "of float32"),
+        ({"images/View1": b"jpeg"}, "images/View1: expected an array, found bytes"),
+        ({"images/View1": None, "images_time/View1": 0.0}, "images/View1: expected it beside"),
+        ({"images_time/View1": 7.0}, "images_time/View1: expected at most 0.1 s"),
+        ({"prompt": 7}, "prompt: expected a text"),
+        ({"prompt": "x" * 1001}, "found 1001 characters"),
+        ({"reset": -1}, "reset: expected true, false or a seed"),
+        ({"reset": "yes"}, "found 'yes'"),
+        ({"guide/chunk": np.zeros((4, 7))}, "guide/chunk: expected guide/chunk and guide/weight"),
+        ({"guide/chunk": np.zeros((3, 7)), "guide/weight": np.zeros(4)}, r"found \(3, 7\)"),
+        ({"guide/chunk": np.zeros((4, 7)), "guide/weight": np.full(4, 2)}, "expected 0 to 1"),
+    ],
+)
+def test_what_is_wrong_is_refused_by_name_and_leaves_no_trace(
+    reader: ObservationReader, observe: Observe, wrong: dict[str, Any], said: str
+) -> None:
+    with pytest.raises(ObservationError, match=said) as refused:
+        reader.read(observe(0, **wrong))
+    assert len(str(refused.value)) < 600
+    reader.read(observe(0))
+
+
+@pytest.mark.parametrize("given", [None, [], "time", 3, np.zeros(3)])
+def test_what_has_no_fields_is_refused(reader: ObservationReader, given: Any) -> None:
+    with pytest.raises(ObservationError, match="expected fields by name"):
+        reader.read(given)
+
+
+def test_observations_follow_one_another_until_a_reset(
+    reader: ObservationReader, observe: Observe
+) -> None:
+    reader.read(observe(5))
+    with pytest.raises(ObservationError, match="Send reset where a new episode begins"):
+        reader.read(observe(4))
+    with pytest.raises(ObservationError, match=r"state_time: .*Send each reading once"):
+        reader.read(observe(5) | {"time": 1.0})
+    reader.read(observe(4, reset=True))
+    reader.read(observe(5))
+
+
+def test_what_the_policy_lacks_is_refused(observe: Observe) -> None:
+    streams = METADATA["streams"] | {"sensor": {"names": []}}
+    lacking = ObservationReader(METADATA | {"streams": streams, "stochastic": False})
+    with pytest.raises(ObservationError, match="sensor: expected none, as the policy was trained"):
+        lacking.read(observe(0))
+    guide = {"guide/chunk": np.zeros((4, 7)), "guide/weight": np.zeros(4)}
+    with pytest.raises(ObservationError, match="guide/chunk: expected none"):
+        lacking.read(observe(0, sensor=None, sensor_time=None) | guide)

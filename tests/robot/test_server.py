@@ -1,0 +1,327 @@
+"""The server answers robots, in order, and what is wrong with one costs that one alone."""
+
+import http.client
+import json
+import socket
+import threading
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+import torch
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+
+from pipeline.base.config import ServeParams
+from pipeline.base.errors import ConfigError
+from pipeline.robot import wire
+from pipeline.robot.client import PolicyClient
+from pipeline.robot.server import PolicyServer, listen, read_token
+
+Observe = Callable[..., dict[str, Any]]
+Serving = Callable[..., PolicyServer]
+Served = Callable[..., Any]
+
+
+def get(server: PolicyServer, path: str, **headers: str) -> tuple[int, str, dict[str, str]]:
+    connection = http.client.HTTPConnection(server.address, timeout=20)
+    try:
+        connection.request("GET", path, headers=headers)
+        answer = connection.getresponse()
+        return answer.status, answer.read().decode(), dict(answer.getheaders())
+    finally:
+        connection.close()
+
+
+def client_of(server: PolicyServer, **options: Any) -> PolicyClient:
+    return PolicyClient(f"ws://{server.address}", **options)
+
+
+@contextmanager
+def opened(server: PolicyServer, **options: Any) -> Generator[ClientConnection]:
+    """A bare websocket that has got the metadata."""
+    options |= {"compression": None, "max_size": None, "proxy": None}
+    with connect(f"ws://{server.address}", **options) as bare:
+        assert wire.unpack(bare.recv(20))["protocol"] == 1
+        yield bare
+
+
+def closing_code(bare: ClientConnection) -> int:
+    """The code with which the server closes a connection, next."""
+    with pytest.raises(ConnectionClosed) as closed:
+        bare.recv(20)
+    assert closed.value.rcvd is not None
+    return closed.value.rcvd.code
+
+
+@pytest.mark.parametrize("model_type", ["regression", "flow_matching"])
+def test_over_the_wire_is_bit_for_bit_what_it_is_in_process(
+    model_type: str, served_policy: Served, serving: Serving, observe: Observe
+) -> None:
+    served = served_policy(model_type)
+    here = served.session(seed=3)
+    with client_of(serving(served, seed=3)) as client:
+        assert client.metadata == served.metadata
+        for tick in range(8):
+            there, own = client.infer(observe(tick)), here.infer(observe(tick))
+            np.testing.assert_array_equal(there["actions"], own["actions"])
+            np.testing.assert_array_equal(there["feature_key"], own["feature_key"])
+            assert there["feature_age_s"] == own["feature_age_s"]
+            assert there["actions"].flags.writeable
+
+
+def test_a_connection_is_one_memory(
+    served_policy: Served, serving: Serving, observe: Observe
+) -> None:
+    server = serving(served_policy("flow_matching"))
+    with client_of(server) as first, client_of(server) as second:
+        alone = [first.infer(observe(tick))["actions"] for tick in range(4)]
+        for tick in range(4):
+            np.testing.assert_array_equal(second.infer(observe(tick))["actions"], alone[tick])
+        first.reconnect()
+        np.testing.assert_array_equal(first.infer(observe(0))["actions"], alone[0])
+
+
+def test_observations_of_one_connection_are_answered_in_order(
+    served_policy: Served, serving: Serving, observe: Observe
+) -> None:
+    with opened(serving(served_policy())) as bare:
+        messages = [wire.pack(observe(tick)) for tick in range(7)]
+        sending = threading.Thread(target=lambda: [bare.send(message) for message in messages])
+        sending.start()
+        ages = [wire.unpack(bare.recv(20))["feature_age_s"] for _ in range(7)]
+        sending.join()
+    np.testing.assert_allclose(ages, [0, 0.1, 0.2, 0, 0.1, 0.2, 0], atol=1e-6)
+
+
+def test_while_the_model_looks_healthz_answers_and_too_many_are_told_busy(
+    served_policy: Served, serving: Serving, observe: Observe
+) -> None:
+    served = served_policy()
+    looking, go = threading.Event(), threading.Event()
+
+    def wait() -> None:
+        looking.set()
+        assert go.wait(20)
+
+    server = serving(served, max_waiting=1)
+    with client_of(server) as busy, client_of(server) as other:
+        other.infer(observe(0))
+        served.glance.before = wait
+        answers: list[Any] = []
+        thread = threading.Thread(target=lambda: answers.append(busy.infer(observe(0))))
+        thread.start()
+        assert looking.wait(20)
+        assert get(server, "/healthz")[:2] == (200, "OK\n")
+        with pytest.raises(ConnectionError, match="busy: 1 observations are waiting"):
+            other.infer(observe(1))
+        go.set()
+        thread.join()
+        assert answers[0]["actions"].shape == (4, 7)
+        served.glance.before = lambda: None
+        # The connection stays, and has taken the readings.
+        session = served.session()
+        session.infer(observe(0))
+        session.take(observe(1))
+        expected = session.infer(observe(2))["actions"]
+        np.testing.assert_array_equal(other.infer(observe(2))["actions"], expected)
+    assert server.status.busy == 1
+
+
+def array_of(dtype: str, shape: Any, data: bytes) -> dict[bytes, Any]:
+    return {b"__ndarray__": True, b"dtype": dtype, b"shape": shape, b"data": data}
+
+
+@pytest.mark.parametrize(
+    ("message", "said", "code"),
+    [
+        ("time", "refused: expected a message of bytes (msgpack), found a text", 1003),
+        (b"", "refused: expected a message in msgpack, found none", 1007),
+        (b"\xdc\xff\xff", "refused: expected a message in msgpack, found none", 1007),
+        (msgpack.packb({"time": array_of("|O", [1], b"0")}), "refused: expected the dtype", 1007),
+        (msgpack.packb([1]), "refused: expected fields by name, found list", 1008),
+        (wire.pack({"time": 0.1, "gripper": 1}), "refused: gripper: expected one of", 1008),
+        (wire.pack({"time": np.nan}), "refused: time: expected finite numbers", 1008),
+    ],
+)
+def test_what_is_wrong_with_a_message_costs_its_connection_only(
+    served_policy: Served, serving: Serving, observe: Observe, message: Any, said: str, code: int
+) -> None:
+    server = serving(served_policy())
+    with client_of(server) as good:
+        good.infer(observe(0))
+        with opened(server) as bare:
+            bare.send(message)
+            text = bare.recv(20)
+            assert isinstance(text, str) and text.startswith(said) and "\n" not in text
+            assert closing_code(bare) == code
+        assert good.infer(observe(1))["actions"].shape == (4, 7)
+    assert server.status.refused == 1
+
+
+def test_a_message_beyond_the_bound_is_not_read(
+    served_policy: Served, serving: Serving, observe: Observe
+) -> None:
+    server = serving(served_policy(), max_message_mb=1)
+    with opened(server) as bare:
+        bare.send(b"\0" * (2**20 + 1))
+        assert closing_code(bare) == 1009
+    with client_of(server) as good:
+        assert good.infer(observe(0))["actions"].shape == (4, 7)
+
+
+def test_a_bug_is_said_in_one_line_and_told_in_full_here(
+    served_policy: Served, serving: Serving, observe: Observe, capfd: Any
+) -> None:
+    served = served_policy()
+
+    def fail(*_: Any) -> torch.Tensor:
+        raise KeyError("secret of the house")
+
+    served.policy.act = fail
+    with opened(serving(served)) as bare:
+        bare.send(wire.pack(observe(0)))
+        assert bare.recv(20) == "error: KeyError: the server's output says more"
+        assert closing_code(bare) == 1011
+    assert "secret of the house" in capfd.readouterr().err
+
+
+def test_who_says_nothing_is_left(served_policy: Served, serving: Serving) -> None:
+    with opened(serving(served_policy(), idle_s=0.2)) as bare:
+        assert closing_code(bare) == 1008
+
+
+def test_more_robots_than_it_takes_are_refused_by_name(
+    served_policy: Served, serving: Serving
+) -> None:
+    server = serving(served_policy(), max_connections=1)
+    with client_of(server) as first:
+        with pytest.raises(ConnectionError, match=r"busy: 1 robots.*serve.max_connections"):
+            client_of(server)
+        assert first.metadata["protocol"] == 1
+
+
+def test_the_token_is_asked_for(served_policy: Served, serving: Serving, observe: Observe) -> None:
+    server = serving(served_policy(), token="s3cret")
+    for wrong in (None, "s3cre", "s3cretx", "é"):
+        headers = {"Authorization": f"Api-Key {wrong}"} if wrong else {}
+        assert get(server, "/status.json", **headers)[0] == 401
+    for wrong in (None, "other"):
+        with pytest.raises(ConnectionError, match=r"401.*Give the server's token"):
+            client_of(server, token=wrong)
+    with client_of(server, token="s3cret") as client:
+        assert client.infer(observe(0))["actions"].shape == (4, 7)
+    assert get(server, "/healthz")[0] == 200
+    assert get(server, "/status.json", Authorization="Api-Key s3cret")[0] == 200
+    # The page itself says nothing of anybody, and asks for the token.
+    assert "models/head" not in get(server, "/")[1]
+
+
+def test_pages_of_other_places_are_refused(served_policy: Served, serving: Serving) -> None:
+    server = serving(served_policy())
+    for headers in (
+        {"Origin": "https://example.org"},
+        {"Origin": "null"},
+        {"Host": "example.org", "Origin": "http://example.org"},  # a name made to mean this machine
+        {"Host": "example.org:8000"},
+    ):
+        for path in ("/", "/status.json"):
+            assert get(server, path, **headers)[0] == 403, headers
+    with pytest.raises(InvalidStatus, match="403"), opened(server, origin="https://example.org"):
+        pass
+    with opened(server, origin=f"http://{server.address}"):
+        pass
+    assert get(server, "/elsewhere")[0] == 404
+
+
+def test_the_page_may_run_its_own_script_alone(served_policy: Served, serving: Serving) -> None:
+    server = serving(served_policy())
+    (status, text, headers), again = get(server, "/"), get(server, "/")
+    assert status == 200 and headers["Content-Type"].startswith("text/html")
+    policy = headers["Content-Security-Policy"]
+    assert "default-src 'none'" in policy and "unsafe" not in policy and "http" not in policy
+    nonce = policy.partition("script-src 'nonce-")[2].partition("'")[0]
+    assert len(nonce) > 20 and text.count(f'nonce="{nonce}"') == 2 and nonce not in again[1]
+
+
+def test_status_says_what_happened(
+    served_policy: Served, serving: Serving, observe: Observe
+) -> None:
+    server = serving(served_policy())
+    assert json.loads(get(server, "/status.json")[1])["latency_ms"]["whole"] is None
+    with client_of(server) as client:
+        answers = [client.infer(observe(tick, prompt="<b>go</b>")) for tick in range(4)]
+        said = json.loads(get(server, "/status.json")[1])
+        assert said["counts"] == {"answered": 4, "refused": 0, "busy": 0}
+        assert said["policy"]["checkpoint"] == "models/head"
+        for part in ("vlm", "head", "wait", "whole"):
+            p50, p99, p999 = said["latency_ms"][part]
+            assert 0 < p50 <= p99 <= p999
+        (robot,) = said["robots"]
+        assert robot["prompt"] == "<b>go</b>" and robot["answers"] == 4
+        assert set(robot["frames"]) == {"View1", "View2", "View5"}
+        np.testing.assert_array_equal(np.float32(robot["actions"]), answers[-1]["actions"])
+
+
+def test_stopping_answers_what_is_under_way_and_takes_no_more(
+    served_policy: Served, serving: Serving, observe: Observe
+) -> None:
+    served = served_policy()
+    looking, go = threading.Event(), threading.Event()
+
+    def wait() -> None:
+        looking.set()
+        assert go.wait(20)
+
+    served.glance.before = wait
+    server = serving(served)
+    with opened(server) as idle, opened(server) as busy:
+        busy.send(wire.pack(observe(0)))
+        assert looking.wait(20)
+        server.stop()
+        assert closing_code(idle) == 1001
+        with pytest.raises(ConnectionError, match="nobody serves a policy there"):
+            client_of(server)
+        go.set()
+        assert wire.unpack(busy.recv(20))["actions"].shape == (4, 7)
+        assert closing_code(busy) == 1001
+
+
+def params(**changed: Any) -> ServeParams:
+    return ServeParams.model_validate(changed)
+
+
+def test_tokens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("VLA_SERVE_TOKEN", raising=False)
+    file = tmp_path / "token.txt"
+    file.write_text(" abc\n")
+    assert read_token(params()) is None
+    assert read_token(params(host="::1")) is None
+    for host in ("0.0.0.0", "::", "192.168.1.7", "robot.local"):
+        with pytest.raises(ConfigError, match="can be reached by other machines"):
+            read_token(params(host=host))
+    assert read_token(params(host="0.0.0.0", token_file=file)) == "abc"
+    monkeypatch.setenv("VLA_SERVE_TOKEN", "def")
+    assert read_token(params(host="0.0.0.0")) == "def"
+    assert read_token(params(token_file=file)) == "abc"
+    for wrong, said in (("  \n", "an empty one"), ("é", "ASCII"), (None, "file with a token")):
+        file.unlink(missing_ok=True)
+        if wrong is not None:
+            file.write_text(wrong, encoding="utf-8")
+        with pytest.raises(ConfigError, match=said):
+            read_token(params(token_file=file))
+
+
+def test_an_address_that_is_taken_or_somebody_elses_is_refused() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(ConfigError, match=r"serve\.port: .* or choose another port"):
+            listen(params(port=port))
+    with pytest.raises(ConfigError, match=r"serve\.port: 192\.0\.2\.1"):
+        listen(params(host="192.0.2.1"))
+    with pytest.raises(ConfigError, match=r"serve\.host: no\.such\.invalid"):
+        listen(params(host="no.such.invalid"))

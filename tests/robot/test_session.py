@@ -1,0 +1,295 @@
+"""A session answers as a rollout does, remembers one robot, and refuses what it cannot use."""
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.base.config import RolloutParams
+from pipeline.base.errors import NumericsError, ObservationError
+from pipeline.evaluate.rollouts import roll_out
+from pipeline.policy.observation import moving_channels
+from pipeline.robot.chunking import Executor
+from pipeline.robot.session import Session
+from pipeline.simulation.environment import InsertionEnvironment
+from pipeline.simulation.insertion_formats import INSTRUCTION
+from pipeline.simulation.rendering import VIEWS
+
+Observe = Callable[..., dict[str, Any]]
+SEED = 78
+
+
+def drive(session: Session, chunking: Any) -> list[np.ndarray]:
+    """The actions of an episode of the phantom that the session drives tick by tick."""
+    metadata = session.metadata
+    executor = Executor(chunking, 1, metadata["horizon"], metadata["moving"])
+    robot = InsertionEnvironment("full", cameras=False)
+    robot.reset(seed=SEED)
+    readings, sent, reset = robot.readings(), [], {"reset": SEED}
+    while not robot.insertion.finished:
+        observation = {**readings, **reset, "prompt": INSTRUCTION}
+        for view, (time, frame) in robot.frames().items():
+            observation |= {f"images/{view}": frame, f"images_time/{view}": time}
+        if (guide := executor.begin()) is not None:
+            observation |= {"guide/chunk": guide.chunk, "guide/weight": guide.weight}
+        executor.plan(session.infer(observation)["actions"])
+        sent.append(executor.next_action().astype(np.float64))
+        readings, reset = robot.step(sent[-1])[0], {}
+    return sent
+
+
+@pytest.mark.parametrize(
+    ("model_type", "chunking"),
+    [("regression", "none"), ("regression", "temporal"), ("flow_matching", "none"),
+     ("flow_matching", "rtc"), ("diffusion", "none")],
+)  # fmt: skip
+def test_a_session_does_bit_for_bit_what_a_rollout_does(
+    model_type: str,
+    chunking: str,
+    phantom_policy: Callable[..., Any],
+    served_policy: Callable[..., Any],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    sent: list[np.ndarray] = []
+    step = InsertionEnvironment.step
+
+    def watched(robot: Any, action: np.ndarray) -> Any:
+        sent.append(action.copy())
+        return step(robot, action)
+
+    checkpoint, policy, glance = phantom_policy(model_type)
+    with monkeypatch.context() as patch:
+        patch.setattr(InsertionEnvironment, "step", watched)
+        wanted = {"episodes": 1, "seed": SEED, "ablations": (), "chunking": chunking}
+        load: Any = lambda: glance  # noqa: E731
+        roll_out(checkpoint, "head", policy, load, RolloutParams.model_validate(wanted))
+    assert torch.get_num_threads() == 1
+    served = served_policy(model_type)
+    actions = drive(served.session(), chunking)
+    np.testing.assert_array_equal(actions, sent)
+    assert len(actions) > 20
+    assert len(served.glance.passes) == len(glance.passes)
+
+
+def test_an_answer_says_what_it_was_made_of(
+    served_policy: Callable[..., Any], observe: Observe
+) -> None:
+    served = served_policy()
+    session = served.session()
+    first = session.infer(observe(0, **{"images_time/View1": 0.07, "images_time/View2": 0.09}))
+    assert first["actions"].shape == (4, 7) and first["actions"].dtype == np.float32
+    assert first["feature_age_s"] == pytest.approx(0.0, abs=1e-6)  # View5's, of now
+    assert first["feature_key"].dtype == np.uint8 and first["feature_key"].shape == (16,)
+    timing = first["server_timing"]
+    assert set(timing) == {"infer_ms", "vlm_ms", "head_ms", "wait_ms"}
+    assert timing["infer_ms"] >= timing["vlm_ms"] + timing["head_ms"] > 0
+    second = session.infer(observe(1))
+    assert second["feature_age_s"] == pytest.approx(0.1, abs=1e-6)
+    np.testing.assert_array_equal(second["feature_key"], first["feature_key"])
+    assert second["server_timing"]["vlm_ms"] == 0
+    session.infer(observe(2))
+    fourth = session.infer(observe(3))
+    assert fourth["feature_age_s"] == pytest.approx(0.0, abs=1e-6)
+    assert not np.array_equal(fourth["feature_key"], first["feature_key"])
+    assert len(served.glance.passes) == 2
+
+
+def test_another_prompt_is_looked_at_at_once(
+    served_policy: Callable[..., Any], observe: Observe
+) -> None:
+    served = served_policy(told=("touch", "leave"))
+    session = served.session()
+    for tick, prompt in enumerate(["touch", "touch", "leave", "leave"]):
+        session.infer(observe(tick, prompt=prompt))
+    assert served.glance.instructions == ["touch", "leave"]
+
+
+def test_prompts(served_policy: Callable[..., Any], observe: Observe) -> None:
+    one = served_policy()
+    one.session().infer(observe(0))
+    assert one.glance.instructions == [INSTRUCTION] and one.said == []
+    for _ in range(3):
+        one.session().infer(observe(0, prompt="fold the towel"))
+    assert len(one.said) == 1 and "'fold the towel'" in one.said[0] and INSTRUCTION in one.said[0]
+    with pytest.raises(ObservationError, match="'touch', 'leave'"):
+        served_policy(told=("touch", "leave")).session().infer(observe(0))
+    with pytest.raises(ObservationError, match="prompt: expected what the robot is to do"):
+        served_policy(told=()).session().infer(observe(0))
+
+
+def test_a_missing_view_is_left_out_as_in_training(
+    served_policy: Callable[..., Any], observe: Observe, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    served = served_policy()
+    given, policy_observe = [], served.policy.observe
+
+    def watched(streams: Any) -> Any:
+        given.append(streams)
+        return policy_observe(streams)
+
+    monkeypatch.setattr(served.policy, "observe", watched)
+    served.session().infer(observe(0, **{f"images/{VIEWS[0]}": None}))
+    assert tuple(served.glance.passes[0][0]) == VIEWS[1:]
+    assert given[0]["slot_valid"].tolist() == [[False, True]]
+    assert np.isnan(given[0]["view_age"][0]).tolist() == [True, False, False]
+
+
+def test_without_frames_the_first_observation_is_refused_and_leaves_a_session_that_works(
+    served_policy: Callable[..., Any], observe: Observe
+) -> None:
+    session = served_policy().session()
+    without = {f"images/{view}": None for view in VIEWS}
+    with pytest.raises(ObservationError, match="images/View1"):
+        session.infer(observe(0, **without))
+    assert session.infer(observe(1))["actions"].shape == (4, 7)
+    assert session.infer(observe(9, **without))["feature_age_s"] == pytest.approx(0.8, abs=1e-6)
+
+
+def test_a_policy_without_features_needs_no_frames(
+    served_policy: Callable[..., Any], observe: Observe
+) -> None:
+    served = served_policy(features_enabled=False)
+    answer = served.session().infer(observe(0, **{f"images/{view}": None for view in VIEWS}))
+    assert set(answer) == {"actions", "server_timing"}
+    assert served.metadata["uses_features"] is False
+    assert served.session().infer(observe(0))["actions"].shape == (4, 7)
+
+
+def test_reset_forgets_and_a_seed_draws_the_same_again(
+    served_policy: Callable[..., Any], observe: Observe
+) -> None:
+    session = served_policy("flow_matching").session()
+
+    def episode(reset: Any) -> list[np.ndarray]:
+        told = [{"reset": reset}, {}, {}, {}]
+        return [session.infer(observe(k) | told[k])["actions"] for k in range(4)]
+
+    first, again, other, going_on = episode(7), episode(7), episode(8), episode(True)
+    np.testing.assert_array_equal(first, again)
+    assert not np.array_equal(first, other)
+    assert not np.array_equal(other, going_on)
+    with pytest.raises(ObservationError, match="time: expected"):
+        session.infer(observe(0))
+
+
+def test_sessions_share_a_policy_and_no_memory(
+    served_policy: Callable[..., Any], observe: Observe
+) -> None:
+    """Six robots at once get what each gets alone."""
+    served = served_policy("flow_matching")
+
+    def run(robot: int, into: dict[int, list[np.ndarray]]) -> None:
+        session = served.session(seed=robot)
+        into[robot] = [session.infer(observe(10 * robot + k))["actions"] for k in range(6)]
+
+    together: dict[int, list[np.ndarray]] = {}
+    threads = [threading.Thread(target=run, args=(robot, together)) for robot in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    alone: dict[int, list[np.ndarray]] = {}
+    for robot in range(6):
+        run(robot, alone)
+    for robot in range(6):
+        np.testing.assert_array_equal(together[robot], alone[robot])
+
+
+def test_what_is_not_fresh_is_answered_while_the_model_looks(
+    served_policy: Callable[..., Any], observe: Observe
+) -> None:
+    served = served_policy()
+    session = served.session(fresh=False)
+    session.infer(observe(0))  # the first is waited for
+    go, looking = threading.Event(), threading.Event()
+
+    def wait() -> None:
+        looking.set()
+        assert go.wait(20)
+
+    served.glance.before = wait
+    ages = [session.infer(observe(tick))["feature_age_s"] for tick in range(1, 10)]
+    np.testing.assert_allclose(ages, np.arange(1, 10) / 10, atol=1e-6)
+    assert looking.wait(20)
+    go.set()
+    served.begin_pass(deque()).exception()  # passes are in order: that one has ended
+    answer = session.infer(observe(10))
+    assert answer["feature_age_s"] == pytest.approx(0.7, abs=1e-6)
+    assert answer["server_timing"]["vlm_ms"] > 0
+    served.begin_pass(deque()).exception()
+    # Frames of tick 9 waited in the place of those of tick 6.
+    assert session.infer(observe(11))["feature_age_s"] == pytest.approx(0.2, abs=1e-6)
+
+
+def test_a_pass_of_the_episode_before_is_not_taken(
+    served_policy: Callable[..., Any], observe: Observe
+) -> None:
+    served = served_policy()
+    session = served.session(fresh=False)
+    session.infer(observe(0))
+    go = threading.Event()
+    served.glance.before = lambda: go.wait(20)
+    session.infer(observe(3))  # begins a pass that does not end
+    served.glance.before = lambda: None
+    threading.Timer(0.05, go.set).start()
+    answer = session.infer(observe(50, reset=True))
+    assert answer["feature_age_s"] == pytest.approx(0.0, abs=1e-6)
+    alone = served.session().infer(observe(50))
+    np.testing.assert_array_equal(answer["actions"], alone["actions"])
+
+
+def test_an_answer_that_is_no_number_is_refused(
+    served_policy: Callable[..., Any], observe: Observe, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    served = served_policy()
+    monkeypatch.setattr(served.policy, "act", lambda *_: torch.full((1, 4, 7), torch.nan))
+    with pytest.raises(NumericsError, match="not a number"):
+        served.session().infer(observe(0))
+
+
+class Suspicious:
+    """A first look that remembers what it saw."""
+
+    def __init__(self) -> None:
+        self.seen: list[tuple[tuple[str, ...], bool]] = []
+
+    def check(self, frames: Any, state: Any) -> None:
+        self.seen.append((tuple(frames), state is not None))
+
+
+def test_the_first_frames_and_states_of_each_episode_are_looked_at(
+    served_policy: Callable[..., Any], observe: Observe
+) -> None:
+    look = Suspicious()
+    session = served_policy(look=look).session()
+    without = {"state": None, "state_time": None}
+    for tick, told in enumerate([without, {}, {}, {"reset": True}, {}]):
+        session.infer(observe(tick, **told))
+    assert look.seen == [(VIEWS, False), ((), True), (VIEWS, True)]
+
+
+def test_another_robot_is_refused_before_the_model_looks(
+    served_policy: Callable[..., Any], observe: Observe
+) -> None:
+    class Strict:
+        def check(self, frames: Any, state: Any) -> None:
+            raise ObservationError("views swapped")
+
+    served = served_policy(look=Strict())
+    with pytest.raises(ObservationError, match="swapped"):
+        served.session().infer(observe(0))
+    assert served.glance.passes == []
+
+
+def test_metadata_says_all_that_a_robot_needs(served_policy: Callable[..., Any]) -> None:
+    served = served_policy("flow_matching")
+    metadata = served.metadata
+    action = served.checkpoint.source["streams"]["action"]
+    assert metadata["moving"] == list(moving_channels(action)) == [True] * 6 + [False]
+    assert metadata["protocol"] == 1 and metadata["stochastic"] is True
+    assert (metadata["horizon"], metadata["action_dim"], metadata["action_hz"]) == (4, 7, 10.0)
+    assert metadata["instructions"] == [INSTRUCTION] and metadata["feature_spec_digest"] == "abc"

@@ -1,0 +1,131 @@
+"""The command proves, listens, says where, and stops cleanly."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from pipeline.robot.client import PolicyClient
+from pipeline.simulation.insertion_formats import write_raw
+from pipeline.simulation.recorder import simulate_episode
+from stages import extract, serve, train_head
+from stages.command import run
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def trained(
+    tmp_path_factory: pytest.TempPathFactory,
+    demo_checkpoint: Path,
+    tiny_head: Callable[..., dict[str, Any]],
+) -> Path:
+    """A params.yaml whose head is trained on two recordings of the phantom."""
+    folder = tmp_path_factory.mktemp("serve")
+    for seed in (5, 6):
+        write_raw(folder / "raw" / "task", simulate_episode(seed, 1.7e9 + 100 * seed))
+    document = {
+        "data": {"root": str(folder), "sources": [{"name": "raw", "path": "raw"}]},
+        "vlm": {
+            "checkpoint": str(demo_checkpoint),
+            "image_resize_height": 56,
+            "image_resize_width": 84,
+            "dtype": "float32",
+            "pooling": ["mean"],
+        },
+        "extract": {"store": str(folder / "store.zarr")},
+        "train_head": tiny_head(folder),
+        "serve": {"port": 0, "device": "cpu"},
+    }
+    path = folder / "params.yaml"
+    path.write_text(yaml.safe_dump(document))
+    for stage in (extract, train_head):
+        assert run("", stage.main, ["--params", str(path)]) == 0
+    return path
+
+
+@contextmanager
+def served(
+    trained: Path, *arguments: str
+) -> Iterator[tuple[subprocess.Popen[str], str, list[str]]]:
+    """The command as a process: where it serves, and what it said before."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "stages.serve", "--params", str(trained), *arguments],
+        cwd=trained.parent,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONPATH": str(ROOT), "VLA_SERVE_TOKEN": "s3cret"},
+    )
+    try:
+        said: list[str] = []
+        assert process.stdout is not None and process.stderr is not None
+        for line in process.stdout:
+            said.append(line)
+            if (place := re.search(r"serving (ws://\S+)", line)) is not None:
+                yield process, place[1], said
+                break
+        else:
+            raise AssertionError(process.stderr.read())
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
+def test_it_serves_until_it_is_told_to_stop(
+    trained: Path, observe_phantom: dict[str, Any], sent: signal.Signals
+) -> None:
+    with served(trained) as (process, url, said):
+        assert any("golden rows" in line for line in said)
+        with PolicyClient(url, token="s3cret", timeout_s=60) as client:
+            answer = client.infer(observe_phantom)
+            assert np.isfinite(answer["actions"]).all()
+            assert answer["actions"].shape == (client.metadata["horizon"], 7)
+            process.send_signal(sent)
+            with pytest.raises(ConnectionError, match="stopping"):
+                client.infer(observe_phantom)
+        _, error = process.communicate(timeout=60)
+        assert process.returncode == 1 and error == "stopped; run the same command again\n"
+
+
+@pytest.fixture
+def observe_phantom() -> dict[str, Any]:
+    from pipeline.simulation.environment import InsertionEnvironment
+
+    robot = InsertionEnvironment()
+    return robot.reset(seed=3)[0] | {"prompt": "Insert"}
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        (["serve.checkpoint=nowhere"], "expected a checkpoint"),
+        (["serve.host=0.0.0.0"], "serve.host: 0.0.0.0 can be reached by other machines"),
+        (["serve.token_file=nowhere.txt"], "serve.token_file: nowhere.txt: expected a file"),
+        (["serve.port=70000"], "serve.port"),
+        (["serve.max_connections=0"], "serve.max_connections"),
+        (["vlm.image_resize_width=112"], "the policy was trained on other features"),
+    ],
+)
+def test_what_cannot_be_served_is_refused_by_name(
+    trained: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    changed: list[str],
+    said: str,
+) -> None:
+    monkeypatch.delenv("VLA_SERVE_TOKEN", raising=False)
+    arguments = [part for line in changed for part in ("--set", line)]
+    assert run("", serve.main, ["--params", str(trained), *arguments]) == 2
+    error = capsys.readouterr().err
+    assert said in error and "Traceback" not in error
