@@ -117,6 +117,7 @@ def main() -> None:
     parser.add_argument("--processes", type=int, nargs="+", choices=(1, 2), default=[1, 2])
     parser.add_argument("--params", type=Path, default=Path("params.yaml"))
     parser.add_argument("--checkpoint", type=Path, help="a trained policy; else an untrained one")
+    parser.add_argument("--fifo", type=int, default=0, help="priority of the loop's thread")
     parser.add_argument("--spin-ms", type=float, default=RunSettings.spin_s * 1000)
     parser.add_argument("--results", type=Path, help="folder of the picture; else none is drawn")
     options = parser.parse_args()
@@ -134,7 +135,10 @@ def main() -> None:
             with (local if processes == 1 else remote)(params) as connect:
                 for hz in rates:
                     name = f"{processes} process{'es' if processes > 1 else ''}, {hz:g} Hz"
-                    settings = RunSettings(INSTRUCTION, hz=hz, spin_s=options.spin_ms / 1000)
+                    settings = RunSettings(
+                        INSTRUCTION, hz=hz, fifo_priority=options.fifo,
+                        spin_s=options.spin_ms / 1000,
+                    )  # fmt: skip
                     courses[name] = run(connect, settings, seconds)
                     tell(name, courses[name])
     finally:
@@ -145,7 +149,7 @@ def main() -> None:
     targets = [target for name, course in courses.items() for target in judged(name, course)]
     report(
         "robot_jitter",
-        settings={"seconds": seconds, "hz": rates, "spin_ms": options.spin_ms,
+        settings={"seconds": seconds, "hz": rates, "fifo": options.fifo, "spin_ms": options.spin_ms,
                   "checkpoint": "trained" if options.checkpoint else "untrained"},
         results={name: course.document() for name, course in courses.items()},
         ratios={},

@@ -73,7 +73,7 @@ class SimulatedRobot:
         self._unread = []
         if begun:
             observed["reset"] = True
-        elif self._environment.insertion.finished:
+        elif self._environment.insertion.finished and not self._again:
             observed["ended"] = self.outcomes[-1]
         return observed
 
