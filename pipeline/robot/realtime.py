@@ -327,8 +327,8 @@ class _Run:
         """Forget all of the last one; an answer that is still to come is of the last one, too."""
         self.loop.reset()
         self.reset: bool | int = True if self.settings.seed is None else self.settings.seed
-        self.asked_first_s: float | None = None
-        self.frames_s = self.features_s = -math.inf
+        self.begun_s = time.monotonic()
+        self.asked_s = self.frames_s = self.features_s = -math.inf
         self.asker.stale = self.asker.busy
         for pending in self.pending.values():
             pending.forget()
@@ -355,10 +355,9 @@ class _Run:
     def take_answer(self) -> None:
         """Plan what was answered, where an answer has come."""
         answer = self.asker.take()
-        now, first_s = time.monotonic(), self.settings.first_answer_s
+        first_s = self.settings.first_answer_s
         if answer is None:
-            waited = now - self.asked_first_s if self.asked_first_s is not None else 0.0
-            if not self.loop.executor.planned and waited > first_s:
+            if not self.loop.executor.planned and time.monotonic() - self.begun_s > first_s:
                 raise SafeStop(StopKind.NO_CHUNK, f"no first chunk within {first_s:g} s")
             return
         self.note_answer(answer)
@@ -389,23 +388,23 @@ class _Run:
 
     def ask(self) -> None:
         """Ask with the readings since the last question, and frames where they are due."""
-        question: dict[str, Any] = {"time": np.array([self.now_s])}
+        question: dict[str, Any] = {"prompt": self.settings.instruction}
         if self.now_s - self.frames_s > self.settings.old_features_s / 2:
             self.loop.pass_ended()  # Nothing says so, but a pass may have been passed over.
         if self.loop.frames_due:
             question |= self.look()
         self.mark(ASK)
+        # A frame may have come since the robot was observed.
+        self.asked_s = max(self.asked_s, self.now_s, self.frames_s)
         for name, pending in self.pending.items():
             if pending.count:
                 question[name], question[f"{name}_time"] = pending.hand_over()
-        question["prompt"] = self.settings.instruction
+                self.asked_s = max(self.asked_s, float(question[f"{name}_time"][-1]))
+        question["time"] = np.array([self.asked_s])
         if self.reset is not False:
             question["reset"], self.reset = self.reset, False
         if (guide := self.loop.ask()) is not None:
             question |= {"guide/chunk": guide.chunk, "guide/weight": guide.weight}
-        self.asked_s = self.now_s
-        if self.asked_first_s is None:
-            self.asked_first_s = time.monotonic()
         self.asker.ask(question)
 
     def look(self) -> dict[str, Any]:

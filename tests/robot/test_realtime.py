@@ -174,6 +174,21 @@ def test_the_policy_is_told_all_readings_once_and_frames_every_third_tick() -> N
     assert len(with_frames) > len(brain.asked) / 6
 
 
+def test_a_frame_that_came_after_the_readings_is_not_of_the_future() -> None:
+    """As `ObservationReader` takes it: nothing is later than the question, and none goes back."""
+
+    def now(tick: int, frames: dict[str, Any]) -> None:
+        frames["View1"] = (arm.now() + 0.004, frames["View1"][1])
+
+    arm, brain = Arm(sees=now), Brain()
+    assert run_robot(arm, brain, CALM).kind == StopKind.TIME
+    asked = np.array([question["time"][0] for question in brain.asked])
+    assert (np.diff(asked) >= 0).all()
+    for question in brain.asked:
+        for name in ("state_time", "sensor_time", "images_time/View1"):
+            assert (question.get(name, [-np.inf])[-1]) <= question["time"][0]
+
+
 def test_the_policy_is_never_waited_for() -> None:
     arm = Arm()
     brain = Brain(lambda n, answer: time.sleep(0.1), action_hz=50.0)
