@@ -1,9 +1,11 @@
 """Timings of a robot's loop -> pictures."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 
 from pipeline.look.page.style import INK, PALETTE, finish, logarithmic, panels
@@ -23,15 +25,17 @@ def jitter(runs: Mapping[str, tuple[float, Timings]]) -> Figure:
     figure, axes = panels(11, 1.2 + 2.3 * len(runs), len(runs), 2, squeeze=False, sharex="col")
     for (name, (hz, timings)), (shares, course) in zip(runs.items(), axes, strict=True):
         rows = timings.ring.rows()
-        for column, (part, colour) in enumerate(zip(timings.parts, _colours(timings), strict=True)):
-            shares.plot(*exceeded(rows[:, column]), color=colour, lw=1.4, label=part)
+        for column, (part, style) in enumerate(zip(timings.parts, _styles(timings), strict=True)):
+            shares.plot(*exceeded(rows[:, column]), lw=1.4, label=part, **style)
         logarithmic(shares)
         shares.set_xscale("log")
+        shares.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        shares.xaxis.set_minor_formatter(NullFormatter())
         shares.set(title=f"{name}: share of ticks above", xlim=(0.01, None), ylim=(None, 1))
         minutes = np.arange(len(rows)) / hz / 60
         for column, part in ((0, "late"), (-1, "tick")):
-            colour = _colours(timings)[column]
-            course.plot(*worst(minutes, rows[:, column]), color=colour, lw=1, label=part)
+            style = _styles(timings)[column]
+            course.plot(*worst(minutes, rows[:, column]), lw=1, label=part, **style)
         course.set(title=f"{name}: latest and longest [ms]", ylim=(0, None))
         for axis, draw in ((shares, shares.axvline), (course, course.axhline)):
             draw(1000 / hz, color=INK, lw=0.8, ls="--")
@@ -58,7 +62,8 @@ def worst(
     return time[starts], np.maximum.reduceat(values, starts)
 
 
-def _colours(timings: Timings) -> Sequence[str]:
-    """The lateness and the whole tick stand out, parts beyond the palette are grey."""
-    others = [*PALETTE[2:], *["#999999"] * len(timings.parts)]
-    return [PALETTE[0], *others[: len(timings.parts) - 2], PALETTE[1]]
+def _styles(timings: Timings) -> Sequence[Mapping[str, Any]]:
+    """The lateness and the whole tick stand out; parts beyond the palette are dashed."""
+    lines = [{"color": colour, "ls": ls} for ls in ("-", "--", ":") for colour in PALETTE[2:]]
+    first, last = {"color": PALETTE[0], "ls": "-"}, {"color": PALETTE[1], "ls": "-"}
+    return [first, *lines[: len(timings.parts) - 2], last]
