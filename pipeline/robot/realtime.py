@@ -7,6 +7,8 @@ wrong ends in `Robot.stop` with a `StopKind` and a reason. Numpy only.
 
 import gc
 import math
+import os
+import sys
 import threading
 import time
 import traceback
@@ -21,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.config import Chunking
+from pipeline.base.errors import ConfigError
 from pipeline.robot.limits import Limits
 from pipeline.robot.loop import ControlLoop, LoopTiming, SafeStop, StopKind
 from pipeline.robot.memory import ReadingWindow, WindowSize
@@ -37,6 +40,8 @@ _BLAMED = {OBSERVE: "observe", FRAMES: "frames", ACT: "act"}
 _FIRST_OBSERVATIONS = 10
 """Of which the quickest one tells the offset of the robot's clock."""
 _MISSED_KEPT = 4096
+_SWITCH_S = 5e-4
+"""How long another thread of this process may keep Python to itself while the loop waits for it."""
 
 
 class Robot(Protocol):
@@ -125,6 +130,9 @@ class RunSettings:
     """Ticks left out without one in time between them, from which the robot stops."""
     hung_s: float = 0.5
     """How long a tick may take, at least two and a half of them, before a watchdog stops it."""
+    fifo_priority: int = 0
+    """1 to 99: the loop's thread goes before whatever has less (SCHED_FIFO of Linux), which needs
+    the right to (`ulimit -r`, or root). 0: as any other."""
     spin_s: float = 0.0
     """How long before a deadline to stop sleeping and look at the clock all the time."""
     kept_ticks: int = 65536
@@ -194,22 +202,23 @@ def run_robot(
 ) -> RunReport:
     """Run a robot until something ends it; `robot.stop` has then been called, whatever it was.
 
-    Raises `ConfigError` before the first observation where settings do not fit the policy.
+    Raises `ConfigError` before the first observation where settings do not fit the policy or the
+    machine.
     """
-    run = _Run(robot, policy, settings, limits, recorder)
     kind, reason, trace = StopKind.LOOP, "the process ends", ""
-    try:
-        with _quiet():
+    with _undisturbed(settings.fifo_priority):
+        run = _Run(robot, policy, settings, limits, recorder)
+        try:
             run.go()
-    except SafeStop as stop:
-        kind, reason = stop.kind, str(stop)
-    except KeyboardInterrupt:
-        kind, reason = StopKind.BY_HAND, "stopped by hand (Ctrl-C)"
-    except Exception as error:
-        (kind, reason), trace = run.blame(error), traceback.format_exc()
-    finally:
-        robot.stop(reason)
-        run.close()
+        except SafeStop as stop:
+            kind, reason = stop.kind, str(stop)
+        except KeyboardInterrupt:
+            kind, reason = StopKind.BY_HAND, "stopped by hand (Ctrl-C)"
+        except Exception as error:
+            (kind, reason), trace = run.blame(error), traceback.format_exc()
+        finally:
+            robot.stop(reason)
+            run.close()
     recording = recorder.finish(reason) if recorder else None
     return run.report(kind, reason, recording, trace)
 
@@ -318,8 +327,8 @@ class _Run:
         """Forget all of the last one; an answer that is still to come is of the last one, too."""
         self.loop.reset()
         self.reset: bool | int = True if self.settings.seed is None else self.settings.seed
-        self.asked_first_s: float | None = None
-        self.frames_s = self.features_s = -math.inf
+        self.begun_s = time.monotonic()
+        self.asked_s = self.frames_s = self.features_s = -math.inf
         self.asker.stale = self.asker.busy
         for pending in self.pending.values():
             pending.forget()
@@ -346,10 +355,9 @@ class _Run:
     def take_answer(self) -> None:
         """Plan what was answered, where an answer has come."""
         answer = self.asker.take()
-        now, first_s = time.monotonic(), self.settings.first_answer_s
+        first_s = self.settings.first_answer_s
         if answer is None:
-            waited = now - self.asked_first_s if self.asked_first_s is not None else 0.0
-            if not self.loop.executor.planned and waited > first_s:
+            if not self.loop.executor.planned and time.monotonic() - self.begun_s > first_s:
                 raise SafeStop(StopKind.NO_CHUNK, f"no first chunk within {first_s:g} s")
             return
         self.note_answer(answer)
@@ -380,23 +388,23 @@ class _Run:
 
     def ask(self) -> None:
         """Ask with the readings since the last question, and frames where they are due."""
-        question: dict[str, Any] = {"time": np.array([self.now_s])}
+        question: dict[str, Any] = {"prompt": self.settings.instruction}
         if self.now_s - self.frames_s > self.settings.old_features_s / 2:
             self.loop.pass_ended()  # Nothing says so, but a pass may have been passed over.
         if self.loop.frames_due:
             question |= self.look()
         self.mark(ASK)
+        # A frame may have come since the robot was observed.
+        self.asked_s = max(self.asked_s, self.now_s, self.frames_s)
         for name, pending in self.pending.items():
             if pending.count:
                 question[name], question[f"{name}_time"] = pending.hand_over()
-        question["prompt"] = self.settings.instruction
+                self.asked_s = max(self.asked_s, float(question[f"{name}_time"][-1]))
+        question["time"] = np.array([self.asked_s])
         if self.reset is not False:
             question["reset"], self.reset = self.reset, False
         if (guide := self.loop.ask()) is not None:
             question |= {"guide/chunk": guide.chunk, "guide/weight": guide.weight}
-        self.asked_s = self.now_s
-        if self.asked_first_s is None:
-            self.asked_first_s = time.monotonic()
         self.asker.ask(question)
 
     def look(self) -> dict[str, Any]:
@@ -648,15 +656,30 @@ def _wait(until_s: float, spin_s: float) -> None:
 
 
 @contextmanager
-def _quiet() -> Generator[None]:
-    """No garbage is collected meanwhile: the loop makes none that counting does not free."""
+def _undisturbed(fifo_priority: int) -> Generator[None]:
+    """This thread goes first, and no garbage is collected: the loop makes none that needs it."""
+    switch_s, collects = sys.getswitchinterval(), gc.isenabled()
+    scheduled = os.sched_getscheduler(0), os.sched_getparam(0)
+    if fifo_priority:
+        # The threads that this one starts compute, and are to do so as any other.
+        policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+        try:
+            os.sched_setscheduler(0, policy, os.sched_param(fifo_priority))
+        except OSError as error:
+            raise ConfigError(
+                f"fifo_priority: this machine does not grant priority {fifo_priority} ({error}). "
+                "Allow it (rtprio in /etc/security/limits.conf), or set it to 0."
+            ) from None
     gc.collect()
     gc.freeze()
-    enabled = gc.isenabled()
     gc.disable()
+    sys.setswitchinterval(_SWITCH_S)
     try:
         yield
     finally:
+        sys.setswitchinterval(switch_s)
         gc.unfreeze()
-        if enabled:
+        if collects:
             gc.enable()
+        if fifo_priority:
+            os.sched_setscheduler(0, *scheduled)

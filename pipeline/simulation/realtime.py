@@ -18,9 +18,12 @@ from pipeline.base.config import Level
 from pipeline.simulation.arm import ActionRotation
 from pipeline.simulation.environment import InsertionEnvironment, Readings
 from pipeline.simulation.insertion import TICK_HZ, TICK_S
+from pipeline.simulation.recorder import CAMERA_HZ
 
 Frames = dict[str, tuple[float, NDArray[np.uint8]]]
 _STREAMS = ("state", "sensor")
+_FRAME_S = 0.9 / CAMERA_HZ
+"""Cameras take no more than so many frames, however fast the world goes: each costs 6 ms."""
 
 
 class SimulatedRobot:
@@ -73,7 +76,7 @@ class SimulatedRobot:
         self._unread = []
         if begun:
             observed["reset"] = True
-        elif self._environment.insertion.finished:
+        elif self._environment.insertion.finished and not self._again:
             observed["ended"] = self.outcomes[-1]
         return observed
 
@@ -122,6 +125,7 @@ class SimulatedRobot:
     def _film(self) -> None:
         while self._shutter.wait() and not self._closed:
             self._shutter.clear()
+            due_s = time.monotonic() + _FRAME_S
             environment, epoch_s = world = self._world
             frames = self._timed(environment.frames(), epoch_s)
             if world is self._world:
@@ -131,6 +135,7 @@ class SimulatedRobot:
                 prepared = self._prepared(seed)
                 if seed == self._seed:  # Else that episode has begun meanwhile.
                     self._next = prepared
+            time.sleep(max(0.0, due_s - time.monotonic()))
 
     def _timed(self, frames: Frames, epoch_s: float) -> Frames:
         return {view: (epoch_s + self._scale * t, frame) for view, (t, frame) in frames.items()}

@@ -1,6 +1,8 @@
 """The loop in real time: what it asks and does, and that whatever goes wrong stops the robot."""
 
+import gc
 import json
+import os
 import subprocess
 import sys
 import threading
@@ -170,6 +172,21 @@ def test_the_policy_is_told_all_readings_once_and_frames_every_third_tick() -> N
     with_frames = [n for n, asked in enumerate(brain.asked) if "images/View1" in asked]
     assert with_frames[0] == 0 and len(with_frames) <= report.ticks / 3 + 1
     assert len(with_frames) > len(brain.asked) / 6
+
+
+def test_a_frame_that_came_after_the_readings_is_not_of_the_future() -> None:
+    """As `ObservationReader` takes it: nothing is later than the question, and none goes back."""
+
+    def now(tick: int, frames: dict[str, Any]) -> None:
+        frames["View1"] = (arm.now() + 0.004, frames["View1"][1])
+
+    arm, brain = Arm(sees=now), Brain()
+    assert run_robot(arm, brain, CALM).kind == StopKind.TIME
+    asked = np.array([question["time"][0] for question in brain.asked])
+    assert (np.diff(asked) >= 0).all()
+    for question in brain.asked:
+        for name in ("state_time", "sensor_time", "images_time/View1"):
+            assert (question.get(name, [-np.inf])[-1]) <= question["time"][0]
 
 
 def test_the_policy_is_never_waited_for() -> None:
@@ -478,6 +495,39 @@ def test_settings_that_do_not_fit_the_policy_are_refused_before_anything_is_aske
     with pytest.raises(ConfigError, match="execute"):
         run_robot(arm, Brain(), replace(CALM, execute=HORIZON + 1))
     assert not arm.ticks and not arm.stops
+
+
+def test_the_process_is_afterwards_as_it_was() -> None:
+    def look(tick: int) -> None:
+        within.append((sys.getswitchinterval(), gc.isenabled()))
+
+    before, within = (sys.getswitchinterval(), gc.isenabled()), list[Any]()
+    run_robot(Arm(moves=look), Brain(), replace(CALM, seconds=0.05))
+    assert before == (sys.getswitchinterval(), gc.isenabled())
+    assert set(within) == {(5e-4, False)}
+
+
+def test_the_loop_goes_before_other_threads_where_the_machine_grants_it() -> None:
+    def look(tick: int) -> None:
+        seen.add(os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK)
+
+    seen: set[int] = set()
+    first = replace(CALM, seconds=0.05, fifo_priority=1)
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+    except PermissionError:
+        with pytest.raises(ConfigError, match="fifo_priority: this machine does not grant"):
+            run_robot(Arm(), Brain(), first)
+        return
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    arm = Arm(moves=look)
+    brain = Brain(lambda n, answer: asked.add(os.sched_getscheduler(0)))
+    asked: set[int] = set()
+    run_robot(arm, brain, first)
+    assert seen == {os.SCHED_FIFO} and asked == {os.SCHED_OTHER}
+    assert os.sched_getscheduler(0) == os.SCHED_OTHER
+    with pytest.raises(ConfigError, match="does not grant priority 1000"):
+        run_robot(arm, brain, replace(first, fifo_priority=1000))
 
 
 def test_a_thousand_ticks_more_need_no_more_memory() -> None:

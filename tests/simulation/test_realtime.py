@@ -95,6 +95,18 @@ def test_the_next_episode_begins_where_asked_for_and_the_clock_goes_on() -> None
         robot.close()
 
 
+def test_an_episode_that_ends_while_nobody_acts_is_followed_by_the_next() -> None:
+    robot = SimulatedRobot(hz=1000.0, seed=3, again=True)
+    try:
+        robot.observe()
+        time.sleep(0.13)  # all its 120 ticks
+        late = robot.observe()
+        assert "ended" not in late and len(robot.outcomes) == 1
+        assert robot.observe()["reset"] is True
+    finally:
+        robot.close()
+
+
 def test_a_robot_that_was_stopped_does_not_move(robot: SimulatedRobot) -> None:
     robot.observe()
     robot.stop("by hand")

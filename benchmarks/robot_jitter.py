@@ -1,0 +1,291 @@
+"""How well a robot's loop keeps its deadlines while the model runs beside it.
+
+The simulated arm is run in real time at each rate: in one process with the policy, and in two, the
+policy behind `stages.serve`. Episode follows episode. Every tick is accounted for: it was run in
+time, or it is listed as missed with those that were left out after it. Where the loop stops safely
+it begins again, and the stop is counted. Rates other than the policy's make the simulated world
+faster, not the policy: what it does there is not what it was trained for, but costs as much.
+"""
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Generator
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from benchmarks.timing import arguments, at_least, at_most, report
+from pipeline.base.config import Params, TrainHeadParams, VLMParams, load_params
+from pipeline.compat.unified import no_normalization
+from pipeline.data.insertion import SENSOR, STATE
+from pipeline.look.page.style import write
+from pipeline.look.robot.pictures import jitter
+from pipeline.policy.checkpoint import PolicyCheckpoint, save_policy
+from pipeline.policy.observation import PolicyShape
+from pipeline.policy.policy import Policy
+from pipeline.robot.client import PolicyClient
+from pipeline.robot.limits import Limits
+from pipeline.robot.loop import StopKind
+from pipeline.robot.realtime import (
+    ANSWER_PARTS,
+    TICK_PARTS,
+    Decides,
+    RunReport,
+    RunSettings,
+    run_robot,
+)
+from pipeline.robot.session import ServedPolicy
+from pipeline.robot.timings import Timings
+from pipeline.simulation.insertion import TICK_HZ
+from pipeline.simulation.insertion_formats import INSTRUCTION
+from pipeline.simulation.realtime import SimulatedRobot
+from pipeline.simulation.rendering import VIEWS
+from pipeline.vlm.demo_checkpoint import write_demo_checkpoint
+from pipeline.vlm.live import live_spec
+
+LIMITS = Path(__file__).resolve().parents[1] / "examples" / "limits.yaml"
+ACTION = {
+    "names": ["dx", "dy", "dz", "rx", "ry", "rz", "gripper"],
+    "units": ["mm"] * 3 + ["deg"] * 3 + [""],
+    "kind": "delta",
+}
+SMALL = {
+    "sensor_encoder": {"channels": [8], "layers": 0, "heads": 1, "output_dim": 8},
+    "state_encoder": {"dim": 8, "layers": 0, "heads": 1, "output_dim": 8},
+    "expert": {"dim": 8, "layers": 1, "heads": 1},
+}
+SERVING = "serving ws://"
+_LONGEST_TICKS = 2**17
+
+
+@dataclass
+class Course:
+    """All runs of the arm at one rate."""
+
+    hz: float
+    ticks: Timings = field(default_factory=lambda: Timings((*TICK_PARTS, "tick"), _LONGEST_TICKS))
+    answers: Timings = field(default_factory=lambda: Timings(ANSWER_PARTS, _LONGEST_TICKS))
+    stops: Counter[str] = field(default_factory=Counter[str])
+    left_out: int = 0
+    missed: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
+    missed_ticks: int = 0
+    episodes: Counter[str] = field(default_factory=Counter[str])
+
+    def take(self, run: RunReport) -> None:
+        """One more run."""
+        for row in run.tick_timings.ring.rows():
+            self.ticks.note(row)
+        for row in run.answer_timings.ring.rows():
+            self.answers.note(row)
+        self.left_out += run.left_out
+        self.missed_ticks += run.missed_ticks
+        self.missed += run.document()["missed"]
+        if run.kind != StopKind.TIME:
+            self.stops[f"{run.kind.value}: {run.reason}"] += 1
+
+    def document(self) -> dict[str, Any]:
+        """What is told of it."""
+        answers = self.answers.ring.rows()
+        passes = int((answers[:, ANSWER_PARTS.index("vlm_ms")] > 0).sum())
+        return {
+            "ticks": self.ticks.ring.count,
+            "missed_ticks": self.missed_ticks,
+            "left_out": self.left_out,
+            "answers": len(answers),
+            "model_passes": passes,
+            "safe_stops": dict(self.stops),
+            "episodes": dict(self.episodes),
+            "tick_ms": self.ticks.document(),
+            "answer_ms": self.answers.document(),
+            "worst": sorted(self.missed, key=lambda tick: -tick["late_ms"])[:20],
+        }
+
+
+def main() -> None:
+    """Serve, run, draw, print."""
+    parser = arguments(__doc__ or "")
+    parser.add_argument("--minutes", type=float, default=10.0, help="at each rate")
+    parser.add_argument("--hz", type=float, nargs="+", default=[10.0, 30.0, 100.0])
+    parser.add_argument("--processes", type=int, nargs="+", choices=(1, 2), default=[1, 2])
+    parser.add_argument("--params", type=Path, default=Path("params.yaml"))
+    parser.add_argument("--checkpoint", type=Path, help="a trained policy; else an untrained one")
+    parser.add_argument("--fifo", type=int, default=0, help="priority of the loop's thread")
+    parser.add_argument("--spin-ms", type=float, default=RunSettings.spin_s * 1000)
+    parser.add_argument("--results", type=Path, help="folder of the picture; else none is drawn")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    seconds = 1.5 if options.quick else 60 * options.minutes
+    rates = [10.0] if options.quick else options.hz
+    params, folder = load_params(options.params), Path(tempfile.mkdtemp(prefix="robot-jitter-"))
+    courses: dict[str, Course] = {}
+    try:
+        if options.checkpoint is None:
+            params = untrained(params, folder, options.quick)
+        else:
+            params = with_checkpoint(params, options.checkpoint)
+        for processes in options.processes:
+            with (local if processes == 1 else remote)(params) as connect:
+                for hz in rates:
+                    name = f"{processes} process{'es' if processes > 1 else ''}, {hz:g} Hz"
+                    settings = RunSettings(
+                        INSTRUCTION, hz=hz, fifo_priority=options.fifo,
+                        spin_s=options.spin_ms / 1000,
+                    )  # fmt: skip
+                    courses[name] = run(connect, settings, seconds)
+                    tell(name, courses[name])
+    finally:
+        shutil.rmtree(folder)
+    if options.results is not None:
+        drawn = {name: (course.hz, course.ticks) for name, course in courses.items()}
+        write(options.results, {"robot_jitter.png": lambda: jitter(drawn)})
+    targets = [target for name, course in courses.items() for target in judged(name, course)]
+    report(
+        "robot_jitter",
+        settings={"seconds": seconds, "hz": rates, "fifo": options.fifo, "spin_ms": options.spin_ms,
+                  "checkpoint": "trained" if options.checkpoint else "untrained"},
+        results={name: course.document() for name, course in courses.items()},
+        ratios={},
+        targets=targets,
+        quick=options.quick,
+    )  # fmt: skip
+
+
+def run(connect: Callable[[], Decides], settings: RunSettings, seconds: float) -> Course:
+    """Run the arm for so many seconds; where it stops safely, begin again."""
+    hz = settings.hz or TICK_HZ
+    course, seed = Course(hz), 0
+    while (left := seconds - (course.ticks.ring.count + course.left_out) / hz) > 0.5 / hz:
+        policy = connect()
+        # Speeds are those of the simulated world, whatever the rate.
+        limits = Limits.read(LIMITS, policy.metadata, TICK_HZ)
+        with closing(SimulatedRobot(hz=hz, seed=seed, again=True)) as robot:
+            # Late ticks are what is to be measured; they stop nothing here.
+            patient = replace(settings, seconds=left, missed_in_a_row=10**9)
+            course.take(run_robot(robot, policy, patient, limits))
+        course.episodes.update(robot.outcomes)
+        seed += 1 + len(robot.outcomes)
+    return course
+
+
+def judged(name: str, course: Course) -> list[dict[str, Any]]:
+    """The targets of the report."""
+    told, ran = course.ticks.document(), course.ticks.ring.count
+    return [
+        at_least(f"{name}: share of ticks in time", 1 - course.left_out / max(1, ran), 0.999),
+        at_most(f"{name}: p99 of how late a tick begins [ms]", told["late"]["p99"], 1.0),
+        at_least(f"{name}: missed ticks that are listed", len(course.missed), course.missed_ticks),
+    ]
+
+
+def tell(name: str, course: Course) -> None:
+    """The tables of a rate, on stderr."""
+    head = f"{name}: {course.ticks.ring.count} ticks, {course.missed_ticks} missed, "
+    print(head + f"{course.left_out} left out, {dict(course.stops)}", file=sys.stderr)
+    for table in (course.ticks.table(), course.answers.table()):
+        print("\n".join(table.text()), file=sys.stderr)
+
+
+@contextmanager
+def local(params: Params) -> Generator[Callable[[], Decides]]:
+    """The policy in this process, its model on a thread beside the loop."""
+    served = ServedPolicy.load(chosen(params), params.vlm, "cpu", say)
+    with closing(served):
+        yield lambda: served.session(fresh=False)
+
+
+@contextmanager
+def remote(params: Params) -> Generator[Callable[[], Decides]]:
+    """The policy in a process of its own, behind `stages.serve`."""
+    wanted = params.serve.model_copy(update={"port": 0, "fresh": False, "device": "cpu"})
+    told = params.model_copy(update={"serve": wanted}).model_dump_json()
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+    with ExitStack() as leaving:
+        written = leaving.enter_context(tempfile.NamedTemporaryFile("w", suffix=".yaml"))
+        written.write(told)
+        written.flush()
+        command = [sys.executable, "-m", "stages.serve", "--params", written.name]
+        server = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
+        leaving.callback(server.communicate)
+        leaving.callback(server.terminate)
+        assert server.stdout is not None
+        serving = next((line for line in server.stdout if line.startswith(SERVING)), None)
+        if serving is None:
+            raise RuntimeError(f"{' '.join(command)}: ended before it served")
+        client = leaving.enter_context(PolicyClient(serving.split()[1]))
+
+        def connect() -> PolicyClient:
+            client.reconnect()
+            return client
+
+        yield connect
+
+
+def untrained(params: Params, folder: Path, quick: bool) -> Params:
+    """These params with the demo's model and a policy of random weights, written below `folder`.
+
+    It moves by tenths of a millimetre and costs what a trained one of the same head does.
+    """
+    write_demo_checkpoint(folder / "vlm")
+    vlm = params.vlm.model_copy(update={"checkpoint": str(folder / "vlm"), "adapter": None})
+    head = params.train_head.model_dump() | (SMALL if quick else {})
+    save_policy(folder / "policy", random_policy(TrainHeadParams.model_validate(head), vlm))
+    return with_checkpoint(params.model_copy(update={"vlm": vlm}), folder / "policy")
+
+
+def random_policy(head: TrainHeadParams, vlm: VLMParams) -> PolicyCheckpoint:
+    """A policy of the phantom with random weights."""
+    spec = live_spec(vlm, VIEWS)
+    groups = ("translation",) * 3 + ("rotation",) * 3 + ("gripper",)
+    sizes = (len(spec.slots), spec.dim, len(SENSOR.names), len(STATE.names), 7)
+    shape = PolicyShape(*sizes, action_groups=groups, views=len(VIEWS))
+    normal = no_normalization(shape)
+    still = np.array([0, 0, -0.1, 0, 0, 0, 1.0])
+    action = replace(normal.action, std=np.full(7, 0.05), mean=still)
+    normal = replace(normal, action=action)
+    streams = {
+        "action": ACTION,
+        "state": {"names": list(STATE.names), "units": list(STATE.units)},
+        "sensor": {"names": list(SENSOR.names), "units": list(SENSOR.units)},
+        "views": list(VIEWS),
+    }
+    source = {
+        "feature_spec": spec.document | {"digest": spec.digest},
+        "streams": streams,
+        "action_hz": float(TICK_HZ),
+        "vlm_reuse_count": 3,
+    }
+    torch.manual_seed(0)
+    weights = Policy(head, shape, normal).state_dict()
+    split: Any = {"train": {}, "val": {}, "test": {}}
+    return PolicyCheckpoint(
+        head, shape, normal, source, split, 0, weights, instructions=(INSTRUCTION,)
+    )
+
+
+def with_checkpoint(params: Params, folder: Path) -> Params:
+    """These params, to serve the policy of `folder`."""
+    return params.model_copy(
+        update={"serve": params.serve.model_copy(update={"checkpoint": folder})}
+    )
+
+
+def chosen(params: Params) -> Path:
+    """The policy that is served."""
+    return params.serve.checkpoint or params.train_head.output
+
+
+def say(line: str) -> None:
+    """Progress goes to stderr."""
+    print(line, file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""How a robot's loop kept its deadlines."""
