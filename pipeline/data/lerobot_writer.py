@@ -89,9 +89,10 @@ def _write_rows(
 
 def _cells(files: Sequence[Path]) -> pa.StructArray:
     encoded = {file: file.read_bytes() for file in dict.fromkeys(files)}
-    place = {file: index for index, file in enumerate(encoded)}
-    values = pa.array(list(encoded.values()), pa.binary())
-    images = pa.DictionaryArray.from_arrays(pa.array([place[f] for f in files], "int32"), values)
+    # Each image once: parquet takes no dictionary with twins, and would store every row.
+    place = {image: index for index, image in enumerate(dict.fromkeys(encoded.values()))}
+    rows = pa.array([place[encoded[file]] for file in files], pa.int32())
+    images = pa.DictionaryArray.from_arrays(rows, pa.array(list(place), pa.binary()))
     return pa.StructArray.from_arrays([images, pa.nulls(len(files), pa.string())], _IMAGE.names)
 
 
