@@ -374,6 +374,17 @@ def test_what_the_loop_gives_wrongly_fails_the_recording_not_the_run(tmp_path: P
     assert recover(recorder.part).name == "run_000000"
 
 
+def test_a_recording_is_one_episode(tmp_path: Path) -> None:
+    recorder = RunRecorder(tmp_path, metadata_of(), "Push")
+    for tick in range(4):
+        recorder.tick(observed_at(tick % 3, reset=tick % 3 == 0), np.full(7, tick))
+    assert recorder.failed is not None
+    with pytest.raises(RecordingError, match="another episode begins"):
+        recorder.finish("done")
+    action = opened(recover(recorder.part)).action()
+    assert action is not None and action.values[:, 0].tolist() == [0, 1, 2]
+
+
 def test_a_run_without_an_action_is_no_recording(tmp_path: Path) -> None:
     recorder = RunRecorder(tmp_path, metadata_of(), "Push")
     recorder.tick(observed_at(0), None)
