@@ -1,36 +1,38 @@
-"""A policy drives a LeRobot arm over the wire: an SO-101 here, any of LeRobot's robots alike.
+"""A policy drives a LeRobot arm over the wire: python examples/lerobot_arm.py PORT INSTRUCTION.
 
-Start the server where the model runs (python -m stages.serve), then this beside the arm. First in
-the air: what is checked before the first action, and what each stop means, is in docs/robot.md.
+An SO-101 here, any of LeRobot's robots alike. Serve the policy where its model runs first (python
+-m stages.serve). What to check before the first action: docs/robot.md.
 """
 
 import sys
+from pathlib import Path
 
 from pipeline.robot.client import PolicyClient
 from pipeline.robot.lerobot_arm import LeRobotArm, LeRobotStyle
-from pipeline.robot.realtime import LoopSettings, run_robot
+from pipeline.robot.realtime import RunSettings, run_robot
 from pipeline.robot.recorder import RunRecorder
 
-CAMERAS = {"View1": "front", "View2": "wrist"}
-"""The policy's views, and what the robot calls these cameras."""
+CAMERAS = {"View1": "front", "View2": "wrist"}  # the policy's views, and the robot's cameras
+URL = "ws://127.0.0.1:8000"
 
 
-def drive(robot: LeRobotStyle, server: str, instruction: str, folder: str = "runs") -> None:
-    """Run the policy of a server on a connected robot, and record the run."""
-    with PolicyClient(server) as policy:
-        arm = LeRobotArm(robot, policy.metadata, cameras=CAMERAS)
-        recorder = RunRecorder(folder, policy.metadata, instruction)
-        print(run_robot(arm, policy, LoopSettings(instruction=instruction), recorder=recorder))
+def drive(robot: LeRobotStyle, settings: RunSettings, folder: Path = Path("runs")) -> None:
+    """Run a connected robot until the settings or Ctrl-C end it, and record what happens."""
+    with PolicyClient(URL) as policy:
+        arm = LeRobotArm(robot, policy.metadata, CAMERAS)
+        recorder = RunRecorder(folder, policy.metadata, settings.instruction, vars(settings))
+        report = run_robot(arm, policy, settings, recorder=recorder)
+        print(f"{report.ticks} ticks, {report.reason}: {report.recording}")
 
 
 if __name__ == "__main__":
     from lerobot.cameras.opencv import OpenCVCameraConfig
     from lerobot.robots.so101_follower import SO101Follower, SO101FollowerConfig
 
-    eyes = {name: OpenCVCameraConfig(i, 30, 640, 480) for i, name in enumerate(CAMERAS.values())}
+    eyes = {name: OpenCVCameraConfig(at, 30, 640, 480) for at, name in enumerate(CAMERAS.values())}
     follower = SO101Follower(SO101FollowerConfig(port=sys.argv[1], cameras=eyes, use_degrees=True))
     follower.connect()
     try:
-        drive(follower, "ws://127.0.0.1:8000", sys.argv[2])
+        drive(follower, RunSettings(instruction=sys.argv[2], seconds=60))
     finally:
         follower.disconnect()

@@ -6,6 +6,7 @@ parquet file, so that rows between two frames cost next to nothing.
 
 import json
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,12 +18,14 @@ from numpy.typing import NDArray
 from pipeline.data.lerobot import MARKER
 
 EPISODE: Final = "episode_000000"
-_ROWS_A_GROUP: Final = 60
-"""Of the parquet file: equal images are stored once a group, and a group is held in memory."""
+_IMAGES_A_GROUP: Final = 64
+"""Of the parquet file's rows: equal images are stored once a group, which is held in memory."""
 _DICTIONARY_BYTES: Final = 2**30
 _DATA: Final = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _FIRST: Final = {"chunk_index": 0, "file_index": 0}
-_IMAGE: Final = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+_IMAGE: Final = pa.struct(
+    [("bytes", pa.dictionary(pa.int32(), pa.binary())), ("path", pa.string())]
+)
 
 
 def write_data_set(
@@ -67,20 +70,30 @@ def _write_rows(
         else pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
         for name, values in columns.items()
     }
-    numbers = pa.table(arrays)
-    schema = pa.schema([*numbers.schema, *(pa.field(key, _IMAGE) for key in images)])
-    with pq.ParquetWriter(path, schema, dictionary_pagesize_limit=_DICTIONARY_BYTES) as writer:
-        for first in range(0, numbers.num_rows, _ROWS_A_GROUP):
-            group = numbers.slice(first, _ROWS_A_GROUP)
+    table = pa.table(arrays)
+    schema = pa.schema([*table.schema, *(pa.field(key, _IMAGE) for key in images)])
+    changes = np.zeros(table.num_rows)
+    for files in images.values():
+        changes += [file != before for before, file in pairwise([None, *files])]
+    group = np.cumsum(changes) // _IMAGES_A_GROUP
+    edges = [0, *(np.flatnonzero(np.diff(group)) + 1).tolist(), table.num_rows]
+    # Without this project's schema, in which the type would be that of a dictionary.
+    how: dict[str, Any] = {"dictionary_pagesize_limit": _DICTIONARY_BYTES, "store_schema": False}
+    with pq.ParquetWriter(path, schema, **how) as writer:
+        for first, stop in pairwise(edges):
+            rows = table.slice(first, stop - first)
             for key, files in images.items():
-                cells = _cells(files[first : first + _ROWS_A_GROUP])
-                group = group.append_column(key, pa.array(cells, _IMAGE))
-            writer.write_table(group)
+                rows = rows.append_column(key, _cells(files[first:stop]))
+            writer.write_table(rows)
 
 
-def _cells(files: Sequence[Path]) -> list[dict[str, Any]]:
-    encoded = {file: file.read_bytes() for file in set(files)}
-    return [{"bytes": encoded[file], "path": None} for file in files]
+def _cells(files: Sequence[Path]) -> pa.StructArray:
+    encoded = {file: file.read_bytes() for file in dict.fromkeys(files)}
+    # Each image once: parquet takes no dictionary with twins, and would store every row.
+    place = {image: index for index, image in enumerate(dict.fromkeys(encoded.values()))}
+    rows = pa.array([place[encoded[file]] for file in files], pa.int32())
+    images = pa.DictionaryArray.from_arrays(rows, pa.array(list(place), pa.binary()))
+    return pa.StructArray.from_arrays([images, pa.nulls(len(files), pa.string())], _IMAGE.names)
 
 
 def _write_meta(

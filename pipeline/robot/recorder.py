@@ -61,7 +61,7 @@ class RunRecorder:
         self.dropped_images = 0
         self._error: Exception | None = None
         self._tick = np.zeros(1, self._types["tick"])
-        self._tick["frame"] = -1
+        self._tick["time"], self._tick["frame"] = -np.inf, -1
         self._frame_time = dict.fromkeys(self._views, -np.inf)
         self._frames = self._put_bytes = self._written_bytes = 0
         self._queue: SimpleQueue[tuple[Callable[[], None], int] | None] = SimpleQueue()
@@ -103,9 +103,12 @@ class RunRecorder:
     def tick(self, observed: Mapping[str, Any], action: ArrayLike | None) -> None:
         """Take a tick: the readings since the last, its `time`, and the action really sent.
 
-        None where none was: then the tick is no row, but its readings are kept.
+        None where none was: then the tick is no row, but its readings are kept. A recording is one
+        episode: it fails, with what came before, where `reset` says that another begins.
         """
         with self._unharmed():
+            if observed.get("reset") and self._tick["time"] > -np.inf:
+                raise RecordingError("another episode begins: give each a recorder of its own")
             for name in READINGS:
                 time = np.asarray(observed.get(f"{name}_time", ()))
                 if name in self._types and len(time):

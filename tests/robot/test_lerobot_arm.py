@@ -1,14 +1,20 @@
 """A robot shaped like LeRobot's is driven by the policy's channels, and refused where it is not."""
 
+import importlib.util
+import json
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from pipeline.base.config import Source
 from pipeline.base.errors import CheckpointMismatch
+from pipeline.data import open_recordings
 from pipeline.robot.lerobot_arm import LeRobotArm
 
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "lerobot_arm.py"
 MOTORS = ("shoulder_pan", "elbow_flex", "gripper")
 
 
@@ -157,3 +163,64 @@ def test_a_delta_of_a_motor_that_is_not_observed_is_refused() -> None:
     metadata = metadata_of(kind="delta", moving=(True, True, False), state=(), views=("front",))
     with pytest.raises(CheckpointMismatch, match=r"found \['elbow_flex.pos', 'shoulder_pan.pos'\]"):
         LeRobotArm(Blind(), metadata)
+
+
+class Policy:
+    """A policy behind no wire: it moves every motor by a hundredth of a degree a tick."""
+
+    def __init__(self, url: str) -> None:
+        channels = [f"delta_{motor}.pos" for motor in MOTORS]
+        action = {"names": channels, "units": ["deg"] * 3, "kind": "delta"}
+        state = {"names": list(MOTORS), "units": ["deg"] * 3}
+        streams = {"action": action, "state": state, "views": ["View1"]}
+        self.metadata: dict[str, Any] = {
+            "streams": streams,
+            "moving": [True] * 3,
+            "horizon": 8,
+            "action_dim": 3,
+            "action_hz": 50.0,
+            "vlm_reuse_count": 3,
+            "uses_features": True,
+            "feature_spec": {"digest": "d"},
+            "feature_spec_digest": "d",
+            "state_window": 5,
+            "sensor_window": 5,
+        }
+        self.key = np.zeros(16, np.uint8)
+
+    def __enter__(self) -> "Policy":
+        return self
+
+    def __exit__(self, *told: object) -> None:
+        pass
+
+    def infer(self, observation: Mapping[str, Any]) -> dict[str, Any]:
+        self.key = self.key + ("images/View1" in observation)
+        chunk = np.full((8, 3), 0.01, np.float32)
+        return {"actions": chunk, "feature_key": self.key, "feature_age_s": 0.01}
+
+
+def test_the_example_drives_a_robot_and_records_it(tmp_path: Path, monkeypatch) -> None:
+    realtime = pytest.importorskip("pipeline.robot.realtime")
+    spec = importlib.util.spec_from_file_location("lerobot_arm_example", EXAMPLE)
+    assert spec is not None and spec.loader is not None
+    example = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(example)
+    monkeypatch.setattr(example, "PolicyClient", Policy)
+    monkeypatch.setattr(example, "CAMERAS", {"View1": "front"})
+    robot = Follower()
+    settings = realtime.RunSettings(instruction="Push", seconds=1.0, missed_in_a_row=1000)
+    example.drive(robot, settings, tmp_path)
+    (root,) = tmp_path.iterdir()
+    (recording,) = open_recordings([Source(name="runs", path=str(root))], tmp_path).recordings
+    action, state = recording.action(), recording.state()
+    assert action is not None and state is not None and action.kind == "delta"
+    assert len(action.time) == len(robot.sent) - 1 > 5, "all but the stop"
+    np.testing.assert_array_equal(action.values, np.full((len(action.time), 3), 0.01, np.float32))
+    assert robot.sent[-1] == robot.place
+    assert list(recording.cameras()) == ["View1"] and recording.instruction == "Push"
+    assert json.loads((root / "run.json").read_text())["settings"]["seconds"] == 1.0
+
+
+def test_the_example_is_short() -> None:
+    assert len(EXAMPLE.read_text().splitlines()) <= 40

@@ -298,15 +298,15 @@ def test_a_frame_is_no_newer_than_the_tick_that_it_came_with(tmp_path: Path) -> 
 def test_equal_images_are_stored_once(tmp_path: Path) -> None:
     sizes: list[int] = []
     noise = np.random.default_rng(0).integers(0, 256, (80, 100, 3), np.uint8)
-    for looks in (range(0, 50, 50), range(50)):
+    for looks, images in (([0], 1), (range(50), 1), (range(0, 50, 3), 4), (range(50), 50)):
         recorder = RunRecorder(tmp_path, metadata_of(), "Push")
         for tick in range(50):
             if tick in looks:
-                recorder.frames({"View1": (5 + tick / 10, np.roll(noise, tick))})
+                recorder.frames({"View1": (5 + tick / 10, np.roll(noise, tick % images))})
             recorder.tick(observed_at(tick), np.zeros(7))
         (data,) = recorder.finish("done").glob("data/*/*.parquet")
         sizes.append(data.stat().st_size)
-    assert sizes[0] < 1.5 * noise.nbytes < 40 * noise.nbytes < sizes[1]
+    np.testing.assert_allclose(np.array(sizes) / noise.nbytes, [1, 1, 4, 50], rtol=0.15)
 
 
 def test_readings_that_are_no_numbers_are_left_out_and_counted(tmp_path: Path) -> None:
@@ -372,6 +372,17 @@ def test_what_the_loop_gives_wrongly_fails_the_recording_not_the_run(tmp_path: P
     with pytest.raises(RecordingError, match=r"run_000000\.part: the recording of this run is not"):
         recorder.finish("done")
     assert recover(recorder.part).name == "run_000000"
+
+
+def test_a_recording_is_one_episode(tmp_path: Path) -> None:
+    recorder = RunRecorder(tmp_path, metadata_of(), "Push")
+    for tick in range(4):
+        recorder.tick(observed_at(tick % 3, reset=tick % 3 == 0), np.full(7, tick))
+    assert recorder.failed is not None
+    with pytest.raises(RecordingError, match="another episode begins"):
+        recorder.finish("done")
+    action = opened(recover(recorder.part)).action()
+    assert action is not None and action.values[:, 0].tolist() == [0, 1, 2]
 
 
 def test_a_run_without_an_action_is_no_recording(tmp_path: Path) -> None:
