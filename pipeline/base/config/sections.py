@@ -19,6 +19,7 @@ from pipeline.base.config.stage_one import (
 from pipeline.base.config.stage_two import (
     CompareParams,
     EvaluateParams,
+    ExportParams,
     FinetuneParams,
     RolloutParams,
     TrainHeadParams,
@@ -36,6 +37,7 @@ class Params(Section):
     train_head: TrainHeadParams = TrainHeadParams()
     evaluate: EvaluateParams = EvaluateParams()
     rollout: RolloutParams = RolloutParams()
+    export: ExportParams = ExportParams()
     finetune: FinetuneParams = FinetuneParams()
     compare: CompareParams = CompareParams()
     verify: VerifyParams = VerifyParams()
