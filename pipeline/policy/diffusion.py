@@ -76,7 +76,7 @@ class DiffusionActionExpert(ActionExpert):
 
         With a guide every step is taken from the clean chunk that it asks for.
         """
-        shape = (len(context), self.horizon, self.action_dim)
+        shape = (context.shape[0], self.horizon, self.action_dim)
         chunk = standard_normal(shape, context.device, generator)
         prepared = self.denoiser.prepare(context)
         for step, to in pairwise(self.steps):
@@ -114,7 +114,7 @@ class DiffusionActionExpert(ActionExpert):
         return self._clipped(sample.detach() + change)
 
     def _estimate(self, noisy: Chunk, step: int, context: Context | Sequence[Projected]) -> Chunk:
-        time = noisy.new_full((len(noisy),), step / self.schedule.timesteps)
+        time = noisy.new_full(noisy.shape[:1], step / self.schedule.timesteps)
         predicted = self.denoiser(noisy, time, context)
         return self.schedule.sample_of(self.prediction, predicted, noisy, step)
 

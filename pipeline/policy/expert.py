@@ -1,7 +1,7 @@
 """The contract of an action expert, and the loss over groups of action channels."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import ClassVar, Literal
 
 import torch
@@ -102,7 +102,12 @@ class GroupedLoss(nn.Module):
 def standard_normal(
     shape: Sequence[int], device: torch.device, generator: Generators
 ) -> Float[Tensor, "..."]:
-    """Float32 noise on `device`, drawn where the generator is; with several, a row of each."""
+    """Float32 noise on `device`, drawn where the generator is; with several, a row of each.
+
+    Noise that is given is taken as it comes.
+    """
+    if isinstance(generator, Iterator):
+        return next(generator)
     if isinstance(generator, Sequence):
         rows = [standard_normal(shape[1:], device, own) for own in generator]
         return torch.stack(rows).view(*shape)

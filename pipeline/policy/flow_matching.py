@@ -116,12 +116,12 @@ class FlowMatchingActionExpert(ActionExpert):
         self, context: Context, generator: Generators = None, guide: Guide | None = None
     ) -> Chunk:
         """Where the flow takes a drawn noise, float32; with a guide, the flow so corrected."""
-        shape = (len(context), self.horizon, self.action_dim)
+        shape = (context.shape[0], self.horizon, self.action_dim)
         noise = standard_normal(shape, context.device, generator)
         prepared = self.denoiser.prepare(context)
 
         def velocity(x: Tensor, time: float) -> Tensor:
-            return self.denoiser(x, x.new_full((len(x),), time), prepared)
+            return self.denoiser(x, x.new_full(x.shape[:1], time), prepared)
 
         def guided(x: Tensor, time: float) -> Tensor:
             assert guide is not None

@@ -171,7 +171,7 @@ class CrossAttentionFusion(Fusion):
         """The context of `queries` tokens and those of sensor and state."""
         tokens = self.tokens(encoded)
         slots = tokens.pop("features", None)
-        batch = len(next(iter(encoded.values())))
+        batch = next(iter(encoded.values())).shape[0]
         asking = torch.cat([self.queries.expand(batch, -1, -1), *tokens.values()], dim=1)
         for layer in self.layers:
             asking = layer(asking, context=slots)

@@ -212,7 +212,7 @@ class Policy(Trainable):
             normalised = self.action_normalizer.normalize(guide.chunk)
             guide = Guide(normalised, guide.weight).repeat(repeats)
         chunks = self.expert.act(context.repeat(repeats, 1, 1), generator, guide)
-        physical = self.action_normalizer.invert(chunks).unflatten(0, (repeats, len(context)))
+        physical = self.action_normalizer.invert(chunks).unflatten(0, (repeats, context.shape[0]))
         return physical.expand(samples, -1, -1, -1)
 
     def observe(

@@ -49,13 +49,14 @@ class RegressionActionExpert(ActionExpert):
 
     def predict(self, context: Context) -> Chunk:
         """The chunk in normalised units, float32."""
-        chunk = context.new_zeros(len(context), self.horizon, self.action_dim, dtype=torch.float32)
+        shape = (context.shape[0], self.horizon, self.action_dim)
+        chunk = context.new_zeros(shape, dtype=torch.float32)
         for _ in range(self.refinements):
             chunk = chunk + self._delta(context, chunk).float()
         return chunk
 
     def _delta(self, context: Tensor, proposal: Tensor) -> Tensor:
-        tokens = self.queries.expand(len(context), -1, -1)
+        tokens = self.queries.expand(context.shape[0], -1, -1)
         if self.read is not None:
             tokens = tokens + self.read(proposal)
         for layer in self.layers:

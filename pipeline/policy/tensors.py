@@ -1,6 +1,6 @@
 """The tensors that the parts of a policy hand on, by name."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from jaxtyping import Bool, Float
 from torch import Generator, Tensor
@@ -20,5 +20,6 @@ StepMask = Bool[Tensor, "batch horizon"]
 Losses = tuple[Float[Tensor, ""], dict[str, Tensor]]
 """The scalar to minimise, and its detached parts by name."""
 
-Generators = Generator | Sequence[Generator] | None
-"""What draws a batch: one generator for all of it, one a sample, or the device's own."""
+Generators = Generator | Sequence[Generator] | Iterator[Tensor] | None
+"""What draws a batch: one generator for all of it, one a sample, or the device's own; or the noise
+itself, in the order in which a sampler asks for it."""

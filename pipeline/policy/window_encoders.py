@@ -100,7 +100,7 @@ class WindowEncoder(nn.Module):
         for layer in self.layers:
             tokens = layer(tokens, attended)
         encoded = self.project(masked_mean(self.norm(tokens), present))
-        newest = age_s[:, -1:] if age_s is not None else encoded.new_zeros(len(encoded), 1)
+        newest = age_s[:, -1:] if age_s is not None else encoded.new_zeros(encoded.shape[0], 1)
         encoded = encoded + self.age(newest.masked_fill(missing, 0.0))
         return torch.where(missing, self.missing.to(encoded.dtype), encoded)
 
@@ -243,6 +243,6 @@ def silenced(
     One copy for both: the windows are the largest tensors of a training step.
     """
     odd = values.shape[1] % 2
-    front = values.new_zeros(len(values), odd, values.shape[2])
+    front = values.new_zeros(values.shape[0], odd, values.shape[2])
     values, valid = torch.cat([front, values], dim=1), F.pad(valid, (odd, 0))
     return values.masked_fill_(~valid.unsqueeze(-1), 0.0), valid

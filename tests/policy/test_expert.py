@@ -109,6 +109,13 @@ class ActionExpertContract:
         assert torch.equal(losses[0], losses[1])
         assert torch.equal(losses[0], losses[2]) != expert.stochastic
 
+    def test_noise_that_is_given_is_noise_that_is_drawn(
+        self, expert: ActionExpert, context: torch.Tensor
+    ) -> None:
+        source = seeded()
+        given = (torch.randn(3, 5, 4, generator=source) for _ in range(1000))
+        assert torch.equal(expert.act(context, given), expert.act(context, seeded()))
+
     def test_a_given_generator_leaves_the_global_one_alone(
         self, expert: ActionExpert, context: torch.Tensor
     ) -> None:

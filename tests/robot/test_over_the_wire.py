@@ -63,12 +63,12 @@ def test_several_steps_of_a_chunk_are_played_between_two_questions(
 
 
 def test_a_latency_is_not_simulated_over_the_wire(served_policy: Served, serving: Served) -> None:
-    with pytest.raises(ConfigError, match="without rollout.server to simulate it"):
+    with pytest.raises(ConfigError, match=r"without rollout\.server to simulate it"):
         over_the_wire(served_policy(), serving, latency_ms=300)
 
 
 def test_another_robots_server_is_refused(served_policy: Served, serving: Served) -> None:
     served = served_policy()
     served.metadata = served.metadata | {"action_hz": 30.0}
-    with pytest.raises(CheckpointMismatch, match="action_hz 30.0, of the phantom 10"):
+    with pytest.raises(CheckpointMismatch, match=r"action_hz 30\.0, of the phantom 10"):
         over_the_wire(served, serving)

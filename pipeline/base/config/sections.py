@@ -19,6 +19,7 @@ from pipeline.base.config.stage_one import (
 from pipeline.base.config.stage_two import (
     CompareParams,
     EvaluateParams,
+    ExportParams,
     FinetuneParams,
     RolloutParams,
     ServeParams,
@@ -38,6 +39,7 @@ class Params(Section):
     evaluate: EvaluateParams = EvaluateParams()
     rollout: RolloutParams = RolloutParams()
     serve: ServeParams = ServeParams()
+    export: ExportParams = ExportParams()
     finetune: FinetuneParams = FinetuneParams()
     compare: CompareParams = CompareParams()
     verify: VerifyParams = VerifyParams()

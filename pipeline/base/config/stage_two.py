@@ -22,6 +22,7 @@ Chunking = Literal["none", "temporal", "rtc"]
 RolloutAblation = Literal[
     "sensor off", "features off", "state off", "sensor frozen", "features frozen", "state frozen"
 ]
+ExportFormat = Literal["onnx", "torch"]
 LoggerName = Literal["tensorboard", "wandb"]
 Weight = Annotated[float, Field(ge=0)]
 
@@ -305,6 +306,30 @@ class ServeParams(Section):
     """Of one observation, in MiB."""
     idle_s: float = Field(default=600.0, gt=0)
     """A connection without a whole message for so long is closed."""
+
+
+class ExportParams(Section):
+    """Which policy's head is written for other runtimes, and as what."""
+
+    checkpoint: Path | None = None
+    """A training run's folder, or one checkpoint in it; `train_head.output` where null."""
+    output: Path = Path("models/export")
+    """Folder of the files and their receipt."""
+    formats: tuple[ExportFormat, ...] = Field(default=("onnx", "torch"), min_length=1)
+    """onnx: `head.onnx`, for ONNX Runtime. torch: `head.pt2`, for `torch.export.load`."""
+    opset: int = Field(default=20, ge=18)
+    """Version of ONNX's operators."""
+    int8: bool = False
+    """Also write `head.int8.onnx`, whose matrix products are in int8."""
+    int8_tolerance: float = Field(default=0.05, gt=0)
+    """Most that it may be off the policy, in training std of the action; else nothing is
+    written."""
+
+    @model_validator(mode="after")
+    def _int8_is_made_from_onnx(self) -> "ExportParams":
+        if self.int8 and "onnx" not in self.formats:
+            raise ValueError("int8: expected onnx among formats, of which it is made")
+        return self
 
 
 class CompareParams(Section):

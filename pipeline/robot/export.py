@@ -1,0 +1,334 @@
+"""The head of a checkpoint, all but the vision-language model, as files that run without this code.
+
+`head.onnx` for ONNX Runtime, `head.pt2` for `torch.export.load`, and `receipt.json`, which says
+what goes in and comes out and how far each file is from the policy. Normalisation is inside:
+physical units in, physical units out. The inputs are the fields of `Observation` that the policy
+looks at and, where it draws, the standard normal `noise` that it draws, so that a file is a
+function. Samplers have their loop unrolled. The batch is of any size, windows are those of the
+params. Guides (`rtc`) differentiate the head, which neither format does.
+"""
+
+import hashlib
+import json
+import logging
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.metadata import version
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.export import Dim, ExportedProgram
+
+from pipeline.base.config import ExportParams
+from pipeline.base.durable import replace_folder, write_document
+from pipeline.base.errors import ConfigError, NumericsError
+from pipeline.base.observation import Observation
+from pipeline.base.ownership import OutputKind
+from pipeline.policy.checkpoint import PolicyCheckpoint
+from pipeline.policy.observation import AGES
+from pipeline.policy.policy import Policy
+from pipeline.policy.tensors import Chunk
+from pipeline.robot.export_inputs import Inputs, chunk_size, golden_inputs
+
+RECEIPT, CONTRACT = "receipt.json", "contract.json"
+EXPORT = OutputKind("an exported head", lambda folder: (folder / RECEIPT).is_file())
+
+TOLERANCE = 1e-4
+"""Most that a float32 file may be off, in training std of the action. Every runtime sums in another
+order: sums of n terms then differ by about sqrt(n) 6e-8 of their size, which for the widest layers
+(n of some thousands) is 3e-6 a layer, and a few 1e-5 behind some ten layers and the steps of a
+sampler. What was translated wrongly is off by far more."""
+
+_PACKAGES = ("onnx", "onnxscript", "onnxruntime")
+_LOOKED_AT = {
+    "slot_valid": ("", "which slots of the features are real"),
+    "feature_age": ("s", "since the newest frame that the features have seen"),
+    "view_age": ("s", "since the frame of each view that they have seen, NaN of a missing view"),
+    "valid": ("", "how many readings are real, the last ones of the window; 0: it is missing"),
+    "age": ("s", "since each reading, 0 where it is not real"),
+    "noise": ("", "standard normal, in the order in which the sampler draws it"),
+}
+
+Runner = Callable[[Inputs], NDArray[np.float32]]
+
+
+class Head(nn.Module):
+    """A policy's `act` as a function of tensors alone, each optional as the policy needs it."""
+
+    def __init__(self, policy: Policy) -> None:
+        super().__init__()
+        self.policy = policy
+
+    def forward(
+        self,
+        *,
+        features: Tensor | None = None,
+        slot_valid: Tensor | None = None,
+        feature_age: Tensor | None = None,
+        view_age: Tensor | None = None,
+        sensor: Tensor | None = None,
+        sensor_valid: Tensor | None = None,
+        sensor_age: Tensor | None = None,
+        state: Tensor | None = None,
+        state_valid: Tensor | None = None,
+        state_age: Tensor | None = None,
+        noise: Tensor | None = None,
+    ) -> Chunk:
+        """Chunks (batch, horizon, action) in physical units; `noise` is (batch, draw, …)."""
+        # The fields are named here, for a graph's inputs have the names of these arguments.
+        seen = cast(Observation, SimpleNamespace(**locals()))
+        return self.policy.act(seen, None if noise is None else iter(noise.unbind(1)))
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """How far a file is from the policy over some inputs, at most."""
+
+    std: float
+    """In training std of the action."""
+    physical: list[float]
+    """Of each action channel, in its unit."""
+
+    @classmethod
+    def of(
+        cls, run: Runner, given: Inputs, expected: Tensor, checkpoint: PolicyCheckpoint
+    ) -> "Deviation":
+        """Of a file over these inputs. Raises `NumericsError` where it says what is no number."""
+        found = run(given)
+        if found.shape != expected.shape or not np.isfinite(found).all():
+            raise NumericsError(
+                f"the exported head: expected {tuple(expected.shape)} finite actions, found "
+                f"{found.shape}, of which {int(np.isfinite(found).sum())} are finite. It was not "
+                "written; the versions of torch and onnxruntime may not fit each other."
+            )
+        off = np.abs(found.astype(np.float64) - expected.numpy()).max(axis=(0, 1))
+        return cls(float((off / checkpoint.normalization.action.scale).max()), off.tolist())
+
+
+def export_head(
+    checkpoint: PolicyCheckpoint, folder: str, params: ExportParams, say: Callable[[str], None]
+) -> dict[str, Any]:
+    """Write the head of `checkpoint`, which lies in `folder`, to `params.output`; the receipt.
+
+    Nothing is put in place unless every file holds parity with the policy. Raises `NumericsError`
+    where one does not, `ConfigError` where packages are missing.
+    """
+    check_packages(params)
+    policy = checkpoint.policy()
+    head = Head(policy).eval().requires_grad_(False)
+    given = golden_inputs(checkpoint, policy)
+    contract = describe(checkpoint, folder, given["random"]) | {"versions": _versions(params)}
+    files: dict[str, Any] = {}
+
+    def write(place: Path) -> None:
+        say("tracing the head")
+        few = {name: value[:2] for name, value in given["random"].items()}  # the file keeps them
+        program = trace(head, few)
+        tolerances: dict[Path, float] = {}
+        if "torch" in params.formats:
+            tolerances[write_torch(program, place, contract)] = TOLERANCE
+        if "onnx" in params.formats:
+            say("translating it to ONNX")
+            path = write_onnx(program, few, place, contract, params.opset)
+            tolerances[path] = TOLERANCE
+            if params.int8:
+                tolerances[quantize(path, place)] = params.int8_tolerance
+        say("comparing the files with the policy")
+        for path, tolerance in tolerances.items():
+            files[path.name] = _judged(path, head, given, checkpoint, tolerance)
+        write_document(place / RECEIPT, contract | {"files": files})
+
+    replace_folder(params.output, write, EXPORT)
+    return contract | {"files": files}
+
+
+def check_packages(params: ExportParams) -> None:
+    """Raise `ConfigError` where a package that a format needs is missing."""
+    missing: list[str] = []
+    for name in _PACKAGES if "onnx" in params.formats else ():
+        try:
+            import_module(name)
+        except ImportError as error:
+            missing.append(f"{name} ({error})")
+    if missing:
+        raise ConfigError(
+            f"export.formats: expected the packages of onnx, cannot load {', '.join(missing)}. Run "
+            "pip install 'vla-feature-cache[export]', in a checkout pip install -e '.[export]', or "
+            "set export.formats=[torch]."
+        )
+
+
+def trace(head: Head, given: Inputs) -> ExportedProgram:
+    """The head as a graph over any batch; where it was traced from is not in it."""
+    batch = Dim("batch", min=1, max=65536)
+    shapes = {name: {0: batch} for name in given}
+    with _quietly(), torch.no_grad():
+        program = torch.export.export(head, (), dict(given), dynamic_shapes=shapes)
+    for node in program.graph.nodes:
+        node.meta.pop("stack_trace", None)
+    return program
+
+
+def describe(checkpoint: PolicyCheckpoint, folder: str, given: Inputs) -> dict[str, Any]:
+    """What goes in and comes out, and what the head is: all of the receipt but the files."""
+    channels = checkpoint.source["streams"]["action"]
+    outputs = {
+        "name": "actions",
+        "shape": ["batch", *chunk_size(checkpoint)],
+        "dtype": "float32",
+        "channels": channels["names"],
+        "units": channels["units"],
+        "kind": channels["kind"],
+    }
+    return {
+        "checkpoint": folder,
+        "step": checkpoint.step,
+        "model_type": checkpoint.params.model_type,
+        "fusion_strategy": checkpoint.params.fusion_strategy,
+        "feature_spec_digest": checkpoint.source["feature_spec"]["digest"],
+        "action_hz": checkpoint.source["action_hz"],
+        "horizon": checkpoint.params.horizon,
+        "inputs": [_input(checkpoint, name, value) for name, value in given.items()],
+        "outputs": [outputs],
+        "guides": "not exported: real-time chunking (rtc) differentiates the head",
+    }
+
+
+def write_torch(program: ExportedProgram, folder: Path, contract: Mapping[str, Any]) -> Path:
+    """Write `head.pt2`, with the contract in it."""
+    path = folder / "head.pt2"
+    torch.export.save(program, path, extra_files={CONTRACT: json.dumps(contract)})
+    return path
+
+
+def write_onnx(
+    program: ExportedProgram, given: Inputs, folder: Path, contract: Mapping[str, Any], opset: int
+) -> Path:
+    """Write `head.onnx`, with the contract among its metadata."""
+    with _quietly():
+        written: Any = torch.onnx.export(
+            program,
+            kwargs=dict(given),
+            dynamo=True,
+            verbose=False,
+            optimize=False,  # ONNX Runtime does as much when it loads; here it takes minutes
+            output_names=["actions"],
+            opset_version=opset,
+        )
+    for node in written.model.graph.all_nodes():
+        node.metadata_props.clear()  # where each was traced from: most of the file otherwise
+    written.model.metadata_props[CONTRACT] = json.dumps(contract)
+    written.save(path := folder / "head.onnx", external_data=False)
+    return path
+
+
+def quantize(source: Path, folder: Path) -> Path:
+    """Write `head.int8.onnx`: the matrix products of `source` in int8.
+
+    Weights are quantised now, what they are multiplied with as it comes.
+    """
+    path = folder / "head.int8.onnx"
+    with _quietly():
+        quantization: Any = import_module("onnxruntime.quantization")
+        quantization.quantize_dynamic(source, path)
+    return path
+
+
+def onnx_session(path: Path, threads: int = 0) -> Any:
+    """The session of an ONNX file on the CPU; on all cores with 0 threads."""
+    runtime: Any = import_module("onnxruntime")
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads, options.log_severity_level = threads, 3
+    return runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+
+
+def onnx_runner(path: Path) -> Runner:
+    """What runs an ONNX file."""
+    session = onnx_session(path)
+    return lambda given: session.run(None, {name: v.numpy() for name, v in given.items()})[0]
+
+
+def torch_runner(path: Path) -> Runner:
+    """What runs a `torch.export` file."""
+    with _quietly():
+        module: Any = torch.export.load(path).module()
+    return lambda given: module(**given).numpy()
+
+
+def _judged(
+    path: Path,
+    head: Head,
+    given: Mapping[str, Inputs],
+    checkpoint: PolicyCheckpoint,
+    tolerance: float,
+) -> dict[str, Any]:
+    """What the receipt says of a file. Raises `NumericsError` where it is off by too much."""
+    run = torch_runner(path) if path.suffix == ".pt2" else onnx_runner(path)
+    off = {
+        name: Deviation.of(run, inputs, head(**inputs), checkpoint)
+        for name, inputs in given.items()
+    }
+    worst = max(off, key=lambda name: off[name].std)
+    if off[worst].std > tolerance:
+        raise NumericsError(
+            f"{path.name}: expected at most {tolerance:g} training std of the action off the "
+            f"policy, found {off[worst].std:.2g} over {worst} inputs (by channel: "
+            f"{', '.join(f'{value:.2g}' for value in off[worst].physical)}). Nothing was written: "
+            f"{_remedy(path)}"
+        )
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    return {
+        "sha256": digest,
+        "bytes": path.stat().st_size,
+        "tolerance_std": tolerance,
+        "deviation": {name: vars(found) for name, found in off.items()},
+    }
+
+
+def _remedy(path: Path) -> str:
+    if "int8" in path.name:
+        return "export without export.int8, or with a larger export.int8_tolerance."
+    return "leave this format out of export.formats, or try other versions of what writes it."
+
+
+def _versions(params: ExportParams) -> dict[str, str]:
+    needed = ("torch", *(_PACKAGES if "onnx" in params.formats else ()))
+    return {name: version(name) for name in needed}
+
+
+@contextmanager
+def _quietly() -> Iterator[None]:
+    """Without what torch and the packages log of their own parts, which is slow to write too."""
+    logging.disable(logging.WARNING)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(logging.NOTSET)
+
+
+def _input(checkpoint: PolicyCheckpoint, name: str, value: Tensor) -> dict[str, Any]:
+    """A line of the receipt about an input."""
+    described: dict[str, Any] = {
+        "name": name,
+        "shape": ["batch", *value.shape[1:]],
+        "dtype": str(value.dtype).removeprefix("torch."),
+    }
+    streams = checkpoint.source["streams"]
+    if name in AGES:  # sensor, state
+        return described | {"channels": streams[name]["names"], "units": streams[name]["units"]}
+    if name == "features":
+        return described | {"unit": "", "meaning": "of the vision-language model, row by slot"}
+    unit, meaning = _LOOKED_AT.get(name) or _LOOKED_AT[name.rpartition("_")[2]]
+    of_views = {"channels": streams["views"]} if name == "view_age" else {}
+    return described | {"unit": unit, "meaning": meaning} | of_views

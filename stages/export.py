@@ -1,0 +1,36 @@
+"""Write the head of a trained policy, all but the vision-language model, for other runtimes.
+
+Takes what stages.train_head wrote to train_head.output, or export.checkpoint if it is given. Writes
+head.onnx (ONNX Runtime) and head.pt2 (torch.export.load) into `export.output`, which need none of
+this project, and receipt.json: inputs and outputs with their units, digests, and how far each file
+is from the policy. A file that is too far is refused, and what was there before stays.
+
+  python -m stages.export
+  python -m stages.export --set export.formats=[torch]         without ONNX's packages
+  python -m stages.export --set export.int8=true               matrix products in int8 too
+"""
+
+from stages.command import run
+
+if __name__ == "__main__":  # here, for --help waits for no import below
+    raise SystemExit(run(__doc__ or "", "stages.export", sections=("export",)))
+
+from functools import partial
+
+from pipeline.base.config import Params
+from pipeline.base.ownership import refuse_foreign
+from pipeline.policy.checkpoint import find_policy, load_policy
+from pipeline.robot.export import EXPORT, RECEIPT, export_head
+
+
+def main(params: Params) -> None:
+    """Export the checkpoint that `export` names, else what `train_head` wrote."""
+    wanted, say = params.export, partial(print, flush=True)
+    refuse_foreign(wanted.output, EXPORT)
+    folder = wanted.checkpoint or params.train_head.output
+    checkpoint = load_policy(find_policy(folder))
+    receipt = export_head(checkpoint, str(folder), wanted, say)
+    for name, file in receipt["files"].items():
+        off = ", ".join(f"{found['std']:.1e} ({of})" for of, found in file["deviation"].items())
+        say(f"{name}: {file['bytes'] / 1e6:.1f} MB, at most {off} training std off the policy")
+    say(f"{wanted.output}: {', '.join(receipt['files'])}, {RECEIPT}")

@@ -1,0 +1,310 @@
+"""Exported heads do what their policy does, without it."""
+
+import json
+import os
+import subprocess
+import sys
+from hashlib import sha256
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.base.config import ExportParams, TrainHeadParams
+from pipeline.base.errors import ConfigError, NumericsError
+from pipeline.policy.checkpoint import PolicyCheckpoint
+from pipeline.policy.normalization import ChannelStatistics, Normalization
+from pipeline.policy.observation import PolicyShape
+from pipeline.policy.policy import Policy
+from pipeline.robot import export
+from pipeline.robot.export import Head, export_head, onnx_runner, torch_runner
+from pipeline.robot.export_inputs import count_draws, random_inputs
+
+GROUPS = ("translation", "translation", "rotation")
+SHAPE = PolicyShape(
+    3, 8, 5, 5, 3, GROUPS, views=2, state_kinds=("plain", "deg", "rotation", "rotation", "rotation")
+)
+STREAMS = {
+    "action": {"names": ["dx", "dy", "da"], "units": ["mm", "mm", "deg"], "kind": "delta"},
+    "sensor": {"names": [f"s{index}" for index in range(5)], "units": ["N", "", "", "", ""]},
+    "state": {"names": ["x", "j1", "a", "b", "r"], "units": ["mm", "deg", "deg", "deg", "deg"]},
+    "views": ["View1", "View2"],
+}
+SMALL: dict[str, Any] = {
+    "sensor_encoder": {"channels": [8], "layers": 1, "heads": 1, "output_dim": 8},
+    "state_encoder": {"dim": 8, "layers": 1, "heads": 1, "output_dim": 8},
+    "expert": {"dim": 8, "layers": 1, "heads": 2},
+    "diffusion": {"timesteps": 6, "sampling_steps": 2},
+    "flow_matching": {"sampling_steps": 2},
+    "horizon": 4,
+    "sensor_window": 6,
+    "state_window": 5,
+}
+EXPERTS = ("regression", "diffusion", "flow_matching")
+KINDS = [
+    {"model_type": expert, "fusion_strategy": fusion}
+    for expert in EXPERTS
+    for fusion in ("concat", "cross_attention", "gated", "none")
+]
+OTHERS = [
+    {"regression": {"refinements": 2}},
+    {"sensor_encoder": SMALL["sensor_encoder"] | {"kind": "force_aware"}},
+    {"sensor_window_s": None, "state_window_s": None},
+    {"features_enabled": False},
+    {"sensor_enabled": False, "fusion_strategy": "cross_attention"},
+    {"robot_state_enabled": False, "fusion_strategy": "gated"},
+    {"sensor_enabled": False, "robot_state_enabled": False},
+    {"model_type": "diffusion", "diffusion": {"timesteps": 6, "sampler": "ddpm"}},
+    {"model_type": "diffusion", "diffusion": {"timesteps": 6, "sampling_steps": 3, "eta": 1.0}},
+    {"model_type": "flow_matching", "flow_matching": {"sampling_steps": 2, "solver": "rk4"}},
+]
+
+
+def named(kind: dict[str, Any]) -> str:
+    return "-".join(str(value) for value in kind.values())
+
+
+def checkpoint_of(**changed: Any) -> PolicyCheckpoint:
+    """Of a policy whose every weight is heard."""
+    params = TrainHeadParams.model_validate(SMALL | changed)
+    rng = np.random.default_rng(0)
+    fitted = {
+        name: ChannelStatistics(rng.normal(size=size), rng.uniform(0.5, 2.0, size), 100)
+        for name, size in SHAPE.channels.items()
+    }
+    normalization = Normalization(**fitted)
+    torch.manual_seed(1)
+    state = Policy(params, SHAPE, normalization).state_dict()
+    kept = ("schedule",)
+    weights = {
+        name: value if name.split(".")[1] in kept else value + 0.1 * torch.randn(value.shape)
+        for name, value in state.items()
+    }
+    source = {
+        "feature_spec": {"digest": "tiny-spec"},
+        "streams": STREAMS,
+        "action_hz": 10.0,
+        "vlm_reuse_count": 3,
+    }
+    return PolicyCheckpoint(params, SHAPE, normalization, source, {}, 7, weights)
+
+
+def exported(
+    folder: Path, checkpoint: PolicyCheckpoint, *formats: str, **changed: Any
+) -> dict[str, Any]:
+    params = ExportParams.model_validate({"output": folder, "formats": formats} | changed)
+    return export_head(checkpoint, "models/head", params, lambda said: None)
+
+
+def onnx() -> None:
+    for package in ("onnx", "onnxscript", "onnxruntime"):
+        pytest.importorskip(package, reason=f"{package} is missing: pip install -e '.[export]'")
+
+
+def assert_same(run: export.Runner, checkpoint: PolicyCheckpoint, atol: float) -> None:
+    """For every batch the file does what the policy does, on other inputs than it was judged on."""
+    policy = checkpoint.policy()
+    for rows in (1, 3, 16):
+        given = random_inputs(checkpoint, policy, rows, seed=rows)
+        expected = Head(policy)(**given)
+        assert expected.std() > 0.01
+        found = torch.from_numpy(run(given))
+        torch.testing.assert_close(found, expected, rtol=0, atol=atol)
+
+
+@pytest.mark.parametrize("kind", [*KINDS[:4], *KINDS[4::5], *OTHERS[::2]], ids=named)
+def test_torch_export_is_the_policy(kind: dict[str, Any], tmp_path: Path) -> None:
+    checkpoint = checkpoint_of(**kind)
+    receipt = exported(tmp_path / "head", checkpoint, "torch")
+    assert receipt["files"]["head.pt2"]["deviation"]["random"]["std"] < 1e-5
+    assert_same(torch_runner(tmp_path / "head/head.pt2"), checkpoint, 1e-5)
+
+
+@pytest.mark.extra
+@pytest.mark.parametrize("kind", [*KINDS, *OTHERS], ids=named)
+def test_both_formats_are_the_policy(kind: dict[str, Any], tmp_path: Path) -> None:
+    onnx()
+    checkpoint = checkpoint_of(**kind)
+    receipt = exported(tmp_path / "head", checkpoint, "onnx", "torch")
+    files = receipt["files"]
+    assert files["head.pt2"]["deviation"]["random"]["std"] < 1e-5
+    assert files["head.onnx"]["deviation"]["random"]["std"] < 2e-5
+    assert_same(onnx_runner(tmp_path / "head/head.onnx"), checkpoint, 2e-5)
+
+
+@pytest.mark.parametrize(
+    ("kind", "draws"),
+    [
+        ({"model_type": "regression"}, 0),
+        ({"model_type": "flow_matching"}, 1),
+        ({"model_type": "diffusion"}, 1),
+        ({"model_type": "diffusion", "diffusion": {"timesteps": 6, "sampler": "ddpm"}}, 7),
+    ],
+    ids=str,
+)
+def test_the_noise_is_what_the_policy_asks_for(kind: dict[str, Any], draws: int) -> None:
+    checkpoint = checkpoint_of(**kind)
+    policy = checkpoint.policy()
+    given = random_inputs(checkpoint, policy, 2)
+    assert count_draws(policy, given) == draws
+    assert ("noise" in given) == (draws > 0)
+    if draws:
+        assert given["noise"].shape == (2, draws, 4, 3)
+        other = given | {"noise": given["noise"] + 1}
+        assert not torch.equal(Head(policy)(**given), Head(policy)(**other))
+
+
+def test_random_inputs_miss_each_stream_and_are_old() -> None:
+    checkpoint = checkpoint_of()
+    given = random_inputs(checkpoint, checkpoint.policy(), 16)
+    assert not given["slot_valid"].any(dim=1).all()
+    for stream in ("sensor", "state"):
+        assert given[f"{stream}_valid"].min() == 0
+        assert given[f"{stream}_valid"].max() == given[stream].shape[1]
+        assert given[f"{stream}_age"].max() > 0
+    assert given["view_age"].isnan().any()
+    assert given["feature_age"].max() > 5
+
+
+def test_the_receipt_says_what_goes_in_and_comes_out(tmp_path: Path) -> None:
+    folder = tmp_path / "head"
+    receipt = exported(folder, checkpoint_of(model_type="flow_matching"), "torch")
+    assert json.loads((folder / "receipt.json").read_text()) == receipt
+    inputs = {one["name"]: one for one in receipt["inputs"]}
+    assert list(inputs) == [
+        "features", "slot_valid", "feature_age", "view_age", "sensor", "sensor_valid",
+        "sensor_age", "state", "state_valid", "state_age", "noise",
+    ]  # fmt: skip
+    assert inputs["sensor"]["shape"] == ["batch", 6, 5]
+    assert inputs["sensor"]["units"] == STREAMS["sensor"]["units"]
+    assert inputs["view_age"]["channels"] == ["View1", "View2"]
+    assert inputs["slot_valid"]["dtype"] == "bool"
+    assert inputs["noise"]["shape"] == ["batch", 1, 4, 3]
+    (action,) = receipt["outputs"]
+    assert (action["shape"], action["units"]) == (["batch", 4, 3], ["mm", "mm", "deg"])
+    assert receipt["feature_spec_digest"] == "tiny-spec"
+    assert (receipt["action_hz"], receipt["horizon"]) == (10.0, 4)
+    assert "rtc" in receipt["guides"]
+    file = receipt["files"]["head.pt2"]
+    assert file["sha256"] == sha256((folder / "head.pt2").read_bytes()).hexdigest()
+
+
+LOADED = """
+import sys
+sys.modules["pipeline"] = None  # whoever imports it now fails
+import torch
+given = torch.load("given.pt", weights_only=True)
+torch.save(torch.export.load("head/head.pt2").module()(**given), "actions.pt")
+"""
+
+
+def test_a_process_without_this_project_runs_it(tmp_path: Path) -> None:
+    checkpoint = checkpoint_of(model_type="diffusion")
+    exported(tmp_path / "head", checkpoint, "torch")
+    policy = checkpoint.policy()
+    given = random_inputs(checkpoint, policy, 2)
+    torch.save(given, tmp_path / "given.pt")
+    bare = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    subprocess.run([sys.executable, "-c", LOADED], cwd=tmp_path, env=bare, check=True)
+    found = torch.load(tmp_path / "actions.pt", weights_only=True)
+    torch.testing.assert_close(found, Head(policy)(**given), rtol=0, atol=1e-6)
+
+
+RUN = """
+import sys
+import numpy as np
+import onnxruntime
+session = onnxruntime.InferenceSession("head/head.onnx")
+assert "torch" not in sys.modules
+(actions,) = session.run(["actions"], dict(np.load("given.npz")))
+np.save("actions.npy", actions)
+print(session.get_modelmeta().custom_metadata_map["contract.json"])
+"""
+
+
+@pytest.mark.extra
+def test_onnx_runtime_needs_no_torch_and_the_file_says_what_it_is(tmp_path: Path) -> None:
+    onnx()
+    checkpoint = checkpoint_of(model_type="flow_matching")
+    receipt = exported(tmp_path / "head", checkpoint, "onnx")
+    policy = checkpoint.policy()
+    given = random_inputs(checkpoint, policy, 2)
+    np.savez(tmp_path / "given.npz", **{name: value.numpy() for name, value in given.items()})
+    ran = subprocess.run(
+        [sys.executable, "-c", RUN], cwd=tmp_path, check=True, capture_output=True, text=True
+    )
+    found = torch.from_numpy(np.load(tmp_path / "actions.npy"))
+    torch.testing.assert_close(found, Head(policy)(**given), rtol=0, atol=2e-5)
+    assert json.loads(ran.stdout) == {n: v for n, v in receipt.items() if n != "files"}
+    assert str(Path(__file__).parents[2]).encode() not in (tmp_path / "head/head.onnx").read_bytes()
+
+
+def test_a_file_that_is_off_is_refused_and_the_old_one_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, checkpoint = tmp_path / "head", checkpoint_of()
+    exported(folder, checkpoint, "torch")
+    before = (folder / "head.pt2").read_bytes()
+    honest = torch_runner
+
+    def off(path: Path) -> export.Runner:
+        run = honest(path)
+        return lambda given: run(given) + np.float32(0.01)
+
+    monkeypatch.setattr(export, "torch_runner", off)
+    with pytest.raises(NumericsError, match=r"at most 0.0001 training std.*random inputs.*0.01"):
+        exported(folder, checkpoint, "torch")
+    assert (folder / "head.pt2").read_bytes() == before
+    assert not folder.with_name("head.new").exists()
+    monkeypatch.setattr(export, "torch_runner", lambda path: lambda given: honest(path)(given) / 0)
+    with (
+        np.errstate(divide="ignore", invalid="ignore"),
+        pytest.raises(NumericsError, match="0 are finite"),
+    ):
+        exported(folder, checkpoint, "torch")
+
+
+def test_a_missing_package_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "onnxscript", None)
+    with pytest.raises(ConfigError, match=r"onnxscript .*pip install .*\[export\]"):
+        exported(tmp_path / "head", checkpoint_of(), "onnx")
+    exported(tmp_path / "head", checkpoint_of(), "torch")
+
+
+def test_somebody_elses_folder_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(ConfigError, match="an exported head that this project wrote"):
+        exported(tmp_path, checkpoint_of(), "torch")
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
+def test_golden_rows_are_judged_too(tmp_path: Path) -> None:
+    checkpoint, rng = checkpoint_of(), np.random.default_rng(0)
+    rows = [
+        SimpleNamespace(
+            features=rng.normal(size=(3, 8)).astype(np.float32), slot_valid=np.ones(3, bool)
+        )
+        for _ in range(4)
+    ]
+    object.__setattr__(checkpoint, "golden", tuple(rows))
+    (file,) = exported(tmp_path / "head", checkpoint, "torch")["files"].values()
+    assert list(file["deviation"]) == ["random", "golden"]
+    rows[0].features[0, 0] = np.nan
+    with pytest.raises(NumericsError, match="finite"):
+        exported(tmp_path / "head", checkpoint, "torch")
+
+
+@pytest.mark.extra
+def test_int8_is_written_or_refused_with_its_figure(tmp_path: Path) -> None:
+    onnx()
+    folder, checkpoint = tmp_path / "head", checkpoint_of()
+    wide = exported(folder, checkpoint, "onnx", int8=True, int8_tolerance=10.0)
+    off = wide["files"]["head.int8.onnx"]["deviation"]["random"]["std"]
+    assert wide["files"]["head.onnx"]["deviation"]["random"]["std"] < 2e-5 < off
+    with pytest.raises(NumericsError, match=rf"head.int8.onnx: .*found {off:.2g} over random"):
+        exported(folder, checkpoint, "onnx", int8=True, int8_tolerance=off / 2)
+    with pytest.raises(ValueError, match="expected onnx among formats"):
+        ExportParams(formats=("torch",), int8=True)
