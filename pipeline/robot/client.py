@@ -81,7 +81,11 @@ class PolicyClient:
             self._connection.send(message)
         except ConnectionClosed as error:
             self._lose(error)
-        answer = wire.unpack(self._receive(self._timeout_s))
+        try:
+            answer = wire.unpack(self._receive(self._timeout_s))
+        except ServerBusy:
+            self._reset = None  # it is taken with the readings
+            raise
         self._reset = None
         if "feature_key" in answer:
             answer["feature_key"] = np.frombuffer(answer["feature_key"], np.uint8)

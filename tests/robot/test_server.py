@@ -117,15 +117,15 @@ def test_while_the_model_looks_healthz_answers_and_too_many_are_told_busy(
         thread.start()
         assert looking.wait(20)
         assert get(server, "/healthz")[:2] == (200, "OK\n")
+        other.reset()
         with pytest.raises(ConnectionError, match="busy: 1 observations are waiting"):
             other.infer(observe(1))
         go.set()
         thread.join()
         assert answers[0]["actions"].shape == (4, 7)
         served.glance.before = lambda: None
-        # The connection stays, and has taken the readings.
+        # The connection stays, and has taken the readings and the reset.
         session = served.session()
-        session.infer(observe(0))
         session.take(observe(1))
         expected = session.infer(observe(2))["actions"]
         np.testing.assert_array_equal(other.infer(observe(2))["actions"], expected)

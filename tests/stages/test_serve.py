@@ -93,7 +93,9 @@ def test_it_serves_until_it_is_told_to_stop(
             assert answer["actions"].shape == (client.metadata["horizon"], 7)
             process.send_signal(sent)
             with pytest.raises(ConnectionError, match="stopping"):
-                client.infer(observe_phantom)
+                while True:
+                    client.reset()
+                    client.infer(observe_phantom)
         _, error = process.communicate(timeout=60)
         assert process.returncode == 1 and error == "stopped; run the same command again\n"
 
