@@ -73,7 +73,9 @@ def golden_issues(
     root: Path, attributes: Mapping[str, Any], keys: ArraySpec | None
 ) -> Iterator[Issue]:
     """What is wrong with the golden rows; nothing where the keys themselves cannot be read."""
-    for number, entry in enumerate(attributes.get(GOLDEN, [])) if keys else ():
+    if keys is None:
+        return
+    for number, entry in enumerate(attributes.get(GOLDEN, [])):
         try:
             key = read_rows(root, keys, entry["row"], entry["row"] + 1)[0]
         except StoreIncomplete:

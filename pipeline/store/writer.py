@@ -232,7 +232,8 @@ class StoreBuild:
 
         For a build whose rows are all there. Raises `DiskFull`.
         """
-        attributes, files = zarr.open_group(self.part, mode="r").attrs.asdict(), self.files(KEYS)
+        attributes: dict[str, Any] = zarr.open_group(self.part, mode="r").attrs.asdict()
+        files = self.files(KEYS)
         given = list(rows)
         proven = [
             golden

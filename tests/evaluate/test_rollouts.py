@@ -369,3 +369,24 @@ def test_metrics_and_table_say_the_same(rollouts: Rollouts) -> None:
     assert lines[0].endswith(",max_force_n,time_s,ticks") and len(lines) == 1 + 3
     beside = rollouts.table(policy=False).csv().splitlines()
     assert beside[0] == f"controller,{lines[0]}" and len(beside) == 1 + 3 * 3
+
+
+def test_the_model_proves_itself_before_the_first_episode(monkeypatch: pytest.MonkeyPatch) -> None:
+    parts = made()
+
+    def refuse(checkpoint: PolicyCheckpoint, features: Any, say: Any) -> None:
+        assert (checkpoint, features) == (parts[0], parts[2])
+        raise CheckpointMismatch("golden rows are not the features")
+
+    monkeypatch.setattr("pipeline.evaluate.rollouts.prove", refuse)
+    with pytest.raises(CheckpointMismatch, match="golden rows"):
+        rolled(parts)
+    assert not parts[2].passes
+
+
+def test_a_checkpoint_without_golden_rows_is_warned_of() -> None:
+    checkpoint, policy, glance = made()
+    said: list[str] = []
+    load: Any = lambda: glance  # noqa: E731
+    roll_out(checkpoint, "models/head", policy, load, wanted(episodes=1, ablations=[]), said.append)
+    assert said[0].startswith("WARNING: this checkpoint carries no golden rows")

@@ -3,15 +3,18 @@
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from pipeline.base.errors import CheckpointMismatch
 from pipeline.extract.reextract import Deviation, Reextraction
 from pipeline.store import part_path
 from stages.command import run
 from stages.verify import SHORTHANDS, main
 
 ROOT = Path(__file__).resolve().parents[2]
+CPU = ("--set", "extract.device=cpu")
 
 
 @pytest.fixture(scope="module")
@@ -108,3 +111,66 @@ def test_rows_computed_again(verified, store, capsys, monkeypatch, relative, cod
     said = capsys.readouterr()
     assert "computed 1 rows again" in said.out
     assert ("here: slot 2 deviates 5.00e-01" in said.err) is (code == 2)
+
+
+class TestCheckpoint:
+    """What the proof itself finds is tested with it."""
+
+    @pytest.fixture
+    def proved(self, tmp_path, monkeypatch) -> list[tuple]:
+        """What was loaded and proved; a policy lies at `tmp_path / "head"`."""
+        (tmp_path / "head" / "best").mkdir(parents=True)
+        (tmp_path / "head" / "best" / "policy.json").write_text("{}")
+        calls: list[tuple] = []
+        spec = {"digest": "x"}
+        held = SimpleNamespace(source={"feature_spec": spec}, golden=(1, 2), step=9)
+
+        def prove(checkpoint, features, say):
+            calls.append((checkpoint, features))
+            if features[2] == "meta":
+                raise CheckpointMismatch("2 of 2 golden rows are not the features")
+            say("2 golden rows computed again")
+
+        monkeypatch.setattr("stages.verify.load_policy", lambda folder: held)
+        monkeypatch.setattr("stages.verify.LiveFeatures", lambda *given: given)
+        monkeypatch.setattr("stages.verify.prove", prove)
+        return calls
+
+    def test_the_one_that_is_named(self, verified, proved, tmp_path, capsys):
+        (tmp_path / "other").mkdir()
+        (tmp_path / "other" / "policy.json").write_text("{}")
+        assert verified("--checkpoint", str(tmp_path / "other"), *CPU) == 0
+        said = capsys.readouterr().out
+        assert said.splitlines() == [
+            f"{tmp_path / 'other'} (step 9): 2 golden rows, cpu",
+            "2 golden rows computed again",
+        ]
+        ((checkpoint, (vlm, spec, device)),) = proved
+        assert (spec, device) == (checkpoint.source["feature_spec"], "cpu")
+        assert vlm.image_resize_height == 112
+
+    def test_that_of_train_head_where_none_is_named(self, verified, proved, tmp_path, capsys):
+        place = f"train_head.output={tmp_path / 'head'}"
+        assert verified("--set", place, *CPU, "--checkpoint") == 0
+        assert f"{tmp_path / 'head/best'} (step 9)" in capsys.readouterr().out
+        assert len(proved) == 1
+
+    def test_a_refusal(self, verified, proved, tmp_path, capsys, monkeypatch):
+        monkeypatch.setattr("stages.verify.resolve_device", lambda name: "meta")
+        assert verified("--checkpoint", str(tmp_path / "head")) == 2
+        assert capsys.readouterr().err.startswith("error: 2 of 2 golden rows are not")
+
+    def test_no_checkpoint_there(self, verified, tmp_path, capsys):
+        assert verified("--checkpoint", str(tmp_path / "none")) == 2
+        assert "expected a checkpoint" in capsys.readouterr().err
+
+
+def test_a_damaged_golden_row_is_named_and_repaired(verified, tiny_golden, tmp_path, capsys):
+    store = tiny_golden(tmp_path, name="golden")
+    (store / "golden/1/View1/c/0/0/0").unlink()
+    place = ("--set", f"verify.store={store}")
+    assert verified(*place) == 2
+    said = capsys.readouterr().err
+    assert f"{store / 'golden/1'}: golden frames and prompt of VL row 7 do not give the key" in said
+    assert verified(*place, "--repair") == 0
+    assert "60 of 60 feature rows taken over, 0 to compute" in capsys.readouterr().out
