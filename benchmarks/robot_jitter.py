@@ -117,7 +117,7 @@ def main() -> None:
     parser.add_argument("--processes", type=int, nargs="+", choices=(1, 2), default=[1, 2])
     parser.add_argument("--params", type=Path, default=Path("params.yaml"))
     parser.add_argument("--checkpoint", type=Path, help="a trained policy; else an untrained one")
-    parser.add_argument("--fifo", type=int, default=0, help="priority of the loop's thread")
+    parser.add_argument("--fifo", type=int, default=0, help="priority of the loop, from 2")
     parser.add_argument("--spin-ms", type=float, default=RunSettings.spin_s * 1000)
     parser.add_argument("--results", type=Path, help="folder of the picture; else none is drawn")
     options = parser.parse_args()
@@ -132,7 +132,7 @@ def main() -> None:
         else:
             params = with_checkpoint(params, options.checkpoint)
         for processes in options.processes:
-            with (local if processes == 1 else remote)(params) as connect:
+            with (local if processes == 1 else remote)(params) as connect, first(options.fifo):
                 for hz in rates:
                     name = f"{processes} process{'es' if processes > 1 else ''}, {hz:g} Hz"
                     settings = RunSettings(
@@ -226,6 +226,18 @@ def remote(params: Params) -> Generator[Callable[[], Decides]]:
             return client
 
         yield connect
+
+
+@contextmanager
+def first(priority: int) -> Generator[None]:
+    """All threads that begin within this go before other processes, as under `chrt -f 1`."""
+    before = os.sched_getscheduler(0), os.sched_getparam(0)
+    if priority:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, *before)
 
 
 def untrained(params: Params, folder: Path, quick: bool) -> Params:

@@ -131,8 +131,10 @@ class RunSettings:
     hung_s: float = 0.5
     """How long a tick may take, at least two and a half of them, before a watchdog stops it."""
     fifo_priority: int = 0
-    """1 to 99: the loop's thread goes before whatever has less (SCHED_FIFO of Linux), which needs
-    the right to (`ulimit -r`, or root). 0: as any other."""
+    """2 to 99: the loop's thread goes before whatever has less (SCHED_FIFO of Linux), and the
+    policy's thread has one less; needs the right to (`ulimit -r`, or root). 0: as they are. Begin
+    the whole process under `chrt -f 1`: any thread that holds Python while another process has its
+    core keeps the loop waiting."""
     spin_s: float = 0.0
     """How long before a deadline to stop sleeping and look at the clock all the time."""
     kept_ticks: int = 65536
@@ -247,7 +249,7 @@ class _Run:
             tuple(meta["moving"]),
         )
         self.loop = ControlLoop(timing, meta["uses_features"])
-        self.asker = _Asker(policy)
+        self.asker = _Asker(policy, settings.fifo_priority - 1)
         self.watchdog = _Watchdog(robot, max(settings.hung_s, 2.5 / self.hz))
         streams = {name: (meta["streams"].get(name) or {}).get("names", ()) for name in _STREAMS}
         self.pending = {
@@ -564,8 +566,8 @@ class _RobotClock:
 class _Asker:
     """Asks the policy on a thread of its own, one question at a time."""
 
-    def __init__(self, policy: Decides) -> None:
-        self._policy = policy
+    def __init__(self, policy: Decides, fifo_priority: int) -> None:
+        self._policy, self._priority = policy, fifo_priority
         self._questions: SimpleQueue[Mapping[str, Any] | None] = SimpleQueue()
         self._answers: SimpleQueue[tuple[float, Mapping[str, Any] | Exception]] = SimpleQueue()
         self.busy = self.stale = False
@@ -597,6 +599,8 @@ class _Asker:
         self._thread.join(timeout=5.0)
 
     def _serve(self) -> None:
+        if self._priority > 0:
+            _go_first(self._priority)
         while (question := self._questions.get()) is not None:
             began = time.monotonic()
             try:
@@ -655,16 +659,19 @@ def _wait(until_s: float, spin_s: float) -> None:
             time.sleep(left - spin_s)
 
 
+def _go_first(fifo_priority: int) -> None:
+    """This thread, and those that it starts, go before whatever has less priority."""
+    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(fifo_priority))
+
+
 @contextmanager
 def _undisturbed(fifo_priority: int) -> Generator[None]:
     """This thread goes first, and no garbage is collected: the loop makes none that needs it."""
     switch_s, collects = sys.getswitchinterval(), gc.isenabled()
     scheduled = os.sched_getscheduler(0), os.sched_getparam(0)
     if fifo_priority:
-        # The threads that this one starts compute, and are to do so as any other.
-        policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
         try:
-            os.sched_setscheduler(0, policy, os.sched_param(fifo_priority))
+            _go_first(fifo_priority)
         except OSError as error:
             raise ConfigError(
                 f"fifo_priority: this machine does not grant priority {fifo_priority} ({error}). "

@@ -509,10 +509,13 @@ def test_the_process_is_afterwards_as_it_was() -> None:
 
 def test_the_loop_goes_before_other_threads_where_the_machine_grants_it() -> None:
     def look(tick: int) -> None:
-        seen.add(os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK)
+        seen.add(priority())
 
-    seen: set[int] = set()
-    first = replace(CALM, seconds=0.05, fifo_priority=1)
+    def priority() -> tuple[int, int]:
+        return os.sched_getscheduler(0), os.sched_getparam(0).sched_priority
+
+    seen: set[tuple[int, int]] = set()
+    first = replace(CALM, seconds=0.05, fifo_priority=2)
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
     except PermissionError:
@@ -521,10 +524,10 @@ def test_the_loop_goes_before_other_threads_where_the_machine_grants_it() -> Non
         return
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     arm = Arm(moves=look)
-    brain = Brain(lambda n, answer: asked.add(os.sched_getscheduler(0)))
-    asked: set[int] = set()
+    brain = Brain(lambda n, answer: asked.add(priority()))
+    asked: set[tuple[int, int]] = set()
     run_robot(arm, brain, first)
-    assert seen == {os.SCHED_FIFO} and asked == {os.SCHED_OTHER}
+    assert seen == {(os.SCHED_FIFO, 2)} and asked == {(os.SCHED_FIFO, 1)}
     assert os.sched_getscheduler(0) == os.SCHED_OTHER
     with pytest.raises(ConfigError, match="does not grant priority 1000"):
         run_robot(arm, brain, replace(first, fifo_priority=1000))
