@@ -78,7 +78,8 @@ def finish_recording(part: Path, end: Mapping[str, Any]) -> Path:
     """Make the recording of a run's logs, in place of them; returns where it is.
 
     `end` is what `run.json` says of the end. Until all is written the logs are kept and nothing
-    looks like a recording. Raises `RecordingError` where no action was sent, and for another folder.
+    looks like a recording. Raises `RecordingError` where no action was sent, and for any other
+    folder.
     """
     if part.suffix != ".part":
         raise RecordingError(f"{part}: expected what is left of a run, run_NNNNNN.part")
