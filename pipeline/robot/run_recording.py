@@ -78,8 +78,11 @@ def finish_recording(part: Path, end: Mapping[str, Any]) -> Path:
     """Make the recording of a run's logs, in place of them; returns where it is.
 
     `end` is what `run.json` says of the end. Until all is written the logs are kept and nothing
-    looks like a recording. Raises `RecordingError` where no action was sent.
+    looks like a recording. Raises `RecordingError` where no action was sent, and for any other
+    folder.
     """
+    if part.suffix != ".part":
+        raise RecordingError(f"{part}: expected what is left of a run, run_NNNNNN.part")
     run = read_json(part / RUN)
     logs = dict.fromkeys(READINGS, np.zeros(0))
     logs |= {name: _read(part, name, kind) for name, kind in log_types(run["metadata"]).items()}

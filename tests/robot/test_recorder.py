@@ -393,6 +393,15 @@ def test_a_run_without_an_action_is_no_recording(tmp_path: Path) -> None:
     assert recorder.part.is_dir()
 
 
+def test_a_finished_recording_is_not_recovered(tmp_path: Path) -> None:
+    recorder = RunRecorder(tmp_path, metadata_of(), "Push")
+    recorder.tick(observed_at(0), np.zeros(7))
+    path = recorder.finish("done")
+    with pytest.raises(RecordingError, match=r"expected what is left of a run, run_NNNNNN\.part"):
+        recover(path)
+    assert opened(path).action() is not None
+
+
 def test_runs_are_numbered_after_those_there(tmp_path: Path) -> None:
     for name in ("run_000007", "run_000009.part", "else"):
         (tmp_path / name).mkdir()
