@@ -9,14 +9,12 @@ import gc
 import math
 import os
 import sys
-import threading
 import time
 import traceback
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from queue import Empty, SimpleQueue
 from typing import Any, Protocol
 
 import numpy as np
@@ -24,9 +22,9 @@ from numpy.typing import NDArray
 
 from pipeline.base.config import Chunking
 from pipeline.base.errors import ConfigError
+from pipeline.robot.beside import Asker, PendingReadings, RobotClock, Watchdog, go_first
 from pipeline.robot.limits import Limits
 from pipeline.robot.loop import ControlLoop, LoopTiming, SafeStop, StopKind
-from pipeline.robot.memory import ReadingWindow, WindowSize
 from pipeline.robot.timings import Ring, Timings
 
 Frames = Mapping[str, tuple[float, NDArray[np.uint8]]]
@@ -37,8 +35,6 @@ LATE, OBSERVE, CHECK, PLAN, FRAMES, ASK, ACT, RECORD = range(len(TICK_PARTS))
 ANSWER_PARTS = ("answer", "infer_ms", "vlm_ms", "head_ms", "wait_ms")
 """answer: from the question to its answer; the others as the answer's `server_timing` says."""
 _BLAMED = {OBSERVE: "observe", FRAMES: "frames", ACT: "act"}
-_FIRST_OBSERVATIONS = 10
-"""Of which the quickest one tells the offset of the robot's clock."""
 _MISSED_KEPT = 4096
 _SWITCH_S = 5e-4
 """How long another thread of this process may keep Python to itself while the loop waits for it."""
@@ -249,16 +245,16 @@ class _Run:
             tuple(meta["moving"]),
         )
         self.loop = ControlLoop(timing, meta["uses_features"])
-        self.asker = _Asker(policy, settings.fifo_priority - 1)
-        self.watchdog = _Watchdog(robot, max(settings.hung_s, 2.5 / self.hz))
+        self.asker = Asker(policy.infer, settings.fifo_priority - 1)
+        self.watchdog = Watchdog(robot.stop, max(settings.hung_s, 2.5 / self.hz))
         streams = {name: (meta["streams"].get(name) or {}).get("names", ()) for name in _STREAMS}
         self.pending = {
-            name: _Pending(max(4 * meta[f"{name}_window"], 64), len(names))
+            name: PendingReadings(max(4 * meta[f"{name}_window"], 64), len(names))
             for name, names in streams.items()
             if names
         }
         self.watched = tuple(self.pending) if settings.watch is None else settings.watch
-        self.clock = _RobotClock(settings)
+        self.clock = RobotClock(settings.clock_offset_s, settings.clock_drift_s)
         self.tick_timings = Timings((*TICK_PARTS, "tick"), settings.kept_ticks)
         self.answer_timings = Timings(ANSWER_PARTS, settings.kept_ticks)
         self.actions = Ring(settings.kept_ticks, 2 + meta["action_dim"])
@@ -496,172 +492,11 @@ class _Run:
 _STREAMS = ("sensor", "state")
 
 
-class _Pending:
-    """The readings of a stream since the last question: the newest, where there are too many."""
-
-    def __init__(self, readings: int, channels: int) -> None:
-        self._window = ReadingWindow(WindowSize(readings, channels, None))
-        self.dropped = 0
-        self.forget()
-
-    def forget(self) -> None:
-        """None is pending, and none was ever seen."""
-        self.count, self.newest_s = 0, None
-
-    count: int
-    newest_s: float | None
-
-    def take_in(
-        self, name: str, values: NDArray[Any], time_s: NDArray[Any], latest_s: float
-    ) -> None:
-        """Raises `SafeStop` for readings that are no numbers, of the future, or not in order."""
-        if values.shape != (len(time_s), self._window.values.shape[1]):
-            wanted = (len(time_s), self._window.values.shape[1])
-            raise SafeStop(StopKind.ROBOT, f"{name}: expected {wanted}, found {values.shape}")
-        if not (np.isfinite(values).all() and np.isfinite(time_s).all()):
-            raise SafeStop(StopKind.NOT_A_NUMBER, f"{name}: a reading or its time is not a number")
-        before = -math.inf if self.newest_s is None else self.newest_s
-        if time_s[0] < before or (np.diff(time_s) < 0).any():
-            raise SafeStop(StopKind.CLOCK, f"{name}: a reading is older than the one before it")
-        if time_s[-1] > latest_s:
-            ahead = time_s[-1] - latest_s
-            raise SafeStop(StopKind.CLOCK, f"{name}: a reading is of the future, by {ahead:.3f} s")
-        self.newest_s = float(time_s[-1])
-        self._window.append(values, time_s)
-        room = len(self._window.values)
-        self.dropped += max(0, self.count + len(values) - room)
-        self.count = min(self.count + len(values), room)
-
-    def hand_over(self) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-        """Copies of the pending readings and their times, which then are no longer pending."""
-        window, count = self._window, self.count
-        self.count = 0
-        return window.values[-count:].copy(), window.time_s[-count:].copy()
-
-
-class _RobotClock:
-    """The robot's clock beside ours."""
-
-    def __init__(self, settings: RunSettings) -> None:
-        self._declared, self._drift_s = settings.clock_offset_s, settings.clock_drift_s
-        self.offset_s = -math.inf if self._declared is None else self._declared
-        self._seen = 0
-
-    def now_s(self) -> float:
-        """What the robot's clock says now, if it has kept its offset."""
-        return time.monotonic() + self.offset_s
-
-    def check(self, told_s: float) -> None:
-        """Compare what the robot tells. Raises `SafeStop` where the clocks have parted."""
-        offset = told_s - time.monotonic()
-        self._seen += 1
-        if self._declared is None and self._seen <= _FIRST_OBSERVATIONS:
-            # What took the least time to come here is the least behind.
-            self.offset_s = max(self.offset_s, offset)
-        if not abs(offset - self.offset_s) <= self._drift_s:
-            said = f"the robot's clock is {offset - self.offset_s:+.3f} s from where it was"
-            raise SafeStop(StopKind.CLOCK, said)
-
-
-class _Asker:
-    """Asks the policy on a thread of its own, one question at a time."""
-
-    def __init__(self, policy: Decides, fifo_priority: int) -> None:
-        self._policy, self._priority = policy, fifo_priority
-        self._questions: SimpleQueue[Mapping[str, Any] | None] = SimpleQueue()
-        self._answers: SimpleQueue[tuple[float, Mapping[str, Any] | Exception]] = SimpleQueue()
-        self.busy = self.stale = False
-        self.took_s = 0.0
-        self._thread = threading.Thread(target=self._serve, name="policy", daemon=True)
-        self._thread.start()
-
-    def ask(self, question: Mapping[str, Any]) -> None:
-        """Put a question, where none is being answered."""
-        self.busy = True
-        self._questions.put(question)
-
-    def take(self) -> Mapping[str, Any] | None:
-        """The answer where it has come. Raises `SafeStop` where the policy failed."""
-        try:
-            self.took_s, answer = self._answers.get_nowait()
-        except Empty:
-            return None
-        self.busy = False
-        if not isinstance(answer, Exception):
-            return answer
-        lost = isinstance(answer, ConnectionError)
-        kind = StopKind.CONNECTION if lost else StopKind.POLICY
-        raise SafeStop(kind, f"{kind.value}: {type(answer).__name__}: {answer}") from answer
-
-    def close(self) -> None:
-        """Ask no more; an answer that takes long is left alone."""
-        self._questions.put(None)
-        self._thread.join(timeout=5.0)
-
-    def _serve(self) -> None:
-        if self._priority > 0:
-            _go_first(self._priority)
-        while (question := self._questions.get()) is not None:
-            began = time.monotonic()
-            try:
-                answer = self._policy.infer(question)
-            except Exception as error:
-                answer = error
-            self._answers.put((time.monotonic() - began, answer))
-
-
-class _Watchdog:
-    """Stops the robot where the loop makes no tick any more.
-
-    It counts its own looks and not seconds, so that a process that was stopped as a whole, and
-    goes on, is not taken for a loop that hangs.
-    """
-
-    LOOKS = 5
-
-    def __init__(self, robot: Robot, hung_s: float) -> None:
-        self._robot, self._hung_s = robot, hung_s
-        self._beats = 0
-        self._closed = threading.Event()
-        self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
-        self.reason = ""
-
-    def start(self) -> None:
-        """Begin to look."""
-        self._thread.start()
-
-    def beat(self) -> None:
-        """A tick has ended."""
-        self._beats += 1
-
-    def check(self) -> None:
-        """Raise `SafeStop` where it has stopped the robot."""
-        if self.reason:
-            raise SafeStop(StopKind.HUNG, self.reason)
-
-    def close(self) -> None:
-        """Look no more."""
-        self._closed.set()
-
-    def _watch(self) -> None:
-        looks, seen = 0, -1
-        while not self._closed.wait(self._hung_s / self.LOOKS):
-            looks, seen = (0 if self._beats != seen else looks + 1), self._beats
-            if looks == self.LOOKS and not self.reason:
-                self.reason = f"no tick has ended for {self._hung_s:g} s"
-                self._robot.stop(self.reason)
-
-
 def _wait(until_s: float, spin_s: float) -> None:
     """Sleep until shortly before a time of the monotonic clock, then look at it all the time."""
     while (left := until_s - time.monotonic()) > 0:
         if left > spin_s:
             time.sleep(left - spin_s)
-
-
-def _go_first(fifo_priority: int) -> None:
-    """This thread, and those that it starts, go before whatever has less priority."""
-    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(fifo_priority))
 
 
 @contextmanager
@@ -671,7 +506,7 @@ def _undisturbed(fifo_priority: int) -> Generator[None]:
     scheduled = os.sched_getscheduler(0), os.sched_getparam(0)
     if fifo_priority:
         try:
-            _go_first(fifo_priority)
+            go_first(fifo_priority)
         except OSError as error:
             raise ConfigError(
                 f"fifo_priority: this machine does not grant priority {fifo_priority} ({error}). "
