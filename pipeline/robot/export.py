@@ -12,7 +12,7 @@ import hashlib
 import json
 import logging
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
@@ -125,7 +125,8 @@ def export_head(
     policy = checkpoint.policy()
     head = Head(policy).eval().requires_grad_(False)
     given = golden_inputs(checkpoint, policy)
-    contract = describe(checkpoint, folder, given["random"]) | {"versions": _versions(params)}
+    written_by = {"opset": params.opset, "versions": _versions(params)}
+    contract = describe(checkpoint, folder, given["random"]) | written_by
     files: dict[str, Any] = {}
 
     def write(place: Path) -> None:
@@ -306,7 +307,7 @@ def _versions(params: ExportParams) -> dict[str, str]:
 
 
 @contextmanager
-def _quietly() -> Iterator[None]:
+def _quietly() -> Generator[None]:
     """Without what torch and the packages log of their own parts, which is slow to write too."""
     logging.disable(logging.WARNING)
     try:

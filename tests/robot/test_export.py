@@ -115,7 +115,7 @@ def assert_same(run: export.Runner, checkpoint: PolicyCheckpoint, atol: float) -
         torch.testing.assert_close(found, expected, rtol=0, atol=atol)
 
 
-@pytest.mark.parametrize("kind", [*KINDS[:4], *KINDS[4::5], *OTHERS[::2]], ids=named)
+@pytest.mark.parametrize("kind", [*KINDS[::5], *OTHERS[::2]], ids=named)
 def test_torch_export_is_the_policy(kind: dict[str, Any], tmp_path: Path) -> None:
     checkpoint = checkpoint_of(**kind)
     receipt = exported(tmp_path / "head", checkpoint, "torch")
@@ -124,7 +124,7 @@ def test_torch_export_is_the_policy(kind: dict[str, Any], tmp_path: Path) -> Non
 
 
 @pytest.mark.extra
-@pytest.mark.parametrize("kind", [*KINDS, *OTHERS], ids=named)
+@pytest.mark.parametrize("kind", [*KINDS, *OTHERS[1::3]], ids=named)
 def test_both_formats_are_the_policy(kind: dict[str, Any], tmp_path: Path) -> None:
     onnx()
     checkpoint = checkpoint_of(**kind)
