@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.config import Chunking
-from pipeline.base.errors import ConfigError
+from pipeline.base.errors import ConfigError, PipelineError
 from pipeline.robot.beside import Asker, PendingReadings, RobotClock, Watchdog, go_first
 from pipeline.robot.limits import Limits
 from pipeline.robot.loop import ControlLoop, LoopTiming, SafeStop, StopKind
@@ -90,8 +90,8 @@ class Recorder(Protocol):
         """An answer of the policy."""
         ...
 
-    def finish(self, reason: str) -> Path:
-        """The finished recording."""
+    def finish(self, reason: str, timings: Mapping[str, Any]) -> Path:
+        """The finished recording; raises a `PipelineError` where there is none, and why."""
         ...
 
 
@@ -176,7 +176,7 @@ class RunReport:
     """(tick, 2 + action): the tick's number, the robot's time, and what was sent, of the newest."""
     recording: Path | None
     traceback: str
-    """Of what raised; empty where nothing did."""
+    """Of what raised, and why there is no recording; empty where all went well."""
 
     def document(self) -> dict[str, Any]:
         """All but the actions, as JSON takes it."""
@@ -217,7 +217,12 @@ def run_robot(
         finally:
             robot.stop(reason)
             run.close()
-    recording = recorder.finish(reason) if recorder else None
+    recording = None
+    if recorder is not None:
+        try:
+            recording = recorder.finish(reason, run.timings())
+        except PipelineError as error:
+            trace += f"no recording: {error}"  # The report still says why the robot stands still.
     return run.report(kind, reason, recording, trace)
 
 
@@ -458,6 +463,13 @@ class _Run:
             return StopKind.ROBOT, f"the robot's {_BLAMED[self.doing]} failed: {said}"
         kind = StopKind.RECORDER if self.doing == RECORD else StopKind.LOOP
         return kind, f"{kind.value}: {said}"
+
+    def timings(self) -> dict[str, Any]:
+        """Milliseconds of ticks and of answers."""
+        return {
+            "tick_ms": self.tick_timings.document(),
+            "answer_ms": self.answer_timings.document(),
+        }
 
     def close(self) -> None:
         """End its threads; the policy may finish an answer that nobody waits for."""

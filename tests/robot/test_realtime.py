@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from pipeline.base.config import LimitsFile
-from pipeline.base.errors import ConfigError
+from pipeline.base.errors import ConfigError, RecordingError
 from pipeline.robot.limits import Limits
 from pipeline.robot.loop import StopKind
 from pipeline.robot.realtime import RunReport, RunSettings, run_robot
@@ -475,8 +475,9 @@ class Notes:
     def answer(self, answer: Mapping[str, Any]) -> None:
         self.told["answer"] += 1
 
-    def finish(self, reason: str) -> Path:
+    def finish(self, reason: str, timings: Mapping[str, Any]) -> Path:
         self.reason = reason
+        assert set(timings) == {"tick_ms", "answer_ms"}
         return Path("recording")
 
 
@@ -488,6 +489,16 @@ def test_all_that_happens_is_told_to_the_recorder() -> None:
         "tick": report.ticks, "action": len(arm.acts), "frames": asked, "answer": report.answers
     }  # fmt: skip
     assert notes.reason == report.reason and report.recording == Path("recording")
+
+
+def test_a_recording_that_cannot_be_finished_hides_no_reason() -> None:
+    class Empty(Notes):
+        def finish(self, reason: str, timings: Mapping[str, Any]) -> Path:
+            raise RecordingError("no action was sent")
+
+    report = run_robot(Arm(), Brain(), replace(CALM, seconds=0.05), recorder=Empty())
+    assert (report.kind, report.recording) == (StopKind.TIME, None)
+    assert report.traceback == "no recording: no action was sent"
 
 
 def test_settings_that_do_not_fit_the_policy_are_refused_before_anything_is_asked() -> None:
