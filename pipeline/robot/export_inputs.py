@@ -1,6 +1,6 @@
 """What an exported head and its policy are compared over: observations, and noise to draw."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -27,7 +27,7 @@ _TURN = {"deg": 5.0, "rad": 0.1, "rotation": 5.0}
 def golden_inputs(checkpoint: PolicyCheckpoint, policy: Policy) -> dict[str, Inputs]:
     """The inputs that the files are judged over: `random` and, where there are some, `golden`."""
     given = {"random": random_inputs(checkpoint, policy, _ROWS)}
-    rows: Sequence[Any] = getattr(checkpoint, "golden", ())
+    rows = checkpoint.golden
     if rows and "features" in policy.encoders:
         golden = random_inputs(checkpoint, policy, len(rows), seed=1)
         golden["features"] = torch.from_numpy(np.stack([row.features for row in rows])).float()
