@@ -1,16 +1,26 @@
 """Rollouts over the wire are those in process, and what cannot be the same is refused."""
 
+import json
 from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
-from pipeline.base.config import RolloutParams
+from pipeline.base.config import RolloutParams, Source
 from pipeline.base.errors import CheckpointMismatch, ConfigError
+from pipeline.data import open_recordings
 from pipeline.evaluate.rollouts import Rollouts, roll_out
 from pipeline.evaluate.served_rollouts import roll_out_served
 from pipeline.robot.client import PolicyClient
+from pipeline.robot.loop import StopKind
+from pipeline.robot.realtime import RunSettings, run_robot
+from pipeline.robot.recorder import RunRecorder
+from pipeline.simulation.insertion_formats import INSTRUCTION
+from pipeline.simulation.realtime import SimulatedRobot
 
 Served = Callable[..., Any]
 
@@ -72,3 +82,25 @@ def test_another_robots_server_is_refused(served_policy: Served, serving: Served
     served.metadata = served.metadata | {"action_hz": 30.0}
     with pytest.raises(CheckpointMismatch, match=r"action_hz 30\.0, of the phantom 10"):
         over_the_wire(served, serving)
+
+
+def test_a_run_in_real_time_over_the_wire_is_recorded(
+    served_policy: Served, serving: Served, tmp_path: Path
+) -> None:
+    """As docs/robot.md says it, with a model that is a stand-in."""
+    served = served_policy()
+    robot = SimulatedRobot(seed=78)
+    with PolicyClient(f"ws://{serving(served, fresh=False).address}") as policy, closing(robot):
+        settings = RunSettings(INSTRUCTION, seconds=1.5, missed_in_a_row=100, stalled_s=10.0)
+        recorder = RunRecorder(tmp_path, policy.metadata, INSTRUCTION, vars(settings))
+        report = run_robot(robot, policy, settings, recorder=recorder)
+    assert report.kind is StopKind.TIME, report.reason
+    assert report.ticks + report.left_out == 15 and report.answers > 0
+    assert report.recording == tmp_path / "run_000000"
+    run = json.loads((report.recording / "run.json").read_text())
+    sent = report.actions[:, 2:]
+    assert run["rows"] == len(sent) > 0 and run["metadata"]["step"] == 1
+    (recording,) = open_recordings([Source(name="runs", path=str(report.recording))]).recordings
+    action = recording.action()
+    assert action is not None
+    np.testing.assert_array_equal(action.values, sent.astype(np.float32))
