@@ -189,7 +189,7 @@ def roll_out(
         instruction_of(checkpoint.instructions),
     )
     alone = len(policy.encoders) == 1
-    ablations = [
+    ablations: list[RolloutAblation] = [
         name
         for name in dict.fromkeys(wanted.ablations)
         if name.split()[0] in policy.encoders and not (alone and name.endswith("off"))
