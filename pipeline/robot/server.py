@@ -259,7 +259,7 @@ class PolicyServer:
             shown = {"Content-Type": "text/html; charset=utf-8", "Content-Security-Policy": policy}
             return _response(HTTPStatus.OK, text, shown)
         if not self._authorized(request.headers):
-            said = "expected the header Authorization: Api-Key <token>, with the server's token\n"
+            said = "expected the header Authorization: Api-Key <the server's token>\n"
             return _response(HTTPStatus.UNAUTHORIZED, said, {"WWW-Authenticate": "Api-Key"})
         if path == "/":
             return self._full()

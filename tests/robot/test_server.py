@@ -211,7 +211,7 @@ def test_the_token_is_asked_for(served_policy: Served, serving: Serving, observe
         headers = {"Authorization": f"Api-Key {wrong}"} if wrong else {}
         assert get(server, "/status.json", **headers)[0] == 401
     for wrong in (None, "other"):
-        with pytest.raises(ConnectionError, match=r"401.*Give the server's token"):
+        with pytest.raises(ConnectionError, match=r"401.*the server's token"):
             client_of(server, token=wrong)
     with client_of(server, token="s3cret") as client:
         assert client.infer(observe(0))["actions"].shape == (4, 7)
