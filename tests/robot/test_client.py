@@ -65,7 +65,7 @@ def test_a_refused_observation_says_why_and_the_client_can_begin_again(
     served_policy: Callable[..., Any], serving: Callable[..., Any], observe: Observe
 ) -> None:
     with PolicyClient(f"ws://{serving(served_policy()).address}") as client:
-        with pytest.raises(ObservationError, match=r"^sensors: expected one of.*mean sensor"):
+        with pytest.raises(ObservationError, match=r"^sensors: expected one of.* sensor"):
             client.infer(observe(0, sensors=np.zeros(3)))
         with pytest.raises(ServerError, match="not connected; call reconnect"):
             client.infer(observe(0))
