@@ -102,13 +102,8 @@ class PolicyClient:
             )
             return self._leaving.enter_context(connecting)
         except InvalidStatus as error:
-            code, body = (
-                error.response.status_code,
-                (error.response.body or b"").decode("utf-8", "replace"),
-            )
-            raise ServerError(
-                f"{self._url}: the server refuses the connection ({code}): {body.strip():.300}"
-            ) from None
+            body = (error.response.body or b"").decode(errors="replace").strip()
+            raise ServerError(f"{self._url}: {error}: {body:.300}") from None
         except (OSError, WebSocketException) as error:
             raise ServerError(
                 f"{self._url}: nobody serves a policy there ({error}). Start python -m "

@@ -20,7 +20,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from functools import partial
 from http import HTTPStatus
-from types import MappingProxyType
 from typing import Final
 from urllib.parse import urlsplit
 
@@ -125,7 +124,7 @@ class PolicyServer:
 
     async def _run(self, started: Callable[[], None]) -> bool:
         loop, signalled = asyncio.get_running_loop(), asyncio.Queue[bool]()
-        self._stop = partial(loop.call_soon_threadsafe, signalled.put_nowait, False)
+        self._stop = lambda: loop.call_soon_threadsafe(signalled.put_nowait, False)
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
                 loop.add_signal_handler(number, signalled.put_nowait, True)
@@ -164,7 +163,7 @@ class PolicyServer:
     async def _converse(self, connection: ServerConnection) -> None:
         """One robot, from its metadata to its last answer."""
         peer = str(connection.remote_address[0])
-        with self.status.connected(peer) as robot, suppress(ConnectionClosed):
+        with self.status.connected(peer) as robot, suppress(ConnectionClosed, TimeoutError):
             await connection.send(wire.pack(self._served.metadata))
             session = self._served.session(self._params.fresh, self._params.seed)
             code = None
@@ -188,7 +187,7 @@ class PolicyServer:
         except TimeoutError:
             why = f"nothing came for {self._params.idle_s:g} s"
             await connection.close(CloseCode.POLICY_VIOLATION, why)
-            return await connection.recv()  # raises that it is closed
+            raise
         finally:
             self._idle.discard(connection)
 
@@ -264,10 +263,10 @@ class PolicyServer:
         Without a token that is also told by the name that the browser believes to talk to: another
         place's name can be made to mean this machine.
         """
-        host = headers.get("Host", "")
-        if "Origin" in headers and urlsplit(headers["Origin"]).netloc != host:
+        here = urlsplit(f"//{headers.get('Host', '')}")
+        if "Origin" in headers and urlsplit(headers["Origin"]).netloc != here.netloc:
             return True
-        return self._token is None and not _is_loopback(urlsplit(f"//{host}").hostname or "")
+        return self._token is None and not _is_loopback(here.hostname or "")
 
     def _authorized(self, headers: Headers) -> bool:
         given = headers.get("Authorization", "").encode()
@@ -278,10 +277,10 @@ def _response(
     connection: ServerConnection,
     status: HTTPStatus,
     text: str,
-    headers: Mapping[str, str] = MappingProxyType({}),
+    headers: Mapping[str, str] = _SHARED,
 ) -> Response:
     response = connection.respond(status, text)
-    for name, value in (_SHARED | headers).items():
+    for name, value in {**_SHARED, **headers}.items():
         response.headers.pop(name, None)
         response.headers[name] = value
     return response
