@@ -159,9 +159,8 @@ def refuse_other_robot(robot: Mapping[str, Any], metadata: Mapping[str, Any]) ->
     own = dict(robot)
     if "views" in robot:
         own["views"] = [view for view in trained["views"] if view in robot["views"]]
-    differing = differences({name: trained[name] for name in robot}, own)
-    if differing:
+    if differing := differences({name: trained[name] for name in robot}, own):
+        lines = describe(differing, " in training, the robot's ")
         raise CheckpointMismatch(
-            "the policy was trained on another robot than this one:\n  "
-            + "\n  ".join(describe(differing, " in training, the robot's "))
+            "\n  ".join(["the policy was trained on another robot than this one:", *lines])
         )

@@ -99,8 +99,7 @@ class ObservationReader:
         if unknown is not None:
             known = ", ".join(self._known)
             raise ObservationError(
-                f"{unknown:.80}: expected one of {known}, which this policy takes, found a field "
-                "of this name. Leave it out"
+                f"{unknown:.80}: expected one of {known}, which this policy takes"
             )
 
     def _values(self, given: Mapping[str, Any]) -> dict[str, NDArray[Any]]:

@@ -203,13 +203,10 @@ class Session:
         fields = self._memory.observation()
         actions, head_s = self._served.chunk(fields, self._drawn, observation.guide)
         whole_s = perf_counter() - self._asked_s
-        answer: Answer = {"actions": actions}
-        answer["server_timing"] = {
-            "infer_ms": 1000 * whole_s,
-            "vlm_ms": 1000 * vlm_s,
-            "head_ms": 1000 * head_s,
-            "wait_ms": 1000 * max(0.0, whole_s - vlm_s - head_s),
-        }
+        wait_s = max(0.0, whole_s - vlm_s - head_s)
+        spent = {"infer_ms": whole_s, "vlm_ms": vlm_s, "head_ms": head_s, "wait_ms": wait_s}
+        timing = {part: 1000 * seconds for part, seconds in spent.items()}
+        answer: Answer = {"actions": actions, "server_timing": timing}
         if self._key is not None:
             key = np.frombuffer(self._key, np.uint8)
             answer |= {"feature_age_s": float(fields["feature_age"]), "feature_key": key}
@@ -252,8 +249,7 @@ class Session:
         if self._memory.features is None:
             views = ", ".join(f"images/{view}" for view in self.metadata["streams"]["views"])
             raise ObservationError(
-                f"images: expected frames with the first observation of an episode ({views}), "
-                "found none"
+                f"images: expected some of {views} with the first observation of an episode"
             )
         return spent
 

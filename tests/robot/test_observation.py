@@ -99,7 +99,7 @@ STATE, STATE_TIME = np.zeros((10, 12)), np.arange(1, 11) / 100
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ({"observation/state": STATE}, "observation/state: expected one of time, .*found a field"),
+        ({"observation/state": STATE}, "observation/state: expected one of time, .*state_time"),
         ({"images/left": FRAME}, "images/left: expected one of .*images/View1"),
         ({"time": "now"}, "time: expected numbers, found str"),
         ({"time": np.zeros(2)}, r"time: expected shape \(1\), found \(2,\)"),
