@@ -1,27 +1,16 @@
 """A client of the policy server, for the robot's computer: needs numpy, msgpack and websockets."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import ExitStack
-from types import TracebackType
-from typing import Any, Final, NoReturn
+from typing import Any
 
 import numpy as np
 from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
 from websockets.sync.client import ClientConnection, connect
 
+from pipeline.base.differences import describe, differences
 from pipeline.base.errors import CheckpointMismatch, ObservationError, ServerBusy, ServerError
 from pipeline.robot import wire
-
-_DESCRIBED: Final = {
-    "state": ("state", "names"),
-    "state_units": ("state", "units"),
-    "sensor": ("sensor", "names"),
-    "sensor_units": ("sensor", "units"),
-    "action": ("action", "names"),
-    "action_units": ("action", "units"),
-    "action_kind": ("action", "kind"),
-}
-"""What a description of a robot may say of its streams, and where metadata says it."""
 
 
 class PolicyClient:
@@ -48,8 +37,8 @@ class PolicyClient:
         nobody listens or the token is another, and `CheckpointMismatch` where the policy was
         trained on another robot than described.
         """
-        self._url, self._token, self._robot = url, token, robot or {}
-        self._timeout_s = timeout_s
+        self._url = url if "://" in url else f"ws://{url}"
+        self._token, self._robot, self._timeout_s = token, robot or {}, timeout_s
         self._reset: bool | int | None = None
         self._connection: ClientConnection | None = None
         self._leaving = ExitStack()
@@ -60,7 +49,7 @@ class PolicyClient:
         self.close()
         self._connection = self._connected()
         try:
-            self.metadata = wire.unpack(self._receive(self._timeout_s))
+            self.metadata = wire.unpack(self._said())
             refuse_other_robot(self._robot, self.metadata)
         except Exception:
             self.close()
@@ -73,16 +62,10 @@ class PolicyClient:
         connection stays, and has taken the readings), `ServerError` where the connection is gone
         or the answer late: then `reconnect`.
         """
-        if self._connection is None:
-            raise ServerError(f"{self._url}: not connected; call reconnect")
         told = {} if self._reset is None else {"reset": self._reset}
         message = wire.pack({**observation, **told})
         try:
-            self._connection.send(message)
-        except ConnectionClosed as error:
-            self._lose(error)
-        try:
-            answer = wire.unpack(self._receive(self._timeout_s))
+            answer = wire.unpack(self._said(message))
         except ServerBusy:
             self._reset = None  # it is taken with the readings
             raise
@@ -103,12 +86,7 @@ class PolicyClient:
     def __enter__(self) -> "PolicyClient":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _connected(self) -> ClientConnection:
@@ -124,93 +102,65 @@ class PolicyClient:
             )
             return self._leaving.enter_context(connecting)
         except InvalidStatus as error:
-            said = (error.response.body or b"").decode(errors="replace").strip()
-            hint = " Give the server's token." if error.response.status_code == 401 else ""
-            raise ServerError(
-                f"{self._url}: the server refuses the connection "
-                f"({error.response.status_code}): {said:.300}.{hint}"
-            ) from None
-        except TimeoutError:
-            raise ServerError(
-                f"{self._url}: expected a connection within {self._timeout_s:g} s, found none. Is "
-                "that a policy server? Look at its /healthz"
-            ) from None
+            body = (error.response.body or b"").decode(errors="replace").strip()
+            raise ServerError(f"{self._url}: {error}: {body:.300}") from None
         except (OSError, WebSocketException) as error:
             raise ServerError(
                 f"{self._url}: nobody serves a policy there ({error}). Start python -m "
                 "stages.serve, and give the address that it prints"
             ) from None
 
-    def _receive(self, timeout_s: float) -> bytes:
-        """The next message of the server; what it says in words is an error."""
-        assert self._connection is not None
+    def _said(self, message: bytes | None = None) -> bytes:
+        """What the server says next, to this message; what it says in words is an error."""
+        if self._connection is None:
+            raise ServerError(f"{self._url}: not connected; call reconnect")
         try:
-            message = self._connection.recv(timeout_s)
+            if message is not None:
+                self._connection.send(message)
+            answer = self._connection.recv(self._timeout_s)
         except TimeoutError:
             self.close()  # a late answer would be taken for the next
             raise ServerError(
-                f"{self._url}: expected an answer within {timeout_s:g} s, found none, and left. "
-                "Stop the robot; then reconnect, with a longer timeout_s if the model is slow"
+                f"{self._url}: expected an answer within {self._timeout_s:g} s, found none, and "
+                "left. Stop the robot; then reconnect, with a longer timeout_s if the model is slow"
             ) from None
         except ConnectionClosed as error:
-            self._lose(error)
-        if isinstance(message, bytes):
-            return message
-        if message.startswith("busy: "):
-            raise ServerBusy(message)
+            self.close()
+            why = (error.rcvd and error.rcvd.reason) or error
+            raise ServerError(
+                f"{self._url}: the connection is lost ({why}), and with it what the server "
+                "remembered. Stop the robot; then reconnect, which begins a new episode"
+            ) from None
+        if isinstance(answer, bytes):
+            return answer
+        if answer.startswith("busy: "):
+            raise ServerBusy(answer)
         self.close()
-        if message.startswith("refused: "):
-            raise ObservationError(message.removeprefix("refused: "))
-        raise ServerError(f"{self._url}: {message}")
-
-    def _lose(self, error: ConnectionClosed) -> NoReturn:
-        self.close()
-        why = error.rcvd.reason if error.rcvd is not None else ""
-        raise ServerError(
-            f"{self._url}: the connection is lost ({why or error}), and with it what the server "
-            "remembered. Stop the robot; then reconnect, which begins a new episode"
-        ) from None
+        if answer.startswith("refused: "):
+            raise ObservationError(answer.removeprefix("refused: "))
+        raise ServerError(f"{self._url}: {answer}")
 
 
 def refuse_other_robot(robot: Mapping[str, Any], metadata: Mapping[str, Any]) -> None:
     """Raise `CheckpointMismatch` where a robot is not the one that a policy was trained on.
 
-    Only what its description says is compared.
+    Only what its description says is compared; it may have more views than the policy looks at.
     """
-    known = [*_DESCRIBED, "views", "action_hz"]
-    if unknown := sorted(set(robot) - set(known)):
+    streams = metadata["streams"]
+    trained = {"views": streams["views"], "action_hz": metadata["action_hz"]}
+    trained["action_kind"] = streams["action"]["kind"]
+    for name in ("state", "sensor", "action"):
+        stream = streams.get(name, {})
+        trained |= {name: stream.get("names", ()), f"{name}_units": stream.get("units", ())}
+    if unknown := sorted(robot.keys() - trained):
         raise CheckpointMismatch(
-            f"the robot's description: expected {', '.join(known)}, found {', '.join(unknown)}"
+            f"the robot's description: expected {', '.join(trained)}, found {', '.join(unknown)}"
         )
-    streams, lines = metadata["streams"], list[str]()
-    for name in (name for name in _DESCRIBED if name in robot):
-        stream, of_it = _DESCRIBED[name]
-        lines += _differences(name, streams.get(stream, {}).get(of_it, ()), robot[name])
-    if missing := sorted(set(streams["views"]) - set(robot.get("views", streams["views"]))):
-        lines.append(
-            f"views: trained on {', '.join(streams['views'])}, the robot has no "
-            f"{', '.join(missing)}"
-        )
-    if abs(robot.get("action_hz", metadata["action_hz"]) - metadata["action_hz"]) > 1e-6:
-        lines.append(
-            f"action_hz: trained {metadata['action_hz']}, the robot's {robot['action_hz']}"
-        )
-    if lines:
+    own = dict(robot)
+    if "views" in robot:
+        own["views"] = [view for view in trained["views"] if view in robot["views"]]
+    if differing := differences({name: trained[name] for name in robot}, own):
+        lines = describe(differing, " in training, the robot's ")
         raise CheckpointMismatch(
-            "the policy was trained on another robot than this one:\n  " + "\n  ".join(lines)
+            "\n  ".join(["the policy was trained on another robot than this one:", *lines])
         )
-
-
-def _differences(name: str, trained: Sequence[str], own: Sequence[str]) -> list[str]:
-    """A line where two lists of names, or two names, are not the same."""
-    if isinstance(own, str) or isinstance(trained, str):
-        return [] if trained == own else [f"{name}: trained {trained!r}, the robot's {own!r}"]
-    if list(trained) == list(own):
-        return []
-    if len(trained) != len(own):
-        return [f"{name}: trained on {len(trained)} channels, the robot has {len(own)}"]
-    place = next(i for i, both in enumerate(zip(trained, own, strict=True)) if both[0] != both[1])
-    order = " (the same in another order)" if sorted(trained) == sorted(own) else ""
-    return [
-        f"{name}: channel {place} trained {trained[place]!r}, the robot's {own[place]!r}{order}"
-    ]

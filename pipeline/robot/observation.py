@@ -5,7 +5,7 @@ Each refusal names the field, what was expected, what was found, and what to men
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
+from time import monotonic
 from typing import Any, Final
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.base.clock import CLOCK_SLACK_S
 from pipeline.base.errors import ObservationError
+from pipeline.base.finite import first_non_finite
 from pipeline.robot.chunking import PlanGuide
 
 LONGEST_PROMPT: Final = 1000
@@ -51,31 +52,40 @@ class ObservationReader:
     """
 
     def __init__(self, metadata: Mapping[str, Any]) -> None:
-        self._views: Sequence[str] = metadata["streams"]["views"]
-        self._channels = {
-            name: len(metadata["streams"].get(name, {}).get("names", ())) for name in STREAMS
-        }
+        streams = metadata["streams"]
+        self._views: Sequence[str] = streams["views"]
         self._chunk = (metadata["horizon"], metadata["action_dim"])
-        self._stochastic: bool = metadata["stochastic"]
-        self._newest_s: dict[str, float] = {}
+        widths = {name: len(streams.get(name, {}).get("names", ())) for name in STREAMS}
+        self._widths = {name: width for name, width in widths.items() if width}
+        self._clocks = {name: f"{name}_time" for name in self._widths}
+        self._clocks |= {f"images/{view}": f"images_time/{view}" for view in self._views}
+        self._known = ["time", "prompt", "reset", *self._clocks, *self._clocks.values()]
+        if metadata["stochastic"]:
+            self._known += ["guide/chunk", "guide/weight"]
+        self._newest_s: Mapping[str, float] = {}
 
     def read(self, given: Any) -> RobotObservation:
-        """The observation of these fields. Raises `ObservationError`."""
+        """The observation of these fields. Raises `ObservationError`.
+
+        Without `time` it is of the newest time that it brings, else of this machine's clock now. A
+        frame or a single reading without its time is of `time`.
+        """
         if not isinstance(given, Mapping):
             raise ObservationError(f"expected fields by name, found {type(given).__name__}")
         self._refuse_unknown(given)
         reset, seed = _reset(given.get("reset", False))
-        newest_s = {} if reset else dict(self._newest_s)
-        time = self._time(given, newest_s)
-        readings = {"time": time}
-        for name in STREAMS:
-            readings |= self._stream(name, given, float(time[0]), newest_s)
-        frames = {view: _frame(f"images/{view}", given[f"images/{view}"]) for view in self._views
-                  if f"images/{view}" in given}  # fmt: skip
+        values = self._values(given)
+        times = self._times(given, values)
+        newest_s = self._follow({} if reset else self._newest_s, times)
+        readings = {"time": times["time"]}
+        for name in self._widths:
+            if len(values.get(name, ())):
+                readings |= {name: values[name], f"{name}_time": times[name]}
+        images = {view: f"images/{view}" for view in self._views}
         observation = RobotObservation(
             readings=readings,
-            frames=frames,
-            frame_time_s=self._frame_times(given, frames, float(time[0])),
+            frames={view: values[name][0] for view, name in images.items() if name in values},
+            frame_time_s=np.array([times.get(name, [np.nan])[0] for name in images.values()]),
             prompt=_prompt(given.get("prompt")),
             reset=reset,
             seed=seed,
@@ -85,74 +95,60 @@ class ObservationReader:
         return observation
 
     def _refuse_unknown(self, given: Mapping[str, Any]) -> None:
-        known = ["time", "prompt", "reset", "guide/chunk", "guide/weight"]
-        known += [name for stream in STREAMS for name in (stream, f"{stream}_time")]
-        known += [f"{of}/{view}" for view in self._views for of in ("images", "images_time")]
-        for name in given:
-            if name in known:
-                continue
-            near = get_close_matches(str(name), known, 1, 0.75)
-            meant = f"did you mean {near[0]}?" if near else "Leave it out."
+        unknown = next((str(name) for name in given if name not in self._known), None)
+        if unknown is not None:
+            known = ", ".join(self._known)
             raise ObservationError(
-                f"{name!s:.80}: expected one of {', '.join(known)}, found a field of this "
-                f"name. {meant}"
+                f"{unknown:.80}: expected one of {known}, which this policy takes"
             )
 
-    def _time(self, given: Mapping[str, Any], newest_s: dict[str, float]) -> NDArray[np.float64]:
-        if "time" not in given:
-            raise ObservationError("time: expected the robot's clock now, in s, found none")
-        time = _numbers("time", given["time"], (1,), np.float64)
-        now, before = float(time[0]), newest_s.get("time", -np.inf)
-        if now < before:
-            raise ObservationError(
-                f"time: expected {before} s or later, as the last observation was made then, found "
-                f"{now}. Send reset where a new episode begins"
-            )
-        newest_s["time"] = now
-        return time
+    def _values(self, given: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+        """The readings (reading, channel) of each stream that came, and frames as one reading."""
+        values: dict[str, NDArray[Any]] = {}
+        for name in self._clocks:
+            if name in given and name in self._widths:
+                shape = ("reading", self._widths[name])
+                values[name] = _numbers(name, given[name], shape, np.float32)
+            elif name in given:
+                values[name] = _frame(name, given[name])[None]
+        return values
 
-    def _stream(
-        self, name: str, given: Mapping[str, Any], now_s: float, newest_s: dict[str, float]
-    ) -> dict[str, NDArray[Any]]:
-        """The readings of a stream and their times, checked; nothing where none came."""
-        clock = f"{name}_time"
-        if name not in given and clock not in given:
-            return {}
-        for there, missing in ((name, clock), (clock, name)):
-            if missing not in given:
-                raise ObservationError(f"{missing}: expected it beside {there}, found none")
-        if not self._channels[name]:
-            raise ObservationError(
-                f"{name}: expected none, as the policy was trained without, found some. Leave it "
-                "out"
-            )
-        values = _numbers(name, given[name], ("reading", self._channels[name]), np.float32)
-        times = _numbers(clock, given[clock], (len(values),), np.float64)
-        if len(times):
-            before = newest_s.get(name, -np.inf)
-            if times[0] < before or (np.diff(times) < 0).any():
+    def _times(
+        self, given: Mapping[str, Any], values: Mapping[str, NDArray[Any]]
+    ) -> dict[str, NDArray[np.float64]]:
+        """The times (reading,) in s of each of the values, and `time` (1,)."""
+        times: dict[str, NDArray[np.float64]] = {}
+        for name, clock in self._clocks.items():
+            if clock in given and name not in given:
+                raise ObservationError(f"{name}: expected it beside {clock}, found none")
+            if clock in given:
+                times[name] = _numbers(clock, given[clock], (len(values[name]),), np.float64)
+        newest_s = max((own.max() for own in times.values() if len(own)), default=monotonic())
+        now = _numbers("time", given.get("time", newest_s), (1,), np.float64)
+        for name, own in values.items():
+            if name not in times and len(own) != 1:
+                clock = self._clocks[name]
+                raise ObservationError(f"{clock}: expected it beside {name}, found none")
+        return {"time": now} | dict.fromkeys(values, now) | times
+
+    def _follow(
+        self, before: Mapping[str, float], times: Mapping[str, NDArray[np.float64]]
+    ) -> Mapping[str, float]:
+        """The newest times of `before` and of these, `time` first, which must follow them."""
+        newest_s, now_s = dict(before), times["time"][0]
+        for name, own in times.items():
+            after = before.get(name, -np.inf)
+            line = np.array([after, *own, now_s + CLOCK_SLACK_S])
+            if (np.diff(line) < 0).any():
                 raise ObservationError(
-                    f"{clock}: expected ascending times from {before} s on, where the last "
-                    f"readings ended, found {times[0]} to {times[-1]}. Send each reading once, in "
-                    "order"
+                    f"{self._clocks.get(name, name)}: expected times from {after} s, where the "
+                    f"last observation ended, to {now_s} s, its own time, found {own[0]} to "
+                    f"{own[-1]}. Send each reading once, in order and on one clock, and reset "
+                    "where a new episode begins"
                 )
-            _check_not_later(clock, float(times[-1]), now_s)
-            newest_s[name] = float(times[-1])
-        return {name: values, clock: times}
-
-    def _frame_times(
-        self, given: Mapping[str, Any], frames: Mapping[str, Any], now_s: float
-    ) -> NDArray[np.float64]:
-        times = np.full(len(self._views), np.nan)
-        for place, view in enumerate(self._views):
-            name = f"images_time/{view}"
-            if view not in frames:
-                if name in given:
-                    raise ObservationError(f"images/{view}: expected it beside {name}, found none")
-                continue
-            times[place] = _numbers(name, given.get(name, now_s), (1,), np.float64)[0]
-            _check_not_later(name, float(times[place]), now_s)
-        return times
+            if len(own) and name in ("time", *STREAMS):
+                newest_s[name] = float(own[-1])
+        return newest_s
 
     def _guide(self, given: Mapping[str, Any]) -> PlanGuide | None:
         names = [name for name in ("guide/chunk", "guide/weight") if name in given]
@@ -160,11 +156,6 @@ class ObservationReader:
             return None
         if len(names) == 1:
             raise ObservationError(f"{names[0]}: expected guide/chunk and guide/weight, found one")
-        if not self._stochastic:
-            raise ObservationError(
-                "guide/chunk: expected none, as this policy draws nothing that could be guided, "
-                "found one. Choose another chunking than rtc"
-            )
         chunk = _numbers("guide/chunk", given["guide/chunk"], self._chunk, np.float32)
         weight = _numbers("guide/weight", given["guide/weight"], self._chunk[:1], np.float32)
         if not ((weight >= 0) & (weight <= 1)).all():
@@ -185,8 +176,7 @@ def _numbers(
         array = np.empty(0, object)
     if array.dtype.kind not in "biuf":
         raise ObservationError(f"{name}: expected numbers, found {type(value).__name__}")
-    if axes == (1,) and array.ndim == 0:
-        array = array[None]
+    array = array.reshape(1) if axes == (1,) and array.ndim == 0 else array
     fits = array.ndim == len(axes) and all(
         isinstance(size, str) or have == size for have, size in zip(array.shape, axes, strict=True)
     )
@@ -195,9 +185,8 @@ def _numbers(
         raise ObservationError(f"{name}: expected shape ({shape}), found {array.shape}")
     with np.errstate(over="ignore"):
         array = array.astype(dtype)
-    if not (finite := np.isfinite(array)).all():
-        place = np.argwhere(~finite)[0].tolist()
-        raise ObservationError(f"{name}: expected finite numbers, found {array[*place]} at {place}")
+    if (place := first_non_finite(array)) is not None:
+        raise ObservationError(f"{name}: expected finite numbers, found {array[place]} at {place}")
     return array
 
 
@@ -216,9 +205,8 @@ def _frame(name: str, value: Any) -> NDArray[np.uint8]:
 def _prompt(value: Any) -> str | None:
     if value is None or (isinstance(value, str) and len(value) <= LONGEST_PROMPT):
         return value
-    found = f"{len(value)} characters" if isinstance(value, str) else type(value).__name__
     raise ObservationError(
-        f"prompt: expected a text of at most {LONGEST_PROMPT} characters, found {found}"
+        f"prompt: expected a text of at most {LONGEST_PROMPT} characters, found {value!r:.80}"
     )
 
 
@@ -229,11 +217,3 @@ def _reset(value: Any) -> tuple[bool, int | None]:
     if isinstance(value, int | np.integer) and 0 <= value < LARGEST_SEED:
         return True, int(value)
     raise ObservationError(f"reset: expected true, false or a seed from 0 on, found {value!r:.80}")
-
-
-def _check_not_later(name: str, time_s: float, now_s: float) -> None:
-    if time_s > now_s + CLOCK_SLACK_S:
-        raise ObservationError(
-            f"{name}: expected at most {now_s} s, the time of the observation, found {time_s}. "
-            "Give all times on one clock"
-        )

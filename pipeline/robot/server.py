@@ -20,26 +20,24 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from functools import partial
 from http import HTTPStatus
-from itertools import count
-from time import perf_counter
 from typing import Final
 from urllib.parse import urlsplit
 
 from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
+from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 
 from pipeline.base.config import ServeParams
 from pipeline.base.errors import ConfigError, ObservationError, PipelineError, WireError
 from pipeline.robot import wire
 from pipeline.robot.session import ServedPolicy, Session
-from pipeline.robot.status import ServerStatus, page
+from pipeline.robot.status import ConnectedRobot, ServerStatus, page
 
 TOKEN_VARIABLE: Final = "VLA_SERVE_TOKEN"
 CLOSING_S: Final = 30.0
 """How long an observation under way may keep the server from closing."""
-_GOING_AWAY, _TEXT, _BROKEN, _REFUSED, _FAILED = 1001, 1003, 1007, 1008, 1011
 _SHARED: Final = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
 
 
@@ -48,16 +46,15 @@ def read_token(params: ServeParams) -> str | None:
 
     Raises `ConfigError` for an empty one, and where the host asks for one and there is none.
     """
-    token, place = os.environ.get(TOKEN_VARIABLE), TOKEN_VARIABLE
-    if params.token_file is not None:
-        place = f"serve.token_file: {params.token_file}"
-        try:
-            token = params.token_file.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(f"{place}: expected a token, found no such file: {error}") from None
+    token, file = os.environ.get(TOKEN_VARIABLE), params.token_file
+    try:
+        token = token if file is None else file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"serve.token_file: {file}: expected a token, found {error}") from None
     if token is not None:
         token = token.strip()
         if not token or not token.isascii():
+            place = TOKEN_VARIABLE if file is None else f"serve.token_file: {file}"
             raise ConfigError(f"{place}: expected a token of ASCII characters, found none")
     elif not _is_loopback(params.host):
         raise ConfigError(
@@ -76,15 +73,14 @@ def listen(params: ServeParams) -> socket.socket:
     with ExitStack() as undo:
         try:
             known = socket.getaddrinfo(params.host, params.port, type=socket.SOCK_STREAM)
-            family, kind, protocol, _, address = min(known, key=lambda entry: entry[0])
-            bound = undo.enter_context(socket.socket(family, kind, protocol))
+            family, *_, address = min(known, key=lambda entry: entry[0])
+            bound = undo.enter_context(socket.socket(family))
             bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             bound.bind(address)
         except OSError as error:
             raise ConfigError(
-                f"serve.port: {params.host}:{params.port} cannot be listened on: {error.strerror}. "
-                "Give an address of this machine as serve.host, and a port that is free (0 takes "
-                "one)"
+                f"serve.port: {params.host}:{params.port}: {error.strerror}. Give an address of "
+                "this machine as serve.host, and a port that is free (0 takes one)"
             ) from None
         undo.pop_all()
         return bound
@@ -109,7 +105,7 @@ class PolicyServer:
         self.status = ServerStatus(served.metadata)
         # A thread a robot, for each has at most one observation under way.
         self._threads = ThreadPoolExecutor(params.max_connections, "robot")
-        self._numbers, self._answering = count(1), 0
+        self._answering = 0
         self._idle: set[ServerConnection] = set()
         self._stopping = False
         self._stop: Callable[[], object] = lambda: None
@@ -127,16 +123,11 @@ class PolicyServer:
             self._stop()
 
     async def _run(self, started: Callable[[], None]) -> bool:
-        loop, ended, signals = asyncio.get_running_loop(), asyncio.Event(), list[int]()
-        self._stop = lambda: loop.call_soon_threadsafe(ended.set)
-
-        def catch(number: int) -> None:
-            signals.append(number)
-            ended.set()
-
+        loop, signalled = asyncio.get_running_loop(), asyncio.Queue[bool]()
+        self._stop = lambda: loop.call_soon_threadsafe(signalled.put_nowait, False)
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
-                loop.add_signal_handler(number, catch, number)
+                loop.add_signal_handler(number, signalled.put_nowait, True)
         # Handshakes of strangers that fail are no news.
         quiet = logging.getLogger(f"{__name__}.websockets")
         quiet.setLevel(logging.CRITICAL + 1)
@@ -152,9 +143,9 @@ class PolicyServer:
             logger=quiet,
         )
         started()
-        await ended.wait()
+        by_signal = await signalled.get()
         await self._close(server)
-        return bool(signals)
+        return by_signal
 
     async def _close(self, server: Server) -> None:
         """No new connections, an answer to each observation under way, then 1001."""
@@ -171,144 +162,132 @@ class PolicyServer:
 
     async def _converse(self, connection: ServerConnection) -> None:
         """One robot, from its metadata to its last answer."""
-        number = next(self._numbers)
-        with self.status.connected(number, str(connection.remote_address[0])):
-            try:
-                await connection.send(wire.pack(self._served.metadata))
-                session = self._served.session(self._params.fresh, self._params.seed)
-                while not self._stopping:
-                    if not await self._answer_next(number, connection, session):
-                        return
+        peer = str(connection.remote_address[0])
+        with self.status.connected(peer) as robot, suppress(ConnectionClosed, TimeoutError):
+            await connection.send(wire.pack(self._served.metadata))
+            session = self._served.session(self._params.fresh, self._params.seed)
+            code = None
+            while code is None and not self._stopping:
+                message = await self._next(connection)
+                said, code = await self._answer(robot, message, session)
+                del message
+                await connection.send(said)
+            if code is None:
                 await _leave(connection)
-            except ConnectionClosed:
-                pass
-            finally:
-                self._idle.discard(connection)
+            else:
+                self.status.refused += 1
+                await connection.close(code)
 
-    async def _answer_next(
-        self, number: int, connection: ServerConnection, session: Session
-    ) -> bool:
-        """Whether the conversation goes on after the next message."""
+    async def _next(self, connection: ServerConnection) -> str | bytes:
+        """The next message; closes a connection from which none comes."""
         self._idle.add(connection)
         try:
             async with asyncio.timeout(self._params.idle_s):
-                message = await connection.recv()
+                return await connection.recv()
         except TimeoutError:
-            await connection.close(_REFUSED, f"nothing came for {self._params.idle_s:g} s")
-            return False
-        self._idle.discard(connection)
-        said, code = await self._answer(number, message, session)
-        del message
-        await connection.send(said)
-        if code is not None:
-            self.status.refused += 1
-            assert isinstance(said, str)
-            await connection.close(code, said.encode()[:120].decode(errors="ignore"))
-        return code is None
+            why = f"nothing came for {self._params.idle_s:g} s"
+            await connection.close(CloseCode.POLICY_VIOLATION, why)
+            raise
+        finally:
+            self._idle.discard(connection)
 
     async def _answer(
-        self, number: int, message: str | bytes, session: Session
+        self, robot: ConnectedRobot, message: str | bytes, session: Session
     ) -> tuple[str | bytes, int | None]:
         """What is said to a message, and the code to close the connection with, None to go on."""
         if isinstance(message, str):
-            return "refused: expected a message of bytes (msgpack), found a text", _TEXT
-        busy = self._answering >= self._params.max_waiting
+            said = "refused: expected a message of bytes (msgpack), found a text"
+            return said, CloseCode.UNSUPPORTED_DATA
+        loop, busy = asyncio.get_running_loop(), self._answering >= self._params.max_waiting
+        asked = (robot, message, session, busy)
         self._answering += 1
-        think = partial(self._think, number, message, session, busy)
         try:
-            return await asyncio.get_running_loop().run_in_executor(self._threads, think), None
-        except (WireError, ObservationError) as error:
-            code = _BROKEN if isinstance(error, WireError) else _REFUSED
-            return f"refused: {_line(error)}", code
+            return await loop.run_in_executor(self._threads, self._think, *asked), None
+        except WireError as error:
+            return f"refused: {_line(error)}", CloseCode.INVALID_DATA
+        except ObservationError as error:
+            return f"refused: {_line(error)}", CloseCode.POLICY_VIOLATION
         except PipelineError as error:
-            return f"error: {_line(error)}", _FAILED
+            return f"error: {_line(error)}", CloseCode.INTERNAL_ERROR
         except Exception as error:
             traceback.print_exception(error, file=sys.stderr)
-            return f"error: {type(error).__name__}: the server's output says more", _FAILED
+            said = f"error: {type(error).__name__}: the server's output says more"
+            return said, CloseCode.INTERNAL_ERROR
         finally:
             self._answering -= 1
 
-    def _think(self, number: int, message: bytes, session: Session, busy: bool) -> str | bytes:
+    def _think(
+        self, robot: ConnectedRobot, message: bytes, session: Session, busy: bool
+    ) -> str | bytes:
         """The answer to a message, in a thread of its own."""
-        began = perf_counter()
         observation = session.take(wire.unpack(message, self._params.max_message_mb * 2**20))
         if busy:
             self.status.busy += 1
-            return (
-                f"busy: {self._params.max_waiting} observations are waiting. The readings were "
-                "taken, send the next observation"
-            )
+            waiting = self._params.max_waiting
+            return f"busy: {waiting} observations are waiting; the readings were taken"
         answer = session.answer(observation)
-        key, timing = answer.get("feature_key"), answer["server_timing"]
-        timing["infer_ms"] = 1000 * (perf_counter() - began)
-        self.status.answered(number, observation, answer)
-        # Bytes, not an array: openpi's chunk broker takes every array for one of steps.
-        sent = answer if key is None else answer | {"feature_key": key.tobytes()}
-        return wire.pack(sent)
+        self.status.answered(robot, observation, answer)
+        if "feature_key" in answer:
+            # Bytes, not an array: openpi's chunk broker takes every array for one of steps.
+            answer["feature_key"] = answer["feature_key"].tobytes()
+        return wire.pack(answer)
 
-    async def _respond(self, _: ServerConnection, request: Request) -> Response | None:
+    async def _respond(self, connection: ServerConnection, request: Request) -> Response | None:
         """The answer to a request by HTTP; None where it opens a websocket."""
-        path = urlsplit(request.path).path
+        path, headers = urlsplit(request.path).path, request.headers
+        opens = path == "/" and headers.get("Upgrade", "").lower() == "websocket"
+        say = partial(_response, connection)
         if path == "/healthz":
-            return _response(HTTPStatus.OK, "OK\n")
-        if (refusal := self._refusal(request)) is not None:
-            return refusal
-        opens = _header(request.headers, "Upgrade").lower() == "websocket"
+            return say(HTTPStatus.OK, "OK\n")
+        if self._is_foreign(headers):
+            return say(HTTPStatus.FORBIDDEN, "pages of other places are not served\n")
         if path == "/" and not opens:
-            text, policy = page()
-            shown = {"Content-Type": "text/html; charset=utf-8", "Content-Security-Policy": policy}
-            return _response(HTTPStatus.OK, text, shown)
-        if not self._authorized(request.headers):
-            said = "expected the header Authorization: Api-Key <token>, with the server's token\n"
-            return _response(HTTPStatus.UNAUTHORIZED, said, {"WWW-Authenticate": "Api-Key"})
-        if path == "/":
-            return self._full()
+            return say(HTTPStatus.OK, *page())
+        if not self._authorized(headers):
+            said = "expected the header Authorization: Api-Key <the server's token>\n"
+            return say(HTTPStatus.UNAUTHORIZED, said, {"WWW-Authenticate": "Api-Key"})
         if path == "/status.json":
             text = await asyncio.to_thread(self.status.json)
-            return _response(HTTPStatus.OK, text, {"Content-Type": "application/json"})
-        return _response(HTTPStatus.NOT_FOUND, "not here: /, /healthz, /status.json\n")
-
-    def _refusal(self, request: Request) -> Response | None:
-        """Refuses pages of other places, which a browser on this machine would let in.
-
-        Without a token that is also done by the name that the browser believes to talk to: another
-        place's name can be made to mean this machine.
-        """
-        host, origin = (_header(request.headers, name) for name in ("Host", "Origin"))
-        if "Origin" in request.headers and urlsplit(origin).netloc != host:
-            return _response(HTTPStatus.FORBIDDEN, "pages of other places are not served\n")
-        if self._token is None and not _is_loopback(urlsplit(f"//{host}").hostname or ""):
-            return _response(HTTPStatus.FORBIDDEN, "without a token only localhost is served\n")
-        return None
-
-    def _full(self) -> Response | None:
-        """Why no more websockets are opened; None where they are."""
+            return say(HTTPStatus.OK, text, {"Content-Type": "application/json"})
+        if not opens:
+            return say(HTTPStatus.NOT_FOUND, "not here: /, /healthz, /status.json\n")
         most = self._params.max_connections
         if len(self.status.robots) < most:
             return None
         said = f"busy: {most} robots are connected (serve.max_connections)\n"
-        return _response(HTTPStatus.SERVICE_UNAVAILABLE, said)
+        return say(HTTPStatus.SERVICE_UNAVAILABLE, said)
+
+    def _is_foreign(self, headers: Headers) -> bool:
+        """Whether a page of another place asks, which a browser on this machine would let in.
+
+        Without a token that is also told by the name that the browser believes to talk to: another
+        place's name can be made to mean this machine.
+        """
+        here = urlsplit(f"//{headers.get('Host', '')}")
+        if "Origin" in headers and urlsplit(headers["Origin"]).netloc != here.netloc:
+            return True
+        return self._token is None and not _is_loopback(here.hostname or "")
 
     def _authorized(self, headers: Headers) -> bool:
-        given = _header(headers, "Authorization").encode()
+        given = headers.get("Authorization", "").encode()
         return self._token is None or hmac.compare_digest(given, f"Api-Key {self._token}".encode())
 
 
-def _header(headers: Headers, name: str) -> str:
-    """The value of a header, empty where it is missing or there several times."""
-    values = headers.get_all(name)
-    return values[0] if len(values) == 1 else ""
-
-
-def _response(status: HTTPStatus, text: str, headers: Mapping[str, str] | None = None) -> Response:
-    body = text.encode()
-    all_headers = {"Content-Type": "text/plain; charset=utf-8", **_SHARED, **(headers or {})}
-    all_headers |= {"Content-Length": str(len(body)), "Connection": "close"}
-    return Response(status.value, status.phrase, Headers(all_headers), body)
+def _response(
+    connection: ServerConnection,
+    status: HTTPStatus,
+    text: str,
+    headers: Mapping[str, str] = _SHARED,
+) -> Response:
+    response = connection.respond(status, text)
+    for name, value in {**_SHARED, **headers}.items():
+        response.headers.pop(name, None)
+        response.headers[name] = value
+    return response
 
 
 async def _leave(connection: ServerConnection) -> None:
-    await connection.close(_GOING_AWAY, "the server is stopping")
+    await connection.close(CloseCode.GOING_AWAY, "the server is stopping")
 
 
 def _is_loopback(host: str) -> bool:

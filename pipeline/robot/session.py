@@ -4,7 +4,6 @@ import threading
 from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -19,6 +18,7 @@ from pipeline.base.errors import NumericsError, ObservationError
 from pipeline.policy.checkpoint import PolicyCheckpoint, find_policy, load_policy
 from pipeline.policy.observation import moving_channels
 from pipeline.policy.policy import Policy
+from pipeline.robot.chunking import PlanGuide
 from pipeline.robot.features import LiveFeatures
 from pipeline.robot.first_look import FirstLook
 from pipeline.robot.guides import stack_guides
@@ -29,26 +29,13 @@ from pipeline.robot.proof import prove
 PROTOCOL = 1
 """Of observations, answers and metadata."""
 
-Frames = Mapping[str, NDArray[np.uint8]]
 Answer = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class _Glance:
-    """Frames that a model is to look at, and what of the observation it takes with them."""
-
-    frames: Frames
-    frame_time_s: NDArray[np.float64]
-    instruction: str
-
-
-@dataclass(frozen=True)
-class _Pass:
-    """What a pass of the model gave, and how long it took."""
-
-    seen: SeenFeatures
-    key: bytes
-    vlm_s: float
+Slot = deque[tuple[RobotObservation, str]]
+"""The newest observation whose frames the model is to look at, if any, and what it is told."""
+Seen = tuple[SeenFeatures, bytes, float]
+"""What a pass of the model gave, the key of it, and the seconds that it took."""
 
 
 class ServedPolicy:
@@ -105,12 +92,13 @@ class ServedPolicy:
         """Begin no more passes, and wait for the one under way."""
         self._passes.shutdown(cancel_futures=True)
 
-    def begin_pass(self, slot: deque[_Glance]) -> Future[_Pass]:
+    def begin_pass(self, slot: Slot) -> Future[Seen]:
         """Have the model look at the frames that are in `slot` when its turn comes."""
         return self._passes.submit(self._pass, slot)
 
-    def chunk(self, fields: Mapping[str, NDArray[Any]], drawn: torch.Generator,
-              guide: Any) -> tuple[NDArray[np.float32], float]:  # fmt: skip
+    def chunk(
+        self, fields: Mapping[str, NDArray[Any]], drawn: torch.Generator, guide: PlanGuide | None
+    ) -> tuple[NDArray[np.float32], float]:
         """The head's chunk (horizon, action) for the fields of one robot, and the seconds it took.
 
         Raises `NumericsError` where it is not finite.
@@ -131,26 +119,24 @@ class ServedPolicy:
         said once.
         """
         trained = self.checkpoint.instructions
-        if prompt is None:
-            if len(trained) != 1:
-                known = f", one of: {', '.join(map(repr, trained))}" if trained else ""
-                raise ObservationError(f"prompt: expected what the robot is to do{known}")
-            return trained[0]
-        if trained and prompt not in trained and prompt not in self._told and len(self._told) < 100:
-            self._told.add(prompt)
-            self._say(
-                f"warning: the policy was never trained on the prompt {prompt!r:.200}, but on "
-                f"{', '.join(map(repr, trained))}"
+        known = ", ".join(map(repr, trained))
+        if prompt is None and len(trained) != 1:
+            raise ObservationError(
+                f"prompt: expected what the robot is to do, found none. Trained on: {known}"
             )
+        prompt = trained[0] if prompt is None else prompt
+        if trained and prompt not in {*trained, *self._told} and len(self._told) < 100:
+            self._told.add(prompt)
+            self._say(f"warning: the policy was never trained on {prompt!r:.200}, but on {known}")
         return prompt
 
-    def _pass(self, slot: deque[_Glance]) -> _Pass:
+    def _pass(self, slot: Slot) -> Seen:
         assert self._features is not None
-        glance, began = slot.pop(), perf_counter()
-        features, valid = self._features([glance.frames], glance.instruction)
-        seen = SeenFeatures(features[0].numpy(), valid[0].numpy(), glance.frame_time_s)
-        key = self._features.key(glance.frames, glance.instruction)
-        return _Pass(seen, key, perf_counter() - began)
+        (observation, instruction), began = slot.pop(), perf_counter()
+        features, valid = self._features([observation.frames], instruction)
+        seen = SeenFeatures(features[0].numpy(), valid[0].numpy(), observation.frame_time_s)
+        key = self._features.key(observation.frames, instruction)
+        return seen, key, perf_counter() - began
 
     def _metadata(self) -> dict[str, Any]:
         source, params = self.checkpoint.source, self.policy.params
@@ -201,6 +187,7 @@ class Session:
 
     def take(self, given: Any) -> RobotObservation:
         """Check an observation and remember its readings; raises `ObservationError`."""
+        self._asked_s = perf_counter()
         observation = self._reader.read(given)
         if observation.reset:
             self._begin_episode()
@@ -211,14 +198,14 @@ class Session:
 
     def answer(self, observation: RobotObservation) -> Answer:
         """The answer to what `take` took."""
-        began = perf_counter()
         self._look_first(observation)
         vlm_s = self._look(observation) if self.metadata["uses_features"] else 0.0
         fields = self._memory.observation()
         actions, head_s = self._served.chunk(fields, self._drawn, observation.guide)
-        whole_s = perf_counter() - began
-        parts = {"infer": whole_s, "vlm": vlm_s, "head": head_s, "wait": whole_s - vlm_s - head_s}
-        timing = {f"{name}_ms": 1000 * max(0.0, spent) for name, spent in parts.items()}
+        whole_s = perf_counter() - self._asked_s
+        wait_s = max(0.0, whole_s - vlm_s - head_s)
+        spent = {"infer_ms": whole_s, "vlm_ms": vlm_s, "head_ms": head_s, "wait_ms": wait_s}
+        timing = {part: 1000 * seconds for part, seconds in spent.items()}
         answer: Answer = {"actions": actions, "server_timing": timing}
         if self._key is not None:
             key = np.frombuffer(self._key, np.uint8)
@@ -232,53 +219,44 @@ class Session:
             WindowSize(params.state_window, shape.state_dim, params.state_window_s),
         )
         # A pass of the episode before keeps a slot of its own, and is never asked for its answer.
-        self._slot: deque[_Glance] = deque(maxlen=1)
-        self._under_way: Future[_Pass] | None = None
+        self._slot: Slot = deque(maxlen=1)
+        self._under_way: Future[Seen] | None = None
         self._began_s, self._instruction = -np.inf, ""
         self._key: bytes | None = None
-        self._new_to_us = {"frames", "state"}
+        self._frames_known = self._state_known = False
 
     def _look_first(self, observation: RobotObservation) -> None:
         """Refuse another robot than the policy's by its first frames and states of an episode."""
-        state = observation.readings.get("state")
-        there = {"frames": bool(observation.frames), "state": state is not None and len(state) > 0}
-        new = {name for name in self._new_to_us if there[name]}
-        if self._served.look is not None and new:
-            frames = observation.frames if "frames" in new else {}
-            self._served.look.check(frames, state if "state" in new else None)
-        self._new_to_us -= new
+        frames = {} if self._frames_known else observation.frames
+        state = None if self._state_known else observation.readings.get("state")
+        if self._served.look is not None and (frames or state is not None):
+            self._served.look.check(frames, state)
+        self._frames_known |= bool(frames)
+        self._state_known |= state is not None
 
     def _look(self, observation: RobotObservation) -> float:
         """See to the newest features; the seconds of the pass that ended for this answer."""
-        spent = self._collect()
-        if self._due(observation):
+        spent = self._collect(wait=False)
+        waited = observation.time_s - self._began_s >= self._between_s
+        told = observation.prompt not in (None, self._instruction)
+        if observation.frames and (waited or told):
             instruction = self._served.instruction(observation.prompt)
-            self._slot.append(_Glance(observation.frames, observation.frame_time_s, instruction))
+            self._slot.append((observation, instruction))
             self._began_s, self._instruction = observation.time_s, instruction
         if self._slot and self._under_way is None:
             self._under_way = self._served.begin_pass(self._slot)
-        if self._under_way is not None and (self._fresh or self._memory.features is None):
-            self._under_way.exception()  # waits
-            spent = self._collect()
+        spent = self._collect(self._fresh or self._memory.features is None) or spent
         if self._memory.features is None:
             views = ", ".join(f"images/{view}" for view in self.metadata["streams"]["views"])
             raise ObservationError(
-                f"images: expected frames with the first observation of an episode ({views}), "
-                "found none"
+                f"images: expected some of {views} with the first observation of an episode"
             )
         return spent
 
-    def _due(self, observation: RobotObservation) -> bool:
-        """Whether the model is to look at these frames: it may rest, unless it is told another
-        thing."""
-        waited = observation.time_s - self._began_s >= self._between_s
-        told = observation.prompt not in (None, self._instruction)
-        return bool(observation.frames) and (waited or told)
-
-    def _collect(self) -> float:
+    def _collect(self, wait: bool) -> float:
         """Take the features of a pass that has ended; the seconds it took, 0 without one."""
-        if self._under_way is None or not self._under_way.done():
+        if self._under_way is None or not (wait or self._under_way.done()):
             return 0.0
-        ended, self._under_way = self._under_way.result(), None
-        self._memory.features, self._key = ended.seen, ended.key
-        return ended.vlm_s
+        ended, self._under_way = self._under_way, None
+        self._memory.features, self._key, spent = ended.result()
+        return spent

@@ -5,11 +5,10 @@ import io
 import json
 import secrets
 import threading
-from collections import deque
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import cache
+from itertools import count
 from pathlib import Path
 from time import monotonic
 from typing import Any, Final
@@ -19,12 +18,13 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.robot.observation import RobotObservation
+from pipeline.robot.timings import Timings
 
 NEWEST: Final = 5000
 """Answers whose times are kept."""
 _SHOWN: Final = 224
 """Width and height of a frame on the page at most, in pixels."""
-_PARTS: Final = {"vlm": "vlm_ms", "head": "head_ms", "wait": "wait_ms", "whole": "infer_ms"}
+_PARTS: Final = ("vlm_ms", "head_ms", "wait_ms", "infer_ms")
 
 
 @dataclass
@@ -42,8 +42,7 @@ class ConnectedRobot:
 
     def document(self) -> dict[str, Any]:
         """As JSON has it; frames as small JPEGs."""
-        shown = ("number", "peer", "answers", "prompt", "feature_age_s")
-        return {name: getattr(self, name) for name in shown} | {
+        return vars(self) | {
             "seconds": monotonic() - self.since_s,
             "actions": None if self.actions is None else self.actions.tolist(),
             "frames": {view: _small(frame) for view, frame in sorted(self.frames.items())},
@@ -56,34 +55,32 @@ class ServerStatus:
     def __init__(self, metadata: Mapping[str, Any]) -> None:
         self.robots: dict[int, ConnectedRobot] = {}
         self.refused = self.busy = 0
-        self._answers = 0
         self._policy = {
             name: metadata[name]
             for name in ("checkpoint", "step", "model_type", "action_hz", "feature_spec_digest")
         } | {"action": metadata["streams"]["action"]}
-        self._timings: deque[Mapping[str, float]] = deque(maxlen=NEWEST)
-        self._since_s, self._lock = monotonic(), threading.Lock()
+        self._timings = Timings(_PARTS, NEWEST)
+        self._numbers, self._since_s, self._lock = count(1), monotonic(), threading.Lock()
 
     @contextmanager
-    def connected(self, number: int, peer: str) -> Generator[None]:
+    def connected(self, peer: str) -> Generator[ConnectedRobot]:
         """While a robot is connected."""
+        robot = ConnectedRobot(next(self._numbers), peer)
         with self._lock:
-            self.robots[number] = ConnectedRobot(number, peer)
+            self.robots[robot.number] = robot
         try:
-            yield
+            yield robot
         finally:
             with self._lock:
-                del self.robots[number]
+                del self.robots[robot.number]
 
     def answered(
-        self, number: int, observation: RobotObservation, answer: Mapping[str, Any]
+        self, robot: ConnectedRobot, observation: RobotObservation, answer: Mapping[str, Any]
     ) -> None:
-        """Take down an answer."""
+        """Take down an answer; a part that took no time counts as none."""
+        timing = answer["server_timing"]
         with self._lock:
-            self._answers += 1
-            self._timings.append(answer["server_timing"])
-            if (robot := self.robots.get(number)) is None:
-                return
+            self._timings.note(np.array([timing[part] or np.nan for part in _PARTS]))
             robot.answers += 1
             robot.prompt = observation.prompt or robot.prompt
             robot.feature_age_s = answer.get("feature_age_s")
@@ -93,35 +90,27 @@ class ServerStatus:
     def json(self) -> str:
         """What the page shows."""
         with self._lock:
-            robots, timings = list(self.robots.values()), list(self._timings)
+            robots = list(self.robots.values())
+            answered, latency = self._timings.ring.count, self._timings.document()
         document = {
             "policy": self._policy,
             "seconds": monotonic() - self._since_s,
-            "counts": {"answered": self._answers, "refused": self.refused, "busy": self.busy},
-            "latency_ms": {part: _quantiles(timings, name) for part, name in _PARTS.items()},
+            "counts": {"answered": answered, "refused": self.refused, "busy": self.busy},
+            "latency": latency,
             "robots": [robot.document() for robot in robots],
         }
         return json.dumps(document)
 
 
-def page() -> tuple[str, str]:
-    """The page, and the Content-Security-Policy under which it alone may run its script."""
+def page() -> tuple[str, dict[str, str]]:
+    """The page, and its headers: by its Content-Security-Policy it may run its own script alone."""
     nonce = secrets.token_urlsafe(16)
     own = f"'nonce-{nonce}'"
     policy = f"default-src 'none'; script-src {own}; style-src {own}; img-src data:; "
     policy += "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-    return _template().replace("NONCE", nonce), policy
-
-
-@cache
-def _template() -> str:
-    return Path(__file__).with_name("status.html").read_text(encoding="utf-8")
-
-
-def _quantiles(timings: list[Mapping[str, float]], name: str) -> list[float] | None:
-    """p50, p99 and p99.9 of those that took any time at all."""
-    taken = [timing[name] for timing in timings if timing[name] > 0]
-    return np.percentile(taken, [50, 99, 99.9]).tolist() if taken else None
+    template = Path(__file__).with_name("status.html").read_text(encoding="utf-8")
+    headers = {"Content-Type": "text/html; charset=utf-8", "Content-Security-Policy": policy}
+    return template.replace("NONCE", nonce), headers
 
 
 def _small(frame: NDArray[np.uint8]) -> str:

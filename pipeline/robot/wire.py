@@ -53,7 +53,7 @@ def unpack(data: bytes, max_bytes: int = MAX_BYTES) -> Any:
         message = msgpack.unpackb(
             data,
             object_hook=reader.mapping,
-            list_hook=reader.sequence,
+            list_hook=reader.counted,
             max_str_len=MAX_TEXT,
             max_bin_len=max_bytes,
             max_array_len=MAX_ENTRIES,
@@ -75,22 +75,19 @@ class _Reader:
     def __init__(self) -> None:
         self._entries = 0
 
-    def mapping(self, value: dict[Any, Any]) -> Any:
-        """The array or number that a map describes, else the map."""
-        self._count(value)
-        if b"__ndarray__" in value:
-            return _array(value)
-        return _number(value) if b"__npgeneric__" in value else value
-
-    def sequence(self, value: list[Any]) -> list[Any]:
-        """The list, once it is counted."""
-        self._count(value)
-        return value
-
-    def _count(self, value: dict[Any, Any] | list[Any]) -> None:
+    def counted(self, value: Any) -> Any:
+        """The list or map."""
         self._entries += 1 + len(value)
         if self._entries > MAX_ENTRIES:
             raise WireError(f"expected a message of at most {MAX_ENTRIES} entries, found more")
+        return value
+
+    def mapping(self, value: dict[Any, Any]) -> Any:
+        """The array or number that a map describes, else the map."""
+        self.counted(value)
+        if b"__ndarray__" in value:
+            return _array(value)
+        return _number(value) if b"__npgeneric__" in value else value
 
 
 def _described(value: Any) -> Any:
@@ -111,18 +108,18 @@ def _described(value: Any) -> Any:
 
 def _array(said: Mapping[Any, Any]) -> NDArray[Any]:
     dtype, shape, data = _dtype(said), said.get(b"shape"), said.get(b"data")
-    whole = isinstance(shape, list) and all(type(size) is int and size >= 0 for size in shape)
-    if not isinstance(shape, list) or not whole or len(shape) > MAX_RANK:
+    if not isinstance(shape, list) or len(shape) > MAX_RANK or not all(map(_is_size, shape)):
         raise WireError(f"expected the shape of an array, found {shape!r:.80}")
-    if not isinstance(data, bytes):
-        raise WireError(f"expected the bytes of an array, found {type(data).__name__}")
-    if len(data) != (size := math.prod(shape) * dtype.itemsize):
-        raise WireError(
-            f"expected {size} bytes for an array of shape {shape!r:.80} of {dtype}, "
-            f"found {len(data)}"
-        )
+    size = math.prod(shape) * dtype.itemsize
+    found = len(data) if isinstance(data, bytes) else type(data).__name__
+    if found != size:
+        raise WireError(f"expected {size} bytes for an array of {dtype}, found {found}")
     plain = np.ndarray(shape, dtype, buffer=data)
     return plain.astype(dtype.newbyteorder("="))
+
+
+def _is_size(value: Any) -> bool:
+    return type(value) is int and value >= 0
 
 
 def _number(said: Mapping[Any, Any]) -> Any:

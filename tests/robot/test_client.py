@@ -1,6 +1,7 @@
 """The client says clearly what is wrong, and needs three packages."""
 
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -64,7 +65,7 @@ def test_a_refused_observation_says_why_and_the_client_can_begin_again(
     served_policy: Callable[..., Any], serving: Callable[..., Any], observe: Observe
 ) -> None:
     with PolicyClient(f"ws://{serving(served_policy()).address}") as client:
-        with pytest.raises(ObservationError, match=r"^sensors: expected one of.*mean sensor"):
+        with pytest.raises(ObservationError, match=r"^sensors: expected one of.* sensor"):
             client.infer(observe(0, sensors=np.zeros(3)))
         with pytest.raises(ServerError, match="not connected; call reconnect"):
             client.infer(observe(0))
@@ -81,11 +82,18 @@ def test_nobody_listens() -> None:
         PolicyClient("ws://no.such.invalid:1")
 
 
+def test_an_address_without_a_scheme_is_a_websockets(
+    served_policy: Callable[..., Any], serving: Callable[..., Any]
+) -> None:
+    with PolicyClient(serving(served_policy()).address) as client:
+        assert client.metadata["protocol"] == 1
+
+
 def test_something_else_listens() -> None:
     """It takes the connection and says nothing."""
     with (
         socket.create_server(("127.0.0.1", 0)) as silent,
-        pytest.raises(ServerError, match=r"expected a connection within 0\.2 s"),
+        pytest.raises(ServerError, match=r"nobody serves a policy there .timed out"),
     ):
         PolicyClient(f"ws://127.0.0.1:{silent.getsockname()[1]}", timeout_s=0.2)
 
@@ -130,21 +138,24 @@ METADATA = {
 @pytest.mark.parametrize(
     ("robot", "said"),
     [
-        ({"state": ["b", "a", "c"]}, r"state: channel 0 trained 'a', .* 'b' \(the same in another"),
-        ({"state": ["a", "b", "d"]}, "state: channel 2 trained 'c', the robot's 'd'$"),
-        ({"state": ["a", "b"]}, "state: trained on 3 channels, the robot has 2"),
-        ({"state_units": ["deg", "rad", "mm"]}, "state_units: channel 1 trained 'deg', .* 'rad'"),
-        ({"action_units": ["m", "m"]}, "action_units: channel 0 trained 'mm', the robot's 'm'"),
-        ({"action": ["dy", "dx"]}, "action: channel 0 trained 'dx', the robot's 'dy'"),
-        ({"action_kind": "absolute"}, "action_kind: trained 'delta', the robot's 'absolute'"),
-        ({"sensor": ["s"]}, "sensor: trained on 0 channels, the robot has 1"),
-        ({"views": ["View2"]}, "views: trained on View1, View2, the robot has no View1"),
-        ({"action_hz": 30}, r"action_hz: trained 10\.0, the robot's 30"),
-        ({"camera": ["View1"]}, "the robot's description: expected state, .*, found camera"),
+        (
+            {"state": ["b", "a", "c"]},
+            'state: ["a", "b", "c"] in training, the robot\'s ["b", "a", ',
+        ),
+        ({"state": ("a", "b", "d")}, 'the robot\'s ["a", "b", "d"]'),
+        ({"state": ["a", "b"]}, 'state: ["a", "b", "c"] in training, the robot\'s ["a", "b"]'),
+        ({"state_units": ["deg", "rad", "mm"]}, 'state_units: ["deg", "deg", "mm"] in training'),
+        ({"action_units": ["m", "m"]}, 'action_units: ["mm", "mm"] in training, the robot\'s ["m"'),
+        ({"action": ["dy", "dx"]}, 'action: ["dx", "dy"] in training, the robot\'s ["dy", "dx"]'),
+        ({"action_kind": "absolute"}, 'action_kind: "delta" in training, the robot\'s "absolute"'),
+        ({"sensor": ["s"]}, 'sensor: [] in training, the robot\'s ["s"]'),
+        ({"views": ["View2"]}, 'views: ["View1", "View2"] in training, the robot\'s ["View2"]'),
+        ({"action_hz": 30}, "action_hz: 10.0 in training, the robot's 30"),
+        ({"camera": ["View1"]}, "the robot's description: expected views, "),
     ],
 )
 def test_another_robot_is_refused_with_both_sides_named(robot: dict[str, Any], said: str) -> None:
-    with pytest.raises(CheckpointMismatch, match=said):
+    with pytest.raises(CheckpointMismatch, match=re.escape(said)):
         refuse_other_robot(robot, METADATA)
 
 

@@ -211,7 +211,7 @@ def test_the_token_is_asked_for(served_policy: Served, serving: Serving, observe
         headers = {"Authorization": f"Api-Key {wrong}"} if wrong else {}
         assert get(server, "/status.json", **headers)[0] == 401
     for wrong in (None, "other"):
-        with pytest.raises(ConnectionError, match=r"401.*Give the server's token"):
+        with pytest.raises(ConnectionError, match=r"401.*the server's token"):
             client_of(server, token=wrong)
     with client_of(server, token="s3cret") as client:
         assert client.infer(observe(0))["actions"].shape == (4, 7)
@@ -252,15 +252,15 @@ def test_status_says_what_happened(
     served_policy: Served, serving: Serving, observe: Observe
 ) -> None:
     server = serving(served_policy())
-    assert json.loads(get(server, "/status.json")[1])["latency_ms"]["whole"] is None
+    assert json.loads(get(server, "/status.json")[1])["latency"] == {}
     with client_of(server) as client:
         answers = [client.infer(observe(tick, prompt="<b>go</b>")) for tick in range(4)]
         said = json.loads(get(server, "/status.json")[1])
         assert said["counts"] == {"answered": 4, "refused": 0, "busy": 0}
         assert said["policy"]["checkpoint"] == "models/head"
-        for part in ("vlm", "head", "wait", "whole"):
-            p50, p99, p999 = said["latency_ms"][part]
-            assert 0 < p50 <= p99 <= p999
+        for part in ("vlm_ms", "head_ms", "wait_ms", "infer_ms"):
+            taken = said["latency"][part]
+            assert 0 < taken["p50"] <= taken["p99"] <= taken["p99.9"] <= taken["max"]
         (robot,) = said["robots"]
         assert robot["prompt"] == "<b>go</b>" and robot["answers"] == 4
         assert set(robot["frames"]) == {"View1", "View2", "View5"}
@@ -308,7 +308,7 @@ def test_tokens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("VLA_SERVE_TOKEN", "def")
     assert read_token(params(host="0.0.0.0")) == "def"
     assert read_token(params(token_file=file)) == "abc"
-    for wrong, said in (("  \n", "ASCII"), ("é", "ASCII"), (None, "no such file")):
+    for wrong, said in (("  \n", "ASCII"), ("é", "ASCII"), (None, "No such file")):
         file.unlink(missing_ok=True)
         if wrong is not None:
             file.write_text(wrong, encoding="utf-8")

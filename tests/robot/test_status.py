@@ -2,13 +2,14 @@
 
 import json
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from pipeline.robot.client import PolicyClient
-from pipeline.robot.status import ServerStatus
+from pipeline.robot.status import ConnectedRobot, ServerStatus
 
 TITLE = "Policy server"
 
@@ -106,11 +107,16 @@ def test_a_server_that_has_gone_is_said(
 
 def test_quantiles_are_of_the_parts_that_took_any_time(served_policy: Callable[..., Any]) -> None:
     status = ServerStatus(served_policy().metadata)
-    assert status.json().count("null") == 4
+    robot = ConnectedRobot(1, "here")
+    assert json.loads(status.json())["latency"] == {}
+    observation: Any = SimpleNamespace(prompt=None, frames={})
     for ms in range(1, 1001):
         timing = {"vlm_ms": 0.0, "head_ms": ms, "wait_ms": 0.0, "infer_ms": 2 * ms}
-        status.answered(1, None, {"server_timing": timing, "actions": np.zeros((4, 7))})  # type: ignore
-    latency = json.loads(status.json())["latency_ms"]
-    assert latency["vlm"] is None and latency["wait"] is None
-    np.testing.assert_allclose(latency["head"], [500.5, 990.01, 999.001])
-    np.testing.assert_allclose(latency["whole"], [1001, 1980.02, 1998.002])
+        answer = {"server_timing": timing, "actions": np.zeros((4, 7))}
+        status.answered(robot, observation, answer)
+    latency = json.loads(status.json())["latency"]
+    assert set(latency) == {"head_ms", "infer_ms"}
+    np.testing.assert_allclose(
+        list(latency["head_ms"].values()), [1000, 500.5, 990.01, 999.001, 1000]
+    )
+    assert latency["infer_ms"]["p99"] == pytest.approx(1980.02)
