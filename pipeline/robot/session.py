@@ -153,6 +153,7 @@ class ServedPolicy:
             "model_type": params.model_type,
             "stochastic": self.policy.stochastic,
             "uses_features": self._features is not None,
+            "looks_at": list(self.policy.encoders),
             "instructions": list(self.checkpoint.instructions),
             "sensor_window": params.sensor_window,
             "state_window": params.state_window,
@@ -236,16 +237,21 @@ class Session:
 
     def _look(self, observation: RobotObservation) -> float:
         """See to the newest features; the seconds of the pass that ended for this answer."""
-        spent = self._collect(wait=False)
-        waited = observation.time_s - self._began_s >= self._between_s
         told = observation.prompt not in (None, self._instruction)
+        if told and not observation.frames and self._memory.features is not None:
+            raise ObservationError(
+                f"prompt: expected frames beside another prompt than {self._instruction!r:.200}, "
+                "for features are of both, found none"
+            )
+        spent = self._collect(wait=told)
+        waited = observation.time_s - self._began_s >= self._between_s
         if observation.frames and (waited or told):
             instruction = self._served.instruction(observation.prompt)
             self._slot.append((observation, instruction))
             self._began_s, self._instruction = observation.time_s, instruction
         if self._slot and self._under_way is None:
             self._under_way = self._served.begin_pass(self._slot)
-        spent = self._collect(self._fresh or self._memory.features is None) or spent
+        spent = self._collect(self._fresh or told or self._memory.features is None) or spent
         if self._memory.features is None:
             views = ", ".join(f"images/{view}" for view in self.metadata["streams"]["views"])
             raise ObservationError(

@@ -108,6 +108,22 @@ def test_another_prompt_is_looked_at_at_once(
     assert served.glance.instructions == ["touch", "leave"]
 
 
+def test_features_of_another_prompt_are_never_answered_with(
+    served_policy: Callable[..., Any], observe: Observe
+) -> None:
+    served = served_policy(told=("touch", "leave"))
+    session = served.session(fresh=False)
+    blind = {f"images/{view}": None for view in VIEWS}
+    session.infer(observe(0, prompt="touch"))
+    with pytest.raises(ObservationError, match="frames beside another prompt than 'touch'"):
+        session.infer(observe(1, prompt="leave", **blind))
+    touched = session.infer(observe(3, prompt="touch"))["feature_key"]
+    left = session.infer(observe(4, prompt="leave"))["feature_key"]
+    assert served.glance.instructions == ["touch", "touch", "leave"]
+    alone = served.session().infer(observe(4, prompt="leave"))["feature_key"]
+    assert left.tobytes() == alone.tobytes() != touched.tobytes()
+
+
 def test_prompts(served_policy: Callable[..., Any], observe: Observe) -> None:
     one = served_policy()
     one.session().infer(observe(0))
@@ -290,6 +306,7 @@ def test_metadata_says_all_that_a_robot_needs(served_policy: Callable[..., Any])
     metadata = served.metadata
     action = served.checkpoint.source["streams"]["action"]
     assert metadata["moving"] == list(moving_channels(action)) == [True] * 6 + [False]
+    assert metadata["looks_at"] == ["features", "sensor", "state"]
     assert metadata["protocol"] == 1 and metadata["stochastic"] is True
     assert (metadata["horizon"], metadata["action_dim"], metadata["action_hz"]) == (4, 7, 10.0)
     assert metadata["instructions"] == [INSTRUCTION] and metadata["feature_spec_digest"] == "abc"
