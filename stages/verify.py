@@ -71,10 +71,13 @@ def main(params: Params) -> None:
 
 
 def _prove(params: Params) -> None:
-    """Compute the golden rows of the checkpoint again, as serving it would."""
+    """Compute the golden rows of the checkpoint again, where and as `stages.serve` does."""
     named = params.verify.checkpoint
     folder = find_policy(params.train_head.output if named in (None, True) else named)
-    checkpoint, device = load_policy(folder), resolve_device(params.extract.device)
+    checkpoint, device = load_policy(folder), resolve_device(params.serve.device)
     trained, say = checkpoint.source["feature_spec"], partial(print, flush=True)
+    if "features" not in checkpoint.policy().encoders:
+        say(f"{folder} (step {checkpoint.step}): looks at no features, so nothing is to be proved")
+        return
     say(f"{folder} (step {checkpoint.step}): {len(checkpoint.golden)} golden rows, {device}")
     prove(checkpoint, LiveFeatures(params.vlm, trained, str(device)), say)

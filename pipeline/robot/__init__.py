@@ -15,6 +15,6 @@ session.py               a served policy, and what it remembers of each robot
 server.py, status.py     it is served over a websocket, and a page shows how it goes
 wire.py, client.py       the messages, and the client; no torch
 
-recorder.py, run_recording.py, recorded_keys.py   a run becomes a recording; its keys and a store's
-export.py, export_inputs.py                       the head as ONNX and torch.export
+recorder.py, run_recording.py   a run becomes a recording
+export.py, export_inputs.py     the head as ONNX and torch.export
 """

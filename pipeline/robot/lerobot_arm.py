@@ -3,10 +3,13 @@
 LeRobot's `Robot` (github.com/huggingface/lerobot, src/lerobot/robots/robot.py) gives one flat dict
 an observation, a float a motor (`shoulder_pan.pos`) and an RGB image a camera, takes such a dict as
 the action, and gives back what it really sent. `observation_features` and `action_features` name
-both without a connection. It says no times: all that comes of one call is given the time at which
-the call began, so that ages are rather too large than too small.
+both without a connection. It says no times. Motors are read within a call, and their readings have
+the time at which it began. Cameras grab on threads of their own, so an image was taken before, by
+up to the period of its camera: `camera_latency_s` says how long, and what is not said is missing
+from the ages of frames and features.
 """
 
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NoReturn, Protocol
@@ -17,6 +20,11 @@ from numpy.typing import NDArray
 from pipeline.base.errors import CheckpointMismatch
 
 _DELTA, _PLACE = "delta_", ".pos"
+_KINDS = ("absolute", "delta")
+_PORT_S = 0.2
+"""How long a stop waits for another call that keeps the robot's port."""
+_ROWS = 8
+"""Of an image every eighth row is compared; the noise of a camera changes each."""
 
 
 class LeRobotStyle(Protocol):
@@ -49,23 +57,28 @@ class LeRobotArm:
         cameras: Mapping[str, str] | None = None,
         motors: Mapping[str, str] | None = None,
         clock_s: Callable[[], float] = time.monotonic,
+        camera_latency_s: float = 0.0,
+        say: Callable[[str], object] = print,
     ) -> None:
         """`metadata` is the policy's; `cameras` are by view, `motors` by channel.
 
         Raises `CheckpointMismatch`, naming both sides, where the robot lacks a motor or a camera
         of the policy's, has a motor that the policy would leave alone, or does not observe one that
         is to move by a delta; where `cameras` or `motors` name none of the policy's; and for
-        velocities.
+        actions that are neither places nor deltas.
         """
-        self._robot, self._clock_s = robot, clock_s
+        self._robot, self._clock_s, self._say = robot, clock_s, say
+        self._camera_latency_s = camera_latency_s
+        self._port = threading.Lock()
+        self._shown: dict[str, tuple[float, NDArray[np.uint8]]] = {}
         streams, seen, moved = (
             metadata["streams"],
             robot.observation_features,
             robot.action_features,
         )
         state, action, views = streams["state"]["names"], streams["action"], streams["views"]
-        if action["kind"] == "velocity":
-            _refuse("places", "velocities", action["names"], moved)
+        if action["kind"] not in _KINDS:
+            _refuse(f"actions that are {action['kind']}", "places", action["names"], moved)
         cameras, motors = cameras or {}, motors or {}
         strange = {*cameras} - {*views} | {*motors} - {*state, *action["names"]}
         if strange:
@@ -86,7 +99,8 @@ class LeRobotArm:
     def observe(self) -> dict[str, NDArray[Any]]:
         """Ask the robot, once a tick: `state` (1, dim), `state_time` (1,) and `time` (1,), s."""
         self._time_s = self._clock_s()
-        self._seen = self._robot.get_observation()
+        with self._port:
+            self._seen = self._robot.get_observation()
         observed = {"time": np.array([self._clock_s()])}
         if self._state:
             state = [float(self._seen[key]) for key in self._state]
@@ -95,9 +109,20 @@ class LeRobotArm:
         return observed
 
     def frames(self) -> dict[str, tuple[float, NDArray[np.uint8]]]:
-        """By view, what came with the newest observation: its time, s, and the image, RGB."""
-        seen = {view: np.asarray(self._seen[key]) for view, key in self._views.items()}
-        return {view: (self._time_s, image) for view, image in seen.items()}
+        """By view, what came with the newest observation: when it was taken, s, and the image, RGB.
+
+        An image that has not changed keeps its time, so that a camera that hangs becomes old.
+        """
+        taken_s = self._time_s - self._camera_latency_s
+        frames: dict[str, tuple[float, NDArray[np.uint8]]] = {}
+        for view, key in self._views.items():
+            image = np.asarray(self._seen[key])
+            shown_s, rows = self._shown.get(view, (taken_s, None))
+            if rows is None or not np.array_equal(image[::_ROWS], rows):
+                shown_s = taken_s
+                self._shown[view] = taken_s, image[::_ROWS].copy()
+            frames[view] = shown_s, image
+        return frames
 
     def act(self, action: NDArray[np.floating[Any]]) -> None:
         """Send an action (action_dim,); what is to move is added to where it was last sent.
@@ -108,18 +133,49 @@ class LeRobotArm:
         for key, moving in zip(self._action, self._moving, strict=True):
             if moving:
                 goal[key] += self._sent.get(key, float(self._seen[key]))
-        self._send(goal)
+        with self._port:
+            self._send(goal)
 
     def stop(self, reason: str) -> None:
-        """Hold the place where the robot is; where it cannot say, that where it was last seen."""
+        """Hold the place where the robot was last seen: what blocks is not asked first.
+
+        From any thread. Where another call keeps the port it is sent all the same, and said.
+        """
+        free = self._port.acquire(timeout=_PORT_S)
         try:
-            self._seen = self._robot.get_observation()
+            if goal := {key: float(self._seen[key]) for key in self._action if key in self._seen}:
+                self._send(goal)
         finally:
-            self._send({key: float(self._seen[key]) for key in self._action if key in self._seen})
+            if free:
+                self._port.release()
+            else:
+                said = f"LeRobotArm: stop ({reason}) was sent while another call kept the port for"
+                self._say(f"{said} {_PORT_S:g} s: see that the robot stands still")
 
     def _send(self, goal: dict[str, float]) -> None:
         sent = self._robot.send_action(dict(goal))
         self._sent = {key: float(sent.get(key, value)) for key, value in goal.items()}
+
+
+def describe(
+    robot: LeRobotStyle,
+    cameras: Mapping[str, str] | None = None,
+    motors: Mapping[str, str] | None = None,
+) -> dict[str, Any]:
+    """What `PolicyClient(robot=...)` compares of a robot that is told places, as LeRobot's are.
+
+    Motors in the robot's order and cameras, by the names that `motors` and `cameras` give them. For
+    a policy of deltas put its `action` and `action_kind` in place; add `state_units` and
+    `action_units` where the training data had any.
+    """
+    own = {key: name for name, key in {**(motors or {}), **(cameras or {})}.items()}
+    images = [key for key, kind in robot.observation_features.items() if isinstance(kind, tuple)]
+    return {
+        "state": [own.get(key, key) for key in robot.observation_features if key not in images],
+        "action": [own.get(key, key) for key in robot.action_features],
+        "action_kind": "absolute",
+        "views": [own.get(key, key) for key in images],
+    }
 
 
 def _matched(

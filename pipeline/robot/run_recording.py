@@ -107,18 +107,6 @@ def finish_recording(part: Path, end: Mapping[str, Any]) -> Path:
     return target
 
 
-def describe_run(recording: Path) -> str | None:
-    """What a recorded run says of itself, in a sentence; None for what is none."""
-    if not (recording / RUN).is_file():
-        return None
-    run = read_json(recording / RUN)
-    dropped = f", {count} images dropped" if (count := run.get("dropped_images")) else ""
-    return (
-        f"Recorded on a robot: {run['rows']} of {run['ticks']} ticks have an action{dropped}; it "
-        f"ended: {run['reason']}."
-    )
-
-
 def _read(part: Path, name: str, kind: "np.dtype[Any]") -> Log:
     """A log's whole rows: one that a kill or a full disk cut off is left out."""
     path = part / f"{name}.bin"

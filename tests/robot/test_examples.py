@@ -7,6 +7,8 @@ from typing import Any
 
 import pytest
 
+from pipeline.base.errors import CheckpointMismatch
+from pipeline.data.insertion import SENSOR, STATE
 from pipeline.simulation.insertion import MAX_TICKS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -24,9 +26,23 @@ def test_the_simulated_arm_runs_over_the_wire(
     serving: Callable[..., Any],
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    server = serving(served_policy())
+    served = served_policy()
+    phantom = {"state": STATE, "sensor": SENSOR}
+    served.metadata["streams"] = served.metadata["streams"] | {
+        name: {"names": list(own.names), "units": list(own.units)} for name, own in phantom.items()
+    }
+    server = serving(served)
     main = runpy.run_path(str(ROOT / "examples" / "simulated_arm.py"))["main"]
     main(f"ws://{server.address}", 78)
     lines = capsys.readouterr().out.splitlines()
     assert 20 < len(lines) <= MAX_TICKS and "features 0." in lines[0]
     assert lines[-1] != "inserted"  # a policy of random weights
+
+
+def test_the_simulated_arm_refuses_a_policy_for_another_robot(
+    served_policy: Callable[..., Any], serving: Callable[..., Any]
+) -> None:
+    server = serving(served_policy())  # whose channels have other names
+    main = runpy.run_path(str(ROOT / "examples" / "simulated_arm.py"))["main"]
+    with pytest.raises(CheckpointMismatch, match="state: channel 0 trained 'joint_0'"):
+        main(f"ws://{server.address}", 78)

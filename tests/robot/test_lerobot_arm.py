@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import threading
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,19 +11,22 @@ import numpy as np
 import pytest
 
 from pipeline.base.config import Source
-from pipeline.base.errors import CheckpointMismatch
+from pipeline.base.errors import CheckpointMismatch, RecordingError
 from pipeline.data import open_recordings
-from pipeline.robot.lerobot_arm import LeRobotArm
+from pipeline.robot.client import refuse_other_robot
+from pipeline.robot.lerobot_arm import LeRobotArm, describe
+from pipeline.robot.realtime import RunSettings
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "lerobot_arm.py"
 MOTORS = ("shoulder_pan", "elbow_flex", "gripper")
+SO101 = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 
 
 class Follower:
     """As LeRobot's SO-101 follower answers: floats by motor, images by camera, clipped actions."""
 
-    def __init__(self, largest: float = 100.0) -> None:
-        self.place = {f"{motor}.pos": float(i) for i, motor in enumerate(MOTORS)}
+    def __init__(self, largest: float = 100.0, motors: tuple[str, ...] = MOTORS) -> None:
+        self.place = {f"{motor}.pos": float(i) for i, motor in enumerate(motors)}
         self.image = np.zeros((4, 6, 3), np.uint8)
         self.asked = 0
         self.largest, self.broken = largest, False
@@ -103,27 +107,96 @@ def test_deltas_add_up_on_what_was_sent_and_not_on_what_is_measured() -> None:
     assert robot.sent[-1]["elbow_flex.pos"] == 1.25
 
 
-def test_stop_holds_where_the_robot_is_and_deltas_begin_there() -> None:
+def test_an_image_is_older_than_the_call_that_gave_it_by_the_cameras_latency() -> None:
+    metadata = metadata_of()
+    arm = LeRobotArm(Follower(), metadata, {"View1": "front"}, None, Clock(), 0.125)
+    assert arm.observe()["state_time"].tolist() == [100.25]
+    assert arm.frames()["View1"][0] == 100.125
+
+
+@pytest.mark.parametrize("copies", [False, True])
+def test_a_camera_that_hangs_becomes_old(copies: bool) -> None:
+    """Whether it gives the same array again, or another of the same pixels."""
+    robot = Follower()
+    arm = arm_of(robot)
+    times = []
+    for tick in range(4):
+        if tick == 3:
+            robot.image[:] += 1  # as one that fills the same array anew
+        elif copies:
+            robot.image = robot.image.copy()
+        arm.observe()
+        times.append(arm.frames()["View1"][0])
+    assert times == [100.25, 100.25, 100.25, 101.75]
+
+
+def test_stop_holds_where_the_robot_was_last_seen_without_asking_and_deltas_begin_there() -> None:
     robot = Follower()
     arm = arm_of(robot, kind="delta", moving=(True, True, True))
     arm.observe()
     arm.act(np.array([5.0, 5.0, 5.0]))
-    robot.place = {key: value + 1 for key, value in robot.place.items()}
+    robot.broken = True
     arm.stop("force beyond 2.5 N")
-    assert robot.sent[-1] == robot.place
+    assert (robot.sent[-1], robot.asked) == (robot.place, 1)
     arm.act(np.zeros(3))
     assert robot.sent[-1] == robot.place
 
 
-def test_a_robot_that_does_not_answer_is_stopped_where_it_was_last_seen() -> None:
+def test_stop_before_anything_was_seen_sends_nothing() -> None:
     robot = Follower()
-    arm = arm_of(robot)
+    arm_of(robot).stop("no server")
+    assert robot.sent == []
+
+
+class Blocked(Follower):
+    """Its first command waits on the bus until `go`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.begun, self.go = threading.Event(), threading.Event()
+        self.log: list[str] = []
+
+    def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
+        first = not self.log
+        self.log.append("begin")
+        if first:
+            self.begun.set()
+            self.go.wait(10)
+        self.log.append("end")
+        return super().send_action(action)
+
+
+@pytest.mark.parametrize("hangs", [False, True])
+def test_stop_waits_for_a_command_under_way_but_not_for_one_that_hangs(
+    hangs: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipeline.robot.lerobot_arm._PORT_S", 0.05 if hangs else 10.0)
+    robot, said = Blocked(), list[str]()
+    arm = LeRobotArm(robot, metadata_of(), {"View1": "front"}, say=said.append)
     arm.observe()
-    arm.act(np.array([50.0, 50.0, 50.0]))
-    robot.broken = True
-    with pytest.raises(ConnectionError):
-        arm.stop("no readings")
-    assert robot.sent[-1] == robot.place
+    acting = threading.Thread(target=arm.act, args=(np.ones(3),))
+    acting.start()
+    assert robot.begun.wait(10)
+    stopping = threading.Thread(target=arm.stop, args=("no tick has ended",))
+    stopping.start()
+    stopping.join(10 if hangs else 0.1)
+    if hangs:
+        assert robot.sent == [robot.place]
+        assert len(said) == 1 and "(no tick has ended) was sent while another call" in said[0]
+    robot.go.set()
+    acting.join(10)
+    stopping.join(10)
+    if not hangs:
+        assert robot.log == ["begin", "end"] * 2
+        assert (robot.sent[-1], said) == (robot.place, [])
+
+
+def test_a_robot_is_described_by_the_policys_names() -> None:
+    said = describe(Follower(), {"View1": "front"}, {"joint_1": "shoulder_pan.pos"})
+    names = ["joint_1", "elbow_flex.pos", "gripper.pos"]
+    assert said == {
+        "state": names, "action": names, "action_kind": "absolute", "views": ["View1"],
+    }  # fmt: skip
 
 
 def test_names_that_differ_are_mapped() -> None:
@@ -143,7 +216,8 @@ def test_names_that_differ_are_mapped() -> None:
         ({"state": ("wrist",)}, "needs wrist, found no wrist or wrist.pos"),
         ({"action": MOTORS[:2], "moving": (False,) * 2}, r"none for \['gripper.pos'\]"),
         ({"action": ("a", "b", "c")}, "needs a, found no a or a.pos"),
-        ({"kind": "velocity"}, "needs places, found velocities"),
+        ({"kind": "velocity"}, "needs actions that are velocity, found places"),
+        ({"kind": "torque"}, "needs actions that are torque, found places"),
         ({"views": ("View1", "View2")}, "needs View2, found no View2"),
         ({"views": ()}, r"needs mappings of what it has, found \['View1'\]"),
     ],
@@ -166,18 +240,20 @@ def test_a_delta_of_a_motor_that_is_not_observed_is_refused() -> None:
 
 
 class Policy:
-    """A policy behind no wire: it moves every motor by a hundredth of a degree a tick."""
+    """A policy for an SO-101 behind no wire: all motors a hundredth from where they are, or one by
+    `far` more."""
 
-    def __init__(self, url: str) -> None:
-        channels = [f"delta_{motor}.pos" for motor in MOTORS]
-        action = {"names": channels, "units": ["deg"] * 3, "kind": "delta"}
-        state = {"names": list(MOTORS), "units": ["deg"] * 3}
-        streams = {"action": action, "state": state, "views": ["View1"]}
+    far = 0.0
+
+    def __init__(self, url: str, robot: Mapping[str, Any]) -> None:
+        names = [f"{motor}.pos" for motor in SO101]
+        action = {"names": names, "units": [""] * 6, "kind": "absolute"}
+        streams = {"action": action, "state": {"names": names, "units": [""] * 6}}
         self.metadata: dict[str, Any] = {
-            "streams": streams,
-            "moving": [True] * 3,
+            "streams": {**streams, "views": ["View1"]},
+            "moving": [False] * 6,
             "horizon": 8,
-            "action_dim": 3,
+            "action_dim": 6,
             "action_hz": 50.0,
             "vlm_reuse_count": 3,
             "uses_features": True,
@@ -186,6 +262,7 @@ class Policy:
             "state_window": 5,
             "sensor_window": 5,
         }
+        refuse_other_robot(robot, self.metadata)
         self.key = np.zeros(16, np.uint8)
 
     def __enter__(self) -> "Policy":
@@ -196,30 +273,67 @@ class Policy:
 
     def infer(self, observation: Mapping[str, Any]) -> dict[str, Any]:
         self.key = self.key + ("images/View1" in observation)
-        chunk = np.full((8, 3), 0.01, np.float32)
+        chunk = np.tile(np.arange(6, dtype=np.float32) + np.float32(0.01), (8, 1))
+        chunk[:, 1] += self.far
         return {"actions": chunk, "feature_key": self.key, "feature_age_s": 0.01}
 
 
-def test_the_example_drives_a_robot_and_records_it(tmp_path: Path, monkeypatch) -> None:
-    realtime = pytest.importorskip("pipeline.robot.realtime")
+class Filming(Follower):
+    """An SO-101 whose camera gives another image each time."""
+
+    def __init__(self) -> None:
+        super().__init__(motors=SO101)
+
+    def get_observation(self) -> dict[str, Any]:
+        self.image = self.image + np.uint8(1)
+        return super().get_observation()
+
+
+@pytest.fixture
+def example(monkeypatch: pytest.MonkeyPatch) -> Any:
     spec = importlib.util.spec_from_file_location("lerobot_arm_example", EXAMPLE)
     assert spec is not None and spec.loader is not None
-    example = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(example)
-    monkeypatch.setattr(example, "PolicyClient", Policy)
-    monkeypatch.setattr(example, "CAMERAS", {"View1": "front"})
-    robot = Follower()
-    settings = realtime.RunSettings(instruction="Push", seconds=1.0, missed_in_a_row=1000)
-    example.drive(robot, settings, tmp_path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    monkeypatch.setattr(module, "PolicyClient", Policy)
+    monkeypatch.setattr(module, "CAMERAS", {"View1": "front"})
+    return module
+
+
+def test_the_example_drives_a_robot_and_records_it(example: Any, tmp_path: Path) -> None:
+    robot = Filming()
+    example.drive(robot, RunSettings("Push", seconds=1.0, missed_in_a_row=1000), tmp_path)
     (root,) = tmp_path.iterdir()
     (recording,) = open_recordings([Source(name="runs", path=str(root))], tmp_path).recordings
     action, state = recording.action(), recording.state()
-    assert action is not None and state is not None and action.kind == "delta"
+    assert action is not None and state is not None and action.kind == "absolute"
     assert len(action.time) == len(robot.sent) - 1 > 5, "all but the stop"
-    np.testing.assert_array_equal(action.values, np.full((len(action.time), 3), 0.01, np.float32))
+    wanted = np.tile(np.arange(6, dtype=np.float32) + np.float32(0.01), (len(action.time), 1))
+    np.testing.assert_array_equal(action.values, wanted)
     assert robot.sent[-1] == robot.place
     assert list(recording.cameras()) == ["View1"] and recording.instruction == "Push"
     assert json.loads((root / "run.json").read_text())["settings"]["seconds"] == 1.0
+
+
+@pytest.mark.parametrize(("far", "most"), [(90.0, 1.0), (10.0, 2.8)])
+def test_the_example_keeps_its_limits(
+    example: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, far: float, most: float
+) -> None:
+    """Too large a step stops the robot before it moves; too fast a one is made slower."""
+    monkeypatch.setattr(Policy, "far", far)
+    robot = Filming()
+    settings = RunSettings("Push", seconds=0.3, missed_in_a_row=1000)
+    try:
+        example.drive(robot, settings, tmp_path)
+    except RecordingError:
+        assert far == 90.0
+    assert robot.sent[0]["shoulder_lift.pos"] <= most + 0.01
+    assert (len(robot.sent) == 1) == (far == 90.0)
+
+
+def test_the_example_refuses_a_policy_for_another_robot(example: Any, tmp_path: Path) -> None:
+    with pytest.raises(CheckpointMismatch, match="trained on another robot"):
+        example.drive(Follower(), RunSettings("Push"), tmp_path)
 
 
 def test_the_example_is_short() -> None:

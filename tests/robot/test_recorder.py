@@ -13,12 +13,12 @@ from PIL import Image
 
 from pipeline.base.config import Params, Source
 from pipeline.base.digests import file_digest
-from pipeline.base.errors import RecordingError, StoreMismatch
+from pipeline.base.errors import RecordingError
 from pipeline.data import Recording, open_recordings
 from pipeline.data.insertion import SENSOR, STATE
 from pipeline.extract import extract
+from pipeline.look.recording.robot_run import compare_keys
 from pipeline.robot import recorder as recorder_module
-from pipeline.robot.recorded_keys import compare_keys
 from pipeline.robot.recorder import RunRecorder, encode_png, recover
 from pipeline.simulation.environment import InsertionEnvironment
 from pipeline.simulation.insertion_formats import INSTRUCTION
@@ -193,31 +193,6 @@ def test_the_run_says_how_it_was_and_ended(run) -> None:
         assert features["answer"].tolist() == [1 + k // REUSE for k in range(len(driven.sent))]
         assert features["age_s"][0] == np.float32(0.05)
         assert features["feature_spec_digest"] == [said["metadata"]["feature_spec_digest"]]
-
-
-def test_keys_that_the_robot_did_not_have_are_named(live, vlm, tmp_path: Path) -> None:
-    spec, key_of = live
-    looks: list[bytes] = []
-
-    def forgetful(frames: Frames) -> bytes:
-        looks.append(key_of(frames))
-        return bytes(16) if len(looks) == 3 else looks[-1]
-
-    path = drive(tmp_path / "runs", told(spec), forgetful, ticks=14).recorder.finish("done")
-    extract(params_of(vlm, tmp_path), say=lambda _: None)
-    store = FeatureStore.open(tmp_path / "runs.zarr")
-    compared = compare_keys(path, store)
-    assert compared.missing.tolist() == [2]
-    assert str(compared) == "4 of 5 VL rows have a key of the robot's; not: 2 (0.60 s)"
-    document = json.loads((path / "run.json").read_text())
-    document["metadata"]["feature_spec"] |= {"digest": "other", "prompt": "other"}
-    (path / "run.json").write_text(json.dumps(document))
-    assert 'the feature specs differ: prompt: "other" ->' in str(compare_keys(path, store))
-    elsewhere = path.rename(tmp_path / "moved")
-    with pytest.raises(StoreMismatch, match="found 0 of 1 at such a path"):
-        compare_keys(elsewhere, store)
-    with pytest.raises(RecordingError, match="expected a recorded run"):
-        compare_keys(tmp_path, store)
 
 
 def test_late_answers_leave_out_the_ticks_before_the_first_action(live, vlm, tmp_path) -> None:

@@ -14,7 +14,7 @@ from stages.command import run
 from stages.verify import SHORTHANDS, main
 
 ROOT = Path(__file__).resolve().parents[2]
-CPU = ("--set", "extract.device=cpu")
+CPU = ("--set", "serve.device=cpu", "--set", "extract.device=cuda:7")
 
 
 @pytest.fixture(scope="module")
@@ -124,6 +124,8 @@ class TestCheckpoint:
         calls: list[tuple] = []
         spec = {"digest": "x"}
         held = SimpleNamespace(source={"feature_spec": spec}, golden=(1, 2), step=9)
+        held.encoders = {"features": 1}
+        held.policy = lambda: held
 
         def prove(checkpoint, features, say):
             calls.append((checkpoint, features))
@@ -154,6 +156,16 @@ class TestCheckpoint:
         assert verified("--set", place, *CPU, "--checkpoint") == 0
         assert f"{tmp_path / 'head/best'} (step 9)" in capsys.readouterr().out
         assert len(proved) == 1
+
+    def test_a_policy_that_looks_at_no_features_has_nothing_to_prove(
+        self, verified, proved, tmp_path, capsys, monkeypatch
+    ):
+        held = SimpleNamespace(source={"feature_spec": {}}, golden=(), step=9)
+        held.policy = lambda: SimpleNamespace(encoders={"state": 1})
+        monkeypatch.setattr("stages.verify.load_policy", lambda folder: held)
+        assert verified("--checkpoint", str(tmp_path / "head"), *CPU) == 0
+        assert "looks at no features, so nothing is to be proved" in capsys.readouterr().out
+        assert proved == []
 
     def test_a_refusal(self, verified, proved, tmp_path, capsys, monkeypatch):
         monkeypatch.setattr("stages.verify.resolve_device", lambda name: "meta")

@@ -17,9 +17,8 @@ from pipeline.look.recording.episode import Draw, EpisodeView, view_episode
 from pipeline.look.recording.frames import camera_blocks
 from pipeline.look.recording.model_input import prompt_blocks, sample_blocks
 from pipeline.look.recording.overview import RecordingsOverview, survey_recordings, worst_first
+from pipeline.look.recording.robot_run import compare_keys, describe_run
 from pipeline.look.recording.streams import motion_blocks, sensor_blocks
-from pipeline.robot.recorded_keys import compare_keys
-from pipeline.robot.run_recording import describe_run
 from pipeline.store import FeatureStore
 
 _TOPICS = {

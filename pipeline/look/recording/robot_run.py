@@ -1,4 +1,4 @@
-"""What was looked at on a robot, beside what a store made of the recording says was to be seen."""
+"""Of a recorded run on a robot: how it went, and whether a store has the features it acted on."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -61,3 +61,15 @@ def compare_keys(recording: str | Path, store: FeatureStore) -> KeyComparison:
     trained = read_json(root / RUN)["metadata"]["feature_spec"]
     told = tuple(describe(differences(trained, store.spec)))
     return KeyComparison(len(stored), missing, store.array("vl/time")[rows][missing], told)
+
+
+def describe_run(recording: Path) -> str | None:
+    """What a recorded run says of itself, in a sentence; None for what is none."""
+    if not (recording / RUN).is_file():
+        return None
+    run = read_json(recording / RUN)
+    dropped = f", {count} images dropped" if (count := run.get("dropped_images")) else ""
+    return (
+        f"Recorded on a robot: {run['rows']} of {run['ticks']} ticks have an action{dropped}; it "
+        f"ended: {run['reason']}."
+    )
