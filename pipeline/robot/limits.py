@@ -53,11 +53,14 @@ class Limits:
     """
 
     def __init__(self, file: LimitsFile, metadata: Mapping[str, Any], hz: float) -> None:
+        self.hz = hz
         self._streams: Mapping[str, Any] = metadata["streams"]
         action = self._streams["action"]
         self._names = list(action["names"])
         self._absolute = ~np.asarray(metadata["moving"], np.bool_)
-        self._per_tick = 1 / hz if action["kind"] == "velocity" else 1.0
+        velocity = action["kind"] == "velocity"
+        self._per_tick = 1 / hz if velocity else 1.0
+        self._goes_on = ~self._absolute & velocity
         self._state_of = [self._place("state", name) for name in self._names]
         self.clipped = 0
         """Ticks in which less was sent than was wanted."""
@@ -90,8 +93,8 @@ class Limits:
 
     def reset(self) -> None:
         """The robot stands still, where its next reading says."""
-        self._reference: Vector | None = None
-        self._moved = np.zeros(len(self._names))
+        self._reference = np.full(len(self._names), np.nan)
+        self._moved, self._sent = np.zeros(len(self._names)), False
 
     def check(self, observed: Mapping[str, NDArray[Any]]) -> None:
         """Raise `SafeStop` for readings outside the workspace or of too much force."""
@@ -106,7 +109,7 @@ class Limits:
                 found = low if low < bound.low else high
                 within = f"{bound.low:g} to {bound.high:g}"
                 raise SafeStop(kind, f"{bound.name} measured at {found:g}, allowed are {within}")
-        if self._reference is None and len(observed.get("state", ())):
+        if not self._sent and len(observed.get("state", ())):
             newest = observed["state"][-1]
             held = [np.nan if at is None else float(newest[at]) for at in self._state_of]
             self._reference = np.array(held)
@@ -114,26 +117,29 @@ class Limits:
     def allow(self, action: Vector) -> Vector:
         """What of an action (action,) may be sent; this very array where all of it may.
 
-        Raises `SafeStop` for a motion beyond a limit that stops.
+        Raises `SafeStop` for a motion beyond a limit that stops, or beyond any limit once others
+        have clipped it.
         """
-        absolute = self._absolute
-        at = np.full(len(action), np.nan) if self._reference is None else self._reference
+        absolute, at = self._absolute, self._reference
         wanted = np.where(absolute, action - at, action * self._per_tick)
         moved = wanted
         for bound in self._bounds:
-            moved = self._bounded(moved, bound)
+            moved = self._bounded(moved, bound, bound.clips)
         if moved is not wanted:
+            for bound in self._bounds:  # A later clip may have undone an earlier one.
+                self._bounded(moved, bound, clips=False)
             self.clipped += 1
             sent = np.where(absolute, at + moved, moved / self._per_tick)
             action = np.where(np.isnan(sent), action, sent)
         self._moved, self._reference = moved, np.where(absolute, action, at)
+        self._sent = True
         return action
 
     def stood_still(self) -> None:
-        """Nothing was sent for a tick or more."""
-        self._moved = np.zeros(len(self._names))
+        """Nothing was sent for a tick or more; what was told a velocity has gone on with it."""
+        self._moved = np.where(self._goes_on, self._moved, 0.0)
 
-    def _bounded(self, moved: Vector, bound: _Bound) -> Vector:
+    def _bounded(self, moved: Vector, bound: _Bound, clips: bool) -> Vector:
         before = self._moved if bound.kind == "acceleration" else np.zeros_like(moved)
         change = (moved - before)[bound.channels]
         length = float(np.linalg.norm(change))
@@ -141,7 +147,7 @@ class Limits:
             raise SafeStop(StopKind.STALLED, f"no reading says where {bound.name} begins")
         if not length > bound.per_tick * (1 + 1e-6):
             return moved
-        if not bound.clips:
+        if not clips:
             found = bound.most * length / bound.per_tick
             raise SafeStop(
                 StopKind.LIMIT,
@@ -179,12 +185,12 @@ class Limits:
     def _range(self, stream: str, where: str, name: str, low: float, high: float) -> _Range:
         channel = self._place(stream, name)
         if channel is None:
-            known = ", ".join((self._streams.get(stream) or {}).get("names", ())[:12]) or "none"
+            known = ", ".join(self._streams[stream]["names"][:12]) or "none"
             raise ConfigError(f"{where}: the {stream} has no such channel; it has {known} …")
         if low >= high:
             raise ConfigError(f"{where}: expected the lowest and the highest, found {low}, {high}")
         return _Range(stream, name, channel, low, high)
 
     def _place(self, stream: str, name: str) -> int | None:
-        names = list((self._streams.get(stream) or {}).get("names", ()))
+        names = self._streams[stream]["names"]
         return names.index(name) if name in names else None

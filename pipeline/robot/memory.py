@@ -20,20 +20,37 @@ class WindowSize:
 
 
 class ReadingWindow:
-    """The newest readings of a stream, right-aligned, in buffers that stay."""
+    """The newest readings of a stream, right-aligned, in ring buffers that stay.
+
+    Each buffer is kept twice in a row, so that the readings stand in order wherever they begin.
+    """
 
     def __init__(self, size: WindowSize) -> None:
-        self.values = np.zeros((size.readings, size.channels), np.float32)
-        self.time_s = np.full(size.readings, -np.inf)
+        self._readings = size.readings
+        self._values = np.zeros((2, size.readings, size.channels), np.float32)
+        self._time_s = np.full((2, size.readings), -np.inf)
+        self._oldest = 0
         self._oldest_s = np.inf if size.oldest_s is None else size.oldest_s + CLOCK_SLACK_S
+
+    @property
+    def values(self) -> NDArray[np.float32]:
+        """(reading, channel), oldest first: a view, as it is until the next `append`."""
+        both = self._values.reshape(2 * self._readings, -1)
+        return both[self._oldest : self._oldest + self._readings]
+
+    @property
+    def time_s(self) -> NDArray[np.float64]:
+        """(reading,), as `values`; -inf where none has come yet."""
+        return self._time_s.reshape(-1)[self._oldest : self._oldest + self._readings]
 
     def append(self, readings: NDArray[np.float32], time_s: NDArray[np.float64]) -> None:
         """Take the readings (reading, channel) that follow, and the times (reading,) of them."""
-        for buffer, following in ((self.values, readings), (self.time_s, time_s)):
-            newest = following[-len(buffer) :]
-            kept = len(buffer) - len(newest)
-            buffer[:kept] = buffer[len(newest) :]
-            buffer[kept:] = newest
+        for buffer, following in ((self._values, readings), (self._time_s, time_s)):
+            newest = following[-self._readings :]
+            to_end = newest[: self._readings - self._oldest]
+            buffer[:, self._oldest : self._oldest + len(to_end)] = to_end
+            buffer[:, : len(newest) - len(to_end)] = newest[len(to_end) :]
+        self._oldest = (self._oldest + min(len(time_s), self._readings)) % self._readings
 
     def at(self, now_s: float) -> tuple[NDArray[np.float32], int, NDArray[np.float32]]:
         """The readings, how many of them are real, the last ones, and their ages in s."""

@@ -9,6 +9,7 @@ another in the simulation then comes 0.15 ms after it.
 import math
 import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,8 @@ class SimulatedRobot:
 
     In ticks without an action the arm stands still. With `again` the episode of the next seed
     begins where one has ended; else `observe` says that the run has `ended`. `outcomes` has how
-    each episode ended. Close it: its cameras are a thread.
+    each episode ended. Close it: its cameras are a thread. They keep to the machine's time; ticks
+    pass by `clock`, s.
     """
 
     def __init__(
@@ -41,10 +43,11 @@ class SimulatedRobot:
         hz: float = TICK_HZ,
         seed: int = 0,
         again: bool = False,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._level: Level = level
         self._rotation: ActionRotation = rotation
-        self._hz, self._again = hz, again
+        self._hz, self._again, self._clock = hz, again, clock
         self._scale = TICK_HZ / hz
         self.outcomes: list[str] = []
         self.stopped: str | None = None
@@ -58,7 +61,7 @@ class SimulatedRobot:
 
     def observe(self) -> dict[str, Any]:
         """The readings since the last call; the arm has stood still in ticks without an action."""
-        now = time.monotonic()
+        now = self._clock()
         if self._steps == 0 and math.isnan(self._began_s):
             self._began_s = now
         # A tick that begins a little early is not yet over: only whole ones were left out.

@@ -27,9 +27,17 @@ JOINTS: dict[str, Any] = {
     "streams": {
         "action": {"names": ["a", "b"], "units": ["deg", "deg"], "kind": "absolute"},
         "state": {"names": ["b", "a"], "units": ["deg", "deg"]},
-        "sensor": None,
+        "sensor": {"names": [], "units": []},
     },
     "moving": [False, False],
+}
+VELOCITY: dict[str, Any] = {
+    "streams": {
+        "action": {"names": ["vx", "grip"], "units": ["mm/s", ""], "kind": "velocity"},
+        "state": {"names": ["grip"], "units": [""]},
+        "sensor": {"names": [], "units": []},
+    },
+    "moving": [True, False],
 }
 HZ = 10.0
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "limits.yaml"
@@ -47,7 +55,7 @@ def test_what_is_within_its_limits_is_sent_as_it_is() -> None:
     own = limits(step={"most": {"translation": 1.0}}, speed={"most": {"dz": 5.0}})
     action = moved(0.6, 0.6, 0.4)
     assert own.allow(action) is action
-    assert own.clipped == 0
+    assert (own.clipped, own.hz) == (0, HZ)
 
 
 @pytest.mark.parametrize(
@@ -89,12 +97,50 @@ def test_what_is_clipped_to_one_limit_is_judged_by_the_next() -> None:
         limits(**both, acceleration={"most": {"dx": 49}}).allow(moved(0.9))
 
 
+@pytest.mark.parametrize("on_exceed", ["stop", "clip"])
+def test_a_clip_that_would_undo_an_earlier_limit_stops(on_exceed: str) -> None:
+    own = limits(
+        speed={"most": {"translation": 10.0}, "on_exceed": on_exceed},
+        acceleration={"most": {"dx": 5.0}, "on_exceed": "clip"},
+    )
+    for tick in range(20):
+        own.allow(moved(0.05 * (tick + 1)))
+    with pytest.raises(SafeStop, match=r"speed of translation would be 13\.79, at most 10") as stop:
+        own.allow(moved(0.0, 1.0))  # dx can only be slowed down to 0.95
+    assert stop.value.kind == StopKind.LIMIT
+    assert own.clipped == 0
+
+
+def test_clips_of_the_same_channels_never_stop_each_other() -> None:
+    clips = {"most": {"translation": 7.0}, "on_exceed": "clip"}
+    own, rng = limits(step=clips, speed=clips, acceleration=clips), np.random.default_rng(0)
+    for _ in range(2000):
+        sent = own.allow(moved(*rng.normal(0, 0.6, 3)))
+        assert np.linalg.norm(sent[:3]) * HZ <= 7.0 * (1 + 1e-6)
+    assert own.clipped > 1000
+
+
 def test_channels_that_say_where_to_be_are_judged_by_where_the_robot_is() -> None:
     own = limits(JOINTS, step={"most": {"a": 2.0}, "on_exceed": "clip"})
     own.check({"state": np.array([[0.0, 9.0], [50.0, 10.0]], np.float32)})  # b, a
     np.testing.assert_allclose(own.allow(np.array([15.0, 99.0])), [12.0, 99.0])
     np.testing.assert_allclose(own.allow(np.array([15.0, 99.0])), [14.0, 99.0])
     np.testing.assert_allclose(own.allow(np.array([15.0, 99.0])), [15.0, 99.0])
+
+
+def test_until_the_first_action_is_sent_the_newest_reading_says_where_the_robot_is() -> None:
+    own = limits(JOINTS, step={"most": {"a": 2.0}})
+    own.check({"state": np.array([[0.0, 10.0]])})
+    own.check({})
+    own.check({"state": np.array([[0.0, 60.0]])})  # moved by hand
+    with pytest.raises(SafeStop, match="step of a would be 49, at most 2"):
+        own.allow(np.array([11.0, 0.0]))
+    own.allow(np.array([61.0, 0.0]))
+    own.check({"state": np.array([[0.0, 60.0]])})  # the arm is slow; what was sent holds
+    own.allow(np.array([63.0, 0.0]))
+    own.reset()
+    own.check({"state": np.array([[0.0, 10.0]])})
+    own.allow(np.array([11.0, 0.0]))
 
 
 def test_without_a_reading_of_where_the_robot_is_it_stands_still() -> None:
@@ -104,12 +150,22 @@ def test_without_a_reading_of_where_the_robot_is_it_stands_still() -> None:
 
 
 def test_a_velocity_is_a_speed() -> None:
-    action = {"names": ["vx"], "units": ["mm/s"], "kind": "velocity"}
-    velocity = {"streams": {"action": action, "state": None, "sensor": None}, "moving": [True]}
-    speed = limits(velocity, speed={"most": {"vx": 5.0}, "on_exceed": "clip"})
-    assert speed.allow(np.array([7.0])) == pytest.approx(5.0)
-    step = limits(velocity, step={"most": {"vx": 0.4}, "on_exceed": "clip"})
-    assert step.allow(np.array([7.0])) == pytest.approx(4.0)
+    speed = limits(VELOCITY, speed={"most": {"vx": 5.0}, "on_exceed": "clip"})
+    assert speed.allow(np.array([7.0, 0.0]))[0] == pytest.approx(5.0)
+    step = limits(VELOCITY, step={"most": {"vx": 0.4}, "on_exceed": "clip"})
+    assert step.allow(np.array([7.0, 0.0]))[0] == pytest.approx(4.0)
+
+
+def test_a_velocity_goes_on_where_nothing_is_sent_and_a_place_is_held() -> None:
+    own = limits(VELOCITY, acceleration={"most": {"vx": 1000.0, "grip": 300.0}})
+    own.check({"state": np.array([[0.0]])})
+    own.allow(np.array([90.0, 2.0]))
+    own.stood_still()
+    with pytest.raises(SafeStop, match="acceleration of vx would be 1800, at most 1000"):
+        own.allow(np.array([-90.0, 2.0]))
+    with pytest.raises(SafeStop, match="acceleration of grip would be 400, at most 300"):
+        own.allow(np.array([90.0, 6.0]))
+    own.allow(np.array([90.0, -1.0]))
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Windows of the newest readings, and what a policy is given of them."""
 
+import tracemalloc
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -17,7 +18,7 @@ from pipeline.train.batches import Windows
 @given(st.integers(1, 12), st.lists(st.integers(0, 20), max_size=12))
 def test_a_window_holds_the_newest_readings_at_its_end(size: int, counts: list[int]) -> None:
     stream = np.arange(2 * sum(counts), dtype=np.float32).reshape(-1, 2) + 1
-    window, taken, buffer = ReadingWindow(WindowSize(size, 2, None)), 0, None
+    window, taken = ReadingWindow(WindowSize(size, 2, None)), 0
     for count in counts:
         time_s = np.arange(taken, taken + count, dtype=np.float64)
         window.append(stream[taken : taken + count], time_s)
@@ -29,8 +30,22 @@ def test_a_window_holds_the_newest_readings_at_its_end(size: int, counts: list[i
         np.testing.assert_array_equal(ages[size - valid :], np.arange(valid, 0, -1) + 0.5)
         assert not values[: size - valid].any()
         assert not ages[: size - valid].any()
-        assert buffer is None or window.values is buffer
-        buffer = window.values
+        np.testing.assert_array_equal(window.values, values)
+        times = [-np.inf] * (size - valid) + list(range(taken - valid, taken))
+        assert window.time_s.tolist() == times
+
+
+@pytest.mark.parametrize("count", [1, 65, 700])
+def test_a_window_takes_readings_without_allocating(count: int) -> None:
+    window = ReadingWindow(WindowSize(650, 64, None))
+    readings, time_s = np.ones((count, 64), np.float32), np.arange(count, dtype=np.float64)
+    window.append(readings, time_s)
+    tracemalloc.start()
+    for _ in range(20):
+        window.append(readings, time_s)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 4096
 
 
 def test_what_is_older_than_the_window_is_no_reading_of_it() -> None:

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterator
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -14,11 +15,30 @@ from pipeline.simulation.rendering import VIEWS
 STILL = np.zeros(7)
 
 
+class Clock:
+    """Stands until it is set."""
+
+    now_s = 1000.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
 @pytest.fixture(params=[10.0, 50.0])
-def robot(request: pytest.FixtureRequest) -> Iterator[SimulatedRobot]:
-    made = SimulatedRobot(hz=request.param, seed=3)
-    yield made
-    made.close()
+def robot(request: pytest.FixtureRequest, clock: Clock) -> Iterator[SimulatedRobot]:
+    with closing(SimulatedRobot(hz=request.param, seed=3, clock=clock)) as made:
+        yield made
+
+
+@pytest.fixture
+def quick(clock: Clock) -> Iterator[SimulatedRobot]:
+    with closing(SimulatedRobot(hz=1000.0, seed=3, again=True, clock=clock)) as made:
+        yield made
 
 
 def hz_of(robot: SimulatedRobot) -> float:
@@ -26,11 +46,13 @@ def hz_of(robot: SimulatedRobot) -> float:
 
 
 def test_an_action_is_a_tick_and_tells_the_readings_of_the_simulation(
-    robot: SimulatedRobot,
+    robot: SimulatedRobot, clock: Clock
 ) -> None:
     environment = InsertionEnvironment(cameras=False)
     readings, _ = environment.reset(seed=3)
     for tick in range(3):
+        # A tick begins a little early or late; which it is changes nothing.
+        clock.now_s = 1000.0 + (tick + (0.0, -0.04, 0.9)[tick]) / hz_of(robot)
         observed = robot.observe()
         assert observed["time"][0] == pytest.approx(tick / hz_of(robot))
         np.testing.assert_array_equal(observed["state"], readings["state"])
@@ -43,12 +65,15 @@ def test_an_action_is_a_tick_and_tells_the_readings_of_the_simulation(
         readings, *_ = environment.step(action)
 
 
-def test_ticks_without_an_action_pass_all_the_same(robot: SimulatedRobot) -> None:
+@pytest.mark.parametrize(("waited", "ticks"), [(0.9, 0), (1.96, 2), (2.2, 2)])
+def test_ticks_without_an_action_pass_all_the_same(
+    robot: SimulatedRobot, clock: Clock, waited: float, ticks: int
+) -> None:
     first = robot.observe()
-    time.sleep(2.2 / hz_of(robot))
+    clock.now_s += waited / hz_of(robot)
     later = robot.observe()
-    ticks = round((later["time"][0] - first["time"][0]) * hz_of(robot))
-    assert ticks >= 2 and len(later["state"]) == 10 * ticks
+    assert later["time"] - first["time"] == pytest.approx(ticks / hz_of(robot))
+    assert len(later.get("state", ())) == 10 * ticks
 
 
 def test_frames_follow_and_say_when_they_were_taken(robot: SimulatedRobot) -> None:
@@ -78,33 +103,41 @@ def test_the_end_of_an_episode_ends_the_run(robot: SimulatedRobot) -> None:
     assert robot.observe()["ended"] == INSERTED
 
 
-def test_the_next_episode_begins_where_asked_for_and_the_clock_goes_on() -> None:
-    robot = SimulatedRobot(hz=1000.0, seed=3, again=True)
-    try:
-        robot.observe()
-        finish(robot)
-        clock = robot._steps / 1000
-        again = robot.observe()
-        assert again["reset"] is True and "ended" not in again
-        assert again["time"][0] >= clock and again["state_time"][-1] <= again["time"][0] + 1e-9
-        second = InsertionEnvironment(cameras=False)
-        readings, _ = second.reset(seed=4)
-        np.testing.assert_array_equal(again["state"][:10], readings["state"])
-        assert "reset" not in robot.observe()
-    finally:
-        robot.close()
+def test_the_next_episode_begins_where_asked_for_and_the_clock_goes_on(
+    quick: SimulatedRobot, clock: Clock
+) -> None:
+    quick.observe()
+    finish(quick)
+    ended_s = quick._steps / 1000
+    clock.now_s += ended_s
+    again = quick.observe()
+    assert again["reset"] is True and "ended" not in again
+    assert again["time"] == pytest.approx(ended_s)
+    assert again["state_time"][-1] <= ended_s + 1e-9
+    second = InsertionEnvironment(cameras=False)
+    readings, _ = second.reset(seed=4)
+    np.testing.assert_array_equal(again["state"], readings["state"])
+    assert "reset" not in quick.observe()
 
 
-def test_an_episode_that_ends_while_nobody_acts_is_followed_by_the_next() -> None:
-    robot = SimulatedRobot(hz=1000.0, seed=3, again=True)
-    try:
+def test_an_episode_that_ends_while_nobody_acts_is_followed_by_the_next(
+    quick: SimulatedRobot, clock: Clock
+) -> None:
+    quick.observe()
+    clock.now_s += 0.13  # all its 120 ticks
+    late = quick.observe()
+    assert "ended" not in late and len(quick.outcomes) == 1
+    assert quick.observe()["reset"] is True
+    assert len(quick.outcomes) == 1
+
+
+def test_its_clock_is_the_monotonic_one() -> None:
+    with closing(SimulatedRobot(hz=1000.0, seed=3)) as robot:
         robot.observe()
-        time.sleep(0.13)  # all its 120 ticks
-        late = robot.observe()
-        assert "ended" not in late and len(robot.outcomes) == 1
-        assert robot.observe()["reset"] is True
-    finally:
-        robot.close()
+        began_s = time.monotonic()
+        while robot.observe()["time"] < 0.02:
+            pass
+        assert time.monotonic() - began_s > 0.018
 
 
 def test_a_robot_that_was_stopped_does_not_move(robot: SimulatedRobot) -> None:
