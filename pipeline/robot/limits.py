@@ -53,6 +53,7 @@ class Limits:
     """
 
     def __init__(self, file: LimitsFile, metadata: Mapping[str, Any], hz: float) -> None:
+        self.hz = hz
         self._streams: Mapping[str, Any] = metadata["streams"]
         action = self._streams["action"]
         self._names = list(action["names"])
@@ -87,6 +88,12 @@ class Limits:
         except ConfigError as error:
             said = str(error)
             raise ConfigError(said if said.startswith(str(path)) else f"{path}: {said}") from None
+
+    @property
+    def streams(self) -> set[str]:
+        """Whose readings it needs."""
+        follows = any(self._absolute[bound.channels].any() for bound in self._bounds)
+        return {bound.stream for bound in self._ranges} | ({"state"} if follows else set())
 
     def reset(self) -> None:
         """The robot stands still, where its next reading says."""
