@@ -164,8 +164,9 @@ def run(connect: Callable[[], Decides], settings: RunSettings, seconds: float) -
     course, seed = Course(hz), 0
     while (left := seconds - (course.ticks.ring.count + course.left_out) / hz) > 0.5 / hz:
         policy = connect()
-        # Speeds are those of the simulated world, whatever the rate.
+        # Speeds are those of the simulated world, which goes as much faster as ticks do.
         limits = Limits.read(LIMITS, policy.metadata, TICK_HZ)
+        limits.hz = hz
         with closing(SimulatedRobot(hz=hz, seed=seed, again=True)) as robot:
             # Late ticks are what is to be measured; they stop nothing here.
             patient = replace(settings, seconds=left, missed_in_a_row=10**9)

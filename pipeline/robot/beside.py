@@ -5,6 +5,7 @@ import math
 import os
 import threading
 import time
+import traceback
 from collections.abc import Callable, Mapping
 from queue import Empty, SimpleQueue
 from typing import Any
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.base.errors import ServerBusy
 from pipeline.robot.loop import SafeStop, StopKind
 from pipeline.robot.memory import ReadingWindow, WindowSize
 
@@ -64,7 +66,12 @@ class PendingReadings:
 
 
 class RobotClock:
-    """The robot's clock beside ours."""
+    """The robot's clock beside ours.
+
+    Its offset is taken once. A crystal of its own, 50 ppm off, has left it by 0.1 s (`drift_s` as
+    it is by default) after some 33 minutes. For longer runs keep the robot's clock to ours (NTP,
+    PTP), let the robot tell times of `time.monotonic()`, or allow more drift.
+    """
 
     def __init__(self, offset_s: float | None, drift_s: float) -> None:
         """`offset_s` is the robot's clock less ours; None: the first observations tell it."""
@@ -106,7 +113,8 @@ class Asker:
         self._questions.put(question)
 
     def take(self) -> Answer | None:
-        """The answer where it has come. Raises `SafeStop` where the policy failed."""
+        """The answer where it has come. Raises `SafeStop` where the policy failed, `ServerBusy`
+        where it will not answer this question."""
         try:
             self.took_s, answer = self._answers.get_nowait()
         except Empty:
@@ -114,6 +122,8 @@ class Asker:
         self.busy = False
         if not isinstance(answer, Exception):
             return answer
+        if isinstance(answer, ServerBusy):
+            raise answer
         lost = isinstance(answer, ConnectionError)
         kind = StopKind.CONNECTION if lost else StopKind.POLICY
         raise SafeStop(kind, f"{kind.value}: {type(answer).__name__}: {answer}") from answer
@@ -149,7 +159,8 @@ class Watchdog:
         self._beats = 0
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
-        self.reason = ""
+        self.reason = self.failed = ""
+        """Why it has stopped the robot, and the tracebacks where that raised."""
 
     def start(self) -> None:
         """Begin to look."""
@@ -167,6 +178,8 @@ class Watchdog:
     def close(self) -> None:
         """Look no more."""
         self._closed.set()
+        if self._thread.is_alive():
+            self._thread.join(timeout=1.0)
 
     def _watch(self) -> None:
         looks, seen = 0, -1
@@ -174,7 +187,19 @@ class Watchdog:
             looks, seen = (0 if self._beats != seen else looks + 1), self._beats
             if looks == self.LOOKS and not self.reason:
                 self.reason = f"no tick has ended for {self._hung_s:g} s"
-                self._stop(self.reason)
+                self.failed = stop_firmly(self._stop, self.reason)
+
+
+def stop_firmly(stop: Callable[[str], object], reason: str) -> str:
+    """Stop the robot, once more where that raises; the tracebacks, empty where all went well."""
+    failed = ""
+    for _ in range(2):
+        try:
+            stop(reason)
+            break
+        except Exception:
+            failed += f"robot.stop failed: {traceback.format_exc()}"
+    return failed
 
 
 def go_first(fifo_priority: int) -> None:

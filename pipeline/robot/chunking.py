@@ -133,6 +133,10 @@ class Executor:
         rest[: len(left)] = left
         return PlanGuide(rest, soft_mask(self.horizon, max(self._delays), overlap))
 
+    def refused(self) -> None:
+        """There will be no chunk of the observation that `begin` marked."""
+        self._begun = None
+
     def plan(self, chunk: ArrayLike) -> None:
         """Take the chunk of the observation that `begin` marked, (horizon, action)."""
         steps = np.array(chunk, np.float32)

@@ -91,6 +91,12 @@ class Limits:
             said = str(error)
             raise ConfigError(said if said.startswith(str(path)) else f"{path}: {said}") from None
 
+    @property
+    def streams(self) -> set[str]:
+        """Whose readings it needs."""
+        follows = any(self._absolute[bound.channels].any() for bound in self._bounds)
+        return {bound.stream for bound in self._ranges} | ({"state"} if follows else set())
+
     def reset(self) -> None:
         """The robot stands still, where its next reading says."""
         self._reference = np.full(len(self._names), np.nan)

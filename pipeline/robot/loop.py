@@ -71,7 +71,7 @@ class ControlLoop:
     def reset(self) -> None:
         """Forget all, for the next episode."""
         self.executor.reset()
-        self._tick, self._pass_began = -1, -self._reuse
+        self._tick, self._pass_began, self._asked = -1, -self._reuse, -1
         self._under_way = False
 
     def begin_tick(self) -> None:
@@ -94,12 +94,19 @@ class ControlLoop:
 
     @property
     def chunk_due(self) -> bool:
-        """Whether the next chunk is to be asked for; never between `ask` and `plan`."""
+        """Whether the next chunk is to be asked for; never from `ask` to `plan` or `refused`."""
         return self.executor.due
 
     def ask(self) -> PlanGuide | None:
         """The chunk that is due is asked for with what is known now; what it is to continue."""
+        self._asked = self._tick
         return self.executor.begin()
+
+    def refused(self) -> None:
+        """What `ask` asked is not answered: nobody looks at the frames that went with it."""
+        self.executor.refused()
+        if self._pass_began == self._asked:
+            self._pass_began, self._under_way = self._asked - self._reuse, False
 
     def plan(self, chunk: NDArray[np.float32]) -> None:
         """Take the chunk (horizon, action) that `ask` was for, in physical units.

@@ -8,21 +8,30 @@ wrong ends in `Robot.stop` with a `StopKind` and a reason. Numpy only.
 import gc
 import math
 import os
+import signal
 import sys
+import threading
 import time
 import traceback
-from collections.abc import Generator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NoReturn, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.config import Chunking
-from pipeline.base.errors import ConfigError, PipelineError
-from pipeline.robot.beside import Asker, PendingReadings, RobotClock, Watchdog, go_first
+from pipeline.base.errors import ConfigError, ServerBusy
+from pipeline.robot.beside import (
+    Asker,
+    PendingReadings,
+    RobotClock,
+    Watchdog,
+    go_first,
+    stop_firmly,
+)
 from pipeline.robot.limits import Limits
 from pipeline.robot.loop import ControlLoop, LoopTiming, SafeStop, StopKind
 from pipeline.robot.timings import Ring, Timings
@@ -36,6 +45,7 @@ ANSWER_PARTS = ("answer", "infer_ms", "vlm_ms", "head_ms", "wait_ms")
 """answer: from the question to its answer; the others as the answer's `server_timing` says."""
 _BLAMED = {OBSERVE: "observe", FRAMES: "frames", ACT: "act"}
 _MISSED_KEPT = 4096
+_BY_HAND = ("SIGINT", "SIGTERM", "SIGHUP")
 _SWITCH_S = 5e-4
 """How long another thread of this process may keep Python to itself while the loop waits for it."""
 
@@ -79,7 +89,8 @@ class Recorder(Protocol):
     """Keeps what happened; cheap, for it is called in the loop."""
 
     def tick(self, observed: Mapping[str, Any], action: NDArray[Any] | None) -> object:
-        """What was observed in a tick and what was sent."""
+        """What was observed in a tick and what was sent. It is told of the tick that ends a run,
+        too: what was observed may be why."""
         ...
 
     def frames(self, frames: Frames) -> object:
@@ -91,7 +102,8 @@ class Recorder(Protocol):
         ...
 
     def finish(self, reason: str, timings: Mapping[str, Any]) -> Path:
-        """The finished recording; raises a `PipelineError` where there is none, and why."""
+        """The finished recording, once the robot stands still; what it raises, where there is none,
+        is told in the report."""
         ...
 
 
@@ -114,14 +126,15 @@ class RunSettings:
     clock_drift_s: float = 0.1
     """How far the robot's clock may leave its offset, and a reading lie in the future."""
     first_answer_s: float = 60.0
-    """How long the first chunk may take."""
+    """How long the first chunk may take. It is waited for no longer than the client's own timeout
+    (`PolicyClient(timeout_s=…)`, 10 s), so that one must be longer."""
     old_features_s: float = 2.0
     """From the newest frame that the features have seen."""
     old_frame_s: float = 0.5
     stalled_s: float = 0.5
     """How long a stream may bring no new reading."""
     watch: tuple[str, ...] | None = None
-    """Streams that must bring readings; None: all that the policy was trained on."""
+    """Streams that must bring readings; None: all that the policy looks at or limits are of."""
     missed_in_a_row: int = 5
     """Ticks left out without one in time between them, from which the robot stops."""
     hung_s: float = 0.5
@@ -165,6 +178,8 @@ class RunReport:
     """The newest 4,096 at most; `missed_ticks` counts all."""
     missed_ticks: int
     answers: int
+    busy: int
+    """Questions that the policy's server was too busy to answer; it took their readings."""
     dropped_readings: int
     """Older than all that a policy's window holds, in the time between two questions."""
     clipped: int
@@ -176,16 +191,22 @@ class RunReport:
     """(tick, 2 + action): the tick's number, the robot's time, and what was sent, of the newest."""
     recording: Path | None
     traceback: str
-    """Of what raised, and why there is no recording; empty where all went well."""
+    """Of what raised, also in stopping and in recording; empty where all went well."""
 
     def document(self) -> dict[str, Any]:
         """All but the actions, as JSON takes it."""
-        plain = ("hz", "ticks", "left_out", "missed_ticks", "answers", "dropped_readings")
+        plain = ("reason", "hz", "ticks", "left_out", "missed_ticks", "answers", "busy")
+        more = ("dropped_readings", "clipped", "clock_offset_s")
         return {
             "kind": self.kind.value,
-            "reason": self.reason,
-            **{name: getattr(self, name) for name in (*plain, "clipped", "clock_offset_s")},
+            **{name: getattr(self, name) for name in (*plain, *more)},
             "missed": [asdict(tick) for tick in self.missed],
+            **self.timings(),
+        }
+
+    def timings(self) -> dict[str, Any]:
+        """Milliseconds of ticks and of answers."""
+        return {
             "tick_ms": self.tick_timings.document(),
             "answer_ms": self.answer_timings.document(),
         }
@@ -198,32 +219,42 @@ def run_robot(
     limits: Limits | None = None,
     recorder: Recorder | None = None,
 ) -> RunReport:
-    """Run a robot until something ends it; `robot.stop` has then been called, whatever it was.
+    """Run a robot until something ends it; `robot.stop` has then been called, and once more where
+    it raised.
 
-    Raises `ConfigError` before the first observation where settings do not fit the policy or the
-    machine.
+    On the main thread Ctrl-C, SIGTERM and SIGHUP (a lost ssh) end the run as well, and the process
+    goes on; those that come while the robot is stopped are passed over. On another thread nothing
+    does this for a signal. Nobody stops the robot where the process is killed (SIGKILL, no memory,
+    no power): its own controller must, when no action comes.
+
+    Raises `ConfigError` before the first observation where settings do not fit the policy, the
+    limits or the machine.
     """
     kind, reason, trace = StopKind.LOOP, "the process ends", ""
-    with _undisturbed(settings.fifo_priority):
+    with _undisturbed(settings.fifo_priority), _ended_by_hand() as deaf:
         run = _Run(robot, policy, settings, limits, recorder)
         try:
-            run.go()
+            try:
+                run.go()
+            finally:
+                deaf()
         except SafeStop as stop:
             kind, reason = stop.kind, str(stop)
-        except KeyboardInterrupt:
-            kind, reason = StopKind.BY_HAND, "stopped by hand (Ctrl-C)"
+            if kind is StopKind.ROBOT:
+                run.untold = None  # Readings of another shape would spoil the recording.
+        except KeyboardInterrupt as hand:
+            kind, reason = StopKind.BY_HAND, f"stopped by hand ({str(hand) or 'Ctrl-C'})"
         except Exception as error:
             (kind, reason), trace = run.blame(error), traceback.format_exc()
         finally:
-            robot.stop(reason)
-            run.close()
-    recording = None
-    if recorder is not None:
-        try:
-            recording = recorder.finish(reason, run.timings())
-        except PipelineError as error:
-            trace += f"no recording: {error}"  # The report still says why the robot stands still.
-    return run.report(kind, reason, recording, trace)
+            trace += stop_firmly(robot.stop, reason) + run.close()
+    report = run.report(kind, reason, trace)
+    if recorder is None:
+        return report
+    try:
+        return replace(report, recording=recorder.finish(reason, report.timings()))
+    except Exception as error:  # The report still says why the robot stands still.
+        return replace(report, traceback=f"{trace}no recording: {type(error).__name__}: {error}")
 
 
 class _Run:
@@ -240,6 +271,11 @@ class _Run:
         self.robot, self.settings, self.limits, self.recorder = robot, settings, limits, recorder
         meta = policy.metadata
         self.hz = float(settings.hz or meta["action_hz"])
+        if limits is not None and abs(limits.hz - self.hz) > 1e-3 * self.hz:
+            raise ConfigError(
+                f"limits: expected hz={self.hz:g}, the actions that the loop sends a second, found "
+                f"{limits.hz:g}. Make the limits with hz={self.hz:g}."
+            )
         self.chunk_shape = (meta["horizon"], meta["action_dim"])
         self.views = tuple(meta["streams"]["views"]) if meta["uses_features"] else ()
         timing = LoopTiming(
@@ -252,11 +288,12 @@ class _Run:
         self.loop = ControlLoop(timing, meta["uses_features"])
         self.asker = Asker(policy.infer, settings.fifo_priority - 1)
         self.watchdog = Watchdog(robot.stop, max(settings.hung_s, 2.5 / self.hz))
-        streams = {name: (meta["streams"].get(name) or {}).get("names", ()) for name in _STREAMS}
+        self.looks_at = set(meta["looks_at"]) - {"features"}
         self.pending = {
-            name: PendingReadings(max(4 * meta[f"{name}_window"], 64), len(names))
-            for name, names in streams.items()
-            if names
+            name: PendingReadings(
+                max(4 * meta[f"{name}_window"], 64), len(meta["streams"][name]["names"])
+            )
+            for name in sorted(self.looks_at | (limits.streams if limits else set()))
         }
         self.watched = tuple(self.pending) if settings.watch is None else settings.watch
         self.clock = RobotClock(settings.clock_offset_s, settings.clock_drift_s)
@@ -265,7 +302,8 @@ class _Run:
         self.actions = Ring(settings.kept_ticks, 2 + meta["action_dim"])
         self.missed = Ring(_MISSED_KEPT, 4)
         self.row, self.answer_row = np.zeros(len(TICK_PARTS) + 1), np.zeros(len(ANSWER_PARTS))
-        self.doing, self.since, self.in_a_row, self.left_out = LATE, 0.0, 0, 0
+        self.doing, self.since, self.in_a_row, self.left_out, self.busy = LATE, 0.0, 0, 0, 0
+        self.untold: tuple[Mapping[str, Any], NDArray[np.float64] | None] | None = None
         self.new_episode()
 
     def go(self) -> None:
@@ -275,14 +313,14 @@ class _Run:
         while True:
             deadline = start + tick * period
             _wait(deadline, self.settings.spin_s)
-            self.row[:] = 0
+            self.row[:] = math.nan
             self.doing, self.since = LATE, deadline
             if self.settings.seconds is not None and tick >= self.settings.seconds * self.hz:
                 raise SafeStop(StopKind.TIME, f"{self.settings.seconds:g} s are over")
             self.tick(tick)
             self.mark(LATE)
             ended = self.since
-            self.row[-1] = self.row[1:-1].sum()
+            self.row[-1] = np.nansum(self.row[1:-1])
             self.tick_timings.note(1000 * self.row)
             following = tick + 1
             if ended > deadline + period:
@@ -310,21 +348,28 @@ class _Run:
         self.mark(PLAN)
         action = self.decide()
         self.watchdog.check()
-        self.mark(ACT)
         if action is not None:
+            self.mark(ACT)
+            self.untold = observed, action
             self.robot.act(action)
             self.actions.note((tick, self.now_s, *action))
-        self.mark(RECORD)
-        if self.recorder is not None:
-            self.recorder.tick(observed, action)
+        self.record()
         self.watchdog.beat()
         self.watchdog.check()
 
     def mark(self, part: int) -> None:
         """What follows is this part: the one before it ends here."""
         now = time.monotonic()
-        self.row[self.doing] += now - self.since
+        before = self.row[self.doing]
+        self.row[self.doing] = now - self.since + (0 if math.isnan(before) else before)
         self.doing, self.since = part, now
+
+    def record(self) -> None:
+        """Tell the recorder of this tick, once: at its end, or where it has stopped the robot."""
+        told, self.untold = self.untold, None
+        if self.recorder is not None and told is not None:
+            self.mark(RECORD)
+            self.recorder.tick(*told)
 
     def new_episode(self) -> None:
         """Forget all of the last one; an answer that is still to come is of the last one, too."""
@@ -341,6 +386,7 @@ class _Run:
     def check(self, observed: Mapping[str, Any]) -> None:
         """Take the readings. Raises `SafeStop` for what is no longer good of them."""
         self.now_s = float(observed["time"][0])
+        self.untold = observed, None
         self.clock.check(self.now_s)
         latest = self.now_s + self.settings.clock_drift_s
         for name, pending in self.pending.items():
@@ -357,7 +403,14 @@ class _Run:
 
     def take_answer(self) -> None:
         """Plan what was answered, where an answer has come."""
-        answer = self.asker.take()
+        try:
+            answer = self.asker.take()
+        except ServerBusy:
+            answer = None
+            self.busy += 1
+            if not self.asker.stale:
+                self.loop.refused()
+            self.asker.stale = False
         first_s = self.settings.first_answer_s
         if answer is None:
             if not self.loop.executor.planned and time.monotonic() - self.begun_s > first_s:
@@ -400,7 +453,7 @@ class _Run:
         # A frame may have come since the robot was observed.
         self.asked_s = max(self.asked_s, self.now_s, self.frames_s)
         for name, pending in self.pending.items():
-            if pending.count:
+            if pending.count and name in self.looks_at:
                 question[name], question[f"{name}_time"] = pending.hand_over()
                 self.asked_s = max(self.asked_s, float(question[f"{name}_time"][-1]))
         question["time"] = np.array([self.asked_s])
@@ -435,7 +488,7 @@ class _Run:
         if action is None:
             return None
         age_s = self.now_s - self.features_s if self.views else 0.0
-        if age_s > self.settings.old_features_s:
+        if not age_s <= self.settings.old_features_s:
             raise SafeStop(StopKind.OLD_FEATURES, f"the newest features are {age_s:.2f} s old")
         if self.limits is None:
             return action
@@ -446,7 +499,7 @@ class _Run:
 
     def note_missed(self, tick: int, late_s: float, left_out: int) -> None:
         """Raises `SafeStop` where too many are left out in a row of a robot that moves."""
-        part = int(self.row[:-1].argmax())
+        part = int(np.nanargmax(self.row[:-1]))
         self.missed.note((tick, 1000 * late_s, part, left_out))
         self.left_out += left_out
         self.in_a_row += left_out
@@ -459,24 +512,28 @@ class _Run:
     def blame(self, error: Exception) -> tuple[StopKind, str]:
         """Whose error it is, by what was being done."""
         said = f"{type(error).__name__}: {error}"
+        if self.doing == CHECK:
+            self.untold = None  # What cannot be checked cannot be recorded, either.
         if self.doing in _BLAMED:
             return StopKind.ROBOT, f"the robot's {_BLAMED[self.doing]} failed: {said}"
         kind = StopKind.RECORDER if self.doing == RECORD else StopKind.LOOP
         return kind, f"{kind.value}: {said}"
 
-    def timings(self) -> dict[str, Any]:
-        """Milliseconds of ticks and of answers."""
-        return {
-            "tick_ms": self.tick_timings.document(),
-            "answer_ms": self.answer_timings.document(),
-        }
+    def close(self) -> str:
+        """Record the tick that stopped the robot, end the threads; the traceback of what failed.
 
-    def close(self) -> None:
-        """End its threads; the policy may finish an answer that nobody waits for."""
+        The policy may finish an answer that nobody waits for.
+        """
+        failed = ""
+        try:
+            self.record()
+        except Exception:
+            failed = f"the last tick is not recorded: {traceback.format_exc()}"
         self.watchdog.close()
         self.asker.close()
+        return self.watchdog.failed + failed
 
-    def report(self, kind: StopKind, reason: str, recording: Path | None, trace: str) -> RunReport:
+    def report(self, kind: StopKind, reason: str, trace: str) -> RunReport:
         """What is told of it."""
         return RunReport(
             kind=kind,
@@ -490,18 +547,16 @@ class _Run:
             ),
             missed_ticks=self.missed.count,
             answers=self.answer_timings.ring.count,
-            dropped_readings=sum(pending.dropped for pending in self.pending.values()),
+            busy=self.busy,
+            dropped_readings=sum(self.pending[name].dropped for name in self.looks_at),
             clipped=self.limits.clipped if self.limits else 0,
             clock_offset_s=self.clock.offset_s,
             tick_timings=self.tick_timings,
             answer_timings=self.answer_timings,
             actions=self.actions.rows(),
-            recording=recording,
+            recording=None,
             traceback=trace,
         )
-
-
-_STREAMS = ("sensor", "state")
 
 
 def _wait(until_s: float, spin_s: float) -> None:
@@ -515,11 +570,14 @@ def _wait(until_s: float, spin_s: float) -> None:
 def _undisturbed(fifo_priority: int) -> Generator[None]:
     """This thread goes first, and no garbage is collected: the loop makes none that needs it."""
     switch_s, collects = sys.getswitchinterval(), gc.isenabled()
-    scheduled = os.sched_getscheduler(0), os.sched_getparam(0)
+    if fifo_priority not in (0, *range(2, 100)):
+        raise ConfigError(f"fifo_priority: expected 0, or 2 to 99, found {fifo_priority}")
+    scheduled: tuple[Any, ...] = ()
     if fifo_priority:
         try:
+            scheduled = os.sched_getscheduler(0), os.sched_getparam(0)
             go_first(fifo_priority)
-        except OSError as error:
+        except (OSError, AttributeError) as error:
             raise ConfigError(
                 f"fifo_priority: this machine does not grant priority {fifo_priority} ({error}). "
                 "Allow it (rtprio in /etc/security/limits.conf), or set it to 0."
@@ -537,3 +595,32 @@ def _undisturbed(fifo_priority: int) -> Generator[None]:
             gc.enable()
         if fifo_priority:
             os.sched_setscheduler(0, *scheduled)
+
+
+@contextmanager
+def _ended_by_hand() -> Generator[Callable[[], None]]:
+    """The first signal to end the process raises `KeyboardInterrupt`, and later ones do nothing; nor
+    does any once what is yielded was called. On the main thread alone: no other sets handlers."""
+    numbers = [getattr(signal, name) for name in _BY_HAND if hasattr(signal, name)]
+    if threading.current_thread() is not threading.main_thread():
+        numbers = []
+    # What the process passes over, as under nohup, it goes on to.
+    before = {n: now for n in numbers if (now := signal.getsignal(n)) not in (signal.SIG_IGN, None)}
+
+    def deaf() -> None:
+        for number in before:
+            signal.signal(number, lambda *_: None)
+
+    def end(number: int, _: object) -> NoReturn:
+        deaf()
+        raise KeyboardInterrupt(
+            "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
+        )
+
+    try:
+        for number in before:
+            signal.signal(number, end)
+        yield deaf
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -257,6 +257,7 @@ class Policy:
             "action_hz": 50.0,
             "vlm_reuse_count": 3,
             "uses_features": True,
+            "looks_at": ["features", "state"],
             "feature_spec": {"digest": "d"},
             "feature_spec_digest": "d",
             "state_window": 5,

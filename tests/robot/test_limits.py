@@ -51,6 +51,12 @@ def moved(*values: float) -> np.ndarray:
     return np.array([*values, *[0.0] * (6 - len(values)), 1.0])
 
 
+def test_limits_say_whose_readings_they_need() -> None:
+    assert limits(force={"most": {SENSOR.names[0]: 1.0}}).streams == {"sensor"}
+    assert limits(step={"most": {"dx": 1.0}}).streams == set()
+    assert limits(JOINTS, step={"most": {"a": 1.0}}).streams == {"state"}
+
+
 def test_what_is_within_its_limits_is_sent_as_it_is() -> None:
     own = limits(step={"most": {"translation": 1.0}}, speed={"most": {"dz": 5.0}})
     action = moved(0.6, 0.6, 0.4)

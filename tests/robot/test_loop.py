@@ -64,6 +64,33 @@ def test_a_policy_without_features_needs_no_frames() -> None:
     assert not loop.frames_due and loop.chunk_due
 
 
+def test_what_was_refused_is_asked_again_with_frames() -> None:
+    loop = make_loop()
+    loop.begin_tick()
+    loop.pass_began()
+    loop.ask()
+    loop.begin_tick()
+    loop.refused()
+    assert loop.frames_due and loop.chunk_due
+
+
+def test_a_refusal_leaves_a_pass_of_an_earlier_question_alone() -> None:
+    loop = make_loop()
+    loop.begin_tick()
+    loop.pass_began()
+    loop.ask()
+    loop.plan(chunk_of(0))
+    for _ in range(3):
+        loop.action()
+        loop.begin_tick()
+        assert loop.chunk_due
+        loop.ask()
+        loop.refused()
+    assert not loop.frames_due, "the pass is still under way"
+    loop.pass_ended()
+    assert loop.frames_due
+
+
 def test_a_robot_stands_still_until_its_first_chunk_is_there() -> None:
     log = run(make_loop(), 6, latency=3)
     assert [asked for _, asked, _ in log] == [False] * 3 + [True] * 3

@@ -3,6 +3,7 @@
 import gc
 import json
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -17,7 +18,7 @@ import numpy as np
 import pytest
 
 from pipeline.base.config import LimitsFile
-from pipeline.base.errors import ConfigError, RecordingError
+from pipeline.base.errors import ConfigError, RecordingError, ServerBusy
 from pipeline.robot.limits import Limits
 from pipeline.robot.loop import StopKind
 from pipeline.robot.realtime import RunReport, RunSettings, run_robot
@@ -36,6 +37,7 @@ META: dict[str, Any] = {
     "action_dim": 2,
     "moving": [True, True],
     "uses_features": True,
+    "looks_at": ["features", "sensor", "state"],
     "sensor_window": 16,
     "state_window": 16,
 }
@@ -190,10 +192,10 @@ def test_a_frame_that_came_after_the_readings_is_not_of_the_future() -> None:
 
 
 def test_the_policy_is_never_waited_for() -> None:
-    arm = Arm()
+    arm = Arm(after(40, put("ended", "enough")))
     brain = Brain(lambda n, answer: time.sleep(0.1), action_hz=50.0)
-    report = run_robot(arm, brain, replace(CALM, seconds=1.0))
-    assert report.answers < 11 and report.ticks > 40
+    report = run_robot(arm, brain, replace(CALM, seconds=20))
+    assert report.ticks == 40 and 0 < 2 * report.answers < report.ticks
     assert report.answer_timings.document()["answer"]["p50"] > 99
 
 
@@ -210,15 +212,20 @@ def test_a_new_episode_begins_with_nothing_and_no_answer_of_the_last_one() -> No
     """The answer that is under way when tick 20 begins a new episode would move by 5."""
 
     def answers(n: int, answer: Observed) -> None:
-        if arm.ticks <= 20:
-            time.sleep(0.015)
-            if arm.ticks > 20:
-                answer["actions"][:] = 5.0
+        if n == 2:
+            spoiled.append(begun.wait(20))
+            answer["actions"][:] = 5.0
 
-    arm = Arm(spoil=lambda tick, observed: observed.update(reset=tick == 20))
-    brain = Brain(answers)
-    report = run_robot(arm, brain, CALM)
-    assert report.kind == StopKind.TIME
+    def begin(tick: int, observed: Observed) -> None:
+        observed["reset"] = tick == 20
+        observed["ended"] = "enough" if tick == 60 else None
+        if tick == 22:
+            begun.set()
+
+    begun, spoiled = threading.Event(), list[bool]()
+    arm, brain = Arm(begin), Brain(answers)
+    report = run_robot(arm, brain, replace(CALM, seconds=20))
+    assert (report.kind, spoiled) == (StopKind.ENDED, [True])
     resets = [n for n, asked in enumerate(brain.asked) if "reset" in asked]
     assert len(resets) == 2 and resets[0] == 0 and "images/View1" in brain.asked[resets[1]]
     assert max(max(action) for action in arm.acts) < 1
@@ -229,10 +236,13 @@ def test_what_limits_cut_off_is_made_up_for() -> None:
         answer["actions"][:] = 0
         answer["actions"][:, 0] = [1.0, *[0.0] * (HORIZON - 1)]
 
-    arm = Arm()
+    def enough(tick: int, observed: Observed) -> None:
+        observed["ended"] = "enough" if len(arm.acts) >= 6 else None
+
+    arm = Arm(enough)
     brain = Brain(answers)
     step = limits(step={"most": {"dx": 0.25}, "on_exceed": "clip"})
-    report = run_robot(arm, brain, replace(CALM, execute=HORIZON, seconds=0.1), step)
+    report = run_robot(arm, brain, replace(CALM, execute=HORIZON, seconds=20), step)
     # The chunk's first step leads 1 mm ahead; the later ones stay there.
     assert [action[0] for action in arm.acts[:6]] in ([0.25] * 4 + [0] * 2, [0.25] * 6)
     assert report.clipped >= 3
@@ -258,6 +268,36 @@ def test_features_that_stay_old_stop_the_robot() -> None:
     stopped(Arm(), StopKind.OLD_FEATURES, "newest features", brain, old_features_s=0.2)
 
 
+def test_features_of_no_age_stop_the_robot() -> None:
+    brain = Brain(lambda n, answer: answer.update(feature_age_s=np.nan))
+    stopped(Arm(), StopKind.OLD_FEATURES, "nan s old", brain)
+
+
+def test_a_busy_server_is_asked_again_with_its_frames_and_the_readings_that_follow() -> None:
+    def busy(n: int, answer: Observed) -> None:
+        if n in (1, 8, 9):
+            raise ServerBusy("busy: 8 observations are waiting")
+
+    arm, brain = Arm(after(60, put("ended", "enough"))), Brain(busy)
+    report = run_robot(arm, brain, replace(CALM, seconds=20))
+    assert (report.kind, report.busy) == (StopKind.ENDED, 3) and arm.acts
+    assert report.document()["busy"] == 3
+    assert "images/View1" in brain.asked[0] and "images/View1" in brain.asked[1]
+    states = np.concatenate([asked["state"][:, 0] for asked in brain.asked])
+    np.testing.assert_array_equal(states, np.repeat(np.arange(len(states) / 2), 2))
+
+
+def test_a_server_that_stays_busy_stops_the_robot() -> None:
+    def busy(n: int, answer: Observed) -> None:
+        if n > since:
+            raise ServerBusy("busy: 8 observations are waiting")
+
+    since = 0
+    stopped(Arm(), StopKind.NO_CHUNK, "first chunk", Brain(busy), first_answer_s=0.1)
+    since = 5
+    stopped(Arm(), StopKind.NO_CHUNK, "used up", Brain(busy))
+
+
 def test_a_dead_camera_stops_the_robot() -> None:
     arm = Arm(sees=after(8, dict[str, Any].clear))
     stopped(arm, StopKind.CAMERA, "View1: the robot gives no frame")
@@ -280,6 +320,33 @@ def test_a_stream_that_stalls_stops_the_robot_unless_nobody_watches(stream: str)
     stopped(Arm(after(9, stall)), StopKind.STALLED, f"{stream}: no new reading", stalled_s=0.15)
     unwatched = replace(CALM, stalled_s=0.15, watch=())
     assert run_robot(Arm(after(9, stall)), Brain(), unwatched).kind == StopKind.TIME
+
+
+def without_sensor(observed: Observed) -> None:
+    observed["sensor_time"] = observed["sensor"] = []
+
+
+def test_a_stream_that_the_policy_does_not_look_at_is_neither_sent_nor_watched() -> None:
+    brain = Brain(looks_at=["features", "state"])
+    calm = replace(CALM, stalled_s=0.15)
+    assert run_robot(Arm(after(9, without_sensor)), brain, calm).kind == StopKind.TIME
+    assert all("sensor" not in asked and "state" in asked for asked in brain.asked)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "kind"),
+    [
+        (without_sensor, StopKind.STALLED),
+        (put("sensor", np.array([[np.nan]], np.float32)), StopKind.NOT_A_NUMBER),
+    ],
+)
+def test_a_stream_that_limits_are_of_is_watched_whatever_the_policy_looks_at(
+    spoil: Callable[[Observed], Any], kind: StopKind
+) -> None:
+    brain = Brain(looks_at=["features", "state"])
+    force = limits(force={"most": {"force": 2.5}})
+    report = stopped(Arm(after(9, spoil)), kind, "sensor", brain, limits=force, stalled_s=0.15)
+    assert report.dropped_readings == 0 and all("sensor" not in asked for asked in brain.asked)
 
 
 def test_readings_that_keep_their_time_have_stalled() -> None:
@@ -381,8 +448,8 @@ def test_one_slow_tick_is_counted_and_told_with_the_part_that_took_the_time() ->
 
 
 def test_too_many_slow_ticks_stop_the_robot() -> None:
-    arm = Arm(moves=lambda tick: time.sleep(0.012) if tick >= 5 else None)
-    stopped(arm, StopKind.MISSED, "'act'", missed_in_a_row=8)
+    arm = Arm(moves=lambda tick: time.sleep(0.05) if tick >= 5 else None)
+    stopped(arm, StopKind.MISSED, "'act'", missed_in_a_row=60)
 
 
 def test_a_policy_that_fails_stops_the_robot() -> None:
@@ -428,6 +495,93 @@ def test_ctrl_c_stops_the_robot() -> None:
     stopped(Arm(moves=interrupt), StopKind.BY_HAND, "Ctrl-C")
 
 
+ENDINGS = [
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
+]
+
+
+@pytest.mark.parametrize("number", ENDINGS)
+def test_a_signal_stops_the_robot_and_none_breaks_off_the_stop(number: int) -> None:
+    class Interrupted(Arm):
+        def stop(self, reason: str) -> None:
+            for each in ENDINGS:
+                os.kill(os.getpid(), each)
+                time.sleep(0.001)
+            super().stop(reason)
+
+    def end(tick: int) -> None:
+        if tick == 7:
+            os.kill(os.getpid(), number)
+
+    # If it fails, then not by ending the tests.
+    kept = {each: signal.signal(each, signal.default_int_handler) for each in ENDINGS}
+    try:
+        name = "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
+        arm, notes = Interrupted(moves=end), Notes()
+        stopped(arm, StopKind.BY_HAND, f"stopped by hand ({name})", recorder=notes)
+        assert len(arm.stops) == 1 and notes.reason
+        assert all(signal.getsignal(each) is signal.default_int_handler for each in ENDINGS)
+    finally:
+        for each, handler in kept.items():
+            signal.signal(each, handler)
+
+
+def test_a_signal_that_the_process_passes_over_does_not_end_the_run() -> None:
+    kept = signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    try:
+        arm = Arm(moves=lambda tick: os.kill(os.getpid(), signal.SIGTERM))
+        assert run_robot(arm, Brain(), replace(CALM, seconds=0.05)).kind == StopKind.TIME
+    finally:
+        signal.signal(signal.SIGTERM, kept)
+
+
+def test_a_run_on_another_thread_leaves_signals_alone() -> None:
+    reports = list[RunReport]()
+    short = replace(CALM, seconds=0.05)
+    running = threading.Thread(target=lambda: reports.append(run_robot(Arm(), Brain(), short)))
+    running.start()
+    running.join(30)
+    assert [report.kind for report in reports] == [StopKind.TIME]
+
+
+class Stubborn(Arm):
+    """Its `stop` fails so often."""
+
+    fails = 1
+
+    def stop(self, reason: str) -> None:
+        super().stop(reason)
+        if len(self.stops) <= self.fails:
+            raise ConnectionError("bus off")
+
+
+@pytest.mark.parametrize("fails", [1, 99])
+def test_a_stop_that_fails_is_tried_again_and_hides_nothing(fails: int) -> None:
+    def fail(tick: int, observed: Observed) -> None:
+        if tick == 6:
+            raise RuntimeError("bus error")
+
+    arm, notes = Stubborn(fail), Notes()
+    arm.fails = fails
+    report = stopped(arm, StopKind.ROBOT, "bus error", recorder=notes)
+    assert len(arm.stops) == 2 and notes.reason == report.reason
+    assert report.recording == Path("recording")
+    assert report.traceback.count("robot.stop failed: Traceback") == min(fails, 2)
+    assert "policy" not in {thread.name for thread in threading.enumerate()}
+
+
+def test_a_watchdog_whose_stop_fails_tries_again_and_tells() -> None:
+    class Blocking(Stubborn):
+        def stop(self, reason: str) -> None:
+            super().stop(reason)
+            told.set()
+
+    told = threading.Event()
+    arm = Blocking(moves=lambda tick: told.wait(10) if tick == 7 else None)
+    report = stopped(arm, StopKind.HUNG, "no tick has ended for 0.5 s", hung_s=0.5)
+    assert len(arm.stops) == 3 and "robot.stop failed: Traceback" in report.traceback
+
+
 def test_the_robot_is_stopped_whatever_ends_the_process() -> None:
     def leave(tick: int) -> None:
         sys.exit(3)
@@ -448,7 +602,7 @@ def test_a_loop_that_hangs_is_stopped_by_the_watchdog() -> None:
             told.set()
 
     arm = Blocking(moves=lambda tick: told.wait(10) if tick == 7 else None)
-    stopped(arm, StopKind.HUNG, "no tick has ended for 0.1 s", hung_s=0.1)
+    stopped(arm, StopKind.HUNG, "no tick has ended for 0.5 s", hung_s=0.5)
     assert len(arm.stops) == 2 and len(arm.acts) == 8
 
 
@@ -498,7 +652,87 @@ def test_a_recording_that_cannot_be_finished_hides_no_reason() -> None:
 
     report = run_robot(Arm(), Brain(), replace(CALM, seconds=0.05), recorder=Empty())
     assert (report.kind, report.recording) == (StopKind.TIME, None)
-    assert report.traceback == "no recording: no action was sent"
+    assert report.traceback == "no recording: RecordingError: no action was sent"
+
+
+def test_whatever_keeps_a_recording_from_being_finished_is_told() -> None:
+    class Broken(Notes):
+        def finish(self, reason: str, timings: Mapping[str, Any]) -> Path:
+            raise ValueError("no such codec")
+
+    report = run_robot(Arm(), Brain(), replace(CALM, seconds=0.05), recorder=Broken())
+    assert (report.kind, report.recording) == (StopKind.TIME, None)
+    assert report.traceback == "no recording: ValueError: no such codec"
+
+
+class Diary(Notes):
+    """A recorder that keeps what it is told of ticks."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.ticks: list[tuple[Mapping[str, Any], Any]] = []
+
+    def tick(self, observed: Mapping[str, Any], action: Any) -> None:
+        self.ticks.append((observed, action))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "kind"),
+    [
+        ("sensor", np.array([[-3.0]], np.float32), StopKind.FORCE),
+        ("state", np.full((2, 2), np.nan, np.float32), StopKind.NOT_A_NUMBER),
+        ("state", np.full((2, 2), 99, np.float32), StopKind.WORKSPACE),
+        ("time", np.array([0.0]), StopKind.CLOCK),
+    ],
+)
+def test_the_tick_that_stops_the_robot_is_recorded(name: str, value: Any, kind: StopKind) -> None:
+    diary = Diary()
+    bounds = limits(force={"most": {"force": 2.5}}, workspace={"box": {"x": [-1, 50]}})
+    arm = Arm(after(9, put(name, value)))
+    stopped(arm, kind, "", recorder=diary, limits=bounds)
+    assert len(diary.ticks) == arm.ticks == 10
+    observed, action = diary.ticks[-1]
+    assert observed[name] is value and action is None
+
+
+def test_an_action_that_the_robot_failed_at_is_recorded() -> None:
+    def fail(tick: int) -> None:
+        if tick == 6:
+            raise RuntimeError("bus error")
+
+    arm, diary = Arm(moves=fail), Diary()
+    stopped(arm, StopKind.ROBOT, "act failed", recorder=diary)
+    assert len(diary.ticks) == arm.ticks
+    assert sum(action is not None for _, action in diary.ticks) == len(arm.acts) + 1
+
+
+def test_readings_of_another_shape_are_kept_from_the_recording() -> None:
+    arm, diary = Arm(after(9, put("state", np.zeros((2, 3), np.float32)))), Diary()
+    stopped(arm, StopKind.ROBOT, "state: expected (2, 2), found (2, 3)", recorder=diary)
+    assert len(diary.ticks) == 9
+    arm, diary = Arm(after(9, lambda observed: observed.pop("state"))), Diary()
+    stopped(arm, StopKind.LOOP, "KeyError: 'state'", recorder=diary)
+    assert len(diary.ticks) == 9
+
+
+def test_parts_that_did_not_happen_in_a_tick_are_not_counted() -> None:
+    arm, brain = Arm(), Brain(lambda n, answer: time.sleep(0.02))
+    report = run_robot(arm, brain, CALM)
+    told = report.tick_timings.document()
+    with_frames = sum("images/View1" in asked for asked in brain.asked)
+    counts = {part: told[part]["count"] for part in ("ask", "frames", "act", "observe", "tick")}
+    assert counts == {
+        "ask": len(brain.asked), "frames": with_frames, "act": len(arm.acts),
+        "observe": report.ticks, "tick": report.ticks,
+    }  # fmt: skip
+    assert "record" not in told and len(brain.asked) < report.ticks
+
+
+def test_limits_of_another_rate_are_refused_before_anything_is_asked() -> None:
+    arm = Arm()
+    with pytest.raises(ConfigError, match=r"hz=100, .* found 200"):
+        run_robot(arm, Brain(), replace(CALM, hz=100.0), limits(step={"most": {"dx": 1}}))
+    assert not arm.ticks and not arm.stops
 
 
 def test_settings_that_do_not_fit_the_policy_are_refused_before_anything_is_asked() -> None:
@@ -540,8 +774,22 @@ def test_the_loop_goes_before_other_threads_where_the_machine_grants_it() -> Non
     run_robot(arm, brain, first)
     assert seen == {(os.SCHED_FIFO, 2)} and asked == {(os.SCHED_FIFO, 1)}
     assert os.sched_getscheduler(0) == os.SCHED_OTHER
-    with pytest.raises(ConfigError, match="does not grant priority 1000"):
-        run_robot(arm, brain, replace(first, fifo_priority=1000))
+    with pytest.raises(ConfigError, match="expected 0, or 2 to 99, found 1"):
+        run_robot(arm, brain, replace(first, fifo_priority=1))
+
+
+@pytest.mark.parametrize("priority", [-1, 1, 100])
+def test_a_priority_that_the_policys_thread_cannot_go_below_is_refused(priority: int) -> None:
+    with pytest.raises(ConfigError, match=f"expected 0, or 2 to 99, found {priority}"):
+        run_robot(Arm(), Brain(), replace(CALM, fifo_priority=priority))
+
+
+def test_a_machine_without_a_scheduler_to_ask_runs_a_robot(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("sched_getscheduler", "sched_getparam", "sched_setscheduler"):
+        monkeypatch.delattr(os, name, raising=False)
+    assert run_robot(Arm(), Brain(), replace(CALM, seconds=0.05)).kind == StopKind.TIME
+    with pytest.raises(ConfigError, match="does not grant priority 2"):
+        run_robot(Arm(), Brain(), replace(CALM, fifo_priority=2))
 
 
 def test_a_thousand_ticks_more_need_no_more_memory() -> None:
@@ -565,12 +813,13 @@ def test_a_thousand_ticks_more_need_no_more_memory() -> None:
     arm = Arm(weigh)
     tracemalloc.start()
     try:
-        settings = replace(CALM, hz=1000.0, seconds=60, kept_ticks=100, execute=100)
-        report = run_robot(arm, Weighed(horizon=200), settings, limits(step={"most": {"dx": 1}}))
+        settings = replace(CALM, hz=500.0, seconds=60, kept_ticks=100, execute=50)
+        step = Limits(LimitsFile.model_validate({"step": {"most": {"dx": 1}}}), META, 500.0)
+        report = run_robot(arm, Weighed(horizon=300), settings, step)
     finally:
         tracemalloc.stop()
     assert report.reason == "weighed"
-    assert sizes[1500] - sizes[500] < 20_000
+    assert sizes[1500] - sizes[500] < 30_000
 
 
 def test_running_a_robot_needs_no_torch() -> None:
