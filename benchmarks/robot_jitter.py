@@ -126,6 +126,8 @@ def main() -> None:
     rates = [10.0] if options.quick else options.hz
     params, folder = load_params(options.params), Path(tempfile.mkdtemp(prefix="robot-jitter-"))
     courses: dict[str, Course] = {}
+    if options.results is not None:
+        options.results.mkdir(parents=True, exist_ok=True)  # before the hours that it waits for
     try:
         if options.checkpoint is None:
             params = untrained(params, folder, options.quick)
