@@ -5,6 +5,7 @@ from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
+from websockets import CloseCode
 from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
 from websockets.sync.client import ClientConnection, connect
 
@@ -38,6 +39,8 @@ class PolicyClient:
         trained on another robot than described.
         """
         self._url = url if "://" in url else f"ws://{url}"
+        if not self._url.startswith(("ws://", "wss://")):
+            raise ServerError(f"{url}: expected an address such as ws://127.0.0.1:8000")
         self._token, self._robot, self._timeout_s = token, robot or {}, timeout_s
         self._reset: bool | int | None = None
         self._connection: ClientConnection | None = None
@@ -127,6 +130,8 @@ class PolicyClient:
         except ConnectionClosed as error:
             self.close()
             why = (error.rcvd and error.rcvd.reason) or error
+            if error.rcvd and error.rcvd.code == CloseCode.MESSAGE_TOO_BIG:
+                why = f"{why}: send smaller images, or raise serve.max_message_mb"
             raise ServerError(
                 f"{self._url}: the connection is lost ({why}), and with it what the server "
                 "remembered. Stop the robot; then reconnect, which begins a new episode"

@@ -55,7 +55,9 @@ def read_token(params: ServeParams) -> str | None:
         token = token.strip()
         if not token or not token.isascii():
             place = TOKEN_VARIABLE if file is None else f"serve.token_file: {file}"
-            raise ConfigError(f"{place}: expected a token of ASCII characters, found none")
+            raise ConfigError(
+                f"{place}: expected a token of ASCII characters, found none; unset it to ask for none"
+            )
     elif not _is_loopback(params.host):
         raise ConfigError(
             f"serve.host: {params.host} can be reached by other machines, so a token is expected, "

@@ -29,16 +29,22 @@ def live_spec(vlm: VLMParams, views: Sequence[str]) -> FeatureSpec:
     return feature_spec(vlm, "float32", views, file_digest)
 
 
+_SHOWN = 8
+"""Entries of a feature spec that a message names."""
+
+
 def refuse_other_features(vlm: VLMParams, trained: Mapping[str, Any], live: FeatureSpec) -> None:
     """Raise `CheckpointMismatch` where features of the spec `trained` are not those of `live`.
 
     It names each entry that differs, as `live_differences` has it. No weight is needed for it.
     """
     if lines := live_differences(trained, live.document):
+        more = [f"… and {len(lines) - _SHOWN} more"] if len(lines) > _SHOWN else []
         raise CheckpointMismatch(
             f"{vlm.checkpoint}: the policy was trained on other features than this model "
-            "gives (trained -> live):\n  " + "\n  ".join(lines) + "\nLoad the model with the "
-            "vlm params and views of the policy's store, or train on this model's features."
+            "gives (trained -> live):\n  " + "\n  ".join([*lines[:_SHOWN], *more]) + "\nLoad the "
+            "model with the vlm params and views of the policy's store (slots follow from "
+            "vlm.layers, norms, pooling and grid), or train on this model's features."
         )
 
 
