@@ -58,9 +58,8 @@ class Limits:
         action = self._streams["action"]
         self._names = list(action["names"])
         self._absolute = ~np.asarray(metadata["moving"], np.bool_)
-        velocity = action["kind"] == "velocity"
-        self._per_tick = 1 / hz if velocity else 1.0
-        self._goes_on = ~self._absolute & velocity
+        self._goes_on = ~self._absolute & (action["kind"] == "velocity")
+        self._per_tick = np.where(self._goes_on, 1 / hz, 1.0)
         self._state_of = [self._place("state", name) for name in self._names]
         self.clipped = 0
         """Ticks in which less was sent than was wanted."""
@@ -85,11 +84,11 @@ class Limits:
     @classmethod
     def read(cls, path: Path, metadata: Mapping[str, Any], hz: float) -> "Limits":
         """Those of a YAML file. Raises `ConfigError` that names file and key."""
+        file = load_section(path, LimitsFile)
         try:
-            return cls(load_section(path, LimitsFile), metadata, hz)
+            return cls(file, metadata, hz)
         except ConfigError as error:
-            said = str(error)
-            raise ConfigError(said if said.startswith(str(path)) else f"{path}: {said}") from None
+            raise ConfigError(f"{path}: {error}") from None
 
     @property
     def streams(self) -> set[str]:
@@ -168,9 +167,8 @@ class Limits:
         groups = action_groups(self._names, action["units"])
         bounds: list[_Bound] = []
         for name, most in limit.most.items():
-            channels = [i for i, group in enumerate(groups) if group == name]
-            if name not in ("translation", "rotation"):
-                channels = [i for i, own in enumerate(self._names) if own == name]
+            among = groups if name in ("translation", "rotation") else self._names
+            channels = [i for i, own in enumerate(among) if own == name]
             where = f"{kind}.most.{name}"
             if not channels:
                 known = ["translation", "rotation", *self._names]

@@ -142,8 +142,8 @@ class ObservationReader:
             if (np.diff(line) < 0).any():
                 ended = f" from {after} s, where the last ended," if name in before else ""
                 raise ObservationError(
-                    f"{self._clocks.get(name, name)}: expected times{ended} "
-                    f"to {now_s} s, the observation's own, found {own[0]} to "
+                    f"{self._clocks.get(name, name)}: expected times{ended} to "
+                    f"{now_s} s, the observation's own, found {own[0]} to "
                     f"{own[-1]}. Send each reading once, in order and on one clock, and reset "
                     "where a new episode begins"
                 )
