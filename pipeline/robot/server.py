@@ -56,7 +56,8 @@ def read_token(params: ServeParams) -> str | None:
         if not token or not token.isascii():
             place = TOKEN_VARIABLE if file is None else f"serve.token_file: {file}"
             raise ConfigError(
-                f"{place}: expected a token of ASCII characters, found none; unset it to ask for none"
+                f"{place}: expected a token of ASCII characters, found none. Unset it to ask for "
+                "none"
             )
     elif not _is_loopback(params.host):
         raise ConfigError(
