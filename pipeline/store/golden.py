@@ -80,7 +80,7 @@ def carried_golden(
         check_metadata(root)
     except StoreIncomplete:
         return
-    attributes = zarr.open_group(root, mode="r").attrs.asdict()
+    attributes: dict[str, Any] = zarr.open_group(root, mode="r").attrs.asdict()
     for number in range(len(attributes.get(GOLDEN, []))):
         with suppress(StoreIncomplete):
             golden = _unproven(root, attributes, number)
