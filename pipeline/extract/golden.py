@@ -1,36 +1,63 @@
-"""Which rows of a build become golden rows, and their frames decoded once more."""
+"""Which rows of a build become golden rows, and their frames: of the store before, or decoded."""
 
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.base.golden import spread
-from pipeline.extract.engine import row_frames
-from pipeline.extract.plan import Say
+from pipeline.extract.engine import RowFrames, row_frames
+from pipeline.extract.plan import Say, StorePlaces
 from pipeline.extract.survey import Survey
 from pipeline.store import GoldenFrames, StoreBuild
+from pipeline.store.golden import carried_golden
+from pipeline.store.schema import KEYS
 from pipeline.vlm.preparation import Preparer
 
 
-def keep_golden(build: StoreBuild, surveyed: Survey, say: Say) -> None:
+def keep_golden(build: StoreBuild, surveyed: Survey, places: StorePlaces, say: Say) -> None:
     """Write the golden rows of a build whose rows are all there: at most four, evenly spread.
 
-    Where the decoder of today gives other pixels than a row was computed from, that row is left out
-    and `say` told. Raises `RecordingError` where a recording has gone, and `DiskFull`.
+    Those that the store before has are taken from it, the others are decoded. Where the decoder of
+    today gives other pixels than a row was computed from, that row is left out, `say` told, and
+    another that the store before has stands in for it. Raises `RecordingError` where a recording
+    has gone, and `DiskFull`.
     """
-    if left_out := build.write_golden(_golden_frames(build, surveyed)):
+    frames = row_frames(build, surveyed)
+    views = np.isfinite(frames.frame_time).sum(axis=1)
+    chosen = spread(np.arange(len(views)), views)
+    carried = _carried(build, surveyed, places)
+    taken = [carried.pop(row) for row in chosen.tolist() if row in carried]
+    wanted = np.setdiff1d(chosen, [golden.row for golden in taken])
+    others = list(carried.values())
+    if left_out := build.write_golden([*taken, *_decoded(frames, wanted, surveyed)], others):
+        stand_in = min(left_out, len(others))
         say(
             f"{left_out} golden row(s) left out: decoded today, their frames are other pixels than "
             "those that the stored features were computed from (stages.verify --reextract tells "
-            "how far the features are apart)"
+            f"how far the features are apart); {stand_in} of the store before stand in for them"
         )
 
 
-def _golden_frames(build: StoreBuild, surveyed: Survey) -> Iterator[GoldenFrames]:
-    frames = row_frames(build, surveyed)
-    views = np.isfinite(frames.frame_time).sum(axis=1)
+def _carried(build: StoreBuild, surveyed: Survey, places: StorePlaces) -> dict[int, GoldenFrames]:
+    """By row, what the store before, and the one before it, have: they prove themselves.
+
+    Of one under repair as well: what is damaged does not prove itself.
+    """
+    keys = build.files(KEYS).read(0, build.specs[KEYS].shape[0])
+    stores = [] if places.finished is None else [places.target]
+    carried: dict[int, GoldenFrames] = {}
+    for store in [*stores, *places.kept]:
+        for golden in carried_golden(store, surveyed.spec.attrs(), keys):
+            carried.setdefault(golden.row, golden)
+    return carried
+
+
+def _decoded(
+    frames: RowFrames, rows: NDArray[np.int64], surveyed: Survey
+) -> Iterator[GoldenFrames]:
     preparer = Preparer(surveyed.params.vlm, surveyed.spec)
-    for part in frames.ranges(spread(np.arange(len(views)), views)):
+    for part in frames.ranges(rows):
         prompt = preparer.render(part.recording.instruction, list(part.frames))
         for row, decoded in part.read():
             yield GoldenFrames(row, prompt, decoded)

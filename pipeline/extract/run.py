@@ -82,7 +82,7 @@ def _resume(
         if surveyed.params.extract.plan:
             return None
         report = fill(build, surveyed, row_sources(places.known, surveyed), digests, missing)
-        keep_golden(build, surveyed, say)
+        keep_golden(build, surveyed, places, say)
     places.put_in_place(build, surveyed, say)
     return report
 
@@ -119,7 +119,7 @@ def _begin(
         known = row_sources(places.known, surveyed)
         lay_out(build, checked, surveyed, known)
         report = fill(build, surveyed, known, digests, rows)
-        keep_golden(build, surveyed, say)
+        keep_golden(build, surveyed, places, say)
     places.put_in_place(build, surveyed, say)
     return report
 

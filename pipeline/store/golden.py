@@ -6,7 +6,8 @@ give the key of their row. A store of an earlier version has none.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,7 +21,7 @@ from pipeline.base.errors import StoreIncomplete
 from pipeline.base.golden import row_key
 from pipeline.base.issue import Issue
 from pipeline.store.chunks import read_rows
-from pipeline.store.metadata import note_metadata
+from pipeline.store.metadata import check_metadata, note_metadata
 from pipeline.store.repair_hints import mend
 from pipeline.store.schema import ArraySpec
 
@@ -67,6 +68,25 @@ def read_golden(
     """
     entries = enumerate(attributes.get(GOLDEN, []))
     return [_read(root, attributes, number, keys[entry["row"]]) for number, entry in entries]
+
+
+def carried_golden(
+    root: Path, spec: Mapping[str, Any], keys: NDArray[np.uint8]
+) -> Iterator[GoldenFrames]:
+    """The golden rows of a store that are rows of a build, whose spec and `keys` (row, 16) these
+    are; as the first row of that key. What is damaged is left out: the rest prove themselves.
+    """
+    try:
+        check_metadata(root)
+    except StoreIncomplete:
+        return
+    attributes: dict[str, Any] = zarr.open_group(root, mode="r").attrs.asdict()
+    for number in range(len(attributes.get(GOLDEN, []))):
+        with suppress(StoreIncomplete):
+            golden = _unproven(root, attributes, number)
+            same = keys == np.frombuffer(golden.key(spec), np.uint8)
+            for row in np.flatnonzero(same.all(axis=1))[:1].tolist():
+                yield replace(golden, row=row)
 
 
 def golden_issues(
@@ -120,6 +140,15 @@ def _read(
     root: Path, attributes: Mapping[str, Any], number: int, key: NDArray[np.uint8]
 ) -> GoldenFrames:
     """One golden row; `StoreIncomplete` where it cannot be read or does not give the key."""
+    golden = _unproven(root, attributes, number)
+    if golden.key(attributes["feature_spec"]) != key.tobytes():
+        why = f"golden frames and prompt of VL row {golden.row} do not give the key of that row"
+        raise StoreIncomplete(f"{root / GOLDEN / str(number)}: {why}. {mend(root)}")
+    return golden
+
+
+def _unproven(root: Path, attributes: Mapping[str, Any], number: int) -> GoldenFrames:
+    """One golden row; `StoreIncomplete` where it cannot be read."""
     entry, place = attributes[GOLDEN][number], root / GOLDEN / str(number)
     row, frames = entry["row"], dict[str, NDArray[np.uint8]]()
     for view in entry["views"]:
@@ -128,8 +157,4 @@ def _read(
         except (OSError, ValueError, RuntimeError, KeyError, TypeError) as error:
             why = f"golden frame of VL row {row} cannot be read ({error})"
             raise StoreIncomplete(f"{place / view}: {why}. {mend(root)}") from None
-    golden = GoldenFrames(row, entry["prompt"], frames)
-    if golden.key(attributes["feature_spec"]) != key.tobytes():
-        why = f"golden frames and prompt of VL row {row} do not give the key of that row"
-        raise StoreIncomplete(f"{place}: {why}. {mend(root)}")
-    return golden
+    return GoldenFrames(row, entry["prompt"], frames)

@@ -227,10 +227,13 @@ class StoreBuild:
         for run in runs:
             self.files(CHECKSUMS).write(int(rows[run[0]]), checksums[run])
 
-    def write_golden(self, rows: Iterable[GoldenFrames]) -> int:
+    def write_golden(
+        self, rows: Iterable[GoldenFrames], instead: Sequence[GoldenFrames] = ()
+    ) -> int:
         """Keep the golden rows that give the key of their row; returns how many do not.
 
-        For a build whose rows are all there. Raises `DiskFull`.
+        For each that does not, the next of `instead` is kept, which are proven. For a build whose
+        rows are all there. Raises `DiskFull`.
         """
         attributes: dict[str, Any] = zarr.open_group(self.part, mode="r").attrs.asdict()
         files = self.files(KEYS)
@@ -240,8 +243,10 @@ class StoreBuild:
             for golden in given
             if golden.key(attributes["feature_spec"]) == files.read(golden.row, 1).tobytes()
         ]
-        write_golden(self.part, proven)
-        return len(given) - len(proven)
+        left_out = len(given) - len(proven)
+        kept = [*proven, *instead[:left_out]]
+        write_golden(self.part, sorted(kept, key=lambda golden: golden.row))
+        return left_out
 
     def seal(self, *, keep: bool = False) -> None:
         """Check every row, write the trailers and put the store in its place.

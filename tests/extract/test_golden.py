@@ -14,6 +14,7 @@ from pipeline.extract import extract
 from pipeline.extract.repair import repair
 from pipeline.store import FeatureStore, StoreBuild
 from pipeline.store.golden import GOLDEN
+from pipeline.store.metadata import note_metadata
 from pipeline.store.verification import verify
 from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.qwen import FrozenVLM
@@ -33,6 +34,30 @@ def assert_golden(params: Params) -> FeatureStore:
     checked = verify(store.path, threads=1)
     assert checked.sound, checked.lines()
     return store
+
+
+def forget_golden(params: Params) -> None:
+    """The store is one of an earlier version."""
+    shutil.rmtree(params.extract.store / GOLDEN)
+    group = zarr.open_group(params.extract.store, mode="r+")
+    del group.attrs[GOLDEN]
+    note_metadata(params.extract.store)
+
+
+def decode_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Today's decoder gives other pixels than that of the store."""
+    real = Image.Image.convert
+    monkeypatch.setattr(
+        Image.Image,
+        "convert",
+        lambda *args, **kw: real(*args, **kw).point(lambda value: min(255, value + 8)),
+    )
+
+
+def golden_bytes(params: Params) -> dict[str, bytes]:
+    """Each file of the golden rows."""
+    root = params.extract.store / GOLDEN
+    return {str(p.relative_to(root)): p.read_bytes() for p in root.rglob("*") if p.is_file()}
 
 
 def without_model(*args: object, **kwargs: object) -> None:
@@ -59,9 +84,13 @@ class TestBuilds:
         assert len(files) == 1 + 4 + 8 * 2
         assert filecmp.cmpfiles(*places, [*map(str, files)], shallow=False)[0] == [*map(str, files)]
 
-    def test_of_rows_that_are_taken_over_those_four_alone_are_decoded(
-        self, params, changed, extracted, monkeypatch
+    @pytest.mark.parametrize("carried", [True, False])
+    def test_of_rows_that_are_taken_over_those_four_alone_are_decoded_and_only_once(
+        self, params, changed, extracted, monkeypatch, carried
     ):
+        """Where the store before has them, not even those."""
+        if not carried:
+            forget_golden(params)
         decoded: list[int] = []
         real = RowRange.read
 
@@ -74,12 +103,10 @@ class TestBuilds:
         report = extract(changed(extract={"sensor_dtype": "float16"}), quiet)
         assert report is not None and report.taken == report.rows
         store = assert_golden(params)
-        assert decoded == [entry["row"] for entry in store.attrs[GOLDEN]]
+        assert decoded == ([] if carried else [entry["row"] for entry in store.attrs[GOLDEN]])
 
     def test_an_earlier_stores_rows_get_theirs(self, params, changed, extracted):
-        shutil.rmtree(params.extract.store / GOLDEN)
-        group = zarr.open_group(params.extract.store, mode="r+")
-        del group.attrs[GOLDEN]
+        forget_golden(params)
         assert FeatureStore.open(params.extract.store).golden == ()
         extract(changed(extract={"sensor_dtype": "float16"}), quiet)
         assert_golden(params)
@@ -87,19 +114,66 @@ class TestBuilds:
     def test_pixels_that_are_decoded_otherwise_today_are_left_out_and_said(
         self, params, changed, extracted, monkeypatch
     ):
-        real = Image.Image.convert
-        monkeypatch.setattr(
-            Image.Image,
-            "convert",
-            lambda *args, **kw: real(*args, **kw).point(lambda value: min(255, value + 8)),
-        )
+        forget_golden(params)
+        decode_otherwise(monkeypatch)
         said: list[str] = []
         extract(changed(extract={"sensor_dtype": "float16"}), said.append)
-        assert any(line.startswith("4 golden row(s) left out: decoded today") for line in said)
+        (line,) = [line for line in said if line.startswith("4 golden row(s) left out: decoded")]
+        assert line.endswith("; 0 of the store before stand in for them")
         store = FeatureStore.open(params.extract.store)
         assert store.golden == ()
         assert store.attrs[GOLDEN] == []
         assert verify(store.path, threads=1).sound
+
+
+class TestStoreBefore:
+    """Its golden rows prove themselves, whatever today's decoder gives."""
+
+    def test_they_are_carried_where_the_decoder_gives_other_pixels(
+        self, params, changed, extracted, monkeypatch
+    ):
+        before = golden_bytes(params)
+        decode_otherwise(monkeypatch)
+        extract(changed(extract={"sensor_dtype": "float16"}), quiet)
+        assert_golden(params)
+        assert golden_bytes(params) == before
+
+    def test_they_are_carried_by_a_repair_but_for_those_that_are_damaged(
+        self, params, extracted, monkeypatch
+    ):
+        store = params.extract.store
+        before = FeatureStore.open(store).golden
+        (store / "golden/2/View1/c/0/0/0").write_bytes(b"rot")
+        repair(verify(store, threads=1), params, quiet)
+        decode_otherwise(monkeypatch)
+        monkeypatch.setattr(FrozenVLM, "load", without_model)
+        said: list[str] = []
+        extract(params, said.append)
+        assert any(line.startswith("1 golden row(s) left out: decoded today") for line in said)
+        after = FeatureStore.open(store).golden
+        assert [golden.key for golden in after] == [before[at].key for at in (0, 1, 3)]
+
+    def test_others_of_it_stand_in_for_what_is_left_out(
+        self, params, changed, extracted, monkeypatch
+    ):
+        """Another row is chosen than the store before has, and today does not prove itself."""
+        before = FeatureStore.open(params.extract.store)
+        rows, first = [entry["row"] for entry in before.attrs[GOLDEN]], before.golden[0]
+        monkeypatch.setattr("pipeline.extract.golden.spread", lambda *of: np.array([rows[0] + 1]))
+        decode_otherwise(monkeypatch)
+        said: list[str] = []
+        extract(changed(extract={"sensor_dtype": "float16"}), said.append)
+        assert any(line.endswith("; 1 of the store before stand in for them") for line in said)
+        store = FeatureStore.open(params.extract.store)
+        assert [entry["row"] for entry in store.attrs[GOLDEN]] == [rows[0]]
+        assert [golden.key for golden in store.golden] == [first.key]
+
+    def test_the_bytes_are_those_of_a_fresh_build(self, params, changed, extracted, tmp_path):
+        other = changed(extract={"store": str(tmp_path / "o.zarr"), "sensor_dtype": "float16"})
+        extract(other, quiet)
+        carried = changed(extract={"sensor_dtype": "float16"})
+        extract(carried, quiet)
+        assert golden_bytes(carried) == golden_bytes(other)
 
 
 class TestKills:

@@ -20,7 +20,7 @@ def store(tiny_store: Callable[..., Path], tmp_path: Path) -> FeatureStore:
 def write_run(root: Path, keys: np.ndarray, **spec: object) -> Path:
     (root / "features").mkdir(parents=True)
     np.savez(root / "features" / "episode_000000.npz", key=keys)
-    run = {"ticks": 9, "rows": 7, "dropped_images": 2, "reason": "time is up"}
+    run: dict[str, object] = {"ticks": 9, "rows": 7, "dropped_images": 2, "reason": "time is up"}
     run["metadata"] = {"feature_spec": spec}
     (root / "run.json").write_text(json.dumps(run))
     return root
