@@ -599,8 +599,8 @@ def _undisturbed(fifo_priority: int) -> Generator[None]:
 
 @contextmanager
 def _ended_by_hand() -> Generator[Callable[[], None]]:
-    """The first signal to end the process raises `KeyboardInterrupt`, and later ones do nothing; nor
-    does any once what is yielded was called. On the main thread alone: no other sets handlers."""
+    """The first signal to end the process raises `KeyboardInterrupt`, later ones do nothing. So do
+    all once what is yielded was called. On the main thread alone: others set no handlers."""
     numbers = [getattr(signal, name) for name in _BY_HAND if hasattr(signal, name)]
     if threading.current_thread() is not threading.main_thread():
         numbers = []

@@ -526,6 +526,18 @@ def test_a_signal_stops_the_robot_and_none_breaks_off_the_stop(number: int) -> N
             signal.signal(each, handler)
 
 
+def test_a_signal_that_comes_while_the_robot_is_stopped_breaks_nothing_off() -> None:
+    class Interrupted(Arm):
+        def stop(self, reason: str) -> None:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.001)
+            super().stop(reason)
+
+    arm, notes = Interrupted(after(5, put("ended", "enough"))), Notes()
+    stopped(arm, StopKind.ENDED, "enough", recorder=notes)
+    assert len(arm.stops) == 1 and notes.reason == "enough"
+
+
 def test_a_signal_that_the_process_passes_over_does_not_end_the_run() -> None:
     kept = signal.signal(signal.SIGTERM, signal.SIG_IGN)
     try:
