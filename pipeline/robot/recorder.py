@@ -52,7 +52,7 @@ class RunRecorder:
     ) -> None:
         """`metadata` is the policy's, `settings` those of the loop; both are kept, as JSON.
 
-        Raises `OSError` where the folder cannot be written, `DiskFull` where the disk is full.
+        Raises `RecordingError` where the folder cannot be made, `DiskFull` where the disk is full.
         """
         self._types = log_types(metadata)
         self._views = {view: i for i, view in enumerate(metadata["streams"]["views"])}

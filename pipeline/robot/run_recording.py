@@ -59,12 +59,20 @@ def log_types(metadata: Mapping[str, Any]) -> "dict[str, np.dtype[Any]]":
 
 
 def begin_part(folder: Path, document: Mapping[str, Any]) -> Path:
-    """A new folder `run_NNNNNN.part` in `folder`, numbered after all runs there."""
-    folder.mkdir(parents=True, exist_ok=True)
-    found = (re.match(r"run_(\d+)", path.name) for path in folder.iterdir())
-    number = max((int(match[1]) for match in found if match), default=-1) + 1
-    part = folder / f"run_{number:06d}.part"
-    (part / "frames").mkdir(parents=True)
+    """A new folder `run_NNNNNN.part` in `folder`, numbered after all runs there.
+
+    Raises `RecordingError` where it cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        found = (re.match(r"run_(\d+)", path.name) for path in folder.iterdir())
+        number = max((int(match[1]) for match in found if match), default=-1) + 1
+        part = folder / f"run_{number:06d}.part"
+        (part / "frames").mkdir(parents=True)
+    except OSError as error:
+        raise RecordingError(
+            f"{folder}: runs cannot be recorded there: {error.strerror}. Name another folder"
+        ) from None
     write_document(part / RUN, document)
     return part
 

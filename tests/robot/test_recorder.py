@@ -393,3 +393,11 @@ def test_a_png_has_the_very_pixels(tmp_path: Path, shape: tuple[int, ...]) -> No
     with Image.open(file) as read:
         assert read.mode == "RGB"
         np.testing.assert_array_equal(np.asarray(read), image)
+
+
+def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("no folder")
+    with pytest.raises(
+        RecordingError, match=r"file/runs: runs cannot be recorded there: Not a dir"
+    ):
+        RunRecorder(tmp_path / "file" / "runs", metadata_of(), "touch")
