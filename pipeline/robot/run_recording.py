@@ -135,17 +135,21 @@ def _rows(logs: Mapping[str, Log]) -> Log:
 def _write_readings(
     root: Path, run: Mapping[str, Any], logs: Mapping[str, Log], start_s: float
 ) -> dict[str, int]:
-    """The sidecars of readings; how many were no numbers, which a reader would refuse."""
+    """The sidecars of readings; how many a reader would refuse: no numbers, or out of order."""
     left_out: dict[str, int] = {}
     for name in READINGS:
         if len(log := logs[name]):
-            bad = np.flatnonzero(non_finite(log["values"]).any(axis=1))
+            times = log["time"]
+            backwards = times < np.fmax.accumulate(times)  # a clock that stopped the robot
+            bad = np.flatnonzero(
+                non_finite(log["values"]).any(axis=1) | ~np.isfinite(times) | backwards
+            )
             left_out[name] = len(bad)
             kept = np.delete(log, bad) if len(bad) else log
             channels = run["metadata"]["streams"][name]
             told = {key: np.array(channels[key], str) for key in ("names", "units")}
-            times = kept["time"] - start_s
-            write_sidecar(root, name, timestamps=times, values=kept["values"], **told)
+            since = kept["time"] - start_s
+            write_sidecar(root, name, timestamps=since, values=kept["values"], **told)
     return left_out
 
 

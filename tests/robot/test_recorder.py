@@ -290,12 +290,15 @@ def test_readings_that_are_no_numbers_are_left_out_and_counted(tmp_path: Path) -
     state[1, 3], state[2, 0] = np.nan, np.inf
     times = {"state_time": 5 + np.arange(4) / 100}
     recorder.tick(observed_at(1, state=state, **times), np.zeros(7))
+    # What a clock that stops the robot brings last: of before, and of no time at all.
+    late = {"state": state[:2] * 0, "state_time": np.array([4.0, np.nan])}
+    recorder.tick(observed_at(2, **late), None)
     path = recorder.finish("safe stop: the state is not a number")
     found = opened(path).state()
     assert found is not None
     np.testing.assert_array_equal(found.values, state[[0, 3]])
     said = json.loads((path / "run.json").read_text())
-    assert said["readings_left_out"] == {"state": 2}
+    assert said["readings_left_out"] == {"state": 4}
 
 
 def test_images_that_find_no_room_are_dropped_and_counted(tmp_path: Path, monkeypatch) -> None:
