@@ -25,7 +25,7 @@ from pipeline.robot.chunking import Executor, check_chunking
 from pipeline.robot.features import LiveFeatures
 from pipeline.robot.guides import stack_guides
 from pipeline.robot.loop import ControlLoop, LoopTiming, SafeStop
-from pipeline.robot.memory import RobotMemory, SeenFeatures, WindowSize
+from pipeline.robot.memory import RobotMemory, SeenFeatures
 from pipeline.robot.proof import prove
 from pipeline.simulation.environment import InsertionEnvironment
 from pipeline.simulation.insertion import INSERTED, TICK_HZ, EpisodeTrace, NeedleInsertion
@@ -398,16 +398,13 @@ class _Driver:
 
     def _robot(self, environment: InsertionEnvironment, seed: int) -> _Robot:
         """The loop and the memory of a robot whose episode begins."""
-        params, shape, wanted = self.policy.params, self.policy.shape, self.wanted
+        params, wanted = self.policy.params, self.wanted
         source = self.checkpoint.source
         moving = moving_channels(source["streams"]["action"])
         timing = LoopTiming(
             source["vlm_reuse_count"], wanted.execute, wanted.chunking, params.horizon, moving
         )
-        memory = RobotMemory(
-            WindowSize(params.sensor_window, shape.sensor_channels, params.sensor_reach_s),
-            WindowSize(params.state_window, shape.state_dim, params.state_window_s),
-        )
+        memory = RobotMemory.of(self.policy)
         loop = ControlLoop(timing, uses_features=self.features is not None)
         return _Robot(environment, loop, memory, torch.Generator().manual_seed(seed))
 

@@ -2,12 +2,15 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.clock import CLOCK_SLACK_S
+
+if TYPE_CHECKING:
+    from pipeline.policy.policy import Policy
 
 
 @dataclass(frozen=True)
@@ -79,6 +82,15 @@ class RobotMemory:
         self._windows = {name: ReadingWindow(size) for name, size in sizes.items() if size.channels}
         self.features: SeenFeatures | None = None
         self.time_s = 0.0
+
+    @classmethod
+    def of(cls, policy: "Policy") -> "RobotMemory":
+        """That of a robot that this policy controls."""
+        params, shape = policy.params, policy.shape
+        return cls(
+            WindowSize(params.sensor_window, shape.sensor_channels, params.sensor_reach_s),
+            WindowSize(params.state_window, shape.state_dim, params.state_window_s),
+        )
 
     def sense(self, readings: Mapping[str, NDArray[Any]]) -> None:
         """Take what came since the last tick, and `time` (1,) now, in s.

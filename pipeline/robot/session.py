@@ -22,7 +22,7 @@ from pipeline.robot.chunking import PlanGuide
 from pipeline.robot.features import LiveFeatures
 from pipeline.robot.first_look import FirstLook
 from pipeline.robot.guides import stack_guides
-from pipeline.robot.memory import RobotMemory, SeenFeatures, WindowSize
+from pipeline.robot.memory import RobotMemory, SeenFeatures
 from pipeline.robot.observation import ObservationReader, RobotObservation
 from pipeline.robot.proof import prove
 
@@ -214,11 +214,7 @@ class Session:
         return answer
 
     def _begin_episode(self) -> None:
-        params, shape = self._served.policy.params, self._served.policy.shape
-        self._memory = RobotMemory(
-            WindowSize(params.sensor_window, shape.sensor_channels, params.sensor_reach_s),
-            WindowSize(params.state_window, shape.state_dim, params.state_window_s),
-        )
+        self._memory = RobotMemory.of(self._served.policy)
         # A pass of the episode before keeps a slot of its own, and is never asked for its answer.
         self._slot: Slot = deque(maxlen=1)
         self._under_way: Future[Seen] | None = None
