@@ -31,6 +31,18 @@ from jaxtyping import AbstractArray, install_import_hook
 ROOT = Path(__file__).resolve().parents[1]
 
 
+SCHEDULED = os.sched_getscheduler(0), os.sched_getparam(0)
+
+
+@pytest.fixture(autouse=True)
+def scheduled_as_before() -> Iterator[None]:
+    """libsvtav1 puts the thread that encodes before all other processes, where it has the right to
+    (SCHED_FIFO 99), for good: what that thread starts later then keeps all others waiting."""
+    os.sched_setscheduler(0, *SCHEDULED)
+    yield
+    os.sched_setscheduler(0, *SCHEDULED)
+
+
 def check_shapes(function: Callable[..., Any]) -> Callable[..., Any]:
     """The function, checking those of its annotations that name a shape; pyright has the rest."""
     shapes = {name: hint for name, hint in function.__annotations__.items() if names_shape(hint)}
