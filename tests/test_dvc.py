@@ -95,6 +95,7 @@ def test_what_is_judged_is_what_was_trained():
 
 
 def test_a_second_run_does_nothing(project):
+    assert project.stale() == {}  # says what changed, where something did
     assert "Data and pipelines are up to date." in project.dvc("repro")
 
 

@@ -95,7 +95,8 @@ def test_a_run_in_real_time_over_the_wire_is_recorded(
         recorder = RunRecorder(tmp_path, policy.metadata, INSTRUCTION, vars(settings))
         report = run_robot(robot, policy, settings, recorder=recorder)
     assert report.kind is StopKind.TIME, report.reason
-    assert report.ticks + report.left_out == 15 and report.answers > 0
+    assert report.ticks + report.left_out >= 15  # more where the last one held it up past the end
+    assert report.answers > 0
     assert report.recording == tmp_path / "run_000000"
     run = json.loads((report.recording / "run.json").read_text())
     sent = report.actions[:, 2:]
