@@ -31,7 +31,7 @@ from pipeline.evaluate.served_rollouts import roll_out_served
 from pipeline.look.page.writing import write_report
 from pipeline.look.rollout.page import rollout_report
 from pipeline.policy.checkpoint import find_policy, load_policy
-from pipeline.robot.client import PolicyClient
+from pipeline.robot.client import TOKEN_VARIABLE, PolicyClient
 from pipeline.robot.features import LiveFeatures
 
 
@@ -66,7 +66,7 @@ def _here(params: Params, say: Callable[[str], None]) -> Rollouts:
 def _served(wanted: RolloutParams, say: Callable[[str], None]) -> Rollouts:
     """Those of the policy that `rollout.server` serves."""
     assert wanted.server is not None
-    with PolicyClient(wanted.server, token=os.environ.get("VLA_SERVE_TOKEN")) as server:
+    with PolicyClient(wanted.server, token=os.environ.get(TOKEN_VARIABLE)) as server:
         told = server.metadata
         say(f"{wanted.server}: {told['checkpoint']} (step {told['step']}), level {wanted.level}")
         return roll_out_served(server, wanted, say)

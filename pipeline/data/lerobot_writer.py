@@ -60,17 +60,22 @@ def write_sidecar(root: Path, name: str, **members: NDArray[Any]) -> None:
     np.savez(root / name / f"{EPISODE}.npz", allow_pickle=False, **members)
 
 
-def _write_rows(
-    path: Path, columns: Mapping[str, NDArray[Any]], images: Mapping[str, Sequence[Path]]
-) -> None:
-    path.parent.mkdir(parents=True)
+def number_table(columns: Mapping[str, NDArray[Any]]) -> pa.Table:
+    """Columns (row,) and (row, channel) of numbers, as LeRobot records them."""
     arrays = {
         name: pa.array(values)
         if values.ndim == 1
         else pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
         for name, values in columns.items()
     }
-    table = pa.table(arrays)
+    return pa.table(arrays)
+
+
+def _write_rows(
+    path: Path, columns: Mapping[str, NDArray[Any]], images: Mapping[str, Sequence[Path]]
+) -> None:
+    path.parent.mkdir(parents=True)
+    table = number_table(columns)
     schema = pa.schema([*table.schema, *(pa.field(key, _IMAGE) for key in images)])
     changes = np.zeros(table.num_rows)
     for files in images.values():

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from contextlib import ExitStack
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from websockets import CloseCode
@@ -12,6 +12,9 @@ from websockets.sync.client import ClientConnection, connect
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import CheckpointMismatch, ObservationError, ServerBusy, ServerError
 from pipeline.robot import wire
+
+TOKEN_VARIABLE: Final = "VLA_SERVE_TOKEN"
+"""Of the environment: the token, where nothing else says it."""
 
 
 class PolicyClient:

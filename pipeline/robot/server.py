@@ -32,10 +32,10 @@ from websockets.http11 import Request, Response
 from pipeline.base.config import ServeParams
 from pipeline.base.errors import ConfigError, ObservationError, PipelineError, WireError
 from pipeline.robot import wire
+from pipeline.robot.client import TOKEN_VARIABLE
 from pipeline.robot.session import ServedPolicy, Session
 from pipeline.robot.status import ConnectedRobot, ServerStatus, page
 
-TOKEN_VARIABLE: Final = "VLA_SERVE_TOKEN"
 CLOSING_S: Final = 30.0
 """How long an observation under way may keep the server from closing."""
 _SHARED: Final = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}

@@ -11,11 +11,11 @@ from typing import Any, Final
 
 import av
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from pipeline.data.insertion import SENSOR, STATE
+from pipeline.data.lerobot_writer import number_table
 from pipeline.data.pickled import ACTION
 from pipeline.simulation.arm import euler_actions
 from pipeline.simulation.insertion import TICK_HZ, TICK_S
@@ -77,7 +77,9 @@ def _write_episode(
         "task_index": np.zeros(rows, np.int64),
     }
     place = {"episode_chunk": 0, "episode_index": index}
-    _write_parquet(root / _DATA.format(**place), columns)
+    data = root / _DATA.format(**place)
+    data.parent.mkdir(parents=True, exist_ok=True)
+    pq.write_table(number_table(columns), data)
     some: dict[str, NDArray[np.uint8]] = {}
     for view, key in _KEYS.items():
         frames = np.stack(list(episode.frames(view, time[:-1])))
@@ -93,17 +95,6 @@ def _write_episode(
         units=np.array(SENSOR.units),
     )
     return columns, some
-
-
-def _write_parquet(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    arrays = {
-        name: pa.array(values)
-        if values.ndim == 1
-        else pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
-        for name, values in columns.items()
-    }
-    pq.write_table(pa.table(arrays), path)
 
 
 def _write_video(path: Path, frames: NDArray[np.uint8]) -> None:

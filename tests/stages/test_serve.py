@@ -5,52 +5,19 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 
 from pipeline.robot.client import PolicyClient
-from pipeline.simulation.insertion_formats import write_raw
-from pipeline.simulation.recorder import simulate_episode
-from stages import extract, serve, train_head
+from stages import serve
 from stages.command import run
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
-@pytest.fixture(scope="module")
-def trained(
-    tmp_path_factory: pytest.TempPathFactory,
-    demo_checkpoint: Path,
-    tiny_head: Callable[..., dict[str, Any]],
-) -> Path:
-    """A params.yaml whose head is trained on two recordings of the phantom."""
-    folder = tmp_path_factory.mktemp("serve")
-    for seed in (5, 6):
-        write_raw(folder / "raw" / "task", simulate_episode(seed, 1.7e9 + 100 * seed))
-    document = {
-        "data": {"root": str(folder), "sources": [{"name": "raw", "path": "raw"}]},
-        "vlm": {
-            "checkpoint": str(demo_checkpoint),
-            "image_resize_height": 56,
-            "image_resize_width": 84,
-            "dtype": "float32",
-            "pooling": ["mean"],
-        },
-        "extract": {"store": str(folder / "store.zarr")},
-        "train_head": tiny_head(folder),
-        "serve": {"port": 0, "device": "cpu"},
-    }
-    path = folder / "params.yaml"
-    path.write_text(yaml.safe_dump(document))
-    for stage in (extract, train_head):
-        assert run("", stage.main, ["--params", str(path)]) == 0
-    return path
 
 
 @contextmanager
