@@ -176,7 +176,7 @@ def _recorded(paths: Sequence[str], wanted: int) -> Blocks:
     streams = [stream.values for one in opened.recordings if (stream := one.sensor()) is not None]
     width = max(values.shape[1] for values in streams)
     rows = np.concatenate([values for values in streams if values.shape[1] == width])
-    step = inner_rows(ArraySpec("recorded", rows.shape, rows.dtype, ("reading", "channel")))
+    step = inner_rows(ArraySpec("recorded", rows.shape, rows.dtype))
     starts = np.linspace(0, max(0, len(rows) - step), wanted).astype(int)
     return [rows[start : start + step] for start in np.unique(starts)]
 

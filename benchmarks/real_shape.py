@@ -9,7 +9,6 @@ from typing import Any
 import torch
 from transformers import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
 
-from pipeline.vlm.checkpoint_folder import read_json
 from pipeline.vlm.demo_checkpoint import write_demo_checkpoint
 
 _TOKENS = ("image_token_id", "video_token_id", "vision_start_token_id", "vision_end_token_id")
@@ -57,8 +56,8 @@ def write_shell(folder: Path) -> Qwen2_5_VLConfig:
     lie there: whoever loads them is told that they do not fit.
     """
     write_demo_checkpoint(folder)
-    demo = read_json(folder / "config.json")
-    config = real_config(**{name: demo[name] for name in _TOKENS})
+    demo = Qwen2_5_VLConfig.from_pretrained(folder, trust_remote_code=False)
+    config = real_config(**{name: getattr(demo, name) for name in _TOKENS})
     config.save_pretrained(folder)
     return config
 

@@ -1,11 +1,11 @@
 """How well a robot's loop keeps its deadlines while the model runs beside it.
 
 The simulated arm is run in real time at each rate: in one process with the policy, and in two, the
-policy behind `stages.serve`. Episode follows episode. Every tick is accounted for: the arm counts
-on its own how often it is observed, and when it was not, a tick must be counted as left out. Where
-the loop stops safely it begins again, and the stop is counted. Rates other than the policy's make
-the simulated world faster, not the policy: what it does there is not what it was trained for, but
-costs as much.
+policy behind `stages.serve`. Each episode is a run, and runs follow one another. Every tick of one
+is accounted for: the arm counts on its own how often it is observed, and when it was not, a tick
+must be counted as left out. Safe stops are counted. Rates other than the policy's make the
+simulated world faster, not the policy: what it does there is not what it was trained for, but costs
+as much.
 """
 
 import math
@@ -17,7 +17,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Callable, Generator, Mapping
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -125,12 +125,13 @@ class Course:
             self.answers.note(row)
         self.left_out += run.left_out
         self.missed_ticks += run.missed_ticks
-        self.missed += run.document()["missed"]
+        self.missed += map(asdict, run.missed)
         safe_stop = run.kind != StopKind.TIME
         unaccounted = robot.unaccounted(run.left_out, safe_stop)
         self.unaccounted = max(self.unaccounted, abs(unaccounted))
-        self.episodes.update(robot.outcomes)
-        if safe_stop:
+        if run.kind == StopKind.ENDED:
+            self.episodes[run.reason] += 1
+        elif safe_stop:
             self.stops[f"{run.kind.value}: {run.reason}"] += 1
 
     def document(self) -> dict[str, Any]:
@@ -161,7 +162,6 @@ def main() -> None:
     parser.add_argument("--params", type=Path, default=Path("params.yaml"))
     parser.add_argument("--checkpoint", type=Path, help="a trained policy; else an untrained one")
     parser.add_argument("--fifo", type=int, default=0, help="priority of the loop, from 2")
-    parser.add_argument("--spin-ms", type=float, default=RunSettings.spin_s * 1000)
     parser.add_argument("--results", type=Path, help="folder of the picture; else none is drawn")
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -180,10 +180,7 @@ def main() -> None:
             with (local if processes == 1 else remote)(params) as connect, first(options.fifo):
                 for hz in rates:
                     name = f"{processes} process{'es' if processes > 1 else ''}, {hz:g} Hz"
-                    settings = RunSettings(
-                        INSTRUCTION, hz=hz, fifo_priority=options.fifo,
-                        spin_s=options.spin_ms / 1000,
-                    )  # fmt: skip
+                    settings = RunSettings(INSTRUCTION, hz=hz, fifo_priority=options.fifo)
                     courses[name] = run(connect, settings, seconds)
                     tell(name, courses[name])
     finally:
@@ -194,7 +191,7 @@ def main() -> None:
     targets = [target for name, course in courses.items() for target in judged(name, course)]
     report(
         "robot_jitter",
-        settings={"seconds": seconds, "hz": rates, "fifo": options.fifo, "spin_ms": options.spin_ms,
+        settings={"seconds": seconds, "hz": rates, "fifo": options.fifo,
                   "checkpoint": "trained" if options.checkpoint else "untrained"},
         results={name: course.document() for name, course in courses.items()},
         ratios={},
@@ -204,17 +201,17 @@ def main() -> None:
 
 
 def run(connect: Callable[[], Decides], settings: RunSettings, seconds: float) -> Course:
-    """Run the arm for so many seconds; where it stops safely, begin again."""
+    """Run the arm for so many seconds, an episode a run."""
     hz = settings.hz or TICK_HZ
     course, seed = Course(hz), 0
     while (left := seconds - (course.ticks.ring.count + course.left_out) / hz) > 0.5 / hz:
         policy = connect()
         limits = world_limits(policy.metadata, hz)
-        with closing(CountedRobot(hz=hz, seed=seed, again=True)) as robot:
+        with closing(CountedRobot(hz=hz, seed=seed)) as robot:
             # Late ticks are what is to be measured; they stop nothing here.
             patient = replace(settings, seconds=left, missed_in_a_row=10**9)
             course.take(run_robot(robot, policy, patient, limits), robot)
-        seed += 1 + len(robot.outcomes)
+        seed += 1
     return course
 
 

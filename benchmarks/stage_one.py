@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from benchmarks.workload import Workload
 from pipeline.data.row_range import RowRange
 from pipeline.extract.encoder import Encoder
-from pipeline.extract.engine import ReadyRow, Row, RowEngine, RowPreparation, fill, in_background
+from pipeline.extract.engine import ReadyRow, Row, RowPreparation, fill, in_background
 from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.qwen import FrozenVLM
 
@@ -36,7 +36,7 @@ class StageOne:
     def run_every_frame(self) -> None:
         """Fill the store, computing anew what is shown again: no row or frame is spared."""
         with ExitStack() as stack:
-            stack.enter_context(patch.object(RowEngine, "prepare", prepare_all))
+            stack.enter_context(patch.object(RowPreparation, "prepare", prepare_all))
             stack.enter_context(patch("pipeline.vlm.collation.unique", _all))
             self.run()
 
@@ -58,12 +58,12 @@ class StageOne:
         return self._build.files("vl/features").read(0, len(self._workload.missing))[:, 0]
 
 
-_prepare = RowEngine.prepare
+_prepare = RowPreparation.prepare
 
 
-def prepare_all(engine: RowEngine, rows: RowRange, firsts: object) -> list[Row]:
+def prepare_all(preparation: RowPreparation, rows: RowRange, firsts: object) -> list[Row]:
     """Every row made ready, as if they all differed."""
-    return _prepare(engine, rows, None)
+    return _prepare(preparation, rows, None)
 
 
 def _all(images: Sequence[NDArray[np.uint8]]) -> tuple[Sequence[NDArray[np.uint8]], list[int]]:

@@ -55,7 +55,8 @@ def write_store(
     build.write("vl/slot_valid", 0, np.ones((sizes.vl_row, slots), np.uint8))
     for name in ("tick/action", "state/values", "sensor/values"):
         _write_random(build, name)
-    build.finish_layout(_attributes(channels, state_dim, reuse), {"slots": [{}] * slots})
+    attributes = _attributes(channels, state_dim, reuse, slots)
+    build.finish_layout(attributes, {"slots": attributes["slots"]})
     _commit_random(build)
     build.seal()
     return target
@@ -88,13 +89,15 @@ def _layout(
     }
 
 
-def _attributes(channels: int, state_dim: int, reuse: int) -> dict[str, object]:
+def _attributes(channels: int, state_dim: int, reuse: int, slots: int) -> dict[str, object]:
     def named(prefix: str, width: int) -> dict[str, list[str]]:
         return {"names": [f"{prefix}_{i}" for i in range(width)], "units": [""] * width}
 
+    named_slots = [{"layer": 0, "norm": True, "pooling": "mean"}] * slots
     return {
         "schema": SCHEMA,
-        "feature_spec": {"digest": "synthetic", "prompt": "{instruction}"},
+        "feature_spec": {"digest": "synthetic", "views": ["View1"], "slots": named_slots},
+        "slots": named_slots,
         "sources": ["synthetic"],
         "streams": {
             "action": {**named("action", ACTION_DIM), "kind": "delta"},

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from pipeline.robot.client import PolicyClient
-from pipeline.robot.lerobot_arm import LeRobotArm, LeRobotStyle, describe
+from pipeline.robot.lerobot_arm import LeRobotArm, describe
 from pipeline.robot.limits import Limits
 from pipeline.robot.realtime import RunSettings, run_robot
 from pipeline.robot.recorder import RunRecorder
@@ -17,7 +17,7 @@ LIMITS = Path(__file__).with_name("lerobot_limits.yaml")  # those of your own ta
 URL = "ws://127.0.0.1:8000"
 
 
-def drive(robot: LeRobotStyle, settings: RunSettings, folder: Path = Path("runs")) -> None:
+def drive(robot: object, settings: RunSettings, folder: Path = Path("runs")) -> None:
     """Run a connected robot until the settings or Ctrl-C end it, and record what happens."""
     with PolicyClient(URL, robot=describe(robot, CAMERAS)) as policy:
         arm = LeRobotArm(robot, policy.metadata, CAMERAS)

@@ -257,7 +257,7 @@ def _figure(errors: NDArray[Any], counts: NDArray[Any]) -> list[float]:
 
 
 def _success(episodes: list[dict[str, str]]) -> list[float]:
-    rate = SuccessRate.counted(sum(row["success"] == "True" for row in episodes), len(episodes))
+    rate = SuccessRate.of([row["success"] == "True" for row in episodes])
     return [round(number, 3) for number in (rate.rate, rate.low, rate.high)]
 
 

@@ -11,7 +11,7 @@ import torch
 
 from pipeline.base.config import RolloutAblation
 from pipeline.base.observation import Observation
-from pipeline.policy import state_channels
+from pipeline.policy import shape, state_channels
 from pipeline.policy.policy import Policy
 
 AS_IT_IS, ON_TIME = "as it is", "on time"
@@ -97,7 +97,7 @@ def _no_age(encoder: Any, age_s: torch.Tensor) -> torch.Tensor:
     return age_s.new_zeros(len(age_s), encoder.network[-1].out_features)
 
 
-_expand, _expanded_names = state_channels.expand, state_channels.expanded_names
+_expand, _expanded_names = state_channels.expand, shape.expanded_names
 
 
 def _with_motion(values: torch.Tensor, kinds: Sequence[str]) -> torch.Tensor:
@@ -115,7 +115,7 @@ def _with_motion_names(names: Sequence[str], kinds: Sequence[str]) -> list[str]:
 _MOTION = {
     "pipeline.policy.policy.expand": _with_motion,
     "pipeline.train.statistics.expand": _with_motion,
-    "pipeline.policy.observation.expanded_names": _with_motion_names,
+    "pipeline.policy.shape.expanded_names": _with_motion_names,
     "pipeline.train.statistics.expanded_names": _with_motion_names,
 }
 _LATE = ("train_head.feature_lag=2",)
@@ -164,7 +164,7 @@ RECIPES = {
         patches={
             # First where it was imported to: an import that comes later must not see the patch.
             "pipeline.train.statistics.channel_kinds": _plain,
-            "pipeline.policy.state_channels.channel_kinds": _plain,
+            "pipeline.policy.shape.channel_kinds": _plain,
         }
     ),
     "no ages": Recipe(patches={"pipeline.policy.ages.AgeEncoder.forward": _no_age}),

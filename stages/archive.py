@@ -28,9 +28,6 @@ from pipeline.base.errors import ConfigError
 from pipeline.base.table import Table
 from pipeline.store.archive import Manifest, archive, restore
 
-SMALL = 0.01
-"""Share of the bytes up to which an array has no line: of a tiny one, padding makes the ratio."""
-
 
 def main(params: Params) -> None:
     """Archive or restore, and report."""
@@ -54,18 +51,14 @@ def main(params: Params) -> None:
 
 
 def _table(manifest: Manifest) -> Table:
-    """The large arrays: size, how much smaller they became, codec; then all of them."""
-    arrays = [
+    """Each array: size, how much smaller it became, codec."""
+    sizes = [
         (name, array.raw_bytes, sum(array.shard_bytes), array.codec)
         for name, array in manifest.arrays.items()
-        if array.raw_bytes > SMALL * manifest.raw_bytes
     ]
     rows = [
         (name, raw / 1e6, raw / stored if stored else None, codec)  # zeros take no shard
-        for name, raw, stored, codec in [
-            *arrays,
-            ("all", manifest.raw_bytes, manifest.stored_bytes, ""),
-        ]
+        for name, raw, stored, codec in sizes
     ]
     return Table(("array", "MB", "ratio", "codec"), rows)
 

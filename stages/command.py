@@ -30,10 +30,10 @@ _stop_without_traceback()  # here, for what is imported below takes a while
 
 import argparse
 import json
+import re
 import select
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -56,11 +56,6 @@ class Shorthand:
     nargs: str | None = None
     """As argparse has it; `"*"` makes a list, `"?"` an option whose value may be left out: true."""
 
-    @property
-    def destination(self) -> str:
-        """Under which name argparse hands the value out."""
-        return self.name.lstrip("-").replace("-", "_")
-
     def add_to(self, parser: argparse.ArgumentParser) -> None:
         """Declare it."""
         said = f"{self.help} (--set {self.key}=…)"
@@ -74,11 +69,12 @@ class Shorthand:
 
     def override(self, options: argparse.Namespace) -> list[str]:
         """The `section.key=value` it stands for, if it was given."""
-        given: Any = getattr(options, self.destination)
+        given: Any = getattr(options, self.name.lstrip("-"))
         if given is None or given == []:
             return []
-        # A word stays as it was typed, so that 8 is a number; a list of paths becomes JSON.
-        return [f"{self.key}={given if isinstance(given, str) else json.dumps(given)}"]
+        # A word stays as it was typed, so that 8 is a number; else no character means anything.
+        word = isinstance(given, str) and re.fullmatch(r"[\w.+-]+", given)
+        return [f"{self.key}={given if word else json.dumps(given)}"]
 
 
 def run(
@@ -96,23 +92,40 @@ def run(
     once options and params are known to be good. `sections` are those of params.yaml that `--keys`
     lists.
     """
+    options = _parse(summary, arguments, shorthands, sections)
     try:
-        code = _run(summary, work, arguments, shorthands, sections)
+        if options.keys:
+            print("\n".join(described_keys(sections or tuple(Params.model_fields))))
+        else:
+            given = (one for each in shorthands for one in each.override(options))
+            params = load_params(options.params, [*options.overrides, *given])
+            main = import_module(work).main if isinstance(work, str) else work
+            _catch_signals()
+            main(params)
         sys.stdout.flush()  # not at the interpreter's exit, where an error is said in any case
-    except BrokenPipeError:
-        _write_to_nobody()
+    except PipelineError as error:
+        return _refuse(str(error))
+    except OSError as error:
+        if isinstance(error, BrokenPipeError) and _is_unread():
+            # What stdout still holds must not fail again when the interpreter exits.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 0 if options.keys else 1  # who reads keys has read enough
+        place = f"{error.filename}: " if error.filename else ""
+        said = f"{place}{error.strerror or error}. Look at that path, then run the same again."
+        return _refuse(said)
+    except KeyboardInterrupt:
+        print(STOPPED, file=sys.stderr)
         return 1
-    return code
+    return 0
 
 
-def _run(
+def _parse(
     summary: str,
-    work: Callable[[Params], None] | str,
     arguments: Sequence[str] | None,
     shorthands: Sequence[Shorthand],
     sections: Sequence[str],
-) -> int:
-    """`run`, which raises `BrokenPipeError` where nobody reads the output any more."""
+) -> argparse.Namespace:
+    """The options of a command."""
     parser = argparse.ArgumentParser(
         description=summary, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -132,53 +145,12 @@ def _run(
     )
     for shorthand in shorthands:
         shorthand.add_to(parser)
-    options, unknown = parser.parse_known_args(arguments)
-    if unknown:
-        known = ["--params", "--set", "--keys", *(one.name for one in shorthands)]
-        parser.error(f"unrecognized arguments: {' '.join(unknown)}{_meant(unknown, known)}")
-    if options.keys:
-        try:
-            print("\n".join(described_keys(sections or tuple(Params.model_fields))), flush=True)
-        except BrokenPipeError:  # who reads has read enough
-            _write_to_nobody()
-        return 0
-    overrides = [
-        *options.overrides,
-        *(one for each in shorthands for one in each.override(options)),
-    ]
-    try:
-        params = load_params(options.params, overrides)
-        main = import_module(work).main if isinstance(work, str) else work
-        _catch_signals()
-        main(params)
-    except PipelineError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except OSError as error:
-        if isinstance(error, BrokenPipeError) and _is_unread():
-            raise
-        place = f"{error.filename}: " if error.filename else ""
-        said = f"{place}{error.strerror or error}. Look at that path, then run the same again."
-        print(f"error: {said}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print(STOPPED, file=sys.stderr)
-        return 1
-    return 0
+    return parser.parse_args(arguments)
 
 
-def _meant(unknown: Sequence[str], known: Sequence[str]) -> str:
-    """A question about the first of some unknown arguments, where it looks like a known one."""
-    first, *values = unknown
-    name, equals, value = first.partition("=")
-    if first.startswith("-"):
-        near = get_close_matches(name, [one for one in known if one.startswith("-")], 1)
-        meant = " ".join([near[0] + equals + value, *values]) if near else ""
-    elif first.endswith((".yaml", ".yml")):
-        meant = f"--params {first}"
-    else:
-        meant = f"--set {first}" if equals else ""
-    return f"; did you mean {meant}?" if meant else ""
+def _refuse(said: str) -> int:
+    print(f"error: {said}", file=sys.stderr)
+    return 2
 
 
 def _is_unread() -> bool:
@@ -187,11 +159,6 @@ def _is_unread() -> bool:
     for stream in (sys.stdout, sys.stderr):
         poll.register(stream, 0)
     return bool(poll.poll(0))
-
-
-def _write_to_nobody() -> None:
-    """What stdout still holds must not fail again when the interpreter exits."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _catch_signals() -> None:

@@ -7,8 +7,7 @@ that differ by train_head.split.fold alone, with the test groups of all folds.
 
 Takes every folder of `compare.reports` that stages.evaluate wrote, and passes over what else lies
 there, such as the logs of a training. Writes report.html, experiments.csv and experiments.png into
-`compare.output`; the table with the training times as Markdown beside that folder, for DVC tracks
-what is in it and a clock never says the same twice.
+`compare.output`; the tables as Markdown beside that folder.
 
   python -m stages.compare                                   of dvc repro experiments/dvc.yaml
   python -m stages.compare --set compare.reports=reports     reports/evaluate, reports/blind, …
@@ -46,7 +45,7 @@ def main(params: Params) -> None:
     claim(output, REPORT)
     files = [experiment_csv(experiments).write_csv(output / "experiments.csv")]
     files += write_report(output, comparison_report(experiments))
-    tables = {span: experiment_table(experiments, span, trained=True) for span in SPANS}
+    tables = {span: experiment_table(experiments, span) for span in SPANS}
     with disk_full_named(markdown):
         text = "\n".join(line for table in tables.values() for line in [*table.markdown(), ""])
         fresh(markdown).write_text(text, encoding="utf-8")

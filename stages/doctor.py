@@ -1,7 +1,7 @@
 """Look at this machine: what is there, what is missing, and what to install or set.
 
 Checks Python and packages, the GPU, torch's build and the attention backend, the checkpoint, the
-recordings and video decoders, and the room for the store, for the params given. Downloads nothing,
+recordings and their videos, and the room for the store, for the params given. Downloads nothing,
 loads no model, changes nothing; takes some seconds. What DVC has and how it links: dvc doctor.
 
   python -m stages.doctor                                        as params.yaml stands

@@ -74,14 +74,7 @@ def _rollouts_page(params: Params) -> str:
 def _write(folder: Path, evaluation: Evaluation, rollouts: str) -> list[Path]:
     """The tables, the page with its pictures, and what was evaluated; returns their paths."""
     claim(folder, REPORT)
-    files = write_tables(
-        folder,
-        evaluation.comparison,
-        evaluation.predictions,
-        evaluation.store,
-        evaluation.study,
-        evaluation.energy,
-    )
+    files = write_tables(folder, evaluation)
     write_document(folder / JUDGED, evaluation.judged)
     report = evaluation_report(evaluation, rollouts)
     return [*files, folder / JUDGED, *write_report(folder, report)]

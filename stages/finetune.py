@@ -23,11 +23,11 @@ if __name__ == "__main__":  # here, for --help waits for no import below
     raise SystemExit(run(__doc__ or "", "stages.finetune", sections=("finetune", "train_head")))
 
 from pipeline.base.config import Params
-from pipeline.store import FeatureStore, build_lock, check_trailers
+from pipeline.store import FeatureStore, check_trailers
 from pipeline.train.finetuning import LiveFeatures, head_params, next_steps, out_of_memory_named
 from pipeline.train.log import check_loggers
 from pipeline.train.loop import Trainer
-from pipeline.train.run import open_run
+from pipeline.train.run import open_run, run_lock
 from pipeline.train.split import split_by_episode
 from pipeline.train.tuned_episodes import refuse_tuned_episodes
 from pipeline.train.world import process_device, process_group
@@ -39,7 +39,7 @@ def main(params: Params) -> None:
         head = head_params(params)
         world.shared(lambda: check_loggers(head))
         store = FeatureStore.open(head.store or params.extract.store)
-        with world.holding(build_lock(head.output)), out_of_memory_named():
+        with world.holding(run_lock(head)), out_of_memory_named():
             source = LiveFeatures(store, params, process_device(head.device))
             opened = world.shared(lambda: open_run(head, store, source.identity, "finetune"))
             world.say(*opened.notes)

@@ -4,7 +4,7 @@ Reads probe.store (extract.store where null), its checksums first (probe.check_s
 slot by itself and each choice of layer, norm and pooling as a whole, alone and beside past actions,
 state and sensor, cross-validated by recording. Prints the ranking with 95 % intervals and the line
 for params.yaml that the evidence supports; writes metrics.json, slots.csv, groups.csv, targets.csv
-and pictures (PNG) into probe.output.
+and a picture (PNG) into probe.output.
 
   python -m stages.probe                             as params.yaml stands
   python -m stages.probe --set probe.max_ticks=2000  that many ticks, evenly spread: a first look
@@ -25,7 +25,8 @@ from pipeline.base.config import Params
 from pipeline.base.ownership import REPORT, claim, refuse_foreign, release
 from pipeline.evaluate.probe.study import probe
 from pipeline.evaluate.probe.tables import advice, table, write_tables
-from pipeline.look.evaluation.draw_probe import write_probe_plots
+from pipeline.look.evaluation.draw_probe import heat_map
+from pipeline.look.page.style import write
 from pipeline.store import FeatureStore, check_trailers
 
 
@@ -40,7 +41,10 @@ def main(params: Params) -> None:
         check_trailers(store.path)
     study = probe(store, wanted)
     claim(wanted.output, REPORT)
-    files = [*write_tables(wanted.output, study), *write_probe_plots(wanted.output, study)]
+    files = [
+        *write_tables(wanted.output, study),
+        *write(wanted.output, {"probe.png": lambda: heat_map(study)}),
+    ]
     release(wanted.output, REPORT)
     print(table(study))
     print(advice(study))

@@ -90,26 +90,12 @@ def _dependents(inventory: Inventory, params: StoresParams) -> dict[Path, list[s
 
 
 def _merge(params: StoresParams) -> None:
-    if params.output is None:
-        raise ConfigError(
-            "stores.output: expected the store to merge into, found none. Name it: "
-            "python -m stages.store merge A.zarr B.zarr --into C.zarr"
-        )
-    merged = merge([_input(path, params.folder) for path in params.inputs], params.output)
+    merged = merge(params.inputs, params.output)
     if merged is not None:
         print(
             f"{params.output}: {len(merged.episodes)} episodes, {merged.count('vl')} rows, none "
             f"computed; {merged.twice} episode(s) were held twice and are kept once"
         )
-
-
-def _input(path: Path, folder: Path) -> Path:
-    """A store as it is named, or the one of that name in `stores.folder`."""
-    inside = folder / path
-    if path.exists() or not inside.exists():
-        return path
-    print(f"{path}: taking {inside}")
-    return inside
 
 
 def _gc(params: StoresParams) -> None:
@@ -125,22 +111,14 @@ def _gc(params: StoresParams) -> None:
             locked.append(error)
     word = "removed" if params.remove else "unneeded"
     for leftover in done:
-        if not _is_idle_lock(leftover):
-            print(f"{word}: {leftover.entry.path}, {size(leftover.bytes)}: {leftover.why}")
-    if idle := sum(_is_idle_lock(leftover) for leftover in done):
-        print(f"{word}: {idle} empty lock file(s), held by no process")
+        print(f"{word}: {leftover.entry.path}, {size(leftover.entry.bytes)}: {leftover.why}")
     if not leftovers:
         print(f"{params.folder}: nothing to remove")
     elif not params.remove:
-        freed = size(sum(leftover.bytes for leftover in leftovers))
+        freed = size(sum(leftover.entry.bytes for leftover in leftovers))
         print(f"{freed} in {len(leftovers)} place(s); --remove removes them")
     if locked:
         raise locked[0]
-
-
-def _is_idle_lock(leftover: Leftover) -> bool:
-    """An empty lock file, of which there may be many."""
-    return leftover.entry.kind == "lock" and not leftover.bytes
 
 
 def _unneeded(params: StoresParams) -> list[Leftover]:

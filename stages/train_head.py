@@ -26,8 +26,8 @@ if __name__ == "__main__":  # here, for --help waits for no import below
     raise SystemExit(run(__doc__ or "", "stages.train_head", sections=("train_head",)))
 
 from pipeline.base.config import Params
-from pipeline.store import FeatureStore, build_lock, check_trailers
-from pipeline.train.run import finished_run, open_run
+from pipeline.store import FeatureStore, check_trailers
+from pipeline.train.run import finished_run, open_run, run_lock
 from pipeline.train.split import split_by_episode
 from pipeline.train.tuned_episodes import refuse_tuned_episodes
 
@@ -51,7 +51,7 @@ def _train(params: Params) -> None:
     with process_group(head.device) as world:
         world.shared(lambda: check_loggers(head))
         store = FeatureStore.open(head.store or params.extract.store)
-        with world.holding(build_lock(head.output)):
+        with world.holding(run_lock(head)):
             opened = world.shared(lambda: open_run(head, store))
             world.say(*opened.notes)
             if opened.status == "finished":

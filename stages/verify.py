@@ -43,6 +43,7 @@ from pipeline.extract.repair import repair
 from pipeline.policy.checkpoint import find_policy, load_policy
 from pipeline.robot.features import LiveFeatures
 from pipeline.robot.proof import prove
+from pipeline.store.repair_hints import mend
 from pipeline.store.verification import verify
 
 
@@ -56,7 +57,7 @@ def main(params: Params) -> None:
     print(checked.summary())
     if not checked.sound:
         if not params.verify.repair:
-            lines = [f"{store}: the store is damaged:", *checked.lines(), checked.advice()]
+            lines = [f"{store}: the store is damaged:", *checked.lines(), mend(store)]
             raise StoreIncomplete("\n".join(lines))
         print("\n".join(checked.lines()))
         repair(checked, params, print)

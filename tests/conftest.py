@@ -149,8 +149,7 @@ def tiny_golden(
             GoldenFrames(row, "say: touch the dot", views)
             for row, views in zip(rows, frames, strict=True)
         ]
-        spec = read_attributes(path)["feature_spec"] | {"views": ["View1"]}
-        note_metadata(path, read_attributes(path) | {"feature_spec": spec})
+        spec = read_attributes(path).raw["feature_spec"]
         count = read_specs(path)["vl/key"].shape[0]
         keys = np.memmap(path / "vl/key/c/0/0", np.uint8, "r+", shape=(count, 16))
         for one in golden:
@@ -362,7 +361,15 @@ def write_tiny_store(
         {
             "schema": SCHEMA,
             "slots": said_of_slots,
-            "feature_spec": {"digest": spec_digest, "prompt": "{instruction}"},
+            "feature_spec": {
+                "digest": spec_digest,
+                "prompt": "{instruction}",
+                "views": ["View1"],
+                "slots": said_of_slots,
+                "dim": dim,
+                "compute_dtype": "float32",
+                "storage_dtype": dtype,
+            },
             "sources": ["left", "right"],
             "streams": streams,
             "action_hz": 10.0,

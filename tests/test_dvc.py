@@ -107,7 +107,7 @@ def test_metrics_and_plots_are_declared(project):
     )
     assert "policy" in evaluated["executed"]["overall"]
     assert set(rolled_out["success"]["policy"]) == {"rate", "low", "high", "episodes"}
-    assert (project.folder / "reports/evaluate/timeline.png").exists()
+    assert (project.folder / "reports/evaluate/scatter.png").exists()
 
 
 @pytest.mark.parametrize(

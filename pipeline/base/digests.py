@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+from pipeline.base.border import Border
 from pipeline.base.errors import (
     ConfigError,
     DiskFull,
@@ -24,35 +25,30 @@ from pipeline.base.ownership import LEDGER_SUFFIX, described
 _APPLICATION = 0x564C4146
 """SQLite's `application_id` of a ledger, in its header at bytes 68 to 71, big-endian."""
 
-_TABLES = (
-    "file (path TEXT PRIMARY KEY, size INTEGER, mtime_ns INTEGER, digest TEXT)",
-    "rate (what TEXT PRIMARY KEY, rows_per_s REAL)",
-    "bad (episode TEXT PRIMARY KEY, reason TEXT)",
-    "text (what TEXT PRIMARY KEY, text TEXT)",
-)
+_TABLE = "known (key TEXT PRIMARY KEY, value BLOB)"
+_DAMAGED = {
+    sqlite3.SQLITE_ERROR,
+    sqlite3.SQLITE_CORRUPT,
+    sqlite3.SQLITE_FORMAT,
+    sqlite3.SQLITE_NOTADB,
+}
+"""What SQLite says of a damaged ledger; of one in memory it may say anything."""
+_FILE = Border(RecordingError, "Copy it again, or leave its recording out.")
 
 
 class ContentDigests:
     """Digests of files, kept in one SQLite file, or where that is None only in memory.
 
     Raises `ConfigError` where something else lies there or it cannot be written. A damaged ledger
-    is begun anew.
+    is begun anew, and what is damaged in it is not known.
     """
 
-    def __init__(self, ledger: Path | None) -> None:
-        self._ledger = ledger
-        if ledger is None:
-            return self._open()
-        _refuse_foreign(ledger)
-        try:
+    def __init__(self, ledger: Path | None, only_read: bool = False) -> None:
+        self._ledger, self._only_read = ledger, only_read
+        if ledger is not None:
+            _refuse_foreign(ledger)
             ledger.parent.mkdir(parents=True, exist_ok=True)
-            self._open()
-        except sqlite3.DatabaseError as error:
-            if error.sqlite_errorcode not in (sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_CORRUPT):
-                raise self._unwritable(error) from None
-            for suffix in ("", "-wal", "-shm"):
-                ledger.with_name(ledger.name + suffix).unlink(missing_ok=True)
-            self._open()
+        self._open()
 
     @classmethod
     def to_read(cls, ledger: Path) -> "ContentDigests":
@@ -62,35 +58,30 @@ class ContentDigests:
         """
         _refuse_foreign(ledger)
         try:
-            opened = cls(None)
-            opened.close()
-            opened._ledger = ledger
-            ledger.parent.mkdir(parents=True, exist_ok=True)
-            opened._open()
-            opened._database.execute("DELETE FROM bad WHERE 0")
+            opened = cls(ledger, only_read=True)
+            opened._ask("DELETE FROM known WHERE 0")
             return opened
-        except (OSError, sqlite3.DatabaseError):
+        except (OSError, PipelineError):
             known = cls(None)
-            if ledger.is_file():
-                with (
-                    suppress(sqlite3.DatabaseError),  # it only saves reading
-                    closing(_immutable(ledger)) as file,
-                ):
-                    file.backup(known._database)
+            # With no file made beside it, as sqlite else would.
+            place = f"file:{quote(str(ledger.absolute()))}?immutable=1"
+            with (
+                suppress(sqlite3.DatabaseError),  # it only saves reading
+                closing(sqlite3.connect(place, uri=True)) as file,
+            ):
+                file.backup(known._database)
             return known
 
     def _open(self) -> None:
-        self._database = sqlite3.connect(self._ledger or ":memory:", isolation_level=None)
         try:
-            if self._known("PRAGMA application_id", ()) != _APPLICATION:
-                self._database.execute(f"PRAGMA application_id = {_APPLICATION}")
-            self._database.execute("PRAGMA journal_mode = WAL")
-            self._database.execute("PRAGMA synchronous = OFF")
-            for table in _TABLES:
-                self._database.execute(f"CREATE TABLE IF NOT EXISTS {table}")
-        except sqlite3.DatabaseError:
-            self._database.close()
-            raise
+            self._database = sqlite3.connect(self._ledger or ":memory:", isolation_level=None)
+        except sqlite3.OperationalError as error:
+            raise self._unusable(error, error.sqlite_errorcode) from None
+        if self._ask("PRAGMA application_id") != (_APPLICATION,):
+            self._ask(f"PRAGMA application_id = {_APPLICATION}")
+        self._ask("PRAGMA journal_mode = WAL")
+        self._ask("PRAGMA synchronous = OFF")
+        self._ask(f"CREATE TABLE IF NOT EXISTS {_TABLE}")
 
     def close(self) -> None:
         """Close the ledger."""
@@ -101,61 +92,74 @@ class ContentDigests:
 
         Raises `RecordingError` when the file cannot be read.
         """
-        try:
-            place, status = str(path.resolve()), path.stat()
-            known = self._known(
-                "SELECT digest FROM file WHERE path = ? AND size = ? AND mtime_ns = ?",
-                (place, status.st_size, status.st_mtime_ns),
-            )
-            if known:
-                return known
-            digest = file_digest(path)
-        except OSError as error:
-            raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
-        row = (place, status.st_size, status.st_mtime_ns, digest)
-        self._write("INSERT OR REPLACE INTO file VALUES (?, ?, ?, ?)", row)
-        return digest
+        _FILE.check_file(path)
+        with _FILE.foreign(path, "cannot be read"):
+            status = path.stat()
+            what = f"{status.st_size} {status.st_mtime_ns} {path.resolve()}"
+            return self._found("file", what, lambda: file_digest(path))
 
     def note_rate(self, what: str, rows_per_s: float) -> None:
         """Remember how fast rows were computed, for the estimate of a later plan."""
-        self._write("INSERT OR REPLACE INTO rate VALUES (?, ?)", (what, rows_per_s))
+        self._note("rate", what, str(rows_per_s))
 
     def rate(self, what: str) -> float | None:
         """Rows a second of the last session under that name."""
-        return self._known("SELECT rows_per_s FROM rate WHERE what = ?", (what,))
+        known = self._known("rate", what)
+        return None if known is None else float(known)
 
     def note_bad(self, episode: str, reason: str) -> None:
         """Remember that the episode of this digest cannot be used."""
-        self._write("INSERT OR REPLACE INTO bad VALUES (?, ?)", (episode, reason))
+        self._note("bad", episode, reason)
 
     def bad(self, episode: str) -> str | None:
         """Why the episode of this digest cannot be used; None where nothing is known."""
-        return self._known("SELECT reason FROM bad WHERE episode = ?", (episode,))
+        return self._known("bad", episode)
 
     def text(self, what: str, make: Callable[[], str]) -> str:
         """What `make` gives, made once: `what` names everything that it depends on."""
-        known = self._known("SELECT text FROM text WHERE what = ?", (what,))
-        if known is not None:
-            return known
-        made = make()
-        self._write("INSERT OR REPLACE INTO text VALUES (?, ?)", (what, made))
-        return made
+        return self._found("text", what, make)
 
-    def _known(self, query: str, values: tuple[object, ...]) -> Any:
-        """The one value that a query finds; None where it finds nothing."""
-        row = self._database.execute(query, values).fetchone()
-        return row[0] if row else None
+    def _found(self, kind: str, what: str, make: Callable[[], str]) -> str:
+        known = self._known(kind, what)
+        if known is None:
+            self._note(kind, what, known := make())
+        return known
 
-    def _write(self, statement: str, values: tuple[object, ...]) -> None:
+    def _known(self, kind: str, what: str) -> str | None:
+        key = joint_digest(kind, what)
+        row = self._ask("SELECT CAST(value AS BLOB) FROM known WHERE key = ?", key)
+        text = row[0].decode("utf-8", "surrogateescape") if row and row[0] else ""
+        checksum, value = text[:32], text[32:]
+        return value if checksum == joint_digest(key, value) else None
+
+    def _note(self, kind: str, what: str, value: str) -> None:
+        """Remember a text by the digest of its name, with a checksum before it."""
+        key = joint_digest(kind, what)
+        text = (joint_digest(key, value) + value).encode("utf-8", "surrogateescape")
+        self._ask("INSERT OR REPLACE INTO known VALUES (?, ?)", key, text)
+
+    def _ask(self, statement: str, *values: object) -> Any:
+        """The first row that a statement gives; None where there is none, or the ledger is damaged:
+        then another is begun in its place, in memory where this one may only be read."""
         try:
-            self._database.execute(statement, values)
-        except sqlite3.OperationalError as error:
-            raise self._unwritable(error) from None
+            return self._database.execute(statement, values).fetchone()
+        except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
+            code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT) & 0xFF
+            if self._ledger is not None and code not in _DAMAGED:
+                raise self._unusable(error, code) from None
+        self._database.close()
+        if self._only_read:
+            self._ledger = None
+        elif self._ledger is not None:
+            for suffix in ("", "-wal", "-shm"):
+                self._ledger.with_name(self._ledger.name + suffix).unlink(missing_ok=True)
+        self._open()
+        return None
 
-    def _unwritable(self, error: sqlite3.DatabaseError) -> PipelineError:
-        if error.sqlite_errorcode == sqlite3.SQLITE_BUSY:
+    def _unusable(self, error: Exception, code: int) -> PipelineError:
+        if code == sqlite3.SQLITE_BUSY:
             return StoreLocked(f"{self._ledger}: in use by another process; try again when it ends")
-        if error.sqlite_errorcode == sqlite3.SQLITE_FULL:
+        if code == sqlite3.SQLITE_FULL:
             return DiskFull(f"{self._ledger}: {error}. Make room and run the same command again.")
         return ConfigError(
             f"{self._ledger}: cannot be written: {error}. Set extract.store to a folder that "
@@ -182,14 +186,7 @@ def is_ledger(path: Path) -> bool:
         return True
     if not header.startswith(b"SQLite format 3\0"):
         return not header
-    if application := int.from_bytes(header[68:72], "big"):
-        return application == _APPLICATION
-    try:  # of an earlier version, which left no application's id
-        with closing(_immutable(path)) as file:
-            made = {row[0] for row in file.execute("SELECT sql FROM sqlite_master")}
-    except sqlite3.DatabaseError:
-        return True
-    return not made or any("TABLE file (path TEXT" in str(text) for text in made)
+    return int.from_bytes(header[68:72], "big") == _APPLICATION
 
 
 def _refuse_foreign(ledger: Path) -> None:
@@ -199,11 +196,6 @@ def _refuse_foreign(ledger: Path) -> None:
             f"there, found {described(ledger)} that it did not write. It was left as it is: move "
             "it away, or name another extract.store."
         )
-
-
-def _immutable(path: Path) -> sqlite3.Connection:
-    """A database to read, with no file made beside it, as sqlite else would."""
-    return sqlite3.connect(f"file:{quote(str(path.absolute()))}?immutable=1", uri=True)
 
 
 def file_digest(path: Path) -> str:
@@ -216,5 +208,5 @@ def joint_digest(*parts: str) -> str:
     """The digest of several texts in this order, each told from its neighbours: 32 hex digits."""
     hasher = hashlib.blake2b(digest_size=16)
     for part in parts:
-        hasher.update(f"{len(part)}:".encode() + part.encode())
+        hasher.update(f"{len(part)}:".encode() + part.encode("utf-8", "surrogateescape"))
     return hasher.hexdigest()

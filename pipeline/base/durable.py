@@ -4,13 +4,16 @@ import errno
 import hashlib
 import json
 import os
+import shutil
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
+from pydantic import JsonValue
 from safetensors import SafetensorError
 
+from pipeline.base.border import Border
 from pipeline.base.errors import CheckpointIncomplete, DiskFull
 from pipeline.base.ownership import (
     OutputKind,
@@ -25,9 +28,20 @@ from pipeline.base.ownership import (
 if TYPE_CHECKING:
     from torch import Tensor
 
+T = TypeVar("T")
+
 FULL = (errno.ENOSPC, errno.EDQUOT)
 DIGEST = "document_sha256"
 """Under which key a document carries the digest of all its others."""
+RUN_FILES = Border(
+    CheckpointIncomplete,
+    "Copy it again, name another, or remove its folder and run the training that writes it "
+    "(stages.train_head or stages.finetune) again.",
+)
+"""What is said of a file of a run that is not as it was written."""
+_DOCUMENT = dict[str, JsonValue]
+_MOST_BYTES = 64 * 2**20
+"""Of a document: the normalisation of a wide policy's features takes 20 MB."""
 
 
 @contextmanager
@@ -52,8 +66,7 @@ def free_bytes(path: Path) -> int:
     """Bytes free on the file system that holds `path` or its nearest existing parent."""
     while not path.exists():
         path = path.parent
-    status = os.statvfs(path)
-    return status.f_bavail * status.f_frsize
+    return shutil.disk_usage(path).free
 
 
 def fresh(path: Path) -> Path:
@@ -187,41 +200,31 @@ def write_document(path: Path, document: Mapping[str, Any]) -> None:
 
 def write_with_digest(path: Path, document: Mapping[str, Any]) -> None:
     """As `write_document`, with a digest of the document in it, which reading checks."""
-    write_document(path, {**document, DIGEST: _document_sha256(document)})
+    read = json.loads(json.dumps(document, allow_nan=False))  # where all keys are strings
+    write_document(path, {**document, DIGEST: _document_sha256(read)})
 
 
-def read_document(path: Path) -> dict[str, Any]:
-    """The JSON document at `path`; `CheckpointIncomplete` where it is not what was written."""
-    return read_with_digest(path)[0]
-
-
-def read_with_digest(path: Path) -> tuple[dict[str, Any], bool]:
-    """The JSON document at `path` and whether it carries a digest of itself, which is left out.
+def read_document(path: Path, model: type[T]) -> tuple[T, dict[str, Any]]:
+    """The JSON document at `path` as the model, and as it is, without the digest of itself.
 
     Raises `CheckpointIncomplete` where it is missing, is none, or is not what its digest is of.
     """
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise CheckpointIncomplete(
-            f"{path}: no such file. Run the training that writes it (stages.train_head or "
-            "stages.finetune), or name another checkpoint."
-        ) from None
-    except ValueError as error:
-        raise CheckpointIncomplete(damaged(path, error)) from None
-    if not isinstance(document, dict):
-        raise CheckpointIncomplete(damaged(path, "not a JSON object"))
+    text = RUN_FILES.read_bytes(path, _MOST_BYTES)
+    read = RUN_FILES.parse_json(text, model, path)
+    document = RUN_FILES.parse_json(text, _DOCUMENT, path)
     digest = document.pop(DIGEST, None)
-    if digest is not None and digest != _document_sha256(document):
+    try:
+        altered = digest not in (None, _document_sha256(document))
+    except ValueError as error:
+        raise RUN_FILES.refusal(path, error) from None
+    if altered:
         why = f"it was altered since it was written: its {DIGEST} is of another content"
-        raise CheckpointIncomplete(damaged(path, why))
-    return document, digest is not None
+        raise RUN_FILES.refusal(path, why)
+    return read, document
 
 
 def _document_sha256(document: Mapping[str, Any]) -> str:
-    # As it is read, where tuples are lists and keys are strings, in whatever order.
-    read = json.loads(json.dumps(document, allow_nan=False))
-    canonical = json.dumps(read, sort_keys=True, separators=(",", ":"))
+    canonical = json.dumps(document, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(canonical.encode()).hexdigest()
 
 
@@ -243,25 +246,14 @@ def read_tensors(path: Path, sha256: str) -> "dict[str, Tensor]":
     try:
         return load_file(path)
     except SafetensorError as error:
-        raise CheckpointIncomplete(damaged(path, error)) from None
+        raise RUN_FILES.refusal(path, error) from None
 
 
 def check_digest(path: Path, sha256: str) -> None:
     """Raise `CheckpointIncomplete` where the file at `path` is not the one that was written."""
-    try:
-        found = _sha256(path)
-    except FileNotFoundError:
-        raise CheckpointIncomplete(damaged(path, "no such file")) from None
-    if found != sha256:
-        raise CheckpointIncomplete(damaged(path, "its sha256 is not the one written with it"))
-
-
-def damaged(path: Path, why: object) -> str:
-    """What is said of a file of a run that is not as it was written."""
-    return (
-        f"{path}: the checkpoint is damaged: {why}. Remove {path.parent} and run the training that "
-        "wrote it (stages.train_head or stages.finetune) again."
-    )
+    RUN_FILES.check_file(path)
+    if _sha256(path) != sha256:
+        raise RUN_FILES.refusal(path, "its sha256 is not the one written with it")
 
 
 def _sha256(path: Path) -> str:

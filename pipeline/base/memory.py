@@ -1,32 +1,16 @@
 """Memory of this process: the machine's, or less where a container or a job is limited.
 
-Limits are those of the control groups that the process is in, version 1 or 2, and of their parents.
+Limits are those of the control groups (version 2) that the process is in, and of their parents.
 """
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 _ROOT = Path("/")
 
 
-class _Version(NamedTuple):
-    """What a version of control groups calls its files."""
-
-    folder: str
-    limit: str
-    used: str
-    file_pages: tuple[str, str]
-    """Lines of memory.stat: pages of files, which are counted as used and can be dropped."""
-
-
-_ONE = _Version(
-    "memory",
-    "memory.limit_in_bytes",
-    "memory.usage_in_bytes",
-    ("total_inactive_file", "total_active_file"),
-)
-_TWO = _Version("", "memory.max", "memory.current", ("inactive_file", "active_file"))
+_FILE_PAGES = ("inactive_file", "active_file")
+"""Lines of memory.stat: pages of files, which are counted as used and can be dropped."""
 
 
 def memory_bytes(root: Path = _ROOT) -> int:
@@ -45,21 +29,16 @@ def available_bytes(root: Path = _ROOT) -> int:
 
 def _limits(root: Path) -> Iterator[tuple[int, int]]:
     """Limit and use, in bytes, of each limited control group from the process's own upwards."""
-    for line in _read(root / "proc/self/cgroup").splitlines():
-        _, controllers, place = line.split(":", 2)
-        if controllers and "memory" not in controllers.split(","):
-            continue
-        version = _ONE if controllers else _TWO
-        top = root / "sys/fs/cgroup" / version.folder
-        own = top / place.lstrip("/")
-        # In a container the place may be that outside of it: then only the first group is seen.
-        for group in (own, *own.parents):
-            limit, used = _read(group / version.limit), _read(group / version.used)
-            if limit.isdigit() and used.isdigit():
-                pages = _numbers(_read(group / "memory.stat"))
-                yield int(limit), int(used) - sum(pages.get(name, 0) for name in version.file_pages)
-            if group == top:
-                break
+    top = root / "sys/fs/cgroup"
+    own = top / _read(root / "proc/self/cgroup").rpartition("::/")[2]
+    # In a container the place may be that outside of it: then only the first group is seen.
+    for group in (own, *own.parents):
+        limit, used = _read(group / "memory.max"), _read(group / "memory.current")
+        if limit.isdigit() and used.isdigit():
+            pages = _numbers(_read(group / "memory.stat"))
+            yield int(limit), int(used) - sum(pages.get(name, 0) for name in _FILE_PAGES)
+        if group == top:
+            break
 
 
 def _meminfo(root: Path) -> dict[str, int]:

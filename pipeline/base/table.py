@@ -32,8 +32,7 @@ class Column:
 class Table:
     """Rows of cells under column heads; numbers stand right, in as many digits as they deserve.
 
-    A cell is a word, a number, a bool or None. Raises `ValueError` for a row of another length
-    than the heads.
+    A cell is a word, a number, a bool or None.
     """
 
     columns: Sequence[str]
@@ -48,11 +47,6 @@ class Table:
         rows = list(rows)
         return cls(list(rows[0]), [list(row.values()) for row in rows])
 
-    def __post_init__(self) -> None:
-        for index, row in enumerate(self.rows):
-            if len(row) != len(self.columns):
-                raise ValueError(f"row {index}: {len(row)} cells, {len(self.columns)} heads")
-
     def words(self) -> list[Column]:
         """The columns as words."""
         return [
@@ -64,10 +58,7 @@ class Table:
         """Aligned lines for a terminal, heads first."""
         columns = self.words()
         widths = [max(map(len, (column.head, *column.cells))) for column in columns]
-        lines = [
-            [column.head for column in columns],
-            *zip(*(c.cells for c in columns), strict=True),
-        ]
+        lines = zip(*((column.head, *column.cells) for column in columns), strict=True)
         return [
             "  ".join(
                 cell.rjust(width) if column.numeric else cell.ljust(width)
@@ -78,11 +69,8 @@ class Table:
 
     def markdown(self) -> list[str]:
         """Lines of a Markdown table."""
-        columns = self.words()
-        rule = ["---:" if column.numeric else "---" for column in columns]
-        lines = [[column.head for column in columns], rule]
-        lines += [list(row) for row in zip(*(column.cells for column in columns), strict=True)]
-        return ["| " + " | ".join(line) + " |" for line in lines]
+        columns = ((c.head, "---:" if c.numeric else "---", *c.cells) for c in self.words())
+        return ["| " + " | ".join(line) + " |" for line in zip(*columns, strict=True)]
 
     def csv(self) -> str:
         """For programs: floats in 6 significant digits, empty where there is no value."""

@@ -2,50 +2,63 @@
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import ValidationError
+from pydantic import Field, Strict, model_validator
 
-from pipeline.base.config.section import Section
-from pipeline.base.durable import damaged, read_document, write_with_digest
-from pipeline.base.errors import CheckpointIncomplete
+from pipeline.base.border import Border, Document, Text
+from pipeline.base.durable import read_document, write_with_digest
+from pipeline.base.errors import StoreIncomplete
 
 TUNED_ON = "tuned_on.json"
 """In the folder of an adapter, or of a checkpoint that was tuned whole: no part of its digest."""
 _ATTRIBUTE = "tuned_on"
 """Of a store, where its model says it."""
+_STORE = Border(
+    StoreIncomplete, "Copy the store again, or extract it anew: python -m stages.extract."
+)
+
+Tick = Annotated[int, Field(ge=0, le=10**12)]
+Side = Literal["train", "val", "test"]
+SIDES: tuple[Side, ...] = ("train", "val", "test")
 
 
-class EpisodePart(Section):
+class EpisodePart(Document):
     """The ticks of one episode on one side of a split."""
 
-    ticks: tuple[int, int]
+    ticks: Annotated[tuple[Tick, Tick], Strict(False)]
     """[first, stop), counted in the episode."""
-    content: str
+    content: Text
     """Digest of the episode's files."""
-    group: str
+    group: Text
     """Episodes of one group are on one side, but for a single one that is cut by time."""
+
+    @model_validator(mode="after")
+    def _has_ticks(self) -> Self:
+        if self.ticks[0] >= self.ticks[1]:
+            raise ValueError(f"ticks: expected the first before the last, found {self.ticks}")
+        return self
 
 
 class TunedPart(EpisodePart):
     """Those that a model has seen."""
 
-    episode: str
+    episode: Text
     """As "source/id"."""
 
 
-class TunedOn(Section):
+class TunedOn(Document):
     """What a model was tuned on, and what its best step was chosen on."""
 
-    train: tuple[TunedPart, ...] = ()
-    val: tuple[TunedPart, ...] = ()
+    train: Annotated[tuple[TunedPart, ...], Strict(False)] = ()
+    val: Annotated[tuple[TunedPart, ...], Strict(False)] = ()
 
     @classmethod
-    def of_split(cls, split: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> "TunedOn":
-        """That of the `split` of a checkpoint's document."""
+    def of_split(cls, split: Mapping[Side, Mapping[str, EpisodePart]]) -> "TunedOn":
+        """That of a checkpoint's split."""
         parts = {
-            side: [{"episode": name, **part} for name, part in split[side].items()]
-            for side in cls.model_fields
+            side: [{"episode": name, **part.model_dump()} for name, part in split[side].items()]
+            for side in SIDES[:2]
         }
         return cls.model_validate(parts)
 
@@ -67,18 +80,17 @@ def read_tuned_on(folder: Path) -> TunedOn | None:
     Raises `CheckpointIncomplete` where the file is damaged.
     """
     path = folder / TUNED_ON
-    if not path.is_file():
-        return None
-    try:
-        return TunedOn.model_validate(read_document(path))
-    except ValidationError as error:
-        raise CheckpointIncomplete(damaged(path, error)) from None
+    return read_document(path, TunedOn)[0] if path.exists() else None
 
 
-def of_store(attributes: Mapping[str, Any]) -> TunedOn | None:
-    """What the model of a store with these attributes was tuned on; None where it does not say."""
+def of_store(attributes: Mapping[str, Any], path: Path) -> TunedOn | None:
+    """What the model of the store at `path` was tuned on; None where it does not say.
+
+    Raises `StoreIncomplete` where the attributes say it otherwise than it was written.
+    """
+    where = f"{path}, attribute {_ATTRIBUTE}"
     document = attributes.get(_ATTRIBUTE)
-    return None if document is None else TunedOn.model_validate(document)
+    return None if document is None else _STORE.parse(document, TunedOn, where)
 
 
 def store_attributes(tuned: TunedOn | None) -> dict[str, Any]:

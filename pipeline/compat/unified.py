@@ -18,7 +18,7 @@ from pipeline.base.errors import ObservationError
 from pipeline.base.observation import Observation
 from pipeline.policy.live_policy import LivePolicy
 from pipeline.policy.normalization import ChannelStatistics, Normalization
-from pipeline.policy.observation import VALIDITY, LiveObservation, PolicyShape, check_axes
+from pipeline.policy.observation import LiveObservation, PolicyShape, check_axes
 from pipeline.policy.policy import Policy
 from pipeline.vlm.feature_spec import feature_shape
 
@@ -162,7 +162,8 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
         `train()` mode, which stays as it is. Raises `ObservationError` for a shape that does not
         fit and where there is nothing to look at.
         """
-        observation = self.observe(images, text, features, sensor, state, **validity)
+        streams = {"features": features, "sensor": sensor, "state": state}
+        observation = self.observe(images, text, **streams, **validity)
         if actions is None:
             return self.act(observation, generator)
         device, batch = observation.features.device, len(observation.features)
@@ -180,13 +181,10 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
         self,
         images: Sequence[FramesByView | None] | None = None,
         text: Sequence[str] | None = None,
-        features: Any = None,
-        sensor: Any = None,
-        state: Any = None,
-        **validity: Any,
+        **streams: Any,
     ) -> LiveObservation:
         """The observation of what `forward` takes; equal frames and text share a row."""
-        if unknown := validity.keys() - (Observation.__dataclass_fields__.keys() - VALIDITY.keys()):
+        if unknown := streams.keys() - Observation.__dataclass_fields__.keys():
             raise TypeError(f"unexpected arguments: {', '.join(sorted(unknown))}")
         rows: list[PreparedRow] = []
         row_of = [] if images is None else [-1] * len(images)
@@ -195,7 +193,6 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
                 wanted = f"expected {len(images)} instructions, one for each of images"
                 raise ObservationError(f"text: {wanted}, found {text!r}")
             rows, row_of = self._preparer.prepare_distinct(images, text)
-        streams = {"features": features, "sensor": sensor, "state": state, **validity}
         return self.policy.observe(streams, rows, row_of)
 
     @cached_property

@@ -1,77 +1,82 @@
 """Numeric files -> arrays, with errors that name the file and the place in it."""
 
 import csv
-import json
-import math
 import zipfile
-import zlib
-from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from array import array
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from functools import partial
+from math import prod
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
+from numpy.lib import format as npy
 from numpy.typing import NDArray
 
+from pipeline.base.border import shown
+from pipeline.base.config import MediaLimits
 from pipeline.base.errors import RecordingError
+from pipeline.data.media import DEFAULT_LIMITS, RECORDINGS, check_unpacked
 
 Numbers = NDArray[Any]
 """An array of real numbers of any width."""
-_DAMAGED = (
-    OSError,
-    EOFError,
-    ValueError,
-    RuntimeError,
-    NotImplementedError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
+_HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+_MOST_COLUMNS, _LONGEST_LINE = 10_000, 2**20
 
 
 def read_npz(
-    path: Path, wanted: Collection[str], text: Collection[str] = ()
+    path: Path,
+    wanted: Collection[str],
+    text: Collection[str] = (),
+    limits: MediaLimits = DEFAULT_LIMITS,
 ) -> dict[str, NDArray[Any]]:
     """Those members of a .npz that are wanted and there; those in `text` hold words.
 
-    Raises `RecordingError` naming file and member where it is truncated, damaged, or holds
-    something else than numbers; object arrays are refused unread.
+    Raises `RecordingError` naming file and member where it is truncated, damaged, larger than the
+    limits, or holds something else than numbers; object arrays are refused unread.
     """
     members: dict[str, NDArray[Any]] = {}
-    # np.load would leave the file open where the archive is damaged.
-    with _damage_named(path, ".npz"), path.open("rb") as file:
-        archive = np.load(file, allow_pickle=False)
-        if not isinstance(archive, np.lib.npyio.NpzFile):
-            raise RecordingError(f"{path}: expected a .npz archive, found a single array")
-        for name in archive.files:
+    RECORDINGS.check_file(path)
+    with RECORDINGS.foreign(path, "cannot be read as .npz"), zipfile.ZipFile(path) as archive:
+        for info in archive.infolist():
+            name = info.filename.removesuffix(".npy")
             where = f"{path}, member {name!r}"
-            with _damage_named(where, ".npz"):
-                if name in wanted:
-                    members[name] = numeric(archive[name], where)
-                elif name in text:
-                    members[name] = _words(archive[name], where)
+            if name in members:
+                raise RECORDINGS.refusal(where, "expected once, found twice")
+            if name in wanted or name in text:
+                check_unpacked(where, info.file_size, info.compress_size, limits)
+                with RECORDINGS.foreign(where, "cannot be read"), archive.open(info) as file:
+                    read = _read_array(file, info.file_size, where)
+                members[name] = numeric(read, where) if name in wanted else _words(read, where)
         if not members:
-            raise RecordingError(
-                f"{path}: expected {' or '.join(wanted)}, found {_listed(archive.files)}"
-            )
+            names = [name.removesuffix(".npy") for name in archive.namelist()]
+            raise RecordingError(f"{path}: expected {' or '.join(wanted)}, found {_listed(names)}")
     return members
 
 
-def read_npy(path: Path) -> Numbers:
+def read_npy(path: Path, limits: MediaLimits = DEFAULT_LIMITS) -> Numbers:
     """The one array of a .npy; errors as in `read_npz`."""
-    with _damage_named(path, ".npy"), path.open("rb") as file:
-        return numeric(np.load(file, allow_pickle=False), str(path))
+    size = RECORDINGS.check_file(path, limits.array_bytes)
+    with RECORDINGS.foreign(path, "cannot be read as .npy"), path.open("rb") as file:
+        return numeric(_read_array(file, size, str(path)), str(path))
 
 
-@contextmanager
-def _damage_named(where: Path | str, kind: str) -> Generator[None, None, None]:
+def _read_array(file: IO[bytes], size: int, where: str) -> NDArray[Any]:
+    """The array of numbers or words that fills the bytes of an open file."""
     try:
-        yield
-    except RecordingError:
-        raise
-    except _DAMAGED as error:
-        raise RecordingError(
-            f"{where}: cannot be read as {kind}: {error}; copy the file again"
-        ) from None
+        shape, _, dtype = _HEADERS[npy.read_magic(file)](file)
+    except Exception:  # A damaged header makes numpy's parser raise almost any exception.
+        why = "cannot be read as an array: its header is damaged or not numpy's"
+        raise RECORDINGS.refusal(where, why) from None
+    if dtype.kind not in "biufU":
+        raise RECORDINGS.refusal(where, f"expected an array of numbers, found {dtype.name[:80]}")
+    rest = size - file.tell()
+    whole = all(type(n) is int and n >= 0 for n in shape)
+    if not whole or prod(shape) * dtype.itemsize != rest:
+        why = f"cannot be read: {shown(shape)} of {dtype} is not what its {rest:,} bytes hold"
+        raise RECORDINGS.refusal(where, why)
+    file.seek(0)
+    return npy.read_array(file, allow_pickle=False)
 
 
 def member(members: Mapping[str, Numbers], names: Sequence[str], path: Path) -> Numbers:
@@ -108,40 +113,54 @@ def csv_header(path: Path) -> list[str]:
 def read_csv(path: Path, columns: Sequence[str]) -> NDArray[np.float64]:
     """The named columns (row, column) of a CSV with a header line, found by name.
 
-    Raises `RecordingError` naming missing columns, the line of a row that is longer or shorter than
-    the header, or the line and column of a bad cell.
+    Raises `RecordingError` naming columns that are missing or stand twice, the line of a row that
+    is longer or shorter than the header, or the line and column of a bad cell.
     """
-    header, lines = csv_header(path), [*_csv_lines(path)][1:]
-    missing = [name for name in columns if name not in header]
-    if missing:
-        raise RecordingError(
-            f"{path}: missing column(s) {', '.join(missing)}; it has {_listed(header)}"
-        )
-    places = {name: header.index(name) for name in columns}
-    table = np.empty((len(lines), len(columns)))
-    for values, (line, row) in zip(table, lines, strict=True):
-        _check_width(f"{path}, line {line}", row, header)
-        for index, (name, place) in enumerate(places.items()):
-            try:
-                values[index] = float(row[place])
-            except ValueError:
-                raise RecordingError(
-                    f"{path}, line {line}, column {name!r}: {row[place]!r} is not a number"
-                ) from None
-    return table
+    lines = _csv_lines(path)
+    header = [name.strip() for name in next(lines, (0, []))[1]]
+    if len(header) > _MOST_COLUMNS:
+        why = f"expected at most {_MOST_COLUMNS:,} columns, found {len(header):,}"
+        raise RECORDINGS.refusal(path, why)
+    for count, what in ((0, "missing column(s)"), (2, "twice the column(s)")):
+        wrong = [name for name in columns if min(header.count(name), 2) == count]
+        if wrong:
+            raise RecordingError(f"{path}: {what} {', '.join(wrong)}; it has {_listed(header)}")
+    places = [header.index(name) for name in columns]
+    table = array("d")
+    for line, row in lines:
+        _check_width(path, line, row, header)
+        try:
+            # Python's own way to write thousands is no number in a table.
+            table.extend(float(row[place].replace("_", "?")) for place in places)
+        except ValueError:
+            column = len(table) % len(columns)
+            raise RecordingError(
+                f"{path}, line {line}, column {columns[column]!r}: {shown(row[places[column]])} "
+                "is not a number"
+            ) from None
+    return np.frombuffer(table, np.float64).reshape(-1, len(columns))
 
 
 def _csv_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Number and cells of each line that is not empty."""
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file)
-            yield from ((reader.line_num, row) for row in reader if row)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise RecordingError(f"{path}: cannot be read as CSV: {error}") from None
+    RECORDINGS.check_file(path)
+    with (
+        RECORDINGS.foreign(path, "cannot be read as CSV"),
+        path.open(newline="", encoding="utf-8-sig") as file,
+    ):
+        reader = csv.reader(_bounded_lines(file, path))
+        yield from ((reader.line_num, row) for row in reader if row)
 
 
-def _check_width(where: str, row: Sequence[str], header: Sequence[str]) -> None:
+def _bounded_lines(file: IO[str], path: Path) -> Iterator[str]:
+    for number, line in enumerate(iter(partial(file.readline, _LONGEST_LINE), ""), start=1):
+        if len(line) == _LONGEST_LINE:
+            why = f"expected lines of fewer than {_LONGEST_LINE:,} characters, found more"
+            raise RECORDINGS.refusal(f"{path}, line {number}", why)
+        yield line
+
+
+def _check_width(path: Path, line: int, row: Sequence[str], header: Sequence[str]) -> None:
     """Raise `RecordingError` for a row of more or fewer cells than the header names.
 
     Which cell is missing or too many cannot be known, so every channel may be a neighbour's. Empty
@@ -151,45 +170,11 @@ def _check_width(where: str, row: Sequence[str], header: Sequence[str]) -> None:
     if len(row) != expected and any((*row[expected:], *header[len(row) :])):
         why = "the line is cut off" if len(row) < expected else "its channels would be shifted"
         raise RecordingError(
-            f"{where}: expected {expected} cells as in the header, found {len(row)}; {why}. Mend "
-            "or delete the line"
+            f"{path}, line {line}: expected {expected} cells as in the header, found {len(row)}; "
+            f"{why}. Mend or delete the line"
         )
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """The object that a JSON file holds."""
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise RecordingError(f"{path}: cannot be read as JSON: {error}") from None
-    if not isinstance(document, dict):
-        raise RecordingError(f"{path}: expected a JSON object, found {type(document).__name__}")
-    return document
-
-
-def number(
-    document: Mapping[str, Any], key: str, where: str, *, positive: bool = False
-) -> float | None:
-    """A number of a metadata object, None where it is absent or null."""
-    value = document.get(key)
-    if value is None:
-        return None
-    wanted = "a positive number" if positive else "a number"
-    real = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    if not real or not math.isfinite(value) or (positive and value <= 0):
-        raise RecordingError(f"{where}: {key} must be {wanted}, found {value!r}")
-    return float(value)
-
-
-def group_name(document: Mapping[str, Any], where: str) -> str | None:
-    """The `group` of a metadata object, None where it is absent, null or empty."""
-    value = document.get("group")
-    if value is None or value == "":
-        return None
-    if isinstance(value, bool) or not isinstance(value, str | int):
-        raise RecordingError(f"{where}: group must be a name or a whole number, found {value!r}")
-    return str(value)
-
-
 def _listed(names: Collection[str]) -> str:
-    return ", ".join(names) or "nothing"
+    more = f", and {len(names) - 50:,} more" if len(names) > 50 else ""
+    return ", ".join(shown(name)[1:-1] for name in [*names][:50]) + more or "nothing"

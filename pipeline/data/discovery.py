@@ -6,12 +6,14 @@ import re
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from fnmatch import filter as matching
+from itertools import islice
 from pathlib import Path
 
+from pipeline.base.border import shown
 from pipeline.base.config import Source
 from pipeline.base.errors import RecordingError
 from pipeline.data import lerobot, pickled, raw, windowed
-from pipeline.data.reader import FileRecording, absolute, natural_key
+from pipeline.data.reader import FileRecording, absolute, entries, natural_key
 
 Found = tuple[Sequence[FileRecording], Sequence[str]]
 """Episodes, and lines about those that are not there."""
@@ -46,18 +48,20 @@ _FOREIGN = {
     "*.hdf5 *.h5": "HDF5, as robomimic and ALOHA write it",
     "*.bag *.mcap *.db3": "a ROS bag",
     "*.parquet": "LeRobot without its meta/info.json, or other parquet files",
-    "*.npz *.npy": "numpy arrays of another recorder",
-    "*.csv *.tsv": "CSV tables of another recorder",
-    "*.pkl *.pickle *.pt": "pickles of another recorder",
-    "*.mp4 *.avi *.mkv *.mov *.webm": "videos alone, without states or actions",
-    "*.jpg *.jpeg *.png": "images alone, without states or actions",
+    "*.npz *.npy *.csv *.tsv *.pkl *.pickle *.pt": "arrays or tables of another recorder",
+    "*.mp4 *.avi *.mkv *.mov *.webm *.jpg *.jpeg *.png": "images alone, without their actions",
 }
 """What recordings that no reader knows look like, by names in them; the first that fits decides."""
 
-_HUB_ID = re.compile(
-    r"(?:https://huggingface\.co/datasets/|hf://datasets/)?(\w[\w.-]*/(\w[\w.-]*))/?"
+_ON_THE_HUB = (
+    "A data set on the Hugging Face hub has to lie here first: hf download --repo-type dataset "
+    "ORG/NAME --local-dir FOLDER"
 )
 
+_ODD = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
+"""Control characters, and bytes of a name that are not UTF-8."""
+_MOST_LOOKED_AT = 1000
+"""Folders that are searched for what a folder without an episode looks like."""
 _DEEPEST = 4
 """Levels below a LeRobot root at which its files lie: videos/chunk-000/view/episode.mp4."""
 
@@ -65,20 +69,21 @@ _DEEPEST = 4
 def episode_folders(source: Source, root: Path) -> list[tuple[Path, FormatReader]]:
     """The source's episode folders and LeRobot roots, each once, in natural order.
 
-    Raises `RecordingError` where a path has none, and where a name is not UTF-8: a store could not
-    keep it.
+    Raises `RecordingError` where a path has none, and where a name is not UTF-8 or holds control
+    characters: a store could not keep it.
     """
     found: dict[Path, tuple[Path, FormatReader]] = {}
     for pattern in source.paths:
+        _check_pattern(source, pattern)
         full = absolute(root / pattern)
         matches = _matches(full)
         if not matches:
             lost = "" if root.is_dir() else f": {root} is no folder; see python -m stages.doctor"
             files = glob.glob(str(full), recursive=True)  # noqa: PTH207
-            hint = meant(Path(files[0]) if files else full) or hub_hint(pattern, root)
+            hint = meant(Path(files[0]) if files else full) or _ON_THE_HUB
             raise RecordingError(
                 f"source {source.name!r}: {pattern!r} matches nothing; looked for folders {full}. "
-                f"Mend data.root or the source's path{lost}{hint and f'. {hint}'}"
+                f"Mend data.root or the source's path{lost}. {hint}"
             )
         episodes = [pair for match in matches for pair in _episodes(match, source)]
         if not episodes:
@@ -97,29 +102,39 @@ def episode_folders(source: Source, root: Path) -> list[tuple[Path, FormatReader
 
 def _matches(full: Path) -> list[Path]:
     """The folders that a path or glob means; a glob's end `/**` is the search that follows."""
-    if full.is_dir():
+    if _is_folder(full):
         return [full]
     while full.name == "**":
         full = full.parent
     # glob follows symbolic links, as data folders often are; pathlib's ** does not.
     found = [Path(match) for match in glob.glob(str(full), recursive=True)]  # noqa: PTH207
-    return sorted((path for path in found if path.is_dir()), key=natural_key)
+    return sorted(filter(_is_folder, found), key=natural_key)
 
 
-def _episodes(
-    folder: Path, source: Source, seen: frozenset[Path] = frozenset()
-) -> Iterator[tuple[Path, FormatReader]]:
+def _is_folder(path: Path) -> bool:
+    return os.path.isdir(path)  # noqa: PTH112, which bears a name that is too long
+
+
+def _episodes(start: Path, source: Source) -> Iterator[tuple[Path, FormatReader]]:
     """Episode folders at or below a folder; nothing is looked for inside an episode."""
-    names = listing(folder)
-    format = _detect(folder, names, source)
-    if format is not None:
-        yield folder, READERS[format]
-        return
-    seen |= {folder.resolve()}
-    for name in sorted(names, key=natural_key):
-        below = folder / name
-        if not name.startswith(".") and below.is_dir() and below.resolve() not in seen:
-            yield from _episodes(below, source, seen)
+    pending, seen = [start], set[tuple[int, int]]()
+    while pending:
+        folder = pending.pop()
+        listed, status = entries(folder), folder.stat()
+        if (status.st_dev, status.st_ino) in seen:
+            continue
+        seen.add((status.st_dev, status.st_ino))
+        format = _detect(folder, [entry.name for entry in listed], source)
+        if format is not None:
+            yield folder, READERS[format]
+        else:
+            below = (entry for entry in listed if not entry.name.startswith("."))
+            # Which files are folders is known without asking for each.
+            pending += [
+                Path(entry.path)
+                for entry in below
+                if (_is_folder(Path(entry.path)) if entry.is_symlink() else entry.is_dir())
+            ]
 
 
 def _detect(folder: Path, names: Collection[str], source: Source) -> str | None:
@@ -153,7 +168,7 @@ def _foreign(path: Path) -> str:
     Zarr v3 groups, as this project's stores are, are passed over.
     """
     names = {path.name.lower()} if path.exists() else set[str]()
-    for _, below, files in os.walk(path):
+    for _, below, files in islice(os.walk(path), _MOST_LOOKED_AT):
         if "zarr.json" in files:
             below.clear()
         else:
@@ -168,29 +183,22 @@ def _foreign(path: Path) -> str:
     return ""
 
 
-def hub_hint(place: str, base: Path) -> str:
-    """What to do with a path that may be the id of a data set on the hub; '' where it is none.
-
-    A path whose parent folder is in `base` is a path.
-    """
-    match = _HUB_ID.fullmatch(place)
-    if match is None or (base / place).parent.exists():
-        return ""
-    return (
-        "It looks like the id of a data set on the Hugging Face hub, but this project reads local "
-        f"folders. Download it, then name its folder: hf download --repo-type dataset {match[1]} "
-        f"--local-dir {base / match[2]}"
-    )
+def _check_pattern(source: Source, pattern: str) -> None:
+    parts = Path(pattern).parts
+    too_long = len(parts) > 255 or max(map(len, parts), default=0) > 255
+    if _ODD.search(pattern) or too_long or parts.count("**") > 2:
+        raise RecordingError(
+            f"source {source.name!r}: expected a path or glob of names that folders can have, "
+            f"with at most two **, found {shown(pattern)}. Mend the source's path"
+        )
 
 
 def _check_name(source: Source, folder: Path) -> None:
-    try:
-        str(folder).encode()
-    except UnicodeEncodeError:
+    if odd := _ODD.search(str(folder)):
         raise RecordingError(
-            f"source {source.name!r}: the name of {str(folder)!r} is not UTF-8, so no store could "
-            "keep it. Rename the folder"
-        ) from None
+            f"source {source.name!r}: the name of {shown(str(folder))} is not UTF-8 or holds a "
+            f"control character, {shown(odd[0])}, which no store could keep. Rename the folder"
+        )
 
 
 def _format(folder: Path, names: Collection[str]) -> str | None:
@@ -199,7 +207,4 @@ def _format(folder: Path, names: Collection[str]) -> str | None:
 
 def listing(folder: Path) -> list[str]:
     """The names in a folder; `RecordingError` where it cannot be read."""
-    try:
-        return os.listdir(folder)
-    except OSError as error:
-        raise RecordingError(f"{folder}: cannot be listed: {error}") from None
+    return [entry.name for entry in entries(folder)]

@@ -3,15 +3,17 @@
 Channels, the task folder's name as instruction, JPEG views, robot states and sensor rows.
 """
 
+import os
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.base.border import Document
+from pipeline.base.config import MediaLimits
 from pipeline.base.errors import RecordingError
 from pipeline.data.arrays import Numbers, csv_header, member, read_csv, read_npz
 from pipeline.data.jpeg import JpegCamera
@@ -48,7 +50,7 @@ class InsertionRecording(FileRecording):
         return Stream(POSES, state.time, np.ascontiguousarray(state.values[:, len(_JOINTS) :]))
 
     def files(self) -> list[Path]:
-        data = (path for path in self._data_files() if path is not None and path.is_file())
+        data = (path for path in self._data_files() if path and os.path.lexists(path))
         views = (paths for view, paths in self._view_files().items() if self._wants(view))
         return sorted({*data, *chain.from_iterable(views)})
 
@@ -60,7 +62,7 @@ class InsertionRecording(FileRecording):
 
     def _cameras(self) -> Mapping[str, CameraStream]:
         return {
-            view: JpegCamera(view, paths)
+            view: JpegCamera(view, paths, self._overrides.limits)
             for view, paths in self._view_files().items()
             if self._wants(view)
         }
@@ -74,26 +76,31 @@ class InsertionRecording(FileRecording):
         """Where files that are not frames are, or would be."""
 
 
-def promised(metadata: Mapping[str, Any], **keys: Sequence[str]) -> dict[str, str]:
+def promised(metadata: Document, **keys: Sequence[str]) -> dict[str, str]:
     """What says that a stream was recorded, by stream: the first of its keys that there is."""
     told: dict[str, str] = {}
     for stream, names in keys.items():
-        said = [(key, metadata[key]) for key in names if metadata.get(key) is not None]
-        if said and said[0][1]:
-            told[stream] = f"{said[0][0]} {said[0][1]}"
+        said = [(key, getattr(metadata, key)) for key in names]
+        key, value = next((pair for pair in said if pair[1] is not None), ("", None))
+        if value:
+            told[stream] = f"{key} {value}"
     return told
 
 
 def robot_state_file(folder: Path) -> Path | None:
     """`robot_states.npz`, else `robot_states.csv`, else None."""
     for name in ("robot_states.npz", "robot_states.csv"):
-        if (folder / name).is_file():
+        if os.path.lexists(folder / name):
             return folder / name
     return None
 
 
 def read_robot_states(
-    path: Path, start: float | None, rate_hz: float | None, end: float | None = None
+    path: Path,
+    limits: MediaLimits,
+    start: float | None,
+    rate_hz: float | None,
+    end: float | None = None,
 ) -> Stream:
     """Joints and poses; without a clock of its own, row i is at `start + i / rate_hz`.
 
@@ -101,7 +108,7 @@ def read_robot_states(
     """
     if path.suffix == ".csv" and CLOCK in csv_header(path):
         return read_state_csv(path)
-    values = _states_of_npz(path) if path.suffix == ".npz" else read_csv(path, STATE.names)
+    values = _states_of_npz(path, limits) if path.suffix == ".npz" else read_csv(path, STATE.names)
     if start is None or rate_hz is None:
         raise RecordingError(
             f"{path}: has no clock, and the episode's metadata gives no start_time and robot_hz "
@@ -110,7 +117,7 @@ def read_robot_states(
     if end is not None and len(values):
         _check_end(path, len(values), start, rate_hz, end)
     time = start + np.arange(len(values), dtype=np.float64) / rate_hz
-    return checked_stream(STATE, time, values.astype(np.float32), str(path))
+    return checked_stream(STATE, time, values, str(path))
 
 
 def _check_end(path: Path, rows: int, start: float, rate_hz: float, end: float) -> None:
@@ -128,9 +135,10 @@ def _check_end(path: Path, rows: int, start: float, rate_hz: float, end: float) 
 def read_state_csv(path: Path) -> Stream:
     """The robot-state stream of a CSV that has `origin_timestamp`."""
     table = read_csv(path, (CLOCK, *STATE.names))
-    return checked_stream(STATE, table[:, 0], table[:, 1:].astype(np.float32), str(path))
+    return checked_stream(STATE, table[:, 0], table[:, 1:], str(path))
 
 
+@np.errstate(over="ignore")
 def sensor_rows(force: Numbers, aline: Numbers, where: str) -> NDArray[np.float32]:
     """Force (reading,) or (reading, 1) and A-lines (reading, 1025) -> (reading, 1026)."""
     if aline.ndim != 2 or aline.shape[1] != ALINE_BINS:
@@ -147,8 +155,8 @@ def sensor_rows(force: Numbers, aline: Numbers, where: str) -> NDArray[np.float3
     return rows
 
 
-def _states_of_npz(path: Path) -> Numbers:
-    members = read_npz(path, ("robot_states", "joints", "poses"))
+def _states_of_npz(path: Path, limits: MediaLimits) -> Numbers:
+    members = read_npz(path, ("robot_states", "joints", "poses"), limits=limits)
     counts = {name: len(array) for name, array in members.items() if array.ndim == 2}
     if len(set(counts.values())) > 1:
         raise RecordingError(

@@ -2,9 +2,7 @@
 
 import math
 import os
-from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from io import BytesIO
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path, PurePath
 from typing import TypeVar
 
@@ -12,31 +10,37 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from pipeline.base.border import shown
+from pipeline.base.config import MediaLimits
 from pipeline.base.errors import RecordingError
-from pipeline.data.reader import natural_key
+from pipeline.data.media import DEFAULT_LIMITS, FARTHEST_S, RECORDINGS, opened_image
+from pipeline.data.reader import entries, natural_key
 from pipeline.data.recording import CameraStream
 
 THUMBNAIL = (32, 18)
 """Width and height of what is seen of a JPEG that is checked."""
 
 Frame = TypeVar("Frame")
+Seen = TypeVar("Seen")
 _EYES = ("left", "right")
 _SUFFIXES = (".jpg", ".jpeg")
-_UNREADABLE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
 
 
 class JpegCamera(CameraStream):
     """A view whose frames are files."""
 
-    def __init__(self, view: str, paths: Sequence[Path]) -> None:
+    def __init__(
+        self, view: str, paths: Sequence[Path], limits: MediaLimits = DEFAULT_LIMITS
+    ) -> None:
         """Sorts the files by the time in their names; raises `RecordingError` on a name without."""
         timed = sorted((frame_time(path), str(path)) for path in paths)
         self.view = view
         self.paths = [Path(path) for _, path in timed]
         self.time = np.array([time for time, _ in timed], np.float64)
+        self._limits = limits
 
     def check(self, indices: Sequence[int]) -> NDArray[np.uint8] | None:
-        seen = [check_image(self.paths[index], str(self.paths[index])) for index in indices]
+        seen = [self._each(check_image, index) for index in indices]
         decoded = [thumbnail for thumbnail in seen if thumbnail is not None]
         return np.stack(decoded) if seen and len(decoded) == len(seen) else None
 
@@ -44,20 +48,23 @@ class JpegCamera(CameraStream):
         last, frame = -1, None
         for index in indices:
             if frame is None or index != last:
-                last, frame = index, read_image(self.paths[index], str(self.paths[index]))
+                last, frame = index, self._each(read_image, index)
             yield frame
 
     def repeats(self) -> NDArray[np.bool_]:
         """Whether files are the same byte by byte; only those of equal length are read."""
-        lengths = np.array([path.stat().st_size for path in self.paths])
+        lengths = np.array([RECORDINGS.check_file(path) for path in self.paths])
         same = lengths[1:] == lengths[:-1]
         for place in np.flatnonzero(same):
             same[place] = self.paths[place].read_bytes() == self.paths[place + 1].read_bytes()
         return same
 
     def sizes(self, indices: Sequence[int]) -> NDArray[np.int64]:
-        found = [image_size(self.paths[index], str(self.paths[index])) for index in indices]
+        found = [self._each(image_size, index) for index in indices]
         return np.array(found, np.int64).reshape(-1, 2)
+
+    def _each(self, ask: Callable[[Path, str, MediaLimits], Seen], index: int) -> Seen:
+        return ask(self.paths[index], str(self.paths[index]), self._limits)
 
 
 def frame_time(path: PurePath) -> float:
@@ -67,10 +74,10 @@ def frame_time(path: PurePath) -> float:
         time = float(text)
     except ValueError:
         time = math.nan
-    if not math.isfinite(time):
+    if not abs(time) <= FARTHEST_S:
         raise RecordingError(
             f"{path}: expected a name that ends in the time in seconds, such as "
-            f"zed_left_1761551500.174.jpg, found {text!r}"
+            f"zed_left_1761551500.174.jpg, found {shown(text)}"
         )
     return time
 
@@ -113,40 +120,34 @@ def split_eye(name: str) -> tuple[str, str]:
     return (base, eye) if base and eye in _EYES else (name, "")
 
 
-def read_image(file: Path | bytes, where: str) -> NDArray[np.uint8]:
+def read_image(
+    file: Path | bytes, where: str, limits: MediaLimits = DEFAULT_LIMITS
+) -> NDArray[np.uint8]:
     """The image (height, width, 3), RGB as stored (EXIF orientation is ignored)."""
-    with _image(file, where) as image:
+    with opened_image(file, where, limits) as image:
         return np.asarray(image.convert("RGB"))
 
 
-def image_size(file: Path, where: str) -> tuple[int, int]:
+def image_size(file: Path, where: str, limits: MediaLimits = DEFAULT_LIMITS) -> tuple[int, int]:
     """Height and width as the file's header says."""
-    with _image(file, where) as image:
+    with opened_image(file, where, limits) as image:
         return image.height, image.width
 
 
-def check_image(file: Path | bytes, where: str) -> NDArray[np.uint8] | None:
+def check_image(
+    file: Path | bytes, where: str, limits: MediaLimits = DEFAULT_LIMITS
+) -> NDArray[np.uint8] | None:
     """Raise `RecordingError` on an unreadable image.
 
     A JPEG is decoded at an eighth of its size and gives some of its pixels, evenly spread, as a
     `THUMBNAIL`; a PNG is judged by its checksums and gives None.
     """
-    with _image(file, where) as image:
+    with opened_image(file, where, limits) as image:
         if image.format == "PNG":
             image.verify()
             return None
         image.draft("RGB", (max(1, image.width // 8), max(1, image.height // 8)))
         return np.asarray(image.resize(THUMBNAIL, Image.Resampling.NEAREST).convert("RGB"))
-
-
-@contextmanager
-def _image(file: Path | bytes, where: str) -> Generator[Image.Image, None, None]:
-    """An open image; what goes wrong inside is a `RecordingError` that begins with `where`."""
-    try:
-        with Image.open(BytesIO(file) if isinstance(file, bytes) else file) as image:
-            yield image
-    except _UNREADABLE as error:
-        raise RecordingError(f"{where}: cannot be decoded as an image: {error}") from None
 
 
 def _view_folders(folder: Path, prefix: str) -> list[Path]:
@@ -166,13 +167,8 @@ def _frames(view: Path) -> Iterator[tuple[str, Path]]:
 
 
 def _entries(folder: Path) -> Iterable[os.DirEntry[str]]:
-    if not folder.is_dir():
-        return []
-    try:
-        with os.scandir(folder) as entries:
-            return [entry for entry in entries if not entry.name.startswith(".")]
-    except OSError as error:
-        raise RecordingError(f"{folder}: cannot be listed: {error}") from None
+    listed = entries(folder) if folder.is_dir() else []
+    return [entry for entry in listed if not entry.name.startswith(".")]
 
 
 def _is_jpeg(name: str) -> bool:

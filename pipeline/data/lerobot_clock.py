@@ -1,4 +1,4 @@
-"""When the rows of a LeRobot episode were recorded, and that they are that episode's rows.
+"""When the rows of a LeRobot episode were recorded.
 
 LeRobot stores `timestamp` as float32, in which 0.1 is 0.10000000149. Where the stored times are
 those of the frame numbers at `fps`, the clock is computed from the numbers, without that rounding.
@@ -11,18 +11,18 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from pipeline.base.errors import RecordingError
-from pipeline.data.lerobot_layout import LeRobotEntry
-from pipeline.data.lerobot_rows import ParquetRows, matrix
+from pipeline.data.lerobot_rows import CLOCK, ParquetRows, matrix
+from pipeline.data.media import RECORDINGS
 from pipeline.data.recording import check_clock, check_rising_clock
 
-CLOCK = "timestamp"
 FRAME = "frame_index"
-EPISODE = "episode_index"
-NUMBERS = (CLOCK, FRAME, EPISODE)
+NUMBERS = (CLOCK, FRAME)
 
 _ROUNDINGS = 2
 """Steps of the stored type by which a time may differ from that of its frame number: the writer
 may have multiplied by a rounded 1 / fps."""
+_LATEST_S = 1e12
+"""Nanoseconds reach it in a quarter of an hour: no clock is in seconds there."""
 _UNITS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
 
 
@@ -43,27 +43,22 @@ def read_clock(table: pa.Table, fps: float, where: str) -> NDArray[np.float64]:
 def stored_clock(table: pa.Table, where: str) -> NDArray[np.float64]:
     """(row,) the column `timestamp` as it stands in the file."""
     if CLOCK not in table.column_names:
-        raise RecordingError(f"{where}: missing column {CLOCK!r}")
-    return matrix(table[CLOCK], 1, f"{where}, {CLOCK!r}")[:, 0]
+        raise RECORDINGS.refusal(where, f"missing column {CLOCK!r}")
+    where += f", {CLOCK!r}"
+    stored = matrix(table[CLOCK], 1, where)[:, 0]
+    if (far := np.flatnonzero(np.abs(stored) > _LATEST_S)).size:
+        why = f"expected seconds, found {stored[far[0]]:g} in row {far[0]}"
+        raise RECORDINGS.refusal(where, why)
+    return stored
 
 
-def check_numbers(table: pa.Table, rows: ParquetRows, entry: LeRobotEntry) -> None:
-    """Raise `RecordingError` where rows are another episode's, or frame numbers do not rise.
+def check_frames(table: pa.Table, rows: ParquetRows) -> None:
+    """Raise `RecordingError` where frame numbers do not rise.
 
-    Frame numbers may begin above 0 and leave some out: rows can have been taken away. A column that
-    is absent contradicts nothing.
+    They may begin above 0 and leave some out: rows can have been taken away.
     """
-    where = f"{rows.path}, {entry.id}"
-    if EPISODE in table.column_names:
-        index = matrix(table[EPISODE], 1, f"{where}, {EPISODE!r}")[:, 0]
-        if (other := np.flatnonzero(index != entry.index)).size:
-            raise RecordingError(
-                f"{rows.path}, row {rows.start + other[0]}: expected {EPISODE} {entry.index}, "
-                f"found {index[other[0]]:g} ({other.size} such rows): the file is another "
-                "episode's. Give the files their own names again, or copy the data set again"
-            )
-    frame = _frames(table, where)
-    if (fallen := np.flatnonzero(np.diff(frame) <= 0)).size:
+    frame = _frames(table, str(rows.path))
+    if (fallen := np.flatnonzero(~(np.diff(frame) > 0))).size:
         row = int(fallen[0]) + 1
         raise RecordingError(
             f"{rows.path}, row {rows.start + row}: expected {FRAME} above {frame[row - 1]:g}, "
@@ -100,7 +95,7 @@ def _exact(
     first = dtype.type(stored[0])
     largest = np.maximum(np.abs(stored), np.abs(stored[0])).astype(dtype)
     allowed = _ROUNDINGS * np.spacing(largest).astype(np.float64)
-    for time in ((round(stored[0] * fps) + since) / fps, float(str(first)) + since / fps):
+    for time in ((np.rint(stored[0] * fps) + since) / fps, float(str(first)) + since / fps):
         if (np.abs(time - stored) <= allowed).all():
             return time
     return stored

@@ -3,302 +3,128 @@
 v2.0 and v2.1 keep a file an episode, v3.0 many episodes a file. Only `meta/` is read here.
 """
 
-import json
-import math
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, reduce
+from itertools import islice, pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-import pyarrow as pa
-import pyarrow.parquet as pq
-
-from pipeline.base.errors import RecordingError
-from pipeline.data.arrays import group_name, number, read_json
+from pipeline.base.config import MediaLimits
+from pipeline.data.lerobot_meta import META, Episode, Info, Place, SharedEpisode, Span, Task
+from pipeline.data.parquet import ParquetTable
 from pipeline.data.reader import natural_key
 from pipeline.data.video import VideoSpan
 
-VERSIONS = ("v2.0", "v2.1", "v3.0")
-_VIEW_PREFIXES = ("observation.images.", "observation.")
-_V3_TEXT = ("task", "__index_level_0__")
-"""Column of a task's text from lerobot 0.5.0 on, and before."""
+T = TypeVar("T")
 
-
-@dataclass(frozen=True)
-class LeRobotEntry:
-    """One episode as `meta/` lists it."""
-
-    index: int
-    length: int
-    tasks: tuple[str, ...]
-    data: Path
-    shared: bool
-    """Whether other episodes' rows may stand in the same file."""
-    videos: Mapping[str, VideoSpan]
-    """By feature key."""
-    group: str | None
-    """Of the episodes that belong together, this project's extension."""
-
-    @property
-    def id(self) -> str:
-        """As in `episode_000003`."""
-        return f"episode_{self.index:06d}"
+MARKER = "meta/info.json"
+_INFO_BYTES = 8 * 2**20
+_MOST_ROWS = 100_000
+"""Episodes or tasks of a data set."""
+_EPISODE_COLUMNS = ("episode_index", "length", "tasks", "group")
+_TASK_COLUMNS = ("task_index", "task", "__index_level_0__")
 
 
 @dataclass(frozen=True)
 class LeRobotLayout:
-    """What all episodes of a data set share."""
+    """A data set: what all its episodes share, and where each of them is."""
 
     root: Path
-    version: str
-    fps: float
-    features: Mapping[str, Mapping[str, Any]]
+    info: Info
+    episodes: Sequence[Episode]
+    """By index."""
     task_text: Mapping[int, str]
+    limits: MediaLimits
+    """Of its files."""
 
-    @property
-    def views(self) -> Mapping[str, str]:
-        """Feature keys of the cameras, by view name."""
-        return {_view_name(key): key for key in _cameras(self.features, depth=False)}
+    def data(self, episode: Episode) -> Path:
+        """The file of its rows, as `meta/` says."""
+        return self.root / self.info.data_path.format(**episode.place(self.info.chunks_size))
 
-    @property
-    def depth(self) -> Mapping[str, str]:
-        """Feature keys of the depth maps, which are no views, by view name."""
-        return {_view_name(key): key for key in _cameras(self.features, depth=True)}
+    def video(self, episode: Episode, key: str) -> VideoSpan:
+        """Its frames of the video of a feature."""
+        place = episode.place(self.info.chunks_size, key)
+        path = (self.info.video_path or "").format(video_key=key, **place)
+        return VideoSpan(self.root / path, *episode.frames(key, self.info.fps))
+
+    @cached_property
+    def rivals(self) -> Mapping[tuple[int, str], str]:
+        """By an episode's index and a feature key: another that some of its frames go to too."""
+        by_file: dict[Path, list[tuple[int, int, str, Episode]]] = defaultdict(list)
+        for episode in self.episodes:
+            for key in self.info.videos:
+                span = self.video(episode, key)
+                by_file[span.path].append((span.first or 0, episode.index, key, episode))
+        rivals: dict[tuple[int, str], str] = {}
+        for spans in by_file.values():
+            until, last = 0, ("", spans[0][-1])
+            for first, index, key, episode in sorted(spans, key=lambda span: span[:3]):
+                if first < until:
+                    rivals[index, key], rivals[last[1].index, last[0]] = last[1].id, episode.id
+                if first + episode.length > until:
+                    until, last = first + episode.length, (key, episode)
+        return rivals
 
 
-def read_layout(root: Path) -> tuple[LeRobotLayout, tuple[LeRobotEntry, ...]]:
-    """The data set's layout, and its episodes by index.
+def read_layout(root: Path, limits: MediaLimits) -> LeRobotLayout:
+    """The data set as its `meta/` describes it.
 
     Raises `RecordingError` naming the file of `meta/` that is wrong, and the place in it: also
     where two cameras would be one view, or an episode is listed twice.
     """
-    path = root / "meta" / "info.json"
-    info = read_json(path)
-    version = info.get("codebase_version")
-    if version not in VERSIONS:
-        raise RecordingError(
-            f"{path}: codebase_version is {version!r}; this reader knows {', '.join(VERSIONS)}. "
-            "Convert the data set with the lerobot release that it names"
-        )
-    fps = number(info, "fps", str(path), positive=True)
-    features = info.get("features")
-    if fps is None or not isinstance(features, dict):
-        raise RecordingError(f"{path}: expected fps and features, found {', '.join(info)}")
-    try:
-        read = _entries_v3(root, info, fps) if version == "v3.0" else _entries_v2(root, info)
-        entries = _apart(sorted(read, key=lambda entry: entry.index), root)
-        _check_view_names(features, path)
-        tasks = _tasks_v3(root) if version == "v3.0" else _tasks_v2(root)
-    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
-        if isinstance(error, RecordingError):
-            raise
-        raise RecordingError(f"{root / 'meta'}: cannot be understood: {error!r}") from None
-    return LeRobotLayout(root, version, fps, features, tasks), entries
-
-
-def _apart(entries: Sequence[LeRobotEntry], root: Path) -> tuple[LeRobotEntry, ...]:
-    """Entries in the order of their index with their rivals for frames, none of them twice."""
-    for one, other in pairwise(entries):
+    info = META.read_json(root / MARKER, Info, _INFO_BYTES)
+    if info.shared:
+        rows = _shared_episodes(root, info, limits)
+    else:
+        rows = META.read_json_lines(root / "meta" / "episodes.jsonl", Episode)
+    episodes = sorted(_some(rows, root), key=lambda episode: episode.index)
+    for one, other in pairwise(episodes):
         if one.index == other.index:
-            place = root / "meta" / ("episodes" if one.shared else "episodes.jsonl")
-            raise RecordingError(
-                f"{place}: expected each episode once, found {one.id} twice. Remove one of the "
-                "two entries, or write the data set again"
-            )
-    rivals = _rivals(entries)
-    return tuple(
-        replace(
-            entry,
-            videos={
-                key: replace(span, rival=rivals.get((entry.index, key), ""))
-                for key, span in entry.videos.items()
-            },
-        )
-        for entry in entries
-    )
+            place = root / "meta" / ("episodes" if info.shared else "episodes.jsonl")
+            raise META.refusal(place, f"expected each episode once, found {one.id} twice")
+    return LeRobotLayout(root, info, episodes, _task_text(root, info.shared, limits), limits)
 
 
-def _rivals(entries: Sequence[LeRobotEntry]) -> dict[tuple[int, str], str]:
-    """Of each span that overlaps another episode's, by index and feature key: that episode."""
-    by_file: dict[Path, list[tuple[int, int, str, LeRobotEntry]]] = defaultdict(list)
-    for entry in entries:
-        for key, span in entry.videos.items():
-            if span.first is not None:
-                by_file[span.path].append((span.first, entry.index, key, entry))
-    rivals: dict[tuple[int, str], str] = {}
-    for spans in by_file.values():
-        until, last = 0, None
-        for first, index, key, entry in sorted(spans, key=lambda span: span[:2]):
-            if last is not None and first < until:
-                rivals[index, key], rivals[last.index, key] = last.id, entry.id
-            if last is None or first + entry.length > until:
-                until, last = first + entry.length, entry
-    return rivals
-
-
-def _cameras(features: Mapping[str, Mapping[str, Any]], depth: bool) -> list[str]:
-    """Feature keys of cameras that are depth maps, or of the others."""
-    return [
-        key
-        for key, feature in features.items()
-        if feature.get("dtype") in ("video", "image") and _is_depth(feature) == depth
-    ]
-
-
-def _is_depth(feature: Mapping[str, Any]) -> bool:
-    """`video_info` is what sets migrated from v1 call `info`."""
-    told = [info for name in ("info", "video_info") if isinstance(info := feature.get(name), dict)]
-    return any(info.get(name) for info in told for name in ("is_depth_map", "video.is_depth_map"))
-
-
-def _check_view_names(features: Mapping[str, Mapping[str, Any]], path: Path) -> None:
-    keys: dict[str, str] = {}
-    for key in _cameras(features, depth=False):
-        if (other := keys.setdefault(_view_name(key), key)) != key:
-            raise RecordingError(
-                f"{path}: features {other!r} and {key!r} are both the view {_view_name(key)!r}, "
-                "and only one can be. Rename one of them there and in the data set's files"
-            )
-
-
-def _view_name(key: str) -> str:
-    for prefix in _VIEW_PREFIXES:
-        if key.startswith(prefix):
-            return key.removeprefix(prefix)
-    return key
-
-
-def _video_keys(info: Mapping[str, Any]) -> list[str]:
-    return [key for key, f in info["features"].items() if f.get("dtype") == "video"]
-
-
-def _entries_v2(root: Path, info: Mapping[str, Any]) -> Iterator[LeRobotEntry]:
-    path = root / "meta" / "episodes.jsonl"
-    chunk = number(info, "chunks_size", str(root / "meta" / "info.json"), positive=True)
-    if chunk is None or chunk % 1:
-        raise RecordingError(
-            f"{root / 'meta' / 'info.json'}: chunks_size must be a whole number, found {chunk}"
-        )
-    for row in _jsonl(path, ("episode_index", "length")):
-        index = int(row["episode_index"])
-        place = {"episode_index": index, "episode_chunk": index // int(chunk)}
-        yield LeRobotEntry(
-            index=index,
-            length=int(row["length"]),
-            tasks=_texts(row, path),
-            data=root / info["data_path"].format(**place),
-            shared=False,
-            videos={
-                key: VideoSpan(root / info["video_path"].format(video_key=key, **place))
-                for key in _video_keys(info)
-            },
-            group=group_name(row, str(path)),
-        )
-
-
-def _entries_v3(root: Path, info: Mapping[str, Any], fps: float) -> Iterator[LeRobotEntry]:
+def _shared_episodes(root: Path, info: Info, limits: MediaLimits) -> Iterator[Episode]:
     folder = root / "meta" / "episodes"
     files = sorted(folder.glob("chunk-*/file-*.parquet"), key=natural_key)
     if not files:
-        raise RecordingError(f"{folder}: expected chunk-000/file-000.parquet, found none")
-    keys = _video_keys(info)
-    needed = ["episode_index", "length", "data/chunk_index", "data/file_index"]
-    for key in keys:
-        needed += [f"videos/{key}/{field}" for field in _SPAN_FIELDS]
-    for row in _rows(files, needed):
-        yield LeRobotEntry(
-            index=row["episode_index"],
-            length=row["length"],
-            tasks=_texts(row, folder),
-            data=root
-            / info["data_path"].format(
-                chunk_index=row["data/chunk_index"], file_index=row["data/file_index"]
-            ),
-            shared=True,
-            videos={key: _span_v3(root, info, row, key, fps) for key in keys},
-            group=group_name(row, str(folder)),
-        )
-
-
-def _texts(row: Mapping[str, Any], where: Path) -> tuple[str, ...]:
-    tasks = row.get("tasks") or []
-    if not isinstance(tasks, list) or not all(isinstance(task, str) for task in tasks):
-        raise RecordingError(
-            f"{where}, episode {row['episode_index']}: expected tasks as texts, found {tasks!r}"
-        )
-    return tuple(tasks)
-
-
-_SPAN_FIELDS = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
-
-
-def _span_v3(
-    root: Path, info: Mapping[str, Any], row: Mapping[str, Any], key: str, fps: float
-) -> VideoSpan:
-    chunk, file, begin, end = (row[f"videos/{key}/{field}"] for field in _SPAN_FIELDS)
-    path = info["video_path"].format(video_key=key, chunk_index=chunk, file_index=file)
-    # Rounded to frame numbers: the timestamps are inexact sums such as 36.900000000000006.
-    return VideoSpan(root / path, round(begin * fps), round((end - begin) * fps))
-
-
-def _tasks_v2(root: Path) -> dict[int, str]:
-    path = root / "meta" / "tasks.jsonl"
-    if not path.is_file():
-        return {}
-    rows = _jsonl(path, ("task_index", "task"))
-    return {int(row["task_index"]): str(row["task"]) for row in rows}
-
-
-def _tasks_v3(root: Path) -> dict[int, str]:
-    path = root / "meta" / "tasks.parquet"
-    if not path.is_file():
-        return {}
-    rows = list(_rows([path], ["task_index"]))
-    text = next((name for name in _V3_TEXT if rows and name in rows[0]), None)
-    return {row["task_index"]: row[text] for row in rows} if text else {}
-
-
-def _rows(files: Sequence[Path], needed: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """Rows of parquet files of `meta/`, statistics left out."""
+        raise META.refusal(folder, "expected chunk-000/file-000.parquet, found none")
+    columns = [*_EPISODE_COLUMNS, *(f"data/{name}" for name in Place.model_fields)]
+    columns += [f"videos/{key}/{name}" for key in info.videos for name in Span.model_fields]
     for path in files:
-        try:
-            with pq.ParquetFile(path) as file:
-                columns = [n for n in file.schema_arrow.names if not n.startswith("stats/")]
-                missing = [name for name in needed if name not in columns]
-                if missing:
-                    raise RecordingError(
-                        f"{path}: missing column(s) {', '.join(missing)}; "
-                        f"it has {', '.join(columns)}"
-                    )
-                rows = file.read(columns=columns).to_pylist()
-        except (pa.ArrowException, OSError) as error:
-            raise RecordingError(f"{path}: cannot be read as parquet: {error}") from None
-        for place, row in enumerate(rows):
-            empty = [name for name in needed if row[name] is None]
-            if empty:
-                raise RecordingError(f"{path}, row {place}: {', '.join(empty)} is null")
-            for name in needed:
-                if isinstance(row[name], float) and not math.isfinite(row[name]):
-                    raise RecordingError(f"{path}, row {place}: {name} is {row[name]}")
-            yield row
+        for where, cells in ParquetTable(path, limits).rows(columns):
+            row: dict[str, Any] = {"videos": {key: {} for key in info.videos}}
+            for column, cell in cells.items():
+                *parents, name = column.split("/")  # no key has one
+                reduce(lambda inner, parent: inner.setdefault(parent, {}), parents, row)[name] = (
+                    cell
+                )
+            yield META.parse(row, SharedEpisode, where)
 
 
-def _jsonl(path: Path, needed: Sequence[str]) -> Iterator[dict[str, Any]]:
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise RecordingError(f"{path}: cannot be read: {error}") from None
-    for place, line in enumerate(lines, start=1):
-        if not line.strip():
-            continue
-        try:
-            row = json.loads(line)
-        except ValueError as error:
-            raise RecordingError(f"{path}, line {place}: not JSON: {error}") from None
-        if not isinstance(row, dict) or any(key not in row for key in needed):
-            raise RecordingError(
-                f"{path}, line {place}: expected an object with {', '.join(needed)}"
-            )
-        yield row
+def _task_text(root: Path, shared: bool, limits: MediaLimits) -> dict[int, str]:
+    """The tasks' texts by their index; none where there is no file of them."""
+    path = root / "meta" / ("tasks.parquet" if shared else "tasks.jsonl")
+    if not path.exists():
+        return {}
+    if shared:
+        rows = ParquetTable(path, limits).rows(_TASK_COLUMNS)
+        tasks = (META.parse(cells, Task, where) for where, cells in rows)
+    else:
+        tasks = META.read_json_lines(path, Task)
+    texts: dict[int, str] = {}
+    for task in _some(tasks, root):
+        if texts.setdefault(task.index, task.text) != task.text:
+            raise META.refusal(path, f"expected each task once, found {task.index} twice")
+    return texts
+
+
+def _some(rows: Iterable[T], root: Path) -> list[T]:
+    """All of these rows of `meta/`, refused where they never end."""
+    some = list(islice(rows, _MOST_ROWS + 1))
+    if len(some) > _MOST_ROWS:
+        raise META.refusal(root / "meta", f"expected at most {_MOST_ROWS:,} episodes or tasks")
+    return some

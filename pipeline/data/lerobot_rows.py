@@ -1,24 +1,25 @@
 """The rows of one LeRobot episode in a parquet file: where they are, and their columns."""
 
-from collections.abc import Generator, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from pipeline.base.border import shown
 from pipeline.base.errors import RecordingError
 from pipeline.data.jpeg import check_image, read_image
-from pipeline.data.lerobot_layout import LeRobotEntry, LeRobotLayout
+from pipeline.data.lerobot_layout import LeRobotLayout
+from pipeline.data.lerobot_meta import META, Episode
+from pipeline.data.media import RECORDINGS
+from pipeline.data.parquet import ParquetTable
 from pipeline.data.reader import natural_key
 from pipeline.data.recording import CameraStream, check_clock
 
-_IMAGE_ROWS = 8
-"""Rows of encoded images held at a time."""
+CLOCK = "timestamp"
+EPISODE = "episode_index"
 _SAME_S = 1e-9
 """By which sums of steps in float64 may differ and be the same time."""
 
@@ -27,40 +28,48 @@ _SAME_S = 1e-9
 class ParquetRows:
     """A half-open range of rows of a parquet file."""
 
-    path: Path
+    table: ParquetTable
     start: int
     stop: int
 
+    @property
+    def path(self) -> Path:
+        """The file."""
+        return self.table.path
+
     def columns(self, wanted: Sequence[str]) -> pa.Table:
-        """Those wanted columns that the file has, (row,) each."""
-        groups, offset = self._groups()
-        table = _read_groups(*_stamped(self.path), groups, tuple(wanted))
-        return table.slice(self.start - offset, self.stop - self.start)
+        """Those wanted columns that the file has, (row,) each, of numbers or lists of them."""
+        groups, offset = self.table.groups(self.start, self.stop)
+        rows = self.table.numbers(wanted, groups).slice(self.start - offset, self.stop - self.start)
+        if rows.num_columns and rows.num_rows != self.stop - self.start:
+            why = f"expected {self.stop - self.start} rows as it declares, found {rows.num_rows}"
+            raise RECORDINGS.refusal(self.path, why)
+        return rows
 
     def images(self, column: str, rows: Sequence[int]) -> Iterator[tuple[int, bytes]]:
-        """The encoded image of each row asked for (ascending, no twins), a few rows at a time."""
-        groups, offset = self._groups()
-        pending = iter(rows)
-        row = next(pending, None)
-        with opened(self.path) as file:
-            at = offset - self.start
-            batches = file.iter_batches(_IMAGE_ROWS, row_groups=list(groups), columns=[column])
-            for batch in batches:
-                while row is not None and row < at + batch.num_rows:
-                    yield row, _encoded(batch.column(0)[row - at].as_py(), self.path, column, row)
-                    row = next(pending, None)
-                at += batch.num_rows
-                if row is None:
+        """The encoded image of each row asked for (ascending, no twins), one row at a time."""
+        groups, offset = self.table.groups(self.start, self.stop)
+        where = f"{self.path}, column {column!r}"
+        asked = set(rows)
+        with self.table.open() as file:
+            there, _ = self.table.check(file, [column], groups)
+            kind = file.schema_arrow.field(column).type if there else pa.null()
+            if not isinstance(kind, pa.StructType) or kind.get_field_index("bytes") < 0:
+                raise RECORDINGS.refusal(where, f"expected images, found {shown(str(kind))}")
+            # One at a time: a single large image may stand in every row.
+            batches = file.iter_batches(1, row_groups=groups, columns=[f"{column}.bytes"])
+            for row, batch in enumerate(batches, offset - self.start):
+                if row not in asked:
+                    continue
+                image = batch.column(column).field("bytes")[0].as_py()
+                if not isinstance(image, bytes):
+                    where += f", row {self.start + row}"
+                    raise RECORDINGS.refusal(where, "the cell has no image bytes")
+                yield row, image
+                asked.remove(row)
+                if not asked:
                     return
-
-    def _groups(self) -> tuple[tuple[int, ...], int]:
-        """The row groups that hold the range, and the file row at which the first begins."""
-        with opened(self.path) as file:
-            sizes = [file.metadata.row_group(i).num_rows for i in range(file.num_row_groups)]
-        ends = np.cumsum(sizes, dtype=np.int64)
-        first = int(np.searchsorted(ends, self.start, side="right"))
-        last = int(np.searchsorted(ends, self.stop, side="left"))
-        return tuple(range(first, last + 1)), int(ends[first] - sizes[first])
+        raise RECORDINGS.refusal(where, f"expected {self.stop - self.start} rows, found less")
 
 
 class ParquetCamera(CameraStream):
@@ -106,13 +115,13 @@ class ParquetCamera(CameraStream):
 
     def check(self, indices: Sequence[int]) -> None:
         for row, image in self._rows.images(self._column, self._rows_of(sorted(set(indices)))):
-            check_image(image, self._where(row))
+            check_image(image, self._where(row), self._rows.table.limits)
 
     def read(self, indices: Sequence[int]) -> Iterator[NDArray[np.uint8]]:
         wanted = self._rows_of(indices)
         place = 0
         for row, image in self._rows.images(self._column, sorted(set(wanted))):
-            frame = read_image(image, self._where(row))
+            frame = read_image(image, self._where(row), self._rows.table.limits)
             while place < len(wanted) and wanted[place] == row:
                 yield frame
                 place += 1
@@ -124,33 +133,35 @@ class ParquetCamera(CameraStream):
         return f"{self._rows.path}, column {self._column!r}, row {self._rows.start + row}"
 
 
-def find_rows(layout: LeRobotLayout, entry: LeRobotEntry) -> ParquetRows:
-    """The episode's rows, found by their `episode_index` in a shared file.
+def find_rows(layout: LeRobotLayout, episode: Episode) -> ParquetRows:
+    """The episode's rows, found by their `episode_index`; the whole file where it has none.
 
     The metadata's file_index can be stale (lerobot up to 0.4.4), so where the file named has none
-    of the rows, the other data files are searched. Raises `RecordingError` naming both counts
-    where they are not as many as `meta/` says, or not together.
+    of the rows, the other data files of v3.0 are searched. Raises `RecordingError` naming both
+    counts where they are not as many as `meta/` says, or not together.
     """
-    if not entry.shared:
-        with opened(entry.data) as file:
-            rows = ParquetRows(entry.data, 0, file.metadata.num_rows)
-        _check_length(rows.stop, entry, entry.data)
-        if not rows.stop:
-            raise RecordingError(f"{entry.data}: has no row of episode {entry.index}")
-        return rows
-    others = sorted((layout.root / "data").glob("*/*.parquet"), key=natural_key)
-    for path in [entry.data, *(other for other in others if other != entry.data)]:
-        if not path.is_file():
-            continue
-        found = np.flatnonzero(_episode_column(*_stamped(path)) == entry.index)
-        if found.size:
-            _check_length(found.size, entry, path)
-            if found[-1] - found[0] + 1 != found.size:
-                raise RecordingError(f"{path}: rows of episode {entry.index} are not together")
-            return ParquetRows(path, int(found[0]), int(found[-1]) + 1)
+    shared, named = layout.info.shared, layout.data(episode)
+    others = sorted((layout.root / "data").glob("*/*.parquet"), key=natural_key) if shared else []
+    for path in [named, *(other for other in others if other != named and other.is_file())]:
+        table = ParquetTable(path, layout.limits)
+        columns = table.numbers((EPISODE, CLOCK))
+        if EPISODE in columns.column_names:
+            index = matrix(columns[EPISODE], 1, f"{path}, {EPISODE!r}")[:, 0]
+        elif shared:
+            raise RECORDINGS.refusal(path, f"missing column {EPISODE!r}")
+        else:
+            index = np.full(columns.num_rows, float(episode.index))
+        rows = np.flatnonzero(index == episode.index)
+        if rows.size:
+            of = f"rows of episode {episode.index}"
+            if rows.size != episode.length:
+                raise META.refusal(path, f"{rows.size} {of}, but meta/ says {episode.length}")
+            if rows[-1] - rows[0] + 1 != rows.size:
+                raise META.refusal(path, f"{of} are not together")
+            return ParquetRows(table, int(rows[0]), int(rows[-1]) + 1)
     raise RecordingError(
-        f"{entry.data}: has no row of episode {entry.index}, nor has any other file under "
-        f"{layout.root / 'data'}"
+        f"{named}: has no row of episode {episode.index}{', nor has any other file' * shared}. "
+        "Give the data files their own names again, or copy the data set again"
     )
 
 
@@ -158,73 +169,16 @@ def matrix(column: pa.ChunkedArray, width: int, where: str) -> NDArray[np.float6
     """A column of vectors, or of numbers where the width is 1, as (row, width)."""
     array = column.combine_chunks()
     if array.null_count:
-        raise RecordingError(f"{where}: no value in row {int(np.argmax(array.is_null()))}")
+        raise RECORDINGS.refusal(where, f"no value in row {int(np.argmax(array.is_null()))}")
     if isinstance(array, pa.ListArray | pa.LargeListArray | pa.FixedSizeListArray):
         fixed = isinstance(array, pa.FixedSizeListArray)
         lengths = np.asarray([array.type.list_size] if fixed else array.value_lengths())
         if (lengths != width).any():
             row = int(np.argmax(lengths != width))
-            raise RecordingError(
-                f"{where}: {lengths[row]} values in row {row}, but its feature has {width}"
-            )
+            why = f"{lengths[row]} values in row {row}, but its feature has {width}"
+            raise RECORDINGS.refusal(where, why)
         array = array.flatten()
-    if not (pa.types.is_floating(array.type) or pa.types.is_integer(array.type)):
-        raise RecordingError(f"{where}: expected numbers, found {array.type}")
     values = array.to_numpy(zero_copy_only=False)
     if values.size != len(column) * width:
-        raise RecordingError(f"{where}: one number a row, but its feature has {width}")
+        raise RECORDINGS.refusal(where, f"one number a row, but its feature has {width}")
     return values.astype(np.float64).reshape(len(column), width)
-
-
-@contextmanager
-def opened(path: Path) -> Generator[pq.ParquetFile, None, None]:
-    """An open parquet file; what goes wrong inside is a `RecordingError` that names it."""
-    try:
-        with pq.ParquetFile(path) as file:
-            yield file
-    except (pa.ArrowException, OSError) as error:
-        raise RecordingError(
-            f"{path}: cannot be read as parquet: {error}; copy the file again"
-        ) from None
-
-
-def _check_length(rows: int, entry: LeRobotEntry, path: Path) -> None:
-    if rows != entry.length:
-        raise RecordingError(
-            f"{path}: {rows} rows of episode {entry.index}, but meta/ says {entry.length}; "
-            "they must agree"
-        )
-
-
-def _encoded(cell: object, path: Path, column: str, row: int) -> bytes:
-    if isinstance(cell, dict) and isinstance(cell.get("bytes"), bytes):
-        return cell["bytes"]
-    raise RecordingError(f"{path}, column {column!r}, row {row}: the cell has no image bytes")
-
-
-def _stamped(path: Path) -> tuple[Path, int]:
-    """A cache key that changes when the file does."""
-    try:
-        return path, path.stat().st_mtime_ns
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be read: {error}") from None
-
-
-# Episodes are read in order, and hundreds of them can share a file or even a row group.
-@lru_cache(maxsize=4)
-def _episode_column(path: Path, stamp: int) -> NDArray[np.int64]:
-    with opened(path) as file:
-        if "episode_index" not in file.schema_arrow.names:
-            raise RecordingError(
-                f"{path}: missing column episode_index; it has {', '.join(file.schema_arrow.names)}"
-            )
-        return file.read(columns=["episode_index"]).column(0).to_numpy()
-
-
-@lru_cache(maxsize=1)
-def _read_groups(
-    path: Path, stamp: int, groups: tuple[int, ...], wanted: tuple[str, ...]
-) -> pa.Table:
-    with opened(path) as file:
-        columns = [name for name in wanted if name in file.schema_arrow.names]
-        return file.read_row_groups(list(groups), columns=columns)

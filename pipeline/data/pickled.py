@@ -3,17 +3,20 @@
 Row k of actions and sensor is at t0 + k / action_hz, t0 the earliest time in a frame's name.
 """
 
+import os
 from collections.abc import Collection, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BeforeValidator, Field, InstanceOf, Strict
 
+from pipeline.base.border import Document, Text
 from pipeline.base.config import Source
 from pipeline.base.errors import RecordingError
-from pipeline.data.arrays import Numbers, number, numeric, read_npy
+from pipeline.data.arrays import Numbers, numeric, read_npy
 from pipeline.data.insertion import (
     SENSOR,
     InsertionRecording,
@@ -23,6 +26,7 @@ from pipeline.data.insertion import (
     sensor_rows,
 )
 from pipeline.data.jpeg import frame_time, name_views, split_eye
+from pipeline.data.media import RECORDINGS, Rate
 from pipeline.data.plain_pickle import load_plain
 from pipeline.data.recording import (
     Channels,
@@ -41,6 +45,36 @@ ACTION = Channels(
 )
 
 
+_Array = InstanceOf[NDArray[Any]]
+
+
+class _Metadata(Document):
+    action_hz: Rate | None = None
+    robot_hz: Rate | None = None
+    has_sensor: bool | None = None
+    num_robot_states: int | None = Field(default=None, ge=0)
+
+
+class _Readings(Document):
+    force: _Array
+    """(N, 1)."""
+    fpi: _Array
+    """(N, 1025)."""
+
+
+class _Content(Document):
+    """What `data.pkl` holds."""
+
+    action: _Array
+    """(N, 7)."""
+    sensor_data: _Array | _Readings | None = None
+    """(N, 1026), or its two parts."""
+    image: dict[Text, Annotated[list[Text], Strict(False)]] | None = None
+    """Paths as recorded, by view."""
+    instruction: Text | None = None
+    metadata: Annotated[_Metadata, BeforeValidator(lambda told: told or {})] = _Metadata()
+
+
 def is_episode(folder: Path, names: Collection[str]) -> bool:
     """Whether a folder with these entries is an episode of the old format."""
     return MARKER in names
@@ -54,11 +88,12 @@ class PickledRecording(InsertionRecording):
     def __init__(self, path: Path, source: Source, views: Sequence[str] | None) -> None:
         super().__init__(path, source, views)
         self._pickle = path / MARKER
+        self._kept: _Content | None = None
 
     def action(self) -> RecordedAction:
-        document = self._document()
-        values = self._matrix(document, "action", len(ACTION.names))
-        rate_hz = self._rate(document, "action_hz", _ACTION_HZ)
+        content = self._content()
+        values = self._rows(content.action, "action", len(ACTION.names))
+        rate_hz = content.metadata.action_hz or _ACTION_HZ
         time = self._start + np.arange(len(values)) / rate_hz
         stream = checked_stream(ACTION, time, values, f"{self._pickle}, 'action'")
         told = self._overrides.action_kind
@@ -66,73 +101,62 @@ class PickledRecording(InsertionRecording):
         return RecordedAction(ACTION, stream.time, stream.values, kind, rate_hz)
 
     def sensor(self) -> Stream | None:
-        document = self._document()
-        values, where = self._sensor_values(document)
+        content = self._read()
+        values, where = self._sensor_values(content)
         if values is None:
             return None
-        actions = len(self._matrix(document, "action", len(ACTION.names)))
+        actions = len(self._rows(content.action, "action", len(ACTION.names)))
         if len(values) != actions:
             raise RecordingError(
                 f"{where}: {len(values)} sensor rows but {actions} actions; they must agree: "
                 "both are recorded at action_hz"
             )
-        rate_hz = self._rate(document, "action_hz", _ACTION_HZ)
+        rate_hz = content.metadata.action_hz or _ACTION_HZ
         return checked_stream(SENSOR, self._start + np.arange(len(values)) / rate_hz, values, where)
 
     def state(self) -> Stream | None:
         path = robot_state_file(self.path)
         if path is None:
             return None
-        rate_hz = self._rate(self._document(), "robot_hz", _ROBOT_HZ)
-        return read_robot_states(path, self._start, rate_hz)
+        rate_hz = self._content().metadata.robot_hz or _ROBOT_HZ
+        return read_robot_states(path, self._overrides.limits, self._start, rate_hz)
 
     def nominal(self) -> Nominal:
         """The streams that the pickle's metadata count; its rates are those of the clocks made."""
-        metadata = self._metadata(self._document())
+        metadata = self._content().metadata
         told = promised(metadata, sensor=("has_sensor",), state=("num_robot_states",))
         return Nominal(streams=told, where=f"{MARKER}'s metadata")
 
-    def _document(self) -> Mapping[str, Any]:
-        # Not kept: thousands of episodes stay open, and each pickle carries its sensor rows.
-        document = load_plain(self._pickle)
-        if not isinstance(document, dict) or "action" not in document:
-            found = ", ".join(map(str, document)) if isinstance(document, dict) else type(document)
-            raise RecordingError(f"{self._pickle}: expected a dict with 'action', found {found}")
-        return document
+    def _content(self) -> _Content:
+        """What the pickle holds, perhaps without the sensor's readings."""
+        return self._kept or self._read()
 
-    def _matrix(self, document: Mapping[str, Any], key: str, width: int) -> NDArray[np.float32]:
+    def _read(self) -> _Content:
+        # Thousands of episodes stay open: the sensor's readings are not kept, the rest is small.
+        loaded = load_plain(self._pickle, self._overrides.limits.array_bytes)
+        content = RECORDINGS.parse(loaded, _Content, self._pickle)
+        self._kept = content.model_copy(update={"sensor_data": None})
+        return content
+
+    def _rows(self, array: Numbers, key: str, width: int) -> Numbers:
         where = f"{self._pickle}, {key!r}"
-        values = numeric(document[key], where)
-        if values.ndim != 2 or values.shape[1] != width:
-            raise RecordingError(f"{where}: expected shape (N, {width}), found {values.shape}")
-        return np.asarray(values, np.float32)
+        if numeric(array, where).ndim != 2 or array.shape[1] != width:
+            raise RecordingError(f"{where}: expected shape (N, {width}), found {array.shape}")
+        return array
 
-    def _sensor_values(self, document: Mapping[str, Any]) -> tuple[Numbers | None, str]:
-        sensor, where = document.get("sensor_data"), f"{self._pickle}, 'sensor_data'"
+    def _sensor_values(self, content: _Content) -> tuple[Numbers | None, str]:
+        sensor, where = content.sensor_data, f"{self._pickle}, 'sensor_data'"
         if sensor is None:
             path = self.path / _SENSOR_FILE
-            return (read_npy(path) if path.is_file() else None), str(path)
-        if isinstance(sensor, dict):
-            missing = [key for key in ("force", "fpi") if key not in sensor]
-            if missing:
-                raise RecordingError(f"{where}: no {' and no '.join(missing)} in {list(sensor)}")
-            force, aline = (numeric(sensor[key], f"{where}, {key!r}") for key in ("force", "fpi"))
-            return sensor_rows(force, aline, where), where
-        return self._matrix(document, "sensor_data", len(SENSOR.names)), where
-
-    def _rate(self, document: Mapping[str, Any], key: str, default: float) -> float:
-        metadata = self._metadata(document)
-        return number(metadata, key, f"{self._pickle}, 'metadata'", positive=True) or default
-
-    def _metadata(self, document: Mapping[str, Any]) -> Mapping[str, Any]:
-        metadata = document.get("metadata") or {}
-        if not isinstance(metadata, dict):
-            raise RecordingError(f"{self._pickle}: 'metadata' is a {type(metadata).__name__}")
-        return metadata
+            there = os.path.lexists(path)
+            return read_npy(path, self._overrides.limits) if there else None, str(path)
+        if isinstance(sensor, _Readings):
+            force, fpi = numeric(sensor.force, where), numeric(sensor.fpi, where)
+            return sensor_rows(force, fpi, where), where
+        return self._rows(sensor, "sensor_data", len(SENSOR.names)), where
 
     def _recorded_instruction(self) -> str:
-        told = self._document().get("instruction")
-        return told if isinstance(told, str) and told else super()._recorded_instruction()
+        return self._content().instruction or super()._recorded_instruction()
 
     @cached_property
     def _start(self) -> float:
@@ -142,27 +166,17 @@ class PickledRecording(InsertionRecording):
     @cached_property
     def _recorded(self) -> Mapping[str, list[str]]:
         """Paths as recorded, by view name; a view with an empty list never came up."""
-        recorded = self._document().get("image") or {}
-        where = f"{self._pickle}, 'image'"
-        if not isinstance(recorded, dict):
-            raise RecordingError(f"{where}: expected paths by view, found {type(recorded)}")
-        found: dict[tuple[str, str], list[str]] = {}
-        for view, paths in recorded.items():
-            if not isinstance(paths, list | tuple) or not all(isinstance(p, str) for p in paths):
-                raise RecordingError(f"{where}, {view!r}: expected a list of paths")
-            if paths:
-                found[split_eye(str(view))] = list(paths)
-        return name_views(found)
+        recorded = self._content().image or {}
+        return name_views({split_eye(view): paths for view, paths in recorded.items() if paths})
 
     def _locate(self, recorded: str, where: str) -> Path:
         """The file as recorded, else the longest tail of its path under this folder."""
-        parts = _pure(recorded).parts
-        absolute = Path(recorded)
-        if absolute.is_absolute() and absolute.is_file():
-            return absolute
-        for depth in range(len(parts)):
-            candidate = self.path / Path(*parts[depth:])
-            if not Path(parts[depth]).is_absolute() and candidate.is_file():
+        # A few parts of it at most still stand under the episode's folder.
+        parts = _pure(recorded).parts[-10:]
+        for tail in (Path(recorded), *(Path(*parts[first:]) for first in range(len(parts)))):
+            candidate = self.path / tail  # the tail alone, where it is absolute
+            inside = tail.is_absolute() or ".." not in tail.parts
+            if inside and os.path.isfile(candidate):  # noqa: PTH113, a name may be too long
                 return candidate
         raise RecordingError(
             f"{where}: {recorded} is not there, nor is any tail of it under {self.path}; "

@@ -3,13 +3,14 @@
 `robot_state_<tag>.csv`, `sensor_data_<tag>.npz` and `View1..5/` (or `View1/left/`) of JPEGs.
 """
 
+import os
 from collections.abc import Collection, Mapping, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
 
 from pipeline.base.config import Source
 from pipeline.base.errors import RecordingError
-from pipeline.data.arrays import group_name, member, read_json, read_npz
+from pipeline.data.arrays import member, read_npz
 from pipeline.data.insertion import (
     SENSOR,
     InsertionRecording,
@@ -17,6 +18,7 @@ from pipeline.data.insertion import (
     sensor_rows,
 )
 from pipeline.data.jpeg import list_empty_views, list_views
+from pipeline.data.media import RECORDINGS, Grouped
 from pipeline.data.recording import Stream, checked_stream
 
 _STATE_FILES = "robot_state_*.csv"
@@ -51,7 +53,7 @@ class RawRecording(InsertionRecording):
     @property
     def group(self) -> str | None:
         path = self.path / _METADATA
-        return group_name(read_json(path), str(path)) if path.is_file() else None
+        return RECORDINGS.read_json(path, Grouped).group_name if os.path.lexists(path) else None
 
     @property
     def has_poses(self) -> bool:
@@ -64,7 +66,8 @@ class RawRecording(InsertionRecording):
         path = self._sensor_file
         if path is None:
             return None
-        members = read_npz(path, ("timestamps", "forces", "force", "alines", "aline"))
+        wanted = ("timestamps", "forces", "force", "alines", "aline")
+        members = read_npz(path, wanted, limits=self._overrides.limits)
         values = sensor_rows(
             member(members, ("forces", "force"), path),
             member(members, ("alines", "aline"), path),

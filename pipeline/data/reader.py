@@ -8,6 +8,7 @@ from functools import cached_property
 from pathlib import Path
 
 from pipeline.base.config import Source
+from pipeline.data.media import RECORDINGS
 from pipeline.data.recording import CameraStream, Recording
 
 
@@ -49,6 +50,12 @@ class FileRecording(Recording):
         return self._views is None or view in self._views
 
 
+def entries(folder: Path) -> list[os.DirEntry[str]]:
+    """What is in a folder; `RecordingError` where it cannot be listed."""
+    with RECORDINGS.foreign(folder, "cannot be listed"), os.scandir(folder) as found:
+        return list(found)
+
+
 def absolute(path: Path) -> Path:
     """The path made absolute without following symbolic links."""
     return Path(os.path.abspath(path))
@@ -57,4 +64,4 @@ def absolute(path: Path) -> Path:
 def natural_key(text: str | Path) -> list[tuple[int, int, str]]:
     """Sorts `View2` before `View10`."""
     parts = re.split(r"(\d+)", str(text))
-    return [(0, int(part), part) if part.isdigit() else (1, 0, part) for part in parts]
+    return [(0, int(part), part) if part.isdecimal() else (1, 0, part) for part in parts]

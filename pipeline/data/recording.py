@@ -14,7 +14,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,10 @@ from numpy.typing import NDArray
 from pipeline.base.digests import joint_digest
 from pipeline.base.errors import RecordingError
 from pipeline.base.finite import first_non_finite, non_finite
+from pipeline.data.media import FARTHEST_S, RECORDINGS
 
+_MOST_BYTES = 2**38
+"""Of a file of an episode: none is read through before its size is known to be possible."""
 ActionKind = Literal["absolute", "velocity", "delta"]
 
 
@@ -179,7 +182,7 @@ class Recording(ABC):
 
 
 def checked_stream(
-    channels: Channels, time: NDArray[np.float64], values: NDArray[np.float32], where: str
+    channels: Channels, time: NDArray[np.float64], values: NDArray[Any], where: str
 ) -> Stream:
     """A `Stream` after checking what every stream must be.
 
@@ -187,7 +190,8 @@ def checked_stream(
     channels', an empty stream, NaN or inf (row and channel named) and a clock that goes backwards.
     """
     time = np.asarray(time, np.float64)
-    values = np.asarray(values, np.float32)
+    with np.errstate(over="ignore"):  # what float32 cannot hold becomes inf, which is refused
+        values = np.asarray(values, np.float32)
     if values.ndim != 2 or values.shape[1] != len(channels.names):
         raise RecordingError(
             f"{where}: expected rows of {len(channels.names)} values, found shape {values.shape}"
@@ -211,9 +215,13 @@ def checked_stream(
 
 
 def check_clock(time: NDArray[np.float64], where: str) -> None:
-    """Raise `RecordingError` where a clock is not finite or goes backwards."""
-    if (at := first_non_finite(time)) is not None:
-        raise RecordingError(f"{where}: timestamp {time[at]} in row {at[0]}")
+    """Raise `RecordingError` where a clock is not finite, farther from zero than any clock, or goes
+    backwards."""
+    far = np.flatnonzero(~(np.abs(time) <= FARTHEST_S))
+    if far.size:
+        raise RECORDINGS.refusal(
+            where, f"timestamp {time[far[0]]} in row {far[0]}, expected seconds"
+        )
     backwards = np.flatnonzero(np.diff(time) < 0)
     if backwards.size:
         row = int(backwards[0]) + 1
@@ -242,5 +250,8 @@ def content_digest(recording: Recording, digest_of: Callable[[Path], str]) -> st
     file cannot be read.
     """
     # Frame times stand in file names, so a name is content too; where the folder lies is not.
-    named = ((os.path.relpath(file, recording.path), digest_of(file)) for file in recording.files())
+    files = recording.files()
+    for file in files:
+        RECORDINGS.check_file(file, _MOST_BYTES)
+    named = ((os.path.relpath(file, recording.path), digest_of(file)) for file in files)
     return joint_digest(recording.identity(), json.dumps(sorted(named)))

@@ -5,6 +5,7 @@ episode has has begun, and end when one ends. Everything that a tick sees is at 
 its action lies ahead. What is stored later than a tick by no more than `rounding` is at it.
 """
 
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -163,18 +164,21 @@ def rate_notes(
     """
     if action_hz is None:
         return {}
-    fastest: dict[str, float] = {}
-    recorded: dict[str, set[float]] = {}
+    said: dict[str, list[str]] = defaultdict(list)
+    by_source: dict[str, list[tuple[float | None, float]]] = defaultdict(list)
     for source, recorded_hz, fastest_hz in rates:
-        fastest[source] = max(fastest.get(source, 0.0), fastest_hz)
-        of_source = recorded.setdefault(source, set())
-        if recorded_hz is not None:
-            of_source.add(recorded_hz)
-    notes = {
-        source: _rate_note(action_hz, sorted(recorded[source]), rate)
-        for source, rate in fastest.items()
-    }
-    return {source: note for source, note in notes.items() if note}
+        by_source[source].append((recorded_hz, fastest_hz))
+    for source, pairs in by_source.items():
+        others = [hz for hz, _ in pairs if hz and abs(action_hz - hz) > RATE_TOLERANCE * hz]
+        if others:
+            low, high = f"{min(others):.3g}", f"{max(others):.3g}"
+            span = low if min(others) == max(others) else f"{low} to {high}"
+            fate = "held" if action_hz > min(others) else "left out between ticks"
+            said[source].append(f"recorded at {span} Hz: actions are {fate}")
+        fastest = max(hz for _, hz in pairs)
+        if action_hz > (1 + RATE_TOLERANCE) * fastest:
+            said[source].append(f"no stream is faster than {fastest:.3g} Hz: check data.action_hz")
+    return {source: f"ticks at {action_hz:g} Hz, {', '.join(why)}" for source, why in said.items()}
 
 
 def wrapped(degrees: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -289,15 +293,15 @@ def _grid(
     recording: Recording, clocks: _Clocks, start: float, stop: float, rate_hz: float
 ) -> NDArray[np.float64]:
     """start, start + 1/rate, … up to `stop`, or to a microsecond or the clocks' slack beyond."""
-    count = int(np.floor((stop - start) * rate_hz + max(1e-6, _slack(clocks)) * rate_hz)) + 1
+    count = np.floor((stop - start) * rate_hz + max(1e-6, _slack(clocks)) * rate_hz) + 1
     fastest = max(map(_hz, clocks.values()))
     if count > _MOST_TICKS or 0 < fastest < _SLOWEST_HZ:
         raise RecordingError(
-            f"{recording.path}: are the clocks in seconds? {stop - start:g} s would be {count:,} "
-            f"ticks at {rate_hz:g} Hz, and its fastest stream has {fastest:.2g} entries a second. "
-            "Divide the recording's times by 1e3 or 1e9, or lower data.action_hz"
+            f"{recording.path}: are the clocks in seconds? {stop - start:g} s would be "
+            f"{count:,.0f} ticks at {rate_hz:g} Hz, and its fastest stream has {fastest:.2g} "
+            "entries a second. Divide the recording's times by 1e3 or 1e9, or lower data.action_hz"
         )
-    return start + np.arange(max(0, count)) / rate_hz
+    return start + np.arange(max(0.0, count)) / rate_hz
 
 
 def _some(recording: Recording, time: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -306,18 +310,6 @@ def _some(recording: Recording, time: NDArray[np.float64]) -> NDArray[np.float64
             f"{recording.path}: too short: no tick has every stream and a following action"
         )
     return time
-
-
-def _rate_note(action_hz: float, recorded: Sequence[float], fastest: float) -> str | None:
-    said: list[str] = []
-    others = [rate for rate in recorded if abs(action_hz - rate) > RATE_TOLERANCE * rate]
-    if others:
-        rates = f"{others[0]:.3g}" + (f" to {others[-1]:.3g}" if len(others) > 1 else "")
-        fate = "held" if action_hz > others[0] else "left out between ticks"
-        said.append(f"recorded at {rates} Hz: actions are {fate}")
-    if action_hz > (1 + RATE_TOLERANCE) * fastest:
-        said.append(f"no stream is faster than {fastest:.3g} Hz: check data.action_hz")
-    return f"ticks at {action_hz:g} Hz, {', '.join(said)}" if said else None
 
 
 def _hz(clock: NDArray[np.float64]) -> float:

@@ -5,13 +5,12 @@ clip: the whole file, or the part of a shared file that holds one episode.
 """
 
 import sys
-from collections.abc import Generator, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import av
 import numpy as np
@@ -20,10 +19,12 @@ from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
+from pipeline.base.config import MediaLimits
 from pipeline.base.errors import RecordingError
+from pipeline.data.media import DEFAULT_LIMITS, opened_video
 from pipeline.data.recording import CameraStream
 
-_AV1_DECODERS = frozenset({"libdav1d", "libaom-av1", "libgav1"})
+_MOST_SEEKS = 1000
 
 
 @dataclass(frozen=True)
@@ -34,8 +35,6 @@ class VideoSpan:
     first: int | None = None
     count: int | None = None
     """How many the metadata says there are; None where it does not say."""
-    rival: str = ""
-    """Another episode to which the metadata gives some of these frames too."""
 
 
 class _FrameTable(NamedTuple):
@@ -50,11 +49,19 @@ class _FrameTable(NamedTuple):
 class VideoClip(CameraStream):
     """A view whose frames are those of a video; `time` has one entry per row of the episode."""
 
-    def __init__(self, view: str, time: NDArray[np.float64], span: VideoSpan, fps: float) -> None:
+    def __init__(
+        self,
+        view: str,
+        time: NDArray[np.float64],
+        span: VideoSpan,
+        fps: float,
+        limits: MediaLimits = DEFAULT_LIMITS,
+    ) -> None:
         self.view = view
         self.time = time
         self._span = span
         self._fps = fps
+        self._limits = limits
 
     def check(self, indices: Sequence[int]) -> None:
         """Reads every packet of the clip and decodes the frames asked for, one held at a time.
@@ -75,7 +82,7 @@ class VideoClip(CameraStream):
     def _frames(self, indices: Sequence[int]) -> Iterator[VideoFrame]:
         """The frames before their conversion to RGB; the same object where an index repeats."""
         table = self._table
-        with self._open() as (container, stream):
+        with opened_video(self._span.path, self._limits) as (container, stream):
             decoded: Iterator[VideoFrame] = iter(())
             at, frame = -1, None
             for index in indices:
@@ -109,7 +116,7 @@ class VideoClip(CameraStream):
     @cached_property
     def _table(self) -> _FrameTable:
         rows, span = len(self.time), self._span
-        with self._open() as (container, stream):
+        with opened_video(self._span.path, self._limits) as (container, stream):
             packets = list(_packets(container, stream, span, self._fps, rows))
         for found in (len(packets), span.count):
             if found is not None and found != rows:
@@ -119,22 +126,6 @@ class VideoClip(CameraStream):
                     "the episode out"
                 )
         return _FrameTable(*np.array(sorted(packets, key=itemgetter(0)), np.int64).reshape(-1, 3).T)
-
-    @contextmanager
-    def _open(self) -> Generator[tuple[InputContainer, VideoStream], None, None]:
-        path = self._span.path
-        try:
-            with av.open(str(path)) as container:
-                if not container.streams.video:
-                    raise RecordingError(f"{path}: holds no video")
-                stream = container.streams.video[0]
-                _check_decoder(stream, path)
-                stream.codec_context.thread_count = 1
-                yield container, stream
-        except av.FFmpegError as error:
-            raise RecordingError(
-                f"{path}: cannot be read as video: {error.strerror}; copy the file again"
-            ) from None
 
 
 def _packets(
@@ -169,21 +160,10 @@ def _seek_before(container: InputContainer, stream: VideoStream, pts: int) -> No
     A seek goes by decoding times, so the key frame it finds may be shown later.
     """
     target = pts
-    while True:
+    for _ in range(_MOST_SEEKS):
         container.seek(target, stream=stream)
         packet = next(packet for packet in container.demux(stream))
         if packet.pts is None or packet.pts <= pts or packet.dts is None or packet.dts >= target:
             break
         target = packet.dts - 1
     container.seek(target, stream=stream)
-
-
-def _check_decoder(stream: VideoStream, path: Path) -> None:
-    context: Any = stream.codec_context
-    if context is None:
-        raise RecordingError(f"{path}: this PyAV build has no decoder for the video's codec")
-    if context.codec.canonical_name == "av1" and not _AV1_DECODERS & av.codecs_available:
-        raise RecordingError(
-            f"{path}: the video is AV1 and this PyAV build decodes none; "
-            "install a wheel that has libdav1d: pip install --upgrade av"
-        )

@@ -3,12 +3,18 @@
 The windows may overlap or abut; `sensor()` rebuilds the stream that they were cut from.
 """
 
+import os
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
+from typing import Annotated
 
+import numpy as np
+from pydantic import Field
+
+from pipeline.base.border import Text
 from pipeline.base.config import Source
 from pipeline.base.errors import RecordingError
-from pipeline.data.arrays import group_name, member, number, read_json, read_npz
+from pipeline.data.arrays import member, read_npz
 from pipeline.data.insertion import (
     SENSOR,
     InsertionRecording,
@@ -17,6 +23,7 @@ from pipeline.data.insertion import (
     robot_state_file,
 )
 from pipeline.data.jpeg import list_empty_views, list_views
+from pipeline.data.media import RECORDINGS, Grouped, Rate, Seconds
 from pipeline.data.recording import Nominal, Stream, check_clock, checked_stream
 from pipeline.data.windows import rebuild
 
@@ -24,6 +31,21 @@ MARKER = "metadata.json"
 _SENSOR_FILE = "sensor_data.npz"
 _LEFT_WITHOUT = frozenset({_SENSOR_FILE, "robot_states.npz"})
 """An episode that lost its metadata.json is reported, not passed over."""
+
+
+_Count = Annotated[int, Field(ge=0, le=10**9)]
+
+
+class _Metadata(Grouped):
+    start_time: Seconds | None = None
+    end_time: Seconds | None = None
+    robot_hz: Rate | None = None
+    sensor_hz: Rate | None = None
+    robot_states_count: _Count | None = None
+    sensor_windows_count: _Count | None = None
+    camera_frames_count: _Count | None = None
+    camera_views: tuple[Text, ...] | None = None
+    instruction: Text | None = None
 
 
 def is_episode(folder: Path, names: Collection[str]) -> bool:
@@ -40,30 +62,28 @@ class WindowedRecording(InsertionRecording):
         """Raises `RecordingError` where `metadata.json` cannot be read."""
         super().__init__(path, source, views)
         self._metadata_file = path / MARKER
-        self._metadata = read_json(self._metadata_file)
-        self._start = self._number("start_time")
-        self._robot_hz = self._number("robot_hz", positive=True)
-        self._sensor_hz = self._number("sensor_hz", positive=True)
+        self._metadata = RECORDINGS.read_json(self._metadata_file, _Metadata)
 
     @property
     def group(self) -> str | None:
-        return group_name(self._metadata, str(self._metadata_file))
+        return self._metadata.group_name
 
     def state(self) -> Stream | None:
         path = robot_state_file(self.path)
         if path is None:
             return None
-        end = self._number("end_time")
-        stream = read_robot_states(path, self._start, self._robot_hz, end)
+        told = self._metadata
+        times = (told.start_time, told.robot_hz, told.end_time)
+        stream = read_robot_states(path, self._overrides.limits, *times)
         self._check_count("robot_states_count", len(stream.time), path)
         return stream
 
     def sensor(self) -> Stream | None:
         path = self.path / _SENSOR_FILE
-        if not path.is_file():
+        if not os.path.lexists(path):
             return None
-        members = read_npz(path, ("timestamps", "data"))
-        ends = member(members, ("timestamps",), path)
+        members = read_npz(path, ("timestamps", "data"), limits=self._overrides.limits)
+        ends = member(members, ("timestamps",), path).astype(np.float64)
         windows = member(members, ("data",), path)
         if windows.ndim != 3 or windows.shape[2] != len(SENSOR.names) or not windows.shape[1]:
             raise RecordingError(
@@ -77,41 +97,35 @@ class WindowedRecording(InsertionRecording):
         if not len(windows):
             return None
         check_clock(ends, f"{path}, member 'timestamps'")
-        time, values = rebuild(ends, windows, self._sensor_hz, str(path))
+        time, values = rebuild(ends, windows, self._metadata.sensor_hz, str(path))
         return checked_stream(SENSOR, time, values, str(path))
 
     def empty_views(self) -> Sequence[str]:
         return [view for view in list_empty_views(self.path / "images") if self._wants(view)]
 
     def nominal(self) -> Nominal:
-        """Raises `RecordingError` where `metadata.json` counts frames in anything but a number."""
-        rates = {"sensor": self._sensor_hz, "state": self._robot_hz}
-        frames = self._number("camera_frames_count")
-        listed = self._metadata.get("camera_views")
+        told = self._metadata
+        rates = {"sensor": told.sensor_hz, "state": told.robot_hz}
         return Nominal(
             rates_hz={name: rate for name, rate in rates.items() if rate is not None},
             streams=promised(
-                self._metadata,
+                told,
                 sensor=("sensor_windows_count", "sensor_hz"),
                 state=("robot_states_count", "robot_hz"),
             ),
-            views=tuple(map(str, listed)) if isinstance(listed, list) else (),
-            frames=None if frames is None else int(frames),
+            views=told.camera_views or (),
+            frames=told.camera_frames_count,
             where=MARKER,
         )
 
     def _recorded_instruction(self) -> str:
-        told = self._metadata.get("instruction")
-        return told if isinstance(told, str) and told else super()._recorded_instruction()
-
-    def _number(self, key: str, *, positive: bool = False) -> float | None:
-        return number(self._metadata, key, str(self._metadata_file), positive=positive)
+        return self._metadata.instruction or super()._recorded_instruction()
 
     def _check_count(self, key: str, rows: int, path: Path) -> None:
-        said = self._number(key)
-        if said is not None and said != rows:
+        said = getattr(self._metadata, key)
+        if said not in (None, rows):
             raise RecordingError(
-                f"{path}: {rows} rows, but {key} in {self._metadata_file} says {said:g}; "
+                f"{path}: {rows} rows, but {key} in {self._metadata_file} says {said}; "
                 "they must agree: copy the episode again, or correct the metadata"
             )
 

@@ -17,6 +17,9 @@ from pipeline.data.arrays import Numbers
 _OVERLAP = 0.75
 """Windows overlap for certain where the clock advances by less than this fraction of one."""
 _PAIRS_ASKED = 16
+_SHIFTS_TRIED = 32
+"""Nearest to the expected stride: readings agree at one shift, or, where they stand still, at the
+nearest."""
 
 
 def rebuild(
@@ -65,10 +68,9 @@ def _strides(
     for index, step in enumerate(expected, start=1):
         near = usual if abs(step - typical) <= 0.5 * typical else float(step)
         previous, window = windows[index - 1], windows[index]
+        shifts = sorted([*_first_rows(previous, window), width], key=lambda s: abs(s - near))
         stride = next(
-            s
-            for s in sorted([*_first_rows(previous, window), width], key=lambda s: abs(s - near))
-            if s == width or _agree(previous, window, s)
+            s for s in (*shifts[:_SHIFTS_TRIED], width) if s == width or _agree(previous, window, s)
         )
         if stride == width and overlapping and step < _OVERLAP * width:
             raise RecordingError(

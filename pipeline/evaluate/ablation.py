@@ -68,11 +68,6 @@ class AblationStudy:
     samples: int
     """Chunks a tick whose errors were averaged; 1 where the policy does not sample."""
 
-    @property
-    def streams(self) -> tuple[str, ...]:
-        """The streams that the policy sees."""
-        return tuple(dict.fromkeys(ablated.stream for ablated in self.ablated))
-
     def times_intact(self, ablated: Ablated) -> Figure | None:
         """The error with a stream ablated, in multiples of the intact one; None where that is 0."""
         return times(ablated.comparison, self.intact)
@@ -86,7 +81,6 @@ def evaluate_ablation(
     baselines: Baselines,
     batch_size: int,
     samples: int = 1,
-    progress: bool = False,
 ) -> AblationStudy | None:
     """The study of this policy, which is `checkpoint.policy()`, on these test ticks.
 
@@ -119,10 +113,8 @@ def evaluate_ablation(
     seen = (store, ticks, windows, batch_size, False, samples)
     others, groups = baselines.act(ticks), groups_of(store, checkpoint, ticks)
     space = action_space(store, checkpoint.normalization)
-    bar = tqdm(ways, "ablating streams", unit="way", disable=None if progress else True)
-    comparisons = [
-        compare(predict(policy, *seen, feed), others, *space, groups) for *_, feed in bar
-    ]
+    bar = tqdm(ways, "ablating streams", unit="way", disable=None)
+    comparisons = [compare(predict(policy, *seen, feed), others, space, groups) for *_, feed in bar]
     ablated = (
         Ablated(stream, how, comparison)
         for (stream, how, _), comparison in zip(ways[1:], comparisons[1:], strict=True)

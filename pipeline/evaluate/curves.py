@@ -7,7 +7,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.base.border import Border
+from pipeline.base.errors import ConfigError
 from pipeline.policy.checkpoint import PolicyCheckpoint
+
+_CURVES = Border(ConfigError, "Train again where curves are wanted.")
 
 
 @dataclass(frozen=True)
@@ -57,6 +61,7 @@ def _of_another(curves: Mapping[str, TrainingCurve], checkpoint: PolicyCheckpoin
 
 def _read(file: Path) -> TrainingCurve:
     """The columns `step` and value below a line of heads; `ValueError` on anything else."""
-    _, *rows = (line.split("\t") for line in file.read_text(encoding="utf-8").splitlines())
+    lines = _CURVES.read_bytes(file).decode().splitlines()
+    _, *rows = (line.split("\t") for line in lines)
     steps = np.array([int(step) for step, _ in rows], np.int64)
     return TrainingCurve(steps, np.array([float(value) for _, value in rows], np.float64))

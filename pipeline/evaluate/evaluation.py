@@ -93,11 +93,11 @@ def evaluate_checkpoint(
     predictions = predict(*seen, progress=True, samples=wanted.samples, watch=sampled)
     others = baselines.act(ticks) | sampled.chunks()
     phases = phases_of(store, ticks)
-    comparison = compare(predictions, others, *space, groups, phases, wanted.execute)
+    comparison = compare(predictions, others, space, groups, phases, wanted.execute)
     study = None
     if wanted.modalities:
         rest = (ticks, baselines, wanted.batch_size, wanted.samples)
-        study = evaluate_ablation(checkpoint, policy, store, *rest, progress=True)
+        study = evaluate_ablation(checkpoint, policy, store, *rest)
     energy = sampled.energy()
     return Evaluation(
         name=str(folder),
@@ -153,7 +153,6 @@ def judged_document(
             "step": checkpoint.step,
             "parameters": sum(count for _, count in policy.parameter_table()),
             "samples": drawn["samples"] if drawn else 1,
-            "logs": str(params.logs),
             "seed": params.seed,
             "recipe": f"{hash64(json.dumps(recipe, sort_keys=True)):016x}",
         },

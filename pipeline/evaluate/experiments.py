@@ -1,17 +1,18 @@
 """Evaluations of several experiments, read back where they may stand in one table."""
 
 import csv
-import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, pairwise
 from pathlib import Path
-from typing import Any, TypeAlias, get_args
+from typing import Annotated, Any, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, JsonValue
 
+from pipeline.base.border import Border, Document, Text
 from pipeline.base.config import FusionStrategy, ModelType
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import ConfigError
@@ -21,7 +22,6 @@ from pipeline.evaluate.evaluation import JUDGED
 from pipeline.evaluate.figures import Figure
 from pipeline.evaluate.intervals import FEWEST_GROUPS, bootstrap_means
 from pipeline.evaluate.tables import GROUPS, HEADINGS
-from pipeline.train.log import speed_file
 
 SPANS = {"executed": "what is executed", "overall": "the whole chunk"}
 """What of a chunk an error is of: its name in `GROUPS`, and in words."""
@@ -34,6 +34,38 @@ _SHARED = {
     "drawn": ("from as many samples and ticks a batch", "evaluate.samples and evaluate.batch_size"),
 }
 """By key of `JUDGED`: how evaluations in one table are alike, and by what they become so."""
+
+
+_REPORT = Border(
+    ConfigError,
+    "compare.reports takes the output of stages.evaluate: evaluate that experiment again with this "
+    "version, or move its folder away.",
+)
+
+
+class JudgedPolicy(Document):
+    """What of an evaluated policy is compared."""
+
+    model_type: ModelType
+    fusion_strategy: FusionStrategy
+    parameters: Annotated[int, Field(ge=0)]
+    samples: Annotated[int, Field(ge=1)]
+    seed: int
+    recipe: Text
+
+
+class JudgedOn(Document):
+    """On what it was judged."""
+
+    test: dict[Text, Any]
+
+
+class JudgedDocument(Document):
+    """The content of `JUDGED`."""
+
+    policy: JudgedPolicy
+    on: JudgedOn
+    drawn: dict[Text, int] | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +86,6 @@ class Experiment:
     """Of each of `SPANS`: (group,) recorded actions that were judged."""
     errors: Mapping[tuple[str, str], NDArray[np.float64]]
     """Of each of `METHODS` in each of `SPANS`: (seed, group) mean absolute error [training std]."""
-    training_s: float | None
-    """Time that a training took; None where its speed file is not there."""
     folds: int = 1
     """Evaluations that are test for other groups each, and taken together."""
 
@@ -136,11 +166,10 @@ def best_experiment(experiments: Sequence[Experiment], span: str) -> Experiment:
     return min(experiments, key=lambda experiment: experiment.error(span).value)
 
 
-def experiment_table(experiments: Sequence[Experiment], span: str, trained: bool = False) -> Table:
+def experiment_table(experiments: Sequence[Experiment], span: str) -> Table:
     """An experiment a row, a baseline a row; mean absolute errors and differences with intervals.
 
-    `trained` adds the time that a training took. The baseline that sees features has the lowest
-    error that it has in any experiment.
+    The baseline that sees features has the lowest error that it has in any experiment.
     """
     best = best_experiment(experiments, span)
     rows: list[list[Any]] = []
@@ -148,7 +177,6 @@ def experiment_table(experiments: Sequence[Experiment], span: str, trained: bool
         low, high = experiment.by_seed(span).min(), experiment.by_seed(span).max()
         baseline = experiment.best_baseline(span)
         own = experiment.minus(experiment, span, baseline)
-        seconds = experiment.training_s
         rows.append(
             [
                 *(experiment.name, len(experiment.seeds), experiment.folds),
@@ -157,21 +185,20 @@ def experiment_table(experiments: Sequence[Experiment], span: str, trained: bool
                 "it is" if experiment is best else _verdict(experiment.minus(best, span)),
                 f"{_verdict(own)} ({HEADINGS[baseline]})",
                 *(experiment.model_type, experiment.fusion_strategy, experiment.samples),
-                *(experiment.parameters, None if seconds is None else round(seconds)),
+                experiment.parameters,
             ]
         )
     for method in BASELINES:
         error = min((one.error(span, method) for one in experiments), key=lambda e: e.value)
-        rows.append([f"baseline: {HEADINGS[method]}", None, None, error.text(), *[None] * 8])
+        rows.append([f"baseline: {HEADINGS[method]}", None, None, error.text(), *[None] * 7])
     heads = ["experiment", "seeds", "folds", f"{SPANS[span]} [training std]", "over seeds"]
     heads += ["minus the best", "minus the best baseline"]
-    heads += ["expert", "fusion", "samples", "parameters", "trained [s]"]
-    stop = len(heads) if trained else -1
-    return Table(heads[:stop], [row[:stop] for row in rows])
+    heads += ["expert", "fusion", "samples", "parameters"]
+    return Table(heads, rows)
 
 
 def experiment_csv(experiments: Sequence[Experiment]) -> Table:
-    """For a file, without the time of training: what the clock says is never tracked."""
+    """For a file."""
     own = ("model_type", "fusion_strategy", "parameters", "samples")
     rows: list[dict[str, Any]] = []
     for experiment in experiments:
@@ -223,7 +250,6 @@ def _pooled(run: Sequence[Evaluated]) -> Sequence[Evaluated]:
         groups=tuple(groups[order].tolist()),
         entries={span: together([one.entries[span] for _, one in run]) for span in SPANS},
         errors={key: together([one.errors[key] for _, one in run]) for key in first.errors},
-        training_s=_mean_time([one for _, one in run]),
         folds=len(run),
     )
     return [({**document, "on": document["on"] | {"test": test}}, experiment)]
@@ -239,7 +265,6 @@ def _merged(seeds: Sequence[Experiment]) -> Experiment:
         name=_less_number(first.name),
         seeds=tuple(seed for one in seeds for seed in one.seeds),
         errors={key: np.concatenate([one.errors[key] for one in seeds]) for key in first.errors},
-        training_s=_mean_time(seeds),
     )
 
 
@@ -248,51 +273,39 @@ def _less_number(name: str) -> str:
     return re.sub(r"([-_]?(seed|fold)[-_]?\d+)+$|[-_]?\d+$", "", name) or name
 
 
-def _mean_time(experiments: Sequence[Experiment]) -> float | None:
-    times = [one.training_s for one in experiments if one.training_s is not None]
-    return float(np.mean(times)) if times else None
-
-
 def _read_experiment(folder: Path) -> Evaluated:
     """What `JUDGED` says, and the experiment of one seed and fold."""
-    file = folder / GROUPS
+    text = _REPORT.read_bytes(folder / JUDGED)
+    policy = _REPORT.parse_json(text, JudgedDocument, folder / JUDGED).policy
+    document = _REPORT.parse_json(text, dict[str, JsonValue], folder / JUDGED)
+    groups, numbers = _read_groups(folder / GROUPS)
+    experiment = Experiment(
+        name=folder.name,
+        seeds=(policy.seed,),
+        **policy.model_dump(exclude={"seed"}),
+        groups=groups,
+        entries={span: numbers[f"{span}_entries"] for span in SPANS},
+        errors={(way, span): numbers[f"{way}_{span}"][None] for way in METHODS for span in SPANS},
+    )
+    return {key: document[key] for key in _SHARED}, experiment
+
+
+def _read_groups(path: Path) -> tuple[tuple[str, ...], dict[str, NDArray[np.float64]]]:
+    """The names of the groups, and (group,) of each column that is compared."""
+    columns = [f"{span}_entries" for span in SPANS]
+    columns += [f"{way}_{span}" for way in METHODS for span in SPANS]
     try:
-        rows = list(csv.DictReader(file.read_text(encoding="utf-8").splitlines()))
-
-        def column(name: str) -> NDArray[np.float64]:
-            return np.array([float(row[name]) for row in rows])
-
-        entries = {span: column(f"{span}_entries") for span in SPANS}
-        errors = {(way, span): column(f"{way}_{span}")[None] for way in METHODS for span in SPANS}
-        file = folder / JUDGED
-        document = json.loads(file.read_text(encoding="utf-8"))
-        policy = document["policy"]
-        own = ("model_type", "fusion_strategy", "recipe", "parameters", "samples")
-        experiment = Experiment(
-            folder.name,
-            **{key: policy[key] for key in own},
-            seeds=(policy["seed"],),
-            groups=tuple(row["group"] for row in rows),
-            entries=entries,
-            errors=errors,
-            training_s=_training_seconds(Path(policy["logs"])),
-        )
-        return {key: document[key] for key in _SHARED}, experiment
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ConfigError(
-            f"compare.reports: expected the output of stages.evaluate in {folder}, but {file.name} "
-            f"cannot be read ({type(error).__name__}: {error}). Evaluate that experiment again "
-            "with this version, or move the folder away."
-        ) from None
-
-
-def _training_seconds(logs: Path) -> float | None:
-    """What the speed file beside these logs says that the training took; None without it."""
-    path = speed_file(logs)
-    if not path.exists():
-        return None
-    rows = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines(), delimiter="\t"))
-    return float(rows[-1]["trained_s"]) if rows and rows[-1].get("trained_s") else None
+        rows = list(csv.DictReader(_REPORT.read_bytes(path).decode().splitlines()))
+        numbers = {name: np.array([float(row[name]) for row in rows]) for name in columns}
+        groups = tuple(row["group"] for row in rows)
+    except (csv.Error, KeyError, TypeError, ValueError) as error:
+        raise _REPORT.refusal(path, f"expected a number in each column: {error}") from None
+    for name, values in numbers.items():
+        if not (np.isfinite(values) & (values >= 0)).all():
+            raise _REPORT.refusal(path, f"{name}: expected finite numbers of at least 0")
+    if len(set(groups)) < max(1, len(groups)):
+        raise _REPORT.refusal(path, "expected a row for each group, each once")
+    return groups, numbers
 
 
 def _check_baselines(reports: Path, experiment: Experiment, other: Experiment) -> None:

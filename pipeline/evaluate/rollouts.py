@@ -7,7 +7,7 @@ Wilson intervals. The same seeds give the same figures, bit for bit on one machi
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -24,7 +24,7 @@ from pipeline.policy.policy import Policy
 from pipeline.robot.chunking import Executor, check_chunking
 from pipeline.robot.features import LiveFeatures
 from pipeline.robot.guides import stack_guides
-from pipeline.robot.loop import ControlLoop, LoopTiming, SafeStop
+from pipeline.robot.loop import ControlLoop, SafeStop
 from pipeline.robot.memory import RobotMemory, SeenFeatures
 from pipeline.robot.proof import prove
 from pipeline.simulation.environment import InsertionEnvironment
@@ -80,15 +80,11 @@ class SuccessRate:
     episodes: int
 
     @classmethod
-    def of(cls, episodes: Sequence[RolloutEpisode]) -> "SuccessRate":
-        """That of these episodes, at least one."""
-        return cls.counted(sum(episode.success for episode in episodes), len(episodes))
-
-    @classmethod
-    def counted(cls, successes: int, episodes: int) -> "SuccessRate":
-        """That of so many successes in `episodes`, at least one."""
-        interval = binomtest(successes, episodes).proportion_ci(method="wilson")
-        return cls(successes / episodes, float(interval.low), float(interval.high), episodes)
+    def of(cls, successes: Sequence[bool]) -> "SuccessRate":
+        """That of episodes, at least one, by whether each succeeded."""
+        count, episodes = sum(successes), len(successes)
+        interval = binomtest(count, episodes).proportion_ci(method="wilson")
+        return cls(count / episodes, float(interval.low), float(interval.high), episodes)
 
     def __str__(self) -> str:
         return f"{self.rate:.0%} ({self.low:.0%} to {self.high:.0%})"
@@ -118,7 +114,9 @@ class Rollouts:
 
     def rates(self) -> dict[str, SuccessRate]:
         """The success of each controller."""
-        return {name: SuccessRate.of(self.of(name)) for name in self.controllers}
+        return {
+            name: SuccessRate.of([e.success for e in self.of(name)]) for name in self.controllers
+        }
 
     def summary(self) -> Table:
         """A row a controller: its success, and where its episodes ended."""
@@ -181,13 +179,8 @@ def roll_out(
     features = load_features() if "features" in policy.encoders else None
     if features is not None:
         prove(checkpoint, features, say)
-    driver = _Driver(
-        checkpoint,
-        policy,
-        features,
-        wanted,
-        instruction_of(checkpoint.instructions),
-    )
+    instruction = instruction_of(checkpoint.instructions)
+    drive = _Driver(checkpoint, policy, features, wanted, instruction).drive
     alone = len(policy.encoders) == 1
     ablations: list[RolloutAblation] = [
         name
@@ -195,33 +188,22 @@ def roll_out(
         if name.split()[0] in policy.encoders and not (alone and name.endswith("off"))
     ]
     settings = {"checkpoint": name, "step": checkpoint.step}
-    settings |= {"model_type": policy.params.model_type, "instruction": driver.instruction}
-    return run_episodes(driver, [None, *ablations], wanted, settings, say)
+    settings |= {"model_type": policy.params.model_type, "instruction": instruction}
+    return run_episodes(drive, checkpoint.source, [None, *ablations], wanted, settings, say)
 
 
-class Driver(Protocol):
-    """Whoever lets a policy control robots: here, or on a server."""
+Drive = Callable[
+    [Sequence[InsertionEnvironment], RolloutAblation | None, Callable[[], Any]], list[str | None]
+]
+"""Runs a policy on these robots to their ends; why each stopped safely, or None.
 
-    def begin(self, seed: int) -> InsertionEnvironment:
-        """The phantom at the beginning of an episode."""
-        ...
-
-    def drive(
-        self,
-        environments: Sequence[InsertionEnvironment],
-        seeds: Sequence[int],
-        ablation: RolloutAblation | None,
-        ended: Callable[[], Any],
-    ) -> list[str | None]:
-        """Run the policy on all robots to their ends; why each stopped safely, or None.
-
-        `ended` is called for each that ends.
-        """
-        ...
+The policy is under an ablation, None for none; the last is called for each robot that ends.
+"""
 
 
 def run_episodes(
-    driver: Driver,
+    drive: Drive,
+    source: Mapping[str, Any],
     ablations: Sequence[RolloutAblation | None],
     wanted: RolloutParams,
     settings: Mapping[str, Any],
@@ -229,7 +211,7 @@ def run_episodes(
 ) -> Rollouts:
     """Episodes of the policy under each of `ablations`, None for none, and of the demonstrator.
 
-    `settings` tell of the policy, its `checkpoint` among them.
+    `source` is what the policy was trained on, `settings` tell of it, its `checkpoint` among them.
     """
     seeds = range(wanted.seed, wanted.seed + wanted.episodes)
     groups = [seeds[at : at + SIDE_BY_SIDE] for at in range(0, len(seeds), SIDE_BY_SIDE)]
@@ -240,26 +222,26 @@ def run_episodes(
             controller = ablation or POLICY
             bar.set_description(controller)
             for group in groups:
-                robots = [driver.begin(seed) for seed in group]
-                stops = driver.drive(robots, group, ablation, bar.update)
+                robots = [_begin_episode(source, wanted.level, seed) for seed in group]
+                stops = drive(robots, ablation, bar.update)
                 episodes += [
-                    _episode(controller, wanted.level, seed, robot.insertion, stop)
-                    for seed, robot, stop in zip(group, robots, stops, strict=True)
+                    _episode(controller, wanted.level, robot.insertion, stop)
+                    for robot, stop in zip(robots, stops, strict=True)
                 ]
-            rate = SuccessRate.of([e for e in episodes if e.controller == controller])
+            rate = SuccessRate.of([e.success for e in episodes if e.controller == controller])
             say(f"{controller_name(controller)}: {rate} of {rate.episodes} episodes")
         bar.set_description(EXPERT)
         for seed in seeds:
-            insertion = driver.begin(seed).insertion
+            insertion = _begin_episode(source, wanted.level, seed).insertion
             while not insertion.finished:
                 insertion.step(insertion.expert_action())
-            episodes.append(_episode(EXPERT, wanted.level, seed, insertion, None))
+            episodes.append(_episode(EXPERT, wanted.level, insertion, None))
             bar.update()
     told = wanted.model_dump(mode="json", exclude={"checkpoint", "output", "device"})
     return Rollouts(settings["checkpoint"], told | dict(settings), tuple(episodes))
 
 
-def begin_episode(source: Mapping[str, Any], level: Level, seed: int) -> InsertionEnvironment:
+def _begin_episode(source: Mapping[str, Any], level: Level, seed: int) -> InsertionEnvironment:
     """The phantom at the beginning of an episode, with actions as a policy's `source` has them."""
     rotation = "rotvec" if "rx" in source["streams"]["action"]["names"] else "euler_delta"
     robot = InsertionEnvironment(level, rotation, cameras=False)
@@ -273,25 +255,18 @@ def refuse_other_robot(source: Mapping[str, Any], widths: Mapping[str, int]) -> 
     `source` has `streams` and `action_hz`; `widths` are those of action, state and sensor, 0 of a
     stream that the policy does not look at.
     """
-    views = tuple(source["streams"]["views"])
-    checked = {
-        "views": (views, VIEWS, set(views) <= set(VIEWS)),
-        "action": (source["streams"]["action"]["kind"], "delta", None),
-        "action channels": (widths["action"], 7, None),
-        "state channels": (widths["state"], 12, widths["state"] in (0, 12)),
-        "sensor channels": (widths["sensor"], 1026, widths["sensor"] in (0, 1026)),
-        "action_hz": (source["action_hz"], TICK_HZ, None),
-    }
-    differs = [
-        f"{name} {trained}, of the phantom {own}"
-        for name, (trained, own, fits) in checked.items()
-        if not (trained == own if fits is None else fits)
-    ]
-    if differs:
+    streams, hz = source["streams"], source["action_hz"]
+    kind, own = streams["action"]["kind"], {"action": (7,), "state": (0, 12), "sensor": (0, 1026)}
+    fits = all(widths[name] in known for name, known in own.items())
+    if not (fits and kind == "delta" and hz == TICK_HZ and set(streams["views"]) <= set(VIEWS)):
+        channels = ", ".join(f"{name} channels {width}" for name, width in widths.items())
         raise CheckpointMismatch(
-            "rollout.environment: the policy was trained on another robot than the phantom: "
-            f"{'; '.join(differs)}. Judge it on its own recordings (python -m stages.evaluate) and "
-            "set rollout.environment to null, which leaves rollouts out of dvc repro."
+            "rollout.environment: the policy was trained on another robot than the phantom: views "
+            f"{', '.join(streams['views'])}, action {kind}, {channels}, action_hz {hz}, of the "
+            f"phantom views {', '.join(VIEWS)}, action delta, action channels 7, state channels "
+            f"12, sensor channels 1026, action_hz {TICK_HZ}. Judge it on its own recordings "
+            "(python -m stages.evaluate) and set rollout.environment to null, which leaves "
+            "rollouts out of dvc repro."
         )
 
 
@@ -352,23 +327,17 @@ class _Driver:
     wanted: RolloutParams
     instruction: str
 
-    def begin(self, seed: int) -> InsertionEnvironment:
-        """The phantom at the beginning of an episode."""
-        return begin_episode(self.checkpoint.source, self.wanted.level, seed)
-
     def drive(
         self,
         environments: Sequence[InsertionEnvironment],
-        seeds: Sequence[int],
         ablation: RolloutAblation | None,
         ended: Callable[[], Any],
     ) -> list[str | None]:
-        """Run the policy on all robots at once to their ends; why each stopped safely, or None.
+        """`Drive` of all robots at once.
 
-        `ended` is called for each that ends. A robot draws from a generator of its own seed, so
-        that it does as it would alone.
+        A robot draws from a generator of its own seed, so that it does as it would alone.
         """
-        robots = [self._robot(*pair) for pair in zip(environments, seeds, strict=True)]
+        robots = [self._robot(environment) for environment in environments]
         stops: list[str | None] = [None] * len(robots)
         for robot in robots:
             robot.sense(robot.environment.readings())
@@ -396,17 +365,16 @@ class _Driver:
             active = going
         return stops
 
-    def _robot(self, environment: InsertionEnvironment, seed: int) -> _Robot:
+    def _robot(self, environment: InsertionEnvironment) -> _Robot:
         """The loop and the memory of a robot whose episode begins."""
         params, wanted = self.policy.params, self.wanted
         source = self.checkpoint.source
         moving = moving_channels(source["streams"]["action"])
-        timing = LoopTiming(
-            source["vlm_reuse_count"], wanted.execute, wanted.chunking, params.horizon, moving
-        )
+        executor = Executor(wanted.chunking, wanted.execute, params.horizon, moving)
         memory = RobotMemory.of(self.policy)
-        loop = ControlLoop(timing, uses_features=self.features is not None)
-        return _Robot(environment, loop, memory, torch.Generator().manual_seed(seed))
+        loop = ControlLoop(executor, source["vlm_reuse_count"], self.features is not None)
+        drawn = torch.Generator().manual_seed(environment.insertion.layout.seed)
+        return _Robot(environment, loop, memory, drawn)
 
     def _sees(self, robot: _Robot) -> bool:
         """Whether the head can be asked: the first features are there, or it looks at none."""
@@ -453,14 +421,14 @@ class _Driver:
 
 
 def _episode(
-    controller: str, level: str, seed: int, insertion: NeedleInsertion, stop: str | None
+    controller: str, level: str, insertion: NeedleInsertion, stop: str | None
 ) -> RolloutEpisode:
     """What is told of an episode that has ended, by its outcome or by a safe stop."""
     progress, trace = insertion.progress, insertion.trace()
     reason = stop or str(insertion.outcome)
     return RolloutEpisode(
         controller=controller,
-        seed=seed,
+        seed=insertion.layout.seed,
         level=level,
         success=reason == INSERTED,
         reason=reason,

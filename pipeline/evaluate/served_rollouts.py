@@ -1,24 +1,22 @@
 """Rollouts over the wire: the same episodes, with chunks that a policy server answers."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.base.config import RolloutAblation, RolloutParams
+from pipeline.base.config import RolloutParams
 from pipeline.base.errors import ConfigError
 from pipeline.evaluate.rollouts import (
     Rollouts,
-    begin_episode,
     instruction_of,
     refuse_other_robot,
     run_episodes,
 )
-from pipeline.robot.chunking import check_chunking
+from pipeline.robot.chunking import Executor, check_chunking
 from pipeline.robot.client import PolicyClient
-from pipeline.robot.loop import ControlLoop, LoopTiming, SafeStop
+from pipeline.robot.loop import ControlLoop, SafeStop
 from pipeline.simulation.environment import InsertionEnvironment
 
 
@@ -44,69 +42,51 @@ def roll_out_served(
     instruction = instruction_of(told["instructions"])
     settings = {name: told[name] for name in ("checkpoint", "step", "model_type")}
     settings["instruction"] = instruction
-    return run_episodes(ServedDriver(server, wanted, instruction), [None], wanted, settings, say)
-
-
-@dataclass(frozen=True)
-class ServedDriver:
-    """Drives robots by the answers of one server, which begins anew with each."""
-
-    server: PolicyClient
-    wanted: RolloutParams
-    instruction: str
-
-    def begin(self, seed: int) -> InsertionEnvironment:
-        """The phantom at the beginning of an episode."""
-        return begin_episode(self.server.metadata, self.wanted.level, seed)
 
     def drive(
-        self,
-        environments: Sequence[InsertionEnvironment],
-        seeds: Sequence[int],
-        ablation: RolloutAblation | None,
-        ended: Callable[[], Any],
+        robots: Sequence[InsertionEnvironment], ablation: object, ended: Callable[[], Any]
     ) -> list[str | None]:
-        """Run the policy on one robot after another; why each stopped safely, or None."""
+        """One robot after another."""
         assert ablation is None, "a served policy sees what there is"
         stops: list[str | None] = []
-        for environment, seed in zip(environments, seeds, strict=True):
+        for robot in robots:
             try:
-                self._drive(environment, seed)
+                _drive(server, wanted, instruction, robot)
                 stops.append(None)
             except SafeStop as stop:
                 stops.append(f"safe stop: {stop}")
             ended()
         return stops
 
-    def _drive(self, robot: InsertionEnvironment, seed: int) -> None:
-        told, wanted = self.server.metadata, self.wanted
-        timing = LoopTiming(
-            reuse=told["vlm_reuse_count"],
-            execute=wanted.execute,
-            chunking=wanted.chunking,
-            horizon=told["horizon"],
-            moving=told["moving"],
-        )
-        loop = ControlLoop(timing, told["uses_features"])
-        self.server.reset(seed)
-        unsent = [robot.readings()]
-        while not robot.insertion.finished:
-            loop.begin_tick()
-            if loop.chunk_due:
-                guide = loop.ask()
-                observation = _together(unsent) | {"prompt": self.instruction}
-                if guide is not None:
-                    observation |= {"guide/chunk": guide.chunk, "guide/weight": guide.weight}
-                if loop.frames_due:
-                    loop.pass_began()
-                    observation |= _seen(robot, told["streams"]["views"])
-                answer = self.server.infer(observation)
-                loop.pass_ended()
-                loop.plan(answer["actions"])
-                unsent = []
-            action = loop.action()
-            assert action is not None, "the first answer was waited for"
-            unsent.append(robot.step(action)[0])
+    return run_episodes(drive, told, [None], wanted, settings, say)
+
+
+def _drive(
+    server: PolicyClient, wanted: RolloutParams, instruction: str, robot: InsertionEnvironment
+) -> None:
+    """Run the policy on one robot, for which the server begins anew. Raises `SafeStop`."""
+    told = server.metadata
+    executor = Executor(wanted.chunking, wanted.execute, told["horizon"], told["moving"])
+    loop = ControlLoop(executor, told["vlm_reuse_count"], told["uses_features"])
+    server.reset(robot.insertion.layout.seed)
+    unsent = [robot.readings()]
+    while not robot.insertion.finished:
+        loop.begin_tick()
+        if loop.chunk_due:
+            guide = loop.ask()
+            observation = _together(unsent) | {"prompt": instruction}
+            if guide is not None:
+                observation |= {"guide/chunk": guide.chunk, "guide/weight": guide.weight}
+            if loop.frames_due:
+                loop.pass_began()
+                observation |= _seen(robot, told["streams"]["views"])
+            answer = server.infer(observation)
+            loop.pass_ended()
+            loop.plan(answer["actions"])
+            unsent = []
+        action = loop.action()
+        assert action is not None, "the first answer was waited for"
+        unsent.append(robot.step(action)[0])
 
 
 def _together(ticks: Sequence[Mapping[str, NDArray[Any]]]) -> dict[str, Any]:

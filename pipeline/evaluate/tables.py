@@ -13,6 +13,7 @@ from pipeline.base.durable import write_document
 from pipeline.base.table import Table
 from pipeline.evaluate.ablation import AblationStudy
 from pipeline.evaluate.baselines import METHODS
+from pipeline.evaluate.evaluation import Evaluation
 from pipeline.evaluate.figures import (
     NO_INTERVAL,
     Figure,
@@ -47,14 +48,7 @@ GROUPS = "groups.csv"
 """The file with the errors of all methods by group of test recordings."""
 OVERALL = "overall"
 _STD = "training std"
-HEADINGS = {
-    "policy": "policy",
-    "zero_action": "zero",
-    "median_action": "median",
-    "repeat_last": "repeat last",
-    "linear_fit": "linear fit",
-    "nearest_neighbour": "nearest neighbour",
-}
+HEADINGS = {method: method.removesuffix("_action").replace("_", " ") for method in METHODS}
 
 
 def scopes(comparison: Comparison) -> dict[str, Comparison]:
@@ -266,20 +260,14 @@ def evaluated_on(study: AblationStudy) -> str:
     )
 
 
-def write_tables(
-    folder: Path,
-    comparison: Comparison,
-    predictions: Predictions,
-    store: FeatureStore,
-    study: AblationStudy | None = None,
-    energy: Figure | None = None,
-) -> list[Path]:
+def write_tables(folder: Path, evaluation: Evaluation) -> list[Path]:
     """Write metrics.json and one CSV each of all errors: see docs/reports.md.
 
     The two by ablated stream have headings alone without a `study`: `dvc plots` would miss the
     file, and one of an evaluation before would stay. steps.csv and streams.csv have one line a
     point, as `dvc plots` takes them; the rest is for others.
     """
+    comparison, store, study = evaluation.comparison, evaluation.store, evaluation.study
     files = {
         EXECUTED: _group_errors(comparison.executed),
         ERRORS: _group_errors(comparison),
@@ -288,11 +276,11 @@ def write_tables(
         "horizon.csv": _horizon(comparison),
         "steps.csv": _steps(comparison),
         "episodes.csv": _episodes(comparison, store),
-        "predictions.csv": _predictions(comparison, predictions, store),
+        "predictions.csv": _predictions(comparison, evaluation.predictions, store),
         "modalities.csv": _ablation_errors(study),
         "streams.csv": _streams(study),
     }
-    write_document(folder / METRICS, metrics(comparison, energy))
+    write_document(folder / METRICS, metrics(comparison, evaluation.energy))
     return [folder / METRICS, *(files[name].write_csv(folder / name) for name in files)]
 
 

@@ -176,7 +176,7 @@ def _prepared(engine: RowEngine, rows: NDArray[np.int64]) -> list[Row]:
     firsts: dict[bytes, int] = {}
     try:
         parts = engine.frames.ranges(rows)
-        return [row for part in parts for row in engine.prepare(part, firsts)]
+        return [row for part in parts for row in engine.preparation.prepare(part, firsts)]
     except RecordingError:
         raise
     except Exception as error:  # a damaged recording may raise anything in its decoder
@@ -197,16 +197,13 @@ def device_of(job: ExtractionJob, worker_name: object) -> str:
 def check_place(job: ExtractionJob) -> None:
     """Raise where this worker does not see the files that the coordinator sees, or not the same."""
     here, host = Path.cwd(), socket.gethostname()
-    if not job.folder.is_dir() or not here.samefile(job.folder):
-        raise ConfigError(
-            f"the worker on {host} runs in {here}, the coordinator in {job.folder}. Start every "
-            f"worker with `cd {job.folder}`, on a file system that all hosts share."
-        )
     surveyed, part = job.surveyed, part_path(job.surveyed.target)
-    if read_plan(part) != surveyed.plan:
-        raise StoreIncomplete(
-            f"the worker on {host} does not see the build {part}. Workers on other hosts need a "
-            "file system that all hosts share: set extract.store to a folder of one."
+    same = job.folder.is_dir() and here.samefile(job.folder)
+    if not same or read_plan(part) != surveyed.plan:
+        raise ConfigError(
+            f"the worker on {host} runs in {here}, the coordinator in {job.folder}, with the build "
+            f"{part}. Start every worker with `cd {job.folder}`, and set extract.store to a folder "
+            "of a file system that all hosts share."
         )
     if not job.local:
         params, spec = surveyed.params, surveyed.spec

@@ -3,7 +3,6 @@
 import sys
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
@@ -84,16 +83,9 @@ class BatchSize:
 Encoded = tuple[list[ReadyRow], NDArray[Any]]
 
 
-@dataclass(frozen=True)
-class _Submitted:
-    """Rows that the model works on, variant after variant, in one pass or several.
-
-    `full` is the batch size, where there are as many rows as it allows.
-    """
-
-    rows: list[ReadyRow]
-    passes: list[Pending]
-    full: int | None
+# Rows that the model works on, variant after variant, in one pass or several; and the batch size,
+# where there are as many rows as it allows.
+_Submitted = tuple[list[ReadyRow], list[Pending], int | None]
 
 
 class Encoder:
@@ -123,7 +115,7 @@ class Encoder:
         for batch in self._batches(rows):
             for submitted in self._submitted(batch):
                 ahead.append(submitted)
-                keep = 0 if all(each.done for each in submitted.passes) else 1
+                keep = 0 if all(each.done for each in submitted[1]) else 1
                 while len(ahead) > keep:
                     yield from self._finished(ahead.pop(0))
         for submitted in ahead:
@@ -163,22 +155,22 @@ class Encoder:
                     raise
                 self.size.halve(min(size, len(every)), error)
                 continue
-            yield _Submitted(batch, passes, size if len(batch) == self._rows else None)
+            yield batch, passes, size if len(batch) == self._rows else None
             rows = rows[len(batch) :]
 
     def _finished(self, submitted: _Submitted) -> Iterator[Encoded]:
-        rows = submitted.rows
+        rows, passes, full = submitted
         try:
-            features = [part.result()[0] for part in submitted.passes]
+            features = [part.result()[0] for part in passes]
         except NumericsError:
             for row in rows:  # alone, the one that is not finite names itself
                 yield [row], _stored([row], [self._alone(row, v) for v in range(self._variants)])
             return
-        seconds = sum(part.model_s for part in submitted.passes)
+        seconds = sum(part.model_s for part in passes)
         self.model_s += seconds
-        if submitted.full is not None:
+        if full is not None:
             tokens = len(rows) * self._variants * rows[0].variants[0].layout.length
-            self.size.note(submitted.full, tokens, seconds)
+            self.size.note(full, tokens, seconds)
         yield rows, _stored(rows, features)
 
     def _alone(self, row: ReadyRow, variant: int) -> torch.Tensor:

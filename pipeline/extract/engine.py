@@ -233,12 +233,8 @@ class RowEngine:
         self.loaded_at = self.waited_s = 0.0
         self._spec, self.variants = surveyed.spec, surveyed.spec.variants
         self._device = device
-        self._preparation = RowPreparation(Preparer(self._vlm, self._spec), self._spec, known)
+        self.preparation = RowPreparation(Preparer(self._vlm, self._spec), self._spec, known)
         self._environment: Mapping[str, Any] = {}
-
-    def prepare(self, rows: RowRange, firsts: dict[bytes, int] | None) -> list[Row]:
-        """`RowPreparation.prepare`; may be called from several threads."""
-        return self._preparation.prepare(rows, firsts)
 
     def encode(self, prepared: Iterator[list[Row]], put: Callable[[FeatureBlock], object]) -> None:
         """Hand over the features of all these rows, a repeated row's after those of its first."""
@@ -380,7 +376,7 @@ def compute_here(
     most = max(1, RANGE_ROWS // engine.variants)
     rows = in_background(
         engine.frames.ranges(missing, most),
-        partial(engine.prepare, firsts={}),
+        partial(engine.preparation.prepare, firsts={}),
         threads,
         ranges_ahead,
     )

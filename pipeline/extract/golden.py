@@ -19,9 +19,8 @@ def keep_golden(build: StoreBuild, surveyed: Survey, places: StorePlaces, say: S
     """Write the golden rows of a build whose rows are all there: at most four, evenly spread.
 
     Those that the store before has are taken from it, the others are decoded. Where the decoder of
-    today gives other pixels than a row was computed from, that row is left out, `say` told, and
-    another that the store before has stands in for it. Raises `RecordingError` where a recording
-    has gone, and `DiskFull`.
+    today gives other pixels than a row was computed from, that row is left out and `say` told.
+    Raises `RecordingError` where a recording has gone, and `DiskFull`.
     """
     frames = row_frames(build, surveyed)
     views = np.isfinite(frames.frame_time).sum(axis=1)
@@ -29,13 +28,11 @@ def keep_golden(build: StoreBuild, surveyed: Survey, places: StorePlaces, say: S
     carried = _carried(build, surveyed, places)
     taken = [carried.pop(row) for row in chosen.tolist() if row in carried]
     wanted = np.setdiff1d(chosen, [golden.row for golden in taken])
-    others = list(carried.values())
-    if left_out := build.write_golden([*taken, *_decoded(frames, wanted, surveyed)], others):
-        stand_in = min(left_out, len(others))
+    if left_out := build.write_golden([*taken, *_decoded(frames, wanted, surveyed)]):
         say(
             f"{left_out} golden row(s) left out: decoded today, their frames are other pixels than "
             "those that the stored features were computed from (stages.verify --reextract tells "
-            f"how far the features are apart); {stand_in} of the store before stand in for them"
+            "how far the features are apart)"
         )
 
 

@@ -98,8 +98,8 @@ def _linkable(
     """
     for source in known:
         if source.path == build.target:
-            pairs = zip(source.episode_contents, checked, strict=False)
-            same = [*takewhile(lambda pair: pair[0] == pair[1].said["content"], pairs)]
+            pairs = zip(source.texts, checked, strict=False)
+            same = [*takewhile(lambda pair: pair[0].content == pair[1].said["content"], pairs)]
             for stream in ("sensor", "state"):
                 rows = sum(episode.counts[stream] for _, episode in same)
                 yield source, f"{stream}/values", rows

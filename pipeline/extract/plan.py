@@ -11,6 +11,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+from pipeline.base.config import setting
 from pipeline.base.differences import describe, differences
 from pipeline.base.digests import ContentDigests, joint_digest
 from pipeline.base.durable import KEPT, free_bytes, previous_path
@@ -84,9 +85,9 @@ class StorePlaces:
         """Set an unfinished build aside; of another feature spec, it is of no use."""
         if self.begun is None:
             return
-        before = RowSource(self.part).attrs["feature_spec"]
-        if before["digest"] != surveyed.spec.digest:
-            for line in spec_differences(before, surveyed.spec.attrs()):
+        before = RowSource(self.part).said
+        if before.feature_spec.digest != surveyed.spec.digest:
+            for line in spec_differences(before.raw["feature_spec"], surveyed.spec.attrs()):
                 say(f"the unfinished build {self.part} is given up: {line}")
             return
         names = (self.target.with_name(f"{self.target.name}.known-{n}") for n in count())
@@ -144,14 +145,16 @@ class StorePlaces:
         follows the advice of a check may run under other params than that store's own. And those of
         a store or build without an episode in common, of another embodiment or other sources only.
         """
-        for place, plan in ((self.target, self.finished), (self.part, self.begun)):
+        under_repair = self.finished is not None and self.finished == self.begun
+        # A store under repair may be one whose metadata are damaged: its build says what it holds.
+        target = None if under_repair else self.finished
+        for place, plan in ((self.target, target), (self.part, self.begun)):
             if plan is not None:
                 _refuse_another(RowSource(place), surveyed, embodiment)
-        under_repair = self.finished is not None and self.finished == self.begun
         if not under_repair and not (self.finished or "").startswith(MERGED):
             return
         source = RowSource(self.part if under_repair else self.target)
-        if lost := set(source.episode_contents) - surveyed.contents:
+        if lost := {text.content for text in source.texts} - surveyed.contents:
             what = "is under repair" if under_repair else "was merged of others"
             raise StoreMismatch(
                 f"{self.target}: {what} and holds {len(lost)} episode(s) that the params do not "
@@ -163,35 +166,18 @@ class StorePlaces:
 def row_sources(places: Sequence[Path], surveyed: Survey) -> list[RowSource]:
     """The stores and laid-out builds of the same feature spec among these."""
     digest, sources = surveyed.spec.digest, map(RowSource, places)
-    return [source for source in sources if source.attrs["feature_spec"]["digest"] == digest]
-
-
-_CHANNEL = ("names", "units")
-
-
-def _apart(before: Sequence[tuple[str, str]], now: Sequence[tuple[str, str]]) -> str:
-    """How the channels, names with units, of a stored stream differ from those that are wanted."""
-    if len(before) != len(now):
-        return f"{len(before)} channels there, {len(now)} here"
-    there, here = next(pair for pair in zip(before, now, strict=True) if pair[0] != pair[1])
-    return f"{' in '.join(there)} there, {' in '.join(here)} here"
+    return [source for source in sources if source.said.feature_spec.digest == digest]
 
 
 def _refuse_another(source: RowSource, surveyed: Survey, embodiment: Embodiment) -> None:
-    known = set(source.episode_contents)
+    known = {text.content for text in source.texts}
     if not known or known & surveyed.contents or not source.rows:
         return
-    there, here = source.attrs["sources"], sorted({r.source for r in surveyed.recordings})
-    before, now = source.attrs["streams"], embodiment.document()
-    channels = {
-        name: [list(zip(*map(side[name].get, _CHANNEL), strict=True)) for side in (before, now)]
-        for name in now
-    }
-    differing = [
-        f"; {name}: {_apart(*sides)}"
-        for name, sides in channels.items()
-        if all(sides) and sides[0] != sides[1]
-    ]
+    there, here = source.said.sources, sorted({r.source for r in surveyed.recordings})
+    streams, now = source.said.raw["streams"], embodiment.document()
+    both = [name for name in now if streams[name]["names"] and now[name]["names"]]
+    apart = differences({name: streams[name] for name in both}, {name: now[name] for name in both})
+    differing = [f"; {line}" for line in describe(apart)]
     if differing or not set(there) & set(here):
         raise StoreMismatch(
             f"{source.path}: holds the feature rows of {len(known)} episode(s), none of which is "
@@ -204,7 +190,7 @@ def _refuse_another(source: RowSource, surveyed: Survey, embodiment: Embodiment)
 def _contents(store: Path) -> list[str] | None:
     """The content digest of each episode; None where they can no longer be read."""
     try:
-        return RowSource(store).episode_contents
+        return [text.content for text in RowSource(store).texts]
     except StoreIncomplete:
         return None
 
@@ -217,9 +203,7 @@ def spec_differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[
         for place, values in differing.items()
         if not place.startswith(("slots", "example_prompt"))
     }
-    lines = describe(first or differing)[:_SHOWN]
-    more = len(differing) - len(lines)
-    return [*lines, *([f"{more} more entries, most of which follow from that"] if more else [])]
+    return describe(first or differing)[:_SHOWN]
 
 
 def plan_lines(
@@ -234,7 +218,7 @@ def plan_lines(
 
     `sources` are stores and builds of the same feature spec.
     """
-    there = {digest for source in sources for digest in source.episode_digests}
+    there = {text.digest for source in sources for text in source.texts}
     unchanged = sum(episode.digest in there for episode in surveyed.episodes)
     resumes = places.begun == surveyed.plan
     place = places.part if resumes or places.repaired else places.target
@@ -292,22 +276,18 @@ def _reasons(
     if before is None:
         yield "there is no store yet"
         return
-    lines = spec_differences(before.attrs["feature_spec"], surveyed.spec.attrs())
+    lines = spec_differences(before.said.raw["feature_spec"], surveyed.spec.attrs())
     yield from (f"feature spec, {line}" for line in lines)
-    digests, contents = set(before.episode_digests), set(before.episode_contents)
+    digests = {text.digest for text in before.texts}
     changed = [episode for episode in surveyed.episodes if episode.digest not in digests]
-    same_files = sum(episode.content in contents for episode in changed)
     here = {episode.digest for episode in surveyed.episodes}
     again = {episode.content for episode in changed}  # said as the new ones are
-    pairs = zip(before.episode_digests, before.episode_contents, strict=True)
-    gone = sum(digest not in here and content not in again for digest, content in pairs)
-    for number, what in (
-        (len(changed) - same_files, "are new or their files changed, or how these are read"),
-        (same_files, "have another instruction, name, place, action_hz or vlm_reuse_count"),
-        (gone, "of the store are gone or changed"),
-    ):
-        if number:
-            yield f"{number} episode(s) {what}"
+    gone = sum(text.digest not in here and text.content not in again for text in before.texts)
+    if changed:
+        what = "files, how these are read, instruction, name, place, action_hz or vlm_reuse_count"
+        yield f"{len(changed)} episode(s) are new or have other {what}"
+    if gone:
+        yield f"{gone} episode(s) of the store are gone or changed"
     dtypes = [
         f"{name} was {before.specs[name].dtype}, is to be {spec.dtype}"
         for name, spec in specs.items()
@@ -321,14 +301,14 @@ def _reasons(
 def _warnings(surveyed: Survey, before: RowSource | None, missing: int) -> Iterator[str]:
     """What may not be meant, each with the way out."""
     params, recordings, views = surveyed.params, surveyed.recordings, surveyed.spec.views
-    known: Sequence[str] = before.attrs["feature_spec"].get("views", ()) if before else ()
+    known = before.said.feature_spec.views if before else []
     if known and (added := set(views) - set(known)):
         having = sum(not added.isdisjoint(recording.view_names()) for recording in recordings)
-        kept = ", ".join(view for view in known if view in views)
+        kept = setting("data.views", [view for view in known if view in views])
         yield (
             f"{having} of {len(recordings)} episode(s) have {', '.join(sorted(added))}, which the "
             "store does not have. The model sees all views of a store at a time, so that every row "
-            f"of every episode is computed again. To keep the rows: --set 'data.views=[{kept}]'"
+            f"of every episode is computed again. To keep the rows: {kept}"
         )
     without = [recording.source for recording in recordings if not recording.has_poses]
     if params.data.action_rotation == "auto" and 0 < len(without) < len(recordings):

@@ -8,6 +8,7 @@ rename at the end. So a kill leaves the damaged store as it was and nothing half
 import shutil
 from contextlib import closing
 from pathlib import Path
+from shlex import quote
 
 import numpy as np
 from tqdm import tqdm
@@ -23,7 +24,7 @@ from pipeline.extract.plan import Say
 from pipeline.extract.survey import sound_episodes, survey
 from pipeline.store import FEATURES, StoreBuild, build_lock, part_path, read_plan, recover
 from pipeline.store.chunks import ChunkFiles, read_rows, row_checksums
-from pipeline.store.paths import MERGED, STORE, read_attributes, refuse_replaced
+from pipeline.store.paths import MERGED, STORE, refuse_replaced
 from pipeline.store.repair_hints import extract_command, gc_command
 from pipeline.store.schema import CHECKSUMS, INCREMENTAL, KEYS, chunk_paths, read_specs
 from pipeline.store.verification import Verification, read_arrays
@@ -102,7 +103,6 @@ def carry_rows(store: Path, build: StoreBuild, verification: Verification) -> in
             path.unlink(missing_ok=True)
     # Chunk files in which everything is sound are linked; of the others, sound rows are copied.
     spec, damaged = build.specs[FEATURES], verification.damaged_chunks(FEATURES)
-    environments = read_attributes(store).get("environment", [])
     step = max(1, _BLOCK_BYTES // max(1, spec.row_bytes))
     with closing(ChunkFiles(build.part, spec)) as files:  # which leaves linked chunks as they are
         for chunk, path in enumerate(chunk_paths(store, spec)):
@@ -111,7 +111,7 @@ def carry_rows(store: Path, build: StoreBuild, verification: Verification) -> in
                 files.link(chunk, path)
         for name in INCREMENTAL:
             build.files(name).allocate()
-        for environment, run in environment_runs(environments, np.flatnonzero(sound)):
+        for environment, run in environment_runs(verification.environments, np.flatnonzero(sound)):
             number = build.environment_index(environment)
             for start in range(run.start, run.stop, step):
                 rows = run[start - run.start :][:step]
@@ -173,7 +173,7 @@ def _repaired(store: Path) -> Path:
 
 def _completed_by(store: Path, plan: str) -> str:
     if plan.startswith(MERGED):
-        return f"the same python -m stages.store merge --into {store} that made it"
+        return f"the same python -m stages.store merge --into {quote(str(store))} that made it"
     return extract_command(store)
 
 

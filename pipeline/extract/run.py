@@ -1,5 +1,6 @@
 """Recordings x frozen model -> store: the list of steps."""
 
+import errno
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
@@ -33,7 +34,7 @@ def extract(params: Params, say: Say) -> ExtractionReport | None:
     Resumes an interrupted build of the same plan, takes known rows over from an older store of the
     same feature spec, and computes the rest. With `extract.plan` it only says what it would do.
     """
-    with _opened(params.extract.store, params.extract.plan) as digests:
+    with _opened(params.extract.store, params.extract.plan) as (digests, unwritable):
         surveyed, checked = survey(params, digests), list[CheckedEpisode]()
         if surveyed.bad and params.data.on_bad_episode == "stop":
             check_episodes(surveyed)  # lists them with whatever else is wrong
@@ -44,6 +45,8 @@ def extract(params: Params, say: Say) -> ExtractionReport | None:
             stands = places.stands(surveyed)
         for line in _survey_lines(surveyed):
             say(line)
+        if unwritable is not None and (not stands or places.begun == surveyed.plan):
+            raise unwritable
         if not stands:
             return _begin(surveyed, checked, places, digests, say)
         if places.begun == surveyed.plan:
@@ -55,16 +58,25 @@ def extract(params: Params, say: Say) -> ExtractionReport | None:
 
 
 @contextmanager
-def _opened(target: Path, only_plan: bool) -> Generator[ContentDigests]:
-    """The digests that are remembered beside the store, which nobody else builds meanwhile."""
+def _opened(target: Path, only_plan: bool) -> Generator[tuple[ContentDigests, OSError | None]]:
+    """The digests that are remembered beside the store, which nobody else builds meanwhile.
+
+    With the error of what cannot be written there: a store that is up to date needs no writing.
+    """
+    read, unwritable = ContentDigests.to_read, None
     with ExitStack() as stack:
         if only_plan:
             refuse_foreign_store(target)
         else:
-            stack.enter_context(build_lock(target))
-            recover(target)
-        read = ContentDigests.to_read if only_plan else ContentDigests
-        yield stack.enter_context(closing(read(ledger_path(target))))
+            try:
+                stack.enter_context(build_lock(target))
+                recover(target)
+                read = ContentDigests
+            except OSError as error:
+                if error.errno not in (errno.EROFS, errno.EACCES, errno.EPERM):
+                    raise
+                unwritable = error
+        yield stack.enter_context(closing(read(ledger_path(target)))), unwritable
 
 
 def _resume(

@@ -8,23 +8,21 @@ has any, by which a live model proves that it gives these features. No pickle.
 A kill at any instant leaves the previous checkpoint or the new one.
 """
 
-import sys
-from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
-from functools import cache
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.config import TrainHeadParams
+from pipeline.base.differences import describe, differences
 from pipeline.base.durable import (
-    DIGEST,
+    RUN_FILES,
     check_digest,
+    read_document,
     read_tensors,
-    read_with_digest,
     replace_folder,
     write_tensors,
     write_with_digest,
@@ -32,27 +30,24 @@ from pipeline.base.durable import (
 from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch, PipelineError
 from pipeline.base.golden import GoldenRow, row_key
 from pipeline.base.ownership import OutputKind
-from pipeline.base.tuned_on import EpisodePart
+from pipeline.base.tuned_on import EpisodePart, Side
+from pipeline.policy.document import FORMAT, PolicyDocument
 from pipeline.policy.normalization import Normalization
+from pipeline.policy.shape import PolicyShape
 
 # torch takes over a second to import, and what only asks whether a training is finished needs none.
 if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-    from pipeline.policy.observation import PolicyShape
     from pipeline.policy.policy import Policy
 
-FORMAT = 3
-"""3: three sides of the split; 2 had two, so that what is reported had chosen the checkpoint."""
 WEIGHTS, DOCUMENT, GOLDEN = "policy.safetensors", "policy.json", "golden.safetensors"
 _FRAMES = "frames/"
-_OF_THE_RUN = ("feed", "loggers", "scratch")
-"""Params of a run that tell nothing of its policy; earlier versions had others of them."""
 CHECKPOINT = OutputKind("a checkpoint of a policy", lambda folder: (folder / DOCUMENT).is_file())
+_Layout = dict[str, tuple[str, tuple[int, ...]]]
+"""The dtype and the shape of each tensor."""
 SOURCE_KEYS = ("feature_spec", "streams", "action_hz", "vlm_reuse_count")
-Side = Literal["train", "val", "test"]
-SIDES: tuple[Side, ...] = ("train", "val", "test")
 
 
 @dataclass(frozen=True)
@@ -60,7 +55,7 @@ class PolicyCheckpoint:
     """A trained policy and what it was trained from."""
 
     params: TrainHeadParams
-    shape: "PolicyShape"
+    shape: PolicyShape
     normalization: Normalization
     source: Mapping[str, Any]
     """What the store was: `feature_spec`, `streams`, `action_hz`, `vlm_reuse_count`."""
@@ -81,13 +76,7 @@ class PolicyCheckpoint:
 
         policy = Policy(self.params, self.shape, self.normalization)
         policy.feature_spec = self.source["feature_spec"]
-        try:
-            policy.load_state_dict(dict(self.weights))
-        except RuntimeError as error:
-            raise CheckpointMismatch(
-                f"{WEIGHTS} does not fit the policy that {DOCUMENT} describes: {error}. Train it "
-                "again, or use the version of this code that wrote it."
-            ) from None
+        policy.load_state_dict(dict(self.weights))
         return policy.to(device).eval()
 
     def typical(self, stream: str) -> NDArray[np.float64]:
@@ -140,16 +129,6 @@ def save_policy(
     replace_folder(folder, write, CHECKPOINT)
 
 
-@cache
-def _note_without_digest(path: Path) -> None:
-    """Say it once in a process: a checkpoint is read several times."""
-    print(
-        f"{path}: it has no {DIGEST}, for an earlier version wrote it, so that nobody can tell "
-        "whether it was altered; it is taken as it is. Train it again to have it checked.",
-        file=sys.stderr,
-    )
-
-
 def find_policy(path: Path) -> Path:
     """The checkpoint folder that `path` means: itself, or the best of a training's output.
 
@@ -172,45 +151,66 @@ def load_policy(folder: Path) -> PolicyCheckpoint:
 
     Raises `CheckpointIncomplete` naming the file that is missing, truncated or altered.
     """
-    from pipeline.policy.observation import PolicyShape
-
-    with _description(folder) as document:
-        shape = PolicyShape(**document["shape"])
-        return PolicyCheckpoint(
-            params=_params(document),
-            shape=replace(
-                shape,
-                action_groups=tuple(shape.action_groups),
-                state_kinds=tuple(shape.state_kinds),
-            ),
-            normalization=Normalization.from_document(document["normalization"]),
-            source={key: document[key] for key in SOURCE_KEYS},
-            split={
-                side: {
-                    name: EpisodePart.model_validate(part)
-                    for name, part in document["split"][side].items()
-                }
-                for side in SIDES
-            },
-            step=document["step"],
-            metrics=document["metrics"],
-            instructions=tuple(document.get("instructions", ())),
-            weights=read_tensors(folder / WEIGHTS, document["weights_sha256"]),
-            golden=_read_golden(folder, document),
-        )
+    document, said = read_document(folder / DOCUMENT, PolicyDocument)
+    path = folder / WEIGHTS
+    weights = read_tensors(path, document.weights_sha256)
+    _check_tensors(path, weights, _described_weights(folder, document))
+    return PolicyCheckpoint(
+        params=document.params.train_head,
+        shape=document.shape,
+        normalization=document.normalization,
+        source={key: said[key] for key in SOURCE_KEYS},
+        split=document.split,
+        step=document.step,
+        metrics=document.metrics,
+        instructions=document.instructions,
+        weights=weights,
+        golden=_read_golden(folder, document),
+    )
 
 
-def check_policy(folder: Path) -> TrainHeadParams:
-    """The params of the checkpoint at `folder`, of which no weight is opened.
+def check_policy(folder: Path) -> None:
+    """Raise `CheckpointIncomplete` as `load_policy`; no weight is opened."""
+    document, _ = read_document(folder / DOCUMENT, PolicyDocument)
+    check_digest(folder / WEIGHTS, document.weights_sha256)
+    if document.golden is not None:
+        check_digest(folder / GOLDEN, document.golden.sha256)
 
-    Raises `CheckpointIncomplete` and `CheckpointMismatch` as `load_policy`.
+
+def _described_weights(folder: Path, document: PolicyDocument) -> _Layout:
+    """What the described policy learns; built without memory, for a document may ask for much.
+
+    Raises `CheckpointIncomplete` where no such policy can be.
     """
-    with _description(folder) as document:
-        check_digest(folder / WEIGHTS, document["weights_sha256"])
-        if "golden" in document:
-            check_digest(folder / GOLDEN, document["golden"]["sha256"])
-        Normalization.from_document(document["normalization"])
-        return _params(document)
+    import torch
+
+    from pipeline.policy.policy import Policy
+
+    try:
+        with torch.device("meta"):
+            policy = Policy(document.params.train_head, document.shape, document.normalization)
+    except (RuntimeError, PipelineError) as error:
+        raise RUN_FILES.refusal(folder / DOCUMENT, error) from None
+    return _layout(policy.state_dict())
+
+
+def _layout(tensors: "Mapping[str, Tensor]") -> _Layout:
+    return {name: (str(value.dtype), tuple(value.shape)) for name, value in tensors.items()}
+
+
+def _check_tensors(path: Path, tensors: "Mapping[str, Tensor]", expected: _Layout) -> None:
+    """Raise `CheckpointMismatch` where a file has not the tensors that the document describes, and
+    `CheckpointIncomplete` where a number in them is none."""
+    if differing := describe(differences(_layout(tensors), expected)):
+        more = f" and {len(differing) - 1} more" if len(differing) > 1 else ""
+        raise CheckpointMismatch(
+            f"{path} does not fit the policy that {DOCUMENT} describes (the file -> the policy): "
+            f"{differing[0]}{more}. Copy both again, train it again, or use the version of this "
+            "code that wrote it."
+        )
+    for name, values in tensors.items():
+        if not values.isfinite().all():
+            raise RUN_FILES.refusal(path, f"{name}: expected finite numbers, found NaN or infinity")
 
 
 def _golden_tensors(rows: Sequence[GoldenRow]) -> "dict[str, Tensor]":
@@ -228,54 +228,28 @@ def _golden_tensors(rows: Sequence[GoldenRow]) -> "dict[str, Tensor]":
     }
 
 
-def _read_golden(folder: Path, document: Mapping[str, Any]) -> tuple[GoldenRow, ...]:
+def _read_golden(folder: Path, document: PolicyDocument) -> tuple[GoldenRow, ...]:
     """The golden rows; their keys are those under the feature spec of the document."""
-    if "golden" not in document:
+    if document.golden is None:
         return ()
-    spec, rows = document["feature_spec"], list[GoldenRow]()
-    tensors = read_tensors(folder / GOLDEN, document["golden"]["sha256"])
-    for number, said in enumerate(document["golden"]["rows"]):
-        own = {
-            name.removeprefix(f"{number}/"): tensor.numpy()
-            for name, tensor in tensors.items()
-            if name.startswith(f"{number}/")
-        }
-        frames = {n.removeprefix(_FRAMES): own[n] for n in own if n.startswith(_FRAMES)}
-        key = row_key(spec["digest"], spec["views"], said["prompt"], frames)
-        rows.append(
-            GoldenRow(
-                key, **said, frames=frames, features=own["features"], slot_valid=own["slot_valid"]
-            )
-        )
+    path, spec, shape = folder / GOLDEN, document.feature_spec, document.shape
+    tensors = read_tensors(path, document.golden.sha256)
+    expected: _Layout = {}
+    frames_of: list[dict[str, Tensor]] = []
+    for number, _ in enumerate(document.golden.rows):
+        expected[f"{number}/features"] = "torch.float32", (shape.slots, shape.feature_dim)
+        expected[f"{number}/slot_valid"] = "torch.bool", (shape.slots,)
+        places = {view: f"{number}/{_FRAMES}{view}" for view in spec.views}
+        there = {view: tensors[at] for view, at in places.items() if at in tensors}
+        frames = {view: frame for view, frame in there.items() if frame.numel()}
+        for view, frame in frames.items():
+            expected[places[view]] = "torch.uint8", (*frame.shape[:2], 3)
+        frames_of.append(frames)
+    _check_tensors(path, tensors, expected)
+    rows: list[GoldenRow] = []
+    for number, (row, shown) in enumerate(zip(document.golden.rows, frames_of, strict=True)):
+        frames = {view: frame.numpy() for view, frame in shown.items()}
+        features, valid = (tensors[f"{number}/{n}"].numpy() for n in ("features", "slot_valid"))
+        key = row_key(spec.digest, spec.views, row.prompt, frames)
+        rows.append(GoldenRow(key, row.instruction, row.prompt, frames, features, valid))
     return tuple(rows)
-
-
-def _params(document: Mapping[str, Any]) -> TrainHeadParams:
-    given: Mapping[str, Any] = document["params"]["train_head"]
-    return TrainHeadParams.model_validate(
-        {name: value for name, value in given.items() if name not in _OF_THE_RUN}
-    )
-
-
-@contextmanager
-def _description(folder: Path) -> Generator[dict[str, Any]]:
-    """The document of a checkpoint; what it lacks where it is read is `CheckpointIncomplete`."""
-    path = folder / DOCUMENT
-    document, has_digest = read_with_digest(path)
-    if not has_digest:
-        _note_without_digest(path)
-    if document.get("format") != FORMAT:
-        raise CheckpointMismatch(
-            f"{path}: expected format {FORMAT}, found {document.get('format')!r}. Checkpoints of "
-            "formats before 3 do not tell what chose them from what reports them. Train it again "
-            "with this version."
-        )
-    try:
-        yield document
-    except PipelineError:
-        raise
-    except (KeyError, TypeError, AttributeError, ValueError) as error:
-        raise CheckpointIncomplete(
-            f"{path}: not what a checkpoint's description must be ({type(error).__name__}: "
-            f"{error}). Train it again."
-        ) from None

@@ -21,7 +21,6 @@ class DiffusionActionExpert(ActionExpert):
     `sampler` ddpm visits every step of the schedule; ddim visits `sampling_steps` of them, with
     `eta` from 0 (nothing random but the first noise) to 1 (as random as ddpm). In each the
     predicted clean chunk is held within +-`clip`, and the step is taken from the chunk so held.
-    Raises `ConfigError` where ddim is to take more steps than there are.
     """
 
     stochastic = True

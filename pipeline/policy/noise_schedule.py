@@ -11,7 +11,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from pipeline.base.errors import ConfigError
 from pipeline.policy.tensors import Chunk
 
 ScheduleKind = Literal["cosine", "linear"]
@@ -47,14 +46,8 @@ class NoiseSchedule(nn.Module):
         A sampler begins with pure noise, so it must begin near the top, or its mean is pulled
         towards the noise's; but at the very top nothing is left of the sample, so a predicted
         epsilon says nothing of it: the first is at 98 % where there is a choice. The last stands at
-        half a share of the schedule, so that the final jump keeps the spread. Raises `ConfigError`
-        where the schedule has fewer steps.
+        half a share of the schedule, so that the final jump keeps the spread.
         """
-        if not 1 <= count <= self.timesteps:
-            raise ConfigError(
-                f"train_head.diffusion.sampling_steps: expected 1 to {self.timesteps} (timesteps), "
-                f"found {count}"
-            )
         first = max(count, round(0.98 * self.timesteps))
         last = max(1, round(self.timesteps / count / 2)) if count > 1 else first
         shares = [index / max(1, count - 1) for index in range(count)]

@@ -3,17 +3,18 @@
 Numpy only; `pipeline.policy.policy.Normalizer` applies them to tensors.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain, islice
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import AfterValidator, Field, GetPydanticSchema
 
-from pipeline.base.errors import CheckpointMismatch, NumericsError
+from pipeline.base.errors import NumericsError
 from pipeline.base.finite import first_non_finite
 
 Block = NDArray[Any] | tuple[NDArray[Any], NDArray[np.bool_]]
@@ -31,6 +32,23 @@ _LEAST_SPREAD = 0.05
 _RELATIVE_FLOOR = 4 * float(np.finfo(np.float32).eps)
 """A spread below a few float32 steps of the mean is rounding, not signal."""
 
+_MOST = 1e30
+"""Of a number in a document: what divides by it or multiplies stays finite in float32."""
+
+
+def _read_from(least: float) -> GetPydanticSchema:
+    """How a document's numbers, of one axis or of two, become an array."""
+    row = tuple[Annotated[float, Field(ge=least, le=_MOST)], ...]
+    numbers = Annotated[row | tuple[row, ...], AfterValidator(_array)]
+    return GetPydanticSchema(lambda source, handler: handler(numbers))
+
+
+def _array(numbers: Sequence[float] | Sequence[Sequence[float]]) -> NDArray[np.float64]:
+    try:
+        return np.array(numbers, np.float64)
+    except ValueError:
+        raise ValueError("expected rows of one length") from None
+
 
 @dataclass(frozen=True, eq=False)
 class ChannelStatistics:
@@ -39,9 +57,9 @@ class ChannelStatistics:
     `mean` and `std` are float64 of one shape: (channel,), or (slot, dim) for features.
     """
 
-    mean: NDArray[np.float64]
-    std: NDArray[np.float64]
-    count: int
+    mean: Annotated[NDArray[np.float64], _read_from(-_MOST)]
+    std: Annotated[NDArray[np.float64], _read_from(0.0)]
+    count: Annotated[int, Field(ge=0)]
 
     @property
     def scale(self) -> NDArray[np.float64]:
@@ -63,14 +81,6 @@ class ChannelStatistics:
         """The statistics as JSON values; Python writes the shortest digits that read back equal."""
         return {"mean": self.mean.tolist(), "std": self.std.tolist(), "count": self.count}
 
-    @classmethod
-    def from_document(cls, document: Mapping[str, Any]) -> "ChannelStatistics":
-        """The statistics of a `document`, bit for bit."""
-        mean, std = (np.asarray(document[name], np.float64) for name in ("mean", "std"))
-        if mean.shape != std.shape:
-            raise ValueError(f"mean of shape {mean.shape} and std of {std.shape}")
-        return cls(mean, std, int(document["count"]))
-
 
 @dataclass(frozen=True, eq=False)
 class Normalization:
@@ -84,19 +94,6 @@ class Normalization:
     def document(self) -> dict[str, Any]:
         """All statistics as JSON values."""
         return {name: fitted and fitted.document() for name, fitted in vars(self).items()}
-
-    @classmethod
-    def from_document(cls, document: Mapping[str, Any]) -> "Normalization":
-        """The normalisation of a `document`, bit for bit. Raises `CheckpointMismatch`."""
-        streams = {name: document.get(name) for name in cls.__dataclass_fields__}
-        try:
-            fitted = {n: ChannelStatistics.from_document(d) for n, d in streams.items() if d}
-            return cls(**fitted)
-        except (KeyError, TypeError, ValueError) as error:
-            raise CheckpointMismatch(
-                "normalisation: expected mean, std and count of `action` and of every stream that "
-                f"there is, found {error!r}"
-            ) from None
 
 
 def fit_channels(blocks: Iterable[Reading], what: str, threads: int = 1) -> ChannelStatistics:

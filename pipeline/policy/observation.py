@@ -13,7 +13,7 @@ from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import ObservationError
 from pipeline.base.observation import Observation
 from pipeline.policy.ages import even_ages
-from pipeline.policy.state_channels import Kind, expanded_names
+from pipeline.policy.shape import Axes, PolicyShape
 
 VALIDITY = {"features": "slot_valid", "sensor": "sensor_valid", "state": "state_valid"}
 """What a policy may have encoders of, in the order in which it builds them, and the field that says
@@ -21,9 +21,6 @@ what of it is real: (batch, slot) bool of the features, else (batch,) counts."""
 
 AGES = {"sensor": "sensor_age", "state": "state_age"}
 """The field with the ages of a stream's readings."""
-
-Axes = Mapping[str, int | None]
-"""Names and sizes of a tensor's axes; None is any size above 0."""
 
 
 @dataclass
@@ -34,58 +31,6 @@ class LiveObservation(Observation):
     """What the model takes (`pipeline.vlm.preparation.PreparedRow`), each distinct one once."""
     row_of: Int[Tensor, " batch"]
     """Index into `rows` of each sample; -1 keeps the sample's cached features."""
-
-
-@dataclass(frozen=True)
-class PolicyShape:
-    """The widths that a store gives to a policy; 0 where the store lacks the stream.
-
-    `action_groups` has one of translation, rotation, gripper, other for each action channel.
-    """
-
-    slots: int
-    feature_dim: int
-    sensor_channels: int
-    state_dim: int
-    action_dim: int
-    action_groups: tuple[str, ...]
-    views: int = 0
-    """Whose ages a policy is told."""
-    state_kinds: tuple[Kind, ...] = ()
-    """Of each state channel; empty where all are plain."""
-
-    @property
-    def kinds(self) -> tuple[Kind, ...]:
-        """The kind of each state channel."""
-        plain: tuple[Kind, ...] = ("plain",)
-        return self.state_kinds or plain * self.state_dim
-
-    @property
-    def channels(self) -> dict[str, tuple[int, ...]]:
-        """The shape of each stream's statistics, and of the action's; a state's is expanded."""
-        expanded = expanded_names([""] * self.state_dim, self.kinds)
-        return {
-            "features": (self.slots, self.feature_dim),
-            "sensor": (self.sensor_channels,),
-            "state": (len(expanded),),
-            "action": (self.action_dim,),
-        }
-
-    def stream_axes(self) -> dict[str, Axes]:
-        """The axes behind the batch of each field of an `Observation` of this shape."""
-        return {
-            "features": {"slot": self.slots, "dim": self.feature_dim},
-            "slot_valid": {"slot": self.slots},
-            "feature_age": {},
-            "view_age": {"view": self.views},
-            # Of any length: readings have steps by their ages.
-            "sensor": {"window": None, "channel": self.sensor_channels},
-            "sensor_valid": {},
-            "sensor_age": {"window": None},
-            "state": {"window": None, "channel": self.state_dim},
-            "state_valid": {},
-            "state_age": {"window": None},
-        }
 
 
 def moving_channels(action: Mapping[str, Any]) -> tuple[bool, ...]:

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor, nn
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.base.errors import CheckpointMismatch, ConfigError, ObservationError
+from pipeline.base.errors import ConfigError, ObservationError
 from pipeline.base.observation import Observation
 from pipeline.policy.diffusion import DiffusionActionExpert
 from pipeline.policy.expert import ActionExpert, uniform
@@ -121,22 +121,11 @@ class Normalizer(nn.Module):
         return values.to(self.mean.dtype) * self.scale + self.mean
 
 
-def build_normalizer(normalization: Normalization, name: str, shape: PolicyShape) -> Normalizer:
-    """That of a stream or the action. Raises `CheckpointMismatch` where it is of another shape."""
-    statistics, expected = getattr(normalization, name), shape.channels[name]
-    if statistics is None or statistics.mean.shape != expected:
-        raise CheckpointMismatch(
-            f"normalisation of {name}: expected statistics of shape {expected}, found "
-            f"{statistics and statistics.mean.shape}. Train again: python -m stages.train_head"
-        )
-    return Normalizer(statistics)
-
-
 class Policy(Trainable):
     """Encoders of the streams that are both present and enabled, fusion, expert.
 
-    Raises `ConfigError` where no stream is left, `CheckpointMismatch` where the statistics do not
-    fit the shape. The state dict holds weights and noise schedule; the statistics travel beside it.
+    Raises `ConfigError` where no stream is left. The state dict holds weights and noise schedule;
+    the statistics, which must fit the shape, travel beside it.
     """
 
     feature_spec: Mapping[str, Any] | None = None
@@ -149,9 +138,9 @@ class Policy(Trainable):
         self.params, self.shape = params, shape
         self.encoders, tokens = build_encoders(params, shape)
         self.normalizers = nn.ModuleDict(
-            {name: build_normalizer(normalization, name, shape) for name in self.encoders}
+            {name: Normalizer(getattr(normalization, name)) for name in self.encoders}
         )
-        self.action_normalizer = build_normalizer(normalization, "action", shape)
+        self.action_normalizer = Normalizer(normalization.action)
         expert = params.expert
         self.fusion = build_fusion(params.fusion_strategy, tokens, expert.dim, expert.heads)
         self.expert = build_expert(params, shape)

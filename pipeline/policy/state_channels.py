@@ -2,36 +2,12 @@
 
 import math
 from collections.abc import Sequence
-from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-Kind = Literal["plain", "deg", "rad", "rotation"]
-"""Of a channel: as it is; an angle; one of three, in degrees, that turn a pose."""
-
-_POSE_ANGLES = ("pose_a", "pose_b", "pose_r")
-_ANGLES: dict[str, Kind] = {"deg": "deg", "rad": "rad"}
-_SIX = tuple(f"rotation_{index}" for index in range(6))
-
-
-def channel_kinds(names: Sequence[str], units: Sequence[str]) -> tuple[Kind, ...]:
-    """The kind of each channel; the arm's pose angles are a rotation where all three are there."""
-    turned = {*_POSE_ANGLES} <= {*names}
-    kinds: list[Kind] = []
-    for name, unit in zip(names, units, strict=True):
-        kind = _ANGLES.get(unit.lower(), "plain")
-        kinds.append("rotation" if turned and name in _POSE_ANGLES and kind == "deg" else kind)
-    return tuple(kinds)
-
-
-def expanded_names(names: Sequence[str], kinds: Sequence[Kind]) -> list[str]:
-    """The channels of `expand`, in its order."""
-    plain = [name for name, kind in zip(names, kinds, strict=True) if kind == "plain"]
-    angles = [name for name, kind in zip(names, kinds, strict=True) if kind in ("deg", "rad")]
-    waves = [f"{name}_{wave}" for wave in ("sin", "cos") for name in angles]
-    return [*plain, *waves, *(_SIX if "rotation" in kinds else ())]
+from pipeline.policy.shape import Kind
 
 
 def expand(

@@ -6,6 +6,7 @@ import os
 import threading
 import time
 import traceback
+from collections import deque
 from collections.abc import Callable, Mapping
 from queue import Empty, SimpleQueue
 from typing import Any
@@ -15,7 +16,6 @@ from numpy.typing import NDArray
 
 from pipeline.base.errors import ServerBusy
 from pipeline.robot.loop import SafeStop, StopKind
-from pipeline.robot.memory import ReadingWindow, WindowSize
 
 Answer = Mapping[str, Any]
 _FIRST_OBSERVATIONS = 10
@@ -26,23 +26,23 @@ class PendingReadings:
     """The readings of a stream since the last question: the newest, where there are too many."""
 
     def __init__(self, readings: int, channels: int) -> None:
-        self._window = ReadingWindow(WindowSize(readings, channels, None))
-        self.dropped = 0
+        self._channels, self.dropped = channels, 0
+        self.pending: deque[tuple[NDArray[np.float32], float]] = deque(maxlen=readings)
         self.forget()
+
+    newest_s: float | None
 
     def forget(self) -> None:
         """None is pending, and none was ever seen."""
-        self.count, self.newest_s = 0, None
-
-    count: int
-    newest_s: float | None
+        self.pending.clear()
+        self.newest_s = None
 
     def take_in(
         self, name: str, values: NDArray[Any], time_s: NDArray[Any], latest_s: float
     ) -> None:
         """Raises `SafeStop` for readings that are no numbers, of the future, or not in order."""
-        if values.shape != (len(time_s), self._window.values.shape[1]):
-            wanted = (len(time_s), self._window.values.shape[1])
+        wanted = (len(time_s), self._channels)
+        if values.shape != wanted:
             raise SafeStop(StopKind.ROBOT, f"{name}: expected {wanted}, found {values.shape}")
         if not (np.isfinite(values).all() and np.isfinite(time_s).all()):
             raise SafeStop(StopKind.NOT_A_NUMBER, f"{name}: a reading or its time is not a number")
@@ -53,16 +53,15 @@ class PendingReadings:
             ahead = time_s[-1] - latest_s
             raise SafeStop(StopKind.CLOCK, f"{name}: a reading is of the future, by {ahead:.3f} s")
         self.newest_s = float(time_s[-1])
-        self._window.append(values, time_s)
-        room = len(self._window.values)
-        self.dropped += max(0, self.count + len(values) - room)
-        self.count = min(self.count + len(values), room)
+        came = len(self.pending) + len(time_s)
+        self.pending.extend(zip(np.array(values, np.float32), map(float, time_s), strict=True))
+        self.dropped += came - len(self.pending)
 
     def hand_over(self) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-        """Copies of the pending readings and their times, which then are no longer pending."""
-        window, count = self._window, self.count
-        self.count = 0
-        return window.values[-count:].copy(), window.time_s[-count:].copy()
+        """The pending readings and their times, which then are no longer pending."""
+        values, times = zip(*self.pending, strict=True)
+        self.pending.clear()
+        return np.stack(values), np.array(times)
 
 
 class RobotClock:

@@ -14,7 +14,6 @@ import logging
 import warnings
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
@@ -88,31 +87,6 @@ class Head(nn.Module):
         return self.policy.act(seen, None if noise is None else iter(noise.unbind(1)))
 
 
-@dataclass(frozen=True)
-class Deviation:
-    """How far a file is from the policy over some inputs, at most."""
-
-    std: float
-    """In training std of the action."""
-    physical: list[float]
-    """Of each action channel, in its unit."""
-
-    @classmethod
-    def of(
-        cls, run: Runner, given: Inputs, expected: Tensor, checkpoint: PolicyCheckpoint
-    ) -> "Deviation":
-        """Of a file over these inputs. Raises `NumericsError` where it says what is no number."""
-        found = run(given)
-        if found.shape != expected.shape or not np.isfinite(found).all():
-            raise NumericsError(
-                f"the exported head: expected {tuple(expected.shape)} finite actions, found "
-                f"{found.shape}, of which {int(np.isfinite(found).sum())} are finite. It was not "
-                "written; the versions of torch and onnxruntime may not fit each other."
-            )
-        off = np.abs(found.astype(np.float64) - expected.numpy()).max(axis=(0, 1))
-        return cls(float((off / checkpoint.normalization.action.scale).max()), off.tolist())
-
-
 def export_head(
     checkpoint: PolicyCheckpoint, folder: str, params: ExportParams, say: Callable[[str], None]
 ) -> dict[str, Any]:
@@ -125,7 +99,8 @@ def export_head(
     policy = checkpoint.policy()
     head = Head(policy).eval().requires_grad_(False)
     given = golden_inputs(checkpoint, policy)
-    written_by = {"opset": params.opset, "versions": _versions(params)}
+    packages = ("torch", *(_PACKAGES if "onnx" in params.formats else ()))
+    written_by = {"opset": params.opset, "versions": {name: version(name) for name in packages}}
     contract = describe(checkpoint, folder, given["random"]) | written_by
     files: dict[str, Any] = {}
 
@@ -135,13 +110,17 @@ def export_head(
         program = trace(head, few)
         tolerances: dict[Path, float] = {}
         if "torch" in params.formats:
-            tolerances[write_torch(program, place, contract)] = TOLERANCE
+            tolerances[path := place / "head.pt2"] = TOLERANCE
+            torch.export.save(program, path, extra_files={CONTRACT: json.dumps(contract)})
         if "onnx" in params.formats:
             say("translating it to ONNX")
-            path = write_onnx(program, few, place, contract, params.opset)
-            tolerances[path] = TOLERANCE
+            tolerances[path := place / "head.onnx"] = TOLERANCE
+            write_onnx(program, few, path, contract, params.opset)
             if params.int8:
-                tolerances[quantize(path, place)] = params.int8_tolerance
+                tolerances[int8 := place / "head.int8.onnx"] = params.int8_tolerance
+                with _quietly():
+                    quantization: Any = import_module("onnxruntime.quantization")
+                    quantization.quantize_dynamic(path, int8)  # activations: as they come
         say("comparing the files with the policy")
         for path, tolerance in tolerances.items():
             files[path.name] = _judged(path, head, given, checkpoint, tolerance)
@@ -203,17 +182,10 @@ def describe(checkpoint: PolicyCheckpoint, folder: str, given: Inputs) -> dict[s
     }
 
 
-def write_torch(program: ExportedProgram, folder: Path, contract: Mapping[str, Any]) -> Path:
-    """Write `head.pt2`, with the contract in it."""
-    path = folder / "head.pt2"
-    torch.export.save(program, path, extra_files={CONTRACT: json.dumps(contract)})
-    return path
-
-
 def write_onnx(
-    program: ExportedProgram, given: Inputs, folder: Path, contract: Mapping[str, Any], opset: int
-) -> Path:
-    """Write `head.onnx`, with the contract among its metadata."""
+    program: ExportedProgram, given: Inputs, path: Path, contract: Mapping[str, Any], opset: int
+) -> None:
+    """Write an ONNX file, with the contract among its metadata."""
     with _quietly():
         written: Any = torch.onnx.export(
             program,
@@ -227,20 +199,7 @@ def write_onnx(
     for node in written.model.graph.all_nodes():
         node.metadata_props.clear()  # where each was traced from: most of the file otherwise
     written.model.metadata_props[CONTRACT] = json.dumps(contract)
-    written.save(path := folder / "head.onnx", external_data=False)
-    return path
-
-
-def quantize(source: Path, folder: Path) -> Path:
-    """Write `head.int8.onnx`: the matrix products of `source` in int8.
-
-    Weights are quantised now, what they are multiplied with as it comes.
-    """
-    path = folder / "head.int8.onnx"
-    with _quietly():
-        quantization: Any = import_module("onnxruntime.quantization")
-        quantization.quantize_dynamic(source, path)
-    return path
+    written.save(path, external_data=False)
 
 
 def onnx_session(path: Path, threads: int = 0) -> Any:
@@ -273,37 +232,27 @@ def _judged(
 ) -> dict[str, Any]:
     """What the receipt says of a file. Raises `NumericsError` where it is off by too much."""
     run = torch_runner(path) if path.suffix == ".pt2" else onnx_runner(path)
-    off = {
-        name: Deviation.of(run, inputs, head(**inputs), checkpoint)
-        for name, inputs in given.items()
-    }
-    worst = max(off, key=lambda name: off[name].std)
-    if off[worst].std > tolerance:
-        raise NumericsError(
-            f"{path.name}: expected at most {tolerance:g} training std of the action off the "
-            f"policy, found {off[worst].std:.2g} over {worst} inputs (by channel: "
-            f"{', '.join(f'{value:.2g}' for value in off[worst].physical)}). Nothing was written: "
-            f"{_remedy(path)}"
-        )
+    off: dict[str, dict[str, Any]] = {}
+    for name, inputs in given.items():
+        furthest = np.abs(run(inputs) - head(**inputs).numpy().astype(np.float64)).max(axis=(0, 1))
+        std = float((furthest / checkpoint.normalization.action.scale).max())
+        off[name] = {"std": std, "physical": furthest.tolist()}
+        if not std <= tolerance:  # nor where one of them is not a number
+            raise NumericsError(
+                f"{path.name}: expected at most {tolerance:g} training std of the action off the "
+                f"policy, found {std:.2g} over {name} inputs (by channel: "
+                f"{', '.join(f'{value:.2g}' for value in furthest)}). Nothing was written: leave "
+                "this format out (export.formats, export.int8), raise export.int8_tolerance for "
+                "int8, or try other versions of what writes it."
+            )
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     return {
         "sha256": digest,
         "bytes": path.stat().st_size,
         "tolerance_std": tolerance,
-        "deviation": {name: vars(found) for name, found in off.items()},
+        "deviation": off,
     }
-
-
-def _remedy(path: Path) -> str:
-    if "int8" in path.name:
-        return "export without export.int8, or with a larger export.int8_tolerance."
-    return "leave this format out of export.formats, or try other versions of what writes it."
-
-
-def _versions(params: ExportParams) -> dict[str, str]:
-    needed = ("torch", *(_PACKAGES if "onnx" in params.formats else ()))
-    return {name: version(name) for name in needed}
 
 
 @contextmanager

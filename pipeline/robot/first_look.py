@@ -35,8 +35,6 @@ _ALIKE = 3.0
 _STRANGE, _UNIT_FITS, _ORDER_FITS = 10.0, 8.0, 4.0
 """Training standard deviations: beyond the first a reading is strange, within the others a reading
 in another unit or order fits. Right ones of the demo reach 7.7; of orders there are many."""
-_MOST_VIEWS = 6
-"""Beyond, only exchanges of two views are tried."""
 _UNITS = {
     "deg": (("radians", 180 / math.pi),),
     "rad": (("degrees", math.pi / 180),),
@@ -78,15 +76,17 @@ class FirstLook:
         """Refuse an exchange of views in which every view fits another's golden frames better."""
         told = {view: _light(pixels) for view, pixels in seen.items()}
         golden = {view: [_light(one) for one in self._golden[view]] for view in told}
-        fits = {(v, w): _better(told[v], golden[v], golden[w]) for v, w in permutations(told, 2)}
-        for reading in _exchanges(tuple(told)):
-            if all(fits[pair] for pair in reading.items()):
-                shows = ", ".join(f"images/{v} shows {w}" for v, w in reading.items())
-                raise ObservationError(
-                    f"views are exchanged: {shows}, going by the frames that the policy was "
-                    "trained on. Name each camera's frames as training did, or plug the cameras "
-                    "as they were."
-                )
+        views = list(told)
+        costs = np.zeros((len(views), len(views)))
+        for (i, v), (j, w) in permutations(enumerate(views), 2):
+            costs[i, j] = -1 if _better(told[v], golden[v], golden[w]) else len(views)
+        pairs = zip(*linear_sum_assignment(costs), strict=True)
+        shows = ", ".join(f"images/{views[i]} shows {views[j]}" for i, j in pairs if i != j)
+        if shows:
+            raise ObservationError(
+                f"views are exchanged: {shows}, going by the frames that the policy was trained "
+                "on. Name each camera's frames as training did, or plug the cameras as they were."
+            )
 
     def _is_reversed(self, view: str, pixels: NDArray[np.float64]) -> bool:
         """Whether a frame's colours fit the golden ones better with red and blue exchanged.
@@ -111,7 +111,10 @@ def _better(seen: Palette, own: Sequence[Palette], other: Sequence[Palette]) -> 
     """
     if len(own) < 2 or len(other) < 2:
         return False
-    own_left, other_left = ([_apart(one, _but(kind, one)) for one in kind] for kind in (own, other))
+    own_left, other_left = (
+        [_apart(one, [rest for rest in kind if rest is not one]) for one in kind]
+        for kind in (own, other)
+    )
     across = [_apart(one, other) for one in own] + [_apart(one, own) for one in other]
     told_apart = min(across) >= _LEAST and all(
         left <= CLEARLY * apart for left, apart in zip(own_left + other_left, across, strict=True)
@@ -121,28 +124,12 @@ def _better(seen: Palette, own: Sequence[Palette], other: Sequence[Palette]) -> 
     return told_apart and clearly and as_other <= _ALIKE * max(_LEAST, *other_left)
 
 
-def _but(kind: Sequence[Palette], left_out: Palette) -> list[Palette]:
-    return [one for one in kind if one is not left_out]
-
-
 def _apart(palette: Palette, kind: Sequence[Palette]) -> float:
     """How far a palette is from the nearest of a kind: root mean square, in grey levels.
 
     Squares, so that what is small and of strong colour counts.
     """
     return min(float(np.sqrt(np.square(palette - one).mean())) for one in kind)
-
-
-def _exchanges(views: tuple[str, ...]) -> list[dict[str, str]]:
-    """Every way to exchange views: those that move -> what they show, the fewest first."""
-    if len(views) > _MOST_VIEWS:
-        pairs = [(a, b) for a in views for b in views if a < b]
-        return [{a: b, b: a} for a, b in pairs]
-    ways = [
-        {view: shown for view, shown in zip(views, order, strict=True) if view != shown}
-        for order in permutations(views)
-    ]
-    return sorted((way for way in ways if way), key=len)
 
 
 def _shrink(frame: NDArray[np.uint8]) -> NDArray[np.float64]:

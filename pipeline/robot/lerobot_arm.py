@@ -12,7 +12,7 @@ from the ages of frames and features.
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NoReturn, Protocol
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,25 +20,10 @@ from numpy.typing import NDArray
 from pipeline.base.errors import CheckpointMismatch
 
 _DELTA, _PLACE = "delta_", ".pos"
-_KINDS = ("absolute", "delta")
 _PORT_S = 0.2
 """How long a stop waits for another call that keeps the robot's port."""
 _ROWS = 8
 """Of an image every eighth row is compared; the noise of a camera changes each."""
-
-
-class LeRobotStyle(Protocol):
-    """What is used of LeRobot's `Robot`."""
-
-    @property
-    def observation_features(self) -> Mapping[str, Any]: ...
-
-    @property
-    def action_features(self) -> Mapping[str, Any]: ...
-
-    def get_observation(self) -> Mapping[str, Any]: ...
-
-    def send_action(self, action: dict[str, Any]) -> Mapping[str, Any]: ...
 
 
 class LeRobotArm:
@@ -52,7 +37,7 @@ class LeRobotArm:
 
     def __init__(
         self,
-        robot: LeRobotStyle,
+        robot: Any,
         metadata: Mapping[str, Any],
         cameras: Mapping[str, str] | None = None,
         motors: Mapping[str, str] | None = None,
@@ -77,7 +62,7 @@ class LeRobotArm:
             robot.action_features,
         )
         state, action, views = streams["state"]["names"], streams["action"], streams["views"]
-        if action["kind"] not in _KINDS:
+        if action["kind"] not in ("absolute", "delta"):
             _refuse(f"actions that are {action['kind']}", "places", action["names"], moved)
         cameras, motors = cameras or {}, motors or {}
         strange = {*cameras} - {*views} | {*motors} - {*state, *action["names"]}
@@ -158,7 +143,7 @@ class LeRobotArm:
 
 
 def describe(
-    robot: LeRobotStyle,
+    robot: Any,
     cameras: Mapping[str, str] | None = None,
     motors: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:

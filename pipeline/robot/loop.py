@@ -6,13 +6,11 @@ tick whoever drives it calls, in this order: `begin_tick`; where `frames_due`, `
 chunk that was answered, at once or ticks later; then `action`.
 """
 
-from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.base.config import Chunking
 from pipeline.robot.chunking import Executor, PlanGuide
 
 
@@ -48,24 +46,11 @@ class SafeStop(Exception):
         self.kind = kind
 
 
-@dataclass(frozen=True)
-class LoopTiming:
-    """How often what is done: `reuse` ticks between passes of the model."""
-
-    reuse: int
-    execute: int
-    chunking: Chunking
-    horizon: int
-    moving: tuple[bool, ...]
-    """`moving_channels` of the action."""
-
-
 class ControlLoop:
-    """The loop of a policy; `uses_features` where it needs the model."""
+    """The loop of a policy; `uses_features` where it needs the model, `reuse` ticks a pass."""
 
-    def __init__(self, timing: LoopTiming, uses_features: bool) -> None:
-        self.executor = Executor(timing.chunking, timing.execute, timing.horizon, timing.moving)
-        self._reuse, self._uses_features = timing.reuse, uses_features
+    def __init__(self, executor: Executor, reuse: int, uses_features: bool) -> None:
+        self.executor, self._reuse, self._uses_features = executor, reuse, uses_features
         self.reset()
 
     def reset(self) -> None:

@@ -13,47 +13,23 @@ if TYPE_CHECKING:
     from pipeline.policy.policy import Policy
 
 
-@dataclass(frozen=True)
-class WindowSize:
-    """Of a stream's window: most readings, their channels, and how old they may be (None: any)."""
-
-    readings: int
-    channels: int
-    oldest_s: float | None
-
-
 class ReadingWindow:
-    """The newest readings of a stream, right-aligned, in ring buffers that stay.
+    """The newest readings of a stream (reading, channel) and their times (reading,), oldest first.
 
-    Each buffer is kept twice in a row, so that the readings stand in order wherever they begin.
+    Right-aligned: where none has come yet, values are 0 and times -inf.
     """
 
-    def __init__(self, size: WindowSize) -> None:
-        self._readings = size.readings
-        self._values = np.zeros((2, size.readings, size.channels), np.float32)
-        self._time_s = np.full((2, size.readings), -np.inf)
-        self._oldest = 0
-        self._oldest_s = np.inf if size.oldest_s is None else size.oldest_s + CLOCK_SLACK_S
-
-    @property
-    def values(self) -> NDArray[np.float32]:
-        """(reading, channel), oldest first: a view, as it is until the next `append`."""
-        both = self._values.reshape(2 * self._readings, -1)
-        return both[self._oldest : self._oldest + self._readings]
-
-    @property
-    def time_s(self) -> NDArray[np.float64]:
-        """(reading,), as `values`; -inf where none has come yet."""
-        return self._time_s.reshape(-1)[self._oldest : self._oldest + self._readings]
+    def __init__(self, readings: int, channels: int, oldest_s: float | None) -> None:
+        """`oldest_s` is how old a reading of the window may be; None: any age."""
+        self.values = np.zeros((readings, channels), np.float32)
+        self.time_s = np.full(readings, -np.inf)
+        self._oldest_s = np.inf if oldest_s is None else oldest_s + CLOCK_SLACK_S
 
     def append(self, readings: NDArray[np.float32], time_s: NDArray[np.float64]) -> None:
         """Take the readings (reading, channel) that follow, and the times (reading,) of them."""
-        for buffer, following in ((self._values, readings), (self._time_s, time_s)):
-            newest = following[-self._readings :]
-            to_end = newest[: self._readings - self._oldest]
-            buffer[:, self._oldest : self._oldest + len(to_end)] = to_end
-            buffer[:, : len(newest) - len(to_end)] = newest[len(to_end) :]
-        self._oldest = (self._oldest + min(len(time_s), self._readings)) % self._readings
+        kept = len(self.time_s)
+        self.values = np.concatenate([self.values, readings], dtype=np.float32)[-kept:]
+        self.time_s = np.concatenate([self.time_s, time_s])[-kept:]
 
     def at(self, now_s: float) -> tuple[NDArray[np.float32], int, NDArray[np.float32]]:
         """The readings, how many of them are real, the last ones, and their ages in s."""
@@ -74,12 +50,10 @@ class SeenFeatures:
 
 
 class RobotMemory:
-    """What a policy with windows of these sizes remembers of one robot."""
+    """What a policy with these windows, by stream, remembers of one robot."""
 
-    def __init__(self, sensor: WindowSize, state: WindowSize) -> None:
-        """Of a stream without channels nothing is remembered."""
-        sizes = {"sensor": sensor, "state": state}
-        self._windows = {name: ReadingWindow(size) for name, size in sizes.items() if size.channels}
+    def __init__(self, windows: Mapping[str, ReadingWindow]) -> None:
+        self._windows = windows
         self.features: SeenFeatures | None = None
         self.time_s = 0.0
 
@@ -87,10 +61,14 @@ class RobotMemory:
     def of(cls, policy: "Policy") -> "RobotMemory":
         """That of a robot that this policy controls."""
         params, shape = policy.params, policy.shape
-        return cls(
-            WindowSize(params.sensor_window, shape.sensor_channels, params.sensor_reach_s),
-            WindowSize(params.state_window, shape.state_dim, params.state_window_s),
-        )
+        windows: dict[str, ReadingWindow] = {}
+        if channels := shape.sensor_channels:
+            reach_s = params.sensor_reach_s
+            windows["sensor"] = ReadingWindow(params.sensor_window, channels, reach_s)
+        if channels := shape.state_dim:
+            reach_s = params.state_window_s
+            windows["state"] = ReadingWindow(params.state_window, channels, reach_s)
+        return cls(windows)
 
     def sense(self, readings: Mapping[str, NDArray[Any]]) -> None:
         """Take what came since the last tick, and `time` (1,) now, in s.

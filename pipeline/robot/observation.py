@@ -72,7 +72,11 @@ class ObservationReader:
         """
         if not isinstance(given, Mapping):
             raise ObservationError(f"expected fields by name, found {type(given).__name__}")
-        self._refuse_unknown(given)
+        if unknown := [str(name) for name in given if name not in self._known]:
+            known = ", ".join(self._known)
+            raise ObservationError(
+                f"{unknown[0]:.80}: expected one of {known}, which this policy takes"
+            )
         reset, seed = _reset(given.get("reset", False))
         values = self._values(given)
         times = self._times(given, values)
@@ -93,14 +97,6 @@ class ObservationReader:
         )
         self._newest_s = newest_s
         return observation
-
-    def _refuse_unknown(self, given: Mapping[str, Any]) -> None:
-        unknown = next((str(name) for name in given if name not in self._known), None)
-        if unknown is not None:
-            known = ", ".join(self._known)
-            raise ObservationError(
-                f"{unknown:.80}: expected one of {known}, which this policy takes"
-            )
 
     def _values(self, given: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
         """The readings (reading, channel) of each stream that came, and frames as one reading."""

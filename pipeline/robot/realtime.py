@@ -13,11 +13,12 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Generator, Mapping
+from collections import deque
+from collections.abc import Generator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NoReturn, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,9 +33,13 @@ from pipeline.robot.beside import (
     go_first,
     stop_firmly,
 )
+from pipeline.robot.chunking import Executor
 from pipeline.robot.limits import Limits
-from pipeline.robot.loop import ControlLoop, LoopTiming, SafeStop, StopKind
+from pipeline.robot.loop import ControlLoop, SafeStop, StopKind
 from pipeline.robot.timings import Ring, Timings
+
+if TYPE_CHECKING:  # it writes images and parquet, for which the loop has no need
+    from pipeline.robot.recorder import RunRecorder
 
 Frames = Mapping[str, tuple[float, NDArray[np.uint8]]]
 
@@ -43,8 +48,7 @@ TICK_PARTS = ("late", "observe", "check", "plan", "frames", "ask", "act", "recor
 LATE, OBSERVE, CHECK, PLAN, FRAMES, ASK, ACT, RECORD = range(len(TICK_PARTS))
 ANSWER_PARTS = ("answer", "infer_ms", "vlm_ms", "head_ms", "wait_ms")
 """answer: from the question to its answer; the others as the answer's `server_timing` says."""
-_BLAMED = {OBSERVE: "observe", FRAMES: "frames", ACT: "act"}
-_MISSED_KEPT = 4096
+_BLAMED = dict.fromkeys((OBSERVE, FRAMES, ACT), StopKind.ROBOT) | {RECORD: StopKind.RECORDER}
 _BY_HAND = ("SIGINT", "SIGTERM", "SIGHUP")
 _SWITCH_S = 5e-4
 """How long another thread of this process may keep Python to itself while the loop waits for it."""
@@ -85,28 +89,6 @@ class Decides(Protocol):
         ...
 
 
-class Recorder(Protocol):
-    """Keeps what happened; cheap, for it is called in the loop."""
-
-    def tick(self, observed: Mapping[str, Any], action: NDArray[Any] | None) -> object:
-        """What was observed in a tick and what was sent. It is told of the tick that ends a run,
-        too: what was observed may be why."""
-        ...
-
-    def frames(self, frames: Frames) -> object:
-        """Frames that the policy was asked with."""
-        ...
-
-    def answer(self, answer: Mapping[str, Any]) -> object:
-        """An answer of the policy."""
-        ...
-
-    def finish(self, reason: str, timings: Mapping[str, Any]) -> Path:
-        """The finished recording, once the robot stands still; what it raises, where there is none,
-        is told in the report."""
-        ...
-
-
 @dataclass(frozen=True)
 class RunSettings:
     """How a robot is run, and what is still good."""
@@ -144,8 +126,6 @@ class RunSettings:
     policy's thread has one less; needs the right to (`ulimit -r`, or root). 0: as they are. Begin
     the whole process under `chrt -f 1`: any thread that holds Python while another process has its
     core keeps the loop waiting."""
-    spin_s: float = 0.0
-    """How long before a deadline to stop sleeping and look at the clock all the time."""
     kept_ticks: int = 65536
     """Of how many of the newest ticks timings and actions are kept."""
 
@@ -163,53 +143,35 @@ class MissedTick:
     """Ticks after it that were not run."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class RunReport:
     """How a run went and why it ended."""
 
-    kind: StopKind
-    reason: str
     hz: float
-    ticks: int
-    """That were run."""
-    left_out: int
-    """Ticks that were not run, for one before them took too long."""
-    missed: tuple[MissedTick, ...]
-    """The newest 4,096 at most; `missed_ticks` counts all."""
-    missed_ticks: int
-    answers: int
-    busy: int
-    """Questions that the policy's server was too busy to answer; it took their readings."""
-    dropped_readings: int
-    """Older than all that a policy's window holds, in the time between two questions."""
-    clipped: int
-    """Ticks in which limits let less through than was wanted."""
-    clock_offset_s: float
     tick_timings: Timings
     answer_timings: Timings
-    actions: NDArray[np.float64]
+    missed: deque[MissedTick]
+    """The newest `kept_ticks` at most; `missed_ticks` counts all."""
+    kind: StopKind = StopKind.LOOP
+    reason: str = "the process ends"
+    ticks: int = 0
+    """That were run."""
+    left_out: int = 0
+    """Ticks that were not run, for one before them took too long."""
+    missed_ticks: int = 0
+    answers: int = 0
+    busy: int = 0
+    """Questions that the policy's server was too busy to answer; it took their readings."""
+    dropped_readings: int = 0
+    """Older than all that a policy's window holds, in the time between two questions."""
+    clipped: int = 0
+    """Ticks in which limits let less through than was wanted."""
+    clock_offset_s: float = math.nan
+    actions: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
     """(tick, 2 + action): the tick's number, the robot's time, and what was sent, of the newest."""
-    recording: Path | None
-    traceback: str
+    recording: Path | None = None
+    traceback: str = ""
     """Of what raised, also in stopping and in recording; empty where all went well."""
-
-    def document(self) -> dict[str, Any]:
-        """All but the actions, as JSON takes it."""
-        plain = ("reason", "hz", "ticks", "left_out", "missed_ticks", "answers", "busy")
-        more = ("dropped_readings", "clipped", "clock_offset_s")
-        return {
-            "kind": self.kind.value,
-            **{name: getattr(self, name) for name in (*plain, *more)},
-            "missed": [asdict(tick) for tick in self.missed],
-            **self.timings(),
-        }
-
-    def timings(self) -> dict[str, Any]:
-        """Milliseconds of ticks and of answers."""
-        return {
-            "tick_ms": self.tick_timings.document(),
-            "answer_ms": self.answer_timings.document(),
-        }
 
 
 def run_robot(
@@ -217,7 +179,7 @@ def run_robot(
     policy: Decides,
     settings: RunSettings,
     limits: Limits | None = None,
-    recorder: Recorder | None = None,
+    recorder: "RunRecorder | None" = None,
 ) -> RunReport:
     """Run a robot until something ends it; `robot.stop` has then been called, and once more where
     it raised.
@@ -230,31 +192,36 @@ def run_robot(
     Raises `ConfigError` before the first observation where settings do not fit the policy, the
     limits or the machine.
     """
-    kind, reason, trace = StopKind.LOOP, "the process ends", ""
-    with _undisturbed(settings.fifo_priority), _ended_by_hand() as deaf:
+    with _undisturbed(settings.fifo_priority), _ended_by_hand() as heard:
         run = _Run(robot, policy, settings, limits, recorder)
+        report = run.report
         try:
             try:
                 run.go()
             finally:
-                deaf()
+                heard.append(0)  # from here on none breaks anything off
         except SafeStop as stop:
-            kind, reason = stop.kind, str(stop)
-            if kind is StopKind.ROBOT:
+            report.kind, report.reason = stop.kind, str(stop)
+            if stop.kind is StopKind.ROBOT:
                 run.untold = None  # Readings of another shape would spoil the recording.
         except KeyboardInterrupt as hand:
-            kind, reason = StopKind.BY_HAND, f"stopped by hand ({str(hand) or 'Ctrl-C'})"
+            report.kind = StopKind.BY_HAND
+            report.reason = f"stopped by hand ({str(hand) or 'SIGINT'})"
         except Exception as error:
-            (kind, reason), trace = run.blame(error), traceback.format_exc()
+            report.kind, report.reason = run.blame(error)
+            report.traceback = traceback.format_exc()
         finally:
-            trace += stop_firmly(robot.stop, reason) + run.close()
-    report = run.report(kind, reason, trace)
-    if recorder is None:
-        return report
-    try:
-        return replace(report, recording=recorder.finish(reason, report.timings()))
-    except Exception as error:  # The report still says why the robot stands still.
-        return replace(report, traceback=f"{trace}no recording: {type(error).__name__}: {error}")
+            report.traceback += stop_firmly(robot.stop, report.reason) + run.close()
+    if recorder is not None:
+        try:
+            timings = {
+                "tick_ms": report.tick_timings.document(),
+                "answer_ms": report.answer_timings.document(),
+            }
+            report.recording = recorder.finish(report.reason, timings)
+        except Exception as error:  # The report still says why the robot stands still.
+            report.traceback += f"no recording: {type(error).__name__}: {error}"
+    return report
 
 
 class _Run:
@@ -266,7 +233,7 @@ class _Run:
         policy: Decides,
         settings: RunSettings,
         limits: Limits | None,
-        recorder: Recorder | None,
+        recorder: "RunRecorder | None",
     ) -> None:
         self.robot, self.settings, self.limits, self.recorder = robot, settings, limits, recorder
         meta = policy.metadata
@@ -278,14 +245,11 @@ class _Run:
             )
         self.chunk_shape = (meta["horizon"], meta["action_dim"])
         self.views = tuple(meta["streams"]["views"]) if meta["uses_features"] else ()
-        timing = LoopTiming(
-            max(1, round(meta["vlm_reuse_count"] * self.hz / meta["action_hz"])),
-            settings.execute,
-            settings.chunking,
-            meta["horizon"],
-            tuple(meta["moving"]),
+        executor = Executor(
+            settings.chunking, settings.execute, meta["horizon"], tuple(meta["moving"])
         )
-        self.loop = ControlLoop(timing, meta["uses_features"])
+        reuse = max(1, round(meta["vlm_reuse_count"] * self.hz / meta["action_hz"]))
+        self.loop = ControlLoop(executor, reuse, meta["uses_features"])
         self.asker = Asker(policy.infer, settings.fifo_priority - 1)
         self.watchdog = Watchdog(robot.stop, max(settings.hung_s, 2.5 / self.hz))
         self.looks_at = set(meta["looks_at"]) - {"features"}
@@ -297,12 +261,12 @@ class _Run:
         }
         self.watched = tuple(self.pending) if settings.watch is None else settings.watch
         self.clock = RobotClock(settings.clock_offset_s, settings.clock_drift_s)
-        self.tick_timings = Timings((*TICK_PARTS, "tick"), settings.kept_ticks)
-        self.answer_timings = Timings(ANSWER_PARTS, settings.kept_ticks)
-        self.actions = Ring(settings.kept_ticks, 2 + meta["action_dim"])
-        self.missed = Ring(_MISSED_KEPT, 4)
+        kept = settings.kept_ticks
+        ticks, answers = Timings((*TICK_PARTS, "tick"), kept), Timings(ANSWER_PARTS, kept)
+        self.report = RunReport(self.hz, ticks, answers, deque(maxlen=kept))
+        self.actions = Ring(kept, 2 + meta["action_dim"])
         self.row, self.answer_row = np.zeros(len(TICK_PARTS) + 1), np.zeros(len(ANSWER_PARTS))
-        self.doing, self.since, self.in_a_row, self.left_out, self.busy = LATE, 0.0, 0, 0, 0
+        self.doing, self.since, self.in_a_row = LATE, 0.0, 0
         self.untold: tuple[Mapping[str, Any], NDArray[np.float64] | None] | None = None
         self.new_episode()
 
@@ -312,7 +276,7 @@ class _Run:
         self.watchdog.start()
         while True:
             deadline = start + tick * period
-            _wait(deadline, self.settings.spin_s)
+            time.sleep(max(0.0, deadline - time.monotonic()))
             self.row[:] = math.nan
             self.doing, self.since = LATE, deadline
             if self.settings.seconds is not None and tick >= self.settings.seconds * self.hz:
@@ -321,7 +285,8 @@ class _Run:
             self.mark(LATE)
             ended = self.since
             self.row[-1] = np.nansum(self.row[1:-1])
-            self.tick_timings.note(1000 * self.row)
+            self.report.tick_timings.note(1000 * self.row)
+            self.report.ticks += 1
             following = tick + 1
             if ended > deadline + period:
                 following = max(following, math.ceil((ended - start) * self.hz))
@@ -407,7 +372,7 @@ class _Run:
             answer = self.asker.take()
         except ServerBusy:
             answer = None
-            self.busy += 1
+            self.report.busy += 1
             if not self.asker.stale:
                 self.loop.refused()
             self.asker.stale = False
@@ -436,7 +401,8 @@ class _Run:
         self.answer_row[0] = 1000 * self.asker.took_s
         for column, part in enumerate(ANSWER_PARTS[1:], 1):
             self.answer_row[column] = told.get(part, math.nan)
-        self.answer_timings.note(self.answer_row)
+        self.report.answer_timings.note(self.answer_row)
+        self.report.answers += 1
         if self.recorder is not None:
             self.mark(RECORD)
             self.recorder.answer(answer)
@@ -453,7 +419,7 @@ class _Run:
         # A frame may have come since the robot was observed.
         self.asked_s = max(self.asked_s, self.now_s, self.frames_s)
         for name, pending in self.pending.items():
-            if pending.count and name in self.looks_at:
+            if pending.pending and name in self.looks_at:
                 question[name], question[f"{name}_time"] = pending.hand_over()
                 self.asked_s = max(self.asked_s, float(question[f"{name}_time"][-1]))
         question["time"] = np.array([self.asked_s])
@@ -500,8 +466,9 @@ class _Run:
     def note_missed(self, tick: int, late_s: float, left_out: int) -> None:
         """Raises `SafeStop` where too many are left out in a row of a robot that moves."""
         part = int(np.nanargmax(self.row[:-1]))
-        self.missed.note((tick, 1000 * late_s, part, left_out))
-        self.left_out += left_out
+        self.report.missed.append(MissedTick(tick, 1000 * late_s, TICK_PARTS[part], left_out))
+        self.report.missed_ticks += 1
+        self.report.left_out += left_out
         self.in_a_row += left_out
         if self.limits is not None:
             self.limits.stood_still()
@@ -511,16 +478,15 @@ class _Run:
 
     def blame(self, error: Exception) -> tuple[StopKind, str]:
         """Whose error it is, by what was being done."""
-        said = f"{type(error).__name__}: {error}"
         if self.doing == CHECK:
             self.untold = None  # What cannot be checked cannot be recorded, either.
-        if self.doing in _BLAMED:
-            return StopKind.ROBOT, f"the robot's {_BLAMED[self.doing]} failed: {said}"
-        kind = StopKind.RECORDER if self.doing == RECORD else StopKind.LOOP
-        return kind, f"{kind.value}: {said}"
+        kind = _BLAMED.get(self.doing, StopKind.LOOP)
+        part = TICK_PARTS[self.doing]
+        return kind, f"{kind.value} ({part}): {type(error).__name__}: {error}"
 
     def close(self) -> str:
-        """Record the tick that stopped the robot, end the threads; the traceback of what failed.
+        """Record the tick that stopped the robot, end the threads, complete the report; the
+        traceback of what failed.
 
         The policy may finish an answer that nobody waits for.
         """
@@ -531,39 +497,11 @@ class _Run:
             failed = f"the last tick is not recorded: {traceback.format_exc()}"
         self.watchdog.close()
         self.asker.close()
+        self.report.dropped_readings = sum(self.pending[name].dropped for name in self.looks_at)
+        self.report.clipped = self.limits.clipped if self.limits else 0
+        self.report.clock_offset_s = self.clock.offset_s
+        self.report.actions = self.actions.rows()
         return self.watchdog.failed + failed
-
-    def report(self, kind: StopKind, reason: str, trace: str) -> RunReport:
-        """What is told of it."""
-        return RunReport(
-            kind=kind,
-            reason=reason,
-            hz=self.hz,
-            ticks=self.tick_timings.ring.count,
-            left_out=self.left_out,
-            missed=tuple(
-                MissedTick(int(tick), late_ms, TICK_PARTS[int(part)], int(left_out))
-                for tick, late_ms, part, left_out in self.missed.rows().tolist()
-            ),
-            missed_ticks=self.missed.count,
-            answers=self.answer_timings.ring.count,
-            busy=self.busy,
-            dropped_readings=sum(self.pending[name].dropped for name in self.looks_at),
-            clipped=self.limits.clipped if self.limits else 0,
-            clock_offset_s=self.clock.offset_s,
-            tick_timings=self.tick_timings,
-            answer_timings=self.answer_timings,
-            actions=self.actions.rows(),
-            recording=None,
-            traceback=trace,
-        )
-
-
-def _wait(until_s: float, spin_s: float) -> None:
-    """Sleep until shortly before a time of the monotonic clock, then look at it all the time."""
-    while (left := until_s - time.monotonic()) > 0:
-        if left > spin_s:
-            time.sleep(left - spin_s)
 
 
 @contextmanager
@@ -598,29 +536,26 @@ def _undisturbed(fifo_priority: int) -> Generator[None]:
 
 
 @contextmanager
-def _ended_by_hand() -> Generator[Callable[[], None]]:
-    """The first signal to end the process raises `KeyboardInterrupt`, later ones do nothing. So do
-    all once what is yielded was called. On the main thread alone: others set no handlers."""
-    numbers = [getattr(signal, name) for name in _BY_HAND if hasattr(signal, name)]
-    if threading.current_thread() is not threading.main_thread():
-        numbers = []
-    # What the process passes over, as under nohup, it goes on to.
-    before = {n: now for n in numbers if (now := signal.getsignal(n)) not in (signal.SIG_IGN, None)}
+def _ended_by_hand() -> Generator[list[int]]:
+    """The first signal to end the process raises `KeyboardInterrupt`, later ones do nothing: none
+    once there is anything in what is yielded. On the main thread alone: others set no handlers."""
+    heard: list[int] = []
+    before: dict[int, Any] = {}
 
-    def deaf() -> None:
-        for number in before:
-            signal.signal(number, lambda *_: None)
+    def end(number: int, _: object) -> None:
+        heard.append(number)
+        if len(heard) == 1:
+            raise KeyboardInterrupt(signal.Signals(number).name)
 
-    def end(number: int, _: object) -> NoReturn:
-        deaf()
-        raise KeyboardInterrupt(
-            "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
-        )
-
+    here = threading.current_thread() is threading.main_thread()
     try:
-        for number in before:
-            signal.signal(number, end)
-        yield deaf
+        for name in _BY_HAND if here else ():
+            handler = signal.getsignal(number := getattr(signal, name, signal.SIGINT))
+            # What the process passes over, as under nohup, it goes on to.
+            if handler not in (signal.SIG_IGN, None) and number not in before:
+                before[number] = handler
+                signal.signal(number, end)
+        yield heard
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

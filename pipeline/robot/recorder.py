@@ -39,8 +39,9 @@ _FASTEST: Final = {"compression_level": "1", "pred": "up"}
 class RunRecorder:
     """Records one run on a robot as `run_NNNNNN` in a folder, of any embodiment.
 
-    In each tick the loop calls `frames` and `answer` where there are new ones, then `tick`; none of
-    them waits or raises. What a kill leaves is `run_NNNNNN.part`, which `recover` finishes.
+    In each tick the loop calls `frames` and `answer` where there are new ones, then `tick`, also
+    for the tick that ends a run: what was observed may be why. None of them waits or raises. What
+    a kill leaves is `run_NNNNNN.part`, which `recover` finishes.
     """
 
     def __init__(

@@ -20,20 +20,32 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ConfigDict
 
+from pipeline.base.border import Document, Text
 from pipeline.base.durable import sync, write_document
 from pipeline.base.errors import RecordingError
 from pipeline.base.finite import non_finite
 from pipeline.base.ownership import OutputKind, begin_folder, remove_folder, unmark
-from pipeline.data.arrays import read_json
 from pipeline.data.lerobot import ACTION, STATE
 from pipeline.data.lerobot_writer import write_data_set, write_sidecar
+from pipeline.data.media import RECORDINGS
 
 RUN: Final = "run.json"
 READINGS: Final = ("state", "sensor")
 _RUN: Final = OutputKind("a run on a robot", lambda folder: (folder / RUN).is_file())
 
 Log = NDArray[Any]
+
+
+class RunDocument(Document):
+    """What `run.json` says; what is not named here is kept, too."""
+
+    model_config = ConfigDict(extra="allow")
+
+    metadata: dict[str, Any]
+    """The policy's."""
+    instruction: Text = ""
 
 
 def log_types(metadata: Mapping[str, Any]) -> "dict[str, np.dtype[Any]]":
@@ -91,9 +103,9 @@ def finish_recording(part: Path, end: Mapping[str, Any]) -> Path:
     """
     if part.suffix != ".part":
         raise RecordingError(f"{part}: expected what is left of a run, run_NNNNNN.part")
-    run = read_json(part / RUN)
+    run = RECORDINGS.read_json(part / RUN, RunDocument)
     logs = dict.fromkeys(READINGS, np.zeros(0))
-    logs |= {name: _read(part, name, kind) for name, kind in log_types(run["metadata"]).items()}
+    logs |= {name: _read(part, name, kind) for name, kind in log_types(run.metadata).items()}
     rows = _rows(logs)
     if not len(rows):
         raise RecordingError(
@@ -104,7 +116,8 @@ def finish_recording(part: Path, end: Mapping[str, Any]) -> Path:
     begin_folder(root, _RUN)
     left_out = _write_readings(root, run, logs, float(rows["time"][0]))
     counts = {"ticks": len(logs["tick"]), "rows": len(rows), "readings_left_out": left_out}
-    write_document(root / RUN, {**run, **end, **counts, "start_s": float(rows["time"][0])})
+    began = run.model_dump(exclude_unset=True)
+    write_document(root / RUN, {**began, **end, **counts, "start_s": float(rows["time"][0])})
     _write_rows(root, part, run, logs, rows)
     unmark(root)
     for file in root.rglob("*"):
@@ -133,7 +146,7 @@ def _rows(logs: Mapping[str, Log]) -> Log:
 
 
 def _write_readings(
-    root: Path, run: Mapping[str, Any], logs: Mapping[str, Log], start_s: float
+    root: Path, run: RunDocument, logs: Mapping[str, Log], start_s: float
 ) -> dict[str, int]:
     """The sidecars of readings; how many a reader would refuse: no numbers, or out of order."""
     left_out: dict[str, int] = {}
@@ -146,7 +159,7 @@ def _write_readings(
             )
             left_out[name] = len(bad)
             kept = np.delete(log, bad) if len(bad) else log
-            channels = run["metadata"]["streams"][name]
+            channels = run.metadata["streams"][name]
             told = {key: np.array(channels[key], str) for key in ("names", "units")}
             since = kept["time"] - start_s
             write_sidecar(root, name, timestamps=since, values=kept["values"], **told)
@@ -154,9 +167,9 @@ def _write_readings(
 
 
 def _write_rows(
-    root: Path, part: Path, run: Mapping[str, Any], logs: Mapping[str, Log], rows: Log
+    root: Path, part: Path, run: RunDocument, logs: Mapping[str, Log], rows: Log
 ) -> None:
-    metadata, start, shown = run["metadata"], rows["time"][0], logs["frame"]
+    metadata, start, shown = run.metadata, rows["time"][0], logs["frame"]
     streams: Mapping[str, Any] = metadata["streams"]
     views = dict(zip(streams["views"], rows["frame"].T, strict=True))
     views = {view: number for view, number in views.items() if number[0] >= 0}
@@ -179,4 +192,4 @@ def _write_rows(
     digest = np.array([str(metadata.get("feature_spec_digest", ""))])
     told = {name: rows[name] for name in ("answer", "key", "age_s")}
     write_sidecar(root, "features", **told, feature_spec_digest=digest)
-    write_data_set(root, columns, images, features, run["instruction"], metadata["action_hz"])
+    write_data_set(root, columns, images, features, run.instruction, metadata["action_hz"])

@@ -154,8 +154,6 @@ class PolicyServer:
         """No new connections, an answer to each observation under way, then 1001."""
         self._stopping = True
         server.close(close_connections=False)
-        if self._answering:
-            self._say(f"stopping once {self._answering} observations are answered")
         await asyncio.gather(*(_leave(connection) for connection in self._idle))
         try:
             async with asyncio.timeout(CLOSING_S):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.base.config import VLMParams
 from pipeline.base.device import resolve_device
-from pipeline.base.errors import NumericsError, ObservationError
+from pipeline.base.errors import CheckpointMismatch, NumericsError, ObservationError
 from pipeline.policy.checkpoint import PolicyCheckpoint, find_policy, load_policy
 from pipeline.policy.observation import moving_channels
 from pipeline.policy.policy import Policy
@@ -72,6 +72,11 @@ class ServedPolicy:
         `find_policy`, and `VLMError` as `LiveVLM.load`.
         """
         checkpoint = load_policy(find_policy(folder))
+        if checkpoint.source["action_hz"] is None:
+            raise CheckpointMismatch(
+                f"{folder}: the policy was trained on ticks as they were recorded (data.action_hz "
+                "null), so its rate is not known. Extract with data.action_hz and train it again."
+            )
         target = resolve_device(device)
         policy = checkpoint.policy(target)
         features = None

@@ -26,10 +26,8 @@ class Ring:
 
     def rows(self) -> NDArray[np.float64]:
         """A copy of the rows that are kept, oldest first."""
-        kept, at = len(self._buffer), self.count % len(self._buffer)
-        if self.count <= kept:
-            return self._buffer[: self.count].copy()
-        return np.roll(self._buffer, -at, axis=0)
+        free = max(0, len(self._buffer) - self.count)
+        return np.roll(self._buffer, -self.count, axis=0)[free:]
 
 
 class Timings:
@@ -38,28 +36,19 @@ class Timings:
     def __init__(self, parts: Sequence[str], rows: int) -> None:
         self.parts = tuple(parts)
         self.ring = Ring(rows, len(self.parts))
-        self._most = np.full(len(self.parts), np.nan)
 
     def note(self, row: NDArray[np.float64]) -> None:
         """Take the milliseconds (part,) of one more."""
         self.ring.note(row)
-        np.fmax(self._most, row, out=self._most)
 
     def document(self) -> dict[str, dict[str, float]]:
-        """By part, in ms: how often it was, its percentiles, and the most ever, also where the
-        buffer has gone round."""
-        rows, found = self.ring.rows(), {}
-        for column, part in enumerate(self.parts):
-            values = rows[:, column]
-            values = values[~np.isnan(values)]
-            if len(values):
-                at = np.percentile(values, list(PERCENTILES.values()))
-                named = zip(PERCENTILES, map(float, at), strict=True)
-                found[part] = {
-                    "count": len(values),
-                    **dict(named),
-                    "max": float(self._most[column]),
-                }
+        """By part, in ms, of the rows that are kept: how often it was, percentiles, the most."""
+        found: dict[str, dict[str, float]] = {}
+        for part, column in zip(self.parts, self.ring.rows().T, strict=True):
+            if len(values := column[~np.isnan(column)]):
+                at = np.percentile(values, list(PERCENTILES.values())).tolist()
+                named = dict(zip(PERCENTILES, at, strict=True))
+                found[part] = {"count": len(values), **named, "max": float(values.max())}
         return found
 
     def table(self, caption: str = "") -> Table:

@@ -107,8 +107,10 @@ def _described(value: Any) -> Any:
 
 
 def _array(said: Mapping[Any, Any]) -> NDArray[Any]:
-    dtype, shape, data = _dtype(said), said.get(b"shape"), said.get(b"data")
-    if not isinstance(shape, list) or len(shape) > MAX_RANK or not all(map(_is_size, shape)):
+    dtype, data = _dtype(said), said.get(b"data")
+    shape: Any = said.get(b"shape")
+    sizes = isinstance(shape, list) and all(type(n) is int and n >= 0 for n in shape)
+    if not sizes or len(shape) > MAX_RANK:
         raise WireError(f"expected the shape of an array, found {shape!r:.80}")
     size = math.prod(shape) * dtype.itemsize
     found = len(data) if isinstance(data, bytes) else type(data).__name__
@@ -116,10 +118,6 @@ def _array(said: Mapping[Any, Any]) -> NDArray[Any]:
         raise WireError(f"expected {size} bytes for an array of {dtype}, found {found}")
     plain = np.ndarray(shape, dtype, buffer=data)
     return plain.astype(dtype.newbyteorder("="))
-
-
-def _is_size(value: Any) -> bool:
-    return type(value) is int and value >= 0
 
 
 def _number(said: Mapping[Any, Any]) -> Any:

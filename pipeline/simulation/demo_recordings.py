@@ -6,16 +6,16 @@
 other params are replaced, and nothing that the demo did not write is ever touched.
 """
 
-import json
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 from tqdm import tqdm
 
+from pipeline.base.border import Border, Document
 from pipeline.base.durable import disk_full_named, write_document
 from pipeline.base.errors import ConfigError
 from pipeline.base.ownership import OutputKind, remove_folder, there
@@ -40,6 +40,18 @@ TASK: Final = "Insert_the_needle_at_the_red_point"
 _FIRST_EPOCH_S = datetime(2026, 1, 5, 9, tzinfo=UTC).timestamp()
 _BETWEEN_EPISODES_S, _BETWEEN_SETS_S = 45.0, 86_400.0
 _OVERLAPPING_EVERY, _ROBOT_CLOCK_EVERY, _CROSSING_EVERY = 6, 3, 6
+
+BORDER: Final = Border(ConfigError, "Remove the folder that it is in and run again.")
+
+
+class _Marker(Document):
+    """What wrote the sets of a folder."""
+
+    version: int = 0
+    episodes: int = 0
+    seed: int = 0
+    sets: tuple[Literal["raw", "new", "old", "lerobot"], ...]
+
 
 Episodes = Iterator[SimulatedEpisode]
 Write = Callable[[Path, Episodes], None]
@@ -106,20 +118,15 @@ def _finished_sets(root: Path, wanted: dict[str, int]) -> list[str]:
     path = root / MARKER
     if not path.exists():
         return []
-    try:
-        marked = json.loads(path.read_text(encoding="utf-8"))
-        written = [name for name in marked["sets"] if (root / name).is_dir()]
-    except (ValueError, KeyError, TypeError) as error:
-        raise ConfigError(
-            f"{path}: expected a JSON object with 'sets' ({error}); remove {root} and run again"
-        ) from None
+    marked = BORDER.read_json(path, _Marker)
+    written = [name for name in marked.sets if (root / name).is_dir()]
     strange = [name for name in _SETS if (root / name).exists() and name not in written]
     if strange:
         raise ConfigError(
             f"{root}: {MARKER} does not list {', '.join(strange)} as the demo's, so it is not "
             "replaced; move it away, or set demo.recordings to another folder"
         )
-    if {key: marked.get(key) for key in wanted} == wanted:
+    if marked.model_dump(exclude={"sets"}) == wanted:
         return written
     for name in written:
         remove_folder(root / name, _SET)

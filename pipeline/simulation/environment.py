@@ -107,14 +107,14 @@ class InsertionEnvironment(gymnasium.Env[Any, NDArray[np.floating[Any]]]):
 
     def readings(self) -> Readings:
         """The newest observation."""
-        seen = self.insertion.observe()
-        begun = seen.time_s - TICK_S
+        now = self.insertion
+        begun = now.time_s - TICK_S
         readings = {
-            "state": seen.state,
+            "state": now.state,
             "state_time": begun + np.arange(1, _STATES_PER_TICK + 1) / STATE_HZ,
-            "sensor": seen.sensor,
+            "sensor": now.sensor,
             "sensor_time": begun + np.arange(1, READINGS_PER_TICK + 1) / READING_HZ,
-            "time": np.array([seen.time_s]),
+            "time": np.array([now.time_s]),
         }
         if self._cameras:
             readings |= {f"images/{view}": frame for view, (_, frame) in self.frames().items()}

@@ -88,19 +88,6 @@ class Scene:
 
 
 @dataclass(frozen=True)
-class InsertionObservation:
-    """What a policy may see at the end of a tick.
-
-    `state` (10, 12) and `sensor` (65, 1026) are the readings of the tick that ends at `time_s`;
-    `rendering.photograph` gives what cameras see.
-    """
-
-    time_s: float
-    state: NDArray[np.float32]
-    sensor: NDArray[np.float32]
-
-
-@dataclass(frozen=True)
 class Knot:
     """Where everything is at the end of a tick.
 
@@ -165,12 +152,16 @@ class EpisodeTrace:
 
 
 class NeedleInsertion:
-    """A needle insertion to step through: `reset`, then `observe` and `step` until `finished`.
+    """A needle insertion to step through: `reset`, then `step` until `finished`.
 
-    The same seed and actions give the same observations, bit for bit. `action_rotation` says how
-    the rotation channels of an action are meant.
+    `state` (10, 12) and `sensor` (65, 1026), the readings of the tick that ends now, are what a
+    policy may see, and what cameras see is `rendering.photograph`. The same seed and actions give
+    the same readings, bit for bit. `action_rotation` says how the rotation channels of an action
+    are meant.
     """
 
+    state: NDArray[np.float32]
+    sensor: NDArray[np.float32]
     layout: InsertionLayout
     knots: list[Knot]
     progress: Progress
@@ -178,12 +169,12 @@ class NeedleInsertion:
     def __init__(self, action_rotation: ActionRotation = "rotvec") -> None:
         self.action_rotation: ActionRotation = action_rotation
 
-    def reset(self, seed: int, level: Level = "full") -> InsertionObservation:
-        """The first observation of the episode that this seed draws."""
-        return self.start(draw_layout(seed, level))
+    def reset(self, seed: int, level: Level = "full") -> None:
+        """Begin the episode that this seed draws."""
+        self.start(draw_layout(seed, level))
 
-    def start(self, layout: InsertionLayout) -> InsertionObservation:
-        """The first observation of this very episode: the arm has stood still for one tick."""
+    def start(self, layout: InsertionLayout) -> None:
+        """Begin this very episode: the arm has stood still for one tick."""
         self.layout = layout
         self._upright = orientation(layout.upright_deg)
         self._sensor = NeedleSensor(layout.oct_gain, layout.seed)
@@ -193,7 +184,7 @@ class NeedleInsertion:
         self.knots = [Knot(resting, layout.start_pose, layout.targets_mm[0], surface)]
         self._place, self._pushing, self._due = 0, 0, 0
         self._entry_mm = layout.start_pose[:2]
-        return self.step(np.zeros(7))
+        self.step(np.zeros(7))
 
     @property
     def time_s(self) -> float:
@@ -210,7 +201,7 @@ class NeedleInsertion:
         """Whether the needle is inserted, a limit was passed, or time is up."""
         return self.outcome is not None
 
-    def step(self, action: NDArray[np.float64]) -> InsertionObservation:
+    def step(self, action: NDArray[np.float64]) -> None:
         """Carry out one tick: dx dy dz (mm, base frame), rotation (deg), gripper (ignored).
 
         It is added to the commanded setpoint, which the arm follows. Raises `ValueError` for an
@@ -232,24 +223,15 @@ class NeedleInsertion:
         if self.contact.inside.any():
             beyond = -self.contact.layer_mm[self.contact.inside].min()
             progress.overshoot_mm = max(progress.overshoot_mm, float(beyond))
-        self._observed = self._observe()
-        return self._observed
+        self._measure()
 
-    def observe(self) -> InsertionObservation:
-        """What the last tick showed."""
-        return self._observed
-
-    def _observe(self) -> InsertionObservation:
-        tick = len(self.knots) - 1
-        rng = np.random.default_rng([self.layout.seed, 101, tick])
+    def _measure(self) -> None:
+        rng = np.random.default_rng([self.layout.seed, 101, len(self.knots) - 1])
         times = np.arange(1, STATE_HZ // TICK_HZ + 1) / STATE_HZ
         state = robot_state(self.knots[-1].motion.at(times))
         noise = ENCODER_NOISE * rng.standard_normal(state.shape)
-        return InsertionObservation(
-            time_s=self.time_s,
-            state=(state + noise).astype(np.float32),
-            sensor=self._sensor.read(self.contact, self.time_s - TICK_S, rng),
-        )
+        self.state = (state + noise).astype(np.float32)
+        self.sensor = self._sensor.read(self.contact, self.time_s - TICK_S, rng)
 
     def poses(self, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
         """True poses (time, 6) at any times of the episode so far, angles not wrapped."""

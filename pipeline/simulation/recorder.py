@@ -102,13 +102,15 @@ def simulate_episode(seed: int, epoch_s: float, crosses_180: bool = False) -> Si
     """
     insertion, rng = NeedleInsertion(), np.random.default_rng([seed, 202])
     layout = _nudged(draw_layout(seed, "moved", crosses_180), rng)
-    readings = [insertion.start(layout).sensor]
+    insertion.start(layout)
+    readings = [insertion.sensor]
     while not insertion.finished:
         action = insertion.expert_action()
         noise = rng.standard_normal(6) * np.repeat([_NOISE_MM, _NOISE_DEG], 3)
         noise[:2] *= not insertion.inside
         action[:6] += noise
-        readings.append(insertion.step(action).sensor)
+        insertion.step(action)
+        readings.append(insertion.sensor)
     if insertion.outcome != INSERTED:
         return simulate_episode(seed + 1, epoch_s, crosses_180)
     rng = np.random.default_rng([seed, 201])

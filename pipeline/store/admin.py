@@ -14,10 +14,9 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from textwrap import shorten
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-import zarr
 
 from pipeline.base.digests import is_ledger
 from pipeline.base.durable import HELD, KEPT
@@ -26,9 +25,10 @@ from pipeline.base.format import size
 from pipeline.base.ownership import LEDGER_SUFFIX, OutputKind, remove_folder
 from pipeline.base.table import Table
 from pipeline.store.archive import ARCHIVE, is_archive, read_manifest
+from pipeline.store.border import StoreAttributes
 from pipeline.store.chunks import read_rows
 from pipeline.store.lock import build_lock, lock_holder
-from pipeline.store.paths import MERGED, STORE, read_plan
+from pipeline.store.paths import MERGED, STORE, laid_out_attributes, read_plan
 from pipeline.store.reader import FeatureStore
 from pipeline.store.repair_hints import gc_command
 from pipeline.store.schema import CHECKSUMS, FEATURES, ArraySpec, read_specs
@@ -59,7 +59,7 @@ _UNNEEDED = {
     "lock": "held by no process",
 }
 """Why something of a kind may go, where it is no work and nothing holds it."""
-_SHOWN = ("weights", "adapter", "compute_dtype", "variants", "prompt")
+_SHOWN = ("processor", "weights", "adapter", "compute_dtype", "variants", "prompt")
 """Entries of a feature spec that are listed."""
 
 
@@ -67,8 +67,7 @@ _SHOWN = ("weights", "adapter", "compute_dtype", "variants", "prompt")
 class StoreContents:
     """What a store, an archive of one or a build says it holds."""
 
-    plan: str | None
-    attrs: Mapping[str, Any]
+    said: StoreAttributes
     specs: Mapping[str, ArraySpec]
     done: int
     """Feature rows that are there; fewer than `rows` in a build."""
@@ -81,7 +80,7 @@ class StoreContents:
     @property
     def digest(self) -> str:
         """The beginning of the feature spec's."""
-        return str(self.attrs["feature_spec"].get("digest", "?"))[:8]
+        return self.said.feature_spec.digest[:8]
 
 
 @dataclass(frozen=True)
@@ -117,15 +116,6 @@ class Inventory:
         files = {key: size for entry in self.entries for key, size in entry.files.items()}
         return sum(files.values())
 
-    def shared(self, entry: StoreEntry) -> dict[Path, int]:
-        """Other entries that share files with this one by hard links -> bytes shared."""
-        shared = {
-            other.path: sum(entry.files[key] for key in entry.files.keys() & other.files.keys())
-            for other in self.entries
-            if other is not entry
-        }
-        return {path: count for path, count in shared.items() if count}
-
     @cached_property
     def holders(self) -> dict[Path, str]:
         """Stores that a living process is building -> that process, as its lock says."""
@@ -141,8 +131,6 @@ class Leftover:
     entry: StoreEntry
     fate: Fate
     why: str
-    bytes: int
-    """On the disk; what hard links elsewhere hold on to is not counted."""
 
 
 def take_inventory(folder: Path, *, subfolders: bool = True) -> Inventory:
@@ -258,27 +246,28 @@ def _entry(path: Path, kind: str, base: Path) -> StoreEntry:
             FeatureStore.open(path)
         if kind in ("store", "archive") or (kind in _BUILDS and read_plan(path) is not None):
             contents = _contents(path, kind)
-    except Exception as error:  # whatever is wrong with it, the others are listed
-        damage = str(error) if isinstance(error, PipelineError) else f"{path}: {error!r}"
+    except PipelineError as error:  # the others are listed
+        damage = str(error)
+    except OSError as error:  # removed meanwhile, or not to be read
+        damage = f"{path}: {error.strerror}"
     return StoreEntry(path, kind, base, _files(path), contents, damage)
 
 
 def _contents(path: Path, kind: str) -> StoreContents:
-    specs = read_specs(path)
-    attrs: dict[str, Any] = zarr.open_group(path, mode="r").attrs.asdict()
-    if not {"feature_spec", "streams", "sources", "action_hz", "vlm_reuse_count"} <= set(attrs):
-        raise StoreIncomplete(f"{path}: its attributes lack what a store says of itself")
     if kind == "archive":
-        return StoreContents(read_manifest(path).plan, attrs, specs, specs[CHECKSUMS].shape[0])
+        manifest = read_manifest(path)
+        specs = manifest.specs(path)
+        return StoreContents(manifest.said(path), specs, specs[CHECKSUMS].shape[0])
+    specs = read_specs(path)
     done = np.count_nonzero(read_rows(path, specs[CHECKSUMS]))
-    return StoreContents(read_plan(path), attrs, specs, int(done))
+    return StoreContents(laid_out_attributes(path), specs, int(done))
 
 
 def _files(path: Path) -> dict[tuple[int, int], int]:
     """Bytes on the disk of each file, by device and inode."""
     files: dict[tuple[int, int], int] = {}
     for file in path.rglob("*") if path.is_dir() else [path]:
-        with suppress(FileNotFoundError):  # removed meanwhile, or a link into an emptied cache
+        with suppress(OSError):  # removed meanwhile, or a link into an emptied cache
             status = file.stat()  # of the file itself where a cache hands out symbolic links
             if not stat.S_ISDIR(status.st_mode):
                 files[status.st_dev, status.st_ino] = status.st_blocks * 512
@@ -301,43 +290,34 @@ def _details(inventory: Inventory, entry: StoreEntry) -> Iterator[str]:
         yield f"damaged: {_clause(entry.damage)}"
     if entry.contents is not None and entry.kind == "store":
         yield _embodiment(entry.contents)
-    if entry.path.is_symlink():
-        yield f"a link to {entry.path.resolve()}"
     holder = inventory.holders.get(entry.base)
     if holder and entry.kind != "archive":
         yield f"being built by {holder}" if entry.kind == "build" else f"locked by {holder}"
-    for path, count in inventory.shared(entry).items():
-        yield f"shares {size(count)} with {path.name} by hard links"
-    plan = entry.contents and entry.contents.plan
-    for other in inventory.entries if entry.kind == "store" and plan else ():
-        if other.kind == "archive" and other.contents and other.contents.plan == plan:
-            yield f"archived as {other.path.name}"
 
 
 def _embodiment(held: StoreContents) -> str:
-    attrs, streams = held.attrs, ("tick/action", "sensor/values", "state/values")
+    said, streams = held.said, ("tick/action", "sensor/values", "state/values")
     action, sensor, state = (held.specs[name].shape[1] for name in streams)
-    kind = attrs["streams"]["action"].get("kind", "")
-    rate = "recorded rows" if attrs["action_hz"] is None else f"{attrs['action_hz']:g} Hz"
+    rate = "recorded rows" if said.action_hz is None else f"{said.action_hz:g} Hz"
     return (
-        f"{kind} action {action}, sensor {sensor}, state {state}; {rate}, an answer every "
-        f"{attrs['vlm_reuse_count']} ticks; sources {', '.join(attrs['sources'])}"
+        f"{said.streams.action.kind} action {action}, sensor {sensor}, state {state}; {rate}, an "
+        f"answer every {said.vlm_reuse_count} ticks; sources {', '.join(said.sources)}"
     ).strip()
 
 
 def _spec(held: StoreContents) -> str:
     """The main entries of a feature spec: what tells two specs apart at a glance."""
-    spec, features = held.attrs["feature_spec"], held.specs[FEATURES]
-    slots = [f"{slot['pooling']} of layer {slot['layer']}" for slot in spec.get("slots", ())]
+    spec, features = held.said.feature_spec, held.specs[FEATURES]
+    document = held.said.raw["feature_spec"]
+    slots = [f"{slot.pooling} of layer {slot.layer}" for slot in spec.slots]
     named = [
         ("pooling", " + ".join(dict.fromkeys(slots))),
-        ("pixels", spec.get("processor", {}).get("image_size")),
-        *((name, spec.get(name)) for name in _SHOWN),
+        *((name, document.get(name)) for name in _SHOWN),
     ]
     _, count, dim = features.shape
     return ", ".join(
         [
-            f"{count} slots x {dim} in {features.attributes.get('dtype', features.dtype.name)}",
+            f"{count} slots x {dim} in {features.stored_dtype}",
             f"sensor in {held.specs['sensor/values'].dtype.name}",
             *(f"{name} {shorten(str(it), 60, placeholder='…')}" for name, it in named if it),
         ]
@@ -352,8 +332,7 @@ def _clause(damage: str) -> str:
 def _judge(inventory: Inventory) -> Iterator[Leftover]:
     """What may become of each entry, by path."""
     for entry in inventory.entries:
-        freed = entry.bytes - sum(inventory.shared(entry).values())
-        yield Leftover(entry, *_fate(inventory, entry), freed)
+        yield Leftover(entry, *_fate(inventory, entry))
 
 
 def _fate(inventory: Inventory, entry: StoreEntry) -> tuple[Fate, str]:
@@ -390,7 +369,7 @@ def _work(entry: StoreEntry) -> str | None:
     held = entry.contents
     if held is None or not held.done:
         return None
-    merged = (held.plan or "").startswith(MERGED)
+    merged = held.said.plan.startswith(MERGED)
     command = "the same stages.store merge" if merged else "stages.extract"
     return f", {held.done} of {held.rows} rows done; {command} takes them over"
 

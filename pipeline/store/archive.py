@@ -13,39 +13,59 @@ store to the byte. The manifest is written last: a folder that has one is a comp
 import hashlib
 import json
 import math
+import re
 import shutil
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypeVar
 
 import google_crc32c
 import numpy as np
 import zarr
 from numpy.typing import NDArray
-from pydantic import BaseModel
+from pydantic import Field
 from tqdm import tqdm
 from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec
+from zarr.storage import LocalStore, StorePath
 
+from pipeline.base.border import Border, Document, Text, shown
 from pipeline.base.digests import file_digest
 from pipeline.base.durable import disk_full_named, put_in_place, sync
-from pipeline.base.errors import StoreIncomplete, StoreMismatch
+from pipeline.base.errors import PipelineError, StoreIncomplete, StoreMismatch
 from pipeline.base.ownership import OutputKind, begin_folder, remove_folder
+from pipeline.store.border import (
+    Group,
+    Length,
+    StoreAttributes,
+    store_border,
+)
 from pipeline.store.chunks import check_row_checksums, check_trailers, read_rows
 from pipeline.store.golden import GOLDEN, read_golden
 from pipeline.store.lock import build_lock
 from pipeline.store.metadata import ATTRIBUTE as METADATA_DIGEST
-from pipeline.store.paths import STORE, inode_of, part_path, read_plan, recover, refuse_replaced
+from pipeline.store.paths import (
+    STORE,
+    group_attributes,
+    inode_of,
+    part_path,
+    read_plan,
+    recover,
+    refuse_replaced,
+)
 from pipeline.store.reader import FeatureStore
 from pipeline.store.repair_hints import extract_command, gc_command
 from pipeline.store.schema import (
+    ARRAY_NAMES,
     CHECKSUMS,
     FEATURES,
     GROUPS,
     KEYS,
     ArraySpec,
+    array_of,
+    check_agreement,
     chunk_paths,
     read_specs,
 )
@@ -56,41 +76,76 @@ _ZARR_JSON = "zarr.json"
 _MANIFEST = "archive"
 """The attribute of the root that holds the manifest."""
 SHARD_BYTES = 256 * 2**20
-"""Raw bytes of a shard at most, where one chunk file of the store is not larger."""
+"""Raw bytes of a shard at most, where one chunk file of the store is not larger. With
+`INNER_BYTES` part of the format: an archive of other sizes has another `_SCHEMA`."""
 INNER_BYTES = 4 * 2**20
 """Raw bytes of an inner chunk at most, where one row is not larger."""
 _OF_A_STORE = ("schema", "plan", METADATA_DIGEST)
 """Attributes of the root that would be false of an archive."""
 
 
-class ArchivedArray(BaseModel, frozen=True):
+_BORDER = Border(
+    StoreIncomplete,
+    "Nothing was restored from it; take another copy of the archive, or make it anew with "
+    "stages.archive where the store still is.",
+)
+_NO_PIECE = 2**64 - 1
+"""Where a shard says that a piece of zeros begins."""
+_ARRAY = rf"^({'|'.join(ARRAY_NAMES)})$"
+_VIEW = r"golden/[0-9]+/[^/.\x00][^/\x00]*"
+_FRAME = rf"^{_VIEW}/c/0/0/0$"
+_METADATA = rf"^(({'|'.join((*GROUPS, *ARRAY_NAMES))}|golden|golden/[0-9]+|{_VIEW})/)?zarr\.json$"
+"""Names of files that a store can have: none climbs out of it."""
+_Model = TypeVar("_Model")
+
+
+class ArchivedArray(Document):
     """What the manifest says of one array."""
 
-    codec: str
-    raw_bytes: int
+    codec: Text
+    raw_bytes: Length
     """Of its rows."""
-    shard_bytes: tuple[int, ...]
+    shard_bytes: list[Length]
     """Size of each shard's file; 0 where all is zero, for which zarr writes no file."""
-    crc32c: tuple[int, ...]
+    crc32c: list[Length]
     """Checksum of the data of each chunk file of the store, in order."""
-    metadata: str
+    metadata: Text
     """Digest of this array's metadata in the archive."""
 
 
-class Manifest(BaseModel, frozen=True):
+class Manifest(Document):
     """The content of an archive."""
 
-    metadata: dict[str, str]
+    metadata: dict[Annotated[str, Field(pattern=_METADATA)], str]
     """Every `zarr.json` of the store, as text, by its path."""
-    arrays: dict[str, ArchivedArray]
-    golden: dict[str, str] = {}
+    arrays: dict[Annotated[str, Field(pattern=_ARRAY)], ArchivedArray] = Field(
+        min_length=len(ARRAY_NAMES)
+    )
+    golden: dict[Annotated[str, Field(pattern=_FRAME)], Text] = Field(default_factory=dict)
     """The digest of each chunk file of the store's golden rows, by its path in it; copied as it is.
     """
 
-    @property
-    def plan(self) -> str | None:
-        """The plan of the store."""
-        return json.loads(self.metadata[_ZARR_JSON])["attributes"].get("plan")
+    def said(self, archive: Path) -> StoreAttributes:
+        """The root attributes of the store. Raises `StoreIncomplete` where they are wrong."""
+        return StoreAttributes.of(archive, self._parsed(archive, "", Group).attributes, _BORDER)
+
+    def specs(self, archive: Path) -> dict[str, ArraySpec]:
+        """The arrays of the store. Raises `StoreIncomplete` where their metadata are wrong."""
+        specs: dict[str, ArraySpec] = {}
+        for name, record in self.arrays.items():
+            found = self._parsed(archive, name, dict[str, Any])
+            spec = array_of(found, name, f"{archive}, {name}/zarr.json of the store", _BORDER)
+            if len(record.crc32c) != spec.chunk_count:
+                what = f"{name}: expected {spec.chunk_count:,} checksums"
+                raise _BORDER.refusal(archive / _ZARR_JSON, f"{what}, found {len(record.crc32c):,}")
+            specs[name] = spec
+        check_agreement(archive, self.said(archive), specs, _BORDER)
+        return specs
+
+    def _parsed(self, archive: Path, place: str, model: type[_Model]) -> _Model:
+        path = f"{place}/{_ZARR_JSON}".lstrip("/")
+        where = f"{archive}, {path} of the store"
+        return _BORDER.parse_json(self.metadata.get(path, ""), model, where)
 
     @property
     def raw_bytes(self) -> int:
@@ -125,11 +180,11 @@ def read_manifest(path: Path) -> Manifest:
     if document.get("schema") != _SCHEMA:
         raise StoreMismatch(
             f"{path}: expected an archive of schema {_SCHEMA}, found "
-            f"{document.get('schema')!r}. Restore it with the version that made it."
+            f"{shown(document.get('schema'))}. Restore it with the version that made it."
         )
     if document.pop("digest", None) != _digest_of(document):
         raise _damaged(path / _ZARR_JSON, "its manifest does not give its digest")
-    return Manifest.model_validate(document)
+    return _BORDER.parse(document, Manifest, path / _ZARR_JSON)
 
 
 def archive(store: Path, output: Path, level: int, threads: int) -> Manifest | None:
@@ -152,7 +207,7 @@ def archive(store: Path, output: Path, level: int, threads: int) -> Manifest | N
                 "away, or name another place with archive.output."
             )
         check_trailers(store)
-        read_golden(store, opened.attrs, opened.array(KEYS))
+        read_golden(store, opened.array(KEYS))
         with _begun(output, ARCHIVE, threads) as part:
             manifest = _write(store, part, level)
         put_in_place(part, output, ARCHIVE)
@@ -201,7 +256,7 @@ def _begun(target: Path, kind: OutputKind, threads: int) -> Generator[Path]:
 def _write(store: Path, part: Path, level: int) -> Manifest:
     """Everything of an archive, its manifest last, all of it on the disk."""
     inode, specs, metadata = inode_of(store), read_specs(store), _read_metadata(store)
-    of_groups = {n: zarr.open_group(store, path=n, mode="r").attrs.asdict() for n in ("", *GROUPS)}
+    of_groups = {name: group_attributes(store / name) for name in ("", *GROUPS)}
     of_groups[""] = {k: v for k, v in of_groups[""].items() if k not in _OF_A_STORE}
     for name, attributes in of_groups.items():
         zarr.create_group(part, path=name, attributes=attributes)
@@ -210,6 +265,7 @@ def _write(store: Path, part: Path, level: int) -> Manifest:
             name: _write_array(store, part, spec, level, progress) for name, spec in specs.items()
         }
     golden = _golden_digests(store)
+    _write_metadata(part, {n: text for n, text in metadata.items() if n.startswith(GOLDEN)})
     _copy_golden(store, part, golden)
     refuse_replaced(store, inode)
     manifest = Manifest(metadata=metadata, arrays=arrays, golden=golden)
@@ -230,7 +286,7 @@ def _write_array(
         values = read_rows(store, spec, rows.start, rows.stop)
         if spec.name == FEATURES:
             wanted = FeatureStore.open(store).array(CHECKSUMS)[rows.start : rows.stop]
-            check_row_checksums(store, spec, rows.start, values, wanted)
+            check_row_checksums(store, spec, rows, values, wanted)
         array[rows.start : rows.stop] = values
         written = google_crc32c.value(values.reshape(-1).view(np.uint8))
         del values  # a shard may be large: what is read back takes its place
@@ -244,24 +300,24 @@ def _write_array(
     return ArchivedArray(
         codec=f"zstd+{codec_for(spec.dtype, 0, level).shuffle.value}",
         raw_bytes=spec.data_bytes,
-        shard_bytes=tuple(sizes),
+        shard_bytes=sizes,
         crc32c=_trailers(store, spec),
         metadata=file_digest(part / spec.name / _ZARR_JSON),
     )
 
 
 def _rebuild(manifest: Manifest, archive: Path, target: Path, part: Path) -> None:
-    for name, text in manifest.metadata.items():
-        if name != _ZARR_JSON:
-            (part / name).parent.mkdir(parents=True, exist_ok=True)
-            (part / name).write_text(text, encoding="utf-8")
-    with closing(StoreBuild(target, read_specs(part), manifest.plan or "")) as build:
+    specs, plan = manifest.specs(archive), manifest.said(archive).plan
+    _write_metadata(part, {n: text for n, text in manifest.metadata.items() if n != _ZARR_JSON})
+    with closing(StoreBuild(target, specs, plan)) as build:
         build.allocate()
         with _progress("restore", manifest.raw_bytes) as progress:
             for name, record in manifest.arrays.items():
-                spec, array = build.specs[name], _open_array(archive, name, record)
+                spec = build.specs[name]
+                array = _open_array(archive, spec, record)
                 shards = _shards(archive, spec, array)
                 for shard, rows in shards:
+                    _check_shard(shard, array)
                     build.write(name, rows.start, _read_shard(array, shard, rows))
                     progress.update(len(rows) * spec.row_bytes)
                 build.files(name).write_trailers()
@@ -295,14 +351,14 @@ def _check_rebuilt(
             raise _damaged(shard, f"rows {rows[0]} to {rows[-1]} of {spec.name} are other ones")
 
 
-def _create_array(root: Path, spec: ArraySpec, level: int) -> "zarr.Array[Any]":
-    """The array in an archive, without data, with the attributes it has in the store."""
+def _create_array(root: Path | dict[str, Any], spec: ArraySpec, level: int) -> "zarr.Array[Any]":
+    """The array in an archive, without data."""
+    shard, inner = _chunks_a_shard(spec) * spec.chunk_rows, inner_rows(spec)
     widths = tuple(max(1, size) for size in spec.shape[1:])
-    inner = inner_rows(spec)
     codec = codec_for(spec.dtype, inner * spec.row_bytes, level)
     return spec.create(
         root,
-        shards=(_chunks_a_shard(spec) * spec.chunk_rows, *widths),
+        shards=(shard, *widths),
         chunks=(inner, *widths),
         compressors=[codec, Crc32cCodec()],
     )
@@ -345,12 +401,33 @@ def _shards(root: Path, spec: ArraySpec, array: "zarr.Array[Any]") -> list[tuple
     return [(path, cut.chunk_rows_of(shard)) for shard, path in enumerate(chunk_paths(root, cut))]
 
 
-def _open_array(archive: Path, name: str, record: ArchivedArray) -> "zarr.Array[Any]":
+def _open_array(archive: Path, spec: ArraySpec, record: ArchivedArray) -> "zarr.Array[Any]":
     """An array of an archive; raises `StoreIncomplete` where its metadata are not as written."""
-    metadata = archive / name / _ZARR_JSON
-    if not metadata.exists() or file_digest(metadata) != record.metadata:
-        raise _damaged(metadata, f"missing, or not the metadata that were written of {name}")
-    return zarr.open_array(archive, path=name, mode="r")
+    metadata = archive / spec.name / _ZARR_JSON
+    if not metadata.is_file() or file_digest(metadata) != record.metadata:
+        raise _damaged(metadata, f"missing, or not the metadata that were written of {spec.name}")
+    written: Any = _create_array({}, spec, level=1).metadata  # of any level: to unpack needs none
+    folder = StorePath(LocalStore(archive, read_only=True), spec.name)
+    return zarr.Array(zarr.AsyncArray(written, folder))
+
+
+def _check_shard(shard: Path, array: "zarr.Array[Any]") -> None:
+    """Raise `StoreIncomplete` where a piece of a shard says that it unpacks to another size."""
+    if not shard.exists():
+        return  # of zeros
+    assert array.shards is not None, "an archive is sharded"
+    whole, size = math.prod(array.chunks) * array.dtype.itemsize, _BORDER.check_file(shard)
+    pieces = array.shards[0] // array.chunks[0]
+    with shard.open("rb") as file:
+        file.seek(max(0, size - 16 * pieces - 4))
+        index = np.frombuffer(file.read(16 * pieces), "<u8", min(size, 16 * pieces) // 16 * 2)
+        for begin, length in index.reshape(-1, 2).tolist():
+            if begin < _NO_PIECE:
+                file.seek(min(begin, size) + 4)  # where Blosc says it
+                if begin + length > size or int.from_bytes(file.read(4), "little") != whole:
+                    raise _damaged(
+                        shard, f"{array.path} cannot be read: a piece is not {whole} bytes"
+                    )
 
 
 def _holds(manifest: Manifest, store: Path) -> bool:
@@ -368,34 +445,30 @@ def _holds(manifest: Manifest, store: Path) -> bool:
 def _golden_digests(store: Path) -> dict[str, str]:
     """The digest of each chunk file of a store's golden rows, by its path in it."""
     paths = sorted(path for path in (store / GOLDEN).rglob("*") if path.is_file())
-    chunks = (path for path in paths if path.name != _ZARR_JSON)
-    return {path.relative_to(store).as_posix(): file_digest(path) for path in chunks}
+    names = {path.relative_to(store).as_posix(): path for path in paths}
+    return {name: file_digest(path) for name, path in names.items() if re.fullmatch(_FRAME, name)}
 
 
 def _copy_golden(root: Path, to: Path, digests: Mapping[str, str]) -> None:
-    """Copy the chunk files of golden rows, and their metadata where they are not there yet.
+    """Copy the chunk files of golden rows.
 
     Raises `StoreIncomplete` where one is missing or not the one that has its digest.
     """
     for name in digests:
         (to / name).parent.mkdir(parents=True, exist_ok=True)
-        if not (root / name).exists():
-            raise _damaged(root / name, "no such file")
+        _BORDER.check_file(root / name)
         shutil.copyfile(root / name, to / name)
         if file_digest(to / name) != digests[name]:
             raise _damaged(root / name, "a golden frame is another one than was written")
         sync(to / name)
-    for path in (root / GOLDEN).rglob(_ZARR_JSON):
-        place = to / path.relative_to(root)
-        if not place.exists():
-            place.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(path, place)
 
 
-def _trailers(store: Path, spec: ArraySpec) -> tuple[int, ...]:
+def _trailers(store: Path, spec: ArraySpec) -> list[int]:
     """The checksum at the end of each chunk file."""
-    trailers = [np.fromfile(p, "<u4", 1, offset=spec.chunk_bytes) for p in chunk_paths(store, spec)]
-    return tuple(int(trailer[0]) for trailer in trailers)
+    paths = chunk_paths(store, spec)
+    if not all(path.is_file() for path in paths):
+        raise FileNotFoundError(store / spec.name)
+    return [int(np.fromfile(path, "<u4", 1, offset=spec.chunk_bytes)[0]) for path in paths]
 
 
 def _refuse_build(target: Path) -> None:
@@ -410,8 +483,15 @@ def _refuse_build(target: Path) -> None:
 
 def _read_metadata(store: Path) -> dict[str, str]:
     """Every `zarr.json` of a store as text, by its path in it."""
-    paths = sorted(store.rglob(_ZARR_JSON))
-    return {path.relative_to(store).as_posix(): path.read_bytes().decode() for path in paths}
+    names = {path.relative_to(store).as_posix(): path for path in sorted(store.rglob(_ZARR_JSON))}
+    known = {name: path for name, path in names.items() if re.fullmatch(_METADATA, name)}
+    return {name: store_border(store).read_bytes(path).decode() for name, path in known.items()}
+
+
+def _write_metadata(root: Path, texts: Mapping[str, str]) -> None:
+    for name, text in texts.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(text, encoding="utf-8")
 
 
 def _progress(label: str, total: int) -> "tqdm[Any]":
@@ -419,11 +499,7 @@ def _progress(label: str, total: int) -> "tqdm[Any]":
 
 
 def _manifest_document(path: Path) -> dict[str, Any] | None:
-    try:
-        attributes = json.loads((path / _ZARR_JSON).read_text(encoding="utf-8"))["attributes"]
-        document = attributes[_MANIFEST]
-    except (FileNotFoundError, NotADirectoryError, ValueError, KeyError, TypeError):
-        return None
+    document = group_attributes(path).get(_MANIFEST)
     return document if isinstance(document, dict) else None
 
 
@@ -432,9 +508,6 @@ def _digest_of(body: Mapping[str, Any]) -> str:
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
-def _damaged(path: Path, why: str) -> StoreIncomplete:
+def _damaged(path: Path, why: str) -> PipelineError:
     """The error for a file of an archive that is not as it was written."""
-    return StoreIncomplete(
-        f"{path}: the archive is damaged: {why}. Nothing was restored from it; take another copy "
-        "of the archive, or make it anew with stages.archive where the store still is."
-    )
+    return _BORDER.refusal(path, f"the archive is damaged: {why}")

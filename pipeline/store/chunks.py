@@ -19,6 +19,7 @@ from tqdm import tqdm
 
 from pipeline.base.durable import disk_full_named, sync
 from pipeline.base.errors import StoreIncomplete
+from pipeline.store.border import store_border
 from pipeline.store.metadata import check_metadata
 from pipeline.store.repair_hints import mend
 from pipeline.store.schema import TRAILER_BYTES, ArraySpec, chunk_path, chunk_paths, read_specs
@@ -36,10 +37,14 @@ def row_checksums(rows: NDArray[Any]) -> NDArray[np.uint32]:
 
 
 def check_row_checksums(
-    store: Path, spec: ArraySpec, start: int, features: NDArray[Any], wanted: NDArray[np.uint32]
+    store: Path,
+    spec: ArraySpec,
+    rows: NDArray[np.int64] | range,
+    features: NDArray[Any],
+    wanted: NDArray[np.uint32],
 ) -> None:
-    """Raise `StoreIncomplete` where feature rows from `start` do not give these checksums."""
-    bad = start + np.flatnonzero(row_checksums(features) != wanted)
+    """Raise `StoreIncomplete` where these feature rows do not give these checksums."""
+    bad = np.asarray(rows)[row_checksums(features) != wanted]
     if bad.size:
         raise StoreIncomplete(
             f"{chunk_path(store, spec, bad[0] // spec.chunk_rows)}: rows {bad[0]} to {bad[-1]} of "
@@ -82,18 +87,20 @@ def read_rows(root: Path, spec: ArraySpec, start: int = 0, stop: int | None = No
 
     Raises `StoreIncomplete` where a chunk file is missing or ends before them.
     """
-    count = (spec.shape[0] if stop is None else stop) - start
-    rows = np.zeros((count, *spec.shape[1:]), spec.dtype)
+    stop = spec.shape[0] if stop is None else stop
+    border, chunks = (
+        store_border(root),
+        range(start // spec.chunk_rows, -(-stop // spec.chunk_rows)),
+    )
+    for chunk in chunks if spec.row_bytes else ():  # before memory is taken for what is not there
+        border.check_file(chunk_path(root, spec, chunk))
+    rows = np.zeros((stop - start, *spec.shape[1:]), spec.dtype)
     for chunk, offset, data in _parts(spec, start, rows):
-        path, what = chunk_path(root, spec, chunk), "the file ends early"
-        try:
-            with path.open("rb") as file:
-                file.seek(offset)
-                if file.readinto(data.data) == len(data):
-                    continue
-        except FileNotFoundError:
-            what = "no such file"
-        raise StoreIncomplete(f"{path}: {what}. {mend(root)}")
+        path = chunk_path(root, spec, chunk)
+        with path.open("rb") as file:
+            file.seek(offset)
+            if file.readinto(data.data) != len(data):
+                raise border.refusal(path, "the file ends early")
     return rows
 
 
@@ -123,6 +130,8 @@ def read_chunk(
     buffer = np.empty(together * spec.row_bytes, np.uint8)
     trailer = np.zeros(1, "<u4")
     done = crc = 0
+    if path.exists() and not path.is_file():
+        return ChunkState(0, 0, "expected a file, found a folder, pipe or device")
     try:
         with path.open("rb") as file:
             for first in range(0, spec.chunk_rows, together):
@@ -176,7 +185,7 @@ class ChunkFiles:
     def is_linked(self, chunk: int) -> bool:
         """Whether this file also belongs to another store and so must not be written."""
         path = self.paths[chunk]
-        return path.exists() and path.stat().st_nlink > 1
+        return path.is_symlink() or (path.exists() and path.stat().st_nlink > 1)
 
     def link(self, chunk: int, source: Path) -> bool:
         """Take a chunk over from another store as it is; False where files cannot be linked."""

@@ -7,14 +7,17 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.store.schema import STREAMS
+from pipeline.base.border import shown
+from pipeline.store.border import EpisodeText, store_border
+from pipeline.store.schema import POSITIONS, STREAMS
 
-SAID = ("id", "path", "format", "instruction", "content", "digest")
+SAID = tuple(name for name in EpisodeText.model_fields if name != "group")
 """What `episode/text` says of each episode; beside it `group`, where the recording names one."""
 
 
@@ -56,16 +59,56 @@ def _text(said: Mapping[str, str]) -> bytes:
     return json.dumps(said, ensure_ascii=False).encode()
 
 
-def read_texts(arrays: Mapping[str, NDArray[Any]]) -> list[dict[str, Any]]:
-    """What `episode/text` says of each episode: the fields named in `SAID`, perhaps `group`."""
-    text = arrays["episode/text"].tobytes()
-    return [json.loads(text[start:stop]) for start, stop in pairwise(arrays["episode/text_start"])]
+def read_texts(root: Path, arrays: Mapping[str, NDArray[Any]]) -> list[EpisodeText]:
+    """What `episode/text` says of each episode.
+
+    Raises `StoreIncomplete` naming the episode whose text is broken.
+    """
+    text, border = arrays["episode/text"].tobytes(), store_border(root)
+    return [
+        border.parse_json(text[start:stop], EpisodeText, f"{root}/episode/text, episode {index}")
+        for index, (start, stop) in enumerate(pairwise(arrays["episode/text_start"].tolist()))
+    ]
+
+
+def check_index(root: Path, arrays: Mapping[str, NDArray[Any]], rows: Mapping[str, int]) -> None:
+    """Raise `StoreIncomplete` where the episodes do not share out the `rows` of each stream."""
+    for stream, count in rows.items():
+        name = f"episode/{stream}_start"
+        edges = arrays[name]
+        rising = (edges[1:] >= edges[:-1]).all()
+        if not (rising and edges[0] == 0 and edges[-1] == count):
+            what = f"expected offsets that rise from 0 to {count}, found {shown(edges.tolist())}"
+            raise store_border(root).refusal(root / name, what)
+
+
+def check_positions(root: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Raise `StoreIncomplete` where a tick points at a row of another episode, or at none."""
+    starts = arrays["episode/tick_start"]
+    having = np.flatnonzero(starts[1:] > starts[:-1])
+    for name, stream in POSITIONS.items() if len(having) else ():
+        low = np.minimum.reduceat(arrays[name], starts[having])
+        high = np.maximum.reduceat(arrays[name], starts[having])
+        edges = arrays[f"episode/{stream}_start"]
+        begin, end = edges[having], edges[having + 1] - (name == "tick/vl_row")
+        for at in np.flatnonzero((low < begin) | (high > end))[:1]:
+            what = f"expected positions from {begin[at]} to {end[at]} in episode {having[at]}"
+            found = f"{low[at]} to {high[at]}"
+            raise store_border(root).refusal(root / name, f"{what}, found {found}")
 
 
 def read_episodes(
-    arrays: Mapping[str, NDArray[Any]], sources: Sequence[str]
+    root: Path, arrays: Mapping[str, NDArray[Any]], sources: Sequence[str]
 ) -> tuple[Episode, ...]:
-    """All episodes of a store with these arrays, in order; `sources` as `episode/source` counts."""
+    """All episodes of a store with these arrays, in order; `sources` as `episode/source` counts.
+
+    Raises `StoreIncomplete` where one has no text, or a source that is none of these.
+    """
+    source_of = arrays["episode/source"]
+    if ((source_of < 0) | (source_of >= len(sources))).any():
+        what = f"expected positions below {len(sources)}, the number of sources"
+        found = f"{source_of.min()} to {source_of.max()}"
+        raise store_border(root).refusal(root / "episode/source", f"{what}, found {found}")
     edges = {stream: arrays[f"episode/{stream}_start"].tolist() for stream in STREAMS}
     return tuple(
         Episode(
@@ -75,10 +118,10 @@ def read_episodes(
                 STREAMS[stream].rows: range(edge[index], edge[index + 1])
                 for stream, edge in edges.items()
             },
-            **text,
+            **dict(text),
         )
         for index, (source, text) in enumerate(
-            zip(arrays["episode/source"], read_texts(arrays), strict=True)
+            zip(source_of, read_texts(root, arrays), strict=True)
         )
     )
 

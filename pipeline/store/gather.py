@@ -66,7 +66,7 @@ class Gatherer:
         self._variants = variants
         self._tensors: dict[str, Tensor] = {}
         wide = {name: arrays[array] for name, array in WIDE.items()}
-        self.in_memory = fitting(wide, available_bytes())
+        self.in_memory = fitting({name: a.nbytes for name, a in wide.items()}, available_bytes())
         """The wide fields whose arrays fit in memory together, the smallest first."""
         for name in wide.keys() - {*self.in_memory}:
             read_at_random(wide[name])

@@ -11,8 +11,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
+import google_crc32c
 import numpy as np
 import zarr
+from numcodecs import Zstd
 from numpy.typing import NDArray
 from zarr.codecs import BytesCodec, Crc32cCodec, ZstdCodec
 
@@ -20,10 +22,11 @@ from pipeline.base.durable import disk_full_named, sync
 from pipeline.base.errors import StoreIncomplete
 from pipeline.base.golden import row_key
 from pipeline.base.issue import Issue
+from pipeline.store.border import FrameDocument, StoreAttributes, StoredGolden, store_border
 from pipeline.store.chunks import read_rows
 from pipeline.store.metadata import check_metadata, note_metadata
-from pipeline.store.repair_hints import mend
-from pipeline.store.schema import ArraySpec
+from pipeline.store.paths import group_attributes, laid_out_attributes
+from pipeline.store.schema import TRAILER_BYTES, ArraySpec
 
 GOLDEN: Final = "golden"
 """The group, and the attribute of the root."""
@@ -55,19 +58,17 @@ def write_golden(root: Path, rows: Sequence[GoldenFrames]) -> None:
         for path in (root / GOLDEN).rglob("*"):
             sync(path)
         entries = [{"row": g.row, "prompt": g.prompt, "views": [*g.frames]} for g in rows]
-        attributes = zarr.open_group(root, mode="r").attrs.asdict()
-        note_metadata(root, attributes | {GOLDEN: entries})
+        note_metadata(root, group_attributes(root) | {GOLDEN: entries})
 
 
-def read_golden(
-    root: Path, attributes: Mapping[str, Any], keys: NDArray[np.uint8]
-) -> list[GoldenFrames]:
-    """The golden rows of a store, whose root has these attributes and whose rows these keys.
+def read_golden(root: Path, keys: NDArray[np.uint8]) -> list[GoldenFrames]:
+    """The golden rows of a store whose rows have these keys.
 
     Raises `StoreIncomplete` naming the one that cannot be read or does not give its key.
     """
-    entries = enumerate(attributes.get(GOLDEN, []))
-    return [_read(root, attributes, number, keys[entry["row"]]) for number, entry in entries]
+    said = laid_out_attributes(root)
+    entries = enumerate(said.golden)
+    return [_read(root, said, number, keys[entry.row]) for number, entry in entries]
 
 
 def carried_golden(
@@ -78,43 +79,39 @@ def carried_golden(
     """
     try:
         check_metadata(root)
+        said = laid_out_attributes(root)
     except StoreIncomplete:
         return
-    attributes: dict[str, Any] = zarr.open_group(root, mode="r").attrs.asdict()
-    for number in range(len(attributes.get(GOLDEN, []))):
+    for number, entry in enumerate(said.golden):
         with suppress(StoreIncomplete):
-            golden = _unproven(root, attributes, number)
+            golden = _unproven(root, number, entry)
             same = keys == np.frombuffer(golden.key(spec), np.uint8)
             for row in np.flatnonzero(same.all(axis=1))[:1].tolist():
                 yield replace(golden, row=row)
 
 
-def golden_issues(
-    root: Path, attributes: Mapping[str, Any], keys: ArraySpec | None
-) -> Iterator[Issue]:
+def golden_issues(root: Path, said: StoreAttributes, keys: ArraySpec | None) -> Iterator[Issue]:
     """What is wrong with the golden rows; nothing where the keys themselves cannot be read."""
     if keys is None:
         return
-    for number, entry in enumerate(attributes.get(GOLDEN, [])):
+    for number, entry in enumerate(said.golden):
         try:
-            key = read_rows(root, keys, entry["row"], entry["row"] + 1)[0]
+            key = read_rows(root, keys, entry.row, entry.row + 1)[0]
         except StoreIncomplete:
             continue
         try:
-            _read(root, attributes, number, key)
+            _read(root, said, number, key)
         except StoreIncomplete as error:
             yield Issue(severity="error", kind="golden row", message=str(error), stream=GOLDEN)
 
 
-def golden_files(root: Path, attributes: Mapping[str, Any]) -> set[Path]:
-    """The files of the golden rows that a store with these attributes has."""
-    if GOLDEN not in attributes:
-        return set()
-    groups = [root / GOLDEN]
+def golden_files(root: Path, said: StoreAttributes) -> set[Path]:
+    """The files of the golden rows that a store says it has."""
+    groups = [root / GOLDEN] * ("golden" in said.model_fields_set)
     frames: list[Path] = []
-    for number, entry in enumerate(attributes[GOLDEN]):
+    for number, entry in enumerate(said.golden):
         groups.append(root / GOLDEN / str(number))
-        frames += [groups[-1] / view for view in entry["views"]]
+        frames += [groups[-1] / view for view in entry.views]
     chunks = {frame / "c" / "0" / "0" / "0" for frame in frames}
     return chunks | {place / "zarr.json" for place in (*groups, *frames)}
 
@@ -136,25 +133,35 @@ def _write_frame(root: Path, name: str, frame: NDArray[np.uint8]) -> None:
     array[:] = frame
 
 
-def _read(
-    root: Path, attributes: Mapping[str, Any], number: int, key: NDArray[np.uint8]
-) -> GoldenFrames:
+def _read(root: Path, said: StoreAttributes, number: int, key: NDArray[np.uint8]) -> GoldenFrames:
     """One golden row; `StoreIncomplete` where it cannot be read or does not give the key."""
-    golden = _unproven(root, attributes, number)
-    if golden.key(attributes["feature_spec"]) != key.tobytes():
+    golden = _unproven(root, number, said.golden[number])
+    if golden.key(said.raw["feature_spec"]) != key.tobytes():
         why = f"golden frames and prompt of VL row {golden.row} do not give the key of that row"
-        raise StoreIncomplete(f"{root / GOLDEN / str(number)}: {why}. {mend(root)}")
+        raise store_border(root).refusal(root / GOLDEN / str(number), why)
     return golden
 
 
-def _unproven(root: Path, attributes: Mapping[str, Any], number: int) -> GoldenFrames:
+def _unproven(root: Path, number: int, entry: StoredGolden) -> GoldenFrames:
     """One golden row; `StoreIncomplete` where it cannot be read."""
-    entry, place = attributes[GOLDEN][number], root / GOLDEN / str(number)
-    row, frames = entry["row"], dict[str, NDArray[np.uint8]]()
-    for view in entry["views"]:
-        try:
-            frames[view] = np.asarray(zarr.open_array(place / view, mode="r")[:])
-        except (OSError, ValueError, RuntimeError, KeyError, TypeError) as error:
-            why = f"golden frame of VL row {row} cannot be read ({error})"
-            raise StoreIncomplete(f"{place / view}: {why}. {mend(root)}") from None
-    return GoldenFrames(row, entry["prompt"], frames)
+    place = root / GOLDEN / str(number)
+    frames = {view: _read_frame(root, place / view) for view in entry.views}
+    return GoldenFrames(entry.row, entry.prompt, frames)
+
+
+def _read_frame(root: Path, place: Path) -> NDArray[np.uint8]:
+    """A frame (height, width, 3) as `_write_frame` wrote it; it unpacks to no more than that."""
+    border = store_border(root)
+    said = border.read_json(place / "zarr.json", FrameDocument)
+    frame = np.zeros(said.shape, np.uint8)
+    chunk = place / "c" / "0" / "0" / "0"
+    packed = border.read_bytes(chunk, frame.nbytes + 2**16)
+    trailer = int.from_bytes(packed[-TRAILER_BYTES:], "little")
+    packed = packed[:-TRAILER_BYTES]
+    try:
+        if google_crc32c.value(packed) != trailer:
+            raise ValueError("its bytes do not give their checksum")
+        Zstd().decode(packed, out=frame)
+    except (ValueError, RuntimeError) as error:
+        raise border.refusal(chunk, f"golden frame cannot be read ({error})") from None
+    return frame

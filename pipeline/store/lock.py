@@ -13,7 +13,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO
 
+from pipeline.base.border import Border
 from pipeline.base.errors import ConfigError, StoreLocked
+from pipeline.base.ownership import there
 
 _BEAT_S = 10.0
 """How often the holder shows that it lives."""
@@ -21,7 +23,11 @@ _BEAT_S = 10.0
 _STALE_S = 60.0
 """Without a sign of life for so long, a holder on another host is dead."""
 
-_HELD = re.compile(r"process \d+ on ")
+_HELD = re.compile(r"process \d{1,20} on \S{1,255}")
+
+_LOCK = Border(
+    ConfigError, "It was left as it is: move it away, or name another place for what it locks."
+)
 
 _NO_FLOCK = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK)
 
@@ -38,23 +44,19 @@ def build_lock(target: Path) -> Generator[None]:
     """
     path = target.with_name(target.name + ".lock")
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a+", encoding="utf-8") as file:
-        locked, holder = _flock(file, fcntl.LOCK_EX), _holder(file)
-        elsewhere = bool(holder) and not (locked and _is_here(holder))
+    if there(path):  # a link to nothing too, through which a file would be made elsewhere
+        _LOCK.check_file(path, 1000)
+    with path.open("a+", encoding="utf-8", errors="replace") as file:
+        locked, holder, elsewhere = _look(file, path, fcntl.LOCK_EX)
         held = (
             f"{target}: being built by {holder or 'another process'} ({path}). Wait for it or stop "
-            "it, then run the same command again."
+            f"it, then run the same command again; or name another place than {target}."
         )
         if locked is False:
             raise StoreLocked(held)
         if not path.exists() or path.stat().st_ino != os.fstat(file.fileno()).st_ino:
             # Tidied away before it was locked: a lock on it excludes nobody.
             raise StoreLocked(f"{path}: removed by another process just now; run the same again.")
-        if elsewhere and not _HELD.match(holder):
-            raise ConfigError(
-                f"{path}: expected the lock of {target}, found a file that this project did not "
-                f"write. It was left as it is: move it away, or name another place than {target}."
-            )
         if elsewhere and (age_s := _age_s(file)) < _STALE_S:
             raise StoreLocked(
                 f"{held} It gave a sign of life {age_s:.0f} s ago; if it was killed, wait until "
@@ -79,43 +81,51 @@ def lock_holder(path: Path) -> str | None:
     A holder on another host, whose lock the kernel may not show here, is believed for a minute
     after its last sign of life, as `build_lock` believes it.
     """
-    with path.open("r", encoding="utf-8") as file:
+    _LOCK.check_file(path, 1000)
+    with path.open("r", encoding="utf-8", errors="replace") as file:
         # Shared, so that two that ask do not take each other for a builder.
-        locked, holder = _flock(file, fcntl.LOCK_SH), _holder(file)
-        elsewhere = bool(holder) and not (locked and _is_here(holder))
-        alive = locked is False or (elsewhere and time.time() - path.stat().st_mtime < _STALE_S)
+        locked, holder, elsewhere = _look(file, path, fcntl.LOCK_SH)
+        age_s = abs(time.time() - path.stat().st_mtime)
+        alive = locked is False or (elsewhere and age_s < _STALE_S)
     return (holder or "another process") if alive else None
 
 
-def _flock(file: TextIO, how: int) -> bool | None:
-    """Whether the kernel's lock was to be had; None where the file system has none."""
+def _look(file: TextIO, path: Path, how: int) -> tuple[bool | None, str, bool]:
+    """Whether the kernel's lock was to be had, who holds it as the file says, and whether that may
+    be a process of another host.
+
+    None where the file system has no locks. Raises `ConfigError` where the file is no lock.
+    """
+    locked: bool | None = True
     try:
         fcntl.flock(file, how | fcntl.LOCK_NB)
     except BlockingIOError:
-        return False
+        locked = False
     except OSError as error:
         if error.errno not in _NO_FLOCK:
             raise
-        return None
-    return True
+        locked = None
+    file.seek(0)
+    holder = file.read().strip()
+    if holder and not _HELD.fullmatch(holder):
+        raise _LOCK.refusal(path, "expected a lock, found a file that this project did not write")
+    here = holder.endswith(f" on {socket.gethostname()}")
+    return locked, holder, bool(holder) and not (locked and here)
 
 
 def _age_s(file: TextIO) -> float:
-    """Seconds since the file's time by the clock of its own host; the time stays as it is."""
+    """Seconds since the file's time by the clock of its own host; the time stays as it is.
+
+    One that lies ahead of that clock is no sign of life: it becomes the present, so that a holder
+    that shows none from now on is dead a minute later, not when the clock gets there.
+    """
     seen = os.fstat(file.fileno()).st_mtime_ns
     os.utime(file.fileno())
     age_s = (os.fstat(file.fileno()).st_mtime_ns - seen) / 1e9
+    if age_s < 0:
+        return 0.0
     os.utime(file.fileno(), ns=(seen, seen))
     return age_s
-
-
-def _is_here(holder: str) -> bool:
-    return bool(_HELD.match(holder)) and holder.endswith(f" on {socket.gethostname()}")
-
-
-def _holder(file: TextIO) -> str:
-    file.seek(0)
-    return file.read().strip()
 
 
 @contextmanager

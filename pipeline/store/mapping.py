@@ -18,7 +18,7 @@ import os
 import weakref
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,19 +93,12 @@ def _mmap(address: int | None, length: int, protection: int, flags: int, descrip
     return int(mapped)
 
 
-class Sized(Protocol):
-    """An array or a tensor."""
-
-    @property
-    def nbytes(self) -> int: ...
-
-
-def fitting(arrays: Mapping[str, Sized], available: int, share: float = _MEMORY_SHARE) -> list[str]:
-    """Which arrays fit in a share of these bytes together: as many as can, the smallest first."""
+def fitting(sizes: Mapping[str, int], available: int, share: float = _MEMORY_SHARE) -> list[str]:
+    """Which of these bytes fit in a share of what is available: as many as can, smallest first."""
     left = int(available * share)
     names: list[str] = []
-    for name in sorted(arrays, key=lambda name: arrays[name].nbytes):
-        left -= arrays[name].nbytes
+    for name in sorted(sizes, key=lambda name: sizes[name]):
+        left -= sizes[name]
         if left >= 0:
             names.append(name)
     return names

@@ -12,12 +12,10 @@ import json
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import zarr
 from tqdm import tqdm
 
 from pipeline.base.differences import describe, differences
@@ -33,6 +31,7 @@ from pipeline.store.metadata import check_metadata
 from pipeline.store.paths import (
     MERGED,
     Inode,
+    group_attributes,
     inode_of,
     part_path,
     read_plan,
@@ -40,13 +39,13 @@ from pipeline.store.paths import (
     refuse_replaced,
 )
 from pipeline.store.reader import FeatureStore
-from pipeline.store.repair_hints import gc_command
 from pipeline.store.schema import (
     ARRAY_NAMES,
     CHECKSUMS,
     FEATURES,
     INCREMENTAL,
     KEYS,
+    POSITIONS,
     STREAMS,
     ArraySpec,
     read_spec,
@@ -56,8 +55,6 @@ from pipeline.store.writer import StoreBuild, environment_runs
 _COPIED = [
     name for name in ARRAY_NAMES if name.split("/")[0] in STREAMS and name not in INCREMENTAL
 ]
-_COUNTED = {stored.counted_by: stream for stream, stored in STREAMS.items()}
-"""Array of positions -> the stream among whose rows they are."""
 _BLOCK_BYTES = 32 * 2**20
 _NOT_TAKEN = (METADATA_DIGEST, GOLDEN)
 """Attributes of an input's root that would be false of the merged store."""
@@ -151,7 +148,7 @@ class MergedEpisodes:
         return int(self.arrays[f"episode/{stream}_start"][run.index]) - run.rows(stream).start
 
 
-def merge(inputs: Sequence[Path], output: Path) -> MergedEpisodes | None:
+def merge(inputs: Sequence[Path], output: Path | None) -> MergedEpisodes | None:
     """Make `output` of the episodes of all inputs, in their order; None where it is that already.
 
     An episode that several hold (equal digest) is taken once, from the first. Memory stays bounded;
@@ -161,7 +158,7 @@ def merge(inputs: Sequence[Path], output: Path) -> MergedEpisodes | None:
     differ or `output` holds something else, `StoreIncomplete` where an input is damaged,
     `StoreLocked` and `DiskFull`.
     """
-    _check_paths(inputs, output)
+    output = _checked_output(inputs, output)
     with build_lock(output):
         recover(output)
         inodes = [inode_of(path) for path in inputs]
@@ -176,8 +173,9 @@ def merge(inputs: Sequence[Path], output: Path) -> MergedEpisodes | None:
             print(f"{output}: up to date, nothing to do")
             return None
         _check_free(output, plan)
-        for path in inputs:
-            check_trailers(path)
+        for store in stores:
+            check_trailers(store.path)
+            store.array("tick/vl_row")  # which refuses positions of another episode
         with closing(StoreBuild(output, merged.specs, plan)) as build:
             if part == plan and build.layout_damage() is None:
                 print(f"continuing the interrupted build {build.part}")
@@ -189,7 +187,8 @@ def merge(inputs: Sequence[Path], output: Path) -> MergedEpisodes | None:
     return merged
 
 
-def _check_paths(inputs: Sequence[Path], output: Path) -> None:
+def _checked_output(inputs: Sequence[Path], output: Path | None) -> Path:
+    """The place of the merged store; raises `ConfigError` for paths that cannot be merged."""
     places = [path.resolve() for path in inputs]
     if len(places) < 2 or len(set(places)) < len(places):
         raise ConfigError(
@@ -197,22 +196,21 @@ def _check_paths(inputs: Sequence[Path], output: Path) -> None:
             f"{', '.join(map(str, inputs)) or 'none'}. "
             "Name them: python -m stages.store merge A.zarr B.zarr --into C.zarr"
         )
-    if output.suffix != ".zarr" or output.resolve() in places:
+    if output is None or output.suffix != ".zarr" or output.resolve() in places:
         raise ConfigError(
             f"stores.output: expected a new store whose name ends in .zarr, found {output}. "
-            "A finished store is never modified: choose another name for the merged one."
+            "A finished store is never modified: name another place with --into C.zarr."
         )
+    return output
 
 
 def _check_free(output: Path, plan: str) -> None:
     """Refuse where something else stands, or is being built, in the place of the output."""
-    for place in (output, part := part_path(output)):
+    for place in (output, part_path(output)):
         if read_plan(place) not in (None, plan):
-            what = "an unfinished build of something else" if place == part else "another store"
             raise StoreMismatch(
-                f"{place}: expected nothing there, or a merge of these very stores; found {what}. "
-                "Choose another name with --into, or remove it"
-                + (f": {gc_command(part)}" if place == part else ".")
+                f"{place}: expected nothing there, or a merge of these very stores; found another. "
+                "Choose another name with --into, or remove it."
             )
 
 
@@ -280,28 +278,26 @@ def _lay_out(build: StoreBuild, merged: MergedEpisodes, inodes: Sequence[Inode |
     for store, inode in zip(merged.stores, inodes, strict=True):
         refuse_replaced(store.path, inode)
     streams = {name: merged.having(name).streams[name] for name in ("sensor", "state")}
-    tuned = joined(of_store(store.attrs) for store in merged.stores)
+    tuned = joined(of_store(store.attrs, store.path) for store in merged.stores)
     its_own = {"sources": merged.sources, "streams": first.streams | streams, "environment": []}
     attrs = {name: value for name, value in first.attrs.items() if name not in _NOT_TAKEN}
-    vl = zarr.open_group(first.path, path="vl", mode="r").attrs.asdict()
-    build.finish_layout(attrs | its_own | store_attributes(tuned), vl)
+    of_vl = group_attributes(first.path / "vl")
+    build.finish_layout(attrs | its_own | store_attributes(tuned), of_vl)
 
 
 def _copy_rows(build: StoreBuild, name: str, merged: MergedEpisodes, run: EpisodeRun) -> None:
-    """Write rows of an input in blocks, those in linked chunks left out.
+    """Write rows of an input in blocks; those in linked chunks are there.
 
     Read with plain system calls: a file that was cut off is an error, not a SIGBUS.
     """
     stream = name.split("/")[0]
-    source, target, rows = read_spec(run.store.path, name), build.specs[name], run.rows(stream)
+    source, rows = read_spec(run.store.path, name), run.rows(stream)
     shift = merged.shift(run, stream)
-    chunks = takewhile(build.files(name).is_linked, range(target.chunk_count))
-    linked = sum(1 for _ in chunks) * target.chunk_rows
     step = max(1, _BLOCK_BYTES // max(1, source.row_bytes))
-    for start in range(max(rows.start, linked - shift), rows.stop, step):
+    for start in range(rows.start, rows.stop, step):
         values = read_rows(run.store.path, source, start, min(start + step, rows.stop))
-        if name in _COUNTED:
-            values += merged.shift(run, _COUNTED[name])
+        if name in POSITIONS:
+            values += merged.shift(run, POSITIONS[name])
         build.write(name, start + shift, values)
 
 
@@ -326,7 +322,7 @@ def _fill(build: StoreBuild, merged: MergedEpisodes) -> None:
                     start, stop = block.start, block.stop
                     values = read_rows(store.path, source, start, stop)
                     checksums = store.array(CHECKSUMS)[start:stop]
-                    check_row_checksums(store.path, source, start, values, checksums)
+                    check_row_checksums(store.path, source, block, values, checksums)
                     keys = [key.tobytes() for key in store.array(KEYS)[start:stop]]
                     build.commit(range(start + shift, stop + shift), values, keys, number)
                     progress.update(len(block))
@@ -334,10 +330,7 @@ def _fill(build: StoreBuild, merged: MergedEpisodes) -> None:
 
 def _golden(merged: MergedEpisodes) -> list[GoldenFrames]:
     """Golden rows of the merged store, chosen among those of the inputs and proven once more."""
-    inputs = {
-        store.path: read_golden(store.path, store.attrs, store.array(KEYS))
-        for store in merged.stores
-    }
+    inputs = {store.path: read_golden(store.path, store.array(KEYS)) for store in merged.stores}
     given = [
         replace(golden, row=golden.row + merged.shift(run, "vl"))
         for run in merged.runs

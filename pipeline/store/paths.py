@@ -1,13 +1,14 @@
 """Where a store lies, what lies beside it, and whether what lies there is one."""
 
-import json
 from pathlib import Path
 from typing import Any
 
+from pipeline.base.border import Border, shown
 from pipeline.base.durable import recover as recover_replaced
 from pipeline.base.errors import StoreIncomplete, StoreMismatch
 from pipeline.base.ownership import OutputKind, described, refuse_foreign, there
-from pipeline.store.repair_hints import extract_command, restore_command, start_over
+from pipeline.store.border import Group, StoreAttributes
+from pipeline.store.repair_hints import extract_command, mend, restore_command, start_over
 from pipeline.store.schema import SCHEMA
 
 MERGED = "merge-"
@@ -23,7 +24,7 @@ def part_path(target: Path) -> Path:
 
 def is_store(path: Path) -> bool:
     """Whether a store of this project, or a laid-out build of one, lies there."""
-    attributes = _attributes(path)
+    attributes = group_attributes(path)
     return "schema" in attributes and bool({"plan", "feature_spec"} & attributes.keys())
 
 
@@ -50,7 +51,7 @@ def read_plan(store: Path) -> str | None:
 
     Raises `StoreIncomplete` where there is one that has lost it.
     """
-    plan = _attributes(store).get("plan")
+    plan = group_attributes(store).get("plan")
     if not isinstance(plan, str) and is_store(store):
         raise StoreIncomplete(
             f"{store / 'zarr.json'}: the metadata no longer say what the store was made of. "
@@ -59,14 +60,27 @@ def read_plan(store: Path) -> str | None:
     return plan if isinstance(plan, str) else None
 
 
-def read_attributes(root: Path) -> dict[str, Any]:
+def read_attributes(root: Path) -> StoreAttributes:
     """The root attributes of a finished store.
+
+    Raises `StoreIncomplete` where one is missing or wrong, and what `find_attributes` does.
+    """
+    return StoreAttributes.of(root, find_attributes(root))
+
+
+def laid_out_attributes(root: Path) -> StoreAttributes:
+    """The root attributes of a store or a laid-out build, wherever it lies."""
+    return StoreAttributes.of(root, group_attributes(root))
+
+
+def find_attributes(root: Path) -> dict[str, Any]:
+    """The root attributes of a finished store, as they stand there: they may be wrong.
 
     Raises `StoreIncomplete` where there is none, only a build of it, one that lost them or
     something else, and `StoreMismatch` where it follows another schema or is an archive.
     """
     build = root.name.endswith(".part")  # which looks like a store until its files are read
-    attributes = {} if build else _attributes(root)
+    attributes = {} if build else group_attributes(root)
     if "archive" in attributes:
         raise StoreMismatch(
             f"{root}: expected a store, found an archive of one. Restore it first: "
@@ -79,12 +93,13 @@ def read_attributes(root: Path) -> dict[str, Any]:
         if part.exists():
             found = f"only the unfinished build {part}"
         elif there(root):
-            found, then = described(root), "It was left as it is: name another place."
+            found = f"{described(root)} and no zarr.json that says so"
+            then = f"It was left as it is: name another place, or, if it was one, {mend(root)}"
         raise StoreIncomplete(f"{root}: no finished store, found {found}. {then}")
     if attributes["schema"] != SCHEMA:
         raise StoreMismatch(
-            f"{root}: expected store schema {SCHEMA}, found {attributes['schema']!r}. "
-            "Extract it again with this version."
+            f"{root / 'zarr.json'}: expected store schema {SCHEMA}, found "
+            f"{shown(attributes['schema'])}. Extract it again with this version."
         )
     return attributes
 
@@ -110,15 +125,11 @@ def refuse_replaced(store: Path, before: Inode | None) -> None:
         )
 
 
-def _attributes(path: Path) -> dict[str, Any]:
-    """Those of the zarr group at `path`; none where there is no group."""
-    try:
-        document = json.loads((path / "zarr.json").read_text())
-    except (FileNotFoundError, NotADirectoryError):
+def group_attributes(path: Path) -> dict[str, Any]:
+    """Those of the zarr group at `path`; none where there is no group.
+
+    Raises `StoreIncomplete` where its metadata cannot be read.
+    """
+    if not (path / "zarr.json").exists():
         return {}
-    except (json.JSONDecodeError, UnicodeDecodeError):
-        raise StoreIncomplete(
-            f"{path / 'zarr.json'}: not a zarr group's metadata. {start_over(path)}"
-        ) from None
-    attributes = document.get("attributes") if isinstance(document, dict) else None
-    return attributes if isinstance(attributes, dict) else {}
+    return Border(StoreIncomplete, start_over(path)).read_json(path / "zarr.json", Group).attributes

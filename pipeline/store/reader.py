@@ -15,21 +15,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.bfloat16 import widen
-from pipeline.base.errors import StoreIncomplete
 from pipeline.base.golden import GoldenRow
-from pipeline.store.episodes import Episode, episode_of, read_episodes
+from pipeline.store.border import store_border
+from pipeline.store.episodes import (
+    Episode,
+    check_index,
+    check_positions,
+    episode_of,
+    read_episodes,
+)
 from pipeline.store.golden import GoldenFrames, read_golden
 from pipeline.store.mapping import map_flat
 from pipeline.store.paths import read_attributes
-from pipeline.store.repair_hints import mend
 from pipeline.store.schema import (
     FEATURES,
     KEYS,
+    POSITIONS,
     STREAMS,
     TRAILER_BYTES,
     ArraySpec,
+    check_agreement,
     chunk_paths,
     read_specs,
+    rows_of,
 )
 
 if TYPE_CHECKING:
@@ -66,16 +74,27 @@ class FeatureStore:
         it follows another schema.
         """
         root = Path(path)
-        attrs = read_attributes(root)
-        specs = read_specs(root)
-        return cls(root, attrs, {name: map_array(root, spec) for name, spec in specs.items()})
+        said, specs = read_attributes(root), read_specs(root)
+        check_agreement(root, said, specs)
+        arrays = {name: map_array(root, spec) for name, spec in specs.items()}
+        check_index(root, arrays, rows_of(specs))
+        return cls(root, said.raw, arrays)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return FeatureStore.open, (self.path,)
 
     def array(self, name: str) -> NDArray[Any]:
-        """Any array of the store by name, mapped; what is written into it is never kept."""
-        return self._arrays[name]
+        """Any array of the store by name, mapped; what is written into it is never kept.
+
+        Raises `StoreIncomplete` where positions of ticks are asked for and lie outside.
+        """
+        return (self._sound_arrays if name in POSITIONS else self._arrays)[name]
+
+    @cached_property
+    def _sound_arrays(self) -> Mapping[str, NDArray[Any]]:
+        """The arrays, once the positions that ticks hold were checked: that takes a read of all."""
+        check_positions(self.path, self._arrays)
+        return self._arrays
 
     @property
     def spec(self) -> dict[str, Any]:
@@ -139,7 +158,7 @@ class FeatureStore:
 
         Raises `StoreIncomplete` where the frames of one do not give its key.
         """
-        proven = read_golden(self.path, self.attrs, self._arrays[KEYS])
+        proven = read_golden(self.path, self._arrays[KEYS])
         return tuple(self._golden_row(frames) for frames in proven)
 
     def _golden_row(self, golden: GoldenFrames) -> GoldenRow:
@@ -157,7 +176,7 @@ class FeatureStore:
     @cached_property
     def episodes(self) -> tuple[Episode, ...]:
         """All episodes, in order."""
-        return read_episodes(self._arrays, self.sources)
+        return read_episodes(self.path, self._arrays, self.sources)
 
     def episode_of(self, ticks: NDArray[np.int64]) -> NDArray[np.int64]:
         """The index of the episode of each of these store-global ticks."""
@@ -171,7 +190,7 @@ class FeatureStore:
 
     def feature_age(self, ticks: NDArray[np.int64]) -> NDArray[np.float64]:
         """(tick,) s since the newest frame that the features of these ticks have seen."""
-        return self.gatherer.feature_age(ticks, self._arrays["tick/vl_row"][ticks])
+        return self.gatherer.feature_age(ticks, self.array("tick/vl_row")[ticks])
 
     def gather(
         self,
@@ -254,7 +273,7 @@ class FeatureStore:
         """What fills batches: their buffers, the maps behind them, the second half of `gather`."""
         from pipeline.store.gather import Gatherer
 
-        return Gatherer(self._arrays, self.variants)
+        return Gatherer(self._sound_arrays, self.variants)
 
 
 def episode_name(episode: Episode) -> str:
@@ -275,11 +294,9 @@ def place(store: FeatureStore, stream: str, row: int) -> str:
 
 def map_array(root: Path, spec: ArraySpec) -> NDArray[Any]:
     """The map of an array; `StoreIncomplete` where a chunk file has another size than it must."""
-    paths, wanted = chunk_paths(root, spec), f"{spec.chunk_bytes + TRAILER_BYTES} bytes"
+    paths, border = chunk_paths(root, spec), store_border(root)
+    wanted = spec.chunk_bytes + TRAILER_BYTES
     for path in paths:
-        actual = f"{path.stat().st_size} bytes" if path.exists() else "no file"
-        if actual != wanted:
-            raise StoreIncomplete(
-                f"{path}: expected {wanted}, found {actual}: the store is damaged. {mend(root)}"
-            )
+        if (actual := border.check_file(path)) != wanted:
+            raise border.refusal(path, f"expected {wanted:,} bytes, found {actual:,}")
     return map_flat(paths, spec.chunk_bytes, spec.shape, spec.dtype)

@@ -3,10 +3,11 @@
 Each names the store that was found damaged, which need not be that of params.yaml.
 """
 
-import json
 import re
 import shlex
 from pathlib import Path
+
+from pipeline.base.config import setting
 
 _STORE = re.compile(
     r"(?P<base>.+?\.zarr)(?P<unfinished>(?:\.repair)?\.part|\.known-\d+|\.previous)?"
@@ -15,7 +16,7 @@ _STORE = re.compile(
 
 def extract_command(store: Path) -> str:
     """Makes a store, or completes the build of it."""
-    return f"python -m stages.extract --set {_set('extract.store', store)}"
+    return f"python -m stages.extract {setting('extract.store', store)}"
 
 
 def gc_command(path: Path) -> str:
@@ -27,7 +28,7 @@ def restore_command(archive: Path) -> str:
     """Makes a store from its archive, beside it."""
     name = archive.stem.removesuffix(".archive")
     store = archive.with_name(f"{name if name != archive.stem else name + '.restored'}.zarr")
-    places = f"--set {_set('archive.output', archive)} --set {_set('archive.store', store)}"
+    places = f"{setting('archive.output', archive)} {setting('archive.store', store)}"
     return f"python -m stages.archive --restore {places}"
 
 
@@ -37,7 +38,7 @@ def mend(path: Path) -> str:
     if folder != store:
         return f"Remove it with {gc_command(folder)}, then run {extract_command(store)}."
     return (
-        f"Run python -m stages.verify --repair --set {_set('verify.store', store)}, which keeps "
+        f"Run python -m stages.verify --repair {setting('verify.store', store)}, which keeps "
         "what is sound, then what it says."
     )
 
@@ -60,9 +61,3 @@ def _owner(path: Path) -> tuple[Path, Path]:
         if found := _STORE.fullmatch(folder.name):
             return folder, folder.with_name(found["base"])
     return path, path
-
-
-def _set(key: str, path: Path) -> str:
-    """A value is YAML: what is more than a plain word has to be quoted for it, too."""
-    plain = re.fullmatch(r"[\w./+-]+", str(path))
-    return shlex.quote(f"{key}={path if plain else json.dumps(str(path))}")

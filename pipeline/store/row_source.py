@@ -6,13 +6,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import zarr
 from numpy.typing import NDArray
 
 from pipeline.base.errors import StoreIncomplete
+from pipeline.store.border import EpisodeText
 from pipeline.store.chunks import check_chunks, find_damage, read_rows, row_checksums
-from pipeline.store.episodes import read_texts
-from pipeline.store.schema import CHECKSUMS, FEATURES, KEYS, ArraySpec, read_specs
+from pipeline.store.episodes import check_index, read_texts
+from pipeline.store.paths import laid_out_attributes
+from pipeline.store.schema import (
+    CHECKSUMS,
+    FEATURES,
+    KEYS,
+    ArraySpec,
+    check_agreement,
+    read_specs,
+    rows_of,
+)
 from pipeline.store.writer import EnvironmentLog, environment_at
 
 
@@ -26,18 +35,10 @@ class RowSource:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.specs: dict[str, ArraySpec] = read_specs(path)
-        self.attrs: dict[str, Any] = zarr.open_group(path, mode="r").attrs.asdict()
+        self.said = laid_out_attributes(path)
+        """Its root attributes."""
+        check_agreement(path, self.said, self.specs)
         self._arrays: dict[str, NDArray[Any]] = {}
-
-    @cached_property
-    def episode_digests(self) -> list[str]:
-        """The digest of each episode, in order: equal digest, equal rows."""
-        return [text["digest"] for text in self._texts]
-
-    @cached_property
-    def episode_contents(self) -> list[str]:
-        """The content digest of each episode, in order: equal content, equal streams."""
-        return [text["content"] for text in self._texts]
 
     @cached_property
     def rows(self) -> dict[bytes, int]:
@@ -80,22 +81,25 @@ class RowSource:
     @cached_property
     def _episodes_by_text(self) -> dict[tuple[str, str], list[int]]:
         episodes = defaultdict[tuple[str, str], list[int]](list)
-        for index, text in enumerate(self._texts):
-            episodes[text["content"], text["instruction"]].append(index)
+        for index, text in enumerate(self.texts):
+            episodes[text.content, text.instruction].append(index)
         return episodes
 
     @cached_property
     def _environments(self) -> list[dict[str, Any]]:
         log = EnvironmentLog(self.path)
-        return log.ranges() if log.noted else self.attrs.get("environment", [])
+        return log.ranges() if log.noted else self.said.raw.get("environment", [])
 
     @cached_property
-    def _texts(self) -> list[dict[str, Any]]:
+    def texts(self) -> list[EpisodeText]:
+        """Of each episode, in order. Equal `digest`, equal rows; equal `content`, equal streams."""
         index = [name for name in self.specs if name.startswith("episode/")]
         read = [self.specs[name] for name in ("vl/frame_time", *index)]
         if not self._finished and find_damage(self.path, *read):
             return []  # rows are known by their keys alone, frame by frame
-        return read_texts({name: self._read(name) for name in index})
+        arrays = {name: self._read(name) for name in index}
+        check_index(self.path, arrays, rows_of(self.specs))
+        return read_texts(self.path, arrays)
 
     @property
     def _finished(self) -> bool:

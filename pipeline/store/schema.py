@@ -7,8 +7,9 @@ block that can be mapped.
 """
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +17,17 @@ import numpy as np
 import zarr
 from zarr.codecs import BytesCodec, Crc32cCodec
 
-from pipeline.base.errors import StoreIncomplete
-from pipeline.store.repair_hints import mend
+from pipeline.base.border import Border, shown
+from pipeline.base.differences import differences
+from pipeline.store.border import ArrayDocument, StoreAttributes, store_border
 
 SCHEMA = 1
 ROW_MULTIPLE = 4096
 CHUNK_BYTES = 64 * 2**20
 TRAILER_BYTES = 4
 KEY_BYTES = 16
+_MOST_CHUNK_BYTES = 2 * CHUNK_BYTES
+_MOST_ROW_BYTES = 2**26
 
 FEATURES, KEYS, CHECKSUMS = "vl/features", "vl/key", "vl/checksum"
 INCREMENTAL = (FEATURES, KEYS, CHECKSUMS)
@@ -53,17 +57,34 @@ STREAMS = {
 }
 
 
+POSITIONS = {stored.counted_by: stream for stream, stored in STREAMS.items() if stored.counted_by}
+"""Array of positions that ticks hold -> the stream among whose rows they are."""
+
+
 @dataclass(frozen=True)
 class ArraySpec:
-    """One array of a store: its name, shape, dtype and the names of its axes."""
+    """One array of a store: its name, shape and dtype."""
 
     name: str
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
-    dimensions: tuple[str, ...]
-    attributes: Mapping[str, Any] = field(default_factory=dict)
     stored_chunk_rows: int | None = None
     """As an array on disk is cut; None for one that follows the rule."""
+
+    @property
+    def dimensions(self) -> tuple[str, ...]:
+        """The names of its axes."""
+        return tuple(axis.removeprefix("key_") for axis in _ARRAYS[self.name][1:])
+
+    @property
+    def stored_dtype(self) -> str:
+        """The name of what its numbers are: only bfloat16 has another dtype in numpy."""
+        return "bfloat16" if self.attributes else self.dtype.name
+
+    @property
+    def attributes(self) -> dict[str, Any]:
+        """Those of the zarr array."""
+        return {"dtype": "bfloat16"} if self.dtype == np.uint16 else {}
 
     @property
     def row_bytes(self) -> int:
@@ -98,6 +119,25 @@ class ArraySpec:
         start = chunk * self.chunk_rows
         return range(start, min(start + self.chunk_rows, self.shape[0]))
 
+    @property
+    def document(self) -> dict[str, Any]:
+        """The `zarr.json` that `create` writes in a store."""
+        endian = {"configuration": {"endian": "little"}} if self.dtype.itemsize > 1 else {}
+        chunk_shape = [self.chunk_rows, *(max(1, size) for size in self.shape[1:])]
+        return {
+            "zarr_format": 3,
+            "node_type": "array",
+            "shape": [*self.shape],
+            "data_type": self.dtype.name,
+            "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": chunk_shape}},
+            "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
+            "codecs": [{"name": "bytes", **endian}, {"name": "crc32c"}],
+            "fill_value": 0,
+            "dimension_names": [*self.dimensions],
+            "attributes": self.attributes,
+            "storage_transformers": [],
+        }
+
     def create(self, root: Path | dict[str, Any], **otherwise: Any) -> "zarr.Array[Any]":
         """Write the array's zarr metadata below `root`; an archive cuts and packs it otherwise."""
         as_in_a_store: dict[str, Any] = {
@@ -113,7 +153,7 @@ class ArraySpec:
             filters=None,
             fill_value=0,
             dimension_names=self.dimensions,
-            attributes=dict(self.attributes),
+            attributes=self.attributes,
             **(as_in_a_store | otherwise),
         )
 
@@ -179,23 +219,11 @@ def arrays(sizes: Sizes, features_dtype: str, sensor_dtype: str) -> dict[str, Ar
     """Every array of a store, by name, in the order of the contract."""
     lengths = {**vars(sizes), "episode_edge": sizes.episode + 1, "key_byte": KEY_BYTES}
     chosen = {FEATURES: features_dtype, "sensor/values": sensor_dtype}
-    return {
-        name: array_spec(name, tuple(lengths[axis] for axis in axes), chosen.get(name))
-        for name, (_, *axes) in _ARRAYS.items()
-    }
-
-
-def array_spec(name: str, shape: tuple[int, ...], dtype: str | None = None) -> ArraySpec:
-    """An array as the contract says; `dtype` is one of `DTYPES` where params choose it."""
-    code, *axes = _ARRAYS[name]
-    bits = name == FEATURES and dtype == "bfloat16"
-    return ArraySpec(
-        name,
-        shape,
-        np.dtype("u2" if bits else code or dtype).newbyteorder("<"),
-        tuple(axis.removeprefix("key_") for axis in axes),
-        {"dtype": dtype} if bits else {},
-    )
+    specs: dict[str, ArraySpec] = {}
+    for name, (code, *axes) in _ARRAYS.items():
+        dtype = np.dtype(code or chosen[name].replace("bfloat16", "u2")).newbyteorder("<")
+        specs[name] = ArraySpec(name, tuple(lengths[axis] for axis in axes), dtype)
+    return specs
 
 
 def read_specs(root: Path) -> dict[str, ArraySpec]:
@@ -206,20 +234,94 @@ def read_specs(root: Path) -> dict[str, ArraySpec]:
 def read_spec(root: Path, name: str) -> ArraySpec:
     """An array of a store or a build as its metadata on disk say.
 
-    Raises `StoreIncomplete` where they are missing or cannot be read.
+    Raises `StoreIncomplete` where they cannot be read or are not as the contract says.
     """
-    try:
-        array = zarr.open_array(root, path=name, mode="r")
-    except (FileNotFoundError, ValueError, KeyError, TypeError) as error:
-        raise StoreIncomplete(
-            f"{root / name / 'zarr.json'}: not the metadata of a zarr array ({error}). {mend(root)}"
-        ) from None
-    names = getattr(array.metadata, "dimension_names", None) or ()
-    return ArraySpec(
-        name,
-        array.shape,
-        array.dtype,
-        tuple(str(axis) for axis in names),
-        array.attrs.asdict(),
-        stored_chunk_rows=array.chunks[0],
-    )
+    path, border = root / name / "zarr.json", store_border(root)
+    spec = array_of(border.read_json(path, dict[str, Any]), name, path, border)
+    if spec.chunk_count > _FEW:  # a shape can claim more chunks than could ever be counted
+        folder = root / name / "c"
+        there = len(os.listdir(folder)) if folder.is_dir() else 0
+        if spec.chunk_count > _FEW + 2 * there:
+            what = f"expected {spec.chunk_count:,} chunk files by the shape, found {there:,}"
+            raise border.refusal(path, what)
+    return spec
+
+
+_FEW = 64
+"""Chunk files that may be missing from an array without a look into its folder."""
+_MOST_TOLD = 5
+_CHOSEN = {FEATURES: ("float32", "float16", "uint16"), "sensor/values": ("float32", "float16")}
+"""The types of arrays whose type the params choose."""
+
+
+def array_of(document: dict[str, Any], name: str, where: Path | str, border: Border) -> ArraySpec:
+    """The array that metadata describe; refused where they are not as the contract says."""
+    found = border.parse(document, ArrayDocument, where)
+    code, *axes = _ARRAYS[name]
+    if len(found.shape) != len(axes):
+        raise border.refusal(where, f"expected the axes {axes}, found the shape {found.shape}")
+    allowed = _CHOSEN.get(name) or (np.dtype(code).name,)
+    dtype = found.data_type if found.data_type in allowed else allowed[0]
+    spec = ArraySpec(name, tuple(found.shape), np.dtype(dtype).newbyteorder("<"))
+    if spec.row_bytes > _MOST_ROW_BYTES:
+        what = f"expected rows of at most {_MOST_ROW_BYTES:,} bytes, found the shape {found.shape}"
+        raise border.refusal(where, what)
+    rows = found.chunk_rows
+    whole = max(1, math.ceil(spec.shape[0] / ROW_MULTIPLE)) * ROW_MULTIPLE
+    most = max(ROW_MULTIPLE, _MOST_CHUNK_BYTES // max(1, spec.row_bytes))
+    if 0 < rows <= min(whole, most) and rows % ROW_MULTIPLE == 0:
+        spec = replace(spec, stored_chunk_rows=rows)
+    if document != spec.document:
+        first = [*differences(spec.document, document).items()][:_MOST_TOLD]
+        lines = [f"expected the {key} {a}, found {shown(b)}" for key, (a, b) in first]
+        raise border.refusal(where, "; ".join(lines))
+    return spec
+
+
+def disagreements(specs: Mapping[str, ArraySpec]) -> Iterator[tuple[str, str]]:
+    """The arrays that have another length along an axis than the others, and what is wrong.
+
+    Those that hold nothing but positions are believed.
+    """
+    lengths = {"key_byte": KEY_BYTES}
+    for name in [name for name in reversed(ARRAY_NAMES) if name in specs]:
+        for axis, length in zip(_ARRAYS[name][1:], specs[name].shape, strict=True):
+            edge = axis == "episode_edge"
+            wanted = lengths.setdefault("episode" if edge else axis, length - edge) + edge
+            if length != wanted:
+                yield name, f"expected the shape to have {wanted} along {axis}, found {length}"
+                break
+
+
+def rows_of(specs: Mapping[str, ArraySpec]) -> dict[str, int]:
+    """The rows of each stream, and the bytes of all texts."""
+    rows = {stream: specs[f"{stream}/time"].shape[0] for stream in STREAMS}
+    return rows | {"text": specs["episode/text"].shape[0]}
+
+
+def check_agreement(
+    root: Path, said: StoreAttributes, specs: Mapping[str, ArraySpec], border: Border | None = None
+) -> None:
+    """Raise `StoreIncomplete` where the arrays of a store do not fit each other, or its attributes
+    say other widths than they have."""
+    border = border or store_border(root)
+    for name, what in disagreements(specs):
+        raise border.refusal(root / name / "zarr.json", what)
+    streams, spec = said.streams, said.feature_spec
+    pairs = {
+        "streams.action.names": (streams.action.names, specs["tick/action"].shape[1]),
+        "streams.action.units": (streams.action.units, specs["tick/action"].shape[1]),
+        "streams.sensor.names": (streams.sensor.names, specs["sensor/values"].shape[1]),
+        "streams.sensor.units": (streams.sensor.units, specs["sensor/values"].shape[1]),
+        "streams.state.names": (streams.state.names, specs["state/values"].shape[1]),
+        "streams.state.units": (streams.state.units, specs["state/values"].shape[1]),
+        "streams.views": (streams.views, specs["vl/frame_time"].shape[1]),
+        "feature_spec.slots": (spec.slots, specs[FEATURES].shape[1]),
+    }
+    wrong = [f"{at}: expected {n}, found {len(k)}" for at, (k, n) in pairs.items() if len(k) != n]
+    if len(spec.slots) % spec.variants:
+        wrong.append(f"feature_spec.variants: expected a divisor of {len(spec.slots)} slots")
+    rows = specs[FEATURES].shape[0]
+    wrong += [f"golden: row {one.row} of {rows}" for one in said.golden if one.row >= rows]
+    if wrong:
+        raise border.refusal(root / "zarr.json", "; ".join(wrong))

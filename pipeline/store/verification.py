@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -19,40 +19,43 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 from tqdm import tqdm
+from zarr.buffer import cpu
+from zarr.storage import MemoryStore
 
-from pipeline.base.differences import differences
 from pipeline.base.errors import StoreIncomplete
 from pipeline.base.finite import non_finite
 from pipeline.base.format import size
 from pipeline.base.issue import Issue
+from pipeline.store.border import StoreAttributes, store_border
 from pipeline.store.chunks import find_damage, read_chunk, read_rows, row_checksums
-from pipeline.store.golden import golden_files, golden_issues
+from pipeline.store.episodes import check_index, check_positions
+from pipeline.store.golden import GOLDEN, golden_files, golden_issues
 from pipeline.store.metadata import metadata_damage
-from pipeline.store.paths import Inode, inode_of, read_attributes, read_plan, refuse_replaced
+from pipeline.store.paths import Inode, find_attributes, inode_of, read_plan, refuse_replaced
 from pipeline.store.reader import FeatureStore, map_array, place
-from pipeline.store.repair_hints import mend
 from pipeline.store.schema import (
     ARRAY_NAMES,
     CHECKSUMS,
     FEATURES,
     GROUPS,
     KEYS,
-    ROW_MULTIPLE,
+    POSITIONS,
     STREAMS,
     ArraySpec,
-    array_spec,
+    check_agreement,
     chunk_path,
     chunk_paths,
+    disagreements,
     read_spec,
+    rows_of,
 )
 
 MOST_LINES = 20
 """Of one kind that are shown; the rest is counted."""
-SOUND, UNREADABLE, UNWRITTEN, CHANGED, NOT_FINITE = range(5)
+SOUND, UNREADABLE, CHANGED, NOT_FINITE = range(4)
 FAULTS = (
     "",
     "not in its file",
-    "was never written (its checksum is 0)",
     "its bytes do not give its checksum",
     "NaN or infinity",
 )
@@ -92,6 +95,8 @@ class Verification:
     """Of metadata, chunk files and feature rows, `stream` being the array, and strange files."""
     bad_rows: NDArray[np.int64]
     """The VL rows whose features cannot be used, ascending."""
+    environments: Sequence[Mapping[str, Any]]
+    """With which software and hardware which rows were computed, where the store says it."""
 
     @property
     def sound(self) -> bool:
@@ -116,12 +121,6 @@ class Verification:
             by_kind.setdefault(issue.kind, []).append(line)
         return [line for kind, lines in by_kind.items() for line in capped(lines, f"of {kind}")]
 
-    def advice(self) -> str:
-        """For people: what to run next."""
-        if all(issue.kind == "strange file" for issue in self.issues):
-            return "All that was stored is sound: look at these files and remove them."
-        return mend(self.store)
-
     def summary(self) -> str:
         """For people: how much was checked, how fast."""
         return (
@@ -139,11 +138,18 @@ def verify(path: Path, threads: int, workers: int | str = 0) -> Verification:
     an archive or was replaced meanwhile, `ConfigError` where no scheduler answers at the address.
     """
     begun, inode = time.monotonic(), inode_of(path)
-    attributes = read_attributes(path)
+    attributes = find_attributes(path)
     read_plan(path)  # without one, nothing of it can be kept
     specs, issues = read_arrays(path)
-    if not issues and (what := metadata_damage(path)):
-        issues.append(_metadata_issue(path, what))
+    said = None
+    try:
+        said = StoreAttributes.of(path, attributes)
+        if not issues and (what := metadata_damage(path)):
+            issues.append(_metadata_issue(path, what))
+        if not issues:
+            check_agreement(path, said, specs)
+    except StoreIncomplete as error:
+        issues.append(_metadata_issue(path, str(error)))
     checks = [
         partial(check_chunk, path, specs, name, chunk)
         for name, spec in specs.items()
@@ -166,13 +172,23 @@ def verify(path: Path, threads: int, workers: int | str = 0) -> Verification:
     reports.sort(key=lambda report: (ARRAY_NAMES.index(report.array), report.rows.start))
     # Rows are named by episode and time, where that part of the store is sound.
     names = [name for name in specs if name.startswith("episode/") or name.endswith("/time")]
+    names += POSITIONS
     store = None
     if not issues and not any(report.damage for report in reports if report.array in names):
         maps = {name: map_array(path, specs[name]) for name in names}
-        store = FeatureStore(path, attributes, maps)
+        try:
+            check_index(path, maps, rows_of(specs))
+            check_positions(path, maps)
+            store = FeatureStore(path, attributes, maps)
+            _ = store.episodes
+        except StoreIncomplete as error:
+            store = None
+            issues.append(_metadata_issue(path, str(error)))
     issues += [issue for report in reports for issue in _issues(report, specs[report.array], store)]
-    issues += golden_issues(path, attributes, specs.get(KEYS))
-    issues += strange_files(path, specs, golden_files(path, attributes))
+    if said is not None:
+        issues += golden_issues(path, said, specs.get(KEYS))
+    issues += strange_files(path, specs, golden_files(path, said) if said else None)
+    issues += [*_strange_to_zarr(path, issues)]
     refuse_replaced(path, inode)
     bad_rows = [report.rows.start + np.flatnonzero(report.faults) for report in reports]
     return Verification(
@@ -183,6 +199,7 @@ def verify(path: Path, threads: int, workers: int | str = 0) -> Verification:
         seconds=time.monotonic() - begun,
         issues=tuple(issues),
         bad_rows=np.concatenate([np.zeros(0, np.int64), *bad_rows]),
+        environments=said.raw.get("environment", []) if said else [],
     )
 
 
@@ -190,19 +207,15 @@ def read_arrays(root: Path) -> tuple[dict[str, ArraySpec], list[Issue]]:
     """The arrays whose metadata can be read and are as the contract says, and what is not."""
     specs: dict[str, ArraySpec] = {}
     issues: list[Issue] = []
-    lengths: dict[str, int] = {}
-    # The arrays that hold nothing but positions come last, and say how long the others must be.
-    for name in reversed(ARRAY_NAMES):
+    for name in ARRAY_NAMES:
         try:
-            spec = read_spec(root, name)
-            wrong = list(_differences(root, spec, lengths))
+            specs[name] = read_spec(root, name)
         except StoreIncomplete as error:
-            wrong = [str(error)]
-        else:
-            if not wrong:
-                specs[name] = spec
-        issues += [_metadata_issue(root, what, name) for what in wrong]
-    return {name: specs[name] for name in ARRAY_NAMES if name in specs}, issues
+            issues.append(_metadata_issue(root, str(error), name))
+    for name, what in [*disagreements(specs)]:
+        issues.append(_metadata_issue(root, what, name))
+        del specs[name]
+    return specs, issues
 
 
 def check_chunk(root: Path, specs: Mapping[str, ArraySpec], array: str, chunk: int) -> ChunkReport:
@@ -218,7 +231,7 @@ def check_chunk(root: Path, specs: Mapping[str, ArraySpec], array: str, chunk: i
             faults[first : first + len(values)] = judged
 
     file = read_chunk(path, spec, judge)
-    by_checksum = (faults == UNWRITTEN) | (faults == CHANGED)
+    by_checksum = faults == CHANGED
     # Where their checksums are lost, those of a sound file are good.
     if not file.damage and by_checksum.any():
         lost = CHECKSUMS not in specs or find_damage(root, specs[CHECKSUMS])
@@ -245,9 +258,7 @@ def _judge_rows(
         valid = np.ones(features.shape[:2], np.uint8)
     broken = (non_finite(features).any(axis=2) & (valid != 0)).any(axis=1)
     changed = checksums != row_checksums(features)
-    return np.select(
-        [broken, checksums == 0, changed], [NOT_FINITE, UNWRITTEN, CHANGED], default=SOUND
-    )
+    return np.select([broken, changed], [NOT_FINITE, CHANGED], default=SOUND)
 
 
 def capped(lines: Sequence[str], kind: str) -> list[str]:
@@ -257,40 +268,45 @@ def capped(lines: Sequence[str], kind: str) -> list[str]:
 
 
 def strange_files(
-    root: Path, specs: Mapping[str, ArraySpec], golden: Collection[Path] = ()
+    root: Path, specs: Mapping[str, ArraySpec], golden: Collection[Path] | None
 ) -> Iterator[Issue]:
-    """Files that have no place in a store; `golden` are those of its golden rows."""
-    expected = {*golden} | {root / place / "zarr.json" for place in ("", *GROUPS, *ARRAY_NAMES)}
+    """Files that have no place in a store; `golden` are those of its golden rows, None where it
+    does not say which these are."""
+    expected = {*(golden or ())} | {
+        root / place / "zarr.json" for place in ("", *GROUPS, *ARRAY_NAMES)
+    }
     expected |= {path for spec in specs.values() for path in chunk_paths(root, spec)}
-    unjudged = tuple(str(root / name) + "/" for name in ARRAY_NAMES if name not in specs)
+    not_told = [GOLDEN] if golden is None else []
+    unjudged = [*(name for name in ARRAY_NAMES if name not in specs), *not_told]
+    prefixes = tuple(f"{root / name}/" for name in unjudged)
     files = (Path(folder) / file for folder, _, names in os.walk(root) for file in names)
     for path in sorted(files):
-        if path not in expected and not str(path).startswith(unjudged):
+        if path not in expected and not str(path).startswith(prefixes):
             what = "has no place in a store, look at it and remove it"
             yield _Error(kind="strange file", message=what, file=path)
 
 
-def _differences(root: Path, spec: ArraySpec, lengths: dict[str, int]) -> Iterator[str]:
-    """Where the metadata of an array depart from the contract, and from `lengths` by axis."""
-    allowed = ("float32", "float16", *(["bfloat16"] if spec.name == FEATURES else []))
-    stored = spec.attributes.get("dtype", spec.dtype.name)
-    dtype = stored if stored in allowed else "float32"
-    chunk_rows = None if spec.chunk_rows % ROW_MULTIPLE else spec.chunk_rows
-    contract = array_spec(spec.name, spec.shape, dtype)
-    if len(contract.dimensions) != len(spec.shape):
-        yield f"expected the axes {contract.dimensions}, found the shape {spec.shape}"
-        return
-    expected = replace(contract, stored_chunk_rows=chunk_rows).create({}).metadata.to_dict()
-    actual = zarr.open_array(root, path=spec.name, mode="r").metadata.to_dict()
-    for key, (wanted, found) in differences(expected, actual).items():
-        yield f"expected the {key} {wanted}, found {found}"
-    for axis, length in zip(contract.dimensions, spec.shape, strict=True):
-        if axis != "byte" and lengths.setdefault(axis, length) != length:
-            yield f"expected the shape to have {lengths[axis]} along {axis}, found {length}"
+def _strange_to_zarr(root: Path, issues: Sequence[Issue]) -> Iterator[Issue]:
+    """Documents that zarr itself cannot open, where nothing else is said of them.
+
+    Each alone, out of memory: beside it may lie one that is a pipe, for whose end zarr would wait.
+    """
+    known = " ".join(f"{issue.file} {issue.message}" for issue in issues)
+    border = store_border(root)
+    for document in sorted(path for path in root.rglob("zarr.json") if str(path) not in known):
+        try:
+            alone = MemoryStore({document.name: cpu.Buffer.from_bytes(border.read_bytes(document))})
+            with border.foreign(document, "zarr cannot open it"):
+                if isinstance(node := zarr.open(alone, mode="r"), zarr.Group):
+                    _ = [*node.members()]  # of what it holds beside its own
+        except StoreIncomplete as error:
+            yield _metadata_issue(root, str(error))
 
 
 def _metadata_issue(root: Path, what: str, array: str = "") -> Issue:
-    return _Error(kind="metadata", message=what, stream=array, file=root / array / "zarr.json")
+    file = root / array / "zarr.json"
+    said = what.removeprefix(f"{file}: ")
+    return _Error(kind="metadata", message=said, stream=array, file=file)
 
 
 def _run(checks: Sequence[Callable[[], ChunkReport]], threads: int) -> Generator[ChunkReport]:

@@ -24,10 +24,11 @@ from numpy.typing import NDArray
 from pipeline.base.durable import disk_full_named, put_in_place, sync
 from pipeline.base.errors import StoreIncomplete
 from pipeline.base.ownership import begin_folder
+from pipeline.store.border import store_border
 from pipeline.store.chunks import ChunkFiles, find_damage, read_chunk, read_rows, row_checksums
 from pipeline.store.golden import GoldenFrames, write_golden
 from pipeline.store.metadata import metadata_damage, note_metadata
-from pipeline.store.paths import STORE, part_path
+from pipeline.store.paths import STORE, group_attributes, part_path
 from pipeline.store.schema import CHECKSUMS, FEATURES, INCREMENTAL, KEYS, ArraySpec, chunk_path
 
 Rows = Sequence[int] | NDArray[np.int64]
@@ -88,6 +89,9 @@ class EnvironmentLog:
         numbers = np.fromfile(self._of_row, "<u2") if self._of_row.exists() else np.zeros(0, "<u2")
         for run in np.split(numbers, np.flatnonzero(np.diff(numbers)) + 1):
             if len(run):
+                if run[0] >= len(known):
+                    what = f"expected the environment of number {run[0]}, found {len(known)}"
+                    raise store_border(self._listed.parent).refusal(self._listed, what)
                 ranges.append({"rows": [start, start + len(run)], **known[run[0]]})
                 start += len(run)
         return ranges
@@ -98,7 +102,9 @@ class EnvironmentLog:
             path.unlink(missing_ok=True)
 
     def _known(self) -> list[dict[str, Any]]:
-        return json.loads(self._listed.read_text()) if self._listed.exists() else []
+        known = list[dict[str, Any]]
+        border = store_border(self._listed.parent)
+        return border.read_json(self._listed, known) if self._listed.exists() else []
 
 
 class StoreBuild:
@@ -227,26 +233,18 @@ class StoreBuild:
         for run in runs:
             self.files(CHECKSUMS).write(int(rows[run[0]]), checksums[run])
 
-    def write_golden(
-        self, rows: Iterable[GoldenFrames], instead: Sequence[GoldenFrames] = ()
-    ) -> int:
+    def write_golden(self, rows: Iterable[GoldenFrames]) -> int:
         """Keep the golden rows that give the key of their row; returns how many do not.
 
-        For each that does not, the next of `instead` is kept, which are proven. For a build whose
-        rows are all there. Raises `DiskFull`.
+        For a build whose rows are all there. Raises `DiskFull`.
         """
-        attributes: dict[str, Any] = zarr.open_group(self.part, mode="r").attrs.asdict()
-        files = self.files(KEYS)
+        spec, files = group_attributes(self.part)["feature_spec"], self.files(KEYS)
         given = list(rows)
         proven = [
-            golden
-            for golden in given
-            if golden.key(attributes["feature_spec"]) == files.read(golden.row, 1).tobytes()
+            golden for golden in given if golden.key(spec) == files.read(golden.row, 1).tobytes()
         ]
-        left_out = len(given) - len(proven)
-        kept = [*proven, *instead[:left_out]]
-        write_golden(self.part, sorted(kept, key=lambda golden: golden.row))
-        return left_out
+        write_golden(self.part, sorted(proven, key=lambda golden: golden.row))
+        return len(given) - len(proven)
 
     def seal(self, *, keep: bool = False) -> None:
         """Check every row, write the trailers and put the store in its place.
@@ -278,9 +276,8 @@ class StoreBuild:
             ) from None
         with disk_full_named(self.part):
             if self._environments.noted:
-                attributes = zarr.open_group(self.part, mode="r").attrs.asdict()
-                ranges = self._environments.ranges()
-                note_metadata(self.part, attributes | {"environment": ranges})
+                ranges = {"environment": self._environments.ranges()}
+                note_metadata(self.part, group_attributes(self.part) | ranges)
             self._environments.remove()
         for partial in self.part.rglob("*.partial"):  # of a write that was killed
             partial.unlink()

@@ -160,8 +160,8 @@ def choose_feed(
     if free is None:
         on_gpu = device.type == "cuda"
         free = torch.cuda.mem_get_info(device)[0] if on_gpu else available_bytes()
-    maps = {name: store.gatherer.tensor(name) for name in WIDE}
-    wide = {name: tensor for name, tensor in maps.items() if tensor.nbytes}
+    sizes = {name: store.gatherer.tensor(name).nbytes for name in WIDE}
+    wide = {name: count for name, count in sizes.items() if count}
     fields = fitting(wide, free, _DEVICE_SHARE)
     room = (
         f"{_DEVICE_SHARE:.0%} of the {size(free)} free on {device} hold "

@@ -1,75 +1,64 @@
 """What going on with a run takes beyond its policy, as safetensors and JSON, and the way back."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Annotated, Any
 
 import torch
+from pydantic import Field
 from torch import Tensor, nn
 
+from pipeline.base.border import Document, Text
 from pipeline.base.differences import describe, differences
-from pipeline.base.durable import (
-    damaged,
-    read_document,
-    read_tensors,
-    write_tensors,
-    write_with_digest,
-)
-from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch
+from pipeline.base.durable import read_document, read_tensors, write_tensors, write_with_digest
+from pipeline.base.errors import CheckpointMismatch
 from pipeline.policy.checkpoint import load_policy
+from pipeline.policy.document import Sha256
 from pipeline.policy.normalization import Normalization
 from pipeline.policy.observation import PolicyShape
-from pipeline.train.log import Row
 from pipeline.train.run import TRAINER_DOCUMENT, TRAINER_WEIGHTS, TrainingRun
 from pipeline.train.world import World
 
 
-@dataclass(frozen=True)
-class TrainerState:
-    """A run after `step` steps.
+class TrainerState(Document):
+    """A run after `step` steps, as `trainer.json` has it.
 
     There is no random state and no schedule state in it: both follow from the seed and the step.
     """
 
-    step: int
-    columns: Sequence[str]
+    step: Annotated[int, Field(ge=0)]
+    columns: tuple[Text, ...]
     """Of the history."""
     best_error: float | None
-    stalled: int
+    stalled: Annotated[int, Field(ge=0)]
     """Evaluations since the best one."""
-    trained_s: float
+    trained_s: Annotated[float, Field(ge=0)]
     """Seconds of training so far, over all starts."""
-    rows: Sequence[Row]
-    tensors: Mapping[str, Tensor]
-    """What learns (`weights:<name in the trained module>`), the moving `average:` of each, the
-    `optimizer:` state and the `history:`, a row for every step so far."""
-
-    def part(self, kind: str) -> dict[str, Tensor]:
-        """The tensors of one kind, by name."""
-        return {
-            key.removeprefix(f"{kind}:"): value
-            for key, value in self.tensors.items()
-            if key.startswith(f"{kind}:")
-        }
+    rows: tuple[tuple[int, dict[Text, float]], ...]
+    weights_sha256: Sha256
 
 
-def write_trainer(folder: Path, state: TrainerState) -> None:
-    """Write the two files of a trainer's state into an existing folder."""
-    document = {key: value for key, value in vars(state).items() if key != "tensors"}
-    document["weights_sha256"] = write_tensors(folder / TRAINER_WEIGHTS, state.tensors)
-    write_with_digest(folder / TRAINER_DOCUMENT, document)
+def write_trainer(folder: Path, state: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
+    """Write the two files of a trainer's state into an existing folder.
+
+    `state` has the fields of `TrainerState` but for the digest. `tensors` are what learns
+    (`weights:<name in the trained module>`), the moving `average:` of each, the `optimizer:` state
+    and the `history:`, a row for every step so far.
+    """
+    digest = write_tensors(folder / TRAINER_WEIGHTS, tensors)
+    write_with_digest(folder / TRAINER_DOCUMENT, {**state, "weights_sha256": digest})
 
 
-def read_trainer(folder: Path) -> TrainerState:
+def read_trainer(folder: Path) -> tuple[TrainerState, dict[str, Tensor]]:
     """The state at `folder`; `CheckpointIncomplete` where a file is missing or damaged."""
-    path = folder / TRAINER_DOCUMENT
-    try:
-        document = read_document(path)
-        tensors = read_tensors(folder / TRAINER_WEIGHTS, document.pop("weights_sha256"))
-        return TrainerState(**document, tensors=tensors)
-    except (KeyError, TypeError) as error:
-        why = f"not what it must hold ({type(error).__name__}: {error})"
-        raise CheckpointIncomplete(damaged(path, why)) from None
+    state, _ = read_document(folder / TRAINER_DOCUMENT, TrainerState)
+    return state, read_tensors(folder / TRAINER_WEIGHTS, state.weights_sha256)
+
+
+def of_kind(tensors: Mapping[str, Tensor], kind: str) -> dict[str, Tensor]:
+    """The tensors of one kind, by name."""
+    kind += ":"
+    return {k.removeprefix(kind): value for k, value in tensors.items() if k.startswith(kind)}
 
 
 @torch.no_grad()
@@ -92,7 +81,9 @@ def load_weights(
         parameter.copy_(tensors[name])
 
 
-def read_last(run: TrainingRun, world: World) -> tuple[Normalization, PolicyShape, TrainerState]:
+def read_last(
+    run: TrainingRun, world: World
+) -> tuple[Normalization, PolicyShape, TrainerState, dict[str, Tensor]]:
     """What a run goes on from, read on rank 0 and sent to the others.
 
     Raises `CheckpointIncomplete` or `CheckpointMismatch`.
@@ -100,10 +91,9 @@ def read_last(run: TrainingRun, world: World) -> tuple[Normalization, PolicyShap
     tensors: dict[str, Tensor] = {}
 
     def read() -> tuple[Normalization, PolicyShape, TrainerState]:
-        checkpoint, state = load_policy(run.last), read_trainer(run.last)
-        tensors.update(state.tensors)
-        # Tensors are not pickled with the rest, but sent one by one.
-        return checkpoint.normalization, checkpoint.shape, replace(state, tensors={})
+        checkpoint = load_policy(run.last)
+        state, own = read_trainer(run.last)
+        tensors.update(own)  # not pickled with the rest, but sent one by one
+        return checkpoint.normalization, checkpoint.shape, state
 
-    normalization, shape, state = world.shared(read)
-    return normalization, shape, replace(state, tensors=world.tensors(tensors))
+    return *world.shared(read), world.tensors(tensors)

@@ -222,18 +222,15 @@ def _run_id(path: Path, resumed: bool) -> str:
 
 def check_loggers(params: TrainHeadParams) -> None:
     """Raise `ConfigError` where a logger's package is not installed or does not load."""
-    troubles: list[str] = []
     for name in params.loggers:
         try:
             import_module(_MODULES[name])
         except ImportError as error:
-            troubles.append(f"{name} ({error})")
-    if troubles:
-        raise ConfigError(
-            "train_head.loggers: expected the package of each logger, cannot load "
-            f"{', '.join(troubles)}. Run pip install 'vla-feature-cache[loggers]', in a checkout "
-            "pip install -e '.[loggers]', or set train_head.loggers=[]."
-        )
+            raise ConfigError(
+                f"train_head.loggers: cannot load the package of {name} ({error}). Run pip install "
+                "'vla-feature-cache[loggers]', in a checkout pip install -e '.[loggers]', or set "
+                "train_head.loggers=[]."
+            ) from None
 
 
 def open_loggers(params: TrainHeadParams, resumed: bool) -> list[Logger]:

@@ -22,7 +22,7 @@ from pipeline.policy.observation import moving_channels
 from pipeline.policy.policy import Policy, Trainable
 from pipeline.store import Batch, FeatureStore
 from pipeline.train.batches import BatchIndices, Windows, choose_feed, evenly
-from pipeline.train.checkpoints import TrainerState, load_weights, read_last, write_trainer
+from pipeline.train.checkpoints import load_weights, of_kind, read_last, write_trainer
 from pipeline.train.feature_source import FeatureSource
 from pipeline.train.log import History, Row, TrainingLog, open_log
 from pipeline.train.optimizer import (
@@ -35,10 +35,11 @@ from pipeline.train.optimizer import (
     schedule,
     trainable,
 )
+from pipeline.train.predictions import predict
 from pipeline.train.progress import Progress, describe_data, peak_memory_bytes
 from pipeline.train.run import TrainingRun, policy_shape
 from pipeline.train.sampling import Plan, StepPart
-from pipeline.train.scores import evaluate_policy
+from pipeline.train.scores import action_space, compare
 from pipeline.train.split import Split, source_of, split_parts
 from pipeline.train.statistics import fit_normalization
 from pipeline.train.world import World, deferred_interrupt, process_device
@@ -86,9 +87,14 @@ class Trainer:
         self._earlier: Sequence[Row] = ()
         self._trained_s = 0.0
         if run.status == "resumed":
-            self.normalization, self.shape, state = read_last(run, self.world)
+            self.normalization, self.shape, state, tensors = read_last(run, self.world)
             self._build()
-            self._restore(state)
+            load_weights(self.learning, of_kind(tensors, "weights"), run.last)
+            load_weights(self.average.weights, of_kind(tensors, "average"), run.last)
+            restore_optimizer(self.optimizer, self.module, of_kind(tensors, "optimizer"))
+            self.history = History(state.columns, tensors["history:"])
+            self.stopping.best_error, self.stopping.stalled = state.best_error, state.stalled
+            self.step, self._earlier, self._trained_s = state.step, state.rows, state.trained_s
         else:
             windows = Windows.of(params)
             fitted = partial(fit_normalization, store, split.train, windows)
@@ -112,7 +118,8 @@ class Trainer:
         self.optimizer = make_optimizer(self.module, params, rates)
         self.average = WeightAverage(self.module, params.ema_decay)
         self._bfloat16 = use_bfloat16(params.amp, self.device)
-        self._terminal = TerminalStop(self.store, self.device) if params.terminal_stop else None
+        moves = moving_channels(self.store.streams["action"])
+        self._moves = torch.tensor(moves, device=self.device)
         self._compiled = compiled(self.module.loss, self.device) if params.compile else None
 
     @property
@@ -229,8 +236,8 @@ class Trainer:
         # Dropout and sampled noise of a part depend on nothing that came before it.
         torch.manual_seed(part.seed)
         action, valid = batch.action, batch.action_valid
-        if self._terminal is not None:
-            action, valid = self._terminal.extend(action, valid)
+        if self.params.terminal_stop:
+            action, valid = stand_still(action, valid, self._moves)
         loss_of = self._compiled or self.module.loss
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self._bfloat16):
             loss, parts = loss_of(batch, action, valid)
@@ -277,16 +284,16 @@ class Trainer:
         if not len(ticks):
             return {}
         windows = Windows.of(self.params)
-        comparison, _ = evaluate_policy(
+        predictions = predict(
             self.averaged,
             self.store,
             ticks,
             windows,
             self.params.batch_size,
-            self.normalization,
             samples=self.params.eval_samples,
             feed=lambda plan: self.source.feed(plan, windows, self.device),
         )
+        comparison = compare(predictions, {}, action_space(self.store, self.normalization))
         metrics = {"val/error": comparison.overall("policy")} | {
             f"val/{group.key}": comparison.error("policy", group) for group in comparison.groups
         }
@@ -318,22 +325,25 @@ class Trainer:
                 ("optimizer", optimizer_tensors(self.optimizer, self.module)),
             ):
                 tensors |= {f"{kind}:{name}": value for name, value in named.items()}
-            state = TrainerState(
-                step=self.step,
-                columns=self.history.columns,
-                best_error=self.stopping.best_error,
-                stalled=self.stopping.stalled,
-                trained_s=progress.trained_s,
-                rows=log.rows,
-                tensors=tensors,
-            )
-            self._save(self.run.last, {"train/loss": self.history.last("loss")}, state)
+            state = {
+                "step": self.step,
+                "columns": self.history.columns,
+                "best_error": self.stopping.best_error,
+                "stalled": self.stopping.stalled,
+                "trained_s": progress.trained_s,
+                "rows": log.rows,
+            }
+            write_state = partial(write_trainer, state=state, tensors=tensors)
+            self._save(self.run.last, {"train/loss": self.history.last("loss")}, write_state)
 
         with progress.paused():
             self.world.shared(save)
 
     def _save(
-        self, folder: Path, metrics: Mapping[str, float], state: TrainerState | None = None
+        self,
+        folder: Path,
+        metrics: Mapping[str, float],
+        write_state: Callable[[Path], None] = lambda folder: None,
     ) -> None:
         """Put the averaged weights into a checkpoint folder. Raises `DiskFull`."""
         checkpoint = PolicyCheckpoint(
@@ -353,39 +363,22 @@ class Trainer:
             self.source.save(temporary, self.averaged)
             for path in temporary.rglob("*"):
                 sync(path)
-            if state is not None:
-                write_trainer(temporary, state)
+            write_state(temporary)
 
         save_policy(folder, checkpoint, beside=write_beside)
 
-    def _restore(self, state: TrainerState) -> None:
-        load_weights(self.learning, state.part("weights"), self.run.last)
-        load_weights(self.average.weights, state.part("average"), self.run.last)
-        restore_optimizer(self.optimizer, self.module, state.part("optimizer"))
-        self.history = History(state.columns, state.tensors["history:"])
-        self.stopping.best_error, self.stopping.stalled = state.best_error, state.stalled
-        self.step, self._earlier, self._trained_s = state.step, state.rows, state.trained_s
 
+def stand_still(
+    action: Float[Tensor, "batch horizon action"],
+    valid: Bool[Tensor, "batch horizon"],
+    moves: Bool[Tensor, " action"],
+) -> tuple[Float[Tensor, "batch horizon action"], Bool[Tensor, "batch horizon"]]:
+    """The chunk beyond an episode's end as something to learn, and what of it counts: everything.
 
-class TerminalStop:
-    """The action chunk beyond an episode's end, as something to learn instead of to leave out.
-
-    A robot that is to stand still moves by zero: so deltas and velocities become 0. Where to be, as
-    a gripper's position, repeats the last one.
+    A robot that is to stand still moves by zero: so deltas and velocities, which `moves` marks,
+    become 0. Where to be, as a gripper's position, repeats the last one, as the store has it.
     """
-
-    def __init__(self, store: FeatureStore, device: torch.device) -> None:
-        self._kept = ~torch.tensor(moving_channels(store.streams["action"]), device=device)
-
-    def extend(
-        self, action: Float[Tensor, "batch horizon action"], valid: Bool[Tensor, "batch horizon"]
-    ) -> tuple[Float[Tensor, "batch horizon action"], Bool[Tensor, "batch horizon"]]:
-        """The chunk and what of it counts: everything.
-
-        The store repeats the last action beyond the end, so what is kept is there already.
-        """
-        counted = valid.unsqueeze(-1) | self._kept
-        return action.masked_fill(~counted, 0.0), torch.ones_like(valid)
+    return action.masked_fill(~valid.unsqueeze(-1) & moves, 0.0), torch.ones_like(valid)
 
 
 @dataclass

@@ -160,11 +160,7 @@ def describe_data(
         elif not getattr(params, switch):
             lines.append(f"{stream}: disabled by train_head.{switch}")
         elif not known:
-            seconds = getattr(params, f"{stream}_window_s", None)
-            near = (
-                f", or older there than train_head.{stream}_window_s {seconds:g}" if seconds else ""
-            )
-            lost.append(f"{stream}: in the store, but absent from the training episodes{near}")
+            lost.append(f"{stream}: in the store, but absent from the training episodes' windows")
     return lines + [
         f"warning: {what}. Nothing is learnt of it. Groups of episodes are held out by a hash, "
         f"train_head.split val {params.split.val:g} and test {params.split.test:g} of them: set "

@@ -8,41 +8,43 @@ stopped run goes on under `dvc repro` too. Without torch, which takes over a sec
 import hashlib
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
+from pydantic import JsonValue
+
+from pipeline.base.border import Document, Text
 from pipeline.base.channels import action_groups
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.differences import differences
 from pipeline.base.durable import (
-    damaged,
     put_in_place,
     read_document,
     recover,
     recover_folder,
     write_with_digest,
 )
-from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch, ConfigError
+from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch
 from pipeline.base.ownership import (
     REPORT,
     OutputKind,
     begin_folder,
     refuse_foreign,
     remove_folder,
-    there,
     unmark,
 )
+from pipeline.base.source import SourceDocument
 from pipeline.policy.checkpoint import CHECKPOINT, DOCUMENT, SOURCE_KEYS, check_policy
+from pipeline.policy.document import PolicyDocument
 from pipeline.policy.normalization import Normalization
+from pipeline.policy.shape import PolicyShape, channel_kinds
 from pipeline.store import FeatureStore, build_lock
 from pipeline.train.split import list_differences, source_of
-
-if TYPE_CHECKING:
-    from pipeline.policy.observation import PolicyShape
 
 RUN, BEST, LAST = "run.json", "best", "last"
 TRAINER_WEIGHTS, TRAINER_DOCUMENT = "trainer.safetensors", "trainer.json"
@@ -64,6 +66,19 @@ FREE_PARAMS = {
 """Params that may change between a stop and the next start: they decide no number of the run, or
 not alone: `parts`, accumulation times processes, stands for the last."""
 NOTHING: Mapping[str, Any] = MappingProxyType({})
+
+
+class Decides(Document):
+    """What of all that decided a run's numbers is used beyond being compared."""
+
+    recordings: dict[Text, JsonValue]
+
+
+class RunDocument(Document):
+    """The content of `run.json`."""
+
+    source: SourceDocument
+    decides: Decides
 
 
 @dataclass(frozen=True)
@@ -102,7 +117,7 @@ class TrainingRun:
         if self.status != "new":
             return
         begun = (self.part / RUN).exists() and _has_checkpoint(self.part)
-        if begun and read_document(self.part / RUN) != self.identity:
+        if begun and read_document(self.part / RUN, RunDocument)[1] != self.identity:
             remove_folder(_aside(self.part), RUN_FOLDER)
             self.part.rename(_aside(self.part))
         begin_folder(self.part, RUN_FOLDER)
@@ -114,6 +129,14 @@ class TrainingRun:
         takes: the optimizer's state and the weights before averaging, four times what learns."""
         put_in_place(self.part, self.output, RUN_FOLDER)
         _drop_trainer_state(self.output)
+
+
+@contextmanager
+def run_lock(params: TrainHeadParams) -> Generator[None]:
+    """Hold a run's output and the folder of its curves. Raises `StoreLocked` where another run
+    works in either."""
+    with build_lock(params.output), build_lock(params.logs):
+        yield
 
 
 def open_run(
@@ -135,27 +158,19 @@ def open_run(
     output, identity = params.output, run_identity(params, store, extra_identity)
     part = _part(output)
     notes = []
-    if there(output) and not RUN_FOLDER.owns(output):
-        raise ConfigError(
-            f"{section}.output: {output} exists and is no training run (it has no {RUN} of one), "
-            "and a finished run would replace it. Choose another output or move it away."
-        )
     recover(output, RUN_FOLDER)
     if (output / RUN).exists():
-        if read_document(output / RUN) != identity:
+        if read_document(output / RUN, RunDocument)[1] != identity:
             notes.append(f"{output} holds another run; it is replaced when this one is finished")
         else:
             try:
-                finished = _finished_notes(params)
+                check_policy(output / BEST)
+                check_policy(output / LAST)
                 _drop_trainer_state(output)
-                return TrainingRun(output, "finished", finished, identity, section)
+                note = f"{output} is this very run, finished"
+                return TrainingRun(output, "finished", (note,), identity, section)
             except (CheckpointIncomplete, CheckpointMismatch) as why:
                 notes.append(f"{output} is this very run, but damaged; it is trained again: {why}")
-    if _has_checkpoint(part) and not (part / RUN).exists():
-        raise ConfigError(
-            f"{part} has checkpoints but no {RUN}, so it cannot be told what run they are of. "
-            f"Move it away or choose another {section}.output."
-        )
     refuse_foreign(part, RUN_FOLDER)
     refuse_foreign(params.logs, REPORT)
     if (part / RUN).exists():
@@ -179,9 +194,10 @@ def _is_run(folder: Path) -> bool:
     if _has_checkpoint(folder):
         return (folder / RUN).is_file()
     try:
-        return {"source", "decides"} <= read_document(folder / RUN).keys()
+        read_document(folder / RUN, RunDocument)
     except CheckpointIncomplete:
         return False
+    return True
 
 
 RUN_FOLDER = OutputKind("a training run", _is_run)
@@ -199,23 +215,10 @@ def finished_run(params: TrainHeadParams, path: Path) -> TrainingRun | None:
     return run if run.status == "finished" else None
 
 
-def _finished_notes(params: TrainHeadParams) -> tuple[str, ...]:
-    """Of a finished run, what to say of it; raises where one of its checkpoints is damaged."""
-    check_policy(params.output / BEST)
-    logs = check_policy(params.output / LAST).logs
-    note = f"{params.output} is this very run, finished"
-    if logs == params.logs:
-        return (note,)
-    return note, f"its curves are left where they were written, in {logs}, not in {params.logs}"
-
-
 def _compare(part: Path, identity: Mapping[str, Any], section: str) -> str:
     """What else the unfinished run in `part` was to be; refused where its store was another."""
-    prior = read_document(part / RUN)
-    source = prior.get("source")
-    if not isinstance(source, dict) or {*SOURCE_KEYS} - {*source} or "decides" not in prior:
-        raise CheckpointIncomplete(damaged(part / RUN, "not what it must hold"))
-    if differing := list_differences(source, identity["source"]):
+    _, prior = read_document(part / RUN, RunDocument)
+    if differing := list_differences(prior["source"], identity["source"]):
         raise CheckpointMismatch(
             f"{part}: this unfinished run cannot go on, its store was another one "
             f"(the run -> the store now):\n{differing}\n"
@@ -265,14 +268,11 @@ def recordings_of(store: FeatureStore) -> dict[str, Any]:
     return {"episodes": len(episodes), "ticks": store.ticks, "digest": digest.hexdigest()}
 
 
-def policy_shape(store: FeatureStore, normalization: Normalization) -> "PolicyShape":
+def policy_shape(store: FeatureStore, normalization: Normalization) -> PolicyShape:
     """The widths that this store gives to a policy.
 
     A stream without statistics is absent from what the policy is trained on, so it has width 0.
     """
-    from pipeline.policy.observation import PolicyShape
-    from pipeline.policy.state_channels import channel_kinds
-
     action, state = store.streams["action"], store.streams["state"]
     return PolicyShape(
         *store.feature_shape,
@@ -325,13 +325,12 @@ def find_trained(folders: Sequence[Path]) -> list[TrainedPolicy]:
 
 def _read_trained(folder: Path, path: Path) -> TrainedPolicy:
     try:
-        document = read_document(path)
         if path.name == RUN:
-            source, recordings = document["source"], dict(document["decides"]["recordings"])
-            return TrainedPolicy(folder, {key: source[key] for key in SOURCE_KEYS}, recordings)
-        source = {key: document[key] for key in SOURCE_KEYS}
-        train, test = (document["split"][side].values() for side in ("train", "test"))
-        episodes = frozenset(part["content"] for part in (*train, *test)) if test else None
-        return TrainedPolicy(folder, source, episodes=episodes)
-    except (CheckpointIncomplete, KeyError, TypeError, ValueError) as error:
-        return TrainedPolicy(folder, damage=f"{path}: {error}")
+            _, run = read_document(path, RunDocument)
+            return TrainedPolicy(folder, run["source"], run["decides"]["recordings"])
+        document, raw = read_document(path, PolicyDocument)
+    except CheckpointIncomplete as error:
+        return TrainedPolicy(folder, damage=str(error))
+    train, test = (document.split[side].values() for side in ("train", "test"))
+    episodes = frozenset(part.content for part in (*train, *test)) if test else None
+    return TrainedPolicy(folder, {key: raw[key] for key in SOURCE_KEYS}, episodes=episodes)

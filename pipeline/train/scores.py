@@ -1,6 +1,6 @@
 """How far actions are from the recorded ones, in physical units."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 
 from pipeline.base.channels import action_groups, hardly_moving
 from pipeline.policy.normalization import Normalization
-from pipeline.policy.policy import Trainable
 from pipeline.store import FeatureStore
-from pipeline.train.batches import Ticks, Windows
-from pipeline.train.predictions import Actions, FeedMaker, Predictions, predict
+from pipeline.train.predictions import Actions, Predictions
 
 Errors = NDArray[np.float64]
 
@@ -91,6 +89,10 @@ class ActionGroup:
     def mean(self, errors: Errors) -> Errors:
         """The group's mean over the last axis."""
         return errors[..., list(self.dimensions)].mean(axis=-1)
+
+
+ActionSpace = tuple[tuple[str, ...], tuple[str, ...], tuple[ActionGroup, ...], Errors]
+"""Names, units, groups and `Comparison.scale` of the action's dimensions."""
 
 
 @dataclass(frozen=True)
@@ -210,28 +212,7 @@ class Comparison:
         return errors[..., dimensions] / np.where(self.scale > 0, self.scale, 1)[dimensions]
 
 
-def evaluate_policy(
-    policy: Trainable,
-    store: FeatureStore,
-    ticks: Ticks,
-    windows: Windows,
-    batch_size: int,
-    normalization: Normalization,
-    progress: bool = False,
-    samples: int = 1,
-    feed: FeedMaker | None = None,
-) -> tuple[Comparison, Predictions]:
-    """The errors of the policy on these ticks, and its predictions there.
-
-    `samples`, `feed` and what is raised are those of `predict`.
-    """
-    predictions = predict(policy, store, ticks, windows, batch_size, progress, samples, feed)
-    return compare(predictions, {}, *action_space(store, normalization)), predictions
-
-
-def action_space(
-    store: FeatureStore, normalization: Normalization
-) -> tuple[tuple[str, ...], tuple[str, ...], tuple[ActionGroup, ...], Errors]:
+def action_space(store: FeatureStore, normalization: Normalization) -> ActionSpace:
     """Names, units, groups and `Comparison.scale` of the action's dimensions."""
     action, statistics = store.streams["action"], normalization.action
     names, units = tuple(action["names"]), tuple(action["units"])
@@ -247,18 +228,15 @@ def action_space(
 def compare(
     predictions: Predictions,
     others: Mapping[str, Actions],
-    names: Sequence[str],
-    units: Sequence[str],
-    groups: Sequence[ActionGroup],
-    scale: NDArray[np.floating],
+    space: ActionSpace,
     group: NDArray[np.str_] | None = None,
     phase: NDArray[np.str_] | None = None,
     execute: int = 1,
 ) -> Comparison:
     """The errors of the policy and of what `others` did, (tick, horizon or 1, action_dim).
 
-    `group` and `phase` are (tick,): those of each tick. Without, each episode is a group, and
-    phases are not known.
+    `space` is what `action_space` gives. `group` and `phase` are (tick,): those of each tick.
+    Without, each episode is a group, and phases are not known.
     """
     episodes = predictions.episodes
     labels = [
@@ -281,8 +259,7 @@ def compare(
         name: ActionErrors(cells, summed(error * valid[..., None], place))
         for name, error in errors.items()
     }
-    scale = np.asarray(scale, np.float64)
-    return Comparison(tuple(names), tuple(units), tuple(groups), scale, cells, scores, execute)
+    return Comparison(*space, cells, scores, execute)
 
 
 def _ratio(total: Errors, entries: NDArray[Any] | np.float64) -> Errors:

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from pipeline.base.config import SplitParams
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import CheckpointMismatch, ConfigError, StoreMismatch
-from pipeline.base.tuned_on import EpisodePart
-from pipeline.policy.checkpoint import SIDES, SOURCE_KEYS, PolicyCheckpoint, Side
+from pipeline.base.tuned_on import SIDES, EpisodePart, Side
+from pipeline.policy.checkpoint import SOURCE_KEYS, PolicyCheckpoint
 from pipeline.store import Episode, FeatureStore, episode_name
 from pipeline.train.groups import episodes_by_group
 
@@ -357,18 +357,14 @@ def find_ticks(
         same = episode is not None and episode.content == part.content
         if not same and (elsewhere := renamed.get(part.content)):
             episode = elsewhere.pop()
-        if episode is None:
-            wrong.append(f"{name} is missing")
-        elif len(episode.ticks) < part.ticks[1]:
-            wrong.append(f"{name} is shorter")
-        elif episode.content != part.content:
-            wrong.append(f"{name} is another recording, or the same one read otherwise since")
+        if episode is None or episode.content != part.content or len(episode.ticks) < part.ticks[1]:
+            wrong.append(name)
         else:
             there.append((episode, part))
     if wrong:
         raise CheckpointMismatch(
-            f"{store.path}: of the {len(parts)} {side} episodes of the checkpoint, "
-            f"{len(wrong)} are not there as they were: {'; '.join(wrong[:5])}"
+            f"{store.path}: of the {len(parts)} {side} episodes of the checkpoint, {len(wrong)} "
+            f"are missing, shorter, or other recordings than they were: {', '.join(wrong[:5])}"
             f"{' …' if len(wrong) > 5 else ''}. Name the store it was trained from in "
             "evaluate.store, or train again."
         )

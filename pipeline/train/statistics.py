@@ -17,7 +17,8 @@ from pipeline.base.errors import NumericsError
 from pipeline.base.finite import first_non_finite
 from pipeline.policy.attention import right_aligned
 from pipeline.policy.normalization import Block, ChannelStatistics, Normalization, fit_channels
-from pipeline.policy.state_channels import channel_kinds, expand, expanded_names
+from pipeline.policy.shape import channel_kinds, expanded_names
+from pipeline.policy.state_channels import expand
 from pipeline.store import FeatureStore, place
 from pipeline.train.batches import Ticks, Windows, evenly
 
@@ -96,7 +97,7 @@ def _fit_state(store: FeatureStore, ticks: Ticks, windows: Windows) -> ChannelSt
         fitted = fit_channels(chain([first], blocks), what)
     except NumericsError:
         for rows in readings:
-            _check_finite(store, "state", rows, what)
+            check_finite(store, "state", rows, what, *_read(store, "state", rows))
         raise
     names = expanded_names(channels["names"], kinds)
     return _floored(fitted, names, [""] * len(names))
@@ -130,12 +131,20 @@ def _fit(
     except NumericsError:
         # It knows the row of what it was given, which says nothing to who made the recordings.
         for rows in parts:
-            _check_finite(store, stream, rows, what)
+            check_finite(store, stream, rows, what, *_read(store, stream, rows))
         raise
 
 
-def _check_finite(store: FeatureStore, stream: str, rows: Rows, what: str) -> None:
-    values, valid = _read(store, stream, rows)
+def check_finite(
+    store: FeatureStore,
+    stream: str,
+    rows: Rows,
+    what: str,
+    values: NDArray[Any],
+    valid: NDArray[np.bool_] | None = None,
+) -> None:
+    """Raise `NumericsError`, naming the place, where one of the valid `values` of these rows of a
+    stream is no number; a row of `vl` stands there once for each variant."""
     bad = first_non_finite(values, valid)
     if bad is None:
         return

@@ -15,7 +15,7 @@ def refuse_tuned_episodes(store: FeatureStore, split: Split) -> list[str]:
 
     Raises `ConfigError` where test has what it was tuned or chosen on, or val what it was tuned on.
     """
-    tuned = of_store(store.attrs)
+    tuned = of_store(store.attrs, store.path)
     if tuned is None:
         if not store.spec.get("adapter"):
             return []
@@ -29,16 +29,12 @@ def refuse_tuned_episodes(store: FeatureStore, split: Split) -> list[str]:
         "val": _seen(parts["val"], tuned.train),
     }
     if any(seen.values()):
-        lines = [
-            f"{side}: {', '.join(names[:_SHOWN])}{' …' if len(names) > _SHOWN else ''}"
-            for side, names in seen.items()
-            if names
-        ]
+        lines = [f"{side}: {', '.join(names[:_SHOWN])}" for side, names in seen.items() if names]
         raise ConfigError(
             f"{store.path}: the model of its features was tuned on episodes that train_head.split "
-            f"holds out ({'; '.join(lines)}), so what is reported on them would flatter it. Set "
-            "train_head.split to what stages.finetune had, the same seed above all, or extract "
-            "with a model that was not tuned on them."
+            f"holds out, the first ({'; '.join(lines)}), so what is reported on them would flatter "
+            "it. Set train_head.split to what stages.finetune had, the same seed above all, or "
+            "extract with a model that was not tuned on them."
         )
     return []
 

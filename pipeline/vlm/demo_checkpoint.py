@@ -21,6 +21,7 @@ from transformers import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
 
 from pipeline.base.durable import replace_folder
 from pipeline.base.ownership import OutputKind
+from pipeline.vlm.checkpoint_folder import QWENS
 from pipeline.vlm.loading import quiet_transformers
 
 _FILES = Path(__file__).with_name("demo")
@@ -28,11 +29,6 @@ _FILES = Path(__file__).with_name("demo")
 tokenizer learns its merges from."""
 
 _VOCABULARY = 1536
-
-_PRETOKENIZE = (
-    r"(?i:'s|'t|'re|'ve|'m|'ll|'d)|[^\r\n\p{L}\p{N}]?\p{L}+|\p{N}| ?[^\s\p{L}\p{N}]+[\r\n]*"
-    r"|\s*[\r\n]+|\s+(?!\S)|\s+"
-)
 
 
 def write_demo_checkpoint(folder: Path, seed: int = 0) -> None:
@@ -69,7 +65,7 @@ def _train_tokenizer() -> Tokenizer:
     tokenizer.normalizer = normalizers.NFC()
     tokenizer.pre_tokenizer = pre_tokenizers.Sequence(
         [
-            pre_tokenizers.Split(Regex(_PRETOKENIZE), behavior="isolated"),
+            pre_tokenizers.Split(Regex(QWENS), behavior="isolated"),
             pre_tokenizers.ByteLevel(add_prefix_space=False, use_regex=False),
         ]
     )

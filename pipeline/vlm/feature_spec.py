@@ -22,8 +22,10 @@ from pipeline.base.errors import VLMError
 from pipeline.vlm.checkpoint_folder import (
     adapter_files,
     could_be_hub_id,
+    folder_here,
     read_config,
     resolve_checkpoint,
+    small_files,
     tokenizer_files,
     weight_files,
 )
@@ -43,7 +45,6 @@ _MANY_LAYERS = 10_000
 
 _PLACEHOLDER_INSTRUCTION = "…"
 _READS_CHECKPOINTS = ("transformers", "tokenizers", "huggingface-hub", "jinja2")
-_READ_FROM_CHECKPOINTS = (".json", ".jinja", ".txt")
 
 
 @dataclass(frozen=True)
@@ -83,9 +84,9 @@ def feature_spec(
     `VLMError` where the checkpoint is incomplete or `vlm.layers` goes past it.
     """
     folder = resolve_checkpoint(vlm.checkpoint, vlm.revision)
-    layer_count, dim = _model_shape(folder)
+    text = read_config(folder).text_config
     ordered = tuple(sorted(set(views)))
-    slots = slots_of(vlm, layer_count, ordered)
+    slots = slots_of(vlm, text.num_hidden_layers, ordered)
     adapter = resolve_checkpoint(vlm.adapter, setting="vlm.adapter") if vlm.adapter else None
 
     def read() -> str:
@@ -105,14 +106,14 @@ def feature_spec(
         "processor": processor,
         "views": list(ordered),
         "slots": slot_documents(slots, vlm.variants),
-        "dim": dim,
+        "dim": text.hidden_size,
         "compute_dtype": vlm.dtype,
         "storage_dtype": storage_dtype,
         **_augmentation(vlm),
     }
     digest = _digest(document)
     image_size = processor["image_size"][0], processor["image_size"][1]
-    return FeatureSpec(document, digest, slots, ordered, dim, image_size, vlm.variants)
+    return FeatureSpec(document, digest, slots, ordered, text.hidden_size, image_size, vlm.variants)
 
 
 def feature_shape(vlm: VLMParams, views: Sequence[str]) -> tuple[int, int]:
@@ -121,10 +122,9 @@ def feature_shape(vlm: VLMParams, views: Sequence[str]) -> tuple[int, int]:
     Raises `VLMError` for what is neither, and for a name in a folder that is here and lacks it.
     """
     slots = len(slots_of(vlm, _MANY_LAYERS, views))
-    folder = Path(vlm.checkpoint).expanduser()
-    if folder.is_dir():
-        return slots, _model_shape(folder)[1]
-    if folder.parent.is_dir() or not could_be_hub_id(vlm.checkpoint):
+    if folder := folder_here(vlm.checkpoint):
+        return slots, read_config(folder).text_config.hidden_size
+    if folder_here(str(Path(vlm.checkpoint).parent)) or not could_be_hub_id(vlm.checkpoint):
         raise VLMError(
             f"{vlm.checkpoint}: no such folder, and no hub id. The demo's checkpoint is written by "
             "`python -m stages.demo`."
@@ -148,12 +148,11 @@ def _read_digest(
     folder: Path, vlm: VLMParams, views: int, digest_file: Callable[[Path], str]
 ) -> str:
     """The digest of all that `_read` depends on: files, libraries, this code and its arguments."""
-    beside = folder.glob("additional_chat_templates/*")
-    files = [p for p in (*folder.glob("*"), *beside) if p.suffix in _READ_FROM_CHECKPOINTS]
-    code = [Path(__file__).with_name(name) for name in ("feature_spec.py", "processor.py")]
+    names = ("checkpoint_folder.py", "feature_spec.py", "processor.py")
+    code = [Path(__file__).with_name(name) for name in names]
     return _digest(
         {
-            "files": {str(path.relative_to(folder)): digest_file(path) for path in sorted(files)},
+            "files": {str(p.relative_to(folder)): digest_file(p) for p in small_files(folder)},
             "libraries": {name: version(name) for name in _READS_CHECKPOINTS},
             "code": [digest_file(path) for path in code],
             "resize": (vlm.image_resize_height, vlm.image_resize_width),
@@ -186,17 +185,6 @@ def _as_live(spec: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in spec.items() if name not in other} | {"slots": slots}
 
 
-def _model_shape(folder: Path) -> tuple[int, int]:
-    """Number of decoder layers, and width of their output."""
-    config = read_config(folder)
-    # The hub's configs are flat, those that transformers 5 writes are nested.
-    text = config.get("text_config", config)
-    try:
-        return int(text["num_hidden_layers"]), int(text["hidden_size"])
-    except KeyError as error:
-        raise VLMError(f"{folder / 'config.json'}: {error} is missing") from None
-
-
 def _augmentation(vlm: VLMParams) -> dict[str, Any]:
     """What augmented variants are; nothing where there is none, so that no feature is renamed."""
     if vlm.variants == 1:
@@ -211,4 +199,4 @@ def _files_digest(files: Sequence[Path], digest_file: Callable[[Path], str]) -> 
 
 def _digest(document: Any) -> str:
     canonical = json.dumps(document, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
-    return hashlib.blake2b(canonical.encode(), digest_size=16).hexdigest()
+    return hashlib.blake2b(canonical.encode("utf-8", "surrogatepass"), digest_size=16).hexdigest()

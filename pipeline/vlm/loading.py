@@ -4,20 +4,27 @@ import sys
 import warnings
 from collections.abc import Generator
 from contextlib import contextmanager
+from math import prod
 from pathlib import Path
 from typing import Any
 
 import PIL
 import torch
 import transformers
-from safetensors import SafetensorError
-from transformers import Qwen2_5_VLForConditionalGeneration
+from transformers import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
 from transformers.utils import is_flash_attn_2_available
 from transformers.utils import logging as transformers_logging
 
 from pipeline.base.config import VLMParams
 from pipeline.base.errors import VLMError
-from pipeline.vlm.checkpoint_folder import adapter_files, resolve_checkpoint, weight_files
+from pipeline.vlm.checkpoint_folder import (
+    ADAPTERS,
+    VLMS,
+    adapter_files,
+    resolve_checkpoint,
+    tensor_shapes,
+    weight_files,
+)
 from pipeline.vlm.vision import tower_attention
 
 _UNUSED = {"lm_head.weight"}
@@ -42,7 +49,11 @@ def load_whole(vlm: VLMParams, device: torch.device, dtype: str | None = None) -
     meant to run. Raises as `load_model`.
     """
     whole = load_checkpoint(vlm, device, dtype)
-    return whole if vlm.adapter is None else adapted(whole, vlm).merge_and_unload(safe_merge=True)
+    if vlm.adapter is None:
+        return whole
+    adapting = adapted(whole, vlm)
+    with ADAPTERS.foreign(Path(vlm.adapter), "this adapter cannot be merged"):
+        return adapting.merge_and_unload(safe_merge=True)
 
 
 def cut(whole: Any, layers: int) -> Any:
@@ -99,32 +110,41 @@ def attention_backend(vlm: VLMParams, device: torch.device) -> str:
 def load_checkpoint(vlm: VLMParams, device: torch.device, dtype: str | None = None) -> Any:
     """As `load_whole`, without the adapter."""
     folder = resolve_checkpoint(vlm.checkpoint, vlm.revision)
-    weight_files(folder)
+    files = weight_files(folder)
     attention = attention_backend(vlm, device)
     if attention == "flash_attention_2" and (device.type != "cuda" or vlm.dtype == "float32"):
         raise VLMError(
             "vlm.attention flash_attention_2 needs CUDA and a half-precision vlm.dtype, found "
             f"{device.type} and {vlm.dtype}. Set vlm.attention to auto."
         )
-    try:
-        with quiet_transformers():
-            loaded: Any = Qwen2_5_VLForConditionalGeneration.from_pretrained(
-                folder,
-                dtype=dtype or vlm.dtype,
-                attn_implementation=attention,
-                local_files_only=True,
-                trust_remote_code=False,
-                output_loading_info=True,
-            )
-    except (OSError, ValueError, RuntimeError, ImportError, TypeError, SafetensorError) as error:
-        raise VLMError(
-            f"{folder}: cannot be loaded as Qwen2.5-VL: {error}. Copy or download it again, or "
-            "set vlm.checkpoint to a complete Qwen2.5-VL checkpoint."
-        ) from error
+    with quiet_transformers(), VLMS.foreign(folder, "cannot be loaded as Qwen2.5-VL"):
+        config = Qwen2_5_VLConfig.from_pretrained(folder, trust_remote_code=False)
+        with torch.device("meta"):
+            empty: Any = Qwen2_5_VLForConditionalGeneration(config)
+        expected, shapes = empty.model.state_dict().values(), tensor_shapes(files)
+        numbers = sum(tensor.numel() for tensor in expected)
+        held = sum(prod(shape) for name, shape in shapes.items() if name not in _UNUSED)
+        if numbers > 2 * held:  # before transformers takes memory for them
+            why = f"expected {numbers:,} numbers in the weights by config.json, found {held:,}"
+            raise VLMS.refusal(folder, why)
+        loaded: Any = Qwen2_5_VLForConditionalGeneration.from_pretrained(
+            folder,
+            config=config,
+            dtype=dtype or vlm.dtype,
+            attn_implementation=attention,
+            local_files_only=True,
+            trust_remote_code=False,
+            ignore_mismatched_sizes=True,  # they are refused below, by name
+            output_loading_info=True,
+        )
     model, report = loaded
-    _refuse_strange(
-        folder, set(report["missing_keys"]) - _UNUSED, set(report["unexpected_keys"]), "checkpoint"
-    )
+    missing, unexpected = set(report["missing_keys"]) - _UNUSED, set(report["unexpected_keys"])
+    _refuse_strange(folder, missing, unexpected, "*.safetensors and config.json")
+    for name, found, wanted in report["mismatched_keys"]:
+        why = f"expected {name} of {list(wanted)} by config.json, found {list(found)}"
+        raise VLMS.refusal(folder, why)
+    if numbers != held:
+        raise VLMS.refusal(folder, "a tensor stands there by two names")
     return model
 
 
@@ -139,34 +159,30 @@ def adapted(whole: Any, vlm: VLMParams, dropout: float | None = None) -> Any:
     assert vlm.adapter is not None, "no adapter to load"
     folder = resolve_checkpoint(vlm.adapter, setting="vlm.adapter")
     adapter_files(folder)
-    try:
-        with warnings.catch_warnings():
-            # peft only warns of missing weights; the report of a second load is checked instead.
-            warnings.simplefilter("ignore")
-            config: Any = PeftConfig.from_pretrained(str(folder))
-            if dropout is not None:
-                config.lora_dropout = dropout
-            learns = dropout is not None
-            adapting: Any = PeftModel.from_pretrained(
-                whole, str(folder), config=config, is_trainable=learns
-            )
-            report = adapting.load_adapter(str(folder), adapter_name="default", is_trainable=learns)
-    except (OSError, ValueError, RuntimeError, KeyError, TypeError, SafetensorError) as error:
-        raise VLMError(
-            f"{folder}: this adapter does not fit the checkpoint {vlm.checkpoint}: {error}. Set "
-            "vlm.adapter to one that was trained on this checkpoint, or to null."
-        ) from error
-    _refuse_strange(folder, set(report.missing_keys), set(report.unexpected_keys), "adapter")
+    what = f"this adapter does not fit the checkpoint {vlm.checkpoint}"
+    with warnings.catch_warnings(), ADAPTERS.foreign(folder, what):
+        # peft only warns of missing weights; the report of a second load is checked instead.
+        warnings.simplefilter("ignore")
+        config: Any = PeftConfig.from_pretrained(str(folder))
+        if dropout is not None:
+            config.lora_dropout = dropout
+        learns = dropout is not None
+        adapting: Any = PeftModel.from_pretrained(
+            whole, str(folder), config=config, is_trainable=learns
+        )
+        report = adapting.load_adapter(str(folder), adapter_name="default", is_trainable=learns)
+    files, unexpected = "adapter_model.safetensors and adapter_config.json", report.unexpected_keys
+    _refuse_strange(folder, set(report.missing_keys), set(unexpected), files)
     if not hasattr(adapting, "merge_and_unload"):
-        raise VLMError(f"{folder}: a {config.peft_type} adapter cannot be merged; use LoRA")
+        raise ADAPTERS.refusal(folder, f"a {config.peft_type} adapter cannot be merged")
     return adapting
 
 
-def _refuse_strange(folder: Path, missing: set[str], unexpected: set[str], what: str) -> None:
+def _refuse_strange(folder: Path, missing: set[str], unexpected: set[str], files: str) -> None:
     if missing or unexpected:
         lacks, has = (", ".join(sorted(keys)[:4]) or "none" for keys in (missing, unexpected))
         raise VLMError(
-            f"{folder}: the {what}'s weights are not those of the model that it describes: "
+            f"{folder}: {files} do not fit each other: "
             f"missing {lacks} ({len(missing)} in all), left over {has} ({len(unexpected)} in all). "
-            f"Copy or download the {what} again."
+            "Copy or download them again."
         )

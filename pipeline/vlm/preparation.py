@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from pipeline.base.border import shown
 from pipeline.base.config import VLMParams
 from pipeline.base.errors import VLMError
 from pipeline.vlm.augmentation import Augmentation
 from pipeline.vlm.checkpoint_folder import resolve_checkpoint
 from pipeline.vlm.feature_spec import FeatureSpec, row_key
-from pipeline.vlm.processor import PixelSettings, PromptRenderer, TokenKind, stretch
+from pipeline.vlm.processor import PROMPTS, PixelSettings, PromptRenderer, TokenKind, stretch
 
 FramesByView = Mapping[str, NDArray[np.uint8] | Image.Image]
 """RGB frames (height, width, 3) of one moment by view."""
@@ -69,7 +70,9 @@ class Preparer:
 
         Raises `VLMError` where the instruction holds a control token, or a view is not the spec's.
         """
-        return self._rendered(instruction, len(self._ordered(views_present)))
+        prompt = self._rendered(instruction, len(self._ordered(views_present)))
+        self._tokens(prompt)  # refuses what is too long
+        return prompt
 
     def describe(self, token: int) -> tuple[str, TokenKind]:
         """The text of a token of a row and its kind."""
@@ -151,6 +154,12 @@ class Preparer:
         is_image = ids == self._renderer.image_token_id
         rows, columns = self._settings.merged_grid
         counts = np.where(is_image, rows * columns, 1)
+        if (length := int(counts.sum())) > self._renderer.window:
+            why = (
+                f"expected at most {self._renderer.window:,} tokens (max_position_embeddings), "
+                f"found {length:,}, {rows * columns:,} for each image"
+            )
+            raise PROMPTS.refusal(shown(prompt), why)
         starts = (np.cumsum(counts) - counts)[is_image]
         token_ids = np.repeat(ids, counts)
         token_ids.flags.writeable = False

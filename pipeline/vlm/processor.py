@@ -4,7 +4,10 @@ The CPU only stretches frames (Pillow), and needs no torch; `extractor` cuts the
 the model is.
 """
 
-from dataclasses import asdict, dataclass
+import resource
+from collections.abc import Generator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,17 +15,27 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from pipeline.base.border import Border, shown
 from pipeline.base.config import VLMParams
 from pipeline.base.errors import VLMError
 from pipeline.vlm.checkpoint_folder import (
+    VLMS,
+    ChatTemplate,
+    check_tokenizer,
     read_config,
-    read_json,
+    read_preprocessor,
     resolve_checkpoint,
-    tokenizer_files,
 )
 
-_QWEN_IMAGE_TOKEN_ID = 151655
-"""What a Qwen2.5-VL config means when it does not say."""
+PROMPTS = Border(
+    VLMError,
+    "Change the instruction in the recording, data.sources or vlm.prompt; fewer data.views and "
+    "smaller images make a prompt shorter, too.",
+)
+_MOST_CHARACTERS = 200_000
+"""Of a chat template, and of a prompt before it is cut into tokens."""
+_MOST_MEMORY, _MOST_SECONDS = 2**30, 5.0
+"""What a tokenizer may take to be read (the seconds), and a chat template to be rendered."""
 
 _PART_OF_A_CHARACTER = "\ufffd"
 
@@ -44,22 +57,24 @@ class PromptRenderer:
         from transformers import AutoTokenizer  # takes long: types and tokens alone do without
 
         config = read_config(folder)
-        tokenizer_files(folder)
-        try:
+        check_tokenizer(folder)
+        what = "its config.json, tokenizer.json or tokenizer_config.json cannot be read"
+        with VLMS.foreign(folder, what), VLMS.time_limit(f"{folder}: {what}", _MOST_SECONDS):
             self._tokenizer: Any = AutoTokenizer.from_pretrained(
                 folder, local_files_only=True, trust_remote_code=False
             )
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise VLMError(f"{folder}: the tokenizer cannot be read: {error}") from error
+            added = {*self._tokenizer.get_added_vocab(), *self._tokenizer.all_special_tokens}
+            self._specials = sorted(filter(None, added))
+            self._image_token = self._tokenizer.convert_ids_to_tokens(config.image_token_id)
         self._folder = folder
         self._template = template
         self.chat_template = self._find_chat_template()
-        self.image_token_id = int(config.get("image_token_id", _QWEN_IMAGE_TOKEN_ID))
-        self._specials = sorted(
-            set(self._tokenizer.get_added_vocab()) | set(self._tokenizer.all_special_tokens)
-        )
-        self._check_vocabulary(config)
+        self.image_token_id = config.image_token_id
+        self.window = config.text_config.max_position_embeddings
+        self._check_vocabulary(config.text_config.vocab_size)
         self._refuse_specials(template, "vlm.prompt")
+        with _memory_limit():
+            self._rendered("", 1)
 
     def render(self, instruction: str, images: int) -> str:
         """The text of one user turn with a placeholder token for each image.
@@ -67,22 +82,14 @@ class PromptRenderer:
         Raises `VLMError` where the instruction holds a token that the model reads as control.
         """
         self._refuse_specials(instruction, "the instruction")
-        before, _, after = self._template.partition("{images}")
-        content = [
-            *self._text_part(before, instruction),
-            *({"type": "image"} for _ in range(images)),
-            *self._text_part(after, instruction),
-        ]
-        text: str = self._tokenizer.apply_chat_template(
-            [{"role": "user", "content": content}],
-            chat_template=self.chat_template,
-            tokenize=False,
-            add_generation_prompt=False,
-        )
-        shown = text.count(self._image_token)
-        if shown != images:
+        text = self._rendered(instruction, images)
+        if len(text) > _MOST_CHARACTERS:
+            why = f"expected at most {_MOST_CHARACTERS:,} characters, found {len(text):,}"
+            raise PROMPTS.refusal(shown(instruction), why)
+        rendered = text.count(self._image_token)
+        if rendered != images:
             raise VLMError(
-                f"{self._folder}: the chat template renders {shown} of {images} images as "
+                f"{self._folder}: the chat template renders {rendered} of {images} images as "
                 f"{self._image_token}. Expected the template of a Qwen2.5-VL checkpoint."
             )
         return text
@@ -90,8 +97,8 @@ class PromptRenderer:
     def tokenize(self, text: str) -> list[int]:
         """The token ids of a rendered prompt, one for each image still."""
         # The Rust tokenizer itself: the Python wrapper around it is not safe among threads.
-        encoding = self._tokenizer.backend_tokenizer.encode(text, add_special_tokens=False)
-        return encoding.ids
+        with PROMPTS.foreign(shown(text), "cannot be cut into tokens"):
+            return self._tokenizer.backend_tokenizer.encode(text, add_special_tokens=False).ids
 
     def describe(self, token: int) -> tuple[str, TokenKind]:
         """The text of a token and its kind; a part of a character as the vocabulary spells it."""
@@ -101,6 +108,23 @@ class PromptRenderer:
         if token == self.image_token_id:
             return text, "image"
         return text, "special" if text in self._specials else "text"
+
+    def _rendered(self, instruction: str, images: int) -> str:
+        before, _, after = self._template.partition("{images}")
+        content = [
+            *self._text_part(before, instruction),
+            *({"type": "image"} for _ in range(images)),
+            *self._text_part(after, instruction),
+        ]
+        what = "the chat template cannot be rendered"
+        where = f"{self._folder}: {what}"
+        with VLMS.foreign(self._folder, what), VLMS.time_limit(where, _MOST_SECONDS):
+            return self._tokenizer.apply_chat_template(
+                [{"role": "user", "content": content}],
+                chat_template=self.chat_template,
+                tokenize=False,
+                add_generation_prompt=False,
+            )
 
     def _text_part(self, part: str, instruction: str) -> list[dict[str, str]]:
         text = part.replace("{instruction}", instruction)
@@ -114,9 +138,7 @@ class PromptRenderer:
                     f"in {text!r:.200}. Remove it from the recording, data.sources or params."
                 )
 
-    def _check_vocabulary(self, config: dict[str, Any]) -> None:
-        self._image_token: str = self._tokenizer.convert_ids_to_tokens(self.image_token_id)
-        rows = int(config.get("text_config", config).get("vocab_size", 0))
+    def _check_vocabulary(self, rows: int) -> None:
         if self._image_token not in self._specials or len(self._tokenizer) > rows:
             raise VLMError(
                 f"{self._folder}: the tokenizer is another checkpoint's: it reads config.json's "
@@ -127,8 +149,8 @@ class PromptRenderer:
     def _find_chat_template(self) -> str:
         template, beside = self._tokenizer.chat_template, self._folder / "chat_template.json"
         if not isinstance(template, str) and beside.exists():
-            template = read_json(beside).get("chat_template")
-        if not isinstance(template, str):
+            template = VLMS.read_json(beside, ChatTemplate).chat_template
+        if not isinstance(template, str) or len(template) > _MOST_CHARACTERS:
             raise VLMError(
                 f"{self._folder}: no chat template in tokenizer_config.json, chat_template.jinja "
                 "or chat_template.json. Take the file from the checkpoint's hub page."
@@ -175,42 +197,38 @@ class PixelSettings:
     @classmethod
     def read(cls, folder: Path, resize: tuple[int, int]) -> "PixelSettings":
         """The settings of a checkpoint folder for frames asked for at `resize` (height, width)."""
-        from transformers import AutoImageProcessor
         from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import smart_resize
 
-        config = folder / "preprocessor_config.json"
-        try:
-            processor: Any = AutoImageProcessor.from_pretrained(
-                folder, local_files_only=True, trust_remote_code=False
-            )
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise VLMError(f"{config}: missing or cannot be read: {error}") from error
-        kind = type(processor).__name__
-        steps = (processor.do_resize, processor.do_rescale, processor.do_normalize)
-        if not kind.startswith("Qwen2VLImageProcessor") or not all(steps):
-            raise VLMError(
-                f"{config}: expected a Qwen2VLImageProcessor with do_resize, do_rescale and "
-                f"do_normalize, as in every Qwen2.5-VL, found a {kind} with {steps}"
-            )
+        config = read_preprocessor(folder)
         try:
             image_size = smart_resize(
                 *resize,
-                factor=processor.patch_size * processor.merge_size,
-                min_pixels=processor.size["shortest_edge"],
-                max_pixels=processor.size["longest_edge"],
+                factor=config.patch_size * config.merge_size,
+                min_pixels=config.min_pixels or config.size.shortest_edge,
+                max_pixels=config.max_pixels or config.size.longest_edge,
             )
         except ValueError as error:
             raise VLMError(
                 f"vlm.image_resize_height and _width {resize[0]} x {resize[1]}: {error}"
             ) from error
-        same = ("patch_size", "merge_size", "temporal_patch_size", "rescale_factor")
-        return cls(
-            resize=resize,
-            image_size=image_size,
-            image_mean=tuple(processor.image_mean),
-            image_std=tuple(processor.image_std),
-            **{name: getattr(processor, name) for name in same},
-        )
+        same = config.model_dump(include={field.name for field in fields(cls)})
+        return cls(resize=resize, image_size=image_size, **same)
+
+
+@contextmanager
+def _memory_limit() -> Generator[None]:
+    """Raise `MemoryError` where what stands inside asks for another GiB, as a template can at once.
+
+    Holds for the process, so only for what is done quickly and before other threads begin.
+    """
+    limits, held = resource.getrlimit(resource.RLIMIT_AS), Path("/proc/self/statm")
+    if limits[0] == resource.RLIM_INFINITY and held.exists():  # not on macOS
+        used = int(held.read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (used + _MOST_MEMORY, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, limits)
 
 
 def stretch(frame: NDArray[np.uint8], image_size: tuple[int, int]) -> NDArray[np.uint8]:

@@ -137,7 +137,9 @@ def _targets(whole: Any, tuning: TuningParams, layers: int) -> str:
 
 def _check_goes_on(model: Any, vlm: VLMParams, tuning: TuningParams) -> None:
     config = model.peft_config["default"]
-    actual = f"lora_r {config.r}, lora_alpha {config.lora_alpha}"
+    # Other kinds of adapters lack them.
+    r, alpha = (getattr(config, name, None) for name in ("r", "lora_alpha"))
+    actual = f"lora_r {r}, lora_alpha {alpha}"
     asked = f"lora_r {tuning.lora_r}, lora_alpha {tuning.lora_alpha}"
     if actual != asked:
         raise VLMError(

@@ -1,10 +1,16 @@
 """params.yaml: what is wrong is said at once, with its place."""
 
+import os
+import shlex
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Annotated, Any
 
 import pytest
+from pydantic import TypeAdapter
 
-from pipeline.base.config import load_params
+from pipeline.base.config import LimitsFile, Params, load_params, load_section, setting
+from pipeline.base.config.section import Section
 from pipeline.base.errors import ConfigError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -81,7 +87,9 @@ def test_overrides_are_yaml_and_reach_any_depth(minimal):
 
 
 def test_one_value_where_a_list_belongs_is_told_how_to_write_it(minimal):
-    with pytest.raises(ConfigError, match=r"pooling: expected a list, such as \[mean\]"):
+    with pytest.raises(
+        ConfigError, match=r"vlm\.pooling: expected a list such as \[a, b\], found 'mean'"
+    ):
         load_params(minimal, ["vlm.pooling=mean"])
 
 
@@ -90,7 +98,7 @@ def test_every_problem_is_said_with_its_place(minimal):
         load_params(minimal, ["train_head.lr=-1", "train_head.lrr=1", "data.vlm_reuse_count=0"])
     text = str(caught.value)
     assert "3 problem(s)" in text
-    assert "train_head.lr: Input should be greater than 0 (found -1)" in text
+    assert "train_head.lr: expected greater than 0, found -1" in text
     assert "train_head.lrr: unknown key; did you mean lr?" in text
     assert "data.vlm_reuse_count" in text
 
@@ -100,17 +108,36 @@ def test_every_problem_is_said_with_its_place(minimal):
     [
         ("lr=1", "expected section.key=value"),
         ("train_head.lr", "expected section.key=value"),
-        ("data.sources=[", "not YAML"),
+        ("data.sources=[", "cannot be read as YAML"),
         ("data.sources.path=x", "data.sources is a list"),
+        ("=", "expected section.key=value"),
+        ("a..b=1", "expected section.key=value"),
+        ("extract.store=", "extract.store: expected a path, found None"),
+        ("extract.store.name=x", "extract.store: expected a path, found keys with values"),
+        ("data.views=&a [*a]", "at most 50,000 values in 50 levels"),
+        ("data.views=" + "[" * 100_000, "at most 50 levels"),
+        ("train_head.seed=" + "9" * 5000, "line 1, column 1: expected a text"),
+        ("train_head.seed=" + "9" * 300, "train_head.seed: expected less than"),
+        ("serve.idle_s=" + "9" * 399, "serve.idle_s: expected a valid number"),
+        ("data.action_hz=.nan", "data.action_hz: expected a finite number, found nan"),
+        ("data.root=!!python/name:os.system", "found !!python/name:os.system"),
+        ("data.root=!!binary aGk=", "found !!binary"),
+        ('data.root="a\\0b"', r"found !!str 'a\x00b'"),
+        ('data.root="a\\ud800b"', r"found !!str 'a\ud800b'"),
+        ("data.root=\x1b[31m", "special characters are not allowed"),
+        ("data.root=" + "x/" * 2000, "data.root: expected a path of at most 3,000 characters"),
+        ("train_head.output=" + "x" * 250, "train_head.output: expected a path"),
+        ("train_head.wandb_project=" + "x" * 100_000, "at most 10,000 characters"),
+        ("serve.port=2026-01-01", "serve.port: expected a valid integer"),
+        ("extract.workers=1000000", "extract.workers: expected a number of processes up to"),
+        ("vlm.image_resize_height=1000000000", "vlm.image_resize_height: expected less than or"),
         ("vlm.prompt='{picture}'", "only {instruction} and {images}"),
         ("vlm.prompt='{images}{images}'", "may stand once"),
         ("extract.store=cache_store/demo", "ends in .zarr"),
         ("data.sources=[{name: a, path: x}, {name: a, path: y}]", "stands more than once"),
-        ("train_head.mixture={other: 1}", "mixture names other"),
         ("extract.workers=-1", "extract.workers"),
         ("extract.workers=somehost", "extract.workers"),
         ("train_head.diffusion={timesteps: 20, sampling_steps: 50}", "above timesteps 20"),
-        ("train_head.grad_accumulation=80", "parts without a tick"),
         ("train_head.model_type=transformer", "flow_matching"),
         ("train_head.fusion_strategy=film", "cross_attention"),
         ("finetune.tuning.towers=[]", "finetune.tuning.towers"),
@@ -120,26 +147,165 @@ def test_every_problem_is_said_with_its_place(minimal):
 def test_what_is_refused(minimal, override, message):
     with pytest.raises(ConfigError) as caught:
         load_params(minimal, [override])
-    assert message in str(caught.value)
+    said = str(caught.value)
+    assert message in said
+    assert len(said) < 2000
+    assert said.isprintable() or "problem(s)\n" in said
+    assert str(minimal) in said or said.startswith("--set ")
 
 
 @pytest.mark.parametrize(
     "override",
-    ["train_head.mixture={other: 1}", "train_head.diffusion={timesteps: 20, sampling_steps: 50}"],
+    ["train_head.split={val: 0.9}", "train_head.diffusion={timesteps: 20, sampling_steps: 50}"],
 )
 def test_a_rule_over_a_section_does_not_print_the_section(minimal, override):
     with pytest.raises(ConfigError) as caught:
         load_params(minimal, [override])
-    _, line = str(caught.value).splitlines()
+    _, line, _ = str(caught.value).splitlines()
     assert "{" not in line and len(line) < 120
 
 
-def test_a_missing_and_a_broken_file(tmp_path):
-    with pytest.raises(ConfigError, match=r"nowhere\.yaml: no such file.*--params"):
-        load_params(tmp_path / "nowhere.yaml")
-    (tmp_path / "broken.yaml").write_text("data: [")
-    with pytest.raises(ConfigError, match="cannot be read as YAML"):
-        load_params(tmp_path / "broken.yaml")
-    (tmp_path / "list.yaml").write_text("- 1")
-    with pytest.raises(ConfigError, match="expected sections"):
-        load_params(tmp_path / "list.yaml")
+LAUGHS = "a0: &a0 [1, 1]\n" + "".join(f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}]\n" for i in range(1, 60))
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (None, "no such file"),
+        ("folder", "expected a file, found a folder"),
+        ("pipe", "expected a file, found a pipe"),
+        (b"data: [", "line 1, column 8: expected the node content"),
+        (b"- 1", "expected sections such as `data:`, found [1]"),
+        (b"", "expected sections such as `data:`, found None"),
+        (b"a: 1\n---\nb: 1\n", "line 2, column 1: but found another document"),
+        (b"#" * 2**20, "expected at most 262,144 bytes, found 1,048,576"),
+        (b"[" * 100_000, "expected at most 50 levels"),
+        (b"{a: " * 60_000, "expected at most 50 levels"),
+        (b"x: " + b"[" * 60 + b"]" * 60, "line 1, column 53: expected at most 50,000 values"),
+        (LAUGHS.encode(), "expected at most 50,000 values in 50 levels"),
+        (b"data: &a {x: *a}", "expected at most 50,000 values in 50 levels"),
+        (b"data: *nobody", "line 1, column 7: found undefined alias 'nobody'"),
+        (b"data: !!set {a, b}", "line 1, column 7: expected a text (Unicode"),
+        (b"data: !!omap [a: 1]", "found !!omap"),
+        (b"data: !!python/object/apply:os.system [ls]", "found !!python/object/apply:os.system"),
+        (b"data: !mine 1", "found !mine '1'"),
+        (b"data: !!int x", "found !!int 'x'"),
+        (b"data: !!bool x", "found !!bool 'x'"),
+        (b"data:\n  <<: 3", "line 2, column 7: expected a section to merge, found 3"),
+        (b"data: {}\ndata: {}", "line 2, column 1: expected a text that stands once as a key"),
+        (b"1: x", "line 1, column 1: expected a text that stands once as a key, found 1"),
+        (b"[1]: x", "expected a text that stands once as a key, found [1]"),
+        (b"data: \0", "character 7: special characters are not allowed"),
+        (b"data: \xff", "character 7: invalid start byte"),
+    ],
+)
+@pytest.mark.parametrize("reads", ["params", "limits"])
+def test_a_file_that_cannot_be_read_is_told_by_name_and_place(tmp_path, content, said, reads):
+    path = tmp_path / "broken.yaml"
+    if content == "folder":
+        path.mkdir()
+    elif content == "pipe":
+        os.mkfifo(path)
+    elif content is not None:
+        path.write_bytes(content)
+    with pytest.raises(ConfigError) as caught:
+        load_params(path) if reads == "params" else load_section(path, LimitsFile)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert said in str(caught.value)
+    assert "--params FILE" in str(caught.value)
+    assert len(str(caught.value)) < 1000
+
+
+def test_many_unknown_keys_and_what_cannot_be_printed_make_a_short_message(tmp_path):
+    path = tmp_path / "many.yaml"
+    path.write_text(MINIMAL + "".join(f"key{i}: 1\n" for i in range(1000)) + '"a\\nb": 1\n')
+    with pytest.raises(ConfigError, match=r"1001 problem\(s\)") as caught:
+        load_params(path)
+    assert len(str(caught.value)) < 20_000
+
+
+def test_dates_are_texts_and_an_alias_has_a_value_of_its_own(tmp_path):
+    path = tmp_path / "params.yaml"
+    path.write_text(
+        "data: {sources: [{name: a, path: 2026-01-01}]}\nvlm: {checkpoint: x}\n"
+        "train_head: {expert: &e {dim: 32}, mixture: &m {a: 1}}\nfinetune: {}\n"
+    )
+    assert load_params(path).data.sources[0].path == "2026-01-01"
+    path.write_text(path.read_text() + "extract: &x {device: cpu}\nevaluate: *x\n")
+    params = load_params(path, ["extract.device=cuda"])
+    assert (params.extract.device, params.evaluate.device) == ("cuda", "cpu")
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "models/head",
+        "a b/c",
+        "0",
+        "1.5",
+        "null",
+        "2026-13-45",
+        "{x}",
+        "#x",
+        "*x",
+        "é/😀",
+        "it's: x",
+        "a\x85b",
+    ],
+)
+def test_advice_typed_as_it_is_printed_gives_the_value(minimal, path):
+    flag, override = shlex.split(setting("data.root", Path(path)))
+    assert flag == "--set"
+    assert load_params(minimal, [override]).data.root == Path(path)
+    _, override = shlex.split(setting("data.views", ["View1", path]))
+    assert load_params(minimal, [override]).data.views == ("View1", path)
+
+
+def test_surrogate_pairs_as_json_prints_them_are_joined(minimal):
+    assert load_params(minimal, [r'data.root="\ud83d\ude00"']).data.root == Path("😀")
+
+
+def _numbers(section: type[Section], above: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
+    """The JSON schema of each number of a section, by its place."""
+
+    def inside(schema: Any) -> Iterator[dict[str, Any]]:
+        if isinstance(schema, dict):
+            if schema.get("type") in ("integer", "number"):
+                yield schema
+            schema = list(schema.values())
+        for inner in schema if isinstance(schema, list) else ():
+            yield from inside(inner)
+
+    for name, field in section.model_fields.items():
+        place, inner = f"{above}{name}", field.annotation
+        if isinstance(inner, type) and issubclass(inner, Section):
+            yield from _numbers(inner, f"{place}.")
+        else:
+            kind: Any = inner
+            if field.metadata:
+                kind = Annotated[kind, *field.metadata]
+            yield from ((place, one) for one in inside(TypeAdapter(kind).json_schema()))
+
+
+UNBOUNDED = {"vlm.layers", "extract.workers", "verify.workers"}
+"""The model has so many layers; workers are bounded by a function of their own."""
+
+
+def test_every_number_has_an_upper_bound():
+    """So that a mistyped one is refused, and neither hangs nor takes all memory."""
+    numbers = list(_numbers(Params))
+    assert len(numbers) > 100
+    open_ended = {
+        place for place, schema in numbers if not {"maximum", "exclusiveMaximum"} & schema.keys()
+    }
+    assert open_ended == UNBOUNDED
+
+
+def test_a_section_is_merged_below_another(tmp_path):
+    path = tmp_path / "limits.yaml"
+    path.write_text(
+        "step: &fast {most: {x: 1.0}, on_exceed: clip}\nspeed: {<<: *fast, most: {x: 2}}"
+    )
+    speed = load_section(path, LimitsFile).speed
+    assert speed is not None
+    assert (speed.most, speed.on_exceed) == ({"x": 2.0}, "clip")

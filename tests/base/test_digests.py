@@ -67,7 +67,7 @@ def test_what_is_no_ledger_is_left_as_it_is(tmp_path, kind, opened):
 def test_names_a_file_that_cannot_be_read(tmp_path):
     with (
         closing(ContentDigests(tmp_path / "ledger.sqlite")) as digests,
-        pytest.raises(RecordingError, match=r"gone: cannot be read: No such file"),
+        pytest.raises(RecordingError, match=r"gone: no such file"),
     ):
         digests.of(tmp_path / "gone")
 
@@ -113,3 +113,43 @@ def test_a_text_is_made_once(tmp_path):
     with closing(ContentDigests(tmp_path / "ledger.sqlite")) as digests:
         assert digests.text("name", lambda: "made again") == "text"
         assert digests.text("another", lambda: "made again") == "made again"
+
+
+@pytest.mark.parametrize("opened", [ContentDigests, ContentDigests.to_read])
+def test_a_ledger_whose_pages_are_damaged_gives_no_wrong_digest(tmp_path, opened):
+    """Some pages are emptied, or have a bit flipped in each 64 bytes."""
+    ledger, files = tmp_path / "ledger.sqlite", [tmp_path / f"file{i}" for i in range(8)]
+    for file in files:
+        file.write_text(file.name)
+    with closing(ContentDigests(ledger)) as digests:
+        expected = [digests.of(file) for file in files]
+        digests.note_rate("model", 12.5)
+    sound = ledger.read_bytes()
+    for start in range(100, len(sound), 4096 * 5):
+        flipped = bytearray(sound)
+        for index in range(start, min(start + 3996, len(sound)), 64):
+            flipped[index] ^= 4
+        emptied = sound[:start] + bytes(4096) + sound[start + 4096 :]
+        for content in (flipped, emptied, sound[:start]):
+            ledger.write_bytes(content)
+            with closing(opened(ledger)) as digests:
+                assert [digests.of(file) for file in files] == expected
+                assert digests.rate("model") in (12.5, None)
+
+
+@pytest.mark.parametrize("kind", ["folder", "pipe"])
+def test_only_regular_files_are_read(tmp_path, kind):
+    (tmp_path / "it").mkdir() if kind == "folder" else os.mkfifo(tmp_path / "it")
+    with (
+        closing(ContentDigests(None)) as digests,
+        pytest.raises(RecordingError, match=rf"it: expected a file, found a {kind}.*Copy it again"),
+    ):
+        digests.of(tmp_path / "it")
+
+
+def test_a_path_that_is_no_unicode_has_a_digest(tmp_path):
+    (tmp_path / "a\udcff").write_text("one")
+    with closing(ContentDigests(tmp_path / "ledger.sqlite")) as digests:
+        assert digests.of(tmp_path / "a\udcff") == digests.of(tmp_path / "a\udcff")
+        digests.note_bad("episode", "a\udcff: damaged")
+        assert digests.bad("episode") == "a\udcff: damaged"

@@ -53,15 +53,3 @@ def test_the_least_limit_of_the_groups_above_counts(machine, limited):
     assert available_bytes(machine) == 2
     limit(groups / limited, 8 * GIB, 9 * GIB, 2)
     assert available_bytes(machine) == 0
-
-
-def test_control_groups_of_version_1(machine):
-    write(machine / "proc/self/cgroup", "5:cpu:/\n4:memory:/docker/abc\n0::/")
-    top = machine / "sys/fs/cgroup/memory"
-    write(top / "memory.limit_in_bytes", 2**63 - PAGE)
-    write(top / "memory.usage_in_bytes", 60 * GIB)
-    write(top / "docker/abc/memory.limit_in_bytes", 4 * GIB)
-    write(top / "docker/abc/memory.usage_in_bytes", 3 * GIB)
-    stat = f"inactive_file 7\ntotal_inactive_file {GIB}\ntotal_active_file {GIB}"
-    write(top / "docker/abc/memory.stat", stat)
-    assert (memory_bytes(machine), available_bytes(machine)) == (4 * GIB, 3 * GIB)

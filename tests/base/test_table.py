@@ -40,11 +40,6 @@ def test_a_table_without_rows_has_heads():
     assert len(empty.markdown()) == 2
 
 
-def test_a_row_of_another_length_is_refused():
-    with pytest.raises(ValueError, match=r"row 1: 1 cells, 2 heads"):
-        Table(("a", "b"), [(1, 2), (1,)])
-
-
 @pytest.mark.parametrize(
     ("value", "words"),
     [

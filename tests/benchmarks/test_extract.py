@@ -13,7 +13,7 @@ from benchmarks.cases import Case
 from benchmarks.extract import _deviation, measure
 from benchmarks.profiling import Stopwatch
 from benchmarks.stage_one import StageOne
-from pipeline.extract.engine import RowEngine
+from pipeline.extract.engine import RowPreparation
 from pipeline.vlm import collation
 
 OPTIONS = Namespace(batch_size=2, rounds=1, profile=True, compile=False)
@@ -80,7 +80,7 @@ def test_no_frame_and_no_row_is_spared_where_every_frame_is_asked_for():
 
     def run() -> None:
         seen.append(collation.unique([frame, frame])[1])
-        seen.append(RowEngine.prepare is stage_one.prepare_all)
+        seen.append(RowPreparation.prepare is stage_one.prepare_all)
 
     ours.run = run  # type: ignore[method-assign]
     ours.run_every_frame()

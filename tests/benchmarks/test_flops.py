@@ -86,9 +86,9 @@ def test_the_real_shape_has_the_parameters_of_the_released_checkpoint():
 def test_the_shell_is_a_checkpoint_folder_of_the_real_shape(tmp_path):
     config = write_shell(tmp_path / "shell")
     read = read_config(tmp_path / "shell")
-    assert read["text_config"]["hidden_size"] == 2048
-    assert read["text_config"]["num_hidden_layers"] == 36
-    assert read["image_token_id"] == config.image_token_id < 1600
+    assert read.text_config.hidden_size == 2048
+    assert read.text_config.num_hidden_layers == 36
+    assert read.image_token_id == config.image_token_id < 1600
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ def test_a_tick_that_is_neither_run_nor_left_out_is_not_accounted_for(
 ) -> None:
     """Ticks 0, 1, 2, 5, 6, 9, and a last one where it is stopped safely, for 35 ticks."""
     now = 0.0
-    with closing(CountedRobot(hz=100.0, again=True, clock=lambda: now)) as robot:
+    with closing(CountedRobot(hz=100.0, clock=lambda: now)) as robot:
         for tick in (0, 1, 2, 5, 6, 9, 10)[: 7 if safe_stop else 6]:
             now = (tick + 0.1) / 100
             robot.observe()

@@ -1,6 +1,7 @@
 """LeRobot data sets of the three layouts."""
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -200,13 +201,10 @@ def test_names_come_in_many_shapes(tmp_path, write, names, found):
 @pytest.mark.parametrize(
     ("feature", "message"),
     [
-        ({"shape": [2], "names": ["p"]}, "1 names for 2 values"),
-        ({"shape": [2], "names": None, "units": ["mm"]}, "1 units for 2 values"),
-        ({"shape": [2], "names": 5}, "expected names and units in lists, found names 5"),
-        ({"shape": [2], "names": "ab"}, "expected names and units in lists, found names 'ab'"),
-        ({"shape": [2], "names": None, "units": 5}, "found names None, units 5"),
-        ({"shape": [2], "names": None, "units": "mm"}, "found names None, units 'mm'"),
+        ({"shape": [2], "names": ["p"]}, "2 values a reading, but 1 names and 2 units"),
+        ({"shape": [2], "names": None, "units": ["mm"]}, "but 2 names and 1 units"),
         ({"shape": [2, 3], "names": None}, r"shape of one number, found \[2, 3\]"),
+        ({"shape": [65_537], "names": None}, "at most 65,536 channels, found 65,537"),
         ({"shape": [3], "names": None}, "2 values in row 0, but its feature has 3"),
     ],
 )
@@ -251,7 +249,7 @@ def test_numbers_in_a_plain_column_are_a_stream_of_one(tmp_path, write):
         ([[0.0, 1.0]] * 6 + [[0.0]], "1 values in row 6"),
         ([[0.0, 1.0]] * 6 + [None], "no value in row 6"),
         ([[0.0, 1.0]] * 6 + [[0.0, None]], "nan in row 6.*'b'"),
-        ([["0", "1"]] * 7, "expected numbers, found string"),
+        ([["0", "1"]] * 7, "expected numbers, found .*string"),
     ],
 )
 def test_spoilt_rows_are_named(tmp_path, write, values, message):
@@ -365,6 +363,21 @@ def test_the_sidecar_is_the_sensor(root, truth):
         opened(root).recordings[0].sensor()
 
 
+@pytest.mark.parametrize("name", ["sensor", "state", "frames"])
+@pytest.mark.parametrize("kind", ["no such file", "a pipe"])
+def test_a_sidecar_that_is_no_file_is_refused_not_absent(root, name, kind):
+    path = root / name / "episode_000000.npz"
+    path.parent.mkdir()
+    os.mkfifo(path) if kind == "a pipe" else path.symlink_to("nowhere")
+    recording = opened(root).recordings[0]
+    message = rf"{name}/episode_000000\.npz: .*{kind}.*Copy the file again"
+    with pytest.raises(RecordingError, match=message):
+        content_digest(recording, file_digest)
+    if name != "frames":  # of images in rows, which this data set has none of
+        with pytest.raises(RecordingError, match=message):
+            getattr(recording, name)()
+
+
 def test_states_faster_than_the_rows_stand_in_a_sidecar(root):
     before = opened(root).recordings[0]
     assert before.nominal().rates_hz.keys() == {"state", "action", "view top"}
@@ -435,8 +448,11 @@ def test_the_kind_of_the_actions_may_stand_beside_their_names(root):
     assert opened(root, action_kind="velocity").recordings[0].action().kind == "velocity"
     document["features"]["action"]["kind"] = "sideways"
     info.write_text(json.dumps(document))
-    with pytest.raises(RecordingError, match="absolute, velocity, delta, found 'sideways'"):
-        opened(root).recordings[0].action()
+    with pytest.raises(
+        RecordingError,
+        match=r"action\.kind: expected 'absolute', 'velocity' or 'delta', found 'sideways'",
+    ):
+        opened(root)
 
 
 @pytest.mark.parametrize("version", VERSIONS)
@@ -504,7 +520,7 @@ def test_swapped_data_files_are_refused(tmp_path, write):
     for read in (swapped.state, swapped.action, swapped.cameras, swapped.identity):
         with pytest.raises(
             RecordingError,
-            match=r"000000\.parquet, row 0: expected episode_index 0, found 1 \(7 such rows",
+            match=r"000000\.parquet: has no row of episode 0\. Give the data files their own names",
         ):
             read()
     assert whole.state() is not None
@@ -570,7 +586,8 @@ def test_two_cameras_that_would_be_one_view_are_refused(tmp_path, write):
     camera = {"dtype": "image", "shape": [48, 64, 3], "names": None}
     root = write.lerobot(tmp_path / "set", features={"observation.top": camera})
     with pytest.raises(
-        RecordingError, match=rf"info\.json: features '{KEY}' and 'observation\.top'.*view 'top'"
+        RecordingError,
+        match=rf"info\.json: features '{KEY}' and 'observation\.top'.*view 'top'; rename one",
     ):
         opened(root)
     # A depth map is no view and takes no name.
@@ -697,7 +714,10 @@ def test_a_truncated_parquet_is_named(tmp_path, write, version):
 def test_an_unknown_version_is_refused(tmp_path, write, version):
     root = write.lerobot(tmp_path / "set")
     write.edit_json(root / "meta/info.json", codebase_version=version)
-    with pytest.raises(RecordingError, match=f"'s'.*codebase_version is {version!r}.*v3.0"):
+    found = "codebase_version: " + ("missing" if version is None else f".*v3.0', found {version!r}")
+    with pytest.raises(
+        RecordingError, match=f"'s'.*{found}.*convert the data set with the lerobot"
+    ):
         opened(root)
 
 
@@ -705,19 +725,23 @@ def test_an_unknown_version_is_refused(tmp_path, write, version):
     ("file", "text", "message"),
     [
         ("info.json", "{", "info.json: cannot be read as JSON"),
-        ("info.json", "[]", "expected a JSON object"),
+        ("info.json", "[]", "info.json: expected an object, found.*Mend meta/"),
         ("episodes.jsonl", '{"episode_index": 0, "length": 7}\n{', "episodes.jsonl, line 2"),
         ("episodes.jsonl", '{"length": 7}', "line 1.*episode_index"),
-        ("episodes.jsonl", '{"episode_index": "a", "length": 7}', "cannot be understood"),
+        (
+            "episodes.jsonl",
+            '{"episode_index": "a", "length": 7}',
+            "line 1: episode_index: .*found 'a'",
+        ),
         (
             "episodes.jsonl",
             '{"episode_index": 4, "length": 7, "tasks": [5]}',
-            r"episodes\.jsonl, episode 4: expected tasks as texts, found \[5\]",
+            r"episodes\.jsonl, line 1: tasks\.0: expected a valid string, found 5",
         ),
         (
             "episodes.jsonl",
             '{"episode_index": 4, "length": 7, "tasks": "pick"}',
-            "episode 4: expected tasks as texts, found 'pick'",
+            r"episodes\.jsonl, line 1: tasks: .*found 'pick'",
         ),
         ("tasks.jsonl", '{"task": "pick"}', "tasks.jsonl, line 1.*task_index"),
     ],
@@ -732,20 +756,22 @@ def test_broken_meta_of_v2_is_named(tmp_path, write, file, text, message):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"fps": None}, "expected fps and features"),
-        ({"fps": 0}, "fps must be a positive number"),
-        ({"chunks_size": 0}, r"info\.json: chunks_size must be a positive number, found 0"),
-        ({"chunks_size": 0.5}, r"info\.json: chunks_size must be a whole number, found 0\.5"),
-        ({"chunks_size": None}, r"info\.json: chunks_size must be a whole number, found None"),
-        ({"features": []}, "expected fps and features"),
-        ({"data_path": "data/{nonsense}.parquet"}, "nonsense"),
-        ({"data_path": None}, "data_path"),
+        ({"fps": None}, "fps: missing"),
+        ({"fps": 0}, "fps: expected .*found 0"),
+        ({"fps": True}, "fps: expected a valid number, found True"),
+        ({"fps": 1e300}, r"fps: expected .*found 1e\+300"),
+        ({"chunks_size": 0}, "chunks_size: expected .*found 0"),
+        ({"chunks_size": 0.5}, "chunks_size: expected .*found 0.5"),
+        ({"chunks_size": None}, "chunks_size: missing"),
+        ({"features": []}, r"features: expected .*found \[\]"),
+        ({"data_path": None}, "data_path: missing"),
+        ({"video_path": None}, "video_path: missing, but features has videos"),
     ],
 )
 def test_broken_info_is_named(tmp_path, write, changes, message):
     root = write.lerobot(tmp_path / "set")
     write.edit_json(root / "meta/info.json", **changes)
-    with pytest.raises(RecordingError, match=f"source 's'.*{message}"):
+    with pytest.raises(RecordingError, match=rf"source 's'.*info\.json: {message}.*Mend meta/"):
         opened(root)
 
 
@@ -754,7 +780,7 @@ def test_broken_info_is_named(tmp_path, write, changes, message):
 def test_a_video_span_that_is_no_time_is_named(tmp_path, write, field, value):
     root = write.lerobot(tmp_path / "set", "v3.0")
     edit_v3(root, **{f"videos/{KEY}/{field}": [0.7, value, 2.1]})
-    place = "cannot be understood" if value == 1e308 else rf"file-000\.parquet, row 1: .*{field}"
+    place = rf"file-000\.parquet, row 1: videos\.{KEY}\.{field}: expected"
     with pytest.raises(RecordingError, match=place):
         opened(root)
 
@@ -764,11 +790,13 @@ def test_broken_meta_of_v3_is_named(tmp_path, write):
     path = root / "meta/episodes/chunk-000/file-000.parquet"
     table = pq.ParquetFile(path).read()
     pq.write_table(table.drop_columns(["data/file_index"]), path)
-    with pytest.raises(RecordingError, match=r"file-000\.parquet: missing column.*data/file_index"):
+    with pytest.raises(
+        RecordingError, match=r"file-000\.parquet, row 0: data\.file_index: missing"
+    ):
         opened(root)
     edit = table.set_column(1, "length", pa.array([7, None, 9]))
     pq.write_table(edit, path)
-    with pytest.raises(RecordingError, match="row 1: length is null"):
+    with pytest.raises(RecordingError, match=r"row 1: length: expected .*found None"):
         opened(root)
     path.write_bytes(path.read_bytes()[:50])
     with pytest.raises(RecordingError, match="cannot be read as parquet"):
@@ -827,3 +855,240 @@ def test_adding_an_episode_leaves_the_files_of_the_others_alone(tmp_path, write)
         assert [p.name for p in one.files()] == [p.name for p in other.files()]
         assert one.identity() == other.identity()
         assert not any("meta" in path.parts for path in one.files())
+
+
+META_MEND = r".*Mend meta/, or convert the data set with the lerobot release that wrote it"
+FILE_MEND = r".*Copy the file again, or leave the episode out"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[" * 100_000, "cannot be read as JSON: recursion limit"),
+        ('{"features":' + '{"a":' * 100_000, "cannot be read as JSON: recursion limit"),
+        ('{"fps": 1' + "0" * 400 + "}", ".*fps: expected a finite number, found 1000"),
+        ('{"codebase_version": "\\ud800"}', "cannot be read as JSON: .*hex escape"),
+        ('{"a": "' + "x" * 2**23 + '"}', "expected at most 8,388,608 bytes"),
+        ("null", "expected an object, found None"),
+    ],
+)
+def test_an_info_that_is_no_document_is_named(tmp_path, write, text, message):
+    root = write.lerobot(tmp_path / "set")
+    (root / "meta/info.json").write_text(text)
+    with pytest.raises(RecordingError, match=rf"info\.json: ({message}){META_MEND}"):
+        opened(root)
+
+
+@pytest.mark.parametrize("name", ["data_path", "video_path"])
+@pytest.mark.parametrize(
+    "path",
+    [
+        "{episode_index:3000000000d}",
+        "{episode_index.__class__}",
+        "{episode_index[0]}",
+        "{episode_index!r}",
+        "{episode_index:{episode_chunk}d}",
+        "{nonsense}",
+        "{chunk_index}",
+        "{}",
+        "data/{episode_index",
+        "/etc/{episode_index}",
+        "data/../../{episode_index}",
+        "data/\x00{episode_index}",
+    ],
+)
+def test_a_path_that_leaves_the_data_set_is_refused(tmp_path, write, name, path):
+    root = write.lerobot(tmp_path / "set")
+    write.edit_json(root / "meta/info.json", **{name: path})
+    with pytest.raises(RecordingError, match=rf"info\.json: {name}: expected .*found{META_MEND}"):
+        opened(root)
+
+
+@pytest.mark.parametrize(
+    "key", ["observation.images.a/b", "observation.images...", "observation.images.", "a\\b", ".."]
+)
+@pytest.mark.parametrize("dtype", ["video", "image"])
+def test_a_camera_that_cannot_be_a_file_is_refused(tmp_path, write, key, dtype):
+    features = {key: {"dtype": dtype, "shape": [48, 64, 3], "names": None}}
+    root = write.lerobot(tmp_path / "set", features=features)
+    message = rf"info\.json: features: a camera cannot have the name.*{META_MEND}"
+    with pytest.raises(RecordingError, match=message):
+        opened(root)
+
+
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        ({"shape": [2_000_000_000]}, r"shape\.0: expected less than 1000000000, found 2000000000"),
+        ({"shape": [True]}, r"shape\.0: expected a valid integer, found True"),
+        ({"shape": None}, "shape: expected .*found None"),
+        ({"names": 5}, "names: expected .*found 5"),
+        ({"names": "ab"}, "names: expected .*found 'ab'"),
+        ({"names": [1, 2]}, r"names\.0: expected a valid string, found 1"),
+        ({"names": [[["a"]], "b"]}, r"names\.0: expected a valid string, found \['a'\]"),
+        ({"names": ["a" * 10_001, "b"]}, r"names\.0: expected .* at most 10000 characters"),
+        ({"units": 5}, "units: expected .*found 5"),
+        ({"units": [None, "mm"]}, r"units\.0: expected a valid string, found None"),
+        ({"dtype": 5}, "dtype: expected a valid string, found 5"),
+        ({"info": {"is_depth_map": "yes"}}, r"info\.is_depth_map: expected .*found 'yes'"),
+    ],
+)
+def test_a_feature_of_wrong_types_is_named(tmp_path, write, entries, message):
+    described = {"dtype": "float32", "shape": [2], "names": None, **entries}
+    root = write.lerobot(tmp_path / "set", features={"observation.state": described})
+    place = rf"info\.json: features\.observation\.state\.{message}"
+    with pytest.raises(RecordingError, match=f"{place}{META_MEND}"):
+        opened(root)
+
+
+@pytest.mark.parametrize(
+    ("column", "cells", "message"),
+    [
+        ("episode_index", ["0", "1", "2"], r"episode_index: expected a valid integer, found '0'"),
+        ("episode_index", [True, False, True], "episode_index: expected .*found True"),
+        ("episode_index", [-1, 1, 2], "episode_index: expected greater .*found -1"),
+        ("length", [10**12, 5, 9], "length: expected less than 1000000000, found 1000000000000"),
+        ("length", [[7], [5], [9]], r"length: expected a valid integer, found \[7\]"),
+        ("data/chunk_index", [0.5, 0.0, 0.0], r"data\.chunk_index: expected .*found 0\.5"),
+        ("tasks", ["a", "b", "c"], "tasks: expected .*found 'a'"),
+        ("tasks", [["x" * 10_001]] * 3, r"tasks\.0: expected .*at most 10000 characters"),
+        ("group", [True, False, True], "group.*found True"),
+    ],
+)
+def test_rows_of_meta_of_wrong_types_are_named(tmp_path, write, column, cells, message):
+    root = write.lerobot(tmp_path / "set", "v3.0")
+    path = root / "meta/episodes/chunk-000/file-000.parquet"
+    table = pq.ParquetFile(path).read()
+    if column in table.column_names:
+        table = table.drop_columns([column])
+    pq.write_table(table.append_column(column, pa.array(cells)), path)
+    with pytest.raises(RecordingError, match=rf"file-000\.parquet, row 0: {message}{META_MEND}"):
+        opened(root)
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+@pytest.mark.parametrize(
+    ("tasks", "message"),
+    [
+        ([{"task_index": 0, "task": None}], "task: expected a valid string, found None"),
+        ([{"task_index": 0, "task": 5}], "task: expected a valid string, found 5"),
+        ([{"task_index": "0", "task": "a"}], "task_index: expected .*found '0'"),
+        ([{"task_index": -1, "task": "a"}], "task_index: expected .*found -1"),
+        ([{"task_index": 0}], "task: missing"),
+        (
+            [{"task_index": 7, "task": "a"}, {"task_index": 7, "task": "b"}],
+            "expected each task once, found 7 twice",
+        ),
+    ],
+)
+def test_broken_tasks_are_named(tmp_path, write, version, tasks, message):
+    root = write.lerobot(tmp_path / "set", version)
+    if version == "v3.0":
+        pq.write_table(pa.Table.from_pylist(tasks), root / "meta/tasks.parquet")
+    else:
+        write.jsonl(root / "meta/tasks.jsonl", tasks)
+    with pytest.raises(RecordingError, match=rf"meta/tasks\.\w+(, \w+ \d)?: {message}{META_MEND}"):
+        opened(root)
+
+
+def zeros(rows: int) -> pa.ChunkedArray:
+    """As many in memory as on disk: next to nothing."""
+    return pa.chunked_array([pa.array(np.zeros(1_000_000, np.int8))] * (rows // 1_000_000))
+
+
+def test_tables_that_unpack_to_more_than_the_limits_are_refused_unread(tmp_path, write):
+    names = ("episode_index", "length", "data/chunk_index", "data/file_index")
+    root = write.lerobot(tmp_path / "v3", "v3.0", image=True)
+    path = root / "meta/episodes/chunk-000/file-000.parquet"
+    pq.write_table(pa.table({name: zeros(20_000_000) for name in names}), path)
+    unpacked = r"parquet: expected at most 268,435,456 bytes unpacked, found.*raise limits\.ratio"
+    with pytest.raises(RecordingError, match=unpacked):
+        opened(root)
+    root = write.lerobot(tmp_path / "v2")
+    names = ("episode_index", "timestamp")
+    pq.write_table(
+        pa.table({name: zeros(20_000_000) for name in names}),
+        root / "data/chunk-000/episode_000000.parquet",
+    )
+    with pytest.raises(RecordingError, match=unpacked):
+        opened(root).recordings[0].state()
+    opened_wide = opened(root, limits={"ratio": 1e6}).recordings[0]
+    with pytest.raises(RecordingError, match="20000000 rows of episode 0, but meta/ says 7"):
+        opened_wide.state()
+
+
+def test_a_list_of_episodes_that_never_ends_is_refused(tmp_path, write, monkeypatch):
+    monkeypatch.setattr("pipeline.data.lerobot_layout._MOST_ROWS", 2)
+    with pytest.raises(RecordingError, match=rf"meta: expected at most 2 episodes{META_MEND}"):
+        opened(write.lerobot(tmp_path / "set"))
+
+
+@pytest.mark.parametrize(
+    ("cells", "found"),
+    [
+        (["a"] * 7, "string"),
+        ([True] * 7, "bool"),
+        ([[[1.0, 2.0]]] * 7, "list<"),
+        ([{"a": 1}] * 7, "struct<"),
+        (pa.array(["a"] * 7).dictionary_encode(), "dictionary<"),
+        (pa.array([1] * 7, pa.timestamp("ns")), "timestamp"),
+        ([None] * 7, "null"),
+    ],
+)
+@pytest.mark.parametrize(
+    "column", ["observation.state", "timestamp", "frame_index", "episode_index"]
+)
+def test_columns_that_are_no_numbers_are_named(tmp_path, write, column, cells, found):
+    root = write.lerobot(tmp_path / "set", lengths=(7,), **{column: cells})
+    message = rf"000000\.parquet, column '{column}': expected numbers, found '.*{found}{FILE_MEND}"
+    with pytest.raises(RecordingError, match=message):
+        opened(root).recordings[0].state()
+
+
+def test_a_column_that_stands_twice_is_named(tmp_path, write):
+    root = write.lerobot(tmp_path / "set", lengths=(7,))
+    path = root / "data/chunk-000/episode_000000.parquet"
+    table = pq.ParquetFile(path).read()
+    pq.write_table(table.append_column("action", table["action"]), path)
+    with pytest.raises(RecordingError, match=rf"one column 'action', found more{FILE_MEND}"):
+        opened(root).recordings[0].action()
+
+
+@pytest.mark.parametrize("times", [[1e300 * n for n in range(7)], [-1e308, *range(5), 1e308]])
+def test_a_clock_that_no_seconds_have_is_named(tmp_path, write, times):
+    root = write.lerobot(tmp_path / "set", lengths=(7,), timestamp=times)
+    message = rf"'timestamp': expected seconds, found -?1e\+30\d in row \d{FILE_MEND}"
+    with pytest.raises(RecordingError, match=message):
+        opened(root).recordings[0].state()
+
+
+@pytest.mark.parametrize(
+    ("file", "version"),
+    [
+        ("meta/episodes.jsonl", "v2.1"),
+        ("meta/tasks.jsonl", "v2.1"),
+        ("meta/tasks.parquet", "v3.0"),
+        ("meta/episodes/chunk-000/file-000.parquet", "v3.0"),
+        ("data/chunk-000/episode_000000.parquet", "v2.1"),
+        ("data/chunk-000/file-000.parquet", "v3.0"),
+    ],
+)
+def test_what_is_no_file_is_named(tmp_path, write, file, version):
+    root = write.lerobot(tmp_path / "set", version, lengths=(7,))
+    for make, found in ((Path.mkdir, "a folder"), (os.mkfifo, "a pipe, socket or device")):
+        (root / file).rename(tmp_path / "aside") if (root / file).is_file() else None
+        make(root / file)
+        with pytest.raises(RecordingError, match=rf"{file}: expected a file, found {found}"):
+            opened(root)
+        (root / file).rmdir() if (root / file).is_dir() else (root / file).unlink()
+
+
+def test_videos_of_one_path_are_refused(tmp_path, write):
+    root = write.lerobot(tmp_path / "set")
+    write.edit_json(
+        root / "meta/info.json", video_path=f"videos/chunk-000/{KEY}/episode_000000.mp4"
+    )
+    message = r"000000\.mp4: meta/ gives frames of .* to episode_00000\d and to episode_00000\d too"
+    for recording in opened(root).recordings:
+        with pytest.raises(RecordingError, match=message):
+            recording.cameras()

@@ -170,7 +170,9 @@ def test_what_is_no_video_is_named_once_and_in_words(tmp_path):
     with pytest.raises(RecordingError) as caught:
         clip(path, 36).check([0])
     said = str(caught.value)
-    assert said.startswith(f"{path}: cannot be read as video: Invalid data found")
+    assert (
+        said.startswith(f"{path}: cannot be read as video (MP4, ") and "Invalid data found" in said
+    )
     assert said.count(str(path)) == 1 and "Errno" not in said
 
 

@@ -194,4 +194,4 @@ def test_unreadable_metadata_is_a_bad_episode(folder, text):
 def test_a_lost_metadata_file_is_a_bad_episode(folder):
     (folder / "metadata.json").unlink()
     (bad,) = open_recordings([Source(name="s", path=str(folder))], folder).bad
-    assert "metadata.json" in bad.reason and "No such file" in bad.reason
+    assert "metadata.json" in bad.reason and "no such file" in bad.reason

@@ -50,15 +50,8 @@ def compared(store: FeatureStore) -> Callable[[Predictions], Comparison]:
     def make(predictions: Predictions) -> Comparison:
         action = store.array("tick/action").astype(np.float64)
         spread = np.where(action.std(0) > 1e-9, action.std(0), 0)
-        return compare(
-            predictions,
-            Baselines(store, np.arange(90, 180), predictions.recorded.shape[1], None).act(
-                predictions.ticks
-            ),
-            store.streams["action"]["names"],
-            store.streams["action"]["units"],
-            GROUPS,
-            spread,
-        )
+        rules = Baselines(store, np.arange(90, 180), predictions.recorded.shape[1], None)
+        named = (tuple(store.streams["action"][key]) for key in ("names", "units"))
+        return compare(predictions, rules.act(predictions.ticks), (*named, GROUPS, spread))
 
     return make

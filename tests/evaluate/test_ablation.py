@@ -3,6 +3,8 @@
 import csv
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -121,8 +123,9 @@ def test_a_stream_that_decides_nothing_is_not(study: AblationStudy) -> None:
 
 
 def test_the_ways_to_spoil_are_those_that_mean_something(study: AblationStudy) -> None:
-    assert study.streams == ("sensor", "state", "features")
-    hows = {name: [s.how for s in study.ablated if s.stream == name] for name in study.streams}
+    names = ("sensor", "state", "features")
+    hows = {name: [s.how for s in study.ablated if s.stream == name] for name in names}
+    assert tuple(dict.fromkeys(s.stream for s in study.ablated)) == names
     late = ["delayed 50 ms", "delayed 100 ms", "delayed 200 ms"]
     assert hows["sensor"] == hows["state"] == ["zeroed", "shuffled", *late]
     # A VL row serves 3 ticks of 100 ms: nothing shorter can be had.
@@ -139,7 +142,9 @@ def test_the_figures_are_the_same_in_table_and_files(
     multiple = times(study, "sensor", "zeroed")
     ticks = np.arange(4)
     predictions = Predictions(ticks, ticks * 0, *[np.zeros((4, 1, 5), np.float32)] * 2, ticks > 0)
-    write_tables(tmp_path, study.intact, predictions, store, study)
+    parts: dict[str, Any] = {"comparison": study.intact, "predictions": predictions}
+    evaluation: Any = SimpleNamespace(**parts, store=store, study=study, energy=None)
+    write_tables(tmp_path, evaluation)
     rows = list(csv.DictReader((tmp_path / "modalities.csv").read_text().splitlines()))
     (row,) = (
         row
@@ -170,7 +175,7 @@ def test_missing_is_judged_where_training_dropped_the_stream(
     checkpoint, policy = trained(store, 1, drop_sensor=0.2, robot_state_enabled=False)
     found = evaluate_ablation(checkpoint, policy, store, held_out(store), rules(store), 64)
     assert found is not None
-    assert found.streams == ("sensor", "features")
+    assert {s.stream for s in found.ablated} == {"sensor", "features"}
     assert times(found, "sensor", "missing") > 0
     first, *others = found.notes
     left_out = len(held_out(store)) - found.intact.ticks

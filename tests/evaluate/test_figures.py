@@ -35,7 +35,8 @@ def compared(policy: np.ndarray, rule: np.ndarray, groups: int = GROUPS, **more)
     )
     names = (episodes % groups).astype(np.str_)
     one = (ActionGroup("translation", "mm", (0,)),)
-    return compare(predictions, rules, ["x"], ["mm"], one, np.array([2.0]), names, **more)
+    space = (("x",), ("mm",), one, np.array([2.0]))
+    return compare(predictions, rules, space, names, **more)
 
 
 def errors(mean: float, seed: int = 0, spread: float = 0.3) -> np.ndarray:

@@ -46,7 +46,8 @@ def test_errors_worked_out_by_hand() -> None:
     groups = (ActionGroup("both", "mm", (0, 1)),)
     rules = {name: np.full((2, 1, 2), 30, np.float32) for name in BASELINES}
     rules["repeat_last"] = np.full((2, 1, 2), -13, np.float32)
-    found = compare(predictions, rules, ["x", "y"], ["mm", "mm"], groups, np.array([2.0, 10.0]))
+    space = (("x", "y"), ("mm", "mm"), groups, np.array([2.0, 10.0]))
+    found = compare(predictions, rules, space)
     score = found.scores["policy"]
     assert found.episodes == (2, 7)
     assert score.mae == pytest.approx([3, 20])
@@ -84,7 +85,7 @@ def test_what_lies_beyond_an_episode_changes_no_score(seed: int, ticks: int, hor
         predictions = Predictions(
             np.arange(ticks), np.arange(ticks) // 3, predicted, np.zeros(shape, np.float32), valid
         )
-        found = compare(predictions, {}, "abc", ["", "", ""], groups, np.ones(3))
+        found = compare(predictions, {}, (("a", "b", "c"), ("", "", ""), groups, np.ones(3)))
         scores.append(found.scores["policy"])
     for name in ("mae", "mae_horizon", "mae_episode"):
         assert np.array_equal(getattr(scores[0], name), getattr(scores[1], name), equal_nan=True)

@@ -5,6 +5,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,12 @@ def comparison(
     predictions: Predictions, compared: Callable[[Predictions], Comparison]
 ) -> Comparison:
     return compared(predictions)
+
+
+def judged(comparison: Comparison, predictions: Predictions, store: FeatureStore) -> Any:
+    """As much of an evaluation as tables are written from."""
+    parts = {"comparison": comparison, "predictions": predictions, "store": store}
+    return SimpleNamespace(**parts, study=None, energy=None)
 
 
 def numbers(document: dict[str, Any]) -> list[float]:
@@ -75,7 +82,7 @@ def test_samples_and_phases_are_there_where_they_are_known(
         name: np.zeros((60, 4, 5), np.float32) for name in (*BASELINES, "mean of n", "best of n")
     }
     action = (comparison.names, comparison.units, comparison.groups, comparison.scale)
-    found = compare(predictions, others, *action, (TICKS % 5).astype(np.str_), phases)
+    found = compare(predictions, others, action, (TICKS % 5).astype(np.str_), phases)
     document = metrics(found, Figure(0.3, 0.2, 0.4))
     assert list(document["samples"]) == ["one", "mean_of_n", "best_of_n", "energy_score"]
     assert document["samples"]["energy_score"] == {"value": 0.3, "low": 0.2, "high": 0.4}
@@ -128,7 +135,7 @@ def test_dimensions_that_hardly_move_are_said_below_the_table(comparison: Compar
 def test_files_hold_every_dimension_step_episode_and_tick(
     comparison: Comparison, predictions: Predictions, store: FeatureStore, tmp_path: Path
 ) -> None:
-    files = write_tables(tmp_path, comparison, predictions, store)
+    files = write_tables(tmp_path, judged(comparison, predictions, store))
     assert sorted(file.name for file in files) == sorted(file.name for file in tmp_path.iterdir())
     assert json.loads((tmp_path / "metrics.json").read_text()) == metrics(comparison)
     rows = {
@@ -184,7 +191,7 @@ def test_a_step_no_chunk_reaches_is_empty(
     tmp_path: Path,
 ) -> None:
     predictions = recorded(np.array([28, 58]))
-    write_tables(tmp_path, compared(predictions), predictions, store)
+    write_tables(tmp_path, judged(compared(predictions), predictions, store))
     lines = (tmp_path / "steps.csv").read_text().splitlines()
     assert lines[3:] == [f"2{',' * 18}", f"3{',' * 18}"] and ",," not in lines[2]
 
@@ -199,7 +206,7 @@ def test_what_a_report_is_linked_to_is_not_written(
     for name in ("metrics.json", "dimensions.csv", "horizon.csv", "episodes.csv"):
         (cache / name).write_text("as it was")
         (report / name).hardlink_to(cache / name)
-    write_tables(report, comparison, predictions, store)
+    write_tables(report, judged(comparison, predictions, store))
     assert {file.read_text() for file in cache.iterdir()} == {"as it was"}
     assert json.loads((report / "metrics.json").read_text()) == metrics(comparison)
 
@@ -212,4 +219,4 @@ def test_a_full_disk_is_named(
 
     monkeypatch.setattr(Path, "open", full)
     with pytest.raises(DiskFull, match=str(tmp_path)):
-        write_tables(tmp_path, comparison, predictions, store)
+        write_tables(tmp_path, judged(comparison, predictions, store))

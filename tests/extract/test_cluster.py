@@ -32,7 +32,6 @@ from pipeline.base.errors import (
     ConfigError,
     PipelineError,
     RecordingError,
-    StoreIncomplete,
     VLMError,
 )
 from pipeline.extract import extract
@@ -59,11 +58,11 @@ from contextlib import suppress
 from pathlib import Path
 from pipeline.base.errors import NumericsError
 from pipeline.extract.encoder import Encoder
-from pipeline.extract.engine import RowEngine
+from pipeline.extract.engine import RowPreparation
 from pipeline.extract.cluster import ExtractionPlugin
 
 control = Path({control!r})
-prepare, encode, begin = RowEngine.prepare, Encoder.encoded, ExtractionPlugin.setup
+prepare, encode, begin = RowPreparation.prepare, Encoder.encoded, ExtractionPlugin.setup
 one_at_a_time = threading.Lock()
 
 def setup(self, worker, begin=begin):
@@ -118,8 +117,8 @@ def wait_until(true):
     while not true() and time.monotonic() < deadline:
         time.sleep(0.02)
 
-if prepare.__module__ == RowEngine.__module__:  # a worker may run this twice
-    RowEngine.prepare, Encoder.encoded, ExtractionPlugin.setup = prepared, encoded, setup
+if prepare.__module__ == RowPreparation.__module__:  # a worker may run this twice
+    RowPreparation.prepare, Encoder.encoded, ExtractionPlugin.setup = prepared, encoded, setup
 """
 """Run by each worker as it starts: it notes what it does, and does what the tests ask for."""
 
@@ -367,9 +366,9 @@ class TestDeaths:
     def edges(self, store: Path) -> dict[str, range]:
         build = RowSource(part_path(store))
         starts = build._read("episode/vl_start")
-        said = [Path(one["id"]).name for one in build._texts]
+        names = [Path(text.id).name for text in build.texts]
         spans = [range(*edges) for edges in pairwise(starts.tolist())]
-        return dict(zip(said, spans, strict=True))
+        return dict(zip(names, spans, strict=True))
 
 
 class TestRefusals:
@@ -398,7 +397,7 @@ class TestRefusals:
             params.model_copy(update={"extract": elsewhere}), (), (), (), spec, "rotvec", "plan"
         )
         job = ExtractionJob(surveyed, (), Path.cwd())
-        with pytest.raises(StoreIncomplete, match=r"does not see the build .*made\.zarr\.part"):
+        with pytest.raises(ConfigError, match=r"with the build .*made\.zarr\.part"):
             check_place(job)
         monkeypatch.setattr("pipeline.extract.cluster.read_plan", lambda part: "plan")
         check_place(job)

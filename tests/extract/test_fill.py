@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.base.errors import DiskFull
 from pipeline.extract import extract
-from pipeline.extract.engine import RowEngine, in_background
+from pipeline.extract.engine import RowPreparation, in_background
 from pipeline.store import FeatureStore, StoreBuild
 from pipeline.vlm.qwen import FrozenVLM
 
@@ -43,9 +43,9 @@ class TestEqualRows:
         assert sum(asked) == report.computed == len(set(keys))
         assert report.repeated == len(keys) - len(set(keys))
         other = changed(extract={"store": str(params.extract.store.with_name("each.zarr"))})
-        prepare = RowEngine.prepare
+        prepare = RowPreparation.prepare
         monkeypatch.setattr(
-            RowEngine, "prepare", lambda self, rows, firsts: prepare(self, rows, None)
+            RowPreparation, "prepare", lambda self, rows, firsts: prepare(self, rows, None)
         )
         assert run(other).computed == len(keys)
         each = FeatureStore.open(other.extract.store)

@@ -118,8 +118,7 @@ class TestBuilds:
         decode_otherwise(monkeypatch)
         said: list[str] = []
         extract(changed(extract={"sensor_dtype": "float16"}), said.append)
-        (line,) = [line for line in said if line.startswith("4 golden row(s) left out: decoded")]
-        assert line.endswith("; 0 of the store before stand in for them")
+        assert any(line.startswith("4 golden row(s) left out: decoded") for line in said)
         store = FeatureStore.open(params.extract.store)
         assert store.golden == ()
         assert store.attrs[GOLDEN] == []
@@ -152,21 +151,6 @@ class TestStoreBefore:
         assert any(line.startswith("1 golden row(s) left out: decoded today") for line in said)
         after = FeatureStore.open(store).golden
         assert [golden.key for golden in after] == [before[at].key for at in (0, 1, 3)]
-
-    def test_others_of_it_stand_in_for_what_is_left_out(
-        self, params, changed, extracted, monkeypatch
-    ):
-        """Another row is chosen than the store before has, and today does not prove itself."""
-        before = FeatureStore.open(params.extract.store)
-        rows, first = [entry["row"] for entry in before.attrs[GOLDEN]], before.golden[0]
-        monkeypatch.setattr("pipeline.extract.golden.spread", lambda *of: np.array([rows[0] + 1]))
-        decode_otherwise(monkeypatch)
-        said: list[str] = []
-        extract(changed(extract={"sensor_dtype": "float16"}), said.append)
-        assert any(line.endswith("; 1 of the store before stand in for them") for line in said)
-        store = FeatureStore.open(params.extract.store)
-        assert [entry["row"] for entry in store.attrs[GOLDEN]] == [rows[0]]
-        assert [golden.key for golden in store.golden] == [first.key]
 
     def test_the_bytes_are_those_of_a_fresh_build(self, params, changed, extracted, tmp_path):
         other = changed(extract={"store": str(tmp_path / "o.zarr"), "sensor_dtype": "float16"})

@@ -99,7 +99,7 @@ class TestDeviations:
 
     def test_a_nan_is_beyond_every_tolerance(self, document):
         overwrite(document, "vl/features", 3, lambda row: row.fill(np.nan))
-        found = again(document, tolerance=1e9)
+        found = again(document, tolerance=1e3)
         assert [one.row for one in found.beyond] == [3]
         assert found.deviations[0].row == 3
 

@@ -167,6 +167,20 @@ def test_metadata_of_the_features_that_are_lost_cost_the_rows(case):
     assert contents(case.store) == contents(case.original)
 
 
+def test_attributes_that_cannot_be_are_written_again_and_every_row_is_kept(case):
+    place = case.store / "zarr.json"
+    document = json.loads(place.read_text())
+    document["attributes"].update(sources=[], action_hz="ten")
+    place.write_text(json.dumps(document))
+    with pytest.raises(StoreIncomplete, match=r"zarr\.json: action_hz: .*; sources: .*--repair"):
+        extract(case.params, quiet)
+    # Of what was computed with what, its attributes no longer say anything that is believed.
+    said, report = case.mended()
+    assert "24 of 24 feature rows taken over" in said
+    assert report.computed == 0
+    assert verify(case.store, threads=1).sound
+
+
 @pytest.mark.parametrize("place", ["zarr.json", "vl/zarr.json"])
 def test_changed_metadata_are_written_again_and_every_row_is_kept(case, place):
     document = json.loads((case.store / place).read_text())

@@ -1,8 +1,11 @@
 """A checkpoint comes back whole, or says what is wrong with it."""
 
 import json
+import os
 from collections.abc import Callable
 from dataclasses import replace
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +14,12 @@ import pytest
 import torch
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.base.durable import read_document, write_document, write_with_digest
+from pipeline.base.durable import (
+    read_document,
+    read_tensors,
+    write_tensors,
+    write_with_digest,
+)
 from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch
 from pipeline.base.tuned_on import EpisodePart
 from pipeline.policy.checkpoint import (
@@ -124,25 +132,98 @@ def test_a_folder_or_a_run_is_found(checkpoint: PolicyCheckpoint, tmp_path: Path
         find_policy(tmp_path / "other")
 
 
+OVERLAPPING = part(10, 24, "0-5", "g").model_dump(mode="json")
+SLOT = {"layer": 0, "norm": True, "pooling": "mean"}
+
+
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("place", "value", "said"),
     [
-        ({"format": 99}, "expected format 3, found 99"),
-        ({"format": 2}, "do not tell what chose them from what reports them. Train it again"),
-        ({"shape": None}, "not what a checkpoint's description must be"),
-        ({"split": {"train": {"left/a": 3}}}, "not what a checkpoint's description must be"),
-        ({"params": {"train_head": {"model_type": "oracle"}}}, "model_type"),
-        ({"normalization": {}}, "std and count of `action`"),
+        ("format", 99, "format: expected 3, found 99"),
+        ("format", 2, "format: expected 3, found 2"),
+        ("step", -1, "step: expected greater than or equal to 0, found -1"),
+        ("step", "7", "step: expected a valid integer, found '7'"),
+        ("metrics.val/error", "low", "metrics.val/error: expected a valid number, found 'low'"),
+        ("shape", None, "shape: expected an object, found None"),
+        ("shape.action_dim", 0, "shape.action_dim: expected greater than or equal to 1"),
+        ("shape.action_dim", 10**9, "shape.action_dim: expected less than or equal to 1000000"),
+        ("shape.action_dim", 10**400, "shape.action_dim: expected a valid integer, found 1000"),
+        ("shape.action_groups", ["other"], "shape.action_groups: expected 5, found 1"),
+        ("shape.action_groups", ["banana"] * 5, "action_groups.0: expected a text to match"),
+        ("shape.state_kinds", ["deg"] * 3, "shape.state_kinds: expected 0 or 4, found 3"),
+        ("shape.slots", 4, "shape.slots: expected 3, found 4"),
+        ("shape.feature_dim", 9, "shape.feature_dim: expected 8, found 9"),
+        ("shape.sensor_channels", 6, "shape.sensor_channels: expected 0 or 5, found 6"),
+        ("shape.future", 1, "shape.future"),
+        ("streams.action.names", ["dx"], "streams.action: 1 names, but 5 units"),
+        ("streams.action.kind", "banana", "streams.action.kind: expected"),
+        ("streams.views", "View1", "streams.views: expected a valid array, found 'View1'"),
+        ("streams.views", ["View2"], "feature_spec.views: expected ('View2',), found ('View1',)"),
+        ("feature_spec.digest", 3, "feature_spec.digest: expected a valid string, found 3"),
+        ("feature_spec.slots", [{**SLOT, "layer": "a"}] * 3, "feature_spec.slots.0.layer"),
+        ("action_hz", -10.0, "action_hz: expected greater than 0, found -10.0"),
+        ("vlm_reuse_count", True, "vlm_reuse_count: expected a valid integer, found True"),
+        ("instructions", [1], "instructions.0: expected a valid string, found 1"),
+        ("split", {"train": {}}, "split: expected train, val, test, found train"),
+        ("split.train.left/a", 3, "split.train.left/a: expected an object, found 3"),
+        ("split.train.right/episode_005.ticks", [9, 3], "expected the first before the last"),
+        ("split.train.right/episode_005.ticks", [-1, 3], "ticks.0: expected greater than"),
+        ("split.test.left/b", OVERLAPPING, "found some of '0-5' in both train and test"),
+        ("normalization.action.std", [-1.0] * 5, "expected greater than or equal to 0"),
+        (
+            "normalization.state",
+            None,
+            "state: expected mean and std of (4,), found None",
+        ),
+        ("normalization.action.mean", [0.0], "action: expected mean and std of (5,), found ((1,)"),
+        ("weights_sha256", "../../x", "weights_sha256: expected a text to match pattern"),
+        ("params.train_head.model_type", "oracle", "params.train_head.model_type: expected"),
+        ("params.train_head.future", 1, "params.train_head.future"),
+        ("params.train_head.horizon", 10**9, "params.train_head.horizon: expected less than"),
+        ("params.train_head.expert.heads", 7, "heads must divide the width"),
     ],
 )
 def test_a_description_that_is_none_is_named(
-    checkpoint: PolicyCheckpoint, tmp_path: Path, change: dict[str, Any], said: str
+    checkpoint: PolicyCheckpoint, tmp_path: Path, place: str, value: object, said: str
 ) -> None:
     save_policy(tmp_path / "best", checkpoint)
     path = tmp_path / "best/policy.json"
-    write_with_digest(path, read_document(path) | change)
-    with pytest.raises((CheckpointIncomplete, CheckpointMismatch), match=said):
+    document = read_document(path, dict)[1]
+    *above, key = place.split(".")
+    reduce(getitem, above, document)[key] = value
+    write_with_digest(path, document)
+    with pytest.raises(CheckpointIncomplete) as caught:
         load_policy(tmp_path / "best")
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ") and said in message
+    assert "Copy it again, name another, or remove its folder and run the training" in message
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b'{"format": 3, "step": NaN}',
+        b'{"format": 3, "step": 1e400}',
+        b'{"format": "\\ud800"}',
+        b'{"format": "\xe9"}',
+        b'{"format":' + b"[" * 100_000,
+        b'{"a":[' + b"{}," * 600_000 + b"{}]}",
+        b"",
+        b"[]",
+        None,
+    ],
+    ids=["nan", "infinite", "surrogate", "latin", "deep", "heavy", "empty", "list", "pipe"],
+)
+def test_what_is_no_document_is_refused_before_it_is_read(
+    checkpoint: PolicyCheckpoint, tmp_path: Path, content: bytes | None
+) -> None:
+    save_policy(tmp_path / "best", checkpoint)
+    path = tmp_path / "best/policy.json"
+    path.unlink()
+    os.mkfifo(path) if content is None else path.write_bytes(content)
+    for read in (load_policy, check_policy):
+        with pytest.raises(CheckpointIncomplete, match=r"policy\.json: .*Copy it again"):
+            read(tmp_path / "best")
 
 
 def _ten_times(document: dict[str, Any]) -> None:
@@ -163,34 +244,37 @@ def test_an_altered_description_is_refused(
     document = json.loads(path.read_text())
     alter(document)
     path.write_text(json.dumps(document))
-    with pytest.raises(CheckpointIncomplete, match=r"policy\.json: .*damaged: it was altered"):
+    with pytest.raises(CheckpointIncomplete, match=r"policy\.json: it was altered"):
         load_policy(tmp_path / "best")
 
 
-def test_a_description_of_before_digests_is_taken_and_told(
-    checkpoint: PolicyCheckpoint, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    save_policy(tmp_path / "best", checkpoint)
-    path = tmp_path / "best/policy.json"
-    document = read_document(path)
-    document["params"]["train_head"] |= {"scratch": None, "loggers": ["report"]}
-    write_document(path, document)
-    for _ in range(2):
-        assert load_policy(tmp_path / "best").step == checkpoint.step
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "document_sha256" in line
+def _first(weights: dict[str, Any], change: Callable[[Any], Any]) -> dict[str, Any]:
+    name = next(name for name, value in weights.items() if value.ndim == 2)
+    return {**weights, name: change(weights[name])}
 
 
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda w: _first(w, lambda v: v.half()), r'"torch.float16", .* -> \["torch.float32"'),
+        (lambda w: _first(w, lambda v: v.long()), r'"torch.int64", .* -> \["torch.float32"'),
+        (
+            lambda w: _first(w, lambda v: v[:1]),
+            "does not fit the policy that policy.json describes",
+        ),
+        (lambda w: _first(w, lambda v: v * torch.nan), "expected finite numbers, found NaN"),
+        (lambda w: {**w, "extra": torch.zeros(3)}, r'extra: \["torch.float32", \[3\]\] -> null'),
+        (lambda w: dict(list(w.items())[1:]), r"null -> \[\"torch.float32"),
+    ],
+    ids=["float16", "int64", "shorter", "nan", "extra", "missing"],
+)
 def test_weights_of_another_policy_are_refused(
-    checkpoint: PolicyCheckpoint, tmp_path: Path
+    checkpoint: PolicyCheckpoint, tmp_path: Path, change: Callable[..., Any], said: str
 ) -> None:
-    save_policy(tmp_path / "best", checkpoint)
-    path = tmp_path / "best/policy.json"
-    document = read_document(path)
-    document["params"]["train_head"]["expert"]["dim"] = 16
-    write_with_digest(path, document)
-    with pytest.raises(CheckpointMismatch, match="does not fit the policy"):
-        load_policy(tmp_path / "best").policy()
+    save_policy(tmp_path / "best", replace(checkpoint, weights=change(checkpoint.weights)))
+    with pytest.raises((CheckpointIncomplete, CheckpointMismatch), match=said) as caught:
+        load_policy(tmp_path / "best")
+    assert str(tmp_path / "best/policy.safetensors") in str(caught.value)
 
 
 def test_missing_weights_are_named(checkpoint: PolicyCheckpoint, tmp_path: Path) -> None:
@@ -235,5 +319,28 @@ class TestGoldenRows:
         if harm == "altered":
             path.write_bytes(content)
         for read in (load_policy, check_policy):
-            with pytest.raises(CheckpointIncomplete, match=r"golden\.safetensors: .*damaged"):
+            with pytest.raises(CheckpointIncomplete, match=r"golden\.safetensors: .*Copy it again"):
                 read(tmp_path / "best")
+
+    @pytest.mark.parametrize(
+        ("name", "value"),
+        [
+            ("0/frames/View1", torch.zeros(6, 8, 3)),
+            ("0/frames/View1", torch.zeros(6, 8, dtype=torch.uint8)),
+            ("0/frames/View1", torch.zeros(0, 8, 3, dtype=torch.uint8)),
+            ("0/frames/View9", torch.zeros(6, 8, 3, dtype=torch.uint8)),
+            ("0/frames/../../x", torch.zeros(6, 8, 3, dtype=torch.uint8)),
+            ("9/features", torch.zeros(2)),
+            ("0/features", torch.zeros(2)),
+            ("0/slot_valid", torch.zeros(3, dtype=torch.int64)),
+        ],
+    )
+    def test_what_is_no_row_of_this_policy_is_named(self, golden, tmp_path, name, value):
+        save_policy(tmp_path / "best", golden)
+        path = tmp_path / "best/golden.safetensors"
+        document = read_document(tmp_path / "best/policy.json", dict)[1]
+        tensors = read_tensors(path, document["golden"]["sha256"])
+        document["golden"]["sha256"] = write_tensors(path, {**tensors, name: value})
+        write_with_digest(tmp_path / "best/policy.json", document)
+        with pytest.raises(CheckpointMismatch, match=rf"golden\.safetensors does not fit.*{name}"):
+            load_policy(tmp_path / "best")

@@ -1,4 +1,5 @@
 import json
+import re
 from itertools import pairwise
 
 import numpy as np
@@ -6,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.base.errors import CheckpointMismatch, NumericsError
+from pipeline.base.durable import RUN_FILES
+from pipeline.base.errors import CheckpointIncomplete, NumericsError
 from pipeline.policy.normalization import ChannelStatistics, Normalization, fit_channels
 
 
@@ -94,12 +96,13 @@ finite = st.floats(allow_nan=False, allow_infinity=False)
 
 @given(st.lists(st.tuples(finite, finite), min_size=1, max_size=6), st.integers(1, 2**40))
 def test_json_keeps_every_bit(pairs: list[tuple[float, float]], count: int) -> None:
-    mean, std = np.array(pairs).T
+    mean, std = np.clip(np.array(pairs).T, -1e30, 1e30)
+    std = np.abs(std)
     fitted = Normalization(
         action=ChannelStatistics(mean, std, count),
-        features=ChannelStatistics(np.stack([mean, std]), np.stack([std, mean]), count),
+        features=ChannelStatistics(np.stack([mean, std]), np.stack([std, std]), count),
     )
-    read = Normalization.from_document(json.loads(json.dumps(fitted.document())))
+    read = RUN_FILES.parse_json(json.dumps(fitted.document()), Normalization, "x.json")
     assert read.action.mean.tobytes() == mean.tobytes()
     assert read.action.std.tobytes() == std.tobytes()
     assert read.features is not None
@@ -110,15 +113,16 @@ def test_json_keeps_every_bit(pairs: list[tuple[float, float]], count: int) -> N
 
 
 @pytest.mark.parametrize(
-    "document",
+    ("action", "said"),
     [
-        {},
-        {"action": None},
-        {"action": {"mean": [1.0], "std": [1.0]}},
-        {"action": {"mean": [1.0], "std": [1.0, 2.0], "count": 3}},
-        {"action": {"mean": ["x"], "std": [1.0], "count": 3}},
+        (None, "action: expected an object, found None"),
+        ({"mean": [1.0], "std": [1.0]}, "action.count: missing"),
+        ({"mean": ["x"], "std": [1.0], "count": 3}, "found 'x'"),
+        ({"mean": [1.0], "std": [-1.0], "count": 3}, "greater than or equal to 0, found -1.0"),
+        ({"mean": [1e300], "std": [1.0], "count": 3}, "less than or equal to 1000000000000"),
+        ({"mean": [[1.0], [1.0, 2.0]], "std": [1.0], "count": 3}, "expected rows of one length"),
     ],
 )
-def test_a_damaged_document_is_refused(document: dict[str, object]) -> None:
-    with pytest.raises(CheckpointMismatch, match="normalisation"):
-        Normalization.from_document(document)
+def test_a_damaged_document_is_refused(action: object, said: str) -> None:
+    with pytest.raises(CheckpointIncomplete, match=re.escape(said)):
+        RUN_FILES.parse_json(json.dumps({"action": action}), Normalization, "x.json")

@@ -9,12 +9,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from pipeline.policy.state_channels import (
-    channel_kinds,
-    expand,
-    expanded_names,
-    typical_state,
-)
+from pipeline.policy.shape import channel_kinds, expanded_names
+from pipeline.policy.state_channels import expand, typical_state
 
 NAMES = (*(f"joint_{n}" for n in range(1, 7)), *(f"pose_{axis}" for axis in "xyzabr"))
 UNITS = ("deg",) * 6 + ("mm",) * 3 + ("deg",) * 3

@@ -70,7 +70,7 @@ def test_another_model_is_refused_before_a_weight_is_loaded(
         save_file(tensors | {name: tensors[name] * 1.5}, weights, {"format": "pt"})
         vlm = params.vlm.model_copy(update={"checkpoint": str(other)})
     else:
-        (tmp_path / "adapter_config.json").write_text("{}")
+        (tmp_path / "adapter_config.json").write_text('{"peft_type": "LORA", "r": 1}')
         save_file({"one": torch.zeros(1)}, tmp_path / "adapter_model.safetensors")
         vlm = params.vlm.model_copy(update={"adapter": str(tmp_path)})
     with pytest.raises(CheckpointMismatch, match=rf"{what}: .* -> "):

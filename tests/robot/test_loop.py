@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 
-from pipeline.robot.loop import ControlLoop, LoopTiming, SafeStop, StopKind
+from pipeline.robot.chunking import Executor
+from pipeline.robot.loop import ControlLoop, SafeStop, StopKind
 
 HORIZON, ACTION = 4, 2
 
 
 def make_loop(execute: int = 1, uses_features: bool = True) -> ControlLoop:
-    return ControlLoop(LoopTiming(3, execute, "none", HORIZON, (False, False)), uses_features)
+    return ControlLoop(Executor("none", execute, HORIZON, (False, False)), 3, uses_features)
 
 
 def chunk_of(tick: int) -> np.ndarray:

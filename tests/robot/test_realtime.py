@@ -1,7 +1,6 @@
 """The loop in real time: what it asks and does, and that whatever goes wrong stops the robot."""
 
 import gc
-import json
 import os
 import signal
 import subprocess
@@ -122,7 +121,6 @@ def stopped(
     report = run_robot(arm, brain or Brain(), settings, limits, recorder)
     assert (report.kind, said in report.reason) == (kind, True), (report.kind, report.reason)
     assert report.reason in arm.stops
-    assert json.dumps(report.document())
     return report
 
 
@@ -281,7 +279,7 @@ def test_a_busy_server_is_asked_again_with_its_frames_and_the_readings_that_foll
     arm, brain = Arm(after(60, put("ended", "enough"))), Brain(busy)
     report = run_robot(arm, brain, replace(CALM, seconds=20))
     assert (report.kind, report.busy) == (StopKind.ENDED, 3) and arm.acts
-    assert report.document()["busy"] == 3
+    assert report.busy == 3
     assert "images/View1" in brain.asked[0] and "images/View1" in brain.asked[1]
     states = np.concatenate([asked["state"][:, 0] for asked in brain.asked])
     np.testing.assert_array_equal(states, np.repeat(np.arange(len(states) / 2), 2))
@@ -475,7 +473,9 @@ def test_an_exception_in_the_robots_code_stops_it_and_is_told(where: str) -> Non
             raise RuntimeError("bus error")
 
     arm = Arm(**{{"observe": "spoil", "act": "moves", "frames": "sees"}[where]: fail})
-    report = stopped(arm, StopKind.ROBOT, f"the robot's {where} failed: RuntimeError: bus error")
+    report = stopped(
+        arm, StopKind.ROBOT, f"the robot's code failed ({where}): RuntimeError: bus error"
+    )
     assert 'raise RuntimeError("bus error")' in report.traceback
 
 
@@ -492,7 +492,7 @@ def test_ctrl_c_stops_the_robot() -> None:
         if tick == 7:
             raise KeyboardInterrupt
 
-    stopped(Arm(moves=interrupt), StopKind.BY_HAND, "Ctrl-C")
+    stopped(Arm(moves=interrupt), StopKind.BY_HAND, "stopped by hand (SIGINT)")
 
 
 ENDINGS = [
@@ -516,7 +516,7 @@ def test_a_signal_stops_the_robot_and_none_breaks_off_the_stop(number: int) -> N
     # If it fails, then not by ending the tests.
     kept = {each: signal.signal(each, signal.default_int_handler) for each in ENDINGS}
     try:
-        name = "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
+        name = signal.Signals(number).name
         arm, notes = Interrupted(moves=end), Notes()
         stopped(arm, StopKind.BY_HAND, f"stopped by hand ({name})", recorder=notes)
         assert len(arm.stops) == 1 and notes.reason
@@ -713,7 +713,7 @@ def test_an_action_that_the_robot_failed_at_is_recorded() -> None:
             raise RuntimeError("bus error")
 
     arm, diary = Arm(moves=fail), Diary()
-    stopped(arm, StopKind.ROBOT, "act failed", recorder=diary)
+    stopped(arm, StopKind.ROBOT, "failed (act)", recorder=diary)
     assert len(diary.ticks) == arm.ticks
     assert sum(action is not None for _, action in diary.ticks) == len(arm.acts) + 1
 

@@ -175,9 +175,8 @@ def test_a_store_of_a_run_has_its_actions_its_clocks_and_the_robots_keys(run) ->
     captured = [[frames[view][0] - start for view in VIEWS] for _, frames, _ in driven.looked]
     np.testing.assert_array_equal(store.array("vl/frame_time"), captured)
     assert len(np.concatenate(driven.readings["state"])) == len(store.array("state/values"))
-    same = compare_keys(path, store)
-    assert (same.rows, len(same.missing), same.differs) == (len(keys), 0, ())
-    assert str(same) == f"{len(keys)} of {len(keys)} VL rows have a key of the robot's"
+    same = f"{len(keys)} of {len(keys)} VL rows have a key of the robot's"
+    assert compare_keys(path, store) == same
 
 
 def test_the_run_says_how_it_was_and_ended(run) -> None:
@@ -203,7 +202,7 @@ def test_late_answers_leave_out_the_ticks_before_the_first_action(live, vlm, tmp
     store = FeatureStore.open(tmp_path / "runs.zarr")
     assert store.ticks == len(driven.sent) == 10
     np.testing.assert_array_equal(store.array("tick/action"), np.stack(driven.sent))
-    assert compare_keys(path, store).missing.tolist() == []
+    assert "; " not in compare_keys(path, store)
     assert len(store.array("state/time")) == 120
 
 

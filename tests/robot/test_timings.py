@@ -16,14 +16,14 @@ def test_a_ring_keeps_the_newest_rows_oldest_first(rows: int) -> None:
     assert ring.count == rows
 
 
-def test_percentiles_are_of_what_is_kept_and_the_most_is_of_all() -> None:
+def test_percentiles_are_of_what_is_kept() -> None:
     timings = Timings(("act", "never", "rare"), 1000)
     timings.note(np.array([5000.0, np.nan, np.nan]))
     for value in range(1, 1001):
         timings.note(np.array([value, np.nan, 7.0 if value == 500 else np.nan]))
     told = timings.document()
     assert set(told) == {"act", "rare"}
-    assert told["act"]["max"] == 5000 and told["act"]["count"] == 1000
+    assert told["act"]["max"] == 1000 and told["act"]["count"] == 1000
     assert told["act"]["p50"] == pytest.approx(500.5)
     assert told["act"]["p99"] == pytest.approx(990.01)
     assert told["rare"] == {"count": 1, "p50": 7, "p99": 7, "p99.9": 7, "max": 7}

@@ -218,10 +218,13 @@ def test_a_folder_that_the_demo_did_not_write_is_left_alone(
     assert (tmp_path / "raw" / "content").is_file()
 
 
-@pytest.mark.parametrize("text", ["{", "[]", '{"sets": 3}'])
+@pytest.mark.parametrize(
+    "text",
+    ["{", "[]", '{"sets": 3}', '{"sets": ["../raw"]}', "[" * 10_000, '{"sets": [], "seed": []}'],
+)
 def test_a_broken_marker_is_named(quick_sets: list[str], tmp_path: Path, text: str) -> None:
     (tmp_path / MARKER).write_text(text, encoding="utf-8")
-    with pytest.raises(ConfigError, match=MARKER):
+    with pytest.raises(ConfigError, match=rf"{MARKER}: .* Remove the folder"):
         write_demo_recordings(tmp_path, 2, 0)
 
 

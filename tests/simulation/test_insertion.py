@@ -19,7 +19,6 @@ from pipeline.simulation.insertion import (
     MISS_MM,
     OVERSHOOT_MM,
     TICK_S,
-    InsertionObservation,
     NeedleInsertion,
 )
 from pipeline.simulation.layout import WORKSPACE_MM, InsertionLayout, draw_layout
@@ -39,22 +38,25 @@ def calm(seed: int = 0) -> InsertionLayout:
     return replace(draw_layout(seed), push_times_s=np.zeros(0))
 
 
-def follow(insertion: NeedleInsertion) -> Iterator[InsertionObservation]:
-    """The demonstrator's episode from here on."""
+def follow(insertion: NeedleInsertion) -> Iterator[NeedleInsertion]:
+    """The demonstrator's episode from here on, tick by tick, the one that ends now among them."""
+    yield insertion
     while not insertion.finished:
-        yield insertion.step(insertion.expert_action())
+        insertion.step(insertion.expert_action())
+        yield insertion
 
 
-def peak_bin(observation: InsertionObservation) -> int:
+def peak_bin(insertion: NeedleInsertion) -> int:
     """The middle of the brightest bins of the newest A-scan, several where it saturates."""
-    scan = observation.sensor[-1, 1:]
+    scan = insertion.sensor[-1, 1:]
     return round(np.flatnonzero(scan == scan.max()).mean())
 
 
 def test_same_seed_and_actions_give_the_same_bits() -> None:
     insertions = [NeedleInsertion(), NeedleInsertion()]
-    runs = [[insertion.reset(3), *follow(insertion)] for insertion in insertions]
-    for first, second in zip(*runs, strict=True):
+    for insertion in insertions:
+        insertion.reset(3)
+    for first, second in zip(*map(follow, insertions), strict=True):
         np.testing.assert_array_equal(first.sensor, second.sensor)
         np.testing.assert_array_equal(first.state, second.state)
         assert first.time_s == second.time_s
@@ -64,22 +66,22 @@ def test_same_seed_and_actions_give_the_same_bits() -> None:
 
 def test_observing_again_changes_nothing() -> None:
     insertion = NeedleInsertion()
-    first = insertion.reset(1)
-    action = insertion.expert_action()
-    np.testing.assert_array_equal(insertion.observe().sensor, first.sensor)
+    insertion.reset(1)
+    first, action = insertion.sensor.copy(), insertion.expert_action()
+    np.testing.assert_array_equal(insertion.sensor, first)
     np.testing.assert_array_equal(insertion.expert_action(), action)
 
 
 def test_a_scan_peaks_at_the_tip_to_tissue_distance() -> None:
     insertion = NeedleInsertion()
-    observation = insertion.start(calm())
+    insertion.start(calm())
     while insertion.contact.distance_mm[-1] > 0.3:
         for _ in range(2):  # held still: the arm lags, and an A-scan is up to 23 ms old
-            observation = insertion.step(STILL)
+            insertion.step(STILL)
         distance = insertion.knots[-1].pose[2] - insertion.knots[-1].surface_mm
-        assert abs(peak_bin(observation) * BIN_MM - distance) <= 8 * BIN_MM
+        assert abs(peak_bin(insertion) * BIN_MM - distance) <= 8 * BIN_MM
         insertion.step(down(0.17))
-    assert peak_bin(observation) < 150
+    assert peak_bin(insertion) < 150
 
 
 def test_the_layer_is_the_second_peak_until_it_is_the_only_one() -> None:
@@ -88,15 +90,15 @@ def test_the_layer_is_the_second_peak_until_it_is_the_only_one() -> None:
     surface, depth = layout.surfaces_mm[0], layout.tissue.layer_depth_mm
     start = layout.start_pose.copy()
     start[2] = surface + 1.0
-    observation = insertion.start(replace(layout, start_pose=start))
-    behind = observation.sensor[-1, 1:].copy()
+    insertion.start(replace(layout, start_pose=start))
+    behind = insertion.sensor[-1, 1:].copy()
     behind[: int(1.0 / BIN_MM) + 60] = 0
     # The layer stands on a slope of scattered light, which pulls its peak towards the tip.
     assert abs(behind.argmax() * BIN_MM - (1.0 + depth)) < 0.05
     while not insertion.inside:
         insertion.step(down(0.2))
-    observation = insertion.step(STILL)
-    inside = observation.sensor[-1, 1:].copy()
+    insertion.step(STILL)
+    inside = insertion.sensor[-1, 1:].copy()
     inside[:150] = 0
     assert abs(inside.argmax() * BIN_MM - insertion.contact.layer_mm[-1]) < 0.05
 
@@ -105,8 +107,9 @@ def test_beyond_the_range_nothing_is_seen() -> None:
     layout = calm()
     start = layout.start_pose.copy()
     start[2] = layout.surfaces_mm[0] + 8.0
-    scan = NeedleInsertion().start(replace(layout, start_pose=start)).sensor[-1, 1:]
-    assert np.ptp(scan) <= 4
+    insertion = NeedleInsertion()
+    insertion.start(replace(layout, start_pose=start))
+    assert np.ptp(insertion.sensor[-1, 1:]) <= 4
 
 
 def test_force_rises_on_contact_drops_at_puncture_and_grows_with_depth() -> None:
@@ -114,7 +117,7 @@ def test_force_rises_on_contact_drops_at_puncture_and_grows_with_depth() -> None
     insertion.start(calm())
     force, depth, inside = [], [], []
     for _ in range(60):
-        observation = insertion.step(down(0.12))
+        insertion.step(down(0.12))
         force.append(insertion.contact.force_n.copy())
         now = insertion.knots[-1]
         before = insertion.knots[-2]
@@ -123,7 +126,7 @@ def test_force_rises_on_contact_drops_at_puncture_and_grows_with_depth() -> None
         depth.append(surface - now.motion.at(part * TICK_S)[:, 2])
         inside.append(insertion.contact.inside.copy())
         # The gauge reads the true force but for noise and a slow drift of 20 mN.
-        assert np.abs(observation.sensor[:, 0] - insertion.contact.force_n).max() < 0.08
+        assert np.abs(insertion.sensor[:, 0] - insertion.contact.force_n).max() < 0.08
     f, d, i = (np.concatenate(rows) for rows in (force, depth, inside))
     assert (f[d <= 0] == 0).all() and (d <= 0).any()
     pressing = f[(d > 0) & ~i]
@@ -175,8 +178,8 @@ def test_depth_does_not_show_in_images_or_state(seed: int) -> None:
         # From here on tissue that is nearer is no longer pushed.
         if one.contact.distance_mm[-1] < 1.2:
             break
-        sensed |= not np.array_equal(one.observe().sensor, other.observe().sensor)
-        np.testing.assert_array_equal(one.observe().state, other.observe().state)
+        sensed |= not np.array_equal(one.sensor, other.sensor)
+        np.testing.assert_array_equal(one.state, other.state)
         if tick % 4 == 0:
             for view in VIEWS:
                 np.testing.assert_array_equal(
@@ -191,9 +194,8 @@ def test_lateral_target_does_not_show_in_sensor_or_state(seed: int) -> None:
     mirrored = replace(layout, targets_mm=-layout.targets_mm)
     seen = 0
     for one, other in twins(layout, mirrored):
-        first, second = one.observe(), other.observe()
-        np.testing.assert_array_equal(first.sensor, second.sensor)
-        np.testing.assert_array_equal(first.state, second.state)
+        np.testing.assert_array_equal(one.sensor, other.sensor)
+        np.testing.assert_array_equal(one.state, other.state)
         scenes = (one.scene(one.time_s), other.scene(other.time_s))
         seen += not np.array_equal(*(render("View2", scene) for scene in scenes))
     assert seen == len(one.knots) - 1

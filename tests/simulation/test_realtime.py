@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.simulation.environment import InsertionEnvironment
-from pipeline.simulation.insertion import INSERTED
+from pipeline.simulation.insertion import INSERTED, TIME_IS_UP
 from pipeline.simulation.realtime import SimulatedRobot
 from pipeline.simulation.rendering import VIEWS
 
@@ -32,12 +32,6 @@ def clock() -> Clock:
 @pytest.fixture(params=[10.0, 50.0])
 def robot(request: pytest.FixtureRequest, clock: Clock) -> Iterator[SimulatedRobot]:
     with closing(SimulatedRobot(hz=request.param, seed=3, clock=clock)) as made:
-        yield made
-
-
-@pytest.fixture
-def quick(clock: Clock) -> Iterator[SimulatedRobot]:
-    with closing(SimulatedRobot(hz=1000.0, seed=3, again=True, clock=clock)) as made:
         yield made
 
 
@@ -99,36 +93,15 @@ def test_the_end_of_an_episode_ends_the_run(robot: SimulatedRobot) -> None:
     robot.observe()
     finish(robot)
     robot.act(STILL)
-    assert robot.outcomes == [INSERTED]
+    assert robot.outcome == INSERTED
     assert robot.observe()["ended"] == INSERTED
 
 
-def test_the_next_episode_begins_where_asked_for_and_the_clock_goes_on(
-    quick: SimulatedRobot, clock: Clock
-) -> None:
-    quick.observe()
-    finish(quick)
-    ended_s = quick._steps / 1000
-    clock.now_s += ended_s
-    again = quick.observe()
-    assert again["reset"] is True and "ended" not in again
-    assert again["time"] == pytest.approx(ended_s)
-    assert again["state_time"][-1] <= ended_s + 1e-9
-    second = InsertionEnvironment(cameras=False)
-    readings, _ = second.reset(seed=4)
-    np.testing.assert_array_equal(again["state"], readings["state"])
-    assert "reset" not in quick.observe()
-
-
-def test_an_episode_that_ends_while_nobody_acts_is_followed_by_the_next(
-    quick: SimulatedRobot, clock: Clock
-) -> None:
-    quick.observe()
-    clock.now_s += 0.13  # all its 120 ticks
-    late = quick.observe()
-    assert "ended" not in late and len(quick.outcomes) == 1
-    assert quick.observe()["reset"] is True
-    assert len(quick.outcomes) == 1
+def test_an_episode_that_ends_while_nobody_acts_ends_the_run_too(clock: Clock) -> None:
+    with closing(SimulatedRobot(hz=1000.0, seed=3, clock=clock)) as robot:
+        robot.observe()
+        clock.now_s += 0.13  # all its 120 ticks
+        assert robot.observe()["ended"] == robot.outcome == f"{TIME_IS_UP} before a puncture"
 
 
 def test_its_clock_is_the_monotonic_one() -> None:
@@ -144,5 +117,5 @@ def test_a_robot_that_was_stopped_does_not_move(robot: SimulatedRobot) -> None:
     robot.observe()
     robot.stop("by hand")
     robot.act(np.array([1.0, 0, 0, 0, 0, 0, 1]))
-    assert robot.stopped == "by hand" and robot.outcomes == []
+    assert robot.stopped == "by hand" and robot.outcome is None
     assert robot._environment.insertion.time_s == pytest.approx(0.1)

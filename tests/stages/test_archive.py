@@ -36,8 +36,7 @@ def test_archive_and_restore_beside_the_store(call, tmp_path, capsys):
     assert lines[0].split() == ["array", "MB", "ratio", "codec"]
     shown = [line.split()[0] for line in lines[1:-1]]
     assert "vl/features" in shown
-    assert not {"vl/checksum", "episode/source"} & set(shown)
-    assert shown[-1] == "all"
+    assert "episode/source" in shown
     assert lines[-1].startswith(f"{output}: ")
     assert ": 1)" in lines[-1]
     kept = call.store.rename(tmp_path / "kept.zarr")

@@ -57,24 +57,13 @@ def test_a_misspelt_key_is_told_which_was_meant(capsys):
     said = capsys.readouterr().err
     assert "train_head.expert.layer: unknown key; did you mean layers?" in said
     assert "data.sources.0.paths: unknown key; did you mean path?" in said
-    assert "data.sources.0.path: Field required" in said
+    assert "data.sources.0.path: missing" in said
 
 
-@pytest.mark.parametrize(
-    ("wrong", "said"),
-    [
-        (["cr5.yaml"], "cr5.yaml; did you mean --params cr5.yaml?"),
-        (["--parms", "cr5.yaml"], "--parms cr5.yaml; did you mean --params cr5.yaml?"),
-        (["--parms=cr5.yaml"], "--parms=cr5.yaml; did you mean --params=cr5.yaml?"),
-        (["data.action_hz=5"], "data.action_hz=5; did you mean --set data.action_hz=5?"),
-        (["--repare"], "--repare; did you mean --repair?"),
-        (["--verbose"], "--verbose"),
-    ],
-)
-def test_an_argument_that_is_none_is_told_which_was_meant(capsys, wrong, said):
+def test_an_argument_that_is_none_is_named(capsys):
     with pytest.raises(SystemExit, match="2"):
-        run("Summary.", print, wrong, SHORTHANDS[:2])
-    assert capsys.readouterr().err.endswith(f"error: unrecognized arguments: {said}\n")
+        run("Summary.", print, ["--repare"])
+    assert capsys.readouterr().err.endswith("error: unrecognized arguments: --repare\n")
 
 
 SHORTHANDS = (
@@ -102,7 +91,9 @@ def test_shorthands_left_out_change_nothing(capsys):
 
 def test_a_shorthands_value_is_checked_as_the_key_is(capsys):
     assert run("Summary.", print, ["--params", PARAMS, "--reextract", "-1"], SHORTHANDS) == 2
-    assert "verify.reextract: Input should be greater than or equal to 0" in capsys.readouterr().err
+    assert (
+        "verify.reextract: expected greater than or equal to 0, found -1" in capsys.readouterr().err
+    )
 
 
 def test_keys_are_listed_with_defaults_and_meaning(capsys):

@@ -209,7 +209,7 @@ def test_mistakes_end_in_one_message(
         ("finetune.lr=-1", "finetune.lr"),
         ("train_head.store=nowhere.zarr", "no finished store"),
         ("vlm.prompt=look", 'prompt: "{instruction}'),
-        ("data.sources=[{name: other, path: .}]", "no source 'made'"),
+        ("data.sources=[{name: other, path: .}]", "no source has it"),
         ("vlm.dtype=float16", 'compute_dtype: "float32" -> "float16"'),
     ):
         assert run("", finetune.main, ["--params", str(params), "--set", override]) == 2

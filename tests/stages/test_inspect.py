@@ -107,7 +107,7 @@ def test_a_store_is_a_page(
 @pytest.mark.parametrize(
     ("place", "said"),
     [
-        ("nowhere", "nowhere is not there"),
+        ("nowhere", "expected a folder, found nothing at nowhere"),
         ("empty", "Mend the path or format"),
         ("tiny.zarr.part", "stages.extract"),
         ("copy.zarr", "--restore"),
@@ -168,17 +168,14 @@ def test_the_summary_says_one_place_and_what_was_found_there() -> None:
     ]
 
 
-def test_a_run_on_a_robot_says_how_it_went(looked: Callable[..., int], tmp_path: Path) -> None:
+def test_a_run_on_a_robot_is_a_recording(looked: Callable[..., int], tmp_path: Path) -> None:
     streams = {"action": {"names": ["a"], "units": ["mm"], "kind": "absolute"}, "views": []}
     spec = {"feature_spec": {"digest": "d"}, "feature_spec_digest": "d"}
     recorder = RunRecorder(tmp_path / "runs", {"streams": streams, "action_hz": 10.0} | spec, "Go")
     for tick in range(5):
         recorder.tick({"time": np.array([tick / 10])}, None if tick == 0 else [tick])
     recorder.finish("safe stop: no answer for 0.5 s")
+    (tmp_path / "runs/run_000000/run.json").write_text("[]")  # of which the page needs nothing
     assert looked(tmp_path / "runs") == 0
     (page,) = tmp_path.rglob("report.html")
-    said = "4 of 5 ticks have an action; it ended: safe stop: no answer for 0.5 s."
-    assert f"Recorded on a robot: {said}" in page.read_text()
-    (tmp_path / "no.zarr").mkdir()
-    assert looked(tmp_path / "runs", "--set", "extract.store=no.zarr") == 0
-    assert "Its features were compared with no store" in page.read_text()
+    assert "run_000000" in page.read_text()

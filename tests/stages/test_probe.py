@@ -14,7 +14,7 @@ from pipeline.store import FeatureStore
 from stages import probe
 from stages.command import run
 
-FILES = ["groups.csv", "metrics.json", "probe.png", "probe_bars.png", "slots.csv", "targets.csv"]
+FILES = ["groups.csv", "metrics.json", "probe.png", "slots.csv", "targets.csv"]
 
 
 @pytest.fixture
@@ -56,8 +56,7 @@ def test_a_ranking_files_and_pictures(params: Path, capsys: pytest.CaptureFixtur
         "past actions + state + sensor",
         "layer 3, mean",
     ]
-    assert lines[-3].endswith("vlm: {layers: [3], norms: [true], pooling: [mean]}")
-    assert "run stages.extract" in lines[-2]
+    assert lines[-2].endswith("vlm: {layers: [3], norms: [true], pooling: [mean]}")
     assert sum("View1 cell" in line for line in lines) == 4
 
     slots = list(csv.DictReader((report / "slots.csv").read_text().splitlines()))

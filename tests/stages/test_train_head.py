@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 import yaml
 
+from pipeline.store import build_lock
 from stages import evaluate, train_head
 from stages.command import run
 
@@ -106,7 +107,8 @@ def test_a_logger_that_is_not_installed_is_named_before_the_store_is_opened(
     path = write_params(loggers=["wandb"])
     arguments = ["--params", str(path), "--set", "extract.store=/no/such.zarr"]
     assert run("", train_head.main, arguments) == 2
-    assert "cannot load wandb (No module named 'no_such_module')" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "cannot load the package of wandb (No module named 'no_such_module')" in said
 
 
 def test_it_trains_evaluates_and_then_has_nothing_to_do(
@@ -141,7 +143,7 @@ def test_it_trains_evaluates_and_then_has_nothing_to_do(
     best = json.loads((tmp_path / "params/head/best/policy.json").read_text())
     error = found["chunk"]["overall"]["policy"]["value"]
     assert error != best["metrics"]["val/error"], "val chose, test reports"
-    assert {"timeline.png", "scatter.png", "horizon.png", "episodes.png"} <= set(os.listdir(report))
+    assert {"scatter.png", "horizon.png", "episode_worst.png"} <= set(os.listdir(report))
 
 
 def test_evaluating_twice_gives_the_same_bytes(
@@ -164,6 +166,19 @@ def test_stage_two_needs_neither_transformers_nor_peft(
     out, err = process.communicate()
     assert process.returncode == 0, err
     assert "overall [training std]" in out
+
+
+def test_two_runs_do_not_write_their_curves_into_one_folder(
+    write_params: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    params, logs = write_params(max_steps=2, store={"episodes": 3, "ticks": 12}), tmp_path / "logs"
+    arguments = ["--params", str(params), "--set", f"train_head.logs={logs}"]
+    with build_lock(logs):  # as another run holds it, to another output
+        assert run("", train_head.main, arguments) == 2
+    said = capsys.readouterr().err
+    assert f"{logs}: being built by process {os.getpid()} on" in said
+    assert f"name another place than {logs}" in said
+    assert run("", train_head.main, arguments) == 0, "the same run goes on"
 
 
 def test_killed_in_mid_run_it_ends_where_an_undisturbed_run_ends(

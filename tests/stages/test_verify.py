@@ -183,6 +183,6 @@ def test_a_damaged_golden_row_is_named_and_repaired(verified, tiny_golden, tmp_p
     place = ("--set", f"verify.store={store}")
     assert verified(*place) == 2
     said = capsys.readouterr().err
-    assert f"{store / 'golden/1'}: golden frames and prompt of VL row 7 do not give the key" in said
+    assert f"{store / 'golden/1/View1/c/0/0/0'}: no such file" in said, said
     assert verified(*place, "--repair") == 0
     assert "60 of 60 feature rows taken over, 0 to compute" in capsys.readouterr().out

@@ -1,6 +1,7 @@
 """Episodes one behind the other: their arrays agree, and give the episodes back."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from hypothesis import given
@@ -64,7 +65,7 @@ def test_their_arrays_agree_and_give_them_back(hold_together, counts):
         "vlm_reuse_count": REUSE,
         "streams": {"action": {"names": ["x", "y"]}, **names, "views": ["View1"]},
     }
-    store = FeatureStore("nowhere", attributes, arrays)
+    store = FeatureStore(Path("nowhere"), attributes, arrays)
     hold_together(store)
     assert [(len(one.ticks), len(one.readings)) for one in store.episodes] == counts
     assert [{name: getattr(one, name) for name in SAID} for one in store.episodes] == said

@@ -77,8 +77,8 @@ class TestDamage:
     @pytest.mark.parametrize(
         ("file", "said"),
         [
-            ("golden/1/View1/c/0/0/0", "golden/1/View1: golden frame of VL row 7 cannot be read"),
-            ("golden/1/View1/zarr.json", "golden/1/View1: golden frame of VL row 7 cannot be read"),
+            ("golden/1/View1/c/0/0/0", "golden/1/View1/c/0/0/0: golden frame cannot be read"),
+            ("golden/1/View1/zarr.json", "golden/1/View1/zarr.json: cannot be read as JSON"),
         ],
     )
     def test_a_flipped_bit_is_named(self, store, file, said):
@@ -89,11 +89,11 @@ class TestDamage:
 
     def test_a_frame_that_is_gone_is_named(self, store):
         (store / "golden/0/View1/c/0/0/0").unlink()
-        self.assert_named(store, "golden/0: golden frames and prompt of VL row 0 do not give the")
+        self.assert_named(store, "golden/0/View1/c/0/0/0: no such file")
 
     def test_a_row_that_is_gone_is_named(self, store):
         shutil.rmtree(store / "golden/1")
-        self.assert_named(store, "golden/1/View1: golden frame of VL row 7 cannot be read")
+        self.assert_named(store, "golden/1/View1/zarr.json: no such file")
 
     def test_another_prompt_is_named(self, store, reseal):
         group = zarr.open_group(store, mode="r+")
@@ -105,7 +105,6 @@ class TestDamage:
         checked = verify(store, threads=1)
         assert said in checked.lines()[0]
         assert {issue.kind for issue in checked.issues} == {"golden row"}
-        assert "--repair" in checked.advice()
         with pytest.raises(StoreIncomplete, match="golden"):
             _ = FeatureStore.open(store).golden
         with pytest.raises(StoreIncomplete, match="golden"):
@@ -169,7 +168,9 @@ class TestOtherStores:
     def test_a_merge_refuses_a_damaged_one(self, store, tiny_golden, tmp_path):
         other = tiny_golden(tmp_path, name="other", seed=4)
         (store / "golden/0/View1/c/0/0/0").write_bytes(b"")
-        with pytest.raises(StoreIncomplete, match="golden frame of VL row 0 cannot be read"):
+        with pytest.raises(
+            StoreIncomplete, match="golden/0/View1/c/0/0/0: golden frame cannot be read"
+        ):
             merge([store, other], tmp_path / "both.zarr")
 
 

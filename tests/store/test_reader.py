@@ -176,7 +176,9 @@ class TestGather:
 def varied(tiny_store, tmp_path_factory, request) -> FeatureStore:
     """A row of six slots is three variants of two, some of them not valid."""
     path = tiny_store(tmp_path_factory.mktemp("varied"), slots=6, dtype=request.param)
-    zarr.open_group(path, mode="r+").attrs["feature_spec"] = {"digest": "x", "variants": 3}
+    attrs = zarr.open_group(path, mode="r+").attrs
+    spec = attrs.asdict()["feature_spec"]
+    attrs["feature_spec"] = {**spec, "variants": 3}
     store = FeatureStore.open(path)
     valid = store.array("vl/slot_valid")
     valid[:] = np.random.default_rng(1).integers(0, 2, valid.shape)
@@ -271,10 +273,10 @@ class TestOpen:
         chunk = path / "vl/features/c/0/0/0"
         with chunk.open("r+b") as file:
             file.truncate(100)
-        with pytest.raises(StoreIncomplete, match=r"vl/features/c/0/0/0.*found 100 bytes"):
+        with pytest.raises(StoreIncomplete, match=r"vl/features/c/0/0/0.*found 100\."):
             FeatureStore.open(path)
         chunk.unlink()
-        with pytest.raises(StoreIncomplete, match="no file"):
+        with pytest.raises(StoreIncomplete, match="no such file"):
             FeatureStore.open(path)
 
     @pytest.mark.parametrize("ending", [".part", ".repair.part"])

@@ -16,23 +16,28 @@ import zarr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from pipeline.base.errors import DiskFull, StoreIncomplete, StoreLocked
+from pipeline.base.errors import ConfigError, DiskFull, StoreIncomplete, StoreLocked
 from pipeline.store import FeatureStore, RowSource, Sizes, StoreBuild, arrays, build_lock, recover
 from pipeline.store.chunks import check_trailers, row_checksums
+from pipeline.store.lock import lock_holder
 from pipeline.store.schema import FEATURES, TRAILER_BYTES, ArraySpec
+from tests.store.samples import TEXT, attributes_of, index_of
 
 ROWS = 12
-SIZES = Sizes(1, 24, ROWS, 0, 0, 2, 3, 8, 1, 2, 0, 0)
+SIZES = Sizes(1, 24, ROWS, 0, 0, len(TEXT), 3, 8, 1, 2, 0, 0)
+
+
+def lay_out(build: StoreBuild) -> None:
+    for name, values in index_of(build.specs).items():
+        build.write(name, 0, values)
+    build.finish_layout(attributes_of(build.specs), {})
 
 
 def begun(folder: Path, plan: str = "plan") -> StoreBuild:
     build = StoreBuild(folder / "s.zarr", arrays(SIZES, "float32", "float32"), plan)
     build.create()
     build.allocate()
-    build.write("episode/text_start", 0, np.array([0, 2]))
-    build.write("episode/text", 0, np.frombuffer(b"{}", np.uint8))
-    build.write("episode/vl_start", 0, np.array([0, ROWS]))
-    build.finish_layout({"schema": 1, "environment": []}, {})
+    lay_out(build)
     return build
 
 
@@ -278,7 +283,7 @@ class TestLinks:
         assert np.array_equal(FeatureStore.open(longer.target).array("sensor/values"), grown)
 
     def _specs(self, folder: Path, readings: int, plan: str):
-        sizes = Sizes(1, 2, 1, readings, 0, 2, 1, 2, 1, 2, 3, 0)
+        sizes = Sizes(1, 2, 1, readings, 0, len(TEXT), 1, 2, 1, 2, 3, 0)
         build = StoreBuild(folder / "s.zarr", arrays(sizes, "float32", "float32"), plan)
         values = np.random.default_rng(readings).normal(size=(readings, 3)).astype(np.float32)
         return build, values
@@ -292,7 +297,7 @@ class TestLinks:
         return build, values
 
     def _finish(self, build: StoreBuild) -> None:
-        build.finish_layout({"schema": 1, "environment": []}, {})
+        lay_out(build)
         build.commit([0], np.zeros((1, 1, 2), np.float32), [bytes(16)], 0)
 
 
@@ -373,6 +378,49 @@ class TestLock:
         with build_lock(self.left_by(tmp_path, "process 7 on elsewhere", 61)):
             pass
 
+    def test_a_time_ahead_of_the_clock_is_no_sign_of_life(self, tmp_path):
+        """Such as that of a host whose clock is wrong: it counts from when it was seen."""
+        target = self.left_by(tmp_path, "process 7 on elsewhere", -86_400)
+        path = tmp_path / "s.zarr.lock"
+        assert lock_holder(path) is None
+        with pytest.raises(StoreLocked, match="sign of life 0 s ago"), build_lock(target):
+            pass
+        assert abs(path.stat().st_mtime - time.time()) < 10
+        assert lock_holder(path) == "process 7 on elsewhere"
+        os.utime(path, (path.stat().st_mtime - 61,) * 2)
+        with build_lock(target):
+            pass
+
+    @pytest.mark.parametrize(
+        ("kind", "said"),
+        [
+            ("folder", "found a folder"),
+            ("pipe", "found a pipe"),
+            ("link to nothing", "no such file"),
+            ("huge", "expected at most 1,000 bytes, found 10,000,000"),
+            ("binary", "found a file that this project did not write"),
+            ("half ours", "found a file that this project did not write"),
+        ],
+    )
+    def test_what_is_no_lock_is_left_as_it_is(self, tmp_path, kind, said):
+        path = tmp_path / "s.zarr.lock"
+        match kind:
+            case "folder":
+                path.mkdir()
+            case "pipe":
+                os.mkfifo(path)
+            case "link to nothing":
+                path.symlink_to("nowhere")
+            case _:
+                text = {"huge": b"x" * 10**7, "binary": b"\xff\x00\x1b" * 20}
+                path.write_bytes(text.get(kind, b"process 7 on elsewhere\nand my thesis\n"))
+        before = path.lstat()
+        for look in (build_lock(tmp_path / "s.zarr").__enter__, lambda: lock_holder(path)):
+            with pytest.raises(ConfigError, match=f"s.zarr.lock: .*{said}.*move it away"):
+                look()
+        assert not (tmp_path / "nowhere").exists()
+        assert (path.lstat().st_size, path.lstat().st_mtime) == (before.st_size, before.st_mtime)
+
     def test_a_holder_gives_signs_of_life(self, tmp_path, monkeypatch):
         monkeypatch.setattr("pipeline.store.lock._BEAT_S", 0.01)
         path = tmp_path / "s.zarr.lock"
@@ -408,7 +456,7 @@ class TestChunkRule:
         dtype=st.sampled_from(["u1", "f2", "f4", "f8"]),
     )
     def test_chunks_are_multiples_of_4096_rows_of_about_64_mb(self, rows, width, dtype):
-        spec = ArraySpec("x", (rows, width), np.dtype(dtype), ("row", "column"))
+        spec = ArraySpec("x", (rows, width), np.dtype(dtype))
         assert spec.chunk_rows % 4096 == 0
         assert spec.chunk_bytes % 4096 == 0
         assert spec.chunk_rows == 4096 or spec.chunk_bytes <= 64 * 2**20

@@ -91,8 +91,9 @@ def any_store(
     }
     path = tiny_store(folder, **changed.get(kind, {}))
     if kind == "variants":
-        spec = {"digest": "two", "variants": 2}
-        zarr.open_group(path, mode="r+").attrs["feature_spec"] = spec
+        attrs = zarr.open_group(path, mode="r+").attrs
+        spec = attrs.asdict()["feature_spec"]
+        attrs["feature_spec"] = {**spec, "variants": 2}
     return FeatureStore.open(path)
 
 

@@ -119,7 +119,8 @@ def test_what_a_front_brings_is_trained_judged_and_saved(store: FeatureStore, pa
         assert set(load_policy(done.run.output / name).weights) == set(
             done.averaged.policy.state_dict()
         )
-    assert read_document(done.run.output / "run.json")["decides"]["front"] == {"adapter": "square"}
+    decides = read_document(done.run.output / "run.json", dict)[1]["decides"]
+    assert decides["front"] == {"adapter": "square"}
     assert any("learns" in line and "of" in line for line in done.summary())
 
 

@@ -23,8 +23,9 @@ from pipeline.train.batches import Windows
 from pipeline.train.checkpoints import read_trainer
 from pipeline.train.log import speed_file
 from pipeline.train.loop import Trainer
+from pipeline.train.predictions import predict
 from pipeline.train.run import TRAINER_VERSION
-from pipeline.train.scores import evaluate_policy
+from pipeline.train.scores import action_space, compare
 
 Make = Callable[..., Any]
 GOLDEN = Path(__file__).with_name("golden_run.json")
@@ -162,7 +163,7 @@ def test_what_a_finished_run_leaves(undisturbed: Trainer, store: FeatureStore) -
     assert rows == pytest.approx(
         [np.mean(losses(undisturbed)[:10]), np.mean(losses(undisturbed)[10:])]
     )
-    metrics = read_document(logs / "metrics.json")
+    metrics = read_document(logs / "metrics.json", dict)[1]
     assert metrics["step"] == 20
     assert {"loss", "grad_norm", "translation", "rotation", "gripper"} == set(metrics["train"])
     assert {"error", "translation_mm", "rotation_deg", "gripper"} == set(metrics["val"])
@@ -241,7 +242,7 @@ def test_a_loss_that_is_not_finite_names_step_and_ticks(
         stopped.fit()
     assert str(stopped.plan.ticks(7).tolist()) in str(caught.value)
     # The checkpoint on disk is the one from before.
-    assert read_trainer(stopped.run.last).step == 5
+    assert read_trainer(stopped.run.last)[0].step == 5
 
 
 @pytest.mark.parametrize("place", ["plain", "git", "git and dvc"])
@@ -370,14 +371,9 @@ def test_on_a_gpu_a_run_is_stopped_resumed_and_judged(
     resumed.fit()
     assert np.isfinite(losses(resumed)).all()
     best = load_policy(resumed.run.output / "best")
-    comparison, _ = evaluate_policy(
-        best.policy("cuda"),
-        store,
-        resumed.split.val,
-        Windows.of(resumed.params),
-        8,
-        best.normalization,
-    )
+    windows = Windows.of(resumed.params)
+    predictions = predict(best.policy("cuda"), store, resumed.split.val, windows, 8)
+    comparison = compare(predictions, {}, action_space(store, best.normalization))
     assert comparison.overall("policy") == pytest.approx(best.metrics["val/error"], rel=1e-3)
 
 
@@ -397,6 +393,7 @@ class TestGoldenRows:
         self, tiny_golden, params, trainer, tmp_path
     ):
         store = FeatureStore.open(tiny_golden(tmp_path))
-        (store.path / "golden/1/View1/c/0/0/0").unlink()
-        with pytest.raises(StoreIncomplete, match="golden frames and prompt of VL row 7"):
+        frame = store.path / "golden/1/View1/c/0/0/0"
+        frame.unlink()
+        with pytest.raises(StoreIncomplete, match=rf"{frame}: no such file\. .*verify --repair"):
             trainer(store, params(max_steps=5))

@@ -194,7 +194,7 @@ def test_a_stream_that_no_training_episode_has_is_named(
     train, absent = np.arange(store.ticks), {"sensor_channels": 0}
     (line,) = warnings(train, absent)
     assert line.startswith("warning: sensor")
-    assert "older there than train_head.sensor_window_s" in line and "train_head.split" in line
+    assert "the training episodes' windows" in line and "train_head.split" in line
     assert warnings(train, absent, sensor_enabled=False) == []
 
 

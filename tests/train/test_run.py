@@ -72,7 +72,6 @@ def test_a_finished_run_is_left_alone(store: FeatureStore, params: Make, trainer
     assert len(open_run(params(), store).notes) == 1
     run = open_run(params(device="cpu", logs="elsewhere", checkpoint_every=1), store)
     assert run.status == "finished"
-    assert f"left where they were written, in {params().logs}, not in elsewhere" in run.notes[1]
     assert not leftover.exists()
 
 
@@ -82,9 +81,13 @@ def test_another_run_replaces_a_finished_one_when_it_is_finished(
     other = trainer(store, params(seed=5))
     assert other.run.status == "new"
     assert "holds another run" in other.run.notes[0]
-    assert read_document(params().output / "run.json")["decides"]["train_head"]["seed"] == 0
+    assert (
+        read_document(params().output / "run.json", dict)[1]["decides"]["train_head"]["seed"] == 0
+    )
     other.fit()
-    assert read_document(params().output / "run.json")["decides"]["train_head"]["seed"] == 5
+    assert (
+        read_document(params().output / "run.json", dict)[1]["decides"]["train_head"]["seed"] == 5
+    )
     assert sorted(p.name for p in params().output.parent.glob("head*")) == ["head"]
 
 
@@ -104,8 +107,10 @@ def test_other_params_move_an_unfinished_run_aside(
     run = open_run(params(lr=0.25), store)
     assert run.notes == ()
     run.begin()
-    assert read_document(unfinished / "run.json")["decides"]["train_head"]["lr"] == 0.25
-    assert read_document(aside / "run.json")["decides"]["train_head"]["lr"] == 0.003
+    decides = read_document(unfinished / "run.json", dict)[1]["decides"]
+    assert decides["train_head"]["lr"] == 0.25
+    decides = read_document(aside / "run.json", dict)[1]["decides"]
+    assert decides["train_head"]["lr"] == 0.003
 
 
 def test_a_run_put_aside_gives_way_to_the_next(
@@ -115,7 +120,8 @@ def test_a_run_put_aside_gives_way_to_the_next(
     shutil.copytree(unfinished, aside)
     (aside / "run.json").write_text("older")
     trainer(store, params(lr=0.5, max_steps=1)).fit()
-    assert read_document(aside / "run.json")["decides"]["train_head"]["lr"] == 0.003
+    decides = read_document(aside / "run.json", dict)[1]["decides"]
+    assert decides["train_head"]["lr"] == 0.003
 
 
 def test_nothing_is_written_before_the_params_are_known_to_be_good(
@@ -180,7 +186,7 @@ def test_a_truncated_checkpoint_is_named(
 ) -> None:
     path = unfinished / "last" / file
     path.write_bytes(path.read_bytes()[:-20])
-    with pytest.raises(CheckpointIncomplete, match=f"{file}: the checkpoint is damaged"):
+    with pytest.raises(CheckpointIncomplete, match=rf"{file}: .*Copy it again"):
         trainer(store, params())
 
 
@@ -204,7 +210,7 @@ def test_an_altered_document_of_a_run_is_named(
     path = unfinished / file
     assert entry in path.read_text()
     path.write_text(path.read_text().replace(entry, altered, 1))
-    with pytest.raises(CheckpointIncomplete, match=rf"{file}: .*damaged: it was altered"):
+    with pytest.raises(CheckpointIncomplete, match=rf"{file}: it was altered"):
         trainer(store, params())
 
 
@@ -228,7 +234,7 @@ def test_what_no_training_wrote_is_never_replaced(store: FeatureStore, params: M
     output.mkdir()
     assert open_run(params(), store).status == "new"
     (output / "thesis.tex").write_text("years of work")
-    with pytest.raises(ConfigError, match="no training run"):
+    with pytest.raises(ConfigError, match="a training run that this project wrote"):
         open_run(params(), store)
     assert (output / "thesis.tex").exists()
 
@@ -248,7 +254,7 @@ def test_a_run_json_of_another_program_makes_no_training_run(
     if beside == "best":  # a run of ours whose run.json was damaged
         assert RUN_FOLDER.owns(output)
     else:
-        with pytest.raises(ConfigError, match="no training run"):
+        with pytest.raises(ConfigError, match="a training run that this project wrote"):
             open_run(params(), store)
 
 
@@ -256,7 +262,7 @@ def test_checkpoints_without_their_run_are_not_guessed_at(
     store: FeatureStore, params: Make, unfinished: Path
 ) -> None:
     (unfinished / "run.json").unlink()
-    with pytest.raises(ConfigError, match=r"no run\.json"):
+    with pytest.raises(ConfigError, match="a training run that this project wrote"):
         open_run(params(), store)
 
 
@@ -286,11 +292,10 @@ def test_the_advice_of_a_damaged_unfinished_run_leads_out(
     store: FeatureStore, params: Make, trainer: Make, unfinished: Path, file: str
 ) -> None:
     (unfinished / file).write_text("{}")
-    with pytest.raises((CheckpointIncomplete, CheckpointMismatch)) as caught:
+    with pytest.raises(CheckpointIncomplete) as caught:
         trainer(store, params())
-    if file != "last/policy.json":  # an empty one says another format
-        assert f"{unfinished / file}: the checkpoint is damaged" in str(caught.value)
-        assert f"Remove {(unfinished / file).parent} and run" in str(caught.value)
+    assert f"{unfinished / file}: " in str(caught.value)
+    assert "or remove its folder and run the training" in str(caught.value)
     shutil.rmtree((unfinished / file).parent)
     trainer(store, params()).fit()
     assert open_run(params(), store).status == "finished"

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from pipeline.base.config import SplitParams
 from pipeline.base.errors import ConfigError, StoreMismatch
-from pipeline.policy.checkpoint import SIDES
+from pipeline.base.tuned_on import SIDES
 from pipeline.store import FeatureStore
 from pipeline.train.groups import episodes_by_group
 from pipeline.train.sampling import ticks_by_source
@@ -299,7 +299,7 @@ class TestSides:
             ({"val": 0.5, "test": 0.5}, "leave nothing to train on"),
             ({"val": 0.5, "folds": 2}, "leave nothing to train on"),
             ({"folds": 5, "fold": 5}, "fold 5 of folds 5"),
-            ({"fold": 1}, "fold 1 without folds"),
+            ({"fold": 1}, "fold 1 of folds None: expected a fold from 0"),
             ({"folds": 1}, "greater than or equal to 2"),
             ({"val": -0.1}, "greater than or equal to 0"),
         ],

@@ -54,7 +54,9 @@ def test_features_are_counted_over_all_variants(
 ) -> None:
     monkeypatch.setattr("pipeline.train.statistics.CHUNK_BYTES", chunk_bytes)
     path = tiny_store(tmp_path, slots=6)
-    zarr.open_group(path, mode="r+").attrs["feature_spec"] = {"digest": "x", "variants": 3}
+    attrs = zarr.open_group(path, mode="r+").attrs
+    spec = attrs.asdict()["feature_spec"]
+    attrs["feature_spec"] = {**spec, "variants": 3}
     store = FeatureStore.open(path)
     store.array("vl/slot_valid")[10:13, [1, 3, 5]] = 0
     found = fit_normalization(store, np.arange(30, 60), WINDOWS).features

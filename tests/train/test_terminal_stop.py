@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import torch
 
+from pipeline.policy.observation import moving_channels
 from pipeline.store import FeatureStore
-from pipeline.train.loop import TerminalStop
+from pipeline.train.loop import stand_still
 
 Make = Callable[..., Any]
 LAST = [29, 28, 5]
@@ -23,9 +24,8 @@ def test_what_is_done_beyond_the_end(
     monkeypatch.setattr(FeatureStore, "streams", streams)
     batch = store.gather(LAST, 3, 1, 1)
     before = batch.action.clone()
-    action, valid = TerminalStop(store, torch.device("cpu")).extend(
-        batch.action, batch.action_valid
-    )
+    moves = torch.tensor(moving_channels(store.streams["action"]))
+    action, valid = stand_still(batch.action, batch.action_valid, moves)
     assert valid.all()
     assert torch.equal(batch.action, before), "the store's buffer is left alone"
     recorded = torch.from_numpy(np.array(store.array("tick/action")))

@@ -11,6 +11,7 @@ import zarr
 from pipeline.base.config import SplitParams
 from pipeline.base.errors import CheckpointIncomplete, ConfigError
 from pipeline.base.tuned_on import (
+    SIDES,
     TUNED_ON,
     TunedOn,
     TunedPart,
@@ -20,7 +21,6 @@ from pipeline.base.tuned_on import (
     store_attributes,
     write_tuned_on,
 )
-from pipeline.policy.checkpoint import SIDES
 from pipeline.store import FeatureStore
 from pipeline.train.split import Split, split_by_episode
 from pipeline.train.tuned_episodes import refuse_tuned_episodes
@@ -101,8 +101,8 @@ def test_it_comes_back_and_damage_is_named(tmp_path: Path) -> None:
     tuned = TunedOn(train=(part(0), part(1, (3, 9))), val=(part(2),))
     write_tuned_on(tmp_path, tuned)
     assert read_tuned_on(tmp_path) == tuned
-    assert of_store(store_attributes(tuned)) == tuned
-    assert store_attributes(of_store({})) == {}
+    assert of_store(store_attributes(tuned), Path("a.zarr")) == tuned
+    assert store_attributes(of_store({}, Path("a.zarr"))) == {}
     again = joined([None, tuned, TunedOn(train=(part(1, (3, 9)), part(4)))])
     assert again == TunedOn(train=(part(0), part(1, (3, 9)), part(4)), val=(part(2),))
     (tmp_path / TUNED_ON).write_text('{"train": [{"episode": "a/b"}]}')

@@ -294,7 +294,7 @@ def test_a_hub_id_that_is_not_there_says_what_to_run(
     with pytest.raises(VLMError, match=r"stages\.demo.*hf download models/demo_vlm") as refused:
         resolve_checkpoint("models/demo_vlm")
     said = str(refused.value)
-    assert "no folder of that name here; and as a hub id, it is neither whole in the local" in said
+    assert "no folder of that name here; and as a hub id, it cannot be downloaded" in said
     assert "Error" not in said and "stages.doctor" in said
 
 
@@ -333,10 +333,10 @@ def test_only_what_transformers_loads_is_digested(tmp_path: Path, demo_checkpoin
     shutil.copytree(demo_checkpoint, folder)
     whole, shard = folder / "model.safetensors", folder / "model-00001-of-00001.safetensors"
     index = folder / "model.safetensors.index.json"
-    index.write_text(json.dumps({"weight_map": {"a": whole.name}}))
+    index.write_text(json.dumps({"metadata": {}, "weight_map": {"a": whole.name}}))
     assert weight_files(folder) == sorted([folder / "config.json", whole, index])
     shutil.copy(whole, shard)
-    index.write_text(json.dumps({"weight_map": {"a": shard.name}}))
+    index.write_text(json.dumps({"metadata": {}, "weight_map": {"a": shard.name}}))
     with pytest.raises(VLMError, match=r"ambiguous.*Remove model\.safetensors if.*else.*index"):
         weight_files(folder)
     whole.unlink()

@@ -10,7 +10,7 @@ their keys; `limits` has what stands in a file of its own; `load` reads files.
 # pyright: reportUnusedImport=false
 
 from pipeline.base.config.limits import LimitsFile, MotionLimit
-from pipeline.base.config.load import load_params, load_section
+from pipeline.base.config.load import load_params, load_section, setting
 from pipeline.base.config.policy import DiffusionParams, FlowMatchingParams, SensorEncoderParams
 from pipeline.base.config.sections import Params, described_keys
 from pipeline.base.config.stage_one import (
@@ -18,6 +18,7 @@ from pipeline.base.config.stage_one import (
     DataParams,
     ExtractParams,
     InspectParams,
+    MediaLimits,
     Pooling,
     Source,
     VLMParams,

@@ -6,7 +6,7 @@ from pydantic import Field
 
 from pipeline.base.config.section import Section
 
-Most = dict[str, Annotated[float, Field(gt=0)]]
+Most = dict[str, Annotated[float, Field(gt=0, le=1e12)]]
 
 
 class MotionLimit(Section):

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from pipeline.base.config.policy import (
     DiffusionParams,
@@ -13,7 +13,7 @@ from pipeline.base.config.policy import (
     SensorEncoderParams,
     StateEncoderParams,
 )
-from pipeline.base.config.section import Fraction, Section, Seed
+from pipeline.base.config.section import Fraction, OwnFolder, Place, Section, Seed
 
 ModelType = Literal["regression", "diffusion", "flow_matching"]
 FusionStrategy = Literal["concat", "cross_attention", "gated", "none"]
@@ -24,9 +24,7 @@ RolloutAblation = Literal[
 ]
 ExportFormat = Literal["onnx", "torch"]
 LoggerName = Literal["tensorboard", "wandb"]
-Weight = Annotated[float, Field(ge=0)]
-
-
+Weight = Annotated[float, Field(ge=0, le=1e6)]
 Share = Annotated[float, Field(ge=0, lt=1)]
 
 
@@ -43,13 +41,13 @@ class SplitParams(Section):
     """Share of groups that choose the checkpoint and stop early."""
     test: Share = 0.15
     """Share of groups that `stages.evaluate` reports on; nothing is ever chosen on them."""
-    train: int | None = Field(default=None, ge=1)
+    train: int | None = Field(default=None, ge=1, le=10**9)
     """Train on at most so many groups, drawn by the same hash, and leave the others out: what would
     more recordings bring?"""
-    folds: int | None = Field(default=None, ge=2)
+    folds: int | None = Field(default=None, ge=2, le=1_000_000)
     """Deal the groups into as many folds, of which one is test, whatever `test` says: with little
     data, train once a fold."""
-    fold: int = Field(default=0, ge=0)
+    fold: int = Field(default=0, ge=0, le=1_000_000)
     """Which of the folds is test, from 0."""
     groups: dict[str, tuple[str, ...]] = Field(default_factory=dict)
     """Episodes that belong together, as of one object or one day: patterns of `<source>/<id>` by
@@ -63,14 +61,10 @@ class SplitParams(Section):
                 f"val {self.val:g} and test {test:g} leave nothing to train on; they must add up "
                 "to less than 1"
             )
-        if self.folds is None and self.fold:
-            raise ValueError(
-                f"fold {self.fold} without folds: expected a number of folds, of which it is test"
-            )
         if self.fold >= (self.folds or 1):
             raise ValueError(
                 f"fold {self.fold} of folds {self.folds}: expected a fold from 0 that is smaller "
-                "than folds"
+                "than folds; without folds, 0"
             )
         return self
 
@@ -100,47 +94,47 @@ class TrainHeadParams(Section):
     """Share of training samples without the sensor."""
     drop_state: Fraction = 0.0
     """Share of training samples without the robot's state."""
-    horizon: int = Field(default=8, ge=1)
+    horizon: int = Field(default=8, ge=1, le=1000)
     """Ticks an action chunk."""
-    sensor_window: int = Field(default=65, ge=1)
+    sensor_window: int = Field(default=65, ge=1, le=20_000)
     """Most readings of the sensor before the tick, and the steps that the encoder makes of them."""
-    sensor_window_s: float | None = Field(default=0.1, gt=0)
+    sensor_window_s: float | None = Field(default=0.1, gt=0, le=3600)
     """Seconds before the tick that the sensor's window covers, whatever the rate of a recording.
     null takes readings of any age, and their order for their time."""
-    state_window: int = Field(default=100, ge=1)
+    state_window: int = Field(default=100, ge=1, le=20_000)
     """As `sensor_window`, of the robot's state."""
-    state_window_s: float | None = Field(default=1.0, gt=0)
+    state_window_s: float | None = Field(default=1.0, gt=0, le=3600)
     """As `sensor_window_s`, of the robot's state."""
-    feature_lag: int = Field(default=0, ge=0)
+    feature_lag: int = Field(default=0, ge=0, le=1000)
     """Most VL rows that features come late in training, drawn evenly for each sample: so a policy
     learns what a slow model does to it."""
-    sensor_lag_s: float = Field(default=0.0, ge=0)
+    sensor_lag_s: float = Field(default=0.0, ge=0, le=3600)
     """Most seconds that the sensor comes late in training, likewise; its window then reaches back
     as much further."""
     terminal_stop: bool = False
     """Beyond an episode's end, train to stand still (zero deltas and velocities, the last absolute
     action) instead of leaving those steps of the chunk out of the loss."""
-    batch_size: int = Field(default=64, ge=1)
+    batch_size: int = Field(default=64, ge=1, le=2**16)
     """Ticks a step, over all accumulated parts and all processes."""
-    grad_accumulation: int = Field(default=1, ge=1)
+    grad_accumulation: int = Field(default=1, ge=1, le=2**16)
     """Parts that a step's ticks are computed in on each process, one after the other."""
-    max_steps: int = Field(default=500, ge=1)
+    max_steps: int = Field(default=500, ge=1, le=10**9)
     """Steps of the run; the learning rate's decay ends there."""
     lr_schedule: Literal["cosine", "trapezoid", "constant"] = "cosine"
     """After the warm-up: half a cosine to the floor, flat and then linear to it, or flat."""
     decay_fraction: Fraction = 0.2
     """Of `trapezoid`: the share of all steps that its final decay takes."""
-    warmup_steps: int = Field(default=100, ge=0)
+    warmup_steps: int = Field(default=100, ge=0, le=10**9)
     """Steps of linear warm-up."""
-    lr: float = Field(default=5e-4, gt=0)
+    lr: float = Field(default=5e-4, gt=0, le=1e3)
     """Peak learning rate of AdamW."""
-    sensor_lr: float | None = Field(default=None, gt=0)
+    sensor_lr: float | None = Field(default=None, gt=0, le=1e3)
     """Peak learning rate of the sensor encoder; `lr` where null."""
     min_lr_fraction: Fraction = 0.05
     """Of the peak, at the end of the decay."""
-    weight_decay: float = Field(default=0.01, ge=0)
+    weight_decay: float = Field(default=0.01, ge=0, le=1e3)
     """On matrices; norms, biases and embeddings are not decayed."""
-    grad_clip: float = Field(default=1.0, gt=0)
+    grad_clip: float = Field(default=1.0, gt=0, le=1e9)
     """Largest norm of the gradient."""
     ema_decay: float = Field(default=0.995, ge=0, lt=1)
     """Of the average of weights that is evaluated and kept."""
@@ -160,14 +154,14 @@ class TrainHeadParams(Section):
     three times as often. (The weights of `create_unified_dataloader` are shares, whatever the
     sizes.)
     """
-    eval_every: int = Field(default=50, ge=1)
+    eval_every: int = Field(default=50, ge=1, le=10**9)
     """Steps between evaluations on the ticks of val."""
-    eval_samples: int = Field(default=4, ge=1)
+    eval_samples: int = Field(default=4, ge=1, le=1000)
     """Chunks sampled a tick, over which the error of one is averaged; experts that do not sample
     give one."""
-    early_stopping: int | None = Field(default=None, ge=1)
+    early_stopping: int | None = Field(default=None, ge=1, le=10**9)
     """Stop after this many evaluations in a row without a better one; null never stops early."""
-    checkpoint_every: int = Field(default=200, ge=1)
+    checkpoint_every: int = Field(default=200, ge=1, le=10**9)
     """Steps between checkpoints."""
     seed: Seed = 0
     """Of weights, order and dropout."""
@@ -179,11 +173,11 @@ class TrainHeadParams(Section):
     check_store: bool = True
     """Read the store once before training or tuning, and refuse a chunk that does not give its
     checksum; false where that takes too long."""
-    store: Path | None = None
+    store: Place | None = None
     """The store to train from; `extract.store` where null. Another one DVC does not watch."""
-    output: Path = Path("models/head")
+    output: OwnFolder = Path("models/head")
     """Folder of the best and the last checkpoint."""
-    logs: Path = Path("reports/train_head")
+    logs: OwnFolder = Path("reports/train_head")
     """Folder of the curves."""
     loggers: tuple[LoggerName, ...] = ()
     """Who shows the curves while it trains, beside the files that DVC plots: `tensorboard` event
@@ -196,45 +190,29 @@ class TrainHeadParams(Section):
         """Seconds before the tick of the oldest reading that the sensor's encoder looks at."""
         return None if self.sensor_window_s is None else self.sensor_window_s + self.sensor_lag_s
 
-    @field_validator("output", "logs")
-    @classmethod
-    def _has_a_name(cls, folder: Path) -> Path:
-        if not folder.name:
-            raise ValueError(f"must be a folder of its own, found {str(folder)!r}")
-        return folder
-
-    @model_validator(mode="after")
-    def _every_part_has_ticks(self) -> "TrainHeadParams":
-        if self.grad_accumulation > self.batch_size:
-            raise ValueError(
-                f"grad_accumulation {self.grad_accumulation} cuts a batch_size of "
-                f"{self.batch_size} into parts without a tick"
-            )
-        return self
-
 
 class EvaluateParams(Section):
     """Which policy is judged, and where the report goes."""
 
-    checkpoint: Path | None = None
+    checkpoint: Place | None = None
     """A training run's folder, or one checkpoint in it; `train_head.output` where null. Another one
     DVC does not watch."""
-    output: Path = Path("reports/evaluate")
+    output: Place = Path("reports/evaluate")
     """Folder of metrics, tables and pictures."""
-    batch_size: int = Field(default=64, ge=1)
+    batch_size: int = Field(default=64, ge=1, le=2**16)
     """Ticks a forward pass."""
-    samples: int = Field(default=16, ge=1)
+    samples: int = Field(default=16, ge=1, le=1000)
     """Chunks sampled a tick: the error is that of one, averaged over them for less noise; the error
     of their mean, of the best of them and the energy score stand beside it. Experts that do not
     sample give one."""
-    execute: int = Field(default=1, ge=1)
+    execute: int = Field(default=1, ge=1, le=1000)
     """Steps of a chunk that the robot carries out before it asks for the next: their error stands
     first."""
     modalities: bool = True
     """Also judge with each stream zeroed, shuffled across episodes and delayed."""
     device: str = "auto"
     """auto, cpu, cuda or cuda:N."""
-    store: Path | None = None
+    store: Place | None = None
     """The store to evaluate on; `train_head.store`, else `extract.store`, where null."""
     check_store: bool = True
     """Read the store once before the evaluation, and refuse a chunk that does not give its
@@ -244,7 +222,7 @@ class EvaluateParams(Section):
 class RolloutParams(Section):
     """How a policy runs closed loop in the simulation, and where the report goes."""
 
-    checkpoint: Path | None = None
+    checkpoint: Place | None = None
     """A training run's folder, or one checkpoint in it; `train_head.output` where null."""
     environment: Literal["phantom"] | None = "phantom"
     """The simulated needle insertion of the demo. null rolls nothing out, which suits recordings of
@@ -252,17 +230,17 @@ class RolloutParams(Section):
     level: Level = "full"
     """depth: the needle begins above the target, so that the sensor suffices. full: it begins
     anywhere. moved: besides, target and tissue are pushed meanwhile."""
-    episodes: int = Field(default=50, ge=1)
+    episodes: int = Field(default=50, ge=1, le=1_000_000)
     """Episodes of each controller."""
     seed: int = Field(default=1_000_000, ge=0, lt=2**53)
     """Of the first episode; those that follow have the seeds that follow."""
-    execute: int = Field(default=1, ge=1)
+    execute: int = Field(default=1, ge=1, le=1000)
     """Steps of a chunk that are carried out before the head is asked for the next."""
     chunking: Chunking = "none"
     """none: the newest chunk. temporal: the weighted mean of all chunks that reach the tick
     (temporal ensembling). rtc: each chunk is drawn to continue the last (real-time chunking), for
     experts that sample."""
-    latency_ms: float = Field(default=0.0, ge=0)
+    latency_ms: float = Field(default=0.0, ge=0, le=60_000)
     """What a pass of the model takes, in simulated time: its features are so much older. The head
     answers at once."""
     ablations: tuple[RolloutAblation, ...] = ("sensor off", "features off")
@@ -275,20 +253,20 @@ class RolloutParams(Section):
     as VLA_SERVE_TOKEN."""
     device: str = "auto"
     """auto, cpu, cuda or cuda:N."""
-    output: Path = Path("reports/rollout")
+    output: Place = Path("reports/rollout")
     """Folder of metrics, table and page."""
 
 
 class ServeParams(Section):
     """How a policy is served to robots."""
 
-    checkpoint: Path | None = None
+    checkpoint: Place | None = None
     """A training run's folder, or one checkpoint in it; `train_head.output` where null."""
     host: str = "127.0.0.1"
     """Address to listen on. Any but this machine's own (127.0.0.1, ::1) needs a token."""
     port: int = Field(default=8000, ge=0, le=65535)
     """0 picks a free one and prints it."""
-    token_file: Path | None = None
+    token_file: Place | None = None
     """File with the token that robots must send; the environment variable VLA_SERVE_TOKEN where
     null, and no token where that is not set either."""
     fresh: bool = True
@@ -298,30 +276,30 @@ class ServeParams(Section):
     """auto, cpu, cuda or cuda:N."""
     seed: Seed = 0
     """Of what a policy draws for a robot that sends no seed."""
-    max_connections: int = Field(default=8, ge=1)
+    max_connections: int = Field(default=8, ge=1, le=10_000)
     """Robots at a time."""
-    max_waiting: int = Field(default=8, ge=1)
+    max_waiting: int = Field(default=8, ge=1, le=10_000)
     """Observations that are answered or wait at a time; who sends one more is told: busy."""
     max_message_mb: int = Field(default=64, ge=1, le=1024)
     """Of one observation, in MiB."""
-    idle_s: float = Field(default=600.0, gt=0)
+    idle_s: float = Field(default=600.0, gt=0, le=1e6)
     """A connection without a whole message for so long is closed."""
 
 
 class ExportParams(Section):
     """Which policy's head is written for other runtimes, and as what."""
 
-    checkpoint: Path | None = None
+    checkpoint: Place | None = None
     """A training run's folder, or one checkpoint in it; `train_head.output` where null."""
-    output: Path = Path("models/export")
+    output: Place = Path("models/export")
     """Folder of the files and their receipt."""
     formats: tuple[ExportFormat, ...] = Field(default=("onnx", "torch"), min_length=1)
     """onnx: `head.onnx`, for ONNX Runtime. torch: `head.pt2`, for `torch.export.load`."""
-    opset: int = Field(default=20, ge=18)
+    opset: int = Field(default=20, ge=18, le=100)
     """Version of ONNX's operators."""
     int8: bool = False
     """Also write `head.int8.onnx`, whose matrix products are in int8."""
-    int8_tolerance: float = Field(default=0.05, gt=0)
+    int8_tolerance: float = Field(default=0.05, gt=0, le=1e3)
     """Most that it may be off the policy, in training std of the action; else nothing is
     written."""
 
@@ -335,9 +313,9 @@ class ExportParams(Section):
 class CompareParams(Section):
     """Which evaluations stand side by side in one table."""
 
-    reports: Path = Path("reports/experiments")
+    reports: Place = Path("reports/experiments")
     """Folder of evaluation folders, each named after its experiment."""
-    output: Path = Path("reports/comparison")
+    output: Place = Path("reports/comparison")
     """Folder of the table and the picture."""
 
 
@@ -346,9 +324,9 @@ class TuningParams(Section):
 
     method: Literal["none", "lora", "full"] = "lora"
     """Nothing, low-rank adapters (Hu et al. 2021), or every weight."""
-    lora_r: int = Field(default=16, ge=1)
+    lora_r: int = Field(default=16, ge=1, le=4096)
     """Rank of an adapter."""
-    lora_alpha: int = Field(default=32, ge=1)
+    lora_alpha: int = Field(default=32, ge=1, le=1_000_000)
     """An adapter's update is scaled by alpha / r."""
     lora_dropout: Annotated[float, Field(ge=0, lt=1)] = 0.05
     """Before an adapter, while training."""
@@ -368,25 +346,25 @@ class FinetuneParams(Section):
     """
 
     tuning: TuningParams = TuningParams()
-    lr: float = Field(default=1e-4, gt=0)
+    lr: float = Field(default=1e-4, gt=0, le=1e3)
     """Peak learning rate of the vision-language model; the policy has `train_head.lr`."""
-    batch_size: int = Field(default=16, ge=1)
+    batch_size: int = Field(default=16, ge=1, le=2**16)
     """Ticks a step."""
-    grad_accumulation: int = Field(default=1, ge=1)
+    grad_accumulation: int = Field(default=1, ge=1, le=2**16)
     """Parts that a step's ticks are computed in, one after the other."""
-    max_steps: int = Field(default=200, ge=1)
+    max_steps: int = Field(default=200, ge=1, le=10**9)
     """Steps of the run."""
-    warmup_steps: int = Field(default=20, ge=0)
+    warmup_steps: int = Field(default=20, ge=0, le=10**9)
     """Steps of linear warm-up."""
-    eval_every: int = Field(default=50, ge=1)
+    eval_every: int = Field(default=50, ge=1, le=10**9)
     """Steps between evaluations on the ticks of val."""
-    eval_ticks: int = Field(default=100, ge=1)
+    eval_ticks: int = Field(default=100, ge=1, le=1_000_000)
     """Ticks of val judged in them at most: each costs a pass through the whole model."""
-    checkpoint_every: int = Field(default=50, ge=1)
+    checkpoint_every: int = Field(default=50, ge=1, le=10**9)
     """Steps between checkpoints."""
-    decode_threads: int = Field(default=2, ge=1)
+    decode_threads: int = Field(default=2, ge=1, le=256)
     """Threads that decode and resize while the model works."""
-    output: Path = Path("models/finetune")
+    output: OwnFolder = Path("models/finetune")
     """Folder of the best and the last checkpoint; the adapter is `best/adapter`."""
-    logs: Path = Path("reports/finetune")
+    logs: OwnFolder = Path("reports/finetune")
     """Folder of the curves."""

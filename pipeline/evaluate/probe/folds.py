@@ -53,7 +53,7 @@ def fold_by_recording(
     actions reaches beyond the episode's end are left out, so that all steps of the chunk are scored
     on the same ticks; of the others, `max_ticks` are read, evenly spread and so of each episode its
     share. Recordings no more than folds are each held out alone: there is one deal. Raises
-    `StoreMismatch` where fewer than two recordings have such ticks, or too few.
+    `StoreMismatch` where fewer than two recordings have such ticks.
     """
     recording = np.full(store.ticks, -1, np.int64)
     for index, episodes in enumerate(episodes_by_group(store).values()):
@@ -61,27 +61,23 @@ def fold_by_recording(
             stop = max(episode.ticks.start, episode.ticks.stop - horizon + 1)
             recording[episode.ticks.start : stop] = index
     ticks = np.flatnonzero(recording >= 0)
-    recordings = len(np.unique(recording[ticks]))
+    most = len(ticks) if max_ticks is None else max_ticks
+    read = evenly(ticks, most)
+    there, group = np.unique(recording[read], return_inverse=True)
+    recordings = len(there)
     if recordings < 2:
         raise StoreMismatch(
             f"{store.path}: expected at least two recordings of {horizon} ticks or more, of which "
             f"each is predicted from the others, found {recordings}. Add recordings to "
-            "data.sources and run stages.extract, or set a shorter probe.horizon."
+            "data.sources and run stages.extract, or set a shorter probe.horizon or more "
+            "probe.max_ticks."
         )
     count = min(folds, recordings)
     notes = _notes(store, recordings, folds, horizon)
-    if max_ticks is not None and max_ticks < len(ticks):
-        ticks = evenly(ticks, max_ticks)
-        notes.append(f"{len(ticks)} of the ticks are read, evenly spread (probe.max_ticks)")
-    there, group = np.unique(recording[ticks], return_inverse=True)
-    if len(there) < count:
-        raise StoreMismatch(
-            f"{store.path}: too few ticks to hold recordings out in turn: one of {count} folds has "
-            "none. Give a store with more or longer recordings, a larger probe.max_ticks or a "
-            "smaller probe.horizon."
-        )
-    deals = _deal(group, count, 1 if len(there) == count else repeats)
-    return ProbeFolds(ticks, group, deals, tuple(notes))
+    if most < len(ticks):
+        notes.append(f"{most} of the ticks are read, evenly spread (probe.max_ticks)")
+    deals = _deal(group, count, 1 if recordings == count else repeats)
+    return ProbeFolds(read, group, deals, tuple(notes))
 
 
 def _deal(group: NDArray[np.int64], folds: int, repeats: int) -> NDArray[np.int64]:

@@ -11,9 +11,9 @@ from sklearn.utils.extmath import randomized_svd
 from tqdm import tqdm
 
 from pipeline.base.bfloat16 import widen
-from pipeline.base.errors import NumericsError
-from pipeline.base.finite import first_non_finite
-from pipeline.store import FeatureStore, place
+from pipeline.store import FeatureStore
+from pipeline.train.statistics import check_finite
+from pipeline.vlm.slots import Slot
 
 Inputs = Float64[np.ndarray, "row _"]
 """What a regression reads or predicts at each VL row or tick."""
@@ -34,14 +34,8 @@ _ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)
-class SlotName:
+class SlotName(Slot):
     """What a slot or a group of slots is: of a group, `view` and `cell` are None."""
-
-    layer: int
-    norm: bool
-    pooling: str
-    view: str | None = None
-    cell: tuple[int, int] | None = None
 
     @property
     def group(self) -> "SlotName":
@@ -73,15 +67,9 @@ def read_slots(
     for slot, there in zip(slots, valid.T, strict=True):
         if not there.any():
             continue
-        values = store.array("vl/features")[rows[there], slot]
-        if (bad := first_non_finite(values)) is not None:
-            row, channel = bad
-            raise NumericsError(
-                f"{store.path}: expected finite numbers, found {widen(values)[bad]} at "
-                f"{place(store, 'vl', int(rows[there][row]))}, slot {slot}, channel {channel}. "
-                "Run stages.verify to see what else is damaged."
-            )
-        reduced = reduce(widen(values), fold[:, there], WIDTH // len(slots))
+        values = widen(store.array("vl/features")[rows[there], slot])
+        check_finite(store, "vl", rows[there], f"slot {slot}", values)
+        reduced = reduce(values, fold[:, there], WIDTH // len(slots))
         inputs.append(np.zeros((len(rows), reduced.shape[1])))
         inputs[-1][there] = reduced
     return np.concatenate(inputs, axis=1), valid.max(axis=1)
@@ -151,13 +139,7 @@ def _summaries(
         if start == stop:
             continue
         readings = values[start:stop]
-        if (bad := first_non_finite(readings)) is not None:
-            name = store.streams[stream]["names"][bad[1]]
-            raise NumericsError(
-                f"{store.path}: expected finite numbers, found {readings[bad]} at "
-                f"{place(store, stream, start + bad[0])}, channel {name!r}. Mend or leave out the "
-                "recording and run stages.extract again."
-            )
+        check_finite(store, stream, range(start, stop), stream, readings)
         summaries[:, tick] = (
             readings[-1],
             readings.mean(axis=0, dtype=np.float64),

@@ -12,14 +12,13 @@ from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from pipeline.base.config import ProbeParams
-from pipeline.base.errors import NumericsError
-from pipeline.base.finite import first_non_finite
 from pipeline.evaluate.figures import Figure
 from pipeline.evaluate.probe.folds import ProbeFolds, fold_by_recording
 from pipeline.evaluate.probe.inputs import Inputs, SlotName, past_actions, read_slots, summarize
 from pipeline.evaluate.probe.ridge import ProbeScore, cross_validate
 from pipeline.policy.normalization import fit_channels
-from pipeline.store import FeatureStore, place
+from pipeline.store import FeatureStore
+from pipeline.train.statistics import check_finite
 
 _ROUNDING = 1e-9
 """A gain below this is none."""
@@ -104,7 +103,8 @@ def probe(store: FeatureStore, params: ProbeParams) -> ProbeStudy:
     Raises `StoreMismatch` where fewer than two recordings are long enough, and `NumericsError` on
     NaN or inf, naming the place.
     """
-    action = _finite_actions(store)
+    action = store.array("tick/action")
+    check_finite(store, "tick", range(store.ticks), "actions", action)
     folds = fold_by_recording(store, params.folds, params.horizon, params.max_ticks, params.repeats)
     slots, dim = store.feature_shape
     names = TypeAdapter(list[SlotName]).validate_python(store.attrs["slots"][:slots])
@@ -171,19 +171,6 @@ def _known_blocks(
         ("sensor", summarize(store, "sensor", ticks, fold, params.sensor_window)),
     ]
     return [(name, block) for name, block in blocks if block.shape[1]]
-
-
-def _finite_actions(store: FeatureStore) -> NDArray[np.float32]:
-    """(tick, channel)"""
-    action = store.array("tick/action")
-    if bad := first_non_finite(action):
-        name = store.streams["action"]["names"][bad[1]]
-        raise NumericsError(
-            f"actions: expected finite numbers, found {action[bad]} at "
-            f"{place(store, 'tick', bad[0])}, channel {name!r}. Mend the recording and run "
-            "stages.extract again."
-        )
-    return action
 
 
 def _targets(action: NDArray[np.float32], folds: ProbeFolds, horizon: int) -> Inputs:

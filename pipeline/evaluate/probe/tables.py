@@ -122,11 +122,6 @@ def advice(study: ProbeStudy) -> str:
         f"recommended for params.yaml: vlm: {{layers: [{name.layer}], "
         f"norms: [{json.dumps(name.norm)}], pooling: [{name.pooling}]}}"
     )
-    if len(study.groups) > 1:
-        lines.append(
-            "to train on it alone: write that into params.yaml, run stages.extract into a store of "
-            "its own (extract.store), then stages.train_head"
-        )
     return "\n".join(lines)
 
 

@@ -29,11 +29,9 @@ def examine(params: Params) -> Generator[tuple[str, list[Issue]]]:
     for title, module in GROUPS.items():
         try:
             issues = list(import_module(f"pipeline.look.doctor.{module}").check(params))
-        except (ImportError, PipelineError) as error:
+        except (ImportError, OSError, PipelineError) as error:
             text = f"cannot be looked at: {error}"
             issues = [missing(module, text, "install or mend that, and run this again")]
-        except OSError as error:
-            issues = [note(module, f"not known: {error}", "look at that path")]
         yield title, issues
 
 

@@ -79,7 +79,7 @@ def check_gpus(gpus: Sequence[GPU], driver: bool, dtype: str) -> Iterator[Issue]
     if gpus:
         yield ok("build", build)
     elif driver:
-        text = f"{build}; this machine has a GPU driver, but torch says: {_why_unseen()}"
+        text = f"{build}; this machine has a GPU driver, but torch sees none"
         yield note("GPU", text, _SEE_GPU)
     else:
         text = f"{build}; this machine has no GPU driver: the CPU does for the demo, not for more"
@@ -91,14 +91,6 @@ def check_gpus(gpus: Sequence[GPU], driver: bool, dtype: str) -> Iterator[Issue]
         else:
             text += "; it only emulates bfloat16, which vlm.dtype asks for"
             yield note(f"cuda:{index}", text, "set vlm.dtype to float16 or float32")
-
-
-def _why_unseen() -> str:
-    try:
-        torch.cuda.init()
-    except (RuntimeError, AssertionError) as error:
-        return str(error).splitlines()[0]
-    return "no device answers"
 
 
 def check_attention(vlm: VLMParams, device: torch.device) -> Issue:

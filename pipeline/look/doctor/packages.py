@@ -54,10 +54,9 @@ def check_required(
         if version and wanted.specifier.contains(version.split("+")[0], prereleases=True):
             good[name] = version
             continue
-        remedy = f"pip install '{line}'"
-        if name == "python":
-            remedy = "make a virtual environment with another Python and install again"
-        bad.append(missing(name, f"expected {line}, found {version or 'none'}", remedy))
+        found = f"expected {line}, found {version or 'none'}"
+        remedy = f"make an environment of {line}" if name == "python" else f"pip install '{line}'"
+        bad.append(missing(name, found, remedy))
     shown = ", ".join(f"{name} {good[name]}" for name in _SHOWN if name in good)
     yield ok("packages", f"{len(good)} of {len(lines)} as they should be: {shown}")
     yield from bad

@@ -1,8 +1,6 @@
 """Whether the store that these params describe has room: on the disk and in memory."""
 
 import math
-import os
-import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -24,9 +22,8 @@ from pipeline.look.doctor.data import unusable
 from pipeline.store import part_path
 from pipeline.vlm.feature_spec import feature_spec
 
-BUDGET_S = 2.0
-"""How long episodes are read for the estimate; the rest is taken to be like them."""
-MOST_READ = 100
+MOST_READ = 10
+"""Episodes that are read for the estimate; the rest is taken to be like them."""
 
 
 def check(params: Params) -> Iterator[Issue]:
@@ -51,21 +48,20 @@ def check(params: Params) -> Iterator[Issue]:
     estimate = f"about {size(taken)} for {episodes} episodes"
     if len(read) < episodes:
         estimate += f", judged by {len(read)} of them"
-    yield check_disk(taken, estimate, target, free_bytes(target), used_bytes(part_path(target)))
+    yield check_disk(taken, estimate, target, free_bytes(target))
     yield check_page_cache(taken, memory_bytes())
 
 
-def check_disk(taken: int, estimate: str, target: Path, free: int, begun: int) -> Issue:
-    """Room for the store, less what an unfinished build of it has already."""
+def check_disk(taken: int, estimate: str, target: Path, free: int) -> Issue:
+    """Room for the store; where it or a build of it is there already, what is lacking is a note."""
     text = f"{estimate}; {size(free)} free in {target.parent}"
-    if begun:
-        text += f", {size(begun)} of it written by an unfinished build"
-    if target.exists():
-        text += f"; {target} is finished"
-    if taken - begun <= free:
+    there = [str(path) for path in (target, part_path(target)) if path.exists()]
+    if there:
+        text += f"; {there[0]} is there already"
+    if taken <= free:
         return ok("disk", text)
     remedy = "make room, set extract.store to another disk, or extract.dtype to float16"
-    return (note if target.exists() else missing)("disk", text, remedy)
+    return (note if there else missing)("disk", text, remedy)
 
 
 def check_page_cache(taken: int, memory: int) -> Issue:
@@ -79,16 +75,12 @@ def check_page_cache(taken: int, memory: int) -> Issue:
 def measure(
     recordings: Sequence[Recording], data: DataParams
 ) -> tuple[list[CheckedEpisode], list[str]]:
-    """A few episodes, read within `BUDGET_S`, and why others of them cannot be used."""
+    """A few episodes from all over, and why others of them cannot be used."""
     rotation = choose_action_rotation(data.action_rotation, recordings)
-    # An order whose every beginning comes from all over: the golden ratio's.
-    order = sorted(range(len(recordings)), key=lambda at: at * 0.6180339887498949 % 1)
+    step = math.ceil(len(recordings) / MOST_READ)
     read: list[CheckedEpisode] = []
     bad: list[str] = []
-    until = time.monotonic() + BUDGET_S
-    for recording in (recordings[at] for at in order[:MOST_READ]):
-        if (read or bad) and time.monotonic() > until:
-            break
+    for recording in recordings[:: max(1, step)]:
         try:
             episode = read_episode(recording, data.action_hz, data.vlm_reuse_count, rotation)
         except RecordingError as error:
@@ -110,9 +102,3 @@ def estimated_bytes(read: Sequence[CheckedEpisode], episodes: int, params: Param
     spec = feature_spec(params.vlm, params.extract.dtype, sorted(views), lambda path: "")
     surveyed = Survey(params, (), (), (), spec, "rotvec", plan="")
     return math.ceil(store_bytes(build_arrays(read, surveyed)) * episodes / len(read))
-
-
-def used_bytes(folder: Path) -> int:
-    """Bytes on the disk of the files below a folder; 0 where there is none."""
-    files = (Path(root, name) for root, _, names in os.walk(folder) for name in names)
-    return sum(file.lstat().st_blocks * 512 for file in files)

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import cycle
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -12,13 +11,11 @@ from pipeline.evaluate.baselines import BASELINES
 from pipeline.evaluate.experiments import SPANS, Experiment, best_experiment, experiment_table
 from pipeline.evaluate.figures import NO_INTERVAL
 from pipeline.evaluate.tables import FOOTNOTE
-from pipeline.look.evaluation.pictures import LABELS, STYLES
+from pipeline.look.evaluation.pictures import LABELS, STYLES, draw_bar
 from pipeline.look.page.blocks import Picture, Report, Section
 from pipeline.look.page.style import INK, finish, panels
 from pipeline.look.page.writing import sentence
 
-_EXPERTS = ("#0072B2", "#D55E00", "#56B4E9", "#F0E442", "#999999")
-"""In the order in which they come."""
 _READING = (
     "Mean errors with 95 % intervals over groups of recordings, differences on the same groups. "
     "The best is chosen on these ticks"
@@ -36,8 +33,8 @@ def comparison_report(experiments: Sequence[Experiment]) -> Report:
         for span in SPANS
     ]
     caption = (
-        "Test error of each experiment, coloured by expert, with 95 % intervals; a dot is a seed, "
-        "the baselines are lines."
+        "Test error of each experiment with 95 % intervals; a dot is a seed, the baselines are "
+        "lines."
     )
     picture = Picture("experiments", caption, partial(comparison_of_experiments, experiments))
     tiles = []
@@ -62,15 +59,9 @@ def comparison_report(experiments: Sequence[Experiment]) -> Report:
 def comparison_of_experiments(experiments: Sequence[Experiment]) -> Figure:
     """Errors of what is executed and of the whole chunk, with intervals, seeds and baselines."""
     figure, axes = panels(11.0, 0.36 * len(experiments) + 2.8, 1, len(SPANS), sharey=True)
-    experts = [experiment.model_type for experiment in experiments]
-    colours = dict(zip(dict.fromkeys(experts), cycle(_EXPERTS), strict=False))
     for axis, (span, words) in zip(axes, SPANS.items(), strict=True):
-        for place, (expert, experiment) in enumerate(zip(experts, experiments, strict=True)):
-            label = expert.replace("_", " ") if experts.index(expert) == place else ""
-            error = experiment.error(span)
-            axis.barh(place, error.value, 0.72, color=colours[expert], label=label)
-            if error.low is not None and error.high is not None:
-                axis.plot([error.low, error.high], [place, place], color=INK, lw=1.6, marker="|")
+        for place, experiment in enumerate(experiments):
+            draw_bar(axis, place, experiment.error(span), 0.72, color=STYLES["policy"]["color"])
             if len(experiment.seeds) > 1:
                 seeds = experiment.by_seed(span)
                 axis.plot(seeds, np.full(len(seeds), place), ls="", marker=".", ms=4, color=INK)

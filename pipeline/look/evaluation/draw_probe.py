@@ -1,31 +1,19 @@
-"""The pictures that say where in the model, and where in the image, the action is found."""
+"""The picture that says where in the model, and where in the image, the action is found."""
 
 from collections import defaultdict
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from pipeline.evaluate.probe.inputs import SlotName
-from pipeline.evaluate.probe.study import ProbeResult, ProbeStudy, ranked
-from pipeline.look.page.style import INK, canvas, draw_map, finish, panels, write
+from pipeline.evaluate.probe.study import ProbeResult, ProbeStudy
+from pipeline.look.page.style import canvas, draw_map
 
-_BARS = 20
-"""Choices that a picture still shows legibly."""
 _MAPS = 6
 """Maps of the cells of a view; most layers of a model look alike."""
 _MAPS_A_ROW = 3
-_LEAST = -0.2
-"""Of the axis of scores: how much worse than the mean action makes no difference."""
-_ALONE, _GAIN = "#56B4E9", "#0072B2"
-
-
-def write_probe_plots(folder: Path, study: ProbeStudy) -> list[Path]:
-    """Write probe.png, the map over layers and poolings, and probe_bars.png, the ranking."""
-    pictures = {"probe.png": lambda: heat_map(study), "probe_bars.png": lambda: bars(study)}
-    return write(folder, pictures)
 
 
 def heat_map(study: ProbeStudy) -> Figure:
@@ -69,52 +57,19 @@ def heat_map(study: ProbeStudy) -> Figure:
         axis.set_title(title, fontsize=9)
 
     extend = "min" if min(values) < limits[0] else "neither"
-    label = f"gain in held-out R² over\n{_known(study)}"
+    known = f"{study.baseline.name} ({study.baseline.score.mean:.2f})"
+    label = f"gain in held-out R² over\n{known}"
     bar = figure.colorbar(image, ax=figure.axes, label=label, extend=extend)
     bar.ax.axhline(max(0.0, limits[0]), color="#D55E00", lw=2.5)
     words = "Where a linear reader finds the action"
     if len(shown) < len(maps):
         words += f" (the {len(shown)} best of {len(maps)} maps of a view; all are in slots.csv)"
-    figure.suptitle(_title(study, words))
+    figure.suptitle(
+        f"{words}\nchunks of {study.horizon} ticks at {len(study.folds.ticks)} ticks of "
+        f"{study.folds.recordings} recordings, {study.folds.count} folds dealt "
+        f"{len(study.folds.deals)} times"
+    )
     return figure
-
-
-def bars(study: ProbeStudy) -> Figure:
-    """The choices of layer, norm and pooling, ranked: R^2 alone, and the gain over what is known.
-
-    A bar that would end left of the axis ends at an arrow and its number.
-    """
-    shown = ranked(study.groups)[:_BARS][::-1]
-    figure, axis = panels(8.5, 2.4 + 0.55 * len(shown))
-    kinds = [
-        ("alone", _ALONE, [result.alone.r2 for result in shown]),
-        (f"gain over {_known(study)}", _GAIN, [study.gain(result) for result in shown]),
-    ]
-    height = 0.76 / len(kinds)
-    for number, (label, colour, scores) in enumerate(kinds):
-        where = np.arange(len(shown)) + height * ((len(kinds) - 1) / 2 - number)
-        means = np.array([score.value for score in scores])
-        low, high = np.array([(score.low, score.high) for score in scores], float).T
-        errors = np.maximum([means - low, high - means], 0)
-        style = {"ecolor": INK, "capsize": 3, "lw": 1}
-        axis.barh(where, means, height, xerr=errors, color=colour, label=label, error_kw=style)
-        style = {"va": "center", "color": "white", "size": 8}
-        for place, mean in zip(where, means, strict=True):
-            if mean < _LEAST:
-                axis.text(_LEAST + 0.005, place, f"◀ {mean:.2f}", **style)
-    axis.axvline(0, color=INK, lw=1)
-    low, high = axis.get_xlim()
-    axis.set_xlim(max(low, _LEAST), min(max(high, 0.1), 1.0))
-    axis.set_yticks(range(len(shown)), [_bar_name(result) for result in shown])
-    axis.grid(axis="y", visible=False)
-    axis.set_xlabel("held-out R², mean over channels and steps (lines: 95 % intervals)")
-    finish(figure, axis, 3, _title(study, "What each choice of features says of the action"))
-    return figure
-
-
-def _known(study: ProbeStudy) -> str:
-    """What is known without features, and its score."""
-    return f"{study.baseline.name} ({study.baseline.score.mean:.2f})"
 
 
 def _grid(places: Sequence[tuple[int, int]], values: Sequence[float]) -> NDArray[np.float64]:
@@ -138,16 +93,3 @@ def _row(name: SlotName) -> str:
 
 def _column(name: SlotName) -> str:
     return name.pooling if name.view is None else f"{name.pooling}\n{name.view}"
-
-
-def _bar_name(result: ProbeResult) -> str:
-    slots = f" ({len(result.slots)} slots)" if len(result.slots) > 1 else ""
-    return f"{_row(result.name)}\n{result.name.pooling}{slots}"
-
-
-def _title(study: ProbeStudy, words: str) -> str:
-    return (
-        f"{words}\nchunks of {study.horizon} ticks at {len(study.folds.ticks)} ticks of "
-        f"{study.folds.recordings} recordings, {study.folds.count} folds dealt "
-        f"{len(study.folds.deals)} times"
-    )

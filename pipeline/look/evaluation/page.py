@@ -33,14 +33,10 @@ _PAIRED = (
 _CAPTIONS = {
     "methods": "Overall error of policy and baselines, of what is executed and of the whole chunk, "
     "with 95 % intervals where there are two groups of test recordings or more.",
-    "dimensions": "Mean absolute error of policy and baselines by dimension, of those that vary, "
-    "over the whole chunk.",
     "scatter": "Predicted against recorded next action at the test ticks.",
     "horizon": "Mean absolute error of policy and baselines by how far ahead an action lies; the "
     "bands of the policy and of the best baseline, where there are some, are 95 % intervals.",
     "dimension_horizon": "The policy's error by dimension and step [training std].",
-    "episodes": "Mean absolute error of policy and baselines in each test episode.",
-    "timeline": "Every action dimension over the episodes of lowest and highest error.",
     "modalities": "The error with one stream ablated as a multiple of that with all intact.",
     "curves": "The training by its steps; dashed, the step of the checkpoint.",
 }
@@ -93,11 +89,6 @@ def _tiles(comparison: Comparison) -> list[tuple[str, str]]:
         tiles.append((f"{scope}: overall error [training std] {ends}", value))
         label = f"{scope}: {rivals.difference.text('+')} beside the best baseline ({best})"
         tiles.append((label, rivals.verdict))
-    rivals = rivalry(comparison.without_low_variance())
-    if comparison.low_variance() and rivals.ratio is not None:
-        best = tables.HEADINGS[rivals.best]
-        label = f"chunk: share of the best baseline's error, without what hardly moves ({best})"
-        tiles.append((label, f"{100 * rivals.ratio:.0f} %"))
     return [*tiles, ("test episodes", f"{len(comparison.episodes)}")]
 
 
@@ -136,7 +127,6 @@ def _dimensions(evaluation: Evaluation) -> list[Block]:
     rows = list(zip(comparison.names, comparison.units, *errors, strict=True))
     return [
         Table(columns, rows, caption="Mean absolute error by dimension."),
-        _picture(plots.dimensions, comparison),
         _picture(plots.scatter, comparison, evaluation.predictions),
         _picture(plots.horizon, comparison, evaluation.store.action_hz),
         _picture(plots.dimension_horizon, comparison),
@@ -158,11 +148,7 @@ def _episodes(evaluation: Evaluation) -> list[Block]:
     if len(rows) < len(comparison.episodes):
         caption += f"; the worst {len(rows)} of {len(comparison.episodes)}"
     heads = ["episode", "test ticks", "policy", tables.HEADINGS[best], "policy / baseline"]
-    return [
-        Table(heads, rows, f"{caption}."),
-        _picture(plots.episodes, comparison, store),
-        _picture(plots.timeline, comparison, evaluation.predictions, store),
-    ]
+    return [Table(heads, rows, f"{caption}.")]
 
 
 def _extremes(evaluation: Evaluation) -> Iterator[Section]:
@@ -171,7 +157,6 @@ def _extremes(evaluation: Evaluation) -> Iterator[Section]:
     The picture of a single one is that of the worst, which dvc.yaml lists.
     """
     comparison, predictions, store = evaluation.comparison, evaluation.predictions, evaluation.store
-    errors = dict(zip(comparison.episodes, comparison.overall_by_episode("policy"), strict=True))
     digest_of = cache(file_digest)  # episodes of a LeRobot data set share files
     *_, (_, worst) = comparison.extremes()
     for title, index in comparison.extremes():
@@ -187,9 +172,8 @@ def _extremes(evaluation: Evaluation) -> Iterator[Section]:
         called = "episode_worst" if index == worst else "episode_best"
         shown = comparison, predictions, store, episode, ticks, seen.frames
         picture = Picture(called, caption, partial(plots.chunks, *shown))
-        words = f"Overall error {errors[index]:.3f} [training std]. {seen.absence}".strip()
         name = f"{title[0].upper()}{title[1:]}: {episode_name(episode)}"
-        yield Section(name, [Text(words), picture])
+        yield Section(name, [*([Text(seen.absence)] if seen.absence else []), picture])
 
 
 def _whole(predictions: Predictions, index: int) -> Ticks:

@@ -7,7 +7,7 @@ drawn in `INK` or `GRID` alone: a page exchanges them for its own colours, in li
 
 import re
 import warnings
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -16,9 +16,9 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib import font_manager
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
+from matplotlib.gridspec import GridSpec
 from matplotlib.image import AxesImage
 from matplotlib.ticker import NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
@@ -66,7 +66,6 @@ RC: dict[Any, Any] = {
     "svg.hashsalt": "pipeline",
     # Matplotlib warns of each that is absent.
     "font.family": families(),
-    "font.size": 10,
     "axes.titlesize": 11,
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -113,9 +112,7 @@ def boxes() -> Generator[set[str]]:
 
 def canvas(width: float, height: float) -> Figure:
     """An empty picture of this size in inches, without a window."""
-    figure = Figure(figsize=(width, height))
-    FigureCanvasAgg(figure)
-    return figure
+    return Figure(figsize=(width, height))
 
 
 def panels(width: float, height: float, *grid: int, **options: Any) -> tuple[Figure, Any]:
@@ -157,6 +154,23 @@ def draw_map(
 def shorten_middle(name: str, begin: int, end: int) -> str:
     """A name with an ellipsis for its middle, where it is longer than both ends."""
     return name if len(name) <= begin + end + 1 else f"{name[:begin]}…{name[-end:]}"
+
+
+def draw_strip(
+    figure: Figure,
+    grid: GridSpec,
+    frames: Mapping[str, Sequence[NDArray[np.uint8]]],
+    times_s: Sequence[float],
+) -> None:
+    """The frames of each view as a row of `grid`, from the first, below the times they are of."""
+    for row, (view, images) in enumerate(frames.items()):
+        for column, image in enumerate(images):
+            axis = figure.add_subplot(grid[row, column])
+            draw_frame(axis, image)
+            # Matplotlib names an image by its content, which may come twice.
+            axis.images[0].set_gid(f"frame-{row}-{column}")
+            axis.set_ylabel("" if column else view)
+            axis.set_title("" if row else f"{times_s[column]:.1f} s")
 
 
 def logarithmic(axis: Axes) -> None:

@@ -4,9 +4,8 @@ Issues are flat, still, frozen and saturated channels, and outliers.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import astuple, dataclass
 from itertools import groupby
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -201,14 +200,13 @@ _HEADS = (
 )
 
 
-@dataclass(frozen=True)
-class ChannelStatistics:
+class ChannelStatistics(NamedTuple):
     """One channel over one episode; `low` and `high` are the first and 99th percentile."""
 
     stream: str
     name: str
     unit: str
-    count: int
+    readings: int
     minimum: float
     low: float
     median: float
@@ -246,7 +244,7 @@ def statistics_table(statistics: Sequence[ChannelStatistics]) -> Table:
     """A row a channel; channels that differ by a number in their names are one from 24 on."""
     rows: list[tuple[object, ...]] = []
     for _, like in groupby(statistics, lambda c: (c.stream, unnumbered(c.name), c.unit)):
-        group = [astuple(channel) for channel in like]
+        group = list(like)
         rows += group if len(group) < PROFILE_CHANNELS else [_joint_row(group)]
     caption = "Of many channels in a row: the extremes of all, else the median over the channels."
     return Table(_HEADS, rows, caption)

@@ -13,7 +13,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from pipeline.base.config import Params
@@ -306,13 +305,8 @@ def _old_frames(view: EpisodeView) -> Iterator[Issue]:
 
 
 GAP_COLOUR = "#D55E00"
-# Colour and meaning of a stroke, in the order of the lanes: what feeds a lane stands above it.
-_KINDS = {
-    "stream": (PALETTE[4], "reading"),
-    "camera": (PALETTE[0], "frame"),
-    "vl_row": (PALETTE[2], "VL row, age of its newest frame; lines: the frames it took"),
-    "tick": (INK, "tick; brackets: the ticks of a VL row"),
-}
+# Colour of a stroke, in the order of the lanes: what feeds a lane stands above it.
+_KINDS = {"stream": PALETTE[4], "camera": PALETTE[0], "vl_row": PALETTE[2], "tick": INK}
 # Strokes that a lane has room for: of entries nearer than that, one is drawn.
 _STROKES = 1500
 # VL rows shown from near, and seconds without any.
@@ -326,7 +320,10 @@ def clock_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
     clocks = read_clocks(view)
     if not clocks:
         return []
-    caption = "When each stream was sampled, and which VL row serves which ticks; gaps are marked."
+    caption = (
+        "When each stream was sampled; hatched boxes are gaps. Lines lead from frames to the VL "
+        "row that took them, brackets from a VL row to the ticks that reuse it."
+    )
     return [draw("clocks", caption, draw_lanes), clock_table(view, clocks)]
 
 
@@ -358,15 +355,13 @@ def draw_lanes(view: EpisodeView) -> Figure:
     near = _choose_near(view, clocks, start, stop)
     room = 0.01 * max(stop - start, 1e-3)
     heights = [0.34 * len(clocks) + 0.3, 0.46 * len(clocks) + 0.5]
-    figure, (whole, detail) = panels(11.0, sum(heights) + 1.6, 2, 1, height_ratios=heights)
+    figure, (whole, detail) = panels(11.0, sum(heights) + 0.9, 2, 1, height_ratios=heights)
     for axis, span in ((whole, (start - room, stop + room)), (detail, near)):
         axis.set_xlim(span[0] - view.zero, span[1] - view.zero)
         for lane, clock in enumerate(clocks):
             _draw_lane(axis, clock, lane, view.zero)
         axis.set_yticks(range(len(clocks)), [clock.name for clock in clocks])
         axis.set_ylim(len(clocks) - 0.2, -0.7)
-        axis.grid(axis="y", visible=False)
-        axis.tick_params(axis="y", length=0)
     whole.axvspan(near[0] - view.zero, near[1] - view.zero, color=GRID, lw=0, zorder=0.3)
     whole.set_title("the whole episode (grey: the stretch below)", loc="left", fontsize=10)
     if view.timeline is not None:
@@ -374,10 +369,6 @@ def draw_lanes(view: EpisodeView) -> Figure:
         _draw_reuse(detail, view.timeline, view.zero, lanes, near)
     detail.set_title(f"from near: {near[1] - near[0]:.2f} s", loc="left", fontsize=10)
     detail.set_xlabel("time since the recording began [s]")
-    kinds = {clock.kind for clock in clocks}
-    patches = [Patch(color=c, label=label) for kind, (c, label) in _KINDS.items() if kind in kinds]
-    patches.append(Patch(facecolor="none", edgecolor=GAP_COLOUR, hatch="////", label="gap"))
-    figure.legend(handles=patches, loc="outside lower center", ncols=3, fontsize=8.5)
     return figure
 
 
@@ -394,13 +385,12 @@ def _choose_near(
 ) -> tuple[float, float]:
     """The stretch in s that is shown from near: five VL rows, around a gap if any.
 
-    The first gap of a camera comes before those of other streams; without one, the middle.
+    The first gap of the topmost lane that has one; without any, the middle.
     """
     line = view.timeline
     step = float("nan") if line is None else usual_step(line.vl_time)
     width = min(_ROWS_NEAR * step if step > 0 else _NEAR_S, max(stop - start, 1e-3))
-    by_kind = sorted(clocks, key=lambda clock: clock.kind != "camera")
-    gaps = [gap.start_s - width / 4 for clock in by_kind for gap in clock.gaps]
+    gaps = [gap.start_s - width / 4 for clock in clocks for gap in clock.gaps]
     begin = max(min([*gaps, (start + stop - width) / 2][0], stop - width), start)
     return begin, begin + width
 
@@ -411,8 +401,7 @@ def _draw_lane(axis: Axes, clock: Clock, lane: int, zero: float) -> None:
     time = clock.time[(clock.time >= low + zero) & (clock.time <= high + zero)] - zero
     places = ((time - low) / (high - low) * _STROKES).astype(np.int64)
     time = time[np.unique(places, return_index=True)[1]]
-    width = 1.6 if len(time) < _STROKES / 6 else 1.0
-    axis.vlines(time, lane - _HALF, lane + _HALF, colors=_KINDS[clock.kind][0], lw=width)
+    axis.vlines(time, lane - _HALF, lane + _HALF, colors=_KINDS[clock.kind], lw=1.0)
     spans = [(gap.start_s - zero, gap.length_s) for gap in clock.gaps]
     # One artist for all: thousands of gaps as patches take many seconds.
     axis.broken_barh(
@@ -425,7 +414,7 @@ def _draw_reuse(
     axis: Axes, line: Timeline, zero: float, lanes: Mapping[str, int], near: tuple[float, float]
 ) -> None:
     """Lines from frames to VL rows and brackets from VL rows to ticks, between two instants."""
-    colour = _KINDS["vl_row"][0]
+    colour = _KINDS["vl_row"]
     row_lane, tick_lane = lanes["VL rows"], lanes["ticks"]
     rows = np.unique(line.vl_row[(line.time >= near[0]) & (line.vl_time[line.vl_row] <= near[1])])
     for name, time in line.frame_time.items():
@@ -439,7 +428,5 @@ def _draw_reuse(
         across, low = [ticks[0], ticks[0], ticks[-1], ticks[-1]], tick_lane - 0.5
         axis.plot(across, [row_lane + _HALF, low, low, tick_lane - _HALF], color=colour, lw=1.6)
         if line.vl_time[row] >= near[0]:
-            at = float(line.vl_time[row])
-            newest = [time[row] for time in line.frame_time.values()]
-            words = f" row {row}" + (f", {1000 * (at - max(newest)):.0f} ms old" if newest else "")
-            axis.text(at - zero, row_lane, words, color=colour, size=8, va="center", clip_on=True)
+            at = float(line.vl_time[row]) - zero
+            axis.text(at, row_lane, f" row {row}", color=colour, size=8, va="center", clip_on=True)

@@ -1,6 +1,5 @@
 """What the model and the policy get of a recording: samples, the batch, the prompt, its tokens."""
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -11,9 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from pipeline.base.clock import CLOCK_SLACK_S
 from pipeline.base.config import Params, VLMParams
@@ -174,7 +171,6 @@ def _draw_row(
             shown = real - real[0] if name == "state" else real
             plot_curves(axis, np.arange(1.0 - len(real), 1.0), shown, group.names)
         axis.set_xlim(start, stop)
-        axis.xaxis.set_major_locator(MaxNLocator(3, integer=True))
         axis.tick_params(labelsize=_SMALL)
     label = f"{name}\n{group.label}" + (", depth" if group.profile else "")
     label += "\nchange since the\nwindow began" if name == "state" else ""
@@ -192,11 +188,9 @@ def _sample_title(view: EpisodeView, tick: int) -> str:
     assert line is not None
     row = line.vl_row[tick]
     old = tick - int(np.argmax(line.vl_row == row))
-    newest = [time[row] for time in line.frame_time.values()]
-    age = f"\nnewest frame {1000 * (line.time[tick] - max(newest)):.0f} ms old" if newest else ""
     return (
         f"tick {tick} of {len(line.time)}\nat {line.time[tick] - view.zero:.2f} s\n"
-        f"reuses VL row {row},\n{old} {'tick' if old == 1 else 'ticks'} old{age}"
+        f"reuses VL row {row},\n{old} {'tick' if old == 1 else 'ticks'} old"
     )
 
 
@@ -212,7 +206,7 @@ def prompt_blocks(view: EpisodeView, params: Params, views: Sequence[str]) -> li
 
 
 def show_prompt(view: EpisodeView, vlm: VLMParams, spec: FeatureSpec) -> list[Block]:
-    """The prompt of the episode's first VL row: its tokens, and tables of images and specials.
+    """The prompt of the episode's first VL row: its tokens, and a table of images.
 
     Loads the checkpoint's tokenizer and settings, no weight. Raises `VLMError` where the checkpoint
     is not there or the instruction holds a control token, and `RecordingError` where the episode
@@ -231,7 +225,6 @@ def show_prompt(view: EpisodeView, vlm: VLMParams, spec: FeatureSpec) -> list[Bl
         (*preparer.describe(token), views.get(place))
         for place, token in enumerate(row.token_ids.tolist())
     ]
-    special = Counter(text for text, kind, _ in tokens if kind != "text")
     pixels = spec.image_size
     return [
         Text(f"{len(tokens):,} tokens, {len(views):,} of images."),
@@ -246,7 +239,6 @@ def show_prompt(view: EpisodeView, vlm: VLMParams, spec: FeatureSpec) -> list[Bl
             ],
             "Image tokens by view; sizes are height × width",
         ),
-        Table(["token", "times"], list(special.items()), "Special tokens by name"),
     ]
 
 
@@ -257,16 +249,8 @@ def remembered_spec(params: Params, views: Sequence[str]) -> FeatureSpec:
     where a file of it has changed: digests are remembered in the ledger of `digest_ledger`. Raises
     `VLMError` where the checkpoint is not there or incomplete.
     """
-    with (
-        closing(ContentDigests.to_read(digest_ledger(params))) as digests,
-        tqdm(desc="digest of the checkpoint", unit="file", disable=None, leave=False) as bar,
-    ):
-
-        def digest(path: Path) -> str:
-            bar.update()
-            return digests.of(path)
-
-        return feature_spec(params.vlm, params.extract.dtype, views, digest)
+    with closing(ContentDigests.to_read(digest_ledger(params))) as digests:
+        return feature_spec(params.vlm, params.extract.dtype, views, digests.of)
 
 
 def digest_ledger(params: Params) -> Path:

@@ -1,25 +1,21 @@
 """Recordings -> their page: all in a table, what looks wrong, some of them in every detail."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
-from pathlib import Path
 
 from pipeline.base.config import Params
-from pipeline.base.errors import PipelineError
 from pipeline.base.format import duration
 from pipeline.base.table import Table
 from pipeline.data import Opened
-from pipeline.look.page.blocks import Block, Issues, Picture, Report, Section, Text
+from pipeline.look.page.blocks import Issues, Picture, Report, Section, Text
 from pipeline.look.recording.channels import statistics_blocks
 from pipeline.look.recording.clocks import clock_blocks
 from pipeline.look.recording.episode import Draw, EpisodeView, view_episode
 from pipeline.look.recording.frames import camera_blocks
 from pipeline.look.recording.model_input import prompt_blocks, sample_blocks
 from pipeline.look.recording.overview import RecordingsOverview, survey_recordings, worst_first
-from pipeline.look.recording.robot_run import compare_keys, describe_run
 from pipeline.look.recording.streams import motion_blocks, sensor_blocks
-from pipeline.store import FeatureStore
 
 _TOPICS = {
     "Camera views": camera_blocks,
@@ -99,7 +95,7 @@ def _episodes_table(overview: RecordingsOverview, chosen: Sequence[int]) -> Tabl
     rows = [
         (
             summary.source, summary.episode, summary.errors, summary.warnings, summary.duration_s,
-            summary.ticks, summary.vl_rows, _frames(summary.frames),
+            summary.ticks, summary.vl_rows, ", ".join(map(str, summary.frames.values())),
             *(summary.counts.get(stream, 0) for stream in ("sensor", "state")), summary.format,
             summary.instruction,
         )
@@ -110,38 +106,16 @@ def _episodes_table(overview: RecordingsOverview, chosen: Sequence[int]) -> Tabl
     return Table(heads, rows, caption, strong)
 
 
-def _frames(counts: Mapping[str, int]) -> str:
-    """`3 × 76` where three views have as many, else the count of each."""
-    if len(set(counts.values())) == 1:
-        return f"{len(counts)} × {next(iter(counts.values())):,}"
-    # Unbroken between a view and its count.
-    return ", ".join(f"{view}\u00a0{count:,}" for view, count in counts.items()) or "none"
-
-
 def _episode_section(
     overview: RecordingsOverview, index: int, view: EpisodeView, draw: Draw, params: Params
 ) -> Section:
     """Everything of one episode."""
     summary = overview.summaries[index]
     words = f"`{summary.path}`, format {summary.format}: “{summary.instruction or '–'}”"
-    blocks: list[Block] = [Text(words), *_run(view.recording.path, params.extract.store)]
-    if len(overview.summaries) > 1:
-        blocks.append(Issues(summary.issues, "Nothing looks wrong in this episode."))
     several = len({summary.source for summary in overview.summaries}) > 1
     title = f"{summary.source} / {summary.episode}" if several else summary.episode
-    errors = [f" {issue.message}" for issue in summary.issues if issue.severity == "error"]
-    absent = Text(f"This episode has nothing of this.{''.join(errors)}")
+    absent = Text("This episode has nothing of this.")
     parts = {topic: blocks_of(view, draw, params) for topic, blocks_of in _TOPICS.items()}
-    return Section(title, blocks, [Section(topic, parts[topic] or [absent]) for topic in parts])
-
-
-def _run(recording: Path, store: Path) -> list[Block]:
-    """Of a run on a robot, how it went, and whether the store of the params has its features."""
-    if (said := describe_run(recording)) is None:
-        return []
-    if store.is_dir():
-        try:
-            said += f" In {store}, {compare_keys(recording, FeatureStore.open(store))}."
-        except PipelineError as error:
-            said += f" Its features were compared with no store: {error}"
-    return [Text(said)]
+    return Section(
+        title, [Text(words)], [Section(topic, parts[topic] or [absent]) for topic in parts]
+    )

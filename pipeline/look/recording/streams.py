@@ -22,7 +22,7 @@ from pipeline.look.recording.episode import Draw, EpisodeView
 
 CONTACT_COLOUR = "#E69F00"
 _LINES = cycler(ls=("-", "--", ":")) * cycler(color=PALETTE)
-_WIDTH_IN, _PANEL_IN, _SMALL_IN, _IMAGE_IN = 10.0, 1.75, 1.0, 2.6
+_WIDTH_IN, _PANEL_IN, _IMAGE_IN = 10.0, 1.75, 2.6
 # Of the span of a group: where its channels move less than this, their changes are drawn.
 _STANDS_STILL = 0.2
 # Readings from which a curve is a bitmap in the page, and columns of an image.
@@ -162,14 +162,10 @@ def legend_beside(axis: Axes) -> None:
 
 
 def _panels(groups: Sequence[Group]) -> tuple[Figure, list[Axes]]:
-    heights = [
-        _IMAGE_IN if group.profile else _PANEL_IN if group.names[1:] else _SMALL_IN
-        for group in groups
-    ]
+    heights = [_IMAGE_IN if group.profile else _PANEL_IN for group in groups]
     shape = {"squeeze": False, "sharex": True, "height_ratios": heights}
     figure, axes = panels(_WIDTH_IN, sum(heights) + 0.5, len(groups), **shape)
     axes[-1, 0].set_xlabel("time since the recording began [s]")
-    figure.align_ylabels(axes)
     return figure, list(axes[:, 0])
 
 
@@ -201,7 +197,6 @@ def _draw_profile(axis: Axes, stream: Stream, group: Group, zero: float) -> None
     image[:, columns - stream.time[shown] >= clock.shortest_gap_s] = np.nan
     low, high = np.nanpercentile(image, (1, 99.5))
     extent = (stream.time[0] - zero, stop - zero, len(image) - 0.5, -0.5)
-    high = high if high > low else low + 1
     drawn = axis.imshow(image, vmin=low, vmax=high, aspect="auto", extent=extent)
     axis.grid(visible=False)
     axis.set_ylabel(f"depth: channel of {group.profile}")

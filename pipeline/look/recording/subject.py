@@ -5,14 +5,14 @@ import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 from pathlib import Path
+from shlex import quote
 
 from pipeline.base.config import InspectParams, Params, Source
 from pipeline.base.errors import ConfigError, RecordingError
 from pipeline.base.ownership import REPORT, refuse_foreign
 from pipeline.data import Opened, open_recordings
-from pipeline.data.discovery import hub_hint, meant
+from pipeline.data.discovery import meant
 
 STORE = (".zarr", ".zarr.part")
 
@@ -33,10 +33,7 @@ class Subject:
 
     def recordings(self, views: Sequence[str] | None) -> Opened:
         """Its recordings; raises `RecordingError` where there is none that can be looked at."""
-        try:
-            opened = open_recordings(self.sources, self.root, views)
-        except RecordingError as error:
-            raise RecordingError(f"{error}{_stores_below(self.sources, self.root)}") from None
+        opened = open_recordings(self.sources, self.root, views)
         if not opened.recordings:
             lines = [f"{self.name}: none of {len(opened.bad)} episode(s) can be looked at:"]
             lines += [f"  {bad.where}: {bad.reason}" for bad in opened.bad]
@@ -58,8 +55,11 @@ def subject_of(params: Params) -> Subject:
     if not places:
         names = ", ".join(source.name for source in params.data.sources)
         return Subject(names, folder, None, params.data.sources, params.data.root)
-    for place in places:
-        _check(place, params.data.root)
+    for path in (Path(place) for place in places if not glob.has_magic(place)):
+        if not path.is_dir():
+            thing = f"the file {path}" if path.exists() else f"nothing at {path}"
+            remedy = meant(path.absolute()) or "Name the folder of recordings, or a store"
+            raise ConfigError(f"inspect.path: expected a folder, found {thing}. {remedy}")
     matches = [
         Path(match)
         for place in places
@@ -69,24 +69,13 @@ def subject_of(params: Params) -> Subject:
     if stores and len(matches) > 1:
         raise ConfigError(
             f"inspect.path: {stores[0]} is a store, and {len(matches) - 1} more paths are named. "
-            f"Look at it alone: python -m stages.inspect {stores[0]}"
+            f"Look at it alone: python -m stages.inspect {quote(str(stores[0]))}"
         )
     # The last part of the first path that is no pattern.
     parts = [part for part in Path(places[0]).absolute().parts if not glob.has_magic(part)]
     name = parts[-1].strip("/") or "recordings"
     source = Source(name=name, path=tuple(places), format=wanted.format)
     return Subject(" ".join(places), folder, stores[0] if stores else None, (source,), Path())
-
-
-def _check(place: str, root: Path) -> None:
-    """Raise `ConfigError` for what is there and no folder, and for what is not there."""
-    path = Path(place)
-    if path.is_dir() or glob.has_magic(place):
-        return
-    if not path.exists():
-        raise ConfigError(f"inspect.path: {path} is not there. {_there_is(place, root)}")
-    remedy = meant(path.absolute()) or "Unpack it, or name the folder of the whole recording"
-    raise ConfigError(f"inspect.path: expected a folder, found the file {path}. {remedy}")
 
 
 def _check_output(folder: Path) -> None:
@@ -102,34 +91,11 @@ def _check_output(folder: Path) -> None:
         raise ConfigError(f"inspect.output: {wrong}. Name another: --set inspect.output=FOLDER")
 
 
-def _there_is(place: str, root: Path) -> str:
-    """What is there instead: below `data.root`, on the hub, or beside it, the likest first."""
-    path = Path(place)
-    if (root / path).exists():
-        return f"It is under data.root: python -m stages.inspect '{root / path}'"
-    hint = hub_hint(place, Path())
-    if hint and path.parts[:1] != root.parts[:1]:  # data/demo, before the demo is written
-        return hint
-    parent = next(folder for folder in path.absolute().parents if folder.is_dir())
-    wanted = path.absolute().relative_to(parent).parts[0]
-    names = [name for name in os.listdir(parent) if not name.startswith(".")]
-    close = get_close_matches(wanted, names, n=8, cutoff=0)
-    return f"In {parent} there is {', '.join(close) or 'nothing'}"
-
-
 def _is_store(path: Path) -> bool:
     """Whether it is a store by its content, or by its name and not of zarr v2, as none is."""
     if (path / "zarr.json").is_file():
         return True
     return path.is_dir() and path.name.endswith(STORE) and not (path / ".zgroup").exists()
-
-
-def _stores_below(sources: Sequence[Source], root: Path) -> str:
-    """What to say where a folder without recordings holds stores."""
-    folders = [root / place for source in sources for place in source.paths]
-    paths = [path for folder in folders if folder.is_dir() for path in sorted(folder.iterdir())]
-    store = next(filter(_is_store, paths), None)
-    return f". There is a store: python -m stages.inspect {store}" if store else ""
 
 
 def _folder(wanted: InspectParams, places: Sequence[str]) -> Path:

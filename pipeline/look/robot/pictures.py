@@ -26,7 +26,8 @@ def jitter(runs: Mapping[str, tuple[float, Timings]]) -> Figure:
     for (name, (hz, timings)), (shares, course) in zip(runs.items(), axes, strict=True):
         rows = timings.ring.rows()
         for column, (part, style) in enumerate(zip(timings.parts, _styles(timings), strict=True)):
-            shares.plot(*exceeded(rows[:, column]), lw=1.4, label=part, **style)
+            if len(rows):
+                shares.ecdf(rows[:, column], complementary=True, lw=1.4, label=part, **style)
         logarithmic(shares)
         shares.set_xscale("log")
         shares.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
@@ -44,12 +45,6 @@ def jitter(runs: Mapping[str, tuple[float, Timings]]) -> Figure:
     axes[-1][1].set_xlabel("time in the run [min]")
     finish(figure, axes[0][0], 5)
     return figure
-
-
-def exceeded(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The values in order, and the share of all that are at least so large."""
-    values = np.sort(values[values > 0])
-    return values, np.arange(len(values), 0, -1) / max(len(values), 1)
 
 
 def worst(

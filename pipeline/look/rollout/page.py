@@ -3,8 +3,6 @@
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 
-import numpy as np
-
 from pipeline.evaluate.rollouts import RolloutEpisode, Rollouts, controller_name
 from pipeline.look.page.blocks import Block, Document, Picture, Report, Section, Text
 from pipeline.look.page.writing import sentence
@@ -32,7 +30,6 @@ _CONTROLLERS = (
     "With a stream off, the same policy sees its training mean; with one frozen, for ever what it "
     "saw first. All of them meet the same episodes."
 )
-_ENDINGS = "Every episode of each controller by how it ended; grey, those that succeeded."
 
 
 def rollout_report(rollouts: Rollouts) -> Report:
@@ -49,11 +46,7 @@ def rollout_report(rollouts: Rollouts) -> Report:
             "The policy acts in the simulated needle insertion and sees what its actions lead to. "
             f"Episodes that succeed at level {rollouts.level}: {shares}."
         ),
-        tiles=(
-            ("success of the policy", str(rates["policy"])),
-            ("median sideways miss [mm]", f"{_median(episodes, 'lateral_mm'):.2f}"),
-            ("median time [s]", f"{_median(episodes, 'time_s'):.1f}"),
-        ),
+        tiles=[("success of the policy", str(rates["policy"]))],
         sections=(
             Section("Success", _success(rollouts)),
             Section("Where the needle went", _places(rollouts)),
@@ -77,19 +70,12 @@ def worst_and_median(
     return ordered[0], ordered[len(ordered) // 2]
 
 
-def _median(episodes: Sequence[RolloutEpisode], field: str) -> float:
-    return float(np.median([getattr(episode, field) for episode in episodes]))
-
-
 def _success(rollouts: Rollouts) -> list[Block]:
-    """How often, as a picture and as a table."""
-    caption = "The share of episodes that succeed, and its 95 % interval (Wilson), by controller."
+    """How often, and why not."""
     return [
         Text(_SUCCESS),
         Text(_CONTROLLERS),
-        Picture("success", caption, partial(plots.success, rollouts)),
         rollouts.summary(),
-        Picture("endings", _ENDINGS, partial(plots.endings, rollouts)),
     ]
 
 
@@ -120,8 +106,8 @@ def _extremes(episodes: Sequence[RolloutEpisode]) -> Mapping[str, RolloutEpisode
 
 def _filmstrips(episodes: Sequence[RolloutEpisode]) -> Iterator[Section]:
     caption = (
-        "What the cameras saw at moments from the beginning to the end, which dotted lines mark "
-        "below. While the needle presses and has not punctured, the layer gives way with it."
+        "What the cameras saw at moments from the beginning to the end. While the needle presses "
+        "and has not punctured, the layer gives way with it."
     )
     for kind, episode in _extremes(episodes).items():
         side = "short of" if episode.depth_mm > 0 else "beyond"

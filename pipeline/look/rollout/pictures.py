@@ -1,17 +1,14 @@
 """Rollouts -> pictures; the same rollouts give the same bytes."""
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
-from itertools import cycle
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from pipeline.evaluate.rollouts import RolloutEpisode, Rollouts, controller_name
-from pipeline.look.page.style import GRID, INK, PALETTE, canvas, draw_frame, finish
+from pipeline.look.page.style import INK, PALETTE, canvas, draw_strip, finish, panels
 from pipeline.simulation.insertion import AT_LAYER_MM, FORCE_LIMIT_N, MISS_MM, OVERSHOOT_MM
 
 _MOMENTS = 8
@@ -21,56 +18,10 @@ _REACH = 1.3
 """Of pictures, as a multiple of how far from the target episodes begin."""
 _WIDTH = 9.0
 _OTHER = "#999999"
-"""Of an episode among many, and of a controller beside the policy."""
+"""Of an episode among many."""
 _OUTCOMES = {True: ("inserted", PALETTE[0], "o"), False: ("not inserted", PALETTE[5], "X")}
 _MANY = 100
 """Episodes from which on paths are pixels in the page, for thousands of lines are slow."""
-
-
-def success(rollouts: Rollouts) -> Figure:
-    """A bar a controller: the share of its episodes that succeed, with its 95 % interval."""
-    rates = rollouts.rates()
-    figure = canvas(_WIDTH, 0.55 * len(rates) + 1.3)
-    axis = figure.subplots()
-    for place, (controller, rate) in enumerate(rates.items()):
-        reach = 100 * np.array([[rate.rate - rate.low], [rate.high - rate.rate]])
-        colour = PALETTE[0] if controller == "policy" else _OTHER
-        style = {"ecolor": INK, "capsize": 4, "lw": 1.5}
-        axis.barh(place, 100 * rate.rate, 0.66, color=colour, xerr=reach, error_kw=style)
-        words = f"{round(rate.rate * rate.episodes)} of {rate.episodes}"
-        axis.text(1.01, place, words, transform=axis.get_yaxis_transform(), va="center")
-    _name_rows(axis, list(rates))
-    axis.set(xlim=(0, 100), xlabel="episodes that succeed [%] (lines: 95 % interval)")
-    figure.suptitle("How often the needle is inserted")
-    return figure
-
-
-def endings(rollouts: Rollouts) -> Figure:
-    """A bar a controller, as long as it has episodes, divided by why they ended.
-
-    Safe stops are of one kind, whatever their cause.
-    """
-    counts = {
-        name: Counter(episode.reason.partition(":")[0] for episode in rollouts.of(name))
-        for name in rollouts.rates()
-    }
-    failures = {reason for count in counts.values() for reason in count} - {"inserted"}
-    colours = {"inserted": GRID, **dict(zip(sorted(failures), cycle(PALETTE[1:]), strict=False))}
-    figure = canvas(_WIDTH, 0.55 * len(counts) + 1.3 + 0.25 * -(-len(colours) // 3))
-    axis = figure.subplots()
-    begins = np.zeros(len(counts))
-    for reason, colour in colours.items():
-        lengths = np.array([count[reason] for count in counts.values()])
-        bars = axis.barh(range(len(lengths)), lengths, 0.66, begins, color=colour, label=reason)
-        words = [f"{length}" if length else "" for length in lengths]
-        ink = INK if colour == GRID else "#111111"
-        axis.bar_label(bars, words, label_type="center", color=ink)
-        begins += lengths
-    _name_rows(axis, list(counts))
-    axis.set_xlabel("episodes")
-    axis.xaxis.set_major_locator(MaxNLocator(integer=True))
-    finish(figure, axis, 3, "How episodes ended")
-    return figure
 
 
 def paths(rollouts: Rollouts) -> Figure:
@@ -78,8 +29,8 @@ def paths(rollouts: Rollouts) -> Figure:
     shown = [name for name in ("policy", "expert") if rollouts.of(name)]
     begins = [episode.trace.offset_mm[:1] for name in shown for episode in rollouts.of(name)]
     far = max(_NEAR_MM, _REACH * float(np.abs(np.concatenate(begins)).max()))
-    figure = canvas(_WIDTH * max(len(shown), 1.4) / 2, _WIDTH + 0.9)
-    axes = figure.subplots(2, len(shown), squeeze=False)
+    size = _WIDTH * max(len(shown), 1.4) / 2, _WIDTH + 0.9
+    figure, axes = panels(*size, 2, len(shown), squeeze=False)
     for column, name in zip(axes.T, shown, strict=True):
         _draw_paths(column[0], rollouts.of(name), far)
         _draw_paths(column[1], rollouts.of(name), _NEAR_MM)
@@ -94,8 +45,7 @@ def courses(episodes: Sequence[RolloutEpisode], strong: Mapping[str, RolloutEpis
 
     `strong` are those that stand out, by what the legend says of them.
     """
-    figure = canvas(_WIDTH, 10.0)
-    axes = figure.subplots(4)
+    figure, axes = panels(_WIDTH, 10.0, 4)
     pixels = len(episodes) > _MANY
     for episode in episodes:
         _draw_course(axes, episode, color=_OTHER, lw=0.7, alpha=0.5, rasterized=pixels)
@@ -110,30 +60,16 @@ def courses(episodes: Sequence[RolloutEpisode], strong: Mapping[str, RolloutEpis
 
 
 def filmstrip(episode: RolloutEpisode, title: str) -> Figure:
-    """What every view showed at moments from begin to end; below, place and force over time."""
+    """What every view showed at moments from begin to end."""
     trace = episode.trace
     ticks = np.unique(np.linspace(0, len(trace.time_s) - 1, _MOMENTS).round().astype(int))
     moments = trace.time_s[ticks].tolist()
-    frames = [episode.frames(moment) for moment in moments]
-    shapes = {view: image.shape for view, image in frames[0].items()}
-    heights = [10 / _MOMENTS * shape[0] / shape[1] for shape in shapes.values()]
-    figure = canvas(10.4, sum(heights) + 8.5)
-    grid = figure.add_gridspec(len(shapes) + 4, _MOMENTS, height_ratios=[*heights, *[1.6] * 4])
-    for row, view in enumerate(shapes):
-        for column, shown in enumerate(frames):
-            axis = figure.add_subplot(grid[row, column])
-            draw_frame(axis, shown[view])
-            # Matplotlib names an image by its content, which may come twice.
-            axis.images[0].set_gid(f"frame-{row}-{column}")
-            axis.set_ylabel("" if column else view)
-            axis.set_title("" if row else f"{moments[column]:.1f} s")
-    axes = [figure.add_subplot(grid[row, :]) for row in range(-4, 0)]
-    _draw_course(axes, episode, color=PALETTE[0], lw=2)
-    _mark_limits(axes)
-    for axis in axes:
-        for moment in moments:
-            axis.axvline(moment, color=INK, lw=0.8, ls=":", zorder=1)
-    figure.align_ylabels(axes)
+    shown = [episode.frames(moment) for moment in moments]
+    frames = {view: [images[view] for images in shown] for view in shown[0]}
+    heights = [10 / _MOMENTS * image.shape[0] / image.shape[1] for image, *_ in frames.values()]
+    figure = canvas(10.4, sum(heights) + 0.8)
+    grid = figure.add_gridspec(len(frames), _MOMENTS, height_ratios=heights)
+    draw_strip(figure, grid, frames, moments)
     figure.suptitle(title)
     return figure
 
@@ -179,9 +115,3 @@ def _mark_limits(axes: Sequence[Axes]) -> None:
     height.set_title("tip above the surface [mm]; dashed: the surface at rest")
     layer.set_title(words)
     force.set(title=f"force [N]; dashed: {FORCE_LIMIT_N:g}", xlabel="time [s]", ylim=(0, None))
-
-
-def _name_rows(axis: Axes, controllers: Sequence[str]) -> None:
-    axis.set_yticks(range(len(controllers)), [controller_name(name) for name in controllers])
-    axis.set_ylim(len(controllers) - 0.5, -0.5)
-    axis.grid(axis="y", visible=False)

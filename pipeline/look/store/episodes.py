@@ -3,18 +3,14 @@
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import ListedColormap
-from matplotlib.figure import Figure
-from matplotlib.patches import Patch
 
 from pipeline.base.issue import Issue, Severity
 from pipeline.base.table import Table
-from pipeline.look.page.blocks import Block, Picture
-from pipeline.look.page.style import INK, PALETTE, draw_map, panels, shorten_middle
+from pipeline.look.page.blocks import Block
+from pipeline.look.page.style import shorten_middle
 from pipeline.store import Episode, FeatureStore, episode_name
 
 ROWS = 100
@@ -22,7 +18,8 @@ ROWS = 100
 FEW_TICKS = 10
 _GAP_STEPS = 5
 _RARE, _USUAL = 0.05, 0.8
-_SEEN = (("#D55E00", "absent"), ("#E69F00", "by some"), ("#0072B2", "seen by all ticks"))
+_LINE = "#222222"
+"""Between sources: a map is light on a dark page too, where ink is white."""
 _NAMED_EPISODES = 16
 
 
@@ -74,7 +71,7 @@ def read_coverage(store: FeatureStore, episode: Episode) -> EpisodeCoverage:
 
 
 def show_coverage(episodes: Sequence[EpisodeCoverage]) -> list[Block]:
-    """A row a source, the picture, and a row an episode."""
+    """A row a source, and a row an episode."""
     caption = "Ticks see all streams and views, none of one (no …), or one in a share of them."
     if len(episodes) > ROWS:
         caption += f" The first {ROWS} of {len(episodes)} episodes."
@@ -84,18 +81,14 @@ def show_coverage(episodes: Sequence[EpisodeCoverage]) -> list[Block]:
         own = part.episode
         counts = len(own.ticks), round(part.seconds, 2), len(own.vl_rows)
         rows.append((own.source, own.id, own.instruction, *counts, _lacking(part.covered)))
-    words = "Length of each episode, and below it which streams and views its ticks see."
-    picture = Picture("coverage", words, partial(draw_coverage, episodes))
-    return [_tabulate_sources(episodes), picture, Table(heads, rows, caption)]
+    return [_tabulate_sources(episodes), Table(heads, rows, caption)]
 
 
 def _tabulate_sources(episodes: Sequence[EpisodeCoverage]) -> Table:
-    """A row a source; of several, their sum."""
+    """A row a source."""
     parts: dict[str, list[EpisodeCoverage]] = defaultdict(list)
     for episode in episodes:
         parts[episode.episode.source].append(episode)
-    if len(parts) > 1:
-        parts["all"] = [*episodes]
     rows: list[tuple[object, ...]] = []
     for name, part in parts.items():
         own = [coverage.episode for coverage in part]
@@ -106,8 +99,7 @@ def _tabulate_sources(episodes: Sequence[EpisodeCoverage]) -> Table:
         instructions = len({episode.instruction for episode in own})
         rows.append((name, formats, instructions, len(own), seconds, *counts))
     heads = ("source", "format", "instructions", "episodes", "length [s]", "ticks", "VL rows")
-    strong = frozenset({len(rows) - 1} if len(parts) > 1 else ())
-    return Table((*heads, "sensor readings", "state readings"), rows, strong=strong)
+    return Table((*heads, "sensor readings", "state readings"), rows)
 
 
 def _lacking(covered: Mapping[str, float]) -> str:
@@ -120,39 +112,12 @@ def _lacking(covered: Mapping[str, float]) -> str:
     return ", ".join(lacking) or "all"
 
 
-def draw_coverage(episodes: Sequence[EpisodeCoverage]) -> Figure:
-    """Length of each episode above, and below which streams and views its ticks see."""
-    streams = list(episodes[0].covered)
-    source_of = np.array([episode.episode.source for episode in episodes])
-    sources = list(dict.fromkeys(source_of.tolist()))
-    seconds = np.array([episode.seconds for episode in episodes])
-    size, heights = (9.0, 3.8 + 0.3 * len(streams)), (2.2, 0.3 * len(streams) + 0.2)
-    figure, (above, below) = panels(*size, 2, 1, sharex=True, height_ratios=heights)
-    for number, source in enumerate(sources):
-        own = np.flatnonzero(source_of == source)
-        above.bar(own, seconds[own], 0.9, color=PALETTE[number % len(PALETTE)], label=source)
-    above.set_ylabel("length [s]")
-    above.grid(axis="x", visible=False)
-    shares = np.array([[episode.covered[name] for episode in episodes] for name in streams])
-    # 0 absent, 1 seen by some ticks, 2 by all.
-    levels = (shares > 0) + np.floor(shares)
-    colours = ListedColormap([colour for colour, _ in _SEEN])
-    draw_map(below, levels, (0, 2), colours, numbered=False)
-    below.set_yticks(range(len(streams)), streams)
-    mark_sources(below, episodes)
-    patches = [Patch(color=colour, label=label) for colour, label in reversed(_SEEN)]
-    figure.legend(handles=patches, loc="outside lower center", ncols=3)
-    if len(sources) > 1:
-        above.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=len(sources))
-    return figure
-
-
-def mark_sources(axis: Axes, episodes: Sequence[EpisodeCoverage], line: str = INK) -> None:
+def mark_sources(axis: Axes, episodes: Sequence[EpisodeCoverage]) -> None:
     """Sources below an axis of episodes, parted by lines; the episodes' names where few."""
     sources = [episode.episode.source for episode in episodes]
     starts = [at for at, source in enumerate(sources) if not at or source != sources[at - 1]]
     for start in starts[1:]:
-        axis.axvline(start - 0.5, color=line, lw=1.0)
+        axis.axvline(start - 0.5, color=_LINE, lw=1.0)
     if len(episodes) <= _NAMED_EPISODES:
         names = [part.episode.id if len(starts) == 1 else part.name for part in episodes]
         # Both ends: where it belongs, and what tells it from its neighbours.

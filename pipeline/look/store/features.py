@@ -17,16 +17,15 @@ from tqdm import tqdm
 
 from pipeline.base.bfloat16 import widen
 from pipeline.base.channels import named
-from pipeline.base.errors import StoreIncomplete
 from pipeline.base.finite import non_finite
 from pipeline.base.issue import Issue
 from pipeline.look.page.blocks import Block, Picture, Text
 from pipeline.look.page.style import GRID, PALETTE, draw_map, panels
 from pipeline.look.store.channels import evenly
 from pipeline.look.store.episodes import EpisodeCoverage, mark_sources
-from pipeline.store import FEATURES, FeatureStore, place
-from pipeline.store.chunks import row_checksums
-from pipeline.store.repair_hints import mend
+from pipeline.store import FEATURES, FeatureStore
+from pipeline.store.chunks import check_row_checksums
+from pipeline.store.schema import read_spec
 from pipeline.vlm.slots import slot_name
 
 DEAD = 1e-3
@@ -91,13 +90,9 @@ def sample_rows(store: FeatureStore, most: int) -> SampledRows:
 def check_rows(store: FeatureStore, rows: NDArray[np.int64]) -> None:
     """Raise `StoreIncomplete` where one of these VL rows does not give its checksum."""
     features, checksums = store.array(FEATURES), store.array("vl/checksum")
+    spec = read_spec(store.path, FEATURES)
     for block in np.array_split(rows, max(1, len(rows) * features[:1].nbytes // _BLOCK_BYTES)):
-        bad = block[row_checksums(features[block]) != checksums[block]]
-        if len(bad):
-            raise StoreIncomplete(
-                f"{store.path}: {len(bad)} VL row(s) do not give their checksum, the first "
-                f"{place(store, 'vl', int(bad[0]))}: the store is damaged. {mend(store.path)}"
-            )
+        check_row_checksums(store.path, spec, block, features[block], checksums[block])
 
 
 def look_at_features(store: FeatureStore, sampled: SampledRows) -> FeatureNorms:
@@ -179,8 +174,7 @@ def draw_norms(norms: FeatureNorms, episodes: Sequence[EpisodeCoverage]) -> Figu
     right.set_facecolor(GRID)
     image = draw_map(right, ratio, (1 - most, 1 + most), _AROUND, numbered=False)
     right.tick_params(left=False)
-    # The map is light on a dark page too, where ink is white.
-    mark_sources(right, episodes, "#222222")
+    mark_sources(right, episodes)
     figure.colorbar(image, ax=right, label="median in the episode / in all", pad=0.02)
     figure.legend(*left.get_legend_handles_labels(), loc="outside lower left", ncols=3)
     return figure

@@ -1,15 +1,12 @@
 """A store -> its page: what is in it, what looks wrong, and what it was made of."""
 
-from collections import defaultdict
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.base.config import InspectParams
+from pipeline.base.config import InspectParams, setting
 from pipeline.base.errors import StoreIncomplete
 from pipeline.base.format import duration, size
 from pipeline.base.issue import Issue
-from pipeline.base.table import Table
 from pipeline.look.page.blocks import Document, Issues, Report, Section, Text
 from pipeline.look.store import channels, episodes, features, rows
 from pipeline.look.store.channels import StreamSummary
@@ -19,9 +16,7 @@ from pipeline.look.store.rows import Ages, Duplicates
 from pipeline.store import FeatureStore, check_trailers
 from pipeline.store.gather import WIDE
 from pipeline.store.repair_hints import extract_command
-from pipeline.store.schema import read_specs
 
-METADATA = "metadata"
 _NOTHING = "Nothing looks wrong: every check passed."
 
 
@@ -32,8 +27,8 @@ class StoreView:
     store: FeatureStore
     episodes: tuple[EpisodeCoverage, ...]
     ages: Ages
-    sizes: Mapping[str, int]
-    """Bytes on the disk, as `read_sizes` gives them."""
+    bytes: int
+    """On the disk."""
     features: FeatureNorms
     duplicates: Duplicates
     statistics: tuple[StreamSummary, ...]
@@ -68,8 +63,9 @@ def inspect_store(path: str | Path, params: InspectParams) -> StoreView:
         *features.find_feature_issues(norms, coverage),
         *rows.find_duplicate_issues(same, coverage),
     )
-    sizes = read_sizes(store.path)
-    return StoreView(store, coverage, age, sizes, norms, same, statistics, issues)
+    files = (file.stat() for file in store.path.rglob("*") if file.is_file())
+    taken = sum(status.st_blocks * 512 for status in files)
+    return StoreView(store, coverage, age, taken, norms, same, statistics, issues)
 
 
 def store_report(view: StoreView) -> Report:
@@ -80,7 +76,6 @@ def store_report(view: StoreView) -> Report:
     often = "each of them" if reuse == 1 else f"one in {reuse}"
     documents = (
         Document("Feature spec", store.spec),
-        Document("Streams", store.streams),
         Document("Computed with", {"environments of VL rows": store.attrs["environment"]}),
     )
     return Report(
@@ -94,9 +89,8 @@ def store_report(view: StoreView) -> Report:
             Section("What looks wrong", [Issues(view.issues, _NOTHING), _checked(view)]),
             Section("Coverage", episodes.show_coverage(view.episodes)),
             Section("Age of the features", rows.show_ages(view.ages)),
-            Section("Size", [tabulate_sizes(store.path, view.sizes)]),
             Section("Features", features.show_features(view.features, view.episodes)),
-            Section("Duplicates", rows.show_duplicates(view.duplicates, view.episodes)),
+            Section("Duplicates", rows.show_duplicates(view.duplicates)),
             Section("Channels", channels.show_channels(view.statistics)),
             Section("What it was made of", documents),
         ),
@@ -109,7 +103,7 @@ def _tiles(view: StoreView) -> list[tuple[str, str]]:
         ("length", duration(sum(episode.seconds for episode in view.episodes))),
         ("ticks", f"{view.store.ticks:,}"),
         ("VL rows", f"{view.features.sampled.total:,}"),
-        ("on the disk", size(sum(view.sizes.values()))),
+        ("on the disk", size(view.bytes)),
         ("findings", f"{len(view.issues):,}"),
     ]
 
@@ -117,35 +111,6 @@ def _tiles(view: StoreView) -> list[tuple[str, str]]:
 def _checked(view: StoreView) -> Text:
     looked_at, total = len(view.features.sampled.rows), view.features.sampled.total
     which = f"all {total:,}" if looked_at == total else f"{looked_at:,} of {total:,}"
-    command = f"python -m stages.verify --set verify.store={view.store.path}"
+    command = f"python -m stages.verify {setting('verify.store', view.store.path)}"
     words = f"Metadata, clocks, offsets and the features of {which} VL rows give the checksums"
     return Text(f"{words} that were written with them; `{command}` reads every byte.")
-
-
-def read_sizes(path: Path) -> dict[str, int]:
-    """Bytes of the blocks that the files of each array take: values, padding and trailers.
-
-    The largest first; `metadata` are all files that are no chunk. Together they are all files below
-    `path`.
-    """
-    sizes: dict[str, int] = defaultdict(int)
-    for file in path.rglob("*"):
-        if file.is_file():
-            # The first two folders of a chunk's path name its array.
-            owner = "/".join(file.relative_to(path).parts[:2])
-            sizes[METADATA if file.name == "zarr.json" else owner] += file.stat().st_blocks * 512
-    return dict(sorted(sizes.items(), key=lambda item: -item[1]))
-
-
-def tabulate_sizes(path: Path, sizes: Mapping[str, int]) -> Table:
-    """A row an array of the store at `path`."""
-    specs, total = read_specs(path), sum(sizes.values())
-    lines: list[tuple[object, ...]] = []
-    for name, taken in sizes.items():
-        spec, held = specs.get(name), ("", "", 0)
-        if spec is not None:
-            shape = " × ".join(f"{count:,}" for count in spec.shape)
-            held = shape, spec.attributes.get("dtype", spec.dtype.name), spec.chunk_count
-        lines.append((name, *held, taken / 2**20, 100 * taken / total))
-    heads = ("array", "shape", "dtype", "chunks", "on the disk [MiB]", "share [%]")
-    return Table(heads, lines, "Bytes on the disk by array.")

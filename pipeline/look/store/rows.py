@@ -2,25 +2,18 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from pipeline.base.issue import Issue
 from pipeline.base.table import Table
 from pipeline.data.timeline import COARSEST_S
-from pipeline.look.page.blocks import Block, Picture, Text
-from pipeline.look.page.style import INK, PALETTE, panels
+from pipeline.look.page.blocks import Block, Text
 from pipeline.look.store.episodes import EpisodeCoverage
 from pipeline.store import KEY_BYTES, FeatureStore
 
 _STALE_PERIODS = 2
-_BINS = 48
-_LISTED = 50
-"""Pairs of episodes in the table; all are counted."""
 _SAME_SHARE = 0.5
 """Of an episode's rows, from which it says little that the other does not."""
 
@@ -48,7 +41,7 @@ def read_ages(store: FeatureStore) -> Ages:
 
 
 def show_ages(ages: Ages) -> list[Block]:
-    """What an age is, its picture, and its spread for each view."""
+    """What an age is, and its spread for each view."""
     rows = [
         (name, *np.nanquantile(age, (0.01, 0.5, 0.99, 1.0)).tolist())
         for name, age in {"newest frame": ages.newest, **ages.by_view}.items()
@@ -56,29 +49,8 @@ def show_ages(ages: Ages) -> list[Block]:
     ]
     return [
         Text("The policy is given the age of the newest frame as `feature_age`."),
-        Picture("ages", "Ticks by the age of what they see.", partial(draw_ages, ages)),
         Table(("age [s] of", "1 %", "median", "99 %", "oldest"), rows),
     ]
-
-
-def draw_ages(ages: Ages) -> Figure:
-    """How many ticks see features how old: since the newest frame, and since that of each view."""
-    figure, axis = panels(8.5, 3.6)
-    age_of = {"newest frame (feature_age)": ages.newest, **ages.by_view}
-    finite = {name: age[np.isfinite(age)] for name, age in age_of.items()}
-    low = min(0.0, *(float(age.min()) for age in finite.values() if len(age)))
-    high = max(low + 1e-3, *(float(age.max()) for age in finite.values() if len(age)))
-    edges = np.linspace(low, high, _BINS + 1)
-    for number, (name, age) in enumerate(finite.items()):
-        shares = np.histogram(age, edges)[0] * (100 / max(1, len(age)))
-        style: dict[str, Any] = {"lw": 1.6} if number else {"fill": True, "alpha": 0.55}
-        axis.stairs(shares, edges, color=PALETTE[number % len(PALETTE)], label=name, **style)
-    if np.isfinite(ages.period_s):
-        axis.axvline(ages.period_s, color=INK, ls="--", lw=1.2, label="one VL row")
-    axis.set_xlabel("age of what the model saw, at each tick [s]")
-    axis.set_ylabel("ticks [%]")
-    figure.legend(loc="outside lower center", ncols=5)
-    return figure
 
 
 def find_age_issues(
@@ -112,8 +84,8 @@ class EpisodePair:
     """Rows of the first whose key the second has, and the other way round."""
     share: float
     """The larger of the two as a share of the rows of that episode."""
-    time_s: tuple[float, float]
-    """When the first of them shows, in s since each episode's first tick."""
+    time_s: float
+    """When the first of them shows, in s since the first tick of the first episode."""
 
 
 @dataclass(frozen=True)
@@ -140,28 +112,19 @@ def find_duplicates(store: FeatureStore) -> Duplicates:
     pairs: list[EpisodePair] = []
     for a, b in np.unique(np.column_stack([first[key], owner])[later], axis=0).tolist():
         of_a, of_b = key[edges[a] : edges[a + 1]], key[edges[b] : edges[b + 1]]
-        of_both, in_a, in_b = np.intersect1d(of_a, of_b, return_indices=True)
+        of_both, in_a, _ = np.intersect1d(of_a, of_b, return_indices=True)
         rows = int(np.isin(of_a, of_both).sum()), int(np.isin(of_b, of_both).sum())
         share = max(rows[0] / len(of_a), rows[1] / len(of_b))
-        at = in_a.argmin()
-        shown = time[[edges[a] + in_a[at], edges[b] + in_b[at]]] - time[edges[[a, b]]]
-        pairs.append(EpisodePair(a, b, rows, share, tuple(shown.tolist())))
+        shown = float(time[edges[a] + in_a.min()] - time[edges[a]])
+        pairs.append(EpisodePair(a, b, rows, share, shown))
     pairs.sort(key=lambda pair: -pair.share)
     return Duplicates(len(keys), int((counts[key] > 1).sum()), tuple(pairs))
 
 
-def show_duplicates(duplicates: Duplicates, episodes: Sequence[EpisodeCoverage]) -> list[Block]:
-    """How many rows there are twice, and in which episodes."""
-    pairs = duplicates.pairs
-    twice = f"{duplicates.rows:,} of {duplicates.total:,} VL rows, in {len(pairs):,} pair(s)"
-    text = Text(f"{twice} of episodes, have exactly the frames and prompt of another row.")
-    rows: list[tuple[object, ...]] = []
-    for pair in pairs[:_LISTED]:
-        first, second = (episodes[index].name for index in (pair.first, pair.second))
-        rows.append((first, pair.rows[0], pair.time_s[0], second, pair.rows[1], pair.time_s[1]))
-    heads = ("episode", "rows", "at [s]", "other episode", "rows ", "at [s] ")
-    table = Table(heads, rows, f"Rows with equal keys, {_LISTED} pairs of episodes at most.")
-    return [text, table] if pairs else [text]
+def show_duplicates(found: Duplicates) -> list[Block]:
+    """How many rows there are twice; the findings say in which episodes."""
+    twice = f"{found.rows:,} of {found.total:,} VL rows, in {len(found.pairs):,} pair(s)"
+    return [Text(f"{twice} of episodes, have exactly the frames and prompt of another row.")]
 
 
 def find_duplicate_issues(
@@ -173,4 +136,4 @@ def find_duplicate_issues(
             text = f"{pair.rows[0]} of its VL rows have the very frames and prompt of "
             text += f"{pair.rows[1]} rows of {episodes[pair.second].name}"
             issue = episodes[pair.first].issue("same recording", "vl/key", text)
-            yield replace(issue, start_s=pair.time_s[0])
+            yield replace(issue, start_s=pair.time_s)

@@ -6,15 +6,15 @@ from functools import lru_cache, partial
 from pathlib import Path
 
 import torch
-from pydantic import ValidationError
 
-from pipeline.base.config import FinetuneParams, Params, TrainHeadParams
+from pipeline.base.config import FinetuneParams, Params, TrainHeadParams, setting
 from pipeline.base.digests import file_digest
 from pipeline.base.durable import read_document, write_with_digest
 from pipeline.base.errors import ConfigError
 from pipeline.base.golden import GoldenRow
 from pipeline.base.tuned_on import TunedOn, joined, of_store, write_tuned_on
 from pipeline.policy.checkpoint import DOCUMENT
+from pipeline.policy.document import PolicyDocument
 from pipeline.policy.live_policy import LivePolicy
 from pipeline.policy.policy import Policy, Trainable
 from pipeline.store import FeatureStore
@@ -58,7 +58,7 @@ class LiveFeatures(FeatureSource):
         # Once for all processes: they would read the same files and say the same.
         self._spec = World.current().shared(checked)
         self._vlm, self._finetune = params.vlm, params.finetune
-        self._compile, self._device = params.train_head.compile, device
+        self._device = device
         self._rows = LiveRows(store, recordings, Preparer(params.vlm, self._spec))
         self._base_digest = lru_cache(file_digest)
         tuning = params.finetune.tuning
@@ -113,11 +113,11 @@ class LiveFeatures(FeatureSource):
         assert module.vlm is not None
         learned = folder / learned_name(self._finetune)
         module.vlm.save(learned)
-        document = read_document(folder / DOCUMENT)
-        before, own = of_store(self.store.attrs), TunedOn.of_split(document["split"])
+        path = folder / DOCUMENT
+        document, said = read_document(path, PolicyDocument)
+        before, own = of_store(self.store.attrs, self.store.path), TunedOn.of_split(document.split)
         write_tuned_on(learned, joined([before, own]) or own)
-        document["feature_spec"] = self._tuned_spec(folder).attrs()
-        write_with_digest(folder / DOCUMENT, document)
+        write_with_digest(path, said | {"feature_spec": self._tuned_spec(folder).attrs()})
 
     def summary(self) -> list[str]:
         """What learns and from which frames, as lines for the user."""
@@ -128,11 +128,6 @@ class LiveFeatures(FeatureSource):
             f"learning rate {self._finetune.lr:g}; {len(self.store.array('vl/time'))} VL rows of "
             f"{len(self.store.episodes)} recordings"
         ]
-        if self._compile:
-            lines.append(
-                "train_head.compile is true, but a tuning runs uncompiled: torch.compile cannot "
-                "take its batches of rows"
-            )
         if self.store.variants > 1:
             lines.append(
                 f"tuning: the store's {self.store.variants - 1} augmented variant(s) of each row "
@@ -176,11 +171,7 @@ def head_params(params: Params) -> TrainHeadParams:
     given = {"lr": params.train_head.lr, "compile": False}
     shared = TrainHeadParams.model_fields.keys() & FinetuneParams.model_fields.keys()
     laid_over = {name: getattr(params.finetune, name) for name in shared} | given
-    try:
-        return TrainHeadParams.model_validate(params.train_head.model_dump() | laid_over)
-    except ValidationError as error:
-        problems = "; ".join(problem["msg"] for problem in error.errors())
-        raise ConfigError(f"finetune: {problems}") from None
+    return params.train_head.model_copy(update=laid_over)
 
 
 @contextmanager
@@ -206,15 +197,16 @@ def next_steps(finetune: FinetuneParams, store: FeatureStore) -> list[str]:
     """What to run with a tuned model, as lines for the user."""
     learned = finetune.output / "best" / learned_name(finetune)
     tuned = store.path.with_name(f"{store.path.stem}_tuned.zarr")
-    setting = f"--set vlm.adapter={learned}"
+    model = setting("vlm.adapter", learned)
     if finetune.tuning.method == "full":
-        setting = f"--set vlm.checkpoint={learned} --set vlm.adapter=null"
-    name = tuned.stem
+        model = f"{setting('vlm.checkpoint', learned)} --set vlm.adapter=null"
+    head, logs = Path("models", tuned.stem), Path("reports", f"{tuned.stem}_training")
     return [
         "next, extract the tuned model's features, train a head on them and evaluate it:",
-        f"  python -m stages.extract {setting} --set extract.store={tuned}",
-        f"  python -m stages.train_head --set train_head.store={tuned} "
-        f"--set train_head.output=models/{name} --set train_head.logs=reports/{name}_training",
-        f"  python -m stages.evaluate --set evaluate.store={tuned} "
-        f"--set evaluate.checkpoint=models/{name} --set evaluate.output=reports/{name}",
+        f"  python -m stages.extract {model} {setting('extract.store', tuned)}",
+        f"  python -m stages.train_head {setting('train_head.store', tuned)} "
+        f"{setting('train_head.output', head)} {setting('train_head.logs', logs)}",
+        f"  python -m stages.evaluate {setting('evaluate.store', tuned)} "
+        f"{setting('evaluate.checkpoint', head)} "
+        f"{setting('evaluate.output', Path('reports', tuned.stem))}",
     ]

@@ -27,8 +27,7 @@ def find_recordings(store: FeatureStore, params: Params) -> tuple[Recording, ...
     known = {(recording.source, recording.id): recording for recording in opened.recordings}
     missing = [episode for episode in store.episodes if (episode.source, episode.id) not in known]
     if missing:
-        sources = {source.name for source in params.data.sources}
-        _refuse(store, [(episode, _why_missing(episode, sources, opened)) for episode in missing])
+        _refuse(store, [(episode, _why_missing(episode, opened)) for episode in missing])
     return tuple(known[episode.source, episode.id] for episode in store.episodes)
 
 
@@ -78,13 +77,11 @@ def known_digests(store: FeatureStore) -> "closing[ContentDigests]":
     return closing(ContentDigests(ledger_path(store.path)))
 
 
-def _why_missing(episode: Episode, sources: set[str], opened: Opened) -> str:
-    if episode.source not in sources:
-        return f"data.sources has no source {episode.source!r}"
+def _why_missing(episode: Episode, opened: Opened) -> str:
     for bad in opened.bad:
         if bad.source == episode.source and bad.where.name == episode.id.rpartition("/")[2]:
             return bad.reason
-    return f"it is not there; it was extracted from {episode.path}, relative to data.root"
+    return f"no source has it; it was extracted from {episode.path}, relative to data.root"
 
 
 def _refuse(store: FeatureStore, wrong: Sequence[tuple[Episode, str]]) -> None:

@@ -66,9 +66,11 @@ def test_a_limit_takes_ticks_evenly(store: FeatureStore) -> None:
     assert folds.notes[1:] == ("20 of the ticks are read, evenly spread (probe.max_ticks)",)
 
 
-def test_too_few_ticks_for_every_fold_are_refused(store: FeatureStore) -> None:
-    with pytest.raises(StoreMismatch, match=r"one of 5 folds.*larger probe.max_ticks"):
-        fold_by_recording(store, 5, 8, max_ticks=4)
+def test_few_ticks_leave_fewer_recordings_and_folds(store: FeatureStore) -> None:
+    folds = fold_by_recording(store, 5, 8, max_ticks=4)
+    assert (folds.count, folds.recordings, len(folds.ticks)) == (4, 4, 4)
+    with pytest.raises(StoreMismatch, match=r"found 1\..* more probe\.max_ticks"):
+        fold_by_recording(store, 5, 8, max_ticks=1)
 
 
 def test_deals_differ_and_each_holds_every_recording_out_once(

@@ -72,16 +72,13 @@ def test_a_file_that_is_cut_off(params: Make, demo_checkpoint: Path, tmp_path: P
         assert f"{weights}: cut off or damaged: " in issue.message
 
 
-def test_what_is_not_here(params: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_not_here(params: Make) -> None:
     (folder,) = check(params("/no/such/folder"))
     assert folder.severity == "error" and "no hub id" in folder.message
     hub = params("Qwen/Qwen2.5-VL-3B-Instruct")
     (fetched,) = check(hub)
     assert fetched.severity == "note" and "first extraction downloads it" in fetched.message
     assert fetched.remedy == "hf download Qwen/Qwen2.5-VL-3B-Instruct"
-    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
-    (offline,) = check(hub)
-    assert offline.severity == "error" and "HF_HUB_OFFLINE forbids" in offline.message
 
 
 def test_the_demos_own_checkpoint_is_written_by_its_stage(params: Make, tmp_path: Path) -> None:
@@ -95,7 +92,7 @@ def test_the_demos_own_checkpoint_is_written_by_its_stage(params: Make, tmp_path
 
 def test_an_adapter(tmp_path: Path) -> None:
     assert check_adapter("/no/such/adapter").severity == "error"
-    (tmp_path / "adapter_config.json").write_text("{}")
+    (tmp_path / "adapter_config.json").write_text('{"peft_type": "LORA", "r": 2}')
     half = check_adapter(str(tmp_path))
     assert half.severity == "error" and "adapter_model.safetensors" in half.message
     weights = tmp_path / "adapter_model.safetensors"

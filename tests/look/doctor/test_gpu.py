@@ -20,7 +20,7 @@ def params(**sections: object) -> Params:
     return Params.model_validate(document)
 
 
-@pytest.mark.parametrize(("driver", "said"), [(False, "no GPU driver"), (True, "torch says: ")])
+@pytest.mark.parametrize(("driver", "said"), [(False, "no GPU driver"), (True, "torch sees none")])
 def test_a_gpu_that_torch_does_not_see(driver: bool, said: str) -> None:
     (issue,) = check_gpus((), driver, "bfloat16")
     assert issue.severity == "note", "everything runs on the CPU too"

@@ -51,7 +51,7 @@ def test_lines_stay_within_the_width_and_words_whole() -> None:
     [
         (ImportError("No module named 'av'"), "error", "No module named 'av'"),
         (lambda params: _raise(ConfigError("device: cuda:7")), "error", "device: cuda:7"),
-        (lambda params: _raise(OSError("stale handle")), "note", "stale handle"),
+        (lambda params: _raise(OSError("stale handle")), "error", "stale handle"),
         (lambda params: [missing("it", "is not there", "get it")], "error", "is not there"),
     ],
 )

@@ -35,7 +35,6 @@ def experiments() -> list[Experiment]:
             groups=tuple(f"demo/{k}" for k in range(6)),
             entries={span: np.full(6, 10.0) for span in SPANS},
             errors=errors | rules,
-            training_s=7.0,
         )
 
     return [

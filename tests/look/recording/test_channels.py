@@ -34,7 +34,7 @@ def test_statistics_of_every_channel(healthy: Path, look: Look) -> None:
     assert len(found) == 1026 + 12 + 7
     force = view.sensor.values[:, 0].astype(np.float64)
     one = found["sensor", "force"]
-    assert (one.unit, one.count) == ("N", len(force))
+    assert (one.unit, one.readings) == ("N", len(force))
     assert (one.minimum, one.maximum) == (force.min(), force.max())
     assert one.median == np.median(force) and one.mean == pytest.approx(force.mean())
     assert one.std == pytest.approx(force.std())

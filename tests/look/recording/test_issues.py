@@ -290,12 +290,14 @@ class TestCameras:
         assert (issue.kind, issue.severity, issue.stream) == ("depth view", "warning", "view View2")
         assert issues_of(root, views=["View1"]) == ()
 
-    def test_frames_counted_in_words(self, copied: Copied, issues_of: Find) -> None:
+    def test_frames_counted_in_words(self, copied: Copied) -> None:
+        """Then it is no recording, and is told with those that cannot be read."""
         folder = copied("new")
         metadata(folder, camera_frames_count="many")
-        (issue,) = issues_of(folder)
-        assert (issue.kind, issue.stream) == ("unreadable", "metadata")
-        assert "camera_frames_count" in issue.message
+        opened = open_recordings([Source(name="s", path=str(folder))], views=None)
+        (bad,) = opened.bad
+        said = f"{folder / 'metadata.json'}: camera_frames_count: expected a valid integer"
+        assert opened.recordings == () and said in bad.reason and "'many'" in bad.reason
 
     def test_frames_lost_one_by_one(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("raw")

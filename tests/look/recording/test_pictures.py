@@ -199,7 +199,7 @@ def test_lines_lead_from_the_frame_to_its_row_and_brackets_to_its_ticks(view: Ep
     assert view.timeline is not None
     line, (_, near) = view.timeline, draw_lanes(view).axes
     said = [text.get_text() for text in near.texts if "row" in text.get_text()]
-    row = int(said[0].split()[1].rstrip(","))
+    row = int(said[0].split()[1])
     took = [
         one for one in near.collections
         if isinstance(one, LineCollection) and str(one.get_label()).startswith("took")

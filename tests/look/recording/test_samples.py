@@ -77,7 +77,7 @@ def test_samples_follow_the_seed_and_are_never_more_than_ticks(healthy: Path, lo
 
     assert ticks(4, 1) == ticks(4, 1) != ticks(4, 2)
     assert ticks(1, 0) == [0]
-    assert len(ticks(10_000, 0)) == len(view.timeline.time)
+    assert len(ticks(1000, 0)) == len(view.timeline.time)
 
 
 def test_of_an_episode_that_training_refuses_there_is_no_sample(
@@ -115,8 +115,6 @@ def test_samples_have_a_column_each_and_say_what_they_reuse(
     title = side_by_side.axes[1].get_title()
     assert f"tick {tick} of {len(line.time)}\nat {line.time[tick] - view.zero:.2f} s" in title
     assert f"reuses VL row {tick // 3},\n{tick % 3} tick" in title
-    newest = max(time[tick // 3] for time in line.frame_time.values())
-    assert f"{1000 * (line.time[tick] - newest):.0f} ms old" in title
     assert side_by_side.get_suptitle().splitlines()[1] == f"“{view.instruction}”"
 
 

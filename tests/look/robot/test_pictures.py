@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.look.page.style import write
-from pipeline.look.robot.pictures import exceeded, jitter, worst
+from pipeline.look.robot.pictures import jitter, worst
 from pipeline.robot.timings import Timings
 
 
@@ -14,11 +14,6 @@ def run(rows: int, seed: int) -> tuple[float, Timings]:
     for row in np.random.default_rng(seed).lognormal(0, 1, (rows, 3)):
         timings.note(row)
     return 10.0, timings
-
-
-def test_the_share_of_ticks_above_a_value() -> None:
-    values, share = exceeded(np.array([3.0, 0.0, 1.0, 2.0, 4.0]))
-    assert values.tolist() == [1, 2, 3, 4] and share.tolist() == [1, 0.75, 0.5, 0.25]
 
 
 def test_no_late_tick_is_lost_among_many() -> None:

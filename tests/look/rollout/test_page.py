@@ -15,7 +15,7 @@ from pipeline.look.rollout.page import rollout_report, worst_and_median
 Sound = Callable[[Path], None]
 MakeEpisode = Callable[..., RolloutEpisode]
 MakeRollouts = Callable[..., Rollouts]
-ALWAYS = {"success", "endings", "paths", "courses", "filmstrip_worst"}
+ALWAYS = {"paths", "courses", "filmstrip_worst"}
 
 
 def failure(make_episode: MakeEpisode, seed: int = 0, **changed: object) -> RolloutEpisode:

@@ -12,16 +12,12 @@ from matplotlib.figure import Figure
 from pipeline.base.config import InspectParams
 from pipeline.look.page.style import INK, RC, write
 from pipeline.look.store.channels import draw_profiles, find_profiles
-from pipeline.look.store.episodes import draw_coverage
 from pipeline.look.store.features import draw_norms
 from pipeline.look.store.page import StoreView, inspect_store
-from pipeline.look.store.rows import draw_ages
 from pipeline.store import FeatureStore
 
 ROWS = 10
 EVERY: dict[str, Callable[[StoreView], Figure]] = {
-    "coverage": lambda view: draw_coverage(view.episodes),
-    "ages": lambda view: draw_ages(view.ages),
     "norms": lambda view: draw_norms(view.features, view.episodes),
 }
 
@@ -68,22 +64,6 @@ def test_sources_are_parted_on_a_map_that_stays_light_on_a_dark_page(flawed):
     _, by_episode, _ = EVERY["norms"](flawed).axes
     assert by_episode.lines
     assert INK not in {line.get_color() for line in by_episode.lines}
-
-
-def test_coverage_marks_what_is_absent(flawed):
-    with mpl.rc_context(RC):
-        above, below = EVERY["coverage"](flawed).axes
-    assert sum(len(one) for one in above.containers) == 6
-    shown = np.asarray(below.images[0].get_array())
-    assert shown.tolist() == [[2] * 6, [2] * 6, [0, 2, 2, 2, 2, 2]]
-    assert [label.get_text() for label in below.get_yticklabels()] == ["sensor", "state", "View1"]
-
-
-def test_ages_are_shares_of_all_ticks(flawed):
-    with mpl.rc_context(RC):
-        (axis,) = EVERY["ages"](flawed).axes
-    newest, view1 = (patch.get_data().values for patch in axis.patches)
-    assert (newest.sum(), view1.sum()) == pytest.approx((100, 100))
 
 
 def test_numbered_channels_are_drawn_together(flawed):

@@ -17,7 +17,7 @@ from pipeline.base.errors import StoreIncomplete, StoreMismatch
 from pipeline.look.store.channels import summarize_streams
 from pipeline.look.store.episodes import EpisodeCoverage, find_episode_issues
 from pipeline.look.store.features import look_at_features, read_slot, sample_rows
-from pipeline.look.store.page import StoreView, inspect_store, tabulate_sizes
+from pipeline.look.store.page import StoreView, inspect_store
 from pipeline.store import Episode, FeatureStore
 from pipeline.store.metadata import note_metadata
 
@@ -78,16 +78,10 @@ class TestFacts:
         assert np.isnan(found.by_view["View1"][rows == 3]).all()
         assert found.period_s == pytest.approx(0.3)
 
-    def test_sizes_are_all_bytes_on_the_disk(self, path):
+    def test_its_size_is_all_bytes_on_the_disk(self, path):
         view = look(path)
         files = [Path(folder, name) for folder, _, names in os.walk(path) for name in names]
-        assert sum(view.sizes.values()) == sum(file.stat().st_blocks * 512 for file in files)
-        rows = {row[0]: row for row in tabulate_sizes(path, view.sizes).rows}
-        assert sum(row[3] for row in rows.values()) == sum(
-            file.name != "zarr.json" for file in files
-        )
-        shape = FeatureStore.open(path).array("vl/features").shape
-        assert rows["vl/features"][1] == " × ".join(map(str, shape))
+        assert view.bytes == sum(file.stat().st_blocks * 512 for file in files)
 
     def test_coverage_is_counted_by_episode(self, path, plant):
         plant(path, "vl/frame_time", lambda shown: shown.__setitem__(slice(0, ROWS // 2), np.nan))
@@ -184,7 +178,7 @@ class TestDuplicates:
         (pair,) = view.duplicates.pairs
         assert (pair.first, pair.second, pair.rows) == (0, 5, (6, 6))
         assert pair.share == pytest.approx(0.6)
-        assert pair.time_s == pytest.approx((0.6, 0))
+        assert pair.time_s == pytest.approx(0.6)
         assert view.duplicates.rows == 12
         assert kinds(view) == [("same recording", "left", "episode_000")]
 
@@ -201,13 +195,14 @@ class TestIntegrity:
 
     def test_a_changed_feature_row(self, path):
         damage(path, "vl/features", lambda rows: rows.__setitem__((34, 2, 1), 0.5))
-        with pytest.raises(StoreIncomplete, match=r"right/episode_003.*VL row 4.*stages\.verify"):
+        said = r"vl/features/c/0/0/0: rows 34 to 34 of vl/features .*damaged.*stages\.verify"
+        with pytest.raises(StoreIncomplete, match=said):
             look(path)
 
     @pytest.mark.parametrize("name", ["tick/vl_row", "vl/frame_time", "episode/vl_start"])
     def test_a_changed_narrow_array(self, path, name):
         damage(path, name, lambda values: values.__setitem__(0, values[-1]))
-        with pytest.raises(StoreIncomplete, match=rf"{name}.*trailer.*stages\.verify"):
+        with pytest.raises(StoreIncomplete, match=rf"{name}.*(trailer|offsets).*stages\.verify"):
             look(path)
 
     def test_changed_metadata(self, path):

@@ -22,8 +22,9 @@ from pipeline.store import FeatureStore
 from pipeline.train.batches import BatchIndices, Windows
 from pipeline.train.finetuning import LiveFeatures, head_params, out_of_memory_named
 from pipeline.train.loop import Trainer
+from pipeline.train.predictions import predict
 from pipeline.train.run import open_run
-from pipeline.train.scores import evaluate_policy
+from pipeline.train.scores import action_space, compare
 from pipeline.train.split import check_store, find_ticks, split_by_episode
 from pipeline.train.tuned_episodes import refuse_tuned_episodes
 from pipeline.vlm.feature_spec import feature_spec
@@ -97,8 +98,8 @@ def test_what_is_kept_is_the_averaged_model_that_was_judged(
     # What it was tuned on goes along with the features, and is no part of what they are.
     tuned = read_tuned_on(output / "best" / "adapter")
     assert tuned is not None
-    assert of_store(store.attrs) == tuned
-    assert of_store(base.attrs) is None
+    assert of_store(store.attrs, store.path) == tuned
+    assert of_store(base.attrs, base.path) is None
     listed = load_policy(find_policy(output)).split
     for side in ("train", "val"):
         told = {part.episode: part.content for part in getattr(tuned, side)}
@@ -127,9 +128,8 @@ def test_what_is_kept_is_the_averaged_model_that_was_judged(
     with pytest.raises(CheckpointMismatch, match=r"feature_spec\.adapter"):
         check_store(best, base)
     ticks, _ = find_ticks(store, best, "val")
-    comparison, _ = evaluate_policy(
-        best.policy(), store, ticks, Windows.of(best.params), 64, best.normalization
-    )
+    predictions = predict(best.policy(), store, ticks, Windows.of(best.params), 64)
+    comparison = compare(predictions, {}, action_space(store, best.normalization))
     assert comparison.overall("policy") == pytest.approx(best.metrics["val/error"], rel=1e-3)
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import pytest
+from pydantic import ValidationError
 
 from pipeline.base.config import Params
 from pipeline.base.errors import ConfigError
@@ -23,8 +24,6 @@ def test_finetune_is_laid_over_train_head(params: Callable[..., Params]) -> None
     [
         ("finetune", {"tuning": {"method": "none"}}, "python -m stages.train_head"),
         ("train_head", {"features_enabled": False}, "would not see the model that is tuned"),
-        ("finetune", {"grad_accumulation": 7}, "finetune: .*grad_accumulation 7"),
-        ("finetune", {"output": "."}, "finetune: .*folder of its own"),
     ],
 )
 def test_what_cannot_be_tuned_is_refused(
@@ -32,3 +31,12 @@ def test_what_cannot_be_tuned_is_refused(
 ) -> None:
     with pytest.raises(ConfigError, match=said):
         head_params(params(**{section: values}))
+
+
+@pytest.mark.parametrize("section", ["finetune", "train_head"])
+@pytest.mark.parametrize("place", ["output", "logs"])
+def test_what_is_renamed_is_a_folder_of_its_own(
+    params: Callable[..., Params], section: str, place: str
+) -> None:
+    with pytest.raises(ValidationError, match=rf"{section}\.{place}\n.*a folder of its own"):
+        params(**{section: {place: "."}})

@@ -48,7 +48,7 @@ def test_a_missing_recording_is_named(
         find_recordings(store, params())
     said = str(refused.value)
     assert "of its 4 episodes 2 cannot be found" in said
-    assert f"made/episode_2: it is not there; it was extracted from {TASK}/episode_2" in said
+    assert f"made/episode_2: no source has it; it was extracted from {TASK}/episode_2" in said
     assert "made/episode_1: " in said
     assert "metadata.json" in said, "why it cannot be read"
     assert "python -m stages.extract" in said
@@ -56,7 +56,7 @@ def test_a_missing_recording_is_named(
 
 def test_a_source_that_is_gone_is_named(store: FeatureStore, params: Callable[..., Params]) -> None:
     renamed = params(data={"sources": [{"name": "other", "path": "."}]})
-    with pytest.raises(StoreMismatch, match=r"made/episode_0: data\.sources has no source 'made'"):
+    with pytest.raises(StoreMismatch, match=r"made/episode_0: no source has it"):
         find_recordings(store, renamed)
 
 

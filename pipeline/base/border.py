@@ -1,0 +1,211 @@
+"""Where something from outside comes in: read once, bounded, and refused in one voice.
+
+A document becomes a pydantic model here, and whatever is wrong with it one error that names the
+file, the place in it, what was expected, what was found and what mends it. Each room has a `Border`
+of its own kind of error; nothing behind it asks a dictionary.
+"""
+
+import gc
+import re
+import signal
+import stat
+import threading
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from reprlib import Repr
+from types import FrameType
+from typing import Annotated, Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from pipeline.base.errors import PipelineError
+
+T = TypeVar("T")
+
+MOST_BYTES = 32 * 2**20
+"""Of one document; a tokenizer's is the largest that is usual, with 11 MB."""
+Text = Annotated[str, Field(max_length=10_000, pattern=r"^[^\x00]*$")]
+"""A name, a path or an instruction: bounded, and without NUL, which no file system takes."""
+_WEIGHTS = {b",": 1, b":": 8, b"[": 8, b"{": 8}
+_MOST_WEIGHT = 4_000_000
+"""Of a document, by what its parts take: pydantic keeps what it refuses once for each problem, so
+that a model of a dozen fields can hold some 1.5 GB. A tokenizer's weighs 3 million."""
+_WORDS = {
+    "Extra inputs are not permitted": "unknown key",
+    "Field required": "missing",
+    "Input is not a valid path for <class 'pathlib.Path'>": "expected a path",
+    "Input should be a valid tuple": "expected a list such as [a, b]",
+    "Input should be ": "expected ",
+    "Input should": "expected to",
+    "Tuple should": "expected a list to",
+    "String should": "expected a text to",
+    "Invalid JSON": "cannot be read as JSON",
+}
+"""How a problem is told here, by pydantic's words."""
+_MOST_TOLD = 5
+"""Problems that one message lists."""
+
+
+class Document(BaseModel):
+    """Base of what others write: no type is guessed, keys that are not known are left alone."""
+
+    model_config = ConfigDict(frozen=True, strict=True, extra="ignore", allow_inf_nan=False)
+
+
+@dataclass(frozen=True)
+class Border:
+    """How one kind of input is refused."""
+
+    error: type[PipelineError]
+    mend: str
+    """What to do, as a sentence with its full stop."""
+
+    def refusal(self, where: Path | str, why: object) -> PipelineError:
+        """The error for something at a place."""
+        return self.error(f"{named(str(where))}: {str(why).rstrip('. ')}. {self.mend}")
+
+    def check_file(self, path: Path, most: int | None = None) -> int:
+        """The bytes of a regular file; refuses a folder, a pipe, a device, one of more than `most`.
+
+        Only what is regular may be opened: a pipe would be waited for, a device has no end.
+        """
+        with self.foreign(path, "cannot be read"):
+            try:
+                status = path.stat()
+            except FileNotFoundError:
+                raise self.refusal(path, "no such file") from None
+        if not stat.S_ISREG(status.st_mode):
+            kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a pipe, socket or device"
+            raise self.refusal(path, f"expected a file, found {kind}")
+        if most is not None and status.st_size > most:
+            why = f"expected at most {most:,} bytes, found {status.st_size:,}"
+            raise self.refusal(path, why)
+        return status.st_size
+
+    def read_bytes(self, path: Path, most: int = MOST_BYTES) -> bytes:
+        """The content of a regular file of at most `most` bytes."""
+        self.check_file(path, most)
+        with self.foreign(path, "cannot be read"), path.open("rb") as file:
+            return file.read(most)
+
+    def read_json(self, path: Path, model: type[T], most: int = MOST_BYTES) -> T:
+        """The JSON document of a file, as the model; it is not followed deeper than 200 levels."""
+        return self.parse_json(self.read_bytes(path, most), model, path)
+
+    def parse_json(self, text: bytes | str, model: type[T], where: Path | str) -> T:
+        """The JSON document of a text, as `read_json`."""
+        raw = text.encode("utf-8", "surrogatepass") if isinstance(text, str) else text
+        weight = sum(much * raw.count(mark) for mark, much in _WEIGHTS.items())
+        if weight > _MOST_WEIGHT:
+            why = f"expected a document of weight {_MOST_WEIGHT:,} (a value 1, a key or a list 8)"
+            raise self.refusal(where, f"{why}, found {weight:,}")
+        collects = gc.isenabled()
+        gc.disable()  # it would walk over what is parsed again and again, for most of the time
+        try:
+            return _adapter(model).validate_json(raw)
+        except ValidationError as error:
+            raise self.refusal(where, told(error)) from None
+        finally:
+            if collects:
+                gc.enable()
+
+    def read_json_lines(self, path: Path, model: type[T], most: int = 2**20) -> Iterator[T]:
+        """The documents of a file with one a line, each of at most `most` bytes; empty lines are
+        passed over."""
+        self.check_file(path)
+        with self.foreign(path, "cannot be read"), path.open("rb") as file:
+            for number, line in enumerate(iter(lambda: file.readline(most + 1), b""), start=1):
+                where = f"{path}, line {number}"
+                if len(line) > most:
+                    raise self.refusal(where, f"expected at most {most:,} bytes, found more")
+                if line.strip():
+                    yield self.parse_json(line, model, where)
+
+    def parse(self, value: object, model: type[T], where: Path | str) -> T:
+        """Something that another parser has read, as the model."""
+        try:
+            return _adapter(model).validate_python(value)
+        except ValidationError as error:
+            raise self.refusal(where, told(error)) from None
+
+    @contextmanager
+    def foreign(self, where: Path | str, what: str) -> Generator[None]:
+        """Refuse with `what` where another library raises inside, whatever its error's class is."""
+        try:
+            yield
+        except BaseException as error:
+            panic = type(error).__name__ == "PanicException"  # of a library in Rust: no `Exception`
+            if isinstance(error, PipelineError) or not (panic or isinstance(error, Exception)):
+                raise
+            said = getattr(error, "strerror", None) or f"{type(error).__name__}: {error}"
+            said = "not enough memory for it" if isinstance(error, MemoryError) else said
+            why = re.sub(r"<class '(\w+)'>", r"\1", f"{what}: {' '.join(str(said).split()):.300}")
+            raise self.refusal(where, why.encode("utf-8", "backslashreplace").decode()) from error
+
+    @contextmanager
+    def time_limit(self, where: Path | str, seconds: float = 10.0) -> Generator[None]:
+        """Refuse where what stands inside takes longer: templates and patterns can loop for ever.
+
+        Holds in the main thread, which is where a command reads what it is given; elsewhere there
+        is no limit.
+        """
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+
+        def ring(number: int, frame: FrameType | None) -> None:
+            raise self.refusal(where, f"was not done after {seconds:g} s")
+
+        before = signal.signal(signal.SIGALRM, ring)
+        signal.setitimer(signal.ITIMER_REAL, seconds)
+        try:
+            yield
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+            signal.signal(signal.SIGALRM, before)
+
+
+def told(error: ValidationError) -> str:
+    """The first few problems of a model, as one line."""
+    lines = [f"{place}: {what}" if place else what for place, what in problems(error)]
+    more = f"; and {len(lines) - _MOST_TOLD} more" if len(lines) > _MOST_TOLD else ""
+    return "; ".join(lines[:_MOST_TOLD]) + more
+
+
+def problems(error: ValidationError) -> Iterator[tuple[str, str]]:
+    """The place of each problem, as in `a.b.0`, and what was expected and found there."""
+    for problem in error.errors(include_url=False, include_context=False):
+        said = problem["msg"].removeprefix("Value error, ")
+        for theirs, ours in _WORDS.items():
+            said = said.replace(theirs, ours)
+        if problem["type"] in ("model_type", "model_attributes_type", "dataclass_type"):
+            said = "expected an object"
+        if problem["type"] == "json_invalid":
+            pass
+        elif not isinstance(problem["input"], dict):
+            said += f", found {shown(problem['input'])}"
+        elif problem["type"] not in ("missing", "extra_forbidden", "value_error"):
+            said += ", found keys with values"  # which would bury it
+        yield named(".".join(map(str, problem["loc"]))), said
+
+
+_SHORT = Repr()
+_SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother = 3, 120, 120
+
+
+def shown(value: object) -> str:
+    """A value as a message shows it: short, and in characters that every terminal can write."""
+    return _SHORT.repr(value).encode("utf-8", "backslashreplace").decode()
+
+
+def named(text: str) -> str:
+    """A name, a path or a place as a message shows it: as it is, unless that cannot be printed."""
+    return text if len(text) <= 1000 and text.isprintable() else shown(text)
+
+
+@cache
+def _adapter(model: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(model)

@@ -1,0 +1,94 @@
+"""What a policy is built for: the widths of its streams and the kinds of its channels. No torch."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from pydantic import ConfigDict, Field
+
+MOST = 1_000_000
+"""Channels of a stream, slots or widths of features."""
+Size = Annotated[int, Field(ge=0, le=MOST)]
+Group = Annotated[str, Field(pattern="^(translation|rotation|gripper|other)$")]
+Axes = Mapping[str, int | None]
+"""Names and sizes of a tensor's axes; None is any size above 0."""
+
+Kind = Literal["plain", "deg", "rad", "rotation"]
+"""Of a channel: as it is; an angle; one of three, in degrees, that turn a pose."""
+
+_POSE_ANGLES = ("pose_a", "pose_b", "pose_r")
+_ANGLES: dict[str, Kind] = {"deg": "deg", "rad": "rad"}
+_SIX = tuple(f"rotation_{index}" for index in range(6))
+
+
+def channel_kinds(names: Sequence[str], units: Sequence[str]) -> tuple[Kind, ...]:
+    """The kind of each channel; the arm's pose angles are a rotation where all three are there."""
+    turned = {*_POSE_ANGLES} <= {*names}
+    kinds: list[Kind] = []
+    for name, unit in zip(names, units, strict=True):
+        kind = _ANGLES.get(unit.lower(), "plain")
+        kinds.append("rotation" if turned and name in _POSE_ANGLES and kind == "deg" else kind)
+    return tuple(kinds)
+
+
+def expanded_names(names: Sequence[str], kinds: Sequence[Kind]) -> list[str]:
+    """The channels of `expand`, in its order."""
+    plain = [name for name, kind in zip(names, kinds, strict=True) if kind == "plain"]
+    angles = [name for name, kind in zip(names, kinds, strict=True) if kind in ("deg", "rad")]
+    waves = [f"{name}_{wave}" for wave in ("sin", "cos") for name in angles]
+    return [*plain, *waves, *(_SIX if "rotation" in kinds else ())]
+
+
+@dataclass(frozen=True)
+class PolicyShape:
+    """The widths that a store gives to a policy; 0 where the store lacks the stream.
+
+    The bounds hold where a checkpoint's document is read.
+    """
+
+    __pydantic_config__ = ConfigDict(strict=True, extra="forbid")
+
+    slots: Size
+    feature_dim: Size
+    sensor_channels: Size
+    state_dim: Size
+    action_dim: Annotated[int, Field(ge=1, le=MOST)]
+    action_groups: tuple[Group, ...]
+    """Of each action channel."""
+    views: Size = 0
+    """Whose ages a policy is told."""
+    state_kinds: tuple[Kind, ...] = ()
+    """Of each state channel; empty where all are plain."""
+
+    @property
+    def kinds(self) -> tuple[Kind, ...]:
+        """The kind of each state channel."""
+        plain: tuple[Kind, ...] = ("plain",)
+        return self.state_kinds or plain * self.state_dim
+
+    @property
+    def channels(self) -> dict[str, tuple[int, ...]]:
+        """The shape of each stream's statistics, and of the action's; a state's is expanded."""
+        expanded = expanded_names([""] * self.state_dim, self.kinds)
+        return {
+            "features": (self.slots, self.feature_dim),
+            "sensor": (self.sensor_channels,),
+            "state": (len(expanded),),
+            "action": (self.action_dim,),
+        }
+
+    def stream_axes(self) -> dict[str, Axes]:
+        """The axes behind the batch of each field of an `Observation` of this shape."""
+        return {
+            "features": {"slot": self.slots, "dim": self.feature_dim},
+            "slot_valid": {"slot": self.slots},
+            "feature_age": {},
+            "view_age": {"view": self.views},
+            # Of any length: readings have steps by their ages.
+            "sensor": {"window": None, "channel": self.sensor_channels},
+            "sensor_valid": {},
+            "sensor_age": {"window": None},
+            "state": {"window": None, "channel": self.state_dim},
+            "state_valid": {},
+            "state_age": {"window": None},
+        }

@@ -1,0 +1,309 @@
+"""A store may come from anywhere: what is wrong with it is refused with file, place and mend."""
+
+import json
+import os
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import google_crc32c
+import numpy as np
+import pytest
+
+from pipeline.base.errors import PipelineError, StoreIncomplete
+from pipeline.store import FeatureStore, RowSource, part_path
+from pipeline.store.archive import archive, restore
+from pipeline.store.metadata import note_metadata
+from pipeline.store.schema import read_spec
+from pipeline.store.verification import verify
+
+DEEP = "[" * 100_000 + "]" * 100_000
+Harm = Callable[[Path], object]
+
+
+@pytest.fixture(scope="module")
+def original(tiny_golden, tmp_path_factory) -> Path:
+    store = tiny_golden(tmp_path_factory.mktemp("original"))
+    archive(store, store.with_name("tiny.archive.zarr"), 1, 1)
+    return store
+
+
+@pytest.fixture
+def store(original, tmp_path) -> Path:
+    return Path(shutil.copytree(original, tmp_path / "tiny.zarr"))
+
+
+@pytest.fixture
+def archived(original, tmp_path) -> Path:
+    source = original.with_name("tiny.archive.zarr")
+    return Path(shutil.copytree(source, tmp_path / "tiny.archive.zarr"))
+
+
+def text(place: str, content: str | bytes) -> Harm:
+    raw = content if isinstance(content, bytes) else content.encode()
+    return lambda root: Path(root, place, "zarr.json").write_bytes(raw)
+
+
+def entry(place: str, value: str) -> Harm:
+    """An entry of a `zarr.json`, named by dots, becomes this JSON."""
+
+    def harm(root: Path) -> None:
+        folder, _, dotted = place.rpartition(":")
+        path = root / folder / "zarr.json"
+        document: Any = json.loads(path.read_text())
+        at, *keys = document, *dotted.split(".")
+        for key in keys[:-1]:
+            at = at[int(key) if key.isdigit() else key]
+        at[keys[-1]] = "@"
+        path.write_text(json.dumps(document).replace('"@"', value, 1))
+
+    return harm
+
+
+def values(array: str, row: int, value: object) -> Harm:
+    """A row of an array becomes this, with the right trailer behind."""
+
+    def harm(root: Path) -> None:
+        spec = read_spec(root, array)
+        path = next(path for path in sorted((root / array / "c").rglob("*")) if path.is_file())
+        content = bytearray(path.read_bytes()[:-4])
+        np.frombuffer(content, spec.dtype).reshape(-1, *spec.shape[1:])[row] = value
+        crc = google_crc32c.value(bytes(content))
+        path.write_bytes(bytes(content) + crc.to_bytes(4, "little"))
+
+    return harm
+
+
+def instead(name: str, make: Callable[[Path], object]) -> Harm:
+    """Something else in place of a file."""
+
+    def harm(root: Path) -> None:
+        (root / name).unlink()
+        make(root / name)
+
+    return harm
+
+
+ROOT = {
+    "schema": ["null", "1" + "0" * 400],
+    "plan": ['"' + "x" * 20_000 + '"'],
+    "feature_spec": ["[]", '{"digest": "x"}'],
+    "feature_spec.views": ['["../x"]'],
+    "feature_spec.slots": ["[1]", "[]"],
+    "feature_spec.variants": ["10000000000"],
+    "streams": ["{}"],
+    "streams.sensor.names": ['["a"]'],
+    "streams.views": ['["View1", "View2"]'],
+    "sources": ["[]", '"left"'],
+    "action_hz": ["0", "NaN", "1" + "0" * 400, '"10"'],
+    "vlm_reuse_count": ["1000000000", "3.5"],
+    "environment": ['[{"rows": [0, 1' + "0" * 300 + "]}]"],
+    "golden": ['[{"row": 60, "prompt": "", "views": []}]'],
+    "golden.0.views": ['["../../x"]'],
+    "golden.0.prompt": ['"' + "x" * 2_000_000 + '"'],
+    "note": [DEEP, '"\\ud800"'],
+}
+ARRAY = {
+    "shape": ["[1000000000000]", "[9223372036854775808]", "[-1]", "[179]", "[180, 1]"],
+    "data_type": ['"float32"', '{"name": "float64"}'],
+    "node_type": ['"group"'],
+    "dimension_names": ["null"],
+    "fill_value": ["1"],
+    "codecs": ['[{"name": "bytes"}, {"name": "zstd"}, {"name": "crc32c"}]'],
+    "codecs.0.configuration.endian": ['"big"'],
+    "chunk_grid.configuration.chunk_shape": ["[100]", "[]", "[4096000000000]"],
+    "storage_transformers": ['[{"name": "x"}]'],
+}
+HARMS: dict[str, tuple[Harm, str]] = {
+    **{
+        f"{key} {value[:20]}": (entry(f"attributes.{key}", value), "zarr.json: ")
+        for key, several in ROOT.items()
+        for value in several
+    },
+    **{
+        f"{key} {value[:20]}": (entry(f"tick/time:{key}", value), "tick/time/zarr.json: ")
+        for key, several in ARRAY.items()
+        for value in several
+    },
+    **{
+        f"{place} {content[:5]!r}": (text(place, content), f"{place}/zarr.json: ".lstrip("/"))
+        for place, contents in {"": (DEEP, "", "null", b"\xff{}", "NaN"), "vl/key": (DEEP,)}.items()
+        for content in contents
+    },
+    **{
+        f"{file} is something else": (instead(file, made), f"{file}: ")
+        for file, made in {
+            "zarr.json": os.mkfifo,
+            "tick/time/zarr.json": lambda path: path.symlink_to("/dev/zero"),
+            "vl/features/c/0/0/0": Path.mkdir,
+            "tick/time/c/0": os.mkfifo,
+        }.items()
+    },
+    **{
+        f"{stream} {row} {value}": (
+            values(f"episode/{stream}_start", row, value),
+            f"episode/{stream}_start: expected offsets that rise from 0 to ",
+        )
+        for stream, row, value in (
+            ("tick", 0, 1),
+            ("vl", 3, 0),
+            ("sensor", 2, -5),
+            ("text", 6, 10**6),
+            ("vl", 3, 2**62),
+        )
+    },
+    **{
+        f"{array} {value}": (values(array, 100, value), f"{array}: expected positions from ")
+        for array, value in {
+            "tick/vl_row": -1,
+            "tick/sensor_end": 10**12,
+            "tick/state_end": -(2**63),
+        }.items()
+    },
+    **{
+        f"source {value}": (values("episode/source", 2, value), "episode/source: expected")
+        for value in (-1, 2)
+    },
+    "text": (values("episode/text", slice(0, 3), 255), "episode/text, episode 0: "),
+    "text depth": (values("episode/text", slice(0, 120), ord("[")), "episode/text, episode 0: "),
+}
+
+
+def used(root: Path) -> None:
+    """Whatever a training does with a store."""
+    opened = FeatureStore.open(root)
+    opened.gather(range(0, opened.ticks, 7))
+    _ = opened.episodes, opened.golden
+
+
+class TestStores:
+    @pytest.mark.timeout(20)
+    @pytest.mark.parametrize(("harm", "said"), HARMS.values(), ids=HARMS)
+    def test_a_broken_one_is_refused_with_place_and_mend(self, store, harm, said):
+        harm(store)
+        with pytest.raises(PipelineError) as caught:
+            used(store)
+        message = str(caught.value)
+        assert f"{store}/{said}" in message
+        assert re.search(r"Run python -m stages|run python -m stages|Extract it again", message)
+        assert len(message) < 2000
+        try:
+            checked = verify(store, threads=1)
+        except PipelineError as error:
+            assert str(store) in str(error)
+        else:
+            assert any(str(store) in line for line in checked.lines())
+
+    def test_all_tell_the_same_lie(self, store):
+        for path in store.rglob("zarr.json"):
+            document = json.loads(path.read_text())
+            if document.get("shape", [0])[0] == 180:
+                document["shape"][0] = 10**12
+                path.write_text(json.dumps(document))
+        note_metadata(store)
+        for work in (FeatureStore.open, RowSource, lambda at: verify(at, threads=1)):
+            with pytest.raises(StoreIncomplete, match=r"expected [\d,]+ chunk files by the shape"):
+                if (checked := work(store)) and hasattr(checked, "lines"):
+                    raise StoreIncomplete("\n".join(checked.lines()))
+
+    @pytest.mark.parametrize(
+        "harm", [text("tick/time", DEEP), values("episode/vl_start", 3, 2**62)]
+    )
+    def test_a_build_is_not_trusted_either(self, store, harm):
+        harm(store)
+        part = store.rename(part_path(store))
+        with pytest.raises(StoreIncomplete, match=rf"{part}/.*Remove it with .*store gc"):
+            _ = RowSource(part).texts
+
+    def test_a_frame_that_unpacks_to_more_than_it_is(self, store):
+        blocks = b"".join((2**20 | 2 | last).to_bytes(3, "little") + b"7" for last in [0] * 9 + [1])
+        packed = b"\x28\xb5\x2f\xfd\x00\x38" + blocks
+        path = store / "golden/0/View1/c/0/0/0"
+        path.write_bytes(packed + google_crc32c.value(packed).to_bytes(4, "little"))
+        with pytest.raises(StoreIncomplete, match=rf"{path}: golden frame cannot be read"):
+            _ = FeatureStore.open(store).golden
+
+    @pytest.mark.parametrize("make", [Path.touch, os.mkfifo, lambda at: at.symlink_to("/nowhere")])
+    def test_no_folder_at_all(self, tmp_path, make):
+        make(tmp_path / "s.zarr")
+        with pytest.raises(StoreIncomplete, match=r"s\.zarr: no finished store, found"):
+            FeatureStore.open(tmp_path / "s.zarr")
+
+
+def manifest(change: Callable[[dict[str, Any]], object]) -> Harm:
+    """Another manifest, with its digest."""
+
+    def harm(root: Path) -> None:
+        from pipeline.store.archive import _digest_of
+
+        path = root / "zarr.json"
+        document = json.loads(path.read_text())
+        said = document["attributes"]["archive"]
+        change(said)
+        said["digest"] = _digest_of({key: said[key] for key in said if key != "digest"})
+        path.write_text(json.dumps(document))
+
+    return harm
+
+
+def of_store(name: str, place: str, value: str) -> Harm:
+    """An entry of one of the texts that the manifest holds."""
+
+    def change(said: dict[str, Any]) -> None:
+        document = json.loads(said["metadata"][name])
+        *keys, last = place.split(".")
+        at = document
+        for key in keys:
+            at = at[key]
+        at[last] = "@"
+        said["metadata"][name] = json.dumps(document).replace('"@"', value)
+
+    return manifest(change)
+
+
+ARCHIVES: dict[str, Harm] = {
+    **{
+        f"{table} {name}": manifest(
+            lambda said, table=table, name=name: said[table].update({name: "x"})
+        )
+        for table in ("metadata", "golden")
+        for name in ("/tmp/x", "golden/0/../zarr.json")
+    },
+    "array gone": manifest(lambda said: said["arrays"].pop("tick/time")),
+    "no text": manifest(lambda said: said["metadata"].pop("zarr.json")),
+    "text": manifest(lambda said: said["metadata"].update({"tick/time/zarr.json": DEEP})),
+    "rows": of_store("tick/time/zarr.json", "shape", "[1000000000000]"),
+    "chunks": of_store("tick/time/zarr.json", "chunk_grid.configuration.chunk_shape", "[8192000]"),
+    "rate": of_store("zarr.json", "attributes.action_hz", "0"),
+    "checksums": manifest(lambda said: said["arrays"]["tick/time"].update(crc32c=[1, 2])),
+    "root": text("", DEEP),
+    "pipe": instead("tick/time/c/0", os.mkfifo),
+    "device": instead("golden/0/View1/c/0/0/0", lambda path: path.symlink_to("/dev/zero")),
+}
+
+
+class TestArchives:
+    @pytest.mark.timeout(20)
+    @pytest.mark.parametrize("harm", ARCHIVES.values(), ids=ARCHIVES)
+    def test_a_broken_one_restores_nothing(self, archived, tmp_path, harm):
+        harm(archived)
+        before = sorted(tmp_path.iterdir())
+        with pytest.raises(PipelineError) as caught:
+            restore(archived, tmp_path / "back.zarr", threads=1)
+        assert str(archived) in str(caught.value)
+        assert "take another copy" in str(caught.value) or "Remove or rename" in str(caught.value)
+        assert set(tmp_path.iterdir()) - {*before} <= {tmp_path / "back.zarr.lock"}
+
+    def test_a_piece_that_unpacks_to_more_than_it_is(self, archived, tmp_path):
+        shard = archived / "tick/time/c/0"
+        content = bytearray(shard.read_bytes())
+        begin, length = np.frombuffer(content[-20:-4], "<u8").tolist()
+        content[begin + 4 : begin + 8] = (2**31 - 32).to_bytes(4, "little")
+        piece = bytes(content[begin : begin + length - 4])
+        checksum = google_crc32c.value(piece).to_bytes(4, "little")
+        content[begin + length - 4 : begin + length] = checksum
+        shard.write_bytes(content)
+        with pytest.raises(StoreIncomplete, match=rf"{shard}: .*a piece is not \d+ bytes"):
+            restore(archived, tmp_path / "back.zarr", threads=1)

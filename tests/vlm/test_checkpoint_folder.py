@@ -1,0 +1,271 @@
+"""A checkpoint folder comes from anywhere: it is read as it stands, or refused in one message."""
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.base.config import VLMParams
+from pipeline.base.digests import file_digest
+from pipeline.base.errors import VLMError
+from pipeline.vlm.checkpoint_folder import read_config, read_preprocessor, resolve_checkpoint
+from pipeline.vlm.feature_spec import feature_spec
+from pipeline.vlm.preparation import Preparer
+from pipeline.vlm.processor import PromptRenderer
+
+MEND = r"Copy or download the checkpoint again, or set vlm\.checkpoint to another"
+
+Spec = Callable[..., object]
+
+
+@pytest.fixture
+def folder(demo_checkpoint: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(demo_checkpoint, tmp_path / "vlm")
+
+
+@pytest.fixture
+def spec(vlm_params: Callable[..., VLMParams]) -> Spec:
+    """What a plan reads of a checkpoint: all but its weights."""
+
+    def read(folder: Path) -> object:
+        vlm = vlm_params(checkpoint=str(folder))
+        return feature_spec(vlm, "float32", ("View1",), file_digest, lambda what, make: make())
+
+    return read
+
+
+def _edit(path: Path, place: str, value: object) -> None:
+    document = json.loads(path.read_text())
+    *outer, last = place.split(".")
+    inside = document
+    for key in outer:
+        inside = inside[key]
+    inside.pop(last, None)
+    if value is not ...:
+        inside[last] = value
+    path.write_text(json.dumps(document))
+
+
+CONFIG = "config.json"
+PIXELS = "preprocessor_config.json"
+TOKENS = "tokenizer_config.json"
+ROPE = "text_config.rope_parameters"
+
+
+@pytest.mark.parametrize(
+    ("name", "place", "value", "told"),
+    [
+        (CONFIG, "model_type", ["qwen2_5_vl"], r"model_type: expected 'qwen2_5_vl', found \["),
+        (CONFIG, "vision_config.depth", 10**6, r"vision_config\.depth: expected .* 512"),
+        (CONFIG, "vision_config.num_hidden_layers", 10**6, r"num_hidden_layers: expected null"),
+        (CONFIG, "vision_config.num_heads", 7, "4 x num_heads 7 to divide"),
+        (CONFIG, "vision_config.num_heads", ..., r"expected \['num_heads'\] in vision_config"),
+        (CONFIG, "vision_config.window_size", 0, r"vision_config\.window_size: expected .* 28"),
+        (CONFIG, "vision_config.window_size", None, r"window_size: expected .* found None"),
+        (CONFIG, "vision_config.fullatt_block_indexes", [4], r"\(4,\) below depth 4"),
+        (CONFIG, "vision_config.fullatt_block_indexes", ..., r"expected .*fullatt_block_indexes"),
+        (CONFIG, "vision_config", [1], r"vision_config: expected an object, found \[1\]"),
+        (CONFIG, "text_config.hidden_size", 10**400, "found 1000.*000"),
+        (CONFIG, "text_config.rms_norm_eps", ..., r"text_config\.rms_norm_eps: missing"),
+        (CONFIG, "text_config.num_labels", 10**9, r"text_config\.num_labels: expected .* 1000"),
+        (CONFIG, "text_config.head_dim", 7, "head_dim 7 to be 32"),
+        (CONFIG, ROPE, None, r"mrope_section \(16, 24, 24\) to sum to half a head of 32"),
+        (CONFIG, f"{ROPE}.mrope_section", [8, 8], "mrope_section: .*at least 3"),
+        (CONFIG, "text_config.hidden_act", [], r"config\.json, .* cannot be read: .*act"),
+        (CONFIG, "image_token_id", -1, "image_token_id: expected .* 0, found -1"),
+        (PIXELS, "image_mean", [0.5], "image_mean: .*at least 3"),
+        (PIXELS, "image_std", [0, 1, 1], r"image_std\.0.*greater than 0, found 0"),
+        (PIXELS, "rescale_factor", None, "rescale_factor.*found None"),
+        (PIXELS, "resample", 2, "resample: expected 3, found 2"),
+        (PIXELS, "do_resize", False, "do_resize: expected True, found False"),
+        (PIXELS, "image_processor_type", "CLIP", "image_processor_type: .*found 'CLIP'"),
+        (PIXELS, "patch_size", 7, r"patch size \(14, 2, 2\) of config\.json, found \(7, 2, 2\)"),
+        (TOKENS, "tokenizer_class", "Own", "tokenizer_class: .*Qwen2Tokenizer.*'Own'"),
+        (TOKENS, "eos_token", 5, r"tokenizer_config\.json cannot be read: .*eos_token"),
+        ("tokenizer.json", "model.merges", [], r"cut off: expected \d+ merges .*found 0"),
+        ("tokenizer.json", "model.vocab.!", "a", r"model\.vocab\.!: expected a valid integer"),
+        ("tokenizer.json", "pre_tokenizer", {"pattern": {"Regex": "(x+x+)+y"}}, "pattern, found '"),
+        ("tokenizer.json", "normalizer", {"type": "Own"}, r"tokenizer\.json .* cannot be read"),
+    ],
+)
+def test_what_a_file_may_not_say(
+    folder: Path, spec: Spec, name: str, place: str, value: object, told: str
+) -> None:
+    _edit(folder / name, place, value)
+    with pytest.raises(VLMError, match=rf"(?s){folder}.*{told}.*{MEND}") as refused:
+        spec(folder)
+    assert len(str(refused.value)) < 1500
+
+
+@pytest.mark.parametrize("name", [CONFIG, PIXELS, TOKENS, "tokenizer.json", "extra.json"])
+@pytest.mark.parametrize("kind", ["pipe", "folder", "device", "deep"])
+def test_a_file_that_is_none_is_never_opened(
+    folder: Path, spec: Spec, name: str, kind: str
+) -> None:
+    path = folder / name
+    path.unlink(missing_ok=True)
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "folder":
+        path.mkdir()
+    elif kind == "device":
+        path.symlink_to("/dev/zero")
+    else:
+        path.write_text('{"a":' * 100_000 + "1" + "}" * 100_000)
+    if (name, kind) == ("extra.json", "deep"):
+        spec(folder)
+        return
+    with pytest.raises(VLMError, match=rf"{path}: .*(found a|recursion limit).*{MEND}"):
+        spec(folder)
+
+
+@pytest.mark.parametrize(
+    ("template", "told"),
+    [
+        ("{{ 'a' * 10**10 }}", "not enough memory|was not done"),
+        ("{% set n = namespace(x='a') %}{% for i in range(60) %}{% set n.x = n.x ~ n.x %}"
+         "{% endfor %}", "not enough memory|was not done"),
+        ("{% for i in range(10**9) %}{% endfor %}", "OverflowError"),
+        ("{{ ''.__class__.__mro__ }}", "SecurityError"),
+        ("{{ raise_exception('no') }}", "TemplateError: no"),
+        ("{% for %}", "TemplateSyntaxError"),
+        ("{{ 1 / 0 }}", "ZeroDivisionError"),
+        ("{{ " + "(" * 5000 + "1" + ")" * 5000 + " }}", "RecursionError"),
+    ],
+)  # fmt: skip
+def test_a_chat_template_that_cannot_be_rendered(folder: Path, template: str, told: str) -> None:
+    _edit(folder / TOKENS, "chat_template", template)
+    with pytest.raises(VLMError, match=rf"{folder}: .*chat template.*{told}.*{MEND}"):
+        PromptRenderer(folder, "{instruction}").render("go", 1)
+
+
+@pytest.mark.slow
+def test_a_chat_template_that_loops(folder: Path) -> None:
+    loops = "{% for i in range(99999) %}" * 3 + "{% endfor %}" * 3
+    _edit(folder / TOKENS, "chat_template", loops)
+    with pytest.raises(VLMError, match=rf"cannot be rendered: was not done after 5 s\. {MEND}"):
+        PromptRenderer(folder, "{instruction}")
+
+
+def test_an_index_names_files_of_its_own_folder(folder: Path, spec: Spec) -> None:
+    index = folder / "model.safetensors.index.json"
+    for weight_map, told in (
+        (
+            {"a": "../vlm/model.safetensors"},
+            r"weight_map\.a: .*found '\.\./vlm/model\.safetensors'",
+        ),
+        ({"a": str(folder / "model.safetensors")}, r"weight_map\.a: "),
+        ({"a": 5}, r"weight_map\.a: expected a valid string, found 5"),
+        ([1], r"weight_map: expected an object, found \[1\]"),
+    ):
+        index.write_text(json.dumps({"metadata": {}, "weight_map": weight_map}))
+        with pytest.raises(VLMError, match=rf"{index}: {told}.*{MEND}"):
+            spec(folder)
+
+
+def test_merges_that_are_cut_off_are_not_taken_for_whole(folder: Path, spec: Spec) -> None:
+    whole = json.loads((folder / "tokenizer.json").read_text())
+    (folder / "tokenizer.json").unlink()
+    (folder / "vocab.json").write_text(json.dumps(whole["model"]["vocab"]))
+    merges = ["#version: 0.2", *map(" ".join, whole["model"]["merges"])]
+    (folder / "merges.txt").write_text("\n".join(merges))
+    spec(folder)
+    (folder / "merges.txt").write_text("\n".join(merges[:300]))
+    with pytest.raises(VLMError, match=rf"merges\.txt: cut off: expected 632.*299\. {MEND}"):
+        spec(folder)
+
+
+@pytest.mark.parametrize("kernel", ["attn_implementation", "_attn_implementation"])
+def test_no_kernel_is_fetched(folder: Path, spec: Spec, kernel: str) -> None:
+    _edit(folder / CONFIG, kernel, {"": "sdpa", "text_config": "someone/kernel"})
+    with pytest.raises(
+        VLMError, match=rf"config\.json: .*no code .*found {kernel} .*someone/kernel"
+    ):
+        spec(folder)
+
+
+PROMPT_MEND = r"Change the instruction in the recording, data\.sources or vlm\.prompt"
+
+
+@pytest.mark.parametrize(
+    ("instruction", "told"),
+    [
+        ("word " * 50_000, "at most 200,000 characters, found 500,"),
+        (
+            "zq " * 2000,
+            r"at most 1,000 tokens \(max_position_embeddings\), found 12,0.*20 for each",
+        ),
+        ("a\ud800b", "cannot be cut into tokens"),
+    ],
+)
+def test_a_prompt_is_no_longer_than_the_models_window(
+    folder: Path, vlm_params: Callable[..., VLMParams], instruction: str, told: str
+) -> None:
+    _edit(folder / CONFIG, "text_config.max_position_embeddings", 1000)
+    vlm = vlm_params(checkpoint=str(folder))
+    preparer = Preparer(vlm, feature_spec(vlm, "float32", ("View1",), file_digest))
+    with pytest.raises(VLMError, match=rf"(?s)^'.*{told}.*{PROMPT_MEND}"):
+        preparer.render(instruction, ["View1"])
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["a\0b", "\ud800", "../x", "../../etc/passwd", "x" * 5000, "~nobody-here/x", "/dev/null"],
+)
+def test_a_name_that_is_no_folder_and_no_hub_id(name: str) -> None:
+    for setting in ("vlm.checkpoint", "vlm.adapter"):
+        with pytest.raises(VLMError, match=rf"{setting} .{{1,200}}: no such folder.*stages\.demo"):
+            resolve_checkpoint(name, setting=setting)
+
+
+FLAT: dict[str, Any] = {
+    "hidden_size": 2048,
+    "intermediate_size": 11008,
+    "max_position_embeddings": 128000,
+    "max_window_layers": 70,
+    "model_type": "qwen2_5_vl",
+    "num_attention_heads": 16,
+    "num_hidden_layers": 36,
+    "num_key_value_heads": 2,
+    "rms_norm_eps": 1e-06,
+    "rope_theta": 1000000.0,
+    "sliding_window": 32768,
+    "use_sliding_window": False,
+    "image_token_id": 151655,
+    "rope_scaling": {"type": "mrope", "mrope_section": [16, 24, 24]},
+    "vocab_size": 151936,
+    "vision_config": {
+        "depth": 32,
+        "hidden_size": 1280,
+        "in_chans": 3,
+        "num_heads": 16,
+        "out_hidden_size": 2048,
+        "spatial_patch_size": 14,
+        "window_size": 112,
+        "fullatt_block_indexes": [7, 15, 23, 31],
+        "tokens_per_second": 2,
+    },
+}
+"""As the hub has it."""
+
+
+def test_what_the_hub_and_older_versions_write_is_read(folder: Path) -> None:
+    short = {"hidden_size": 1280, "in_chans": 3, "model_type": "qwen2_5_vl"}
+    text = {**FLAT, "model_type": "qwen2_5_vl_text", "image_token_id": None}
+    text["rope_scaling"] = {"mrope_section": [16, 24, 24], "rope_type": "default"}
+    for document in (FLAT, FLAT | {"vision_config": short}, FLAT | {"text_config": text}):
+        (folder / CONFIG).write_text(json.dumps(document))
+        config = read_config(folder)
+        assert (config.text_config.hidden_size, config.text_config.num_hidden_layers) == (2048, 36)
+        assert config.vision_config.fullatt_block_indexes == (7, 15, 23, 31)
+        assert config.image_token_id == 151655
+    older = {"size": {"max_pixels": 12845056, "min_pixels": 3136}}
+    newer = {"size": {"longest_edge": 12845056, "shortest_edge": 3136}, "min_pixels": None}
+    for size in (older, newer):
+        _edit(folder / PIXELS, "size", size["size"])
+        read = read_preprocessor(folder).size
+        assert (read.shortest_edge, read.longest_edge) == (3136, 12845056)
