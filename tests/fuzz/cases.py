@@ -1,0 +1,233 @@
+"""A case: which thing, what is done to it, and which command reads it.
+
+A case is known by the suite's seed and its number alone. `make`, `run` and `judge` happen in a
+process of their own.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from random import Random
+
+import yaml
+
+from pipeline.store.metadata import note_metadata
+from stages.command import run
+from tests.fuzz import oracle
+from tests.fuzz.corpus import ARCHIVE, HEAD, LIMITS, REAL, RECORDINGS, STORE, params
+from tests.fuzz.hostile import CANARY, HOSTILE
+from tests.fuzz.mutations import Change, change_any, rewrite
+
+ROOT = Path(__file__).parents[2]
+_PARTS = {"read": "extract", "load": "evaluate", "limits": "rollout"}
+"""The parts of commands that read, which take a tenth of the time, and their commands."""
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A thing of the corpus."""
+
+    kind: str
+    """Its class in the table."""
+    place: str
+    """Where it lies in a case's folder, as in the corpus."""
+    stages: tuple[str, ...] = ("extract",)
+    """What reads it: each as often as it stands here."""
+    sets: dict[str, str] = field(default_factory=dict)
+    """What its command is told, where {} is its place, and {corpus} that of the corpus."""
+
+
+_HEAD = {"evaluate.checkpoint": "{}", "evaluate.store": f"{{corpus}}/{STORE}"}
+SUBJECTS = {
+    **{n: Subject("recordings", n, ("read",) * 3 + ("extract",)) for n in (*RECORDINGS, *REAL)},
+    "params": Subject("params", "params.yaml", sets={"extract.plan": "true"}),
+    "limits": Subject("params", "limits.yaml", ("limits",)),
+    "vlm": Subject("VLM folders", "vlm", sets={"vlm.checkpoint": "{}"}),
+    "adapter": Subject("adapters", "adapter", sets={"vlm.adapter": "{}"}),
+    "store": Subject("stores", STORE, ("verify", "verify", "train_head")),
+    "archive": Subject("archives", ARCHIVE, ("archive",), {"archive.restore": "true"}),
+    "head": Subject("trained heads", HEAD, ("load",) * 3 + ("evaluate",), _HEAD),
+}
+TURN = (
+    ["recordings"] * 9 + ["params"] * 3 + ["VLM folders"] * 2 + ["adapters"] * 2 + ["stores"] * 3
+) + (["archives"] + ["trained heads"] * 2 + ["hostile"] * 3)
+"""The classes of the cases, over and over."""
+CLASSES = tuple(dict.fromkeys(TURN))
+_BY_SHELL = {"params": 4, "archives": 5, "recordings": 1, "stores": 1, "trained heads": 1}
+"""How many cases of a class, its first, run as a user runs them: a dozen, which takes seconds."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One changed thing in a folder of its own, and the command that reads it."""
+
+    seed: int
+    number: int
+    corpus: Path
+    whole: tuple[str, str] | None = None
+    """The thing and the stage of a case in which nothing is changed."""
+    fault: Callable[[], object] = lambda: None
+    """What breaks the pipeline first."""
+    seconds: float = 10.0
+    """Of processor time that it may take; and six times as long by the clock."""
+
+    @cached_property
+    def rng(self) -> Random:
+        """Gives the same to whoever asks in the same order."""
+        return Random(f"{self.seed}-{self.number}")
+
+    @property
+    def kind(self) -> str:
+        """The class of the table."""
+        return TURN[self.number % len(TURN)]
+
+    @property
+    def turn(self) -> int:
+        """How many cases of its class come before it."""
+        rounds, place = divmod(self.number, len(TURN))
+        return rounds * TURN.count(self.kind) + TURN[:place].count(self.kind)
+
+    @cached_property
+    def thing(self) -> str:
+        """The name of what is changed; hostile changes come each in its turn."""
+        if self.whole:
+            return self.whole[0]
+        if self.kind == "hostile":
+            return HOSTILE[self.turn % len(HOSTILE)][0]
+        if self.by_shell and self.kind == "params":
+            return "params"  # there is no command for limits but one that has a robot
+        names = [n for n, s in SUBJECTS.items() if s.kind == self.kind and n not in REAL]
+        real = [name for name in REAL if (self.corpus / name).exists()]
+        return self.rng.choice(names + real * (self.kind == "recordings"))
+
+    @property
+    def subject(self) -> Subject:
+        """What is changed."""
+        return SUBJECTS[self.thing]
+
+    @property
+    def by_shell(self) -> bool:
+        """Whether the command runs as a user runs it."""
+        return not self.whole and self.turn < _BY_SHELL.get(self.kind, 0)
+
+    @cached_property
+    def stage(self) -> str:
+        """What reads it."""
+        stage = (
+            self.whole[1]
+            if self.whole
+            else Random(f"{self.seed}-{self.number}-stage").choice(self.subject.stages)
+        )
+        return _PARTS.get(stage, stage) if self.by_shell else stage
+
+    @property
+    def folder(self) -> Path:
+        """Where all of it lies, and where the command runs."""
+        return self.corpus.parent / f"case-{self.seed}-{self.number}"
+
+    @property
+    def place(self) -> Path:
+        """Where the thing lies."""
+        return self.folder / self.subject.place
+
+    @property
+    def baseline(self) -> Path:
+        """Where the result is kept that the thing gives as it is in the corpus."""
+        stage = "read" if self.subject.kind == "recordings" else self.stage
+        return self.corpus / f"{self.thing}-{stage}.baseline"
+
+    @property
+    def arguments(self) -> list[str]:
+        """The options of the command."""
+        words = {k: v.format(self.place, corpus=self.corpus) for k, v in self.subject.sets.items()}
+        options = [word for key in words for word in ("--set", f"{key}={words[key]}")]
+        return ["--params", str(self.folder / "params.yaml"), *options]
+
+    @property
+    def command(self) -> list[str]:
+        """As a user types it."""
+        return ["python", "-m", f"stages.{_PARTS.get(self.stage, self.stage)}", *self.arguments]
+
+    def make(self) -> Change:
+        """Lay the thing out as it is in the corpus, linked, and do to it what the number says."""
+        self.folder.mkdir(parents=True)
+        data = self.thing if self.subject.kind == "recordings" else "lerobot_images"
+        document = params(self.corpus, data, self.folder)
+        if data != self.thing:
+            document["data"]["root"] = str(self.corpus)
+        (self.folder / "params.yaml").write_text(yaml.safe_dump(document, sort_keys=False))
+        (self.folder / "limits.yaml").write_text(yaml.safe_dump(LIMITS))
+        if not self.place.exists():
+            source = self.corpus / self.subject.place
+            shutil.copytree(source, self.place, copy_function=os.link)
+        if self.whole:
+            return Change("nothing", self.place, "same")
+        if self.kind == "hostile":
+            _, pattern, what, act = HOSTILE[self.turn % len(HOSTILE)]
+            paths = sorted(path for path in self.folder.rglob(pattern) if path.is_file())
+            path = self.rng.choice(paths)
+            act(path)
+            permits = "plain" if what == "an AVI" else "refuse"
+            sound = self.subject.kind != "recordings" and what != "a terabyte"
+            return Change(what, path, permits, sound=sound)
+        change = change_any(self.rng, self.place, self.corpus / "other" / self.subject.place)
+        sealed = change.path.name in ("zarr.json", "policy.json") and change.path.is_file()
+        if sealed and self.rng.random() < 0.6:
+            with suppress(Exception):  # of what is no document any more
+                _seal(self.place, change.path)
+                return replace(change, what=f"{change.what}, with a digest that fits", sealed=True)
+        return change
+
+    def run(self) -> int:
+        """The exit code of the command, whose messages go to this process's stderr."""
+        if self.by_shell:
+            environment = os.environ | {"PYTHONPATH": str(ROOT)}
+            command = [sys.executable, *self.command[1:]]
+            return subprocess.run(command, env=environment, check=False).returncode
+        parts = {
+            "read": oracle.read_all,
+            "load": oracle.load_head,
+            "limits": lambda _: oracle.load_limits(self.place),
+        }
+        return run("", parts.get(self.stage, f"stages.{self.stage}"), self.arguments)
+
+    def judge(self, change: Change) -> str:
+        """After exit 0: what is not as the files have it; empty where all is right."""
+        if (self.folder / CANARY).exists():
+            return "code of the file was executed"
+        try:
+            return oracle.judge(self, change)
+        except Exception as error:  # whatever a plain reader stumbles over
+            return f"a plain reader refuses it: {type(error).__name__}: {error!s:.300}"
+
+
+def _seal(place: Path, path: Path) -> None:
+    """Give a changed document of a store, an archive or a head the digest of what it says now."""
+    if path.name == "zarr.json":
+        return note_metadata(place)
+    document = json.loads(path.read_bytes())
+    document.pop("document_sha256", None)
+    text = json.dumps(document, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    document["document_sha256"] = hashlib.sha256(text.encode()).hexdigest()
+    rewrite(path, json.dumps(document).encode())
+    return None
+
+
+def wholes(corpus: Path) -> list[Case]:
+    """Every thing of a corpus as it is, with every stage whose result is kept."""
+    pairs = [
+        (name, stage)
+        for name, subject in SUBJECTS.items()
+        if (corpus / subject.place).exists()
+        for stage in dict.fromkeys(subject.stages)
+        if subject.kind != "recordings" or stage == "read"
+    ]
+    return [Case(-1, number, corpus, pair) for number, pair in enumerate(pairs)]

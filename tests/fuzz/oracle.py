@@ -1,0 +1,295 @@
+"""What a command has read or made, and what it should have; and when a refusal is clear.
+
+What recordings and params say is read once more by a plain reader. What has digests of its own
+(stores, archives, heads) must come out as it was written. Features may be others where they are
+called by another name.
+"""
+
+import json
+import os
+import pickle
+import re
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import yaml
+import zarr
+from safetensors.numpy import load_file
+
+from pipeline.base.config import LimitsFile, load_params, load_section
+from pipeline.base.digests import ContentDigests, ledger_path
+from pipeline.extract.survey import check_episodes, sound_episodes, survey
+from pipeline.policy import checkpoint as checkpoints
+from pipeline.store import FeatureStore
+from pipeline.train.split import check_store
+from tests.fuzz import plain
+from tests.fuzz.corpus import HEAD, STORE
+from tests.fuzz.mutations import Change
+
+if TYPE_CHECKING:
+    from tests.fuzz.cases import Case
+
+read: Any = None
+"""What `read_all`, `load_head` or `load_limits` read in this process."""
+
+# --- the parts of commands that read -------------------------------------------------------------
+
+
+def read_all(params: Any, frames: bool = True) -> None:
+    """Survey and check recordings as extraction does, and then read all streams and all frames."""
+    global read
+    with closing(ContentDigests(ledger_path(params.extract.store))) as digests:
+        surveyed = survey(params, digests)
+        if surveyed.bad:
+            check_episodes(surveyed)
+        surveyed, _ = sound_episodes(surveyed, digests)
+    recordings = surveyed.recordings
+    read = {
+        recording.id.rpartition("/")[2]: _episode(recording, frames) for recording in recordings
+    }
+
+
+def _episode(recording: Any, frames: bool) -> plain.Episode:
+    episode: plain.Episode = {"instruction": recording.instruction}
+    for name in ("state", "sensor", "action"):
+        if (stream := getattr(recording, name)()) is not None:
+            episode |= {f"{name}.time": stream.time, f"{name}.values": stream.values}
+            channels = stream.channels
+            episode |= {f"{name}.names": channels.names, f"{name}.units": channels.units}
+    for view, camera in recording.cameras().items() if frames else ():
+        episode[f"frames.{view}"] = list(camera.read(range(len(camera.time))))
+        episode[f"frames.{view}.time"] = camera.time
+    return episode
+
+
+def load_head(params: Any) -> None:
+    """Load a head, as an evaluation begins."""
+    global read
+    folder = checkpoints.find_policy(params.evaluate.checkpoint)
+    checkpoint = checkpoints.load_policy(folder)
+    check_store(checkpoint, FeatureStore.open(params.evaluate.store))
+    weights = {name: tensor.numpy() for name, tensor in checkpoint.policy().state_dict().items()}
+    document = json.loads((folder / "policy.json").read_bytes())
+    digests = document["weights_sha256"], (document.get("golden") or {}).get("sha256")
+    said = json.loads(json.dumps(checkpoint.document(*digests)))
+    read = {"document": said, "weights": weights}
+
+
+def load_limits(path: Path) -> None:
+    """Load a file of limits."""
+    global read
+    read = json.loads(load_section(path, LimitsFile).model_dump_json())
+
+
+# --- what came out -------------------------------------------------------------------------------
+
+
+def result(case: "Case") -> Any:
+    """What a command that ended with 0 has read or made."""
+    match case.subject.kind, case.stage:
+        case _, "read" | "load" | "limits":
+            return read
+        case "params", _:
+            document = load_params(case.folder / "params.yaml").model_dump_json()
+            return json.loads(document.replace(str(case.folder), "CASE"))
+        case "stores", "train_head":
+            return load_file(case.folder / HEAD / "best/policy.safetensors")
+        case "trained heads", _:
+            return json.loads((case.folder / "evaluation/metrics.json").read_bytes())
+        case "recordings", _:  # without frames: no tick needs the last ones
+            read_all(load_params(case.folder / "params.yaml"), frames=False)
+            return read
+        case _:
+            return _arrays(case.folder / STORE)
+
+
+def _arrays(store: Path) -> dict[str, Any]:
+    """Every array of a store and what its attributes say, read by zarr alone."""
+    group: Any = zarr.open_group(store, mode="r")
+    members = group.members(max_depth=None)
+    kept = group.attrs.asdict()
+    for of_a_run in ("metadata_digest", "plan", "environment"):
+        kept.pop(of_a_run, None)
+    arrays = {path: array[:] for path, array in members if hasattr(array, "shape")}
+    return arrays | {"attributes": json.loads(json.dumps(kept))}
+
+
+# --- what should have come out -------------------------------------------------------------------
+
+
+def judge(case: "Case", change: Change) -> str:
+    """What is not as the files have it; empty where all is right."""
+    found = result(case)
+    if case.whole and not case.baseline.exists():
+        case.baseline.write_bytes(pickle.dumps(found))
+    before = pickle.loads(case.baseline.read_bytes())
+    if case.stage == "extract" and case.subject.kind == "recordings":
+        if why := _not_stored(found, case.folder / STORE):
+            return why
+        before = _without_frames(before)
+    why = difference(case, found, before)
+    unknown = case.subject.kind in ("VLM folders", "adapters")  # features, that nobody else knows
+    if not why and (unknown or not case.whole):
+        return ""
+    # A limit may be of a channel of any name; and of a data set, episodes whose files are not
+    # there are told and passed over, whatever stands in the place of a file.
+    told = case.thing.startswith("lerobot") and change.path.suffix in (".parquet", ".mp4")
+    excepted = case.thing == "limits" or (told and not change.path.is_file())
+    if why and change.permits in ("same", "refuse") and not excepted:
+        return f"gave other data than before: {why}"
+    return _as_it_stands(case, found, before, change, why)
+
+
+def difference(case: "Case", found: Any, before: Any) -> str:
+    """The first place at which two results differ; empty where they do not."""
+    if case.subject.kind == "recordings":
+        return plain.difference(found, before)
+    if case.subject.kind in ("VLM folders", "adapters"):  # their digest is of the bytes of files
+        return differ("features", before["vl/features"], found["vl/features"])
+    return differ("", before, found)
+
+
+def _as_it_stands(case: "Case", found: Any, before: Any, change: Change, why: str) -> str:
+    """What differs from what the files of a case say, read plainly."""
+    strange = f"{change.key} is of a strange type and was taken" * (change.permits == "type")
+    match case.subject.kind:
+        case "params":
+            document = yaml.load(case.place.read_bytes(), _Undated)
+            text = json.dumps(document, default=bytes.decode)
+            return differ(
+                "", json.loads(text.replace(str(case.folder), "CASE")), found, partly=True
+            )
+        case "VLM folders" | "adapters":
+            if not np.isfinite(found["vl/features"]).all():
+                return "features are not finite"
+            digests = [one["attributes"]["feature_spec"]["digest"] for one in (found, before)]
+            if digests[0] == digests[1]:
+                return "other features go by the same name"
+            if change.path.suffix == ".json" and change.path.is_file():
+                plain.json_object(change.path.read_bytes())
+            return strange
+        case "trained heads" if change.sealed and case.stage == "load":
+            said = plain.json_object((case.place / "best/policy.json").read_bytes())
+            del said["document_sha256"]
+            for of_a_run in ("feed", "loggers", "scratch"):
+                said["params"]["train_head"].pop(of_a_run, None)
+            return differ("", said, found["document"], partly=True)
+        case "recordings" if case.thing != "real_new":  # whose windows overlap
+            there = plain.recording(case.thing, case.place)
+            there = _without_frames(there) if case.stage == "extract" else there
+            return plain.difference(found, there)
+        case "recordings":
+            return ""
+        case _:  # a sealed document may say something else, but nothing of another type
+            return strange if change.sealed else why
+
+
+def _without_frames(episodes: dict[str, plain.Episode]) -> dict[str, plain.Episode]:
+    return {
+        name: {key: value for key, value in episode.items() if not key.startswith("frames.")}
+        for name, episode in episodes.items()
+    }
+
+
+def _not_stored(episodes: dict[str, plain.Episode], store: Path) -> str:
+    """The first stream of which a store has other readings than recordings."""
+    group: Any = zarr.open_group(store, mode="r")
+    for key in ("state.values", "sensor.values"):
+        rows = [episode[key] for episode in episodes.values() if key in episode]
+        given = np.concatenate(rows).astype(np.float32) if rows else np.zeros((0, 0), np.float32)
+        if not np.array_equal(group[key.replace(".", "/")][:].reshape(given.shape), given):
+            return f"the store has another {key}"
+    return ""
+
+
+class _Undated(yaml.SafeLoader):
+    """YAML in which a date is a text, as no key holds a date."""
+
+
+_Undated.add_constructor("tag:yaml.org,2002:timestamp", yaml.SafeLoader.construct_yaml_str)
+
+
+def differ(where: str, said: Any, taken: Any, partly: bool = False) -> str:
+    """The first place at which two documents of objects, lists, arrays and values differ.
+
+    `partly`: what was taken may have more keys, and values where nothing was said.
+    """
+    if partly and said is None:
+        return ""
+    if isinstance(said, np.ndarray):
+        same = said.shape == np.shape(taken) and np.array_equal(said, taken, equal_nan=True)
+        return "" if same else f"{where} holds other numbers"
+    if isinstance(said, dict) and isinstance(taken, dict):
+        keys = said if partly else {**said, **taken}
+        strange = [key for key in keys if (key in said) != (key in taken)]
+        if strange := [key for key in strange if not partly or key != "zz_nobody_knows"]:
+            return f"{where}.{strange[0]} was taken, or was said, but not both"
+        pairs = {key: (said[key], taken[key]) for key in keys if key in taken}
+    elif isinstance(said, list | tuple) and isinstance(taken, list | tuple):
+        if len(said) != len(taken):
+            return f"{where}: {len(taken)} of {len(said)} entries were taken"
+        pairs = dict(enumerate(zip(said, taken, strict=True)))
+    else:
+        if partly and isinstance(said, str) and "/" in said:
+            said = os.path.normpath(said)
+        numbers = (int, float)
+        alike = type(said) is type(taken) or (type(said) in numbers and type(taken) in numbers)
+        same = alike and (said == taken or said != said)
+        return "" if same else f"{where}: {said!r:.80} was taken as {taken!r:.80}"
+    wrong = (differ(f"{where}.{key}", *pair, partly) for key, pair in pairs.items())
+    return next(filter(None, wrong), "")
+
+
+# --- when a refusal is clear ---------------------------------------------------------------------
+
+MOST = 2000
+"""Characters of a message; params list every problem, by contract."""
+MOST_OF_PARAMS = 5000
+MEND = re.compile(
+    r"(?:^|[.;:,)]\s+|\(|\n\s*|\b(?:or|and|then|please|to) )"
+    r"(add|copy|correct|convert|choose|cut|delete|download|drop|export|extract|free|give|have|keep|"
+    r"leave|look|make|mend|move|name|pass|pick|put|read|remove|rename|replace|re-?run|restore|run|"
+    r"save|say|set|sort|split|take|train|try|turn|unpack|upgrade|use|wait|write)\b",
+    re.IGNORECASE,
+)
+"""A sentence that begins with what to do, in the imperative."""
+FOREIGN = re.compile(
+    r"Traceback|(Error|Exception)\(|MemoryError|object at 0x|<class '|allow_pickle|above report|"
+    r"trust_remote_code|weights_only|errors\.pydantic\.dev|NoneType"
+)
+"""What speaks of the code and not of the file, or advises to open it unsafely."""
+
+
+def unclear(stderr: str, change: Change, case: "Case") -> str:
+    """What a message lacks; empty where it is clear: one that names the file and what to do."""
+    text = stderr.strip()
+    if not text.startswith("error: ") or len(re.findall(r"^error: ", text, re.MULTILINE)) != 1:
+        return "not one message that begins with `error: `"
+    if len(text) > (MOST_OF_PARAMS if case.subject.kind == "params" else MOST):
+        return f"{len(text)} characters"
+    if strange := FOREIGN.search(text):
+        return f"speaks of {strange[0]}"
+    if not MEND.search(text.removeprefix("error: ")):
+        return "does not say what to do"
+    return "" if _names(text, change, case) else f"does not name {change.path.name}"
+
+
+def _names(text: str, change: Change, case: "Case") -> bool:
+    """Whether a message names the changed file.
+
+    Of a file that is still one of its kind, it may name another file of the same thing, which the
+    first contradicts; of a store's file the folder of its array; of params the key alone.
+    """
+    name = change.path.name.encode("utf-8", "backslashreplace").decode()
+    if (len(name) > 1 and name in text) or repr(change.path.name)[1:-1] in text.split("/"):
+        return True
+    match case.subject.kind:
+        case "params":
+            return bool(change.key) and any(part in text for part in change.key.split("."))
+        case "stores" | "archives":
+            above = [path for path in change.path.parents if path.is_relative_to(case.place)]
+            return any(str(path) in text for path in above if path != case.place)
+        case _:
+            return change.sound and case.place.name in text

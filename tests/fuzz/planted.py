@@ -1,0 +1,127 @@
+"""Faults planted in the pipeline, one for each way in which a case can end wrongly.
+
+A suite that cannot fail is worth nothing: each of them must be reported in its column.
+"""
+
+import ctypes
+import os
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import pipeline.base.config.sections as sections
+import pipeline.policy.checkpoint as checkpoint
+import stages.verify
+from pipeline.base.errors import CheckpointIncomplete
+from pipeline.data.jpeg import JpegCamera
+from pipeline.data.raw import RawRecording
+from pipeline.policy.policy import Policy
+from tests.fuzz.cases import Case
+from tests.fuzz.mutations import rewrite
+from tests.fuzz.runner import run_cases
+
+
+def unreported(corpus: Path, jobs: int) -> list[str]:
+    """The planted faults that the suite does not report in their column."""
+    cases = [
+        Case(-2, number, corpus, WHOLES[whole], plant, seconds=2.0)
+        for number, (whole, _, plant) in enumerate(FAULTS.values())
+    ]
+    expected = [f"{name}: expected {outcome}" for name, (_, outcome, _) in FAULTS.items()]
+    return [
+        f"{expected[verdict.case.number]}, found {verdict}"
+        for verdict in run_cases(cases, jobs)
+        if not expected[verdict.case.number].endswith(f" {verdict.outcome}")
+    ]
+
+
+def _plant(owner: Any, name: str, make: Callable[[Any], Callable[..., Any]]) -> Callable[[], None]:
+    """What puts a function, made of the one that is there, in its place."""
+    return lambda: setattr(owner, name, make(getattr(owner, name)))
+
+
+def _sensor(work: Callable[[Any], Any]) -> Callable[[], None]:
+    """Put something in the place of what reads the sensor of a raw recording."""
+    return _plant(RawRecording, "sensor", lambda read: lambda recording: work(read(recording)))
+
+
+def _refuse(message: str) -> Callable[[], None]:
+    """Have every head refused so."""
+
+    def refuse(folder: Path) -> Any:
+        raise CheckpointIncomplete(message)
+
+    return _plant(checkpoint, "load_policy", lambda load: refuse)
+
+
+def _raise(stream: Any) -> Any:
+    raise KeyError("forces")
+
+
+def _spin(stream: Any) -> Any:
+    while True:
+        time.thread_time()
+
+
+def _blind(verify: Any) -> Any:
+    """A store with a damaged chunk, and a check that looks at no chunk."""
+
+    def check(path: Path, *arguments: Any) -> Any:
+        chunk = path / "tick/action/c/0/0"
+        rewrite(chunk, bytes([1]) + chunk.read_bytes()[1:])
+        return replace(verify(path, *arguments), issues=())
+
+    return check
+
+
+def _altered(load: Any) -> Any:
+    """Weights that are not those of the file."""
+    more = lambda weights: {name: tensor + 1 for name, tensor in weights.items()}  # noqa: E731
+    return lambda policy, weights: load(policy, more(weights))
+
+
+def _reread(check: Any) -> Any:
+    """A number of params that is taken for another."""
+    data = {"vlm_reuse_count": 2}
+    return lambda document: check({**document, "data": {**document["data"], **data}})
+
+
+WHOLES = {
+    "raw": ("raw", "read"),
+    "store": ("store", "verify"),
+    "head": ("head", "load"),
+    "params": ("params", "extract"),
+}
+FAULTS: dict[str, tuple[str, str, Callable[[], object]]] = {
+    "a sensor of zeros": ("raw", "wrong", _sensor(lambda s: replace(s, values=0 * s.values))),
+    "a clock that is late": ("raw", "wrong", _sensor(lambda s: replace(s, time=s.time + 0.001))),
+    "a sensor that is passed over": ("raw", "wrong", _sensor(lambda stream: None)),
+    "the first frame in the place of all": (
+        "raw",
+        "wrong",
+        _plant(
+            JpegCamera, "read", lambda read: lambda camera, rows: read(camera, [0 for _ in rows])
+        ),
+    ),
+    "a blind check of a store": ("store", "wrong", _plant(stages.verify, "verify", _blind)),
+    "weights of another head": ("head", "wrong", _plant(Policy, "load_state_dict", _altered)),
+    "params that nobody wrote": (
+        "params",
+        "wrong",
+        _plant(sections.Params, "model_validate", _reread),
+    ),
+    "a KeyError": ("raw", "traceback", _sensor(_raise)),
+    "a loop": ("raw", "hang", _sensor(_spin)),
+    "a segmentation fault": ("raw", "crash", _sensor(lambda stream: ctypes.string_at(0))),
+    "an exit without a word": ("raw", "crash", _sensor(lambda stream: os._exit(3))),
+    "3 GiB": ("raw", "over memory", _sensor(lambda stream: np.ones(3 * 2**27))),
+    "a refusal without a mend": ("head", "unclear", _refuse("head: something is wrong.")),
+    "a refusal without a file": ("head", "unclear", _refuse("it is wrong. Copy it again.")),
+    "a refusal of the code": ("head", "unclear", _refuse("head: KeyError('a'). Copy it.")),
+    "a refusal of a novel": ("head", "unclear", _refuse("head: no. Copy it. " * 200)),
+}
+"""By name: which thing, in which column it must be reported, and what breaks the pipeline."""

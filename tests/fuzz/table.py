@@ -1,0 +1,108 @@
+"""Break files of every kind, run commands on them, and write the table of how that ended.
+
+python -m tests.fuzz.table --cases 10000 --seed 1 --write    into docs/data/errors.md
+python -m tests.fuzz.table --seed 1 --case 77 --corpus DIR   one case; keeps its folder beside DIR
+
+How it works:
+1. corpus.py writes one small thing of every kind that commands read: recordings of each format, a
+   checkpoint, an adapter, a store, its archive, a head, params and limits.
+2. cases.py chooses, by the seed and the case's number alone: a thing, what is done to it, and the
+   command that reads it. The thing is laid into a folder of its own, in hard links.
+3. mutations.py has what chance does to a file, by the kind of file; hostile.py, what somebody would
+   write on purpose. Each change says what may come of it where the command ends with 0.
+4. runner.py forks a process for each case from one that has imported everything, and limits it to
+   10 s and 2 GiB. The first cases of a class run as a user runs them instead, by the shell.
+5. oracle.py judges. After exit 0, what was read must be as before, or what plain.py finds in the
+   files, which reads each format once more in a few lines and uses nothing of the project. After
+   exit 2, one message must name the file and say what to do. Whatever else happens is a failure.
+6. planted.py breaks the pipeline in every way that the table has a column for: a suite that cannot
+   fail is worth nothing. And whatever lies in the corpus must first be right as it is.
+"""
+
+import os
+
+os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+os.environ |= {"TOKENIZERS_PARALLELISM": "false", "HF_HUB_OFFLINE": "1"}
+
+import argparse
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+from tests.fuzz.cases import CLASSES, Case, wholes
+from tests.fuzz.corpus import write_corpus
+from tests.fuzz.planted import unreported
+from tests.fuzz.runner import OUTCOMES, Verdict, in_child, run_cases, warm
+
+PAGE = Path(__file__).parents[2] / "docs/data/errors.md"
+BEGIN, END = "<!-- fuzz table: begin -->", "<!-- fuzz table: end -->"
+HEADS = ("exit 0, right", "exit 2, clear", *OUTCOMES[2:-1], "silently wrong")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Exit 1 where a case ended in another way than the rule allows."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--cases", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--case", type=int, help="run this one alone")
+    parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1))
+    parser.add_argument("--corpus", type=Path, help="where it is, or is to be made and kept")
+    parser.add_argument("--real", type=Path, help="where real recordings are")
+    parser.add_argument("--planted", action="store_true", help="first see that faults are reported")
+    parser.add_argument("--write", action="store_true", help="put the table into the page")
+    options = parser.parse_args(arguments)
+    with tempfile.TemporaryDirectory(prefix="fuzz-") as folder:
+        corpus = (options.corpus or Path(folder) / "corpus").absolute()
+        prepare(corpus, options.real, options.jobs)
+        if options.planted and (missed := unreported(corpus, options.jobs)):
+            print("planted, and not reported:", *missed, sep="\n  ", file=sys.stderr)
+            return 1
+        numbers = range(options.cases) if options.case is None else [options.case]
+        cases = [Case(options.seed, number, corpus) for number in numbers]
+        verdicts = []
+        for verdict in run_cases(cases, options.jobs, keep=options.case is not None):
+            verdicts.append(verdict)
+            if options.case is not None or not verdict.good:
+                print(verdict, file=sys.stderr, flush=True)
+    table = rows(verdicts)
+    print("\n".join(table))
+    if options.write:
+        put(table, f"--cases {options.cases} --seed {options.seed} --write")
+    return not all(verdict.good for verdict in verdicts)
+
+
+def prepare(corpus: Path, real: Path | None, jobs: int) -> None:
+    """Import, write the corpus where it is not there, and see that it is read rightly as it is."""
+    warm()
+    if not (corpus / "ready").exists():
+        in_child(lambda: write_corpus(corpus, real))
+        wrong = [str(v) for v in run_cases(wholes(corpus), jobs) if v.outcome != "right"]
+        assert not wrong, "\n".join(["what is as it was written is not read rightly:", *wrong])
+        (corpus / "ready").touch()
+
+
+def rows(verdicts: Sequence[Verdict]) -> list[str]:
+    """The table in Markdown."""
+    counts = Counter((verdict.case.kind, verdict.outcome) for verdict in verdicts)
+    lines = [f"| | tried | {' | '.join(HEADS)} |", f"|---|{'---:|' * (len(HEADS) + 1)}"]
+    for kind in (*CLASSES, "all"):
+        kinds = CLASSES if kind == "all" else (kind,)
+        numbers = [sum(counts[one, outcome] for one in kinds) for outcome in OUTCOMES]
+        lines.append(f"| {kind} | {sum(numbers)} | {' | '.join(map(str, numbers))} |")
+    return lines
+
+
+def put(table: Sequence[str], options: str) -> None:
+    """Write the table into the page, between its marks."""
+    before, _, rest = PAGE.read_text("utf-8").partition(BEGIN)
+    told = f"`python -m tests.fuzz.table {options}` made this table."
+    text = "\n".join([BEGIN, told, "", *table, END])
+    PAGE.write_text(f"{before}{text}{rest.partition(END)[2]}", "utf-8")
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

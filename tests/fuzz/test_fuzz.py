@@ -1,0 +1,42 @@
+"""Whatever is done to a file, a command gives the right data or says what to do."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.fuzz.table import BEGIN, CLASSES, END, HEADS, PAGE
+
+ROOT = Path(__file__).parents[2]
+
+
+def run_suite(*options: str) -> None:
+    """Run the suite in a process that can fork: this one has threads."""
+    command = [sys.executable, "-m", "tests.fuzz.table", *options]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, f"{done.stderr[-20_000:]}\n{done.stdout[-2_000:]}"
+
+
+def test_two_hundred_cases_and_faults_that_are_planted() -> None:
+    run_suite("--cases", "200", "--planted")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(4 * 3600)
+def test_ten_thousand_cases() -> None:
+    run_suite("--cases", "10000", "--seed", "1")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_real_recordings(shared_data: Path) -> None:
+    run_suite("--cases", "1000", "--seed", "2", "--real", str(shared_data))
+
+
+def test_the_page_shows_nothing_but_what_is_right_or_clear() -> None:
+    table = PAGE.read_text("utf-8").partition(BEGIN)[2].partition(END)[0]
+    lines = [line.strip("| ").split(" | ") for line in table.splitlines() if line.startswith("|")]
+    assert [line[0] for line in lines[2:]] == [*CLASSES, "all"]
+    wrong = {line[0]: line[4:] for line in lines[2:] if {*line[4:]} != {"0"}}
+    assert not wrong, f"{HEADS[2:]}: {wrong}"
