@@ -295,7 +295,7 @@ class TestStructure:
         [
             ("zarr.json", lambda at: at.pop("sources"), "sources: missing"),
             ("zarr.json", lambda at: at.update(streams=[]), "streams: expected"),
-            ("zarr.json", lambda at: at["streams"]["action"]["names"].pop(), "4 names, but 5 units"),
+            ("zarr.json", lambda at: at["streams"]["action"]["names"].pop(), "4 names, but 5"),
             ("zarr.json", lambda at: at.update(action_hz=11), "were changed"),
             ("vl/zarr.json", lambda at: at.clear(), "were changed"),
         ],
