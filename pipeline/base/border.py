@@ -30,7 +30,7 @@ MOST_BYTES = 32 * 2**20
 Text = Annotated[str, Field(max_length=10_000, pattern=r"^[^\x00]*$")]
 """A name, a path or an instruction: bounded, and without NUL, which no file system takes."""
 _WEIGHTS = {b",": 1, b":": 8, b"[": 8, b"{": 8}
-_MOST_WEIGHT = 4_000_000
+MOST_WEIGHT = 4_000_000
 """Of a document, by what its parts take: pydantic keeps what it refuses once for each problem, so
 that a model of a dozen fields can hold some 1.5 GB. A tokenizer's weighs 3 million."""
 _WORDS = {
@@ -95,12 +95,14 @@ class Border:
         """The JSON document of a file, as the model; it is not followed deeper than 200 levels."""
         return self.parse_json(self.read_bytes(path, most), model, path)
 
-    def parse_json(self, text: bytes | str, model: type[T], where: Path | str) -> T:
-        """The JSON document of a text, as `read_json`."""
+    def parse_json(
+        self, text: bytes | str, model: type[T], where: Path | str, most: int = MOST_WEIGHT
+    ) -> T:
+        """The JSON document of a text of at most that weight, as `read_json`."""
         raw = text.encode("utf-8", "surrogatepass") if isinstance(text, str) else text
         weight = sum(much * raw.count(mark) for mark, much in _WEIGHTS.items())
-        if weight > _MOST_WEIGHT:
-            why = f"expected a document of weight {_MOST_WEIGHT:,} (a value 1, a key or a list 8)"
+        if weight > most:
+            why = f"expected a document of weight {most:,} (a value 1, a key or a list 8)"
             raise self.refusal(where, f"{why}, found {weight:,}")
         collects = gc.isenabled()
         gc.disable()  # it would walk over what is parsed again and again, for most of the time
@@ -140,8 +142,12 @@ class Border:
             panic = type(error).__name__ == "PanicException"  # of a library in Rust: no `Exception`
             if isinstance(error, PipelineError) or not (panic or isinstance(error, Exception)):
                 raise
-            said = getattr(error, "strerror", None) or f"{type(error).__name__}: {error}"
-            said = "not enough memory for it" if isinstance(error, MemoryError) else said
+            if isinstance(error, MemoryError):
+                mend = "Free memory, take a machine with more of it, or leave this out."
+                why = f"{what}: not enough memory for it"
+                raise Border(self.error, mend).refusal(where, why) from error
+            raised = str(error).removeprefix("Error(s) in ")  # torch's, of several
+            said = getattr(error, "strerror", None) or f"{type(error).__name__}: {raised}"
             why = re.sub(r"<class '(\w+)'>", r"\1", f"{what}: {' '.join(str(said).split()):.300}")
             raise self.refusal(where, why.encode("utf-8", "backslashreplace").decode()) from error
 

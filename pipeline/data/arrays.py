@@ -130,8 +130,8 @@ def read_csv(path: Path, columns: Sequence[str]) -> NDArray[np.float64]:
     for line, row in lines:
         _check_width(path, line, row, header)
         try:
-            # Python's own way to write thousands is no number in a table.
-            table.extend(float(row[place].replace("_", "?")) for place in places)
+            # Python's own way to write thousands, and digits of other scripts, are none in a table.
+            table.extend(float(row[place].replace("_", "?").encode("ascii")) for place in places)
         except ValueError:
             column = len(table) % len(columns)
             raise RecordingError(

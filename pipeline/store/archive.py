@@ -173,9 +173,10 @@ def read_manifest(path: Path) -> Manifest:
     """
     document = _manifest_document(path)
     if document is None:
+        found = f"no manifest in its {_ZARR_JSON}" if path.exists() else "nothing"
         raise StoreMismatch(
-            f"{path}: expected an archive, found {'something else' if path.exists() else 'nothing'}"
-            ". Name one with archive.output, or make it with stages.archive."
+            f"{path}: expected an archive, found {found}. Name one with archive.output, or make it "
+            "with stages.archive."
         )
     if document.get("schema") != _SCHEMA:
         raise StoreMismatch(
@@ -416,8 +417,11 @@ def _check_shard(shard: Path, array: "zarr.Array[Any]") -> None:
     if not shard.exists():
         return  # of zeros
     assert array.shards is not None, "an archive is sharded"
-    whole, size = math.prod(array.chunks) * array.dtype.itemsize, _BORDER.check_file(shard)
-    pieces = array.shards[0] // array.chunks[0]
+    whole, pieces = (
+        math.prod(array.chunks) * array.dtype.itemsize,
+        array.shards[0] // array.chunks[0],
+    )
+    size = _BORDER.check_file(shard, (pieces + 1) * (whole + 64))  # zarr reads it whole
     with shard.open("rb") as file:
         file.seek(max(0, size - 16 * pieces - 4))
         index = np.frombuffer(file.read(16 * pieces), "<u8", min(size, 16 * pieces) // 16 * 2)

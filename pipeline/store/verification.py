@@ -289,16 +289,16 @@ def strange_files(
 def _strange_to_zarr(root: Path, issues: Sequence[Issue]) -> Iterator[Issue]:
     """Documents that zarr itself cannot open, where nothing else is said of them.
 
-    Each alone, out of memory: beside it may lie one that is a pipe, for whose end zarr would wait.
+    Each alone in a group: beside it may lie one that is a pipe, for whose end zarr would wait.
     """
     known = " ".join(f"{issue.file} {issue.message}" for issue in issues)
     border = store_border(root)
     for document in sorted(path for path in root.rglob("zarr.json") if str(path) not in known):
         try:
-            alone = MemoryStore({document.name: cpu.Buffer.from_bytes(border.read_bytes(document))})
+            raw = cpu.Buffer.from_bytes(border.read_bytes(document))
             with border.foreign(document, "zarr cannot open it"):
-                if isinstance(node := zarr.open(alone, mode="r"), zarr.Group):
-                    _ = [*node.members()]  # of what it holds beside its own
+                node = zarr.open_group(MemoryStore({"its/zarr.json": raw}), mode="a")["its"]
+                _ = isinstance(node, zarr.Group) and [*node.members()]  # of what it says itself
         except StoreIncomplete as error:
             yield _metadata_issue(root, str(error))
 

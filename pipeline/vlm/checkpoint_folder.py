@@ -36,6 +36,9 @@ _DTYPES = {"F32", "F16", "BF16"}
 
 _INDEX = "model.safetensors.index.json"
 
+_LOADED = re.compile(r"config|token|vocab|merges|template|index")
+"""In the names of what transformers reads; a trainer leaves others, of any size."""
+
 _QUANTIZED = "quantization_config"
 _REFUSED = {
     "auto_map": "",
@@ -240,7 +243,9 @@ class _AdapterConfig(Document):
     """adapter_config.json; what peft would import, open or go on with for ever is refused."""
 
     r: _Count = 8
-    rank_pattern: dict[Text, _Count] | None = None
+    rank_pattern: dict[Text, _Count] = Field(default_factory=dict)
+    alpha_pattern: dict[Text, int | float] = Field(default_factory=dict)
+    bias: Literal["none", "all", "lora_only"] = "none"
     # So short that `pissa_niter_` has three digits.
     init_lora_weights: bool | Annotated[str, Field(max_length=15)] | None = True
     loftq_config: dict[Text, Annotated[int, Field(le=100)]] | None = None
@@ -331,8 +336,9 @@ def check_tokenizer(folder: Path) -> None:
                 raise VLMS.refusal(where, f"expected Qwen2's pattern, found {shown(pattern)}")
     else:
         where, vocab = folder / "merges.txt", VLMS.read_json(folder / "vocab.json", dict[str, int])
-        lines = VLMS.read_bytes(where).splitlines()
-        model = _BPE(vocab=vocab, merges=[line for line in lines if line[:1] not in b"#"])
+        lines = filter(bytes.strip, VLMS.read_bytes(where).splitlines())
+        merges = [line for line in lines if not line.startswith(b"#version:")]
+        model = _BPE(vocab=vocab, merges=merges)
     # A merge makes each token of several characters, but for the control tokens.
     made = sum(len(token) > 1 and token[0] + token[-1] != "<>" for token in model.vocab)
     if len(model.merges) < made:
@@ -353,12 +359,12 @@ def read_config(folder: Path) -> VLMConfig:
 def small_files(folder: Path) -> list[Path]:
     """Every document, template and text of a folder, sorted.
 
-    Raises `VLMError` for what is no file, is too large, or cannot be read as JSON.
+    Raises `VLMError` for what is no file, or one for transformers that is too large.
     """
     beside = (*folder.glob("*"), *folder.glob("additional_chat_templates/*"))
     files = sorted(path for path in beside if path.suffix in (".json", ".jinja", ".txt"))
     for path in files:
-        VLMS.check_file(path, MOST_BYTES)
+        VLMS.check_file(path, MOST_BYTES if _LOADED.search(path.name) else None)
     return files
 
 
@@ -465,7 +471,7 @@ def adapter_files(folder: Path) -> list[Path]:
     _refuse_code(folder, ADAPTERS)
     shapes = tensor_shapes(files, ADAPTERS)
     widest = max((size for shape in shapes.values() for size in shape), default=0)
-    if (rank := max([config.r, *(config.rank_pattern or {}).values()])) > widest:
+    if (rank := max([config.r, *config.rank_pattern.values()])) > widest:
         why = f"expected a rank of at most the widest tensor of its weights, {widest}, found {rank}"
         raise ADAPTERS.refusal(files[0], why)
     document = ADAPTERS.read_json(files[0], dict[str, JsonValue])

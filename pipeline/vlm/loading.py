@@ -29,6 +29,7 @@ from pipeline.vlm.vision import tower_attention
 
 _UNUSED = {"lm_head.weight"}
 """Weights that a feature never meets: a checkpoint may lack them."""
+_ADAPTER_FILES = "adapter_model.safetensors and adapter_config.json"
 
 
 def load_model(vlm: VLMParams, layers: int, device: torch.device) -> Any:
@@ -117,16 +118,17 @@ def load_checkpoint(vlm: VLMParams, device: torch.device, dtype: str | None = No
             "vlm.attention flash_attention_2 needs CUDA and a half-precision vlm.dtype, found "
             f"{device.type} and {vlm.dtype}. Set vlm.attention to auto."
         )
-    with quiet_transformers(), VLMS.foreign(folder, "cannot be loaded as Qwen2.5-VL"):
+    what = "cannot be loaded as Qwen2.5-VL"
+    with quiet_transformers(), VLMS.foreign(folder, what), torch.device("meta"):
         config = Qwen2_5_VLConfig.from_pretrained(folder, trust_remote_code=False)
-        with torch.device("meta"):
-            empty: Any = Qwen2_5_VLForConditionalGeneration(config)
-        expected, shapes = empty.model.state_dict().values(), tensor_shapes(files)
-        numbers = sum(tensor.numel() for tensor in expected)
-        held = sum(prod(shape) for name, shape in shapes.items() if name not in _UNUSED)
-        if numbers > 2 * held:  # before transformers takes memory for them
-            why = f"expected {numbers:,} numbers in the weights by config.json, found {held:,}"
-            raise VLMS.refusal(folder, why)
+        empty: Any = Qwen2_5_VLForConditionalGeneration(config)
+    numbers = sum(tensor.numel() for tensor in empty.model.state_dict().values())
+    shapes = tensor_shapes(files)
+    held = sum(prod(shape) for name, shape in shapes.items() if name not in _UNUSED)
+    if numbers > 2 * held:  # before transformers takes memory for them
+        why = f"expected {numbers:,} numbers in the weights by config.json, found {held:,}"
+        raise VLMS.refusal(folder, why)
+    with quiet_transformers(), VLMS.foreign(folder, what):
         loaded: Any = Qwen2_5_VLForConditionalGeneration.from_pretrained(
             folder,
             config=config,
@@ -139,7 +141,7 @@ def load_checkpoint(vlm: VLMParams, device: torch.device, dtype: str | None = No
         )
     model, report = loaded
     missing, unexpected = set(report["missing_keys"]) - _UNUSED, set(report["unexpected_keys"])
-    _refuse_strange(folder, missing, unexpected, "*.safetensors and config.json")
+    _refuse_strange(folder, missing, unexpected, f"{files[-1].name} and config.json")
     for name, found, wanted in report["mismatched_keys"]:
         why = f"expected {name} of {list(wanted)} by config.json, found {list(found)}"
         raise VLMS.refusal(folder, why)
@@ -159,7 +161,7 @@ def adapted(whole: Any, vlm: VLMParams, dropout: float | None = None) -> Any:
     assert vlm.adapter is not None, "no adapter to load"
     folder = resolve_checkpoint(vlm.adapter, setting="vlm.adapter")
     adapter_files(folder)
-    what = f"this adapter does not fit the checkpoint {vlm.checkpoint}"
+    what = f"{_ADAPTER_FILES} hold what does not fit the checkpoint {vlm.checkpoint}"
     with warnings.catch_warnings(), ADAPTERS.foreign(folder, what):
         # peft only warns of missing weights; the report of a second load is checked instead.
         warnings.simplefilter("ignore")
@@ -171,8 +173,8 @@ def adapted(whole: Any, vlm: VLMParams, dropout: float | None = None) -> Any:
             whole, str(folder), config=config, is_trainable=learns
         )
         report = adapting.load_adapter(str(folder), adapter_name="default", is_trainable=learns)
-    files, unexpected = "adapter_model.safetensors and adapter_config.json", report.unexpected_keys
-    _refuse_strange(folder, set(report.missing_keys), set(unexpected), files)
+    unexpected = set(report.unexpected_keys)
+    _refuse_strange(folder, set(report.missing_keys), unexpected, _ADAPTER_FILES)
     if not hasattr(adapting, "merge_and_unload"):
         raise ADAPTERS.refusal(folder, f"a {config.peft_type} adapter cannot be merged")
     return adapting

@@ -88,10 +88,8 @@ class PromptRenderer:
             raise PROMPTS.refusal(shown(instruction), why)
         rendered = text.count(self._image_token)
         if rendered != images:
-            raise VLMError(
-                f"{self._folder}: the chat template renders {rendered} of {images} images as "
-                f"{self._image_token}. Expected the template of a Qwen2.5-VL checkpoint."
-            )
+            why = f"the chat template renders {rendered} of {images} images as {self._image_token}"
+            raise VLMS.refusal(self._folder, why)
         return text
 
     def tokenize(self, text: str) -> list[int]:
@@ -140,10 +138,11 @@ class PromptRenderer:
 
     def _check_vocabulary(self, rows: int) -> None:
         if self._image_token not in self._specials or len(self._tokenizer) > rows:
-            raise VLMError(
-                f"{self._folder}: the tokenizer is another checkpoint's: it reads config.json's "
-                f"image_token_id {self.image_token_id} as {self._image_token!r}, and has "
-                f"{len(self._tokenizer)} tokens of a vocabulary of {rows}"
+            raise VLMS.refusal(
+                self._folder,
+                "the tokenizer is another checkpoint's: it reads config.json's image_token_id "
+                f"{self.image_token_id} as {self._image_token!r}, and has {len(self._tokenizer)} "
+                f"tokens of a vocabulary of {rows}",
             )
 
     def _find_chat_template(self) -> str:

@@ -12,6 +12,7 @@ import torch
 
 from pipeline.base.durable import (
     KEPT,
+    check_digest,
     fresh,
     put_in_place,
     read_document,
@@ -209,6 +210,16 @@ def test_a_damaged_document_is_named(tmp_path: Path, content: str) -> None:
         read_document(path, dict)[1]
 
 
+def test_only_a_document_with_its_digest_may_be_as_long_as_a_long_run(tmp_path: Path) -> None:
+    path = tmp_path / "d.json"
+    document = {"rows": [[step, {"loss": 0.5}] for step in range(200_000)]}
+    write_with_digest(path, document)
+    assert read_document(path, dict)[1] == document
+    write_document(path, document)
+    with pytest.raises(CheckpointIncomplete, match=r"d\.json: expected a document of weight"):
+        read_document(path, dict)
+
+
 def test_tensors_come_back_and_damage_is_found(tmp_path: Path) -> None:
     path = tmp_path / "t.safetensors"
     tensors = {"a": torch.arange(12.0).view(3, 4).T, "b": torch.ones((), dtype=torch.bfloat16)}
@@ -218,10 +229,16 @@ def test_tensors_come_back_and_damage_is_found(tmp_path: Path) -> None:
     assert path.stat().st_mode & 0o777 == tmp_path.stat().st_mode & 0o666
 
     whole = path.read_bytes()
-    for broken in (whole[:-1], whole[:40], b"", whole[:-1] + bytes([whole[-1] ^ 1])):
+    for broken in (whole[:-1], whole[:40], b""):
         path.write_bytes(broken)
-        with pytest.raises(CheckpointIncomplete, match="sha256"):
+        with pytest.raises(CheckpointIncomplete, match=r"t\.safetensors: cut off or damaged"):
             read_tensors(path, digest)
+    path.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+    with pytest.raises(CheckpointIncomplete, match="sha256"):
+        read_tensors(path, digest)
+    os.truncate(path, 2**40)  # of holes: its digest would take an hour
+    with pytest.raises(CheckpointIncomplete, match="cut off or damaged"):
+        check_digest(path, digest)
     path.unlink()
     with pytest.raises(CheckpointIncomplete, match="no such file"):
         read_tensors(path, digest)

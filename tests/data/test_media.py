@@ -215,6 +215,7 @@ def test_a_member_stands_once(tmp_path):
     ("text", "message"),
     [
         ("a,b\n1,2\n1_0,2\n", r"line 3, column 'a': '1_0' is not a number"),
+        ("a,b\n1,١٢\n", r"line 2, column 'b': '١٢' is not a number"),
         ("a,b\n1,0x10\n", r"line 2, column 'b': '0x10' is not a number"),
         ("a,b\n1,2\0\n", r"line 2, column 'b': '2\\x00' is not a number"),
         ("a,b,a\n1,2,3\n", r"twice the column\(s\) a; it has a, b, a"),

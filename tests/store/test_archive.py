@@ -413,7 +413,9 @@ class TestRestore:
             restore(archived[1], target, threads=2)
 
     def test_something_that_is_no_archive(self, archived, tmp_path):
-        with pytest.raises(StoreMismatch, match="expected an archive, found something else"):
+        with pytest.raises(
+            StoreMismatch, match=r"expected an archive, found no manifest in its zarr\.json"
+        ):
             restore(archived[0], tmp_path / "back.zarr", threads=2)
         with pytest.raises(StoreMismatch, match="expected an archive, found nothing"):
             restore(tmp_path / "no.zarr", tmp_path / "back.zarr", threads=2)

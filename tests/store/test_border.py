@@ -208,6 +208,12 @@ class TestStores:
                 if (checked := work(store)) and hasattr(checked, "lines"):
                     raise StoreIncomplete("\n".join(checked.lines()))
 
+    def test_a_group_is_opened_as_zarr_opens_it_below_another(self, store):
+        (store / "golden/zarr.json").write_text('{"zarr_format": 3, "attributes": {}}')
+        note_metadata(store)
+        lines = verify(store, threads=1).lines()
+        assert any("golden/zarr.json: zarr cannot open it" in line for line in lines), lines
+
     @pytest.mark.parametrize(
         "harm", [text("tick/time", DEEP), values("episode/vl_start", 3, 2**62)]
     )
@@ -280,6 +286,7 @@ ARCHIVES: dict[str, Harm] = {
     "checksums": manifest(lambda said: said["arrays"]["tick/time"].update(crc32c=[1, 2])),
     "root": text("", DEEP),
     "pipe": instead("tick/time/c/0", os.mkfifo),
+    "terabyte": lambda root: os.truncate(root / "tick/time/c/0", 2**40),
     "device": instead("golden/0/View1/c/0/0/0", lambda path: path.symlink_to("/dev/zero")),
 }
 

@@ -12,7 +12,12 @@ import pytest
 from pipeline.base.config import VLMParams
 from pipeline.base.digests import file_digest
 from pipeline.base.errors import VLMError
-from pipeline.vlm.checkpoint_folder import read_config, read_preprocessor, resolve_checkpoint
+from pipeline.vlm.checkpoint_folder import (
+    check_tokenizer,
+    read_config,
+    read_preprocessor,
+    resolve_checkpoint,
+)
 from pipeline.vlm.feature_spec import feature_spec
 from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.processor import PromptRenderer
@@ -176,6 +181,17 @@ def test_merges_that_are_cut_off_are_not_taken_for_whole(folder: Path, spec: Spe
     spec(folder)
     (folder / "merges.txt").write_text("\n".join(merges[:300]))
     with pytest.raises(VLMError, match=rf"merges\.txt: cut off: expected 632.*299\. {MEND}"):
+        spec(folder)
+    signs = [merge.replace(merge[0], "#", 1) for merge in merges[1:]]  # no comments, but merges
+    (folder / "merges.txt").write_text("\n".join([merges[0], *signs]))
+    check_tokenizer(folder)
+
+
+def test_what_a_trainer_left_beside_it_may_be_large(folder: Path, spec: Spec) -> None:
+    (folder / "trainer_state.json").write_text("[" + " " * 33 * 2**20 + "]")
+    spec(folder)
+    os.truncate(folder / "generation_config.json", 33 * 2**20)
+    with pytest.raises(VLMError, match=r"generation_config\.json: expected at most"):
         spec(folder)
 
 

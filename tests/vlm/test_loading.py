@@ -359,6 +359,8 @@ def test_an_adapter_that_does_not_fit_is_refused(
         ("target_modules", "((", "does not fit the checkpoint .*unterminated"),
         ("target_modules", 5, "does not fit the checkpoint .*TypeError"),
         ("target_modules", ["nowhere"], "does not fit the checkpoint .*nowhere"),
+        ("bias", float("inf"), "bias: expected 'none', 'all' or 'lora_only', found inf"),
+        ("alpha_pattern", None, "alpha_pattern: expected"),
         ("layer_replication", [[0, 10**9]], "layer_replication: expected null"),
         ("megatron_config", {"a": 1}, "megatron_config: expected null"),
         ("arrow_config", {"a": 1}, "arrow_config: expected null"),

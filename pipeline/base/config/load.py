@@ -20,8 +20,9 @@ from pipeline.base.errors import ConfigError
 
 _Section = TypeVar("_Section", bound=Section)
 
-_MOST_BYTES, _MOST_VALUES, _MOST_LEVELS = 2**18, 50_000, 50
+_MOST_BYTES, _MOST_VALUES, _MOST_LEVELS = 2**20, 50_000, 50
 """Of a document; those of people have a hundredth."""
+_NUMBERS = ("!!int", "!!float", "!!bool", "!!null")
 _MOST_TOLD = 50
 """Problems that one message lists."""
 _FILE = Border(ConfigError, "Run from the project's root, name it (--params FILE), or correct it.")
@@ -130,10 +131,12 @@ class _Loader(yaml.SafeLoader):
             return merged | values
         if isinstance(node, yaml.ScalarNode):
             found = f"{found} {shown(node.value)}"
-            with suppress(ValueError, KeyError):  # half a surrogate pair, another tag than its text
+            with suppress(ValueError, KeyError):  # half a surrogate pair, a bool that is none
                 if tag == "!!str" and len(node.value) <= 10_000 and "\0" not in node.value:
                     return node.value.encode("utf-16", "surrogatepass").decode("utf-16")
-                if tag in ("!!int", "!!float", "!!bool", "!!null") and len(node.value) <= 400:
+                # As it would be without the tag: yaml takes `!!float --1` for 1.
+                plain = self.resolve(yaml.ScalarNode, node.value, (True, False)) == node.tag
+                if plain and tag in _NUMBERS and len(node.value) <= 400:
                     return self.construct_object(node)
         raise _wrong(
             node,

@@ -2,9 +2,16 @@
 
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidatorFunctionWrapHandler,
+    field_validator,
+)
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Seed = Annotated[int, Field(ge=0, lt=2**53)]
@@ -30,9 +37,25 @@ OwnFolder = Annotated[Place, AfterValidator(_has_a_name)]
 """One that is written beside its place and renamed."""
 
 
+def _keeps_truth(given: Any, taken: Any) -> bool:
+    """Whether no true or false was taken for a number."""
+    if isinstance(given, dict) and isinstance(taken, dict):
+        return all(_keeps_truth(value, taken.get(key)) for key, value in given.items())
+    if isinstance(given, list | tuple) and isinstance(taken, list | tuple):
+        return all(map(_keeps_truth, given, taken))
+    return isinstance(taken, bool) or not isinstance(given, bool)
+
+
 class Section(BaseModel):
     """Base of every section: immutable, no unknown keys, no NaN or infinity."""
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True
     )
+
+    @field_validator("*", mode="wrap")
+    @classmethod
+    def _no_truth_for_a_number(cls, given: Any, take: ValidatorFunctionWrapHandler) -> Any:
+        if not _keeps_truth(given, taken := take(given)):
+            raise ValueError("expected a number, found true or false")
+        return taken

@@ -5,6 +5,7 @@ import json
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+from pydantic import model_validator
 from pydantic.fields import FieldInfo
 
 from pipeline.base.config.section import Section
@@ -46,6 +47,15 @@ class Params(Section):
     probe: ProbeParams = ProbeParams()
     stores: StoresParams = StoresParams()
     inspect: InspectParams = InspectParams()
+
+    @model_validator(mode="after")
+    def _mixture_names_sources(self) -> "Params":
+        names = [source.name for source in self.data.sources]
+        unknown = sorted(set(self.train_head.mixture) - set(names))
+        if unknown and self.train_head.store is None:
+            mixture, there = ", ".join(unknown), ", ".join(names)
+            raise ValueError(f"train_head.mixture names {mixture}, but data.sources has {there}")
+        return self
 
 
 def described_keys(sections: Sequence[str]) -> list[str]:
