@@ -19,7 +19,8 @@ def is_view_name(name: str) -> bool:
 
 def _view_name(name: str) -> str:
     if not is_view_name(name):
-        raise ValueError("expected a name of at most 200 bytes, no / or \\ in it, no dot first")
+        what = "at most 200 bytes, no /, \\ or NUL, no dot first, not zarr.json"
+        raise ValueError(f"expected a name of {what}")
     return name
 
 
