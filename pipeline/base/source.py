@@ -1,13 +1,31 @@
 """What a store and a policy trained from it say alike: features, streams, clocks."""
 
+import re
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from pipeline.base.border import Document, Text
 
-ViewName = Annotated[str, Field(max_length=200, pattern=r"^[^/\x00.][^/\x00]*$")]
-"""A name that is a file's too: it neither climbs nor enters a folder."""
+
+def is_view_name(name: str) -> bool:
+    """Whether it can be a folder's name too, beside zarr's own: it neither climbs nor enters one.
+
+    zarr takes a backslash for a slash.
+    """
+    whole = re.fullmatch(r"(?!\.|zarr\.json$)[^/\\\x00]+", name)
+    return whole is not None and len(name.encode()) <= 200
+
+
+def _view_name(name: str) -> str:
+    if not is_view_name(name):
+        what = "at most 200 bytes, no /, \\ or NUL, no dot first, not zarr.json"
+        raise ValueError(f"expected a name of {what}")
+    return name
+
+
+ViewName = Annotated[str, Field(max_length=200), AfterValidator(_view_name)]
+"""What a view can be called, in a recording as in a store."""
 _Small = Annotated[int, Field(ge=0, le=2**20)]
 
 
@@ -66,4 +84,4 @@ class SourceDocument(Document):
     feature_spec: Spec
     streams: Streams
     action_hz: Annotated[float, Field(gt=0, le=10**6)] | None
-    vlm_reuse_count: Annotated[int, Field(ge=1, le=10**5)]
+    vlm_reuse_count: Annotated[int, Field(ge=1, le=10**6)]

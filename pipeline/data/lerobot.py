@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from pipeline.base.border import shown
+from pipeline.base.border import Text, shown
 from pipeline.base.config import MediaLimits, Source
 from pipeline.base.errors import RecordingError
 from pipeline.data.arrays import member, read_npz
@@ -282,7 +282,10 @@ def _sidecar_stream(path: Path, limits: MediaLimits) -> Stream:
     values = member(members, ("values",), path)
     if values.ndim != 2:
         raise RecordingError(f"{path}: expected values (N, channel), found {values.shape}")
-    names, units = (tuple(map(str, members.get(name, ()))) for name in ("names", "units"))
+    names, units = (
+        RECORDINGS.parse([*map(str, members.get(key, ()))], tuple[Text, ...], f"{path}, {key!r}")
+        for key in ("names", "units")
+    )
     width = values.shape[1]
     if not names and width == len(SENSOR.names):
         names, units = SENSOR.names, units or SENSOR.units

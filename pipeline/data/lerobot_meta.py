@@ -11,6 +11,7 @@ from pydantic import AliasChoices, BeforeValidator, Field, JsonValue, Strict, mo
 
 from pipeline.base.border import Border, Document, Text, shown
 from pipeline.base.errors import RecordingError
+from pipeline.base.source import is_view_name
 from pipeline.data.media import Grouped
 from pipeline.data.recording import ActionKind
 
@@ -18,8 +19,6 @@ META = Border(
     RecordingError, "Mend meta/, or convert the data set with the lerobot release that wrote it."
 )
 _VIEW_PREFIXES = ("observation.images.", "observation.")
-_VIEW_NAME = re.compile(r"(?!\.+$)[^/\\\x00]{1,200}")
-"""What can be the name of a file."""
 _PLACES = {"v2": "episode_chunk|episode_index", "v3": "chunk_index|file_index"}
 """Numbers that a path may name, as in `{episode_index:06d}`."""
 
@@ -102,7 +101,7 @@ class Info(Document):
         for key, feature in self.features.items():
             if feature.dtype in ("video", "image") and feature.is_depth_map == depth:
                 view = key.removeprefix(next(filter(key.startswith, _VIEW_PREFIXES), ""))
-                if not _VIEW_NAME.fullmatch(view):
+                if not is_view_name(view):
                     raise ValueError(f"features: a camera cannot have the name {shown(key)}")
                 if (other := keys.setdefault(view, key)) != key:
                     both = f"features {shown(other)} and {shown(key)} are both the view {view!r}"

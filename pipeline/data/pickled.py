@@ -16,6 +16,7 @@ from pydantic import BeforeValidator, Field, InstanceOf, Strict
 from pipeline.base.border import Document, Text
 from pipeline.base.config import Source
 from pipeline.base.errors import RecordingError
+from pipeline.base.source import ViewName
 from pipeline.data.arrays import Numbers, numeric, read_npy
 from pipeline.data.insertion import (
     SENSOR,
@@ -69,7 +70,7 @@ class _Content(Document):
     """(N, 7)."""
     sensor_data: _Array | _Readings | None = None
     """(N, 1026), or its two parts."""
-    image: dict[Text, Annotated[list[Text], Strict(False)]] | None = None
+    image: dict[ViewName, Annotated[list[Text], Strict(False)]] | None = None
     """Paths as recorded, by view."""
     instruction: Text | None = None
     metadata: Annotated[_Metadata, BeforeValidator(lambda told: told or {})] = _Metadata()

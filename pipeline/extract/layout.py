@@ -1,5 +1,6 @@
 """Write everything of a store that needs no model: streams, ticks, episodes."""
 
+import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from itertools import takewhile
@@ -9,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from pipeline.base.border import MOST_BYTES, Border
 from pipeline.base.durable import free_bytes
-from pipeline.base.errors import DiskFull, NumericsError
+from pipeline.base.errors import DiskFull, NumericsError, RecordingError
 from pipeline.base.finite import first_non_finite
 from pipeline.base.format import size
 from pipeline.base.tuned_on import store_attributes
@@ -19,10 +21,30 @@ from pipeline.data.timeline import Timeline
 from pipeline.extract.plan import store_bytes
 from pipeline.extract.survey import CheckedEpisode, Survey, embodiment_of
 from pipeline.store import SCHEMA, RowSource, Sizes, StoreBuild, arrays
+from pipeline.store.border import StoreAttributes
 from pipeline.store.episodes import episode_arrays
-from pipeline.store.schema import ArraySpec
+from pipeline.store.schema import ArraySpec, array_of
 from pipeline.vlm.checkpoint_folder import tuned_on
 from pipeline.vlm.feature_spec import FeatureSpec
+
+_READERS = Border(
+    RecordingError,
+    "No reader would take the store: give it fewer or shorter names of channels and views, or "
+    "fewer vlm.layers, vlm.pooling slots or vlm.variants.",
+)
+
+
+def check_readable(build: StoreBuild, checked: Sequence[CheckedEpisode], survey: Survey) -> None:
+    """Raise `RecordingError` where readers would refuse what the store is to say of itself."""
+    where = build.target / "zarr.json"
+    text = json.dumps(_attributes(checked, survey) | {"plan": build.plan}, indent=2)
+    if len(text) > MOST_BYTES // 2:  # golden rows and environments come yet
+        why = f"expected attributes of at most {MOST_BYTES // 2:,} bytes, found {len(text):,}"
+        raise _READERS.refusal(where, why)
+    said = _READERS.parse_json(text, dict[str, Any], where)
+    StoreAttributes.of(build.target, said, _READERS)
+    for name, spec in build.specs.items():
+        array_of(spec.document, name, build.target / name / "zarr.json", _READERS)
 
 
 def check_space(

@@ -13,7 +13,7 @@ from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.data.timeline import rate_notes
 from pipeline.extract.engine import ExtractionReport, fill
 from pipeline.extract.golden import keep_golden
-from pipeline.extract.layout import build_arrays, check_space, lay_out
+from pipeline.extract.layout import build_arrays, check_readable, check_space, lay_out
 from pipeline.extract.plan import Say, StorePlaces, count_known, plan_lines, row_sources
 from pipeline.extract.survey import (
     CheckedEpisode,
@@ -113,6 +113,7 @@ def _begin(
         say(line)
     build = StoreBuild(places.target, build_arrays(checked, surveyed), surveyed.plan)
     with closing(build):
+        check_readable(build, checked, surveyed)
         begun = [] if places.begun is None else [places.part]
         known = row_sources([*begun, *places.known], surveyed)
         taken = count_known(checked, surveyed, known)

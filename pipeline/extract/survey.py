@@ -15,16 +15,25 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from pipeline.base.border import Border
 from pipeline.base.config import DataParams, Params
 from pipeline.base.digests import ContentDigests, joint_digest
 from pipeline.base.errors import RecordingError, VLMError
+from pipeline.base.source import Streams
 from pipeline.data import BadEpisode, Recording, content_digest, open_recordings
 from pipeline.data.embodiment import Embodiment, common_embodiment
 from pipeline.data.episode import read_episode
 from pipeline.data.timeline import ActionRotation, choose_action_rotation
+from pipeline.store.border import EpisodeText
 from pipeline.store.episodes import EpisodeRows
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 from pipeline.vlm.preparation import Preparer
+
+_STORED = Border(
+    RecordingError,
+    "No store could be read with it: rename or shorten it there, or leave the episode out.",
+)
+"""How what a store is to say of an episode is refused, by the models that will read it."""
 
 
 @dataclass(frozen=True)
@@ -186,7 +195,11 @@ def _checked(episode: SurveyedEpisode, surveyed: Survey, preparer: Preparer) -> 
     for view, camera in cameras.items():
         camera.check(np.unique(read.timeline.frames[view]).tolist())
     rows = (read.timeline, read.readings, read.states)
-    return CheckedEpisode(*rows, recording.source, episode.text, recording, read.embodiment)
+    checked = CheckedEpisode(*rows, recording.source, episode.text, recording, read.embodiment)
+    where = f"{recording.path}, {recording.id}"
+    _STORED.parse_json(checked.text, EpisodeText, where)
+    _STORED.parse(read.embodiment.document() | {"views": [*cameras]}, Streams, where)
+    return checked
 
 
 def _refuse_bad(bad: Sequence[BadEpisode], of: int) -> None:

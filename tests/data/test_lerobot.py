@@ -358,6 +358,10 @@ def test_the_sidecar_is_the_sensor(root, truth):
     save(0, timestamps=time, values=truth.sensor[:30, :2], names=["fx"])
     with pytest.raises(RecordingError, match="2 values a reading, but 1 names"):
         opened(root).recordings[0].sensor()
+    for key, words in (("names", ["f\0x", "fy"]), ("units", ["N", "N" * 10_001])):
+        save(0, timestamps=time, values=truth.sensor[:30, :2], **{key: words})
+        with pytest.raises(RecordingError, match=rf"{key}': \d: expected a text to .*Copy the"):
+            opened(root).recordings[0].sensor()
     save(0, timestamps=time[:-1], values=truth.sensor[:30])
     with pytest.raises(RecordingError, match="30 rows but 29 timestamps"):
         opened(root).recordings[0].sensor()
@@ -905,7 +909,8 @@ def test_a_path_that_leaves_the_data_set_is_refused(tmp_path, write, name, path)
 
 
 @pytest.mark.parametrize(
-    "key", ["observation.images.a/b", "observation.images...", "observation.images.", "a\\b", ".."]
+    "key",
+    [f"observation.images.{view}" for view in ("a/b", "..", "", ".hidden")] + ["a\\b", ".."],
 )
 @pytest.mark.parametrize("dtype", ["video", "image"])
 def test_a_camera_that_cannot_be_a_file_is_refused(tmp_path, write, key, dtype):

@@ -145,6 +145,10 @@ def test_params_may_say_what_the_action_is(tmp_path, write, truth, only):
         ({"metadata": {"action_hz": 0}}, r"metadata\.action_hz: expected .*0\.001, found 0"),
         ({"image": ["a_1.jpg"]}, r"image: .*found \['a_1\.jpg'\]"),
         ({"image": {"View1": [1, 2]}}, r"image\.View1\.0: expected a valid string, found 1"),
+        *(
+            ({"image": {view: []}}, "image.*expected a name of at most 200 bytes.*found '")
+            for view in ("../../up", "/View1", ".View1", "a\\b", "zarr.json", "\u00e9" * 101, "")
+        ),
     ],
 )
 def test_a_spoilt_pickle_is_named(tmp_path, write, truth, only, changes, message):

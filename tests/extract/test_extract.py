@@ -724,6 +724,45 @@ class TestRefusals:
         assert str(image) in text
         assert "on_bad_episode=skip" in text
 
+    @pytest.mark.parametrize("name", ["a\\b", "zarr.json", "\u00e9" * 101])
+    def test_a_view_that_no_reader_of_a_store_would_take(
+        self, params, recordings, no_model_later, name
+    ):
+        no_model_later(images=False)
+        views = recordings / "Press/episode_3/images"
+        (views / "View2").rename(views / name)
+        with pytest.raises(RecordingError, match=r"1 of 3 .*\n.*episode_3: views\.0: .*found '"):
+            run(params)
+
+    def test_an_episode_whose_text_no_reader_of_a_store_would_take(
+        self, params, monkeypatch, no_model_later
+    ):
+        no_model_later(images=False)
+        monkeypatch.setattr(WindowedRecording, "group", "g" * 10_001)
+        with pytest.raises(RecordingError, match=r"3 of 3 .*\n.*: group: expected a text to have"):
+            run(params)
+
+    @pytest.mark.parametrize(
+        ("most", "message"),
+        [
+            ("pipeline.extract.layout.MOST_BYTES", "zarr.json: expected attributes of at most"),
+            ("pipeline.store.schema._MOST_ROW_BYTES", "features/zarr.json: expected rows of at"),
+        ],
+    )
+    def test_a_store_that_no_reader_would_take(
+        self, params, monkeypatch, no_model_later, most, message
+    ):
+        no_model_later(images=False)
+        monkeypatch.setattr(most, 1000)
+        with pytest.raises(RecordingError, match=rf"{message}.*found.*fewer vlm\.layers"):
+            run(params)
+        assert not part_path(params.extract.store).exists()
+
+    def test_as_many_ticks_a_row_as_params_allow_can_be_read_again(self, changed):
+        params = changed(data={"vlm_reuse_count": 1_000_000}, vlm={"pooling": ["mean"]})
+        run(params)
+        assert len(FeatureStore.open(params.extract.store).episodes) == 3
+
     def test_skip_leaves_bad_episodes_out_and_lists_them_every_time(
         self, changed, recordings, no_model_later
     ):

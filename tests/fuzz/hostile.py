@@ -98,6 +98,31 @@ def _zip(name: bytes, head: bytes, zeros: int) -> bytes:
     )
 
 
+def _view(name: str) -> Act:
+    """Call the view of a pickle that has frames by another name."""
+
+    def act(path: Path) -> None:
+        content = pickle.loads(path.read_bytes())
+        paths = content["image"]
+        paths[name] = paths.pop(max(paths, key=lambda view: len(paths[view])))
+        rewrite(path, pickle.dumps(content))
+
+    return act
+
+
+def _name(name: str) -> Act:
+    """Call the first channel of a sidecar so."""
+
+    def act(path: Path) -> None:
+        with np.load(path) as archive:
+            members = dict(archive)
+        buffer = io.BytesIO()
+        np.savez(buffer, **members | {"names": np.array([name, *members["names"][1:]])})
+        rewrite(path, buffer.getvalue())
+
+    return act
+
+
 def _elsewhere(absolute: bool) -> Act:
     """Rows that are where the template leads, which is beside the data set."""
 
@@ -294,5 +319,11 @@ HOSTILE: list[tuple[str, str, str, Act]] = [
         }.items()
         for name in names.split()
     ),
+    *(
+        ("old", "data.pkl", f"the view {name!r:.40}", _view(name))
+        for name in ("../../../../up", "/tmp/up", ".hidden", "a\\b", "zarr.json", "\u00e9" * 200)
+    ),
+    ("lerobot_images", "*.npz", "a name with NUL", _name("a\0b")),
+    ("lerobot_images", "*.npz", "a name of 20,000 characters", _name("a" * 20_000)),
 ]
 """The thing of the corpus, which file of it (by `rglob`), what is done to it in words, and how."""

@@ -18,11 +18,13 @@ import yaml
 import zarr
 from safetensors.numpy import load_file
 
-from pipeline.base.config import LimitsFile, load_params, load_section
+from pipeline.base.config import LimitsFile, Params, load_params, load_section
 from pipeline.base.digests import ContentDigests, ledger_path
+from pipeline.base.errors import StoreIncomplete
 from pipeline.extract.survey import check_episodes, sound_episodes, survey
 from pipeline.policy import checkpoint as checkpoints
 from pipeline.store import FeatureStore
+from pipeline.store.verification import verify
 from pipeline.train.split import check_store
 from tests.fuzz import plain
 from tests.fuzz.corpus import HEAD, STORE
@@ -106,14 +108,22 @@ def result(case: "Case") -> Any:
 
 
 def _arrays(store: Path) -> dict[str, Any]:
-    """Every array of a store and what its attributes say, read by zarr alone."""
-    group: Any = zarr.open_group(store, mode="r")
+    """Every array of a store and what its attributes say, as plain zarr reads them."""
+    group = _opened(store)
     members = group.members(max_depth=None)
     kept = group.attrs.asdict()
     for of_a_run in ("metadata_digest", "plan", "environment"):
         kept.pop(of_a_run, None)
     arrays = {path: array[:] for path, array in members if hasattr(array, "shape")}
     return arrays | {"attributes": json.loads(json.dumps(kept))}
+
+
+def _opened(store: Path) -> Any:
+    """A store, opened by zarr alone; raises where its own readers refuse it."""
+    FeatureStore.open(store)
+    if not (checked := verify(store, 1)).sound:
+        raise StoreIncomplete("; ".join(checked.lines()))
+    return zarr.open_group(store, mode="r")
 
 
 # --- what should have come out -------------------------------------------------------------------
@@ -195,7 +205,7 @@ def _without_frames(episodes: dict[str, plain.Episode]) -> dict[str, plain.Episo
 
 def _not_stored(episodes: dict[str, plain.Episode], store: Path) -> str:
     """The first stream of which a store has other readings than recordings."""
-    group: Any = zarr.open_group(store, mode="r")
+    group = _opened(store)
     for key in ("state.values", "sensor.values"):
         rows = [episode[key] for episode in episodes.values() if key in episode]
         given = np.concatenate(rows).astype(np.float32) if rows else np.zeros((0, 0), np.float32)
@@ -287,7 +297,9 @@ def _names(text: str, change: Change, case: "Case") -> bool:
         return True
     match case.subject.kind:
         case "params":
-            return bool(change.key) and any(part in text for part in change.key.split("."))
+            sections = [f"{name}." for name in Params.model_fields]  # a changed byte has no key
+            keys = change.key.split(".") if change.key else sections
+            return any(key in text for key in keys)
         case "stores" | "archives":
             above = [path for path in change.path.parents if path.is_relative_to(case.place)]
             return any(str(path) in text for path in above if path != case.place)

@@ -20,6 +20,9 @@ from pipeline.base.errors import CheckpointIncomplete
 from pipeline.data.jpeg import JpegCamera
 from pipeline.data.raw import RawRecording
 from pipeline.policy.policy import Policy
+from pipeline.store import StoreBuild
+from pipeline.store.metadata import note_metadata
+from pipeline.store.paths import group_attributes
 from tests.fuzz.cases import Case
 from tests.fuzz.mutations import rewrite
 from tests.fuzz.runner import run_cases
@@ -90,8 +93,19 @@ def _reread(check: Any) -> Any:
     return lambda document: check({**document, "data": {**document["data"], **data}})
 
 
+def _unreadable(seal: Any) -> Any:
+    """A store that plain zarr reads and its own readers refuse."""
+
+    def strange(build: Any, **options: Any) -> None:
+        seal(build, **options)
+        note_metadata(build.target, group_attributes(build.target) | {"vlm_reuse_count": 0})
+
+    return strange
+
+
 WHOLES = {
     "raw": ("raw", "read"),
+    "extraction": ("raw", "extract"),
     "store": ("store", "verify"),
     "head": ("head", "load"),
     "params": ("params", "extract"),
@@ -108,6 +122,16 @@ FAULTS: dict[str, tuple[str, str, Callable[[], object]]] = {
         ),
     ),
     "a blind check of a store": ("store", "wrong", _plant(stages.verify, "verify", _blind)),
+    "a store that nothing reads": (
+        "extraction",
+        "wrong",
+        _plant(StoreBuild, "seal", _unreadable),
+    ),
+    "a refusal by the limit of memory": (
+        "head",
+        "over memory",
+        _refuse("head: not enough memory for it. Copy it again."),
+    ),
     "weights of another head": ("head", "wrong", _plant(Policy, "load_state_dict", _altered)),
     "params that nobody wrote": (
         "params",

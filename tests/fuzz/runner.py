@@ -123,9 +123,10 @@ class _Child:
     def _outcome(self, told: dict[str, Any], status: int, stderr: str) -> tuple[str, str]:
         code, peak = told.get("ran", (None, 0))
         memory = any(word in stderr for word in ("MemoryError", "bad_alloc", "not enough memory"))
-        if peak > BYTES or (memory and code != 2):
+        if peak > BYTES or memory:  # refused only by the limit that stands here
             return "over memory", f"{peak / 2**30:.1f} GiB"
-        if code is None and (self.killed or os.WTERMSIG(status) == signal.SIGXCPU):
+        ended = -os.WTERMSIG(status) if code is None else code  # by itself, or as its shell says
+        if ended == -signal.SIGXCPU or (code is None and self.killed):
             return "hang", f"more than {self.case.seconds:g} s"
         if code is None:
             return "crash", f"exit code {os.waitstatus_to_exitcode(status)} without a word"
@@ -151,7 +152,7 @@ def _in_child(case: Case, write: int) -> None:
         os.write(write, pickle.dumps(("made", change)))
         os.chdir(case.folder)
         case.fault()
-        before = _limit(case.seconds)
+        before = _limit(case.seconds * (2 if case.by_shell else 1))  # it has to import first
         try:
             code = case.run()
         except SystemExit as stop:
