@@ -6,7 +6,7 @@ the model is.
 
 import resource
 from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
@@ -116,13 +116,15 @@ class PromptRenderer:
         ]
         what = "the chat template cannot be rendered"
         where = f"{self._folder}: {what}"
-        with VLMS.foreign(self._folder, what), VLMS.time_limit(where, _MOST_SECONDS):
+        limit = VLMS.time_limit(where, _MOST_SECONDS)
+        with VLMS.foreign(self._folder, what), limit, suppress(MemoryError):
             return self._tokenizer.apply_chat_template(
                 [{"role": "user", "content": content}],
                 chat_template=self.chat_template,
                 tokenize=False,
                 add_generation_prompt=False,
             )
+        raise VLMS.refusal(where, f"took more than {_MOST_MEMORY:,} bytes")
 
     def _text_part(self, part: str, instruction: str) -> list[dict[str, str]]:
         text = part.replace("{instruction}", instruction)

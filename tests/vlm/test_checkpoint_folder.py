@@ -131,9 +131,9 @@ def test_a_file_that_is_none_is_never_opened(
 @pytest.mark.parametrize(
     ("template", "told"),
     [
-        ("{{ 'a' * 10**10 }}", "not enough memory|was not done"),
+        ("{{ 'a' * 10**10 }}", "took more than|was not done"),
         ("{% set n = namespace(x='a') %}{% for i in range(60) %}{% set n.x = n.x ~ n.x %}"
-         "{% endfor %}", "not enough memory|was not done"),
+         "{% endfor %}", "took more than|was not done"),
         ("{% for i in range(10**9) %}{% endfor %}", "OverflowError"),
         ("{{ ''.__class__.__mro__ }}", "SecurityError"),
         ("{{ raise_exception('no') }}", "TemplateError: no"),
