@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pipeline.base.border import shown
 from pipeline.base.config import MediaLimits, Source
 from pipeline.base.errors import RecordingError
-from pipeline.data.arrays import member, read_npz
+from pipeline.data.arrays import MOST_CHANNELS, member, read_npz
 from pipeline.data.insertion import SENSOR
 from pipeline.data.lerobot_clock import NUMBERS, check_frames, read_clock, stored_clock
 from pipeline.data.lerobot_layout import MARKER, LeRobotLayout, read_layout
@@ -39,7 +39,6 @@ from pipeline.data.recording import (
 )
 from pipeline.data.video import VideoClip, VideoSpan
 
-MOST_CHANNELS = 65_536
 STATE = "observation.state"
 ACTION = "action"
 _SIDECARS = ("sensor", "state", "frames")

@@ -206,7 +206,9 @@ def npy(shape: str, body: bytes = b"", dtype: str = "<f8", version: bytes = b"\1
         (npy("(1,)", bytes(8), version=b"\x09\0"), "its header is damaged or not numpy's"),
         (npy("(" * 5000), "its header is damaged or not numpy's"),
         (b"\x93NUMPY\x02\x00\xff\xff\xff\xff{", "its header is damaged or not numpy's"),
-        (npy("(200000,)", bytes(1_600_000)), "expected at most 1,048,576 bytes"),
+        (npy("(200000,)", bytes(1_600_000)), "at most 1,048,576 bytes unpacked.* Leave the"),
+        (npy("(2147483648, 0)"), r"expected rows with values, found \(2147483648, 0\) of float64"),
+        (npy("(2147483648,)", dtype="<U0"), r"expected rows with values, found \(2147483648,\)"),
     ],
 )
 def test_arrays_are_what_their_bytes_hold(tmp_path, content, message):
@@ -218,9 +220,18 @@ def test_arrays_are_what_their_bytes_hold(tmp_path, content, message):
         (lambda: read_npy(path, SMALL), "a.npy"),
         (lambda: read_npz(packed, ["values"], limits=SMALL), "a.npz, member 'values'"),
     ):
-        with pytest.raises(RecordingError, match=rf"{place}: .*{message}.* episode out") as caught:
+        with pytest.raises(RecordingError, match=rf"{place}: .*{message}.*episode out") as caught:
             attempt()
         assert "pickle" not in str(caught.value)
+
+
+def test_an_array_may_have_no_rows_and_lists_of_words_end(tmp_path):
+    path = tmp_path / "a.npz"
+    np.savez(path, values=np.zeros((0, 7)), names=np.zeros(65_537, "<U1"))
+    assert read_npz(path, ["values"])["values"].shape == (0, 7)
+    message = r"'names': expected a list of at most 65,536 words, found <U1 of shape \(65537,\)"
+    with pytest.raises(RecordingError, match=message):
+        read_npz(path, ["values"], text=["names"])
 
 
 def test_what_unpacks_a_hundredfold_is_refused_unread():
