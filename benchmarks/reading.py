@@ -2,7 +2,8 @@
 
 Each code reads in a process of its own, and each round asks both, so that a machine that drifts is
 the same for both. Opening finds the episodes and reads their metadata; reading takes every stream
-and the first frames of every view.
+and the first frames of every view; checking asks for the sizes of those frames and whether they can
+be decoded.
 """
 
 import os
@@ -18,7 +19,7 @@ from benchmarks.timing import Work, arguments, at_most, race, report
 from pipeline.simulation.demo_recordings import write_demo_recordings
 
 ROOT = Path(__file__).resolve().parents[1]
-WAYS = ("open", "read")
+WAYS = ("open", "read", "check")
 SLOWER = 1.1
 """How many times as long it may take: two runs of one code differ by this much."""
 PROGRAM = """
@@ -36,6 +37,10 @@ for line in sys.stdin:
             for camera in recording.cameras().values():
                 for frame in camera.read(range(min(10, len(camera.time)))):
                     pass
+        if line.strip() == "check":
+            for camera in recording.cameras().values():
+                first = range(min(10, len(camera.time)))
+                camera.check(first), camera.sizes(first)
     print(line, end="", flush=True)
 """
 """What either code runs: only names that both have."""
@@ -69,7 +74,7 @@ def main() -> None:
 
 
 def _reader(readers: ExitStack, code: Path, folders: list[Path]) -> Callable[[str], None]:
-    """Ask a process of that code to `open` or to `read` these recordings, and wait for it."""
+    """Ask a process of that code to go over these recordings in a way, and wait for it."""
     process = readers.enter_context(
         subprocess.Popen(
             [sys.executable, "-c", PROGRAM, *map(str, folders)],

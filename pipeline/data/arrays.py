@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 from pipeline.base.border import shown
 from pipeline.base.config import MediaLimits
 from pipeline.base.errors import RecordingError
-from pipeline.data.media import DEFAULT_LIMITS, RECORDINGS, check_unpacked
+from pipeline.data.media import DEFAULT_LIMITS, INTACT, RECORDINGS, check_unpacked
 
 Numbers = NDArray[Any]
 """An array of real numbers of any width."""
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+MOST_CHANNELS = 65_536
 _MOST_COLUMNS, _LONGEST_LINE = 10_000, 2**20
 
 
@@ -56,7 +57,8 @@ def read_npz(
 
 def read_npy(path: Path, limits: MediaLimits = DEFAULT_LIMITS) -> Numbers:
     """The one array of a .npy; errors as in `read_npz`."""
-    size = RECORDINGS.check_file(path, limits.array_bytes)
+    size = RECORDINGS.check_file(path)
+    check_unpacked(path, size, size, limits)
     with RECORDINGS.foreign(path, "cannot be read as .npy"), path.open("rb") as file:
         return numeric(_read_array(file, size, str(path)), str(path))
 
@@ -75,6 +77,8 @@ def _read_array(file: IO[bytes], size: int, where: str) -> NDArray[Any]:
     if not whole or prod(shape) * dtype.itemsize != rest:
         why = f"cannot be read: {shown(shape)} of {dtype} is not what its {rest:,} bytes hold"
         raise RECORDINGS.refusal(where, why)
+    if not rest and shape[:1] > (0,):
+        raise INTACT.refusal(where, f"expected rows with values, found {shown(shape)} of {dtype}")
     file.seek(0)
     return npy.read_array(file, allow_pickle=False)
 
@@ -100,8 +104,10 @@ def numeric(array: Any, where: str) -> Numbers:
 
 
 def _words(array: NDArray[Any], where: str) -> NDArray[Any]:
-    if array.dtype.kind != "U" or array.ndim != 1:
-        raise RecordingError(f"{where}: expected a list of words, found {array.dtype}")
+    if array.dtype.kind != "U" or array.ndim != 1 or len(array) > MOST_CHANNELS:
+        found = f"{array.dtype} of shape {array.shape}"
+        why = f"expected a list of at most {MOST_CHANNELS:,} words, found {found}"
+        raise INTACT.refusal(where, why)
     return array
 
 

@@ -3,6 +3,7 @@
 import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from filecmp import cmp
 from pathlib import Path, PurePath
 from typing import TypeVar
 
@@ -13,7 +14,7 @@ from PIL import Image
 from pipeline.base.border import shown
 from pipeline.base.config import MediaLimits
 from pipeline.base.errors import RecordingError
-from pipeline.data.media import DEFAULT_LIMITS, FARTHEST_S, RECORDINGS, opened_image
+from pipeline.data.media import DEFAULT_LIMITS, FARTHEST_S, check_image_file, opened_image
 from pipeline.data.reader import entries, natural_key
 from pipeline.data.recording import CameraStream
 
@@ -53,10 +54,10 @@ class JpegCamera(CameraStream):
 
     def repeats(self) -> NDArray[np.bool_]:
         """Whether files are the same byte by byte; only those of equal length are read."""
-        lengths = np.array([RECORDINGS.check_file(path) for path in self.paths])
+        lengths = np.array([check_image_file(path, self._limits) for path in self.paths])
         same = lengths[1:] == lengths[:-1]
         for place in np.flatnonzero(same):
-            same[place] = self.paths[place].read_bytes() == self.paths[place + 1].read_bytes()
+            same[place] = cmp(self.paths[place], self.paths[place + 1], shallow=False)
         return same
 
     def sizes(self, indices: Sequence[int]) -> NDArray[np.int64]:

@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from pipeline.base.border import Text, shown
 from pipeline.base.config import MediaLimits, Source
 from pipeline.base.errors import RecordingError
-from pipeline.data.arrays import member, read_npz
+from pipeline.data.arrays import MOST_CHANNELS, member, read_npz
 from pipeline.data.insertion import SENSOR
 from pipeline.data.lerobot_clock import NUMBERS, check_frames, read_clock, stored_clock
 from pipeline.data.lerobot_layout import MARKER, LeRobotLayout, read_layout
-from pipeline.data.lerobot_meta import META, Episode
+from pipeline.data.lerobot_meta import META, Episode, Vector
 from pipeline.data.lerobot_rows import ParquetCamera, find_rows, matrix
 from pipeline.data.media import RECORDINGS
 from pipeline.data.reader import FileRecording
@@ -39,7 +39,6 @@ from pipeline.data.recording import (
 )
 from pipeline.data.video import VideoClip, VideoSpan
 
-MOST_CHANNELS = 65_536
 STATE = "observation.state"
 ACTION = "action"
 _SIDECARS = ("sensor", "state", "frames")
@@ -227,11 +226,9 @@ class LeRobotRecording(FileRecording):
 
     def _stream(self, name: str) -> Stream:
         feature, told = self._info.features[name], f"{self.path / MARKER}, {name!r}"
-        if len(feature.shape) != 1:
-            why = f"expected a shape of one number, found {list(feature.shape)}"
-            raise META.refusal(told, why)
-        stem, (width,) = name.rpartition(".")[2], feature.shape
-        channels = _channels(stem, width, feature.channels, feature.units, told)
+        vector = META.parse(feature.model_dump(), Vector, told)
+        stem, (width,) = name.rpartition(".")[2], vector.shape
+        channels = _channels(stem, width, vector.names, feature.units, told)
         where, table, time = self._numbers()
         if name not in table.column_names:
             raise RECORDINGS.refusal(where, f"missing column {name!r}")

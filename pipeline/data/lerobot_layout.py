@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from pipeline.base.config import MediaLimits
+from pipeline.base.errors import RecordingError
 from pipeline.data.lerobot_meta import META, Episode, Info, Place, SharedEpisode, Span, Task
 from pipeline.data.parquet import ParquetTable
 from pipeline.data.reader import natural_key
@@ -21,8 +22,8 @@ T = TypeVar("T")
 
 MARKER = "meta/info.json"
 _INFO_BYTES = 8 * 2**20
-_MOST_ROWS = 100_000
-"""Episodes or tasks of a data set."""
+_MOST_ROWS = 500_000
+"""Episodes or tasks of a data set; language_table has 440,000 episodes."""
 _EPISODE_COLUMNS = ("episode_index", "length", "tasks", "group")
 _TASK_COLUMNS = ("task_index", "task", "__index_level_0__")
 
@@ -126,5 +127,6 @@ def _some(rows: Iterable[T], root: Path) -> list[T]:
     """All of these rows of `meta/`, refused where they never end."""
     some = list(islice(rows, _MOST_ROWS + 1))
     if len(some) > _MOST_ROWS:
-        raise META.refusal(root / "meta", f"expected at most {_MOST_ROWS:,} episodes or tasks")
+        why = f"expected at most {_MOST_ROWS:,} episodes or tasks, found more"
+        raise RecordingError(f"{root / 'meta'}: {why}. Split the data set")
     return some

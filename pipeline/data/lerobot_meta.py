@@ -22,7 +22,12 @@ _VIEW_PREFIXES = ("observation.images.", "observation.")
 _PLACES = {"v2": "episode_chunk|episode_index", "v3": "chunk_index|file_index"}
 """Numbers that a path may name, as in `{episode_index:06d}`."""
 
-Index = Annotated[int, Field(ge=0, lt=10**9)]
+Index = Annotated[
+    int,
+    Field(ge=0, lt=10**9),
+    BeforeValidator(lambda n: int(n) if isinstance(n, float) and n.is_integer() else n),
+]
+"""A float without a fraction is taken too: pandas makes them of whole columns."""
 Seconds = Annotated[float, Field(ge=0, le=1e9)]
 
 
@@ -38,20 +43,18 @@ def _flat_names(names: Any) -> Any:
 
 
 class _VideoInfo(Document):
-    depth: bool | None = Field(default=None, alias="is_depth_map")
-    video_depth: bool | None = Field(default=None, alias="video.is_depth_map")
+    depth: Annotated[bool | None, Strict(False)] = Field(default=None, alias="is_depth_map")
+    video_depth: Annotated[bool | None, Strict(False)] = Field(
+        default=None, alias="video.is_depth_map"
+    )
 
 
 class Feature(Document):
     """What `info.json` says of a column, or of a video."""
 
     dtype: Text
-    shape: Annotated[tuple[Index, ...], Field(max_length=32)] = ()
+    shape: JsonValue = None
     names: JsonValue = None
-    channels: Annotated[tuple[Text, ...] | None, BeforeValidator(_flat_names)] = Field(
-        default=None, validation_alias="names"
-    )
-    """The names, flat."""
     units: tuple[Text, ...] | None = None
     kind: ActionKind | None = None
     """Of the actions; None where their names tell it."""
@@ -64,6 +67,14 @@ class Feature(Document):
         """Whether its pictures are of depth, by any of the words for it."""
         told = [info for info in (self.info, self.video_info) if info is not None]
         return any(info.depth or info.video_depth for info in told)
+
+
+class Vector(Document):
+    """What `info.json` says of the numbers of a column: judged only where it is read."""
+
+    shape: Annotated[tuple[Index], Strict(False)]
+    names: Annotated[tuple[Text, ...] | None, BeforeValidator(_flat_names)] = None
+    """Flat."""
 
 
 class Info(Document):

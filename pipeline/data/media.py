@@ -4,7 +4,7 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
-from typing import Annotated, Any
+from typing import IO, Annotated, Any
 
 import av
 from av.container import InputContainer
@@ -17,6 +17,8 @@ from pipeline.base.config import MediaLimits
 from pipeline.base.errors import RecordingError
 
 RECORDINGS = Border(RecordingError, "Copy the file again, or leave the episode out.")
+INTACT = Border(RecordingError, "Write the file again as expected, or leave the episode out.")
+"""Of what is no damage, so that a copy would be the same."""
 
 DEFAULT_LIMITS = MediaLimits()
 """Of a file that is of no source."""
@@ -29,6 +31,8 @@ Rate = Annotated[float, Field(ge=1e-3, le=1e6)]
 _ALWAYS_TAKEN = 256 * 2**20
 """Unpacked bytes that no ratio forbids: what stands still packs a thousandfold."""
 _IMAGES = ("JPEG", "PNG")
+_IMAGE_BYTES = 16 * 2**20
+"""That an image may have beside one for each pixel of the limits; a good JPEG has half of that."""
 _SCAN, _MOST_SCANS = b"\xff\xda", 100
 """A progressive JPEG has about ten; each goes over all pixels again."""
 _CODECS = ("av1", "h264", "hevc", "mjpeg", "mpeg4", "vp8", "vp9")
@@ -54,7 +58,14 @@ def check_unpacked(where: Path | str, unpacked: int, packed: int, limits: MediaL
     """Refuse an array or a table of so many bytes in so many bytes of a file, before it is read."""
     ratio = max(_ALWAYS_TAKEN, int(limits.ratio * packed))
     for most, name in ((limits.array_bytes, "array_bytes"), (ratio, "ratio")):
-        _check_limit(where, unpacked, most, name, "bytes unpacked")
+        check_limit(where, unpacked, most, name, "bytes unpacked")
+
+
+def check_image_file(file: Path, limits: MediaLimits) -> int:
+    """The bytes of a regular file, refused where no image within the limits needs as many."""
+    size = RECORDINGS.check_file(file)
+    check_limit(file, size, _IMAGE_BYTES + limits.pixels, "pixels", "bytes")
+    return size
 
 
 @contextmanager
@@ -66,18 +77,23 @@ def opened_image(
     Its pixels are within the limits, by its header: nothing is decoded yet.
     """
     if isinstance(file, Path):
-        file = RECORDINGS.read_bytes(file, RECORDINGS.check_file(file))
-    with RECORDINGS.foreign(where, "cannot be decoded as an image"):
+        check_image_file(file, limits)
+    unreadable = "cannot be decoded as an image"
+    with (
+        RECORDINGS.foreign(where, unreadable),
+        BytesIO(file) if isinstance(file, bytes) else file.open("rb") as stream,
+    ):
         try:
-            image = Image.open(BytesIO(file), formats=_IMAGES)
+            image = Image.open(stream, formats=_IMAGES)
         except UnidentifiedImageError:
-            why = f"cannot be decoded as an image: expected a JPEG or PNG, found {shown(file[:16])}"
+            stream.seek(0)
+            why = f"{unreadable}: expected a JPEG or PNG, found {shown(stream.read(16))}"
             raise RECORDINGS.refusal(where, why) from None
         with image:
-            _check_limit(where, image.width * image.height, limits.pixels, "pixels", "pixels")
-            if (scans := file.count(_SCAN)) > _MOST_SCANS and image.format != "PNG":
+            check_limit(where, image.width * image.height, limits.pixels, "pixels", "pixels")
+            if (scans := _scans(image, stream)) > _MOST_SCANS:
                 why = f"expected at most {_MOST_SCANS} scans over the image, found {scans:,}"
-                raise RECORDINGS.refusal(where, why)
+                raise INTACT.refusal(where, why)
             yield image
 
 
@@ -101,23 +117,34 @@ def opened_video(
         context: Any = stream.codec_context
         codec = context.codec.canonical_name if context else "one that PyAV does not know"
         if codec not in _CODECS:
-            raise RECORDINGS.refusal(
-                path, f"expected a video of {', '.join(_CODECS)}, found {codec}"
-            )
+            raise INTACT.refusal(path, f"expected a video of {', '.join(_CODECS)}, found {codec}")
         if codec == "av1" and not _AV1_DECODERS & av.codecs_available:
             raise RecordingError(
                 f"{path}: the video is AV1 and this PyAV build decodes none; "
                 "install a wheel that has libdav1d: pip install --upgrade av"
             )
-        _check_limit(path, context.width * context.height, limits.pixels, "pixels", "pixels")
+        check_limit(path, context.width * context.height, limits.pixels, "pixels", "pixels")
         context.options = {"max_pixels": str(limits.pixels)}
         context.thread_count = 1
         yield container, stream
 
 
-def _check_limit(where: Path | str, found: int, most: int, name: str, what: str) -> None:
+def check_limit(where: Path | str, found: int, most: int, name: str, what: str) -> None:
+    """Refuse what is more than `limits.<name>` of its source allow."""
     if found > most:
         raise Border(
             RecordingError,
             f"Leave the episode out, or if this is right, raise limits.{name} of its source.",
         ).refusal(where, f"expected at most {most:,} {what}, found {found:,}")
+
+
+def _scans(image: Image.Image, stream: IO[bytes]) -> int:
+    """Scans over a JPEG; its file is read for them only where it has several."""
+    if image.format == "PNG":
+        return 0
+    first = 8 + 2 * getattr(image, "layers", 0)  # the bytes of a scan's head that names them all
+    stream.seek(max(0, stream.tell() - first))
+    if "progressive" not in image.info and stream.read(first).rfind(_SCAN) == 0:
+        return 1  # the decoder takes no other after it
+    stream.seek(0)
+    return stream.read().count(_SCAN)

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 
 from pipeline.base.border import shown
 from pipeline.base.config import MediaLimits
-from pipeline.data.media import RECORDINGS, check_unpacked
+from pipeline.data.media import INTACT, RECORDINGS, check_unpacked
 
 _WIDEST = 8
 """Bytes of one number, or of what tells where a text begins."""
@@ -47,7 +47,7 @@ class ParquetTable:
         names = file.schema_arrow.names
         there = [name for name in wanted if name in names]
         if twice := [name for name in there if names.count(name) > 1]:
-            raise RECORDINGS.refusal(self.path, f"expected one column {twice[0]!r}, found more")
+            raise INTACT.refusal(self.path, f"expected one column {twice[0]!r}, found more")
         # Arrow reads all leaves whose path begins so.
         begins = tuple(f"{name}." for name in there)
         schema = file.schema

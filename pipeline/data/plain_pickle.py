@@ -13,17 +13,24 @@ from math import prod
 from pathlib import Path
 from pickle import _Unpickler  # pyright: ignore[reportPrivateUsage]
 from struct import unpack
+from sys import getsizeof
 from typing import Any
 
 import numpy as np
 
 from pipeline.base.border import shown
-from pipeline.data.media import RECORDINGS
+from pipeline.data.media import INTACT, RECORDINGS, check_limit
 
 _DTYPE = re.compile(r"[<>=|]?(\?|[biuf][1248]|[SU]\d{1,6})")
 _DEEPEST = 20
 _MOST = 500_000
 """Opcodes of a pickle, and values in it; what stands in two places counts twice."""
+_COPIED = 64 * 2**20
+"""Bytes that calls may make of any file; of a larger one, twice its own. What is no call takes its
+bytes from the file, or a few for a step."""
+_LONGEST = 40_000
+"""Bytes of a key, of a member of a set and of a scalar, which may be gone over at every step."""
+_MOST_DIMENSIONS = 64
 _KEYS = (str, bytes, int, float, type(None))
 _PLAIN = (*_KEYS, bytearray, np.ndarray)
 
@@ -63,12 +70,15 @@ def _frombuffer(data: Any, dtype: Any, shape: Any, order: Any, axes: Any = None)
 
 
 def _scalar(dtype: Any, data: Any) -> Any:
+    if len(data) > _LONGEST:
+        raise _Refused(f"a scalar of more than {_LONGEST:,} bytes")
     return np.frombuffer(data, _fitting((), dtype, data))[0].item()
 
 
 def _fitting(shape: Any, dtype: Any, data: Any) -> "np.dtype[Any]":
     """The dtype, if an array of that shape has as many bytes as the data."""
-    plain = isinstance(shape, tuple) and all(type(n) is int and n >= 0 for n in shape)
+    plain = isinstance(shape, tuple) and len(shape) <= _MOST_DIMENSIONS
+    plain = plain and all(type(n) is int and 0 <= n < 2**63 for n in shape)
     if not plain or not isinstance(dtype, _Dtype) or not isinstance(data, bytes | bytearray):
         raise _Refused("an array whose shape, dtype or data is not plain")
     if prod(shape) * dtype.dtype.itemsize != len(data):
@@ -97,7 +107,16 @@ def _hashed(keys: Any) -> Any:
     for key in keys:
         if not isinstance(key, _KEYS):
             raise _Refused(f"a key or a member of a set that is a {type(key).__name__}")
+        if getsizeof(key) > _LONGEST:
+            raise _Refused(f"a key or a member of a set of more than {_LONGEST:,} bytes")
     return keys
+
+
+def _set(members: Any) -> set[Any]:
+    """A set of members that all differ: comparing those that do not could take for ever."""
+    if not isinstance(members, list) or len(made := set(_hashed(members))) < len(members):
+        raise _Refused("a set that is not made of a list whose members differ")
+    return made
 
 
 _CALLS: Mapping[str, Callable[..., Any]] = {
@@ -108,8 +127,8 @@ _CALLS: Mapping[str, Callable[..., Any]] = {
     "numpy._core.numeric _frombuffer": _frombuffer,
     "_codecs encode": _latin1,
     "collections OrderedDict": _ordered,
-    "builtins set": lambda members: set(_hashed(members)),
-    "builtins frozenset": lambda members: frozenset(_hashed(members)),
+    "builtins set": _set,
+    "builtins frozenset": lambda members: frozenset(_set(members)),
     "builtins bytes": lambda: b"",
 }
 """What the names in a pickle stand for."""
@@ -135,6 +154,7 @@ class _Reader(_Unpickler):
     metastack: list[list[Any]]
     read: Callable[[int], bytes]
     left = _MOST
+    most_copied = copied = 0
 
     def find_class(self, module: str, name: str) -> Any:
         # As numpy 2 and protocol 3 spell them.
@@ -157,6 +177,7 @@ def _guarded(opcode: str, step: Callable[[Any], None]) -> Callable[[Any], None]:
     """A step of the reader, refused where plain data do not need it."""
     admitted = _ADMITTED.fullmatch(opcode)
     keys = _KEYED.get(opcode, slice(0))
+    calls = opcode in ("REDUCE", "BUILD")
 
     def take(reader: _Reader) -> None:
         reader.left -= 1
@@ -170,6 +191,10 @@ def _guarded(opcode: str, step: Callable[[Any], None]) -> Callable[[Any], None]:
                 raise _Refused(f"a {type(filled).__name__} with keys")
         _hashed(reader.stack[keys])
         step(reader)
+        if calls:  # An array that views its bytes is small.
+            reader.copied += getsizeof(reader.stack[-1])
+            if reader.copied > reader.most_copied:
+                raise _Refused(f"copies of more than {reader.most_copied:,} bytes")
 
     return take
 
@@ -203,14 +228,17 @@ def load_plain(path: Path, most: int) -> Any:
     Scalars of numpy become plain numbers. Raises `RecordingError` naming what else it asks for, of
     which nothing is executed, or how it is damaged, or that the file has more than `most` bytes.
     """
-    RECORDINGS.check_file(path, most)
+    size = RECORDINGS.check_file(path)
+    check_limit(path, size, most, "array_bytes", "bytes")
     # Damaged bytes make numpy and the opcodes' readers raise almost any exception.
     with RECORDINGS.foreign(path, "damaged pickle"), path.open("rb") as file:
         try:
-            _check_plain(value := _Reader(file, encoding="latin1").load(), _MOST, 0)
+            reader = _Reader(file, encoding="latin1")
+            reader.most_copied = max(_COPIED, 2 * size)
+            _check_plain(value := reader.load(), _MOST, 0)
             return value
         except _Refused as error:
-            raise RECORDINGS.refusal(
+            raise INTACT.refusal(
                 path,
                 f"refused: it asks for {error}; only numpy arrays and plain containers are "
                 "admitted, because a pickle can run code. Nothing was executed",

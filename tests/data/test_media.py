@@ -3,10 +3,12 @@
 import io
 import os
 import struct
+import tracemalloc
 import warnings
 import zipfile
 import zlib
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 
 import av
@@ -17,11 +19,12 @@ from PIL import Image
 from pipeline.base.config import MediaLimits
 from pipeline.base.errors import RecordingError
 from pipeline.data.arrays import read_csv, read_npy, read_npz
-from pipeline.data.jpeg import check_image, image_size, read_image
+from pipeline.data.jpeg import JpegCamera, check_image, image_size, read_image
 from pipeline.data.media import check_unpacked, opened_video
 from pipeline.data.recording import content_digest
 
 MEND = "Copy the file again, or leave the episode out"
+ASKED = (read_image, check_image, image_size)
 SMALL = MediaLimits(pixels=1000, array_bytes=2**20, ratio=1)
 
 SPECIAL = {
@@ -60,9 +63,9 @@ def test_only_regular_files_are_opened(tmp_path, write, truth, only, format, fil
             content_digest(only(folder), str)
 
 
-def saved(format: str, size: tuple[int, int] = (40, 30), **options) -> bytes:
+def saved(format: str, size: tuple[int, int] = (40, 30), kind: str = "RGB", **options) -> bytes:
     buffer = io.BytesIO()
-    Image.new("RGB", size).save(buffer, format, **options)
+    Image.new(kind, size).save(buffer, format, **options)
     return buffer.getvalue()
 
 
@@ -81,6 +84,13 @@ def many_scans() -> bytes:
     return content[:last] + content[last:-2] * 101 + b"\xff\xd9"
 
 
+def many_plain_scans(before: bytes = b"", kind: str = "RGB") -> bytes:
+    """A JPEG that is not progressive, and has one colour a scan."""
+    content = saved("JPEG", kind=kind)
+    scans = b"".join(b"\xff\xda\0\x08\x01%c\0\0\x3f\0\0" % color for color in (1, 2, 3))
+    return content[: content.rfind(b"\xff\xda")] + before + scans * 34 + b"\xff\xd9"
+
+
 @pytest.mark.parametrize(
     ("content", "limits", "message"),
     [
@@ -94,15 +104,46 @@ def many_scans() -> bytes:
         (saved("JPEG"), SMALL, r"at most 1,000 pixels, found 1,200\. .*raise limits\.pixels"),
         (saved("PNG"), SMALL, r"at most 1,000 pixels, found 1,200\. .*raise limits\.pixels"),
         (large_png(), MediaLimits(), "at most 64,000,000 pixels, found 900,000,000"),
-        (many_scans(), MediaLimits(), f"at most 100 scans over the image, found 1.*{MEND}"),
+        *(
+            (content, MediaLimits(), "at most 100 scans over the image, found 1.*Write the file")
+            for content in (
+                many_scans(),
+                many_plain_scans(),
+                many_plain_scans(b"\xff\xfe\0\x10" + b"\xff\xda\0\x0e\x04" * 3),
+                many_plain_scans(b"\xff\xfe\0\x08\xff\xda\0\x0e\x04\0", kind="CMYK"),
+            )
+        ),
     ],
 )
 def test_images_are_of_two_kinds_and_within_limits(tmp_path, content, limits, message):
     path = tmp_path / "a_1.5.jpg"
     path.write_bytes(content)
-    for attempt in (read_image, check_image, image_size):
+    for attempt in ASKED:
         with pytest.raises(RecordingError, match=rf"a_1\.5\.jpg: .*{message}"):
             attempt(path, str(path), limits)
+
+
+def test_an_image_has_no_more_bytes_than_its_pixels_need(tmp_path):
+    path = tmp_path / "a_1.5.jpg"
+    path.write_bytes(saved("JPEG"))
+    os.truncate(path, 2**34)
+    camera = JpegCamera("a", [path, path])
+    for attempt in (*(partial(ask, path, str(path)) for ask in ASKED), camera.repeats):
+        with pytest.raises(RecordingError, match=r"at most 80,777,216 bytes.*limits\.pixels"):
+            attempt()
+
+
+@pytest.mark.parametrize("options", [{}, {"progressive": True}, {"kind": "L"}, {"kind": "CMYK"}])
+def test_an_image_is_read_whole_only_for_its_scans(tmp_path, options):
+    path = tmp_path / "a_1.5.jpg"
+    path.write_bytes(saved("JPEG", **options))
+    os.truncate(path, 60_000_000)
+    for ask in ASKED:
+        tracemalloc.start()
+        ask(path, str(path))
+        _, most = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert (most > 60_000_000) == ("progressive" in options)
 
 
 def mjpeg(path: Path, *sizes: int) -> Path:
@@ -165,7 +206,9 @@ def npy(shape: str, body: bytes = b"", dtype: str = "<f8", version: bytes = b"\1
         (npy("(1,)", bytes(8), version=b"\x09\0"), "its header is damaged or not numpy's"),
         (npy("(" * 5000), "its header is damaged or not numpy's"),
         (b"\x93NUMPY\x02\x00\xff\xff\xff\xff{", "its header is damaged or not numpy's"),
-        (npy("(200000,)", bytes(1_600_000)), "expected at most 1,048,576 bytes"),
+        (npy("(200000,)", bytes(1_600_000)), "at most 1,048,576 bytes unpacked.* Leave the"),
+        (npy("(2147483648, 0)"), r"expected rows with values, found \(2147483648, 0\) of float64"),
+        (npy("(2147483648,)", dtype="<U0"), r"expected rows with values, found \(2147483648,\)"),
     ],
 )
 def test_arrays_are_what_their_bytes_hold(tmp_path, content, message):
@@ -177,9 +220,18 @@ def test_arrays_are_what_their_bytes_hold(tmp_path, content, message):
         (lambda: read_npy(path, SMALL), "a.npy"),
         (lambda: read_npz(packed, ["values"], limits=SMALL), "a.npz, member 'values'"),
     ):
-        with pytest.raises(RecordingError, match=rf"{place}: .*{message}.* episode out") as caught:
+        with pytest.raises(RecordingError, match=rf"{place}: .*{message}.*episode out") as caught:
             attempt()
         assert "pickle" not in str(caught.value)
+
+
+def test_an_array_may_have_no_rows_and_lists_of_words_end(tmp_path):
+    path = tmp_path / "a.npz"
+    np.savez(path, values=np.zeros((0, 7)), names=np.zeros(65_537, "<U1"))
+    assert read_npz(path, ["values"])["values"].shape == (0, 7)
+    message = r"'names': expected a list of at most 65,536 words, found <U1 of shape \(65537,\)"
+    with pytest.raises(RecordingError, match=message):
+        read_npz(path, ["values"], text=["names"])
 
 
 def test_what_unpacks_a_hundredfold_is_refused_unread():

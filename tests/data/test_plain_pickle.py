@@ -1,5 +1,6 @@
 """The unpickler that runs nothing."""
 
+import _codecs as codecs
 import builtins
 import io
 import os
@@ -214,9 +215,67 @@ SHARED = b"".join(b"h%ch%c\x86\x94" % (n, n) for n in range(60))
 def test_what_would_take_for_ever_is_refused_at_once(tmp_path, content, message):
     path = tmp_path / "data.pkl"
     path.write_bytes(content)
-    with pytest.raises(RecordingError, match=rf"data\.pkl: .*{message}.*Copy the file") as caught:
+    mend = "Copy the file" if "damaged" in message else "(Write|Copy) the file"
+    with pytest.raises(RecordingError, match=rf"data\.pkl: .*{message}.*{mend}") as caught:
         load_plain(path)
     assert len(str(caught.value)) < 600
+
+
+SWAPPED = np.zeros(2**17, ">f8").__reduce__()
+
+
+class Again:
+    """Pickles as the same call of the same arguments, whose bytes stand in the file once."""
+
+    def __init__(self, *reduced: object) -> None:
+        self.reduced = reduced
+
+    def __reduce__(self):
+        return self.reduced
+
+
+@pytest.mark.parametrize("protocol", range(6))
+@pytest.mark.parametrize(
+    "reduced",
+    [
+        (codecs.encode, ("a" * 2**20, "latin1")),
+        (set, ([*range(20_000)],)),
+        (frozenset, ([*range(20_000)],)),
+        SWAPPED,
+    ],
+)
+def test_what_stands_once_is_not_copied_again_and_again(tmp_path, reduced, protocol):
+    path = save(tmp_path / "data.pkl", [Again(*reduced) for _ in range(100)], protocol)
+    message = r"data\.pkl: refused: it asks for copies of more than 67,108,864 bytes"
+    with pytest.raises(RecordingError, match=message):
+        load_plain(path)
+
+
+@pytest.mark.parametrize("protocol", range(6))
+@pytest.mark.parametrize("dtype", ["<f8", ">f8"])
+def test_an_array_may_be_copied_once_for_its_byte_order(tmp_path, monkeypatch, dtype, protocol):
+    monkeypatch.setattr("pipeline.data.plain_pickle._COPIED", 0)
+    array = np.arange(99_999.0).astype(dtype)
+    loaded = load_plain(save(tmp_path / "data.pkl", [array], protocol))
+    np.testing.assert_array_equal(loaded[0], array)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (Again(set, ([1, 1],)), "a set that is not made of a list whose members differ"),
+        (Again(set, ((1, 2),)), "a set that is not made of a list whose members differ"),
+        (Again(set, (np.zeros(3),)), "a set that is not made of a list whose members differ"),
+        ({"a" * 50_000: 1}, "a key or a member of a set of more than 40,000 bytes"),
+        (np.str_("a" * 20_000), "a scalar of more than 40,000 bytes"),
+        (Again(*SWAPPED[:2], (1, (1,) * 65, np.dtype("i1"), False, b"a")), "shape, dtype or data"),
+        (Again(*SWAPPED[:2], (1, (0, 2**63), np.dtype("i1"), False, b"")), "shape, dtype or data"),
+    ],
+)
+def test_what_takes_long_again_and_again_is_refused(tmp_path, content, message):
+    path = save(tmp_path / "data.pkl", content, 2 if isinstance(content, Again) else 0)
+    with pytest.raises(RecordingError, match=rf"data\.pkl: refused: .*{message}.*Write the file"):
+        load_plain(path)
 
 
 def test_an_index_of_the_memo_costs_nothing(tmp_path):
