@@ -65,7 +65,7 @@ class Border:
 
     def refusal(self, where: Path | str, why: object) -> PipelineError:
         """The error for something at a place."""
-        return self.error(f"{named(str(where))}: {str(why).rstrip('. ')}. {self.mend}")
+        return self.error(f"{named(str(where))}: {str(why).rstrip('.: ')}. {self.mend}")
 
     def check_file(self, path: Path, most: int | None = None) -> int:
         """The bytes of a regular file; refuses a folder, a pipe, a device, one of more than `most`.

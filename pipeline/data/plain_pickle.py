@@ -14,7 +14,7 @@ from pathlib import Path
 from pickle import _Unpickler  # pyright: ignore[reportPrivateUsage]
 from struct import unpack
 from sys import getsizeof
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -154,7 +154,18 @@ class _Reader(_Unpickler):
     metastack: list[list[Any]]
     read: Callable[[int], bytes]
     left = _MOST
-    most_copied = copied = 0
+    copied = 0
+
+    def __init__(self, file: IO[bytes], size: int) -> None:
+        super().__init__(file, encoding="latin1")
+        self.most_copied = max(_COPIED, 2 * size)
+
+        def read(count: int) -> bytes:
+            if count > size:  # for which Python would make room
+                raise EOFError(f"{count:,} bytes of {size:,}")
+            return file.read(count)
+
+        self._file_read = read
 
     def find_class(self, module: str, name: str) -> Any:
         # As numpy 2 and protocol 3 spell them.
@@ -233,9 +244,7 @@ def load_plain(path: Path, most: int) -> Any:
     # Damaged bytes make numpy and the opcodes' readers raise almost any exception.
     with RECORDINGS.foreign(path, "damaged pickle"), path.open("rb") as file:
         try:
-            reader = _Reader(file, encoding="latin1")
-            reader.most_copied = max(_COPIED, 2 * size)
-            _check_plain(value := reader.load(), _MOST, 0)
+            _check_plain(value := _Reader(file, size).load(), _MOST, 0)
             return value
         except _Refused as error:
             raise INTACT.refusal(

@@ -332,3 +332,11 @@ def test_random_bytes_never_raise_anything_else(tmp_path):
             load_plain(path)
         except RecordingError as error:
             assert "data.pkl" in str(error)
+
+
+@pytest.mark.parametrize("opcode", [b"\x95", b"\x8e", b"\x96", b"\x8d"])
+def test_a_length_beyond_the_file_takes_no_memory(tmp_path, opcode):
+    path = tmp_path / "data.pkl"
+    path.write_bytes(b"\x80\x05" + opcode + (2**62).to_bytes(8, "little") + b"N.")
+    with pytest.raises(RecordingError, match=r"damaged pickle: (?!not enough memory)"):
+        load_plain(path)
