@@ -84,8 +84,8 @@ def open_recordings(
             if not found:
                 raise RecordingError(
                     f"source {source.name!r}: {folder} has none of the {len(absent)} episode(s) "
-                    f"that its meta/ lists{'; first: ' + absent[0] if absent else ''}. "
-                    "Copy the data and video files too"
+                    f"that its meta/ lists{'; first: ' + absent[0].rstrip('.') if absent else ''}. "
+                    "Copy the data and video files too, or correct the paths in meta/info.json."
                 )
             of_source += found
             missing += absent

@@ -180,7 +180,7 @@ def read_manifest(path: Path) -> Manifest:
         )
     if document.get("schema") != _SCHEMA:
         raise StoreMismatch(
-            f"{path}: expected an archive of schema {_SCHEMA}, found "
+            f"{path / _ZARR_JSON}: expected an archive of schema {_SCHEMA}, found "
             f"{shown(document.get('schema'))}. Restore it with the version that made it."
         )
     if document.pop("digest", None) != _digest_of(document):

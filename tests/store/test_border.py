@@ -208,6 +208,13 @@ class TestStores:
                 if (checked := work(store)) and hasattr(checked, "lines"):
                     raise StoreIncomplete("\n".join(checked.lines()))
 
+    def test_a_document_that_is_a_link_to_itself(self, store):
+        document = store / "golden/1/zarr.json"
+        document.unlink()
+        document.symlink_to(document)
+        lines = verify(store, threads=1).lines()
+        assert any(f"{document}: cannot be read" in line for line in lines), lines
+
     def test_a_group_is_opened_as_zarr_opens_it_below_another(self, store):
         (store / "golden/zarr.json").write_text('{"zarr_format": 3, "attributes": {}}')
         note_metadata(store)
