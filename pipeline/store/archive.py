@@ -417,10 +417,8 @@ def _check_shard(shard: Path, array: "zarr.Array[Any]") -> None:
     if not shard.exists():
         return  # of zeros
     assert array.shards is not None, "an archive is sharded"
-    whole, pieces = (
-        math.prod(array.chunks) * array.dtype.itemsize,
-        array.shards[0] // array.chunks[0],
-    )
+    whole = math.prod(array.chunks) * array.dtype.itemsize
+    pieces = array.shards[0] // array.chunks[0]
     size = _BORDER.check_file(shard, (pieces + 1) * (whole + 64))  # zarr reads it whole
     with shard.open("rb") as file:
         file.seek(max(0, size - 16 * pieces - 4))
