@@ -61,9 +61,11 @@ class Robot(Protocol):
         """`state`, `state_time`, `sensor`, `sensor_time`: the readings since the last call; `time`
         (1,), its clock now, s. `reset` true where a new episode has begun since; `ended`, a text,
         where there is no more to do, and why."""
+        ...
 
     def frames(self) -> Frames:
         """The newest frame of each camera: when it was taken, s, and RGB."""
+        ...
 
     def act(self, action: NDArray[np.float64]) -> object:
         """Carry out one action, in the units of the policy's metadata."""
@@ -78,9 +80,11 @@ class Decides(Protocol):
     @property
     def metadata(self) -> Mapping[str, Any]:
         """What it takes and gives."""
+        ...
 
     def infer(self, observation: Mapping[str, Any]) -> Mapping[str, Any]:
         """Its answer; raises `ConnectionError` where there is nobody to answer any more."""
+        ...
 
 
 @dataclass(frozen=True)

@@ -101,9 +101,8 @@ def _draw_side(draw: _Draw, scene: Scene) -> None:
 
 def _draw_above(draw: _Draw, scene: Scene) -> None:
     _phantom(draw, np.zeros(2), scene.target_mm, _BENCH_PX_MM)
-    tip, hub = (
-        _pixels(place, _BENCH_PX_MM) for place in (scene.needle_mm, scene.needle_mm + scene.lean_mm)
-    )
+    tip = _pixels(scene.needle_mm, _BENCH_PX_MM)
+    hub = _pixels(scene.needle_mm + scene.lean_mm, _BENCH_PX_MM)
     _line(draw, hub, np.array([hub[0], -1.0]), _BENCH_PX_MM * _ARM_MM, _ARM)
     _line(draw, tip, hub, _BENCH_PX_MM * _SHAFT_MM, _STEEL)
     _disc(draw, hub, _BENCH_PX_MM * _HUB_RADIUS_MM, _HUB)
