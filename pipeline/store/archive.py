@@ -354,7 +354,10 @@ def _check_rebuilt(
 
 def _create_array(root: Path | dict[str, Any], spec: ArraySpec, level: int) -> "zarr.Array[Any]":
     """The array in an archive, without data."""
-    shard, inner = _chunks_a_shard(spec) * spec.chunk_rows, inner_rows(spec)
+    # As few shards as can be, all but the last of one size.
+    most = max(1, SHARD_BYTES // max(1, spec.chunk_bytes))
+    chunks = math.ceil(spec.chunk_count / max(1, math.ceil(spec.chunk_count / most))) or 1
+    shard, inner = chunks * spec.chunk_rows, inner_rows(spec)
     widths = tuple(max(1, size) for size in spec.shape[1:])
     codec = codec_for(spec.dtype, inner * spec.row_bytes, level)
     return spec.create(
@@ -387,12 +390,6 @@ def inner_rows(spec: ArraySpec) -> int:
     """Rows of an inner chunk: the most that divide a chunk of the store and are not too large."""
     parts = min(spec.chunk_rows, max(1, math.ceil(spec.chunk_bytes / INNER_BYTES)))
     return spec.chunk_rows // next(part for part in count(parts) if not spec.chunk_rows % part)
-
-
-def _chunks_a_shard(spec: ArraySpec) -> int:
-    """As few shards as can be, all but the last of one size."""
-    most = max(1, SHARD_BYTES // max(1, spec.chunk_bytes))
-    return math.ceil(spec.chunk_count / max(1, math.ceil(spec.chunk_count / most))) or 1
 
 
 def _shards(root: Path, spec: ArraySpec, array: "zarr.Array[Any]") -> list[tuple[Path, range]]:

@@ -276,8 +276,7 @@ def strange_files(
         root / place / "zarr.json" for place in ("", *GROUPS, *ARRAY_NAMES)
     }
     expected |= {path for spec in specs.values() for path in chunk_paths(root, spec)}
-    not_told = [GOLDEN] if golden is None else []
-    unjudged = [*(name for name in ARRAY_NAMES if name not in specs), *not_told]
+    unjudged = {*ARRAY_NAMES} - {*specs} | ({GOLDEN} if golden is None else set[str]())
     prefixes = tuple(f"{root / name}/" for name in unjudged)
     files = (Path(folder) / file for folder, _, names in os.walk(root) for file in names)
     for path in sorted(files):

@@ -60,13 +60,6 @@ class Extractor:
             parts = (self._tower.__call__, self._read)
             self._compiled = tuple(torch.compile(p, dynamic=False, mode=mode) for p in parts)
 
-    def extract(
-        self, rows: Sequence[PreparedRow]
-    ) -> tuple[Float[Tensor, "batch slot dim"], Bool[Tensor, "batch slot"]]:
-        """Features of each row in float32 on the model's device; which are valid, on the CPU."""
-        batch = self.collate(rows)
-        return self.features(batch), self.valid(batch)
-
     def collate(self, rows: Sequence[PreparedRow]) -> TokenBatch:
         """The rows as `features` takes them, sent to the model's device without waiting."""
         return self._collator.collate(rows)
