@@ -36,12 +36,7 @@ from pipeline.base.digests import file_digest
 from pipeline.base.durable import disk_full_named, put_in_place, sync
 from pipeline.base.errors import PipelineError, StoreIncomplete, StoreMismatch
 from pipeline.base.ownership import OutputKind, begin_folder, remove_folder
-from pipeline.store.border import (
-    Group,
-    Length,
-    StoreAttributes,
-    store_border,
-)
+from pipeline.store.border import Group, Length, StoreAttributes, store_border
 from pipeline.store.chunks import check_row_checksums, check_trailers, read_rows
 from pipeline.store.golden import GOLDEN, read_golden
 from pipeline.store.lock import build_lock
@@ -361,10 +356,7 @@ def _create_array(root: Path | dict[str, Any], spec: ArraySpec, level: int) -> "
     widths = tuple(max(1, size) for size in spec.shape[1:])
     codec = codec_for(spec.dtype, inner * spec.row_bytes, level)
     return spec.create(
-        root,
-        shards=(shard, *widths),
-        chunks=(inner, *widths),
-        compressors=[codec, Crc32cCodec()],
+        root, shards=(shard, *widths), chunks=(inner, *widths), compressors=[codec, Crc32cCodec()]
     )
 
 

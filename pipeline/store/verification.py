@@ -53,12 +53,7 @@ from pipeline.store.schema import (
 MOST_LINES = 20
 """Of one kind that are shown; the rest is counted."""
 SOUND, UNREADABLE, CHANGED, NOT_FINITE = range(4)
-FAULTS = (
-    "",
-    "not in its file",
-    "its bytes do not give its checksum",
-    "NaN or infinity",
-)
+FAULTS = ("", "not in its file", "its bytes do not give its checksum", "NaN or infinity")
 """How a feature row is, in words."""
 _Error = partial(Issue, severity="error")
 

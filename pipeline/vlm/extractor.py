@@ -33,11 +33,7 @@ class Extractor:
     """
 
     def __init__(
-        self,
-        model: Any,
-        settings: PixelSettings,
-        slots: tuple[Slot, ...],
-        compiled: bool = False,
+        self, model: Any, settings: PixelSettings, slots: tuple[Slot, ...], compiled: bool = False
     ) -> None:
         """`model` may be cut after the last layer that a slot reads.
 
