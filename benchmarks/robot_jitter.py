@@ -119,9 +119,9 @@ class Course:
 
     def take(self, run: RunReport, robot: CountedRobot) -> None:
         """One more run."""
-        for row in run.tick_timings.ring.rows():
+        for row in run.tick_timings.rows():
             self.ticks.note(row)
-        for row in run.answer_timings.ring.rows():
+        for row in run.answer_timings.rows():
             self.answers.note(row)
         self.left_out += run.left_out
         self.missed_ticks += run.missed_ticks
@@ -136,10 +136,10 @@ class Course:
 
     def document(self) -> dict[str, Any]:
         """What is told of it."""
-        answers = self.answers.ring.rows()
+        answers = self.answers.rows()
         passes = int((answers[:, ANSWER_PARTS.index("vlm_ms")] > 0).sum())
         return {
-            "ticks": self.ticks.ring.count,
+            "ticks": self.ticks.count,
             "missed_ticks": self.missed_ticks,
             "left_out": self.left_out,
             "unaccounted": self.unaccounted,
@@ -204,7 +204,7 @@ def run(connect: Callable[[], Decides], settings: RunSettings, seconds: float) -
     """Run the arm for so many seconds, an episode a run."""
     hz = settings.hz or TICK_HZ
     course, seed = Course(hz), 0
-    while (left := seconds - (course.ticks.ring.count + course.left_out) / hz) > 0.5 / hz:
+    while (left := seconds - (course.ticks.count + course.left_out) / hz) > 0.5 / hz:
         policy = connect()
         limits = world_limits(policy.metadata, hz)
         with closing(CountedRobot(hz=hz, seed=seed)) as robot:
@@ -226,7 +226,7 @@ def world_limits(metadata: Mapping[str, Any], hz: float) -> Limits:
 
 def judged(name: str, course: Course) -> list[dict[str, Any]]:
     """The targets of the report."""
-    told, ran = course.ticks.document(), course.ticks.ring.count
+    told, ran = course.ticks.document(), course.ticks.count
     return [
         at_least(f"{name}: share of ticks in time", 1 - course.left_out / max(1, ran), 0.999),
         at_most(f"{name}: p99 of how late a tick begins [ms]", told["late"]["p99"], 1.0),
@@ -236,7 +236,7 @@ def judged(name: str, course: Course) -> list[dict[str, Any]]:
 
 def tell(name: str, course: Course) -> None:
     """The tables of a rate, on stderr."""
-    head = f"{name}: {course.ticks.ring.count} ticks, {course.missed_ticks} missed, "
+    head = f"{name}: {course.ticks.count} ticks, {course.missed_ticks} missed, "
     print(head + f"{course.left_out} left out, {dict(course.stops)}", file=sys.stderr)
     for table in (course.ticks.table(), course.answers.table()):
         print("\n".join(table.text()), file=sys.stderr)

@@ -13,13 +13,7 @@ from typing import Any
 from urllib.parse import quote
 
 from pipeline.base.border import Border
-from pipeline.base.errors import (
-    ConfigError,
-    DiskFull,
-    PipelineError,
-    RecordingError,
-    StoreLocked,
-)
+from pipeline.base.errors import ConfigError, DiskFull, PipelineError, RecordingError, StoreLocked
 from pipeline.base.ownership import LEDGER_SUFFIX, described
 
 _APPLICATION = 0x564C4146

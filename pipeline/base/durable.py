@@ -237,7 +237,7 @@ def write_tensors(path: Path, tensors: Mapping[str, "Tensor"]) -> str:
     save_file({name: value.detach().cpu().contiguous() for name, value in tensors.items()}, path)
     # safetensors writes for the owner alone; other files have what the umask leaves.
     path.chmod(path.parent.stat().st_mode & 0o666)
-    return _sha256(path)
+    return sha256_of(path)
 
 
 def read_tensors(path: Path, sha256: str) -> "dict[str, Tensor]":
@@ -254,11 +254,12 @@ def check_digest(path: Path, sha256: str) -> None:
     RUN_FILES.check_file(path)
     with RUN_FILES.foreign(path, "cut off or damaged"), safe_open(path, "numpy"):
         pass  # the head says how long the file is: none is read without an end
-    if _sha256(path) != sha256:
+    if sha256_of(path) != sha256:
         raise RUN_FILES.refusal(path, "its sha256 is not the one written with it")
 
 
-def _sha256(path: Path) -> str:
+def sha256_of(path: Path) -> str:
+    """The sha256 of a file."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

@@ -109,7 +109,7 @@ def number(value: float) -> str:
 
 def _column(head: str, values: Sequence[Any]) -> Column:
     given = [value for value in values if value is not None]
-    numeric = bool(given) and all(_is_number(value) for value in given)
+    numeric = bool(given) and all(isinstance(v, numbers.Real) and not _is_bool(v) for v in given)
     whole = numeric and all(math.isnan(value) or float(value).is_integer() for value in given)
     cells = [int(v) if whole and v is not None and not math.isnan(v) else v for v in values]
     return Column(head, numeric, tuple(map(_word, cells)))
@@ -133,7 +133,3 @@ def _plain(value: Any) -> Any:
 
 def _is_bool(value: Any) -> bool:
     return type(value).__name__ in ("bool", "bool_")
-
-
-def _is_number(value: Any) -> bool:
-    return not _is_bool(value) and isinstance(value, numbers.Real)

@@ -125,10 +125,7 @@ def trained_on_too(checkpoint: PolicyCheckpoint) -> str:
 
 
 def judged_document(
-    checkpoint: PolicyCheckpoint,
-    policy: Trainable,
-    store: FeatureStore,
-    wanted: EvaluateParams,
+    checkpoint: PolicyCheckpoint, policy: Trainable, store: FeatureStore, wanted: EvaluateParams
 ) -> dict[str, Any]:
     """What was evaluated (`policy`), how it was sampled (`drawn`) and on what (`on`), as JSON.
 

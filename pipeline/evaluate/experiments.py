@@ -3,10 +3,10 @@
 import csv
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import chain, pairwise
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias, get_args
+from typing import Annotated, Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +19,7 @@ from pipeline.base.errors import ConfigError
 from pipeline.base.table import Table
 from pipeline.evaluate.baselines import BASELINES, METHODS
 from pipeline.evaluate.evaluation import JUDGED
-from pipeline.evaluate.figures import Figure
-from pipeline.evaluate.intervals import FEWEST_GROUPS, bootstrap_means
+from pipeline.evaluate.figures import Figure, draws
 from pipeline.evaluate.tables import GROUPS, HEADINGS
 
 SPANS = {"executed": "what is executed", "overall": "the whole chunk"}
@@ -86,6 +85,8 @@ class Experiment:
     """Of each of `SPANS`: (group,) recorded actions that were judged."""
     errors: Mapping[tuple[str, str], NDArray[np.float64]]
     """Of each of `METHODS` in each of `SPANS`: (seed, group) mean absolute error [training std]."""
+    judged: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    """What `JUDGED` says by key of `_SHARED`."""
     folds: int = 1
     """Evaluations that are test for other groups each, and taken together."""
 
@@ -108,13 +109,8 @@ class Experiment:
         return Figure.of(float(value), None if own is None or others is None else own - others)
 
     def _draws(self, span: str, method: str) -> NDArray[np.float64] | None:
-        entries = self.entries[span][:, None]
-        sums = self.errors[method, span].mean(axis=0)[:, None] * entries
-        return bootstrap_means(sums, entries)[:, 0] if len(sums) >= FEWEST_GROUPS else None
-
-
-Evaluated: TypeAlias = tuple[Mapping[str, Any], Experiment]
-"""What `JUDGED` says by key of `_SHARED`, and what is compared."""
+        entries = self.entries[span]
+        return draws(self.errors[method, span].mean(axis=0) * entries, entries)
 
 
 def read_experiments(reports: Path) -> tuple[Experiment, ...]:
@@ -136,17 +132,16 @@ def read_experiments(reports: Path) -> tuple[Experiment, ...]:
             f"{JUDGED}, found none. Run stages.evaluate for each with its own evaluate.output "
             "there, or dvc repro experiments/dvc.yaml."
         )
-    runs: dict[tuple[Any, ...], list[Evaluated]] = {}
-    for document, experiment in map(_read_experiment, folders):
-        runs.setdefault((experiment.recipe, *experiment.seeds), []).append((document, experiment))
-    pooled = chain.from_iterable(map(_pooled, runs.values()))
-    documents, experiments = zip(*pooled, strict=True)
+    runs: dict[tuple[Any, ...], list[Experiment]] = {}
+    for experiment in map(_read_experiment, folders):
+        runs.setdefault((experiment.recipe, *experiment.seeds), []).append(experiment)
+    experiments = list(chain.from_iterable(map(_pooled, runs.values())))
     for key, (alike, remedy) in _SHARED.items():
-        pairs = zip(experiments, documents, strict=True)
-        shared = [(one.name, document[key]) for one, document in pairs if document[key] is not None]
-        for (name, what), (other, other_what) in pairwise(shared):
-            if differing := differences(what, other_what):
-                lines = [f"  {line} ({other})" for line in describe(differing, f" ({name}), ")]
+        shared = [one for one in experiments if one.judged[key] is not None]
+        for one, other in pairwise(shared):
+            if differing := differences(one.judged[key], other.judged[key]):
+                told = describe(differing, f" ({one.name}), ")
+                lines = [f"  {line} ({other.name})" for line in told]
                 raise ConfigError(
                     f"compare.reports: expected evaluations {alike} in {reports}, but:\n"
                     + "\n".join(lines)
@@ -229,13 +224,13 @@ def _apart(name: str, apart: Figure) -> dict[str, Any]:
     return {**apart.columns(name), f"{name}_is": apart.verdict}
 
 
-def _pooled(run: Sequence[Evaluated]) -> Sequence[Evaluated]:
+def _pooled(run: Sequence[Experiment]) -> Sequence[Experiment]:
     """One evaluation of the folds of one training, whose test groups stand side by side.
 
     As they are where some test group is in two of them: then they are no folds.
     """
-    (document, first), *others = run
-    groups = np.array([group for _, one in run for group in one.groups])
+    first, *others = run
+    groups = np.array([group for one in run for group in one.groups])
     if not others or len(set(groups)) < len(groups):
         return run
     order = np.argsort(groups)
@@ -243,16 +238,17 @@ def _pooled(run: Sequence[Evaluated]) -> Sequence[Evaluated]:
     def together(parts: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
         return np.concatenate(parts, axis=-1)[..., order]
 
-    test = {name: part for document, _ in run for name, part in document["on"]["test"].items()}
-    experiment = replace(
+    test = {name: part for one in run for name, part in one.judged["on"]["test"].items()}
+    pooled = replace(
         first,
         name=_less_number(first.name),
         groups=tuple(groups[order].tolist()),
-        entries={span: together([one.entries[span] for _, one in run]) for span in SPANS},
-        errors={key: together([one.errors[key] for _, one in run]) for key in first.errors},
+        entries={span: together([one.entries[span] for one in run]) for span in SPANS},
+        errors={key: together([one.errors[key] for one in run]) for key in first.errors},
+        judged={**first.judged, "on": first.judged["on"] | {"test": test}},
         folds=len(run),
     )
-    return [({**document, "on": document["on"] | {"test": test}}, experiment)]
+    return [pooled]
 
 
 def _merged(seeds: Sequence[Experiment]) -> Experiment:
@@ -273,21 +269,21 @@ def _less_number(name: str) -> str:
     return re.sub(r"([-_]?(seed|fold)[-_]?\d+)+$|[-_]?\d+$", "", name) or name
 
 
-def _read_experiment(folder: Path) -> Evaluated:
-    """What `JUDGED` says, and the experiment of one seed and fold."""
+def _read_experiment(folder: Path) -> Experiment:
+    """The experiment of one seed and fold."""
     text = _REPORT.read_bytes(folder / JUDGED)
     policy = _REPORT.parse_json(text, JudgedDocument, folder / JUDGED).policy
     document = _REPORT.parse_json(text, dict[str, JsonValue], folder / JUDGED)
     groups, numbers = _read_groups(folder / GROUPS)
-    experiment = Experiment(
+    return Experiment(
         name=folder.name,
         seeds=(policy.seed,),
         **policy.model_dump(exclude={"seed"}),
         groups=groups,
         entries={span: numbers[f"{span}_entries"] for span in SPANS},
         errors={(way, span): numbers[f"{way}_{span}"][None] for way in METHODS for span in SPANS},
+        judged={key: document[key] for key in _SHARED},
     )
-    return {key: document[key] for key in _SHARED}, experiment
 
 
 def _read_groups(path: Path) -> tuple[tuple[str, ...], dict[str, NDArray[np.float64]]]:

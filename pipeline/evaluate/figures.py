@@ -102,8 +102,8 @@ def sums_by_group(
 
 def error(comparison: Comparison, method: str, group: ActionGroup | None = None) -> Figure:
     """`Comparison.error` with its interval."""
-    draws = _draws(*sums_by_group(comparison, method, group))
-    return Figure.of(comparison.error(method, group), draws)
+    drawn = draws(*sums_by_group(comparison, method, group))
+    return Figure.of(comparison.error(method, group), drawn)
 
 
 def best_baseline(comparison: Comparison, group: ActionGroup | None = None) -> str:
@@ -116,7 +116,7 @@ def rivalry(comparison: Comparison, group: ActionGroup | None = None) -> Rivalry
     best = best_baseline(comparison, group)
     policy, baseline = (error(comparison, method, group) for method in ("policy", best))
     (sums, counts), (others, _) = (sums_by_group(comparison, m, group) for m in ("policy", best))
-    apart = Figure.of(policy.value - baseline.value, _draws(sums - others, counts))
+    apart = Figure.of(policy.value - baseline.value, draws(sums - others, counts))
     return Rivalry(policy, best, baseline, apart)
 
 
@@ -128,17 +128,17 @@ def times(over: Comparison, under: Comparison) -> Figure | None:
     (sums, _), (others, _) = (sums_by_group(which, "policy") for which in (over, under))
     if not others.any():
         return None
-    return Figure.of(float(sums.sum() / others.sum()), _draws(sums, others))
+    return Figure.of(float(sums.sum() / others.sum()), draws(sums, others))
 
 
 def mean_over_ticks(values: NDArray[np.floating], groups: NDArray[np.str_]) -> Figure:
     """The mean of (tick,) `values` whose ticks are of these `groups`."""
     _, place, counts = np.unique(groups, return_inverse=True, return_counts=True)
-    return Figure.of(float(values.mean()), _draws(summed(values, place), counts))
+    return Figure.of(float(values.mean()), draws(summed(values, place), counts))
 
 
-def _draws(sums: Errors, counts: NDArray[np.number]) -> Draws | None:
-    """Ratios of sums (draw,); None of too few groups."""
+def draws(sums: Errors, counts: NDArray[np.number]) -> Draws | None:
+    """Ratios (draw,) of sums over groups, both (group,); None of too few groups."""
     if len(sums) < FEWEST_GROUPS:
         return None
     return bootstrap_means(sums[:, None], counts[:, None].astype(np.float64))[:, 0]

@@ -40,9 +40,8 @@ def _phases(store: FeatureStore, episode: Episode, columns: list[int]) -> NDArra
     force = store.array("sensor/values")[first:stop, columns]
     step_s = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
     at = store.array("tick/time")[episode.ticks.start : episode.ticks.stop]
-    spans = contact_spans(time, force, units == {"N"}, step_s)
     touching = np.zeros(len(at), np.bool_)
-    for begin, end in spans:
+    for begin, end in contact_spans(time, force, units == {"N"}, step_s):
         touching |= (begin <= at) & (at <= end)
     if touching.any():
         motion = _motion(store, episode)

@@ -8,12 +8,7 @@ from numpy.typing import NDArray
 
 from pipeline.base.config import RolloutParams
 from pipeline.base.errors import ConfigError
-from pipeline.evaluate.rollouts import (
-    Rollouts,
-    instruction_of,
-    refuse_other_robot,
-    run_episodes,
-)
+from pipeline.evaluate.rollouts import Rollouts, instruction_of, refuse_other_robot, run_episodes
 from pipeline.robot.chunking import Executor, check_chunking
 from pipeline.robot.client import PolicyClient
 from pipeline.robot.loop import ControlLoop, SafeStop

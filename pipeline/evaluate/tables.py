@@ -176,8 +176,7 @@ def still_dimensions(comparison: Comparison) -> str:
     if not still:
         return ""
     largest = max(still, key=lambda index: comparison.scale[index] / still[index])
-    moving = comparison.without_low_variance()
-    rivals = rivalry(moving)
+    rivals = rivalry(comparison.without_low_variance())
     return (
         f"hardly moving: {named(comparison.names, list(still))} (training std at most "
         f"{comparison.scale[largest]:.2g}, where {still[largest]:.2g} is usual for such "

@@ -65,7 +65,10 @@ class Denoiser(nn.Module):
             # Attention needs one token a row; a chunk without a valid step counts nothing anyway.
             valid = valid | ~valid.any(dim=1, keepdim=True)
         sources = [context] * len(self.layers) if isinstance(context, Tensor) else context
-        shared, last = self._modulations(time)
+        angles = time.float().unsqueeze(-1) * self.frequencies
+        waves = torch.cat([angles.sin(), angles.cos()], dim=-1)
+        modulation = self.modulation(self.time(waves)).unflatten(-1, (8, -1))
+        shared, last = modulation[:, :6], modulation[:, 6:]
         tokens = self.read(noisy) + self.positions
         for layer, source, own in zip(self.layers, sources, self.layer_modulation, strict=True):
             tokens = layer(tokens, valid, source, shared + own)
@@ -75,9 +78,3 @@ class Denoiser(nn.Module):
     def prepare(self, context: Context) -> Sequence[Projected]:
         """The context as every layer attends to it, for a sampler that asks many times."""
         return [cast(TransformerLayer, layer).project(context) for layer in self.layers]
-
-    def _modulations(self, time: Tensor) -> tuple[Tensor, Tensor]:
-        angles = time.float().unsqueeze(-1) * self.frequencies
-        waves = torch.cat([angles.sin(), angles.cos()], dim=-1)
-        modulation = self.modulation(self.time(waves)).unflatten(-1, (8, -1))
-        return modulation[:, :6], modulation[:, 6:]

@@ -14,6 +14,10 @@ Tokens = Mapping[str, Float[Tensor, "batch _ _"]]
 Shapes = Mapping[str, tuple[int, int]]
 """Tokens and width of each encoder, by its name."""
 
+_TOKENS = 4
+"""Of a context that is read out of one vector, or asked for by learned queries."""
+_LAYERS = 2
+"""Of `CrossAttentionFusion`."""
 _MARK_STD = 3**-0.5
 """That of a normalised token after a linear layer as torch initialises it."""
 
@@ -91,31 +95,31 @@ class StreamTokens(nn.Module):
         }
 
 
-def read_out(dim: int, tokens: int) -> nn.Sequential:
+def read_out(dim: int) -> nn.Sequential:
     """Several context tokens from one vector: attention to a single one is a constant."""
     return nn.Sequential(
-        nn.Linear(dim, tokens * dim), nn.Unflatten(-1, (tokens, dim)), nn.LayerNorm(dim)
+        nn.Linear(dim, _TOKENS * dim), nn.Unflatten(-1, (_TOKENS, dim)), nn.LayerNorm(dim)
     )
 
 
 class ConcatFusion(Fusion):
-    """The streams' vectors side by side through a small network, read out as `tokens` tokens."""
+    """The streams' vectors side by side through a small network, read out as four tokens."""
 
-    def __init__(self, shapes: Shapes, dim: int, tokens: int = 4) -> None:
+    def __init__(self, shapes: Shapes, dim: int) -> None:
         super().__init__()
         self.vectors = StreamVectors(shapes, dim)
         self.mix = nn.Sequential(
             nn.Linear(sum(self.vectors.widths.values()), dim), nn.GELU(approximate="tanh")
         )
-        self.read_out = read_out(dim, tokens)
+        self.read_out = read_out(dim)
 
     def forward(self, encoded: Tokens) -> Context:
-        """The context of `tokens` tokens."""
+        """The context of four tokens."""
         return self.read_out(self.mix(torch.cat([*self.vectors(encoded).values()], dim=-1)))
 
 
 class GatedFusion(Fusion):
-    """A gated multimodal unit over the streams, read out as `tokens` context tokens.
+    """A gated multimodal unit over the streams, read out as four context tokens.
 
     h = sum_i z_i * tanh(W_i x_i) with gates z_i = sigmoid(V_i [x_1, ..., x_n]) in (0, 1), one for
     each stream and each of the `dim` channels (Arevalo et al. 2017, "Gated Multimodal Units",
@@ -123,7 +127,7 @@ class GatedFusion(Fusion):
     can be shut out in favour of the sensor, sample by sample.
     """
 
-    def __init__(self, shapes: Shapes, dim: int, tokens: int = 4) -> None:
+    def __init__(self, shapes: Shapes, dim: int) -> None:
         super().__init__()
         self.vectors = StreamVectors(shapes, dim)
         widths = self.vectors.widths
@@ -131,7 +135,7 @@ class GatedFusion(Fusion):
             {name: nn.Linear(width, dim) for name, width in widths.items()}
         )
         self.gate = nn.Linear(sum(widths.values()), len(widths) * dim)
-        self.read_out = read_out(dim, tokens)
+        self.read_out = read_out(dim)
 
     def gates(
         self, vectors: Mapping[str, Float[Tensor, "batch _"]]
@@ -141,7 +145,7 @@ class GatedFusion(Fusion):
         return dict(zip(vectors, opened.chunk(len(vectors), dim=-1), strict=True))
 
     def forward(self, encoded: Tokens) -> Context:
-        """The context of `tokens` tokens."""
+        """The context of four tokens."""
         vectors = self.vectors(encoded)
         gates = self.gates(vectors)
         parts = [gates[name] * torch.tanh(self.content[name](x)) for name, x in vectors.items()]
@@ -151,24 +155,22 @@ class GatedFusion(Fusion):
 class CrossAttentionFusion(Fusion):
     """Sensor, state and learned queries look at the feature slots: what is felt asks what is seen.
 
-    Each of `layers` layers lets these tokens attend to one another and then to the slots; the
-    context is the tokens, `queries` and one for each token of sensor and state. Without features
+    Each of two layers lets these tokens attend to one another and then to the slots; the
+    context is the tokens, four queries and one for each token of sensor and state. Without features
     they attend to one another alone; without sensor and state the queries ask.
     """
 
-    def __init__(
-        self, shapes: Shapes, dim: int, heads: int, queries: int = 4, layers: int = 2
-    ) -> None:
+    def __init__(self, shapes: Shapes, dim: int, heads: int) -> None:
         super().__init__()
         self.tokens = StreamTokens(shapes, dim)
-        self.queries = learned(queries, dim)
+        self.queries = learned(_TOKENS, dim)
         self.layers = nn.ModuleList(
-            TransformerLayer(dim, heads, cross="features" in shapes) for _ in range(layers)
+            TransformerLayer(dim, heads, cross="features" in shapes) for _ in range(_LAYERS)
         )
         self.norm = nn.LayerNorm(dim)
 
     def forward(self, encoded: Tokens) -> Context:
-        """The context of `queries` tokens and those of sensor and state."""
+        """The context of the queries' tokens and those of sensor and state."""
         tokens = self.tokens(encoded)
         slots = tokens.pop("features", None)
         batch = next(iter(encoded.values())).shape[0]

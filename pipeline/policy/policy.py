@@ -79,10 +79,7 @@ class Trainable(nn.Module, ABC):
         that continue its chunk: only a `stochastic` policy is given a guide."""
 
     def act(
-        self,
-        observation: Observation,
-        generator: Generators = None,
-        guide: Guide | None = None,
+        self, observation: Observation, generator: Generators = None, guide: Guide | None = None
     ) -> Chunk:
         """One sample: an action chunk in physical units, float32."""
         return self.sample(observation, 1, generator, guide)[0]

@@ -60,6 +60,12 @@ class WindowEncoder(nn.Module):
     window: int
     span_s: float | None
 
+    def tokenize(
+        self, values: Float[Tensor, "batch step channel"], mask: Bool[Tensor, "batch step"]
+    ) -> tuple[Float[Tensor, "batch token dim"], Bool[Tensor, "batch token"]]:
+        """The window's tokens, and which of them stand on a reading, as its steps in `mask` do."""
+        raise NotImplementedError
+
     def place(
         self,
         values: Float[Tensor, "batch reading channel"],
@@ -85,14 +91,16 @@ class WindowEncoder(nn.Module):
         self.age = AgeEncoder(1, output_dim)
         self.missing = learned(output_dim)
 
-    def summarize(
+    def forward(
         self,
-        tokens: Float[Tensor, "batch token dim"],
-        present: Bool[Tensor, "batch token"],
-        valid: Int[Tensor, " batch"],
-        age_s: Float[Tensor, "batch reading"] | None,
+        values: Float[Tensor, "batch reading channel"],
+        valid: Int[Tensor, " batch"] | None = None,
+        age_s: Float[Tensor, "batch reading"] | None = None,
     ) -> Float[Tensor, "batch output"]:
-        """The vector of a window from its tokens, of which those `present` stand on a reading."""
+        """Encode; `valid` None means that every reading is real."""
+        if valid is None:
+            valid = torch.full((len(values),), values.shape[1], device=values.device)
+        tokens, present = self.tokenize(*self.place(values, valid, age_s))
         missing = (valid == 0).unsqueeze(-1)
         tokens = tokens + self.position
         # A row without any reading attends to zeros: softmax over nothing is NaN on some devices.
@@ -103,11 +111,6 @@ class WindowEncoder(nn.Module):
         newest = age_s[:, -1:] if age_s is not None else encoded.new_zeros(encoded.shape[0], 1)
         encoded = encoded + self.age(newest.masked_fill(missing, 0.0))
         return torch.where(missing, self.missing.to(encoded.dtype), encoded)
-
-
-def all_valid(values: Float[Tensor, "batch window channel"]) -> Int[Tensor, " batch"]:
-    """As many valid readings in each row as its window is long."""
-    return torch.full((len(values),), values.shape[1], device=values.device)
 
 
 class SensorEncoder(WindowEncoder):
@@ -135,18 +138,21 @@ class SensorEncoder(WindowEncoder):
             tokens = (tokens + 1) // 2
         self.build_layers(tokens, widths[-1], layers, heads, 2, output_dim)
 
-    def forward(
-        self,
-        values: Float[Tensor, "batch window channel"],
-        valid: Int[Tensor, " batch"] | None = None,
-        age_s: Float[Tensor, "batch window"] | None = None,
-    ) -> Float[Tensor, "batch output"]:
-        """Encode; `valid` None means that every reading is real."""
-        valid = all_valid(values) if valid is None else valid
-        values, mask = silenced(*self.place(values, valid, age_s))
+    def tokenize(
+        self, values: Float[Tensor, "batch step channel"], mask: Bool[Tensor, "batch step"]
+    ) -> tuple[Float[Tensor, "batch token dim"], Bool[Tensor, "batch token"]]:
+        """What the last block gives, of a copy of the window that is zero where no reading stands.
+
+        One copy for that and for a step in front of an odd number of them: the windows are the
+        largest tensors of a training step.
+        """
+        odd = values.shape[1] % 2
+        front = values.new_zeros(values.shape[0], odd, values.shape[2])
+        values, mask = torch.cat([front, values], dim=1), F.pad(mask, (odd, 0))
+        values.masked_fill_(~mask.unsqueeze(-1), 0.0)
         for block in self.blocks:
             values, mask = block(values, mask)
-        return self.summarize(values, mask, valid, age_s)
+        return values, mask
 
 
 class ForceAwareSensorEncoder(nn.Module):
@@ -217,32 +223,13 @@ class RobotStateEncoder(WindowEncoder):
         self.embed = nn.Linear(patch * (state_dim + 1), dim)
         self.build_layers(-(-window // patch), dim, layers, heads, 4, output_dim)
 
-    def forward(
-        self,
-        values: Float[Tensor, "batch window dim"],
-        valid: Int[Tensor, " batch"] | None = None,
-        age_s: Float[Tensor, "batch window"] | None = None,
-    ) -> Float[Tensor, "batch output"]:
-        """Encode; `valid` None means that every reading is real."""
-        valid = all_valid(values) if valid is None else valid
-        values, present = self.place(values, valid, age_s)
+    def tokenize(
+        self, values: Float[Tensor, "batch step channel"], mask: Bool[Tensor, "batch step"]
+    ) -> tuple[Float[Tensor, "batch token dim"], Bool[Tensor, "batch token"]]:
+        """The embedded patches."""
         short = -values.shape[1] % self.patch
-        mask = F.pad(present, (short, 0)).unsqueeze(-1)
+        mask = F.pad(mask, (short, 0)).unsqueeze(-1)
         values = F.pad(values, (0, 0, short, 0)).masked_fill(~mask, 0.0)
         values = torch.cat([values, mask.to(values.dtype)], dim=-1)
         present = mask.squeeze(-1).unflatten(1, (-1, self.patch)).any(dim=-1)
-        tokens = self.embed(values.unflatten(1, (-1, self.patch)).flatten(2))
-        return self.summarize(tokens, present, valid, age_s)
-
-
-def silenced(
-    values: Float[Tensor, "batch time channel"], valid: Bool[Tensor, "batch time"]
-) -> tuple[Float[Tensor, "batch even channel"], Bool[Tensor, "batch even"]]:
-    """A copy that is zero where not valid, with a step put in front of an odd number of them.
-
-    One copy for both: the windows are the largest tensors of a training step.
-    """
-    odd = values.shape[1] % 2
-    front = values.new_zeros(values.shape[0], odd, values.shape[2])
-    values, valid = torch.cat([front, values], dim=1), F.pad(valid, (odd, 0))
-    return values.masked_fill_(~valid.unsqueeze(-1), 0.0), valid
+        return self.embed(values.unflatten(1, (-1, self.patch)).flatten(2)), present

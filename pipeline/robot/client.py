@@ -1,7 +1,7 @@
 """A client of the policy server, for the robot's computer: needs numpy, msgpack and websockets."""
 
 from collections.abc import Mapping
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from typing import Any, Final
 
 import numpy as np
@@ -17,7 +17,7 @@ TOKEN_VARIABLE: Final = "VLA_SERVE_TOKEN"
 """Of the environment: the token, where nothing else says it."""
 
 
-class PolicyClient:
+class PolicyClient(AbstractContextManager["PolicyClient"]):
     """One robot's connection to a policy server, which is one memory there.
 
     To be closed, or used in a `with` statement. Its errors are `ServerError`s; what the server
@@ -88,9 +88,6 @@ class PolicyClient:
         """Leave the server."""
         self._connection = None
         self._leaving.close()
-
-    def __enter__(self) -> "PolicyClient":
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

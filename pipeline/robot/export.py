@@ -8,7 +8,6 @@ function. Samplers have their loop unrolled. The batch is of any size, windows a
 params. Guides (`rtc`) differentiate the head, which neither format does.
 """
 
-import hashlib
 import json
 import logging
 import warnings
@@ -27,7 +26,7 @@ from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 
 from pipeline.base.config import ExportParams
-from pipeline.base.durable import replace_folder, write_document
+from pipeline.base.durable import replace_folder, sha256_of, write_document
 from pipeline.base.errors import ConfigError, NumericsError
 from pipeline.base.observation import Observation
 from pipeline.base.ownership import OutputKind
@@ -245,10 +244,8 @@ def _judged(
                 "this format out (export.formats, export.int8), raise export.int8_tolerance for "
                 "int8, or try other versions of what writes it."
             )
-    with path.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
     return {
-        "sha256": digest,
+        "sha256": sha256_of(path),
         "bytes": path.stat().st_size,
         "tolerance_std": tolerance,
         "deviation": off,

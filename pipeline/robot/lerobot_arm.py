@@ -143,9 +143,7 @@ class LeRobotArm:
 
 
 def describe(
-    robot: Any,
-    cameras: Mapping[str, str] | None = None,
-    motors: Mapping[str, str] | None = None,
+    robot: Any, cameras: Mapping[str, str] | None = None, motors: Mapping[str, str] | None = None
 ) -> dict[str, Any]:
     """What `PolicyClient(robot=...)` compares of a robot that is told places, as LeRobot's are.
 

@@ -61,14 +61,11 @@ class RobotMemory:
     def of(cls, policy: "Policy") -> "RobotMemory":
         """That of a robot that this policy controls."""
         params, shape = policy.params, policy.shape
-        windows: dict[str, ReadingWindow] = {}
-        if channels := shape.sensor_channels:
-            reach_s = params.sensor_reach_s
-            windows["sensor"] = ReadingWindow(params.sensor_window, channels, reach_s)
-        if channels := shape.state_dim:
-            reach_s = params.state_window_s
-            windows["state"] = ReadingWindow(params.state_window, channels, reach_s)
-        return cls(windows)
+        sizes = {
+            "sensor": (params.sensor_window, shape.sensor_channels, params.sensor_reach_s),
+            "state": (params.state_window, shape.state_dim, params.state_window_s),
+        }
+        return cls({name: ReadingWindow(*size) for name, size in sizes.items() if size[1]})
 
     def sense(self, readings: Mapping[str, NDArray[Any]]) -> None:
         """Take what came since the last tick, and `time` (1,) now, in s.

@@ -69,11 +69,9 @@ class Robot(Protocol):
 
     def act(self, action: NDArray[np.float64]) -> object:
         """Carry out one action, in the units of the policy's metadata."""
-        ...
 
     def stop(self, reason: str) -> object:
         """Stand still, now and until told otherwise; another thread may call it, and twice."""
-        ...
 
 
 class Decides(Protocol):

@@ -91,7 +91,7 @@ class ServerStatus:
         """What the page shows."""
         with self._lock:
             robots = list(self.robots.values())
-            answered, latency = self._timings.ring.count, self._timings.document()
+            answered, latency = self._timings.count, self._timings.document()
         document = {
             "policy": self._policy,
             "seconds": monotonic() - self._since_s,

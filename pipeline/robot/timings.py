@@ -30,21 +30,17 @@ class Ring:
         return np.roll(self._buffer, -self.count, axis=0)[free:]
 
 
-class Timings:
+class Timings(Ring):
     """Milliseconds of parts, a row a tick or an answer; NaN where a part did not happen."""
 
     def __init__(self, parts: Sequence[str], rows: int) -> None:
         self.parts = tuple(parts)
-        self.ring = Ring(rows, len(self.parts))
-
-    def note(self, row: NDArray[np.float64]) -> None:
-        """Take the milliseconds (part,) of one more."""
-        self.ring.note(row)
+        super().__init__(rows, len(self.parts))
 
     def document(self) -> dict[str, dict[str, float]]:
         """By part, in ms, of the rows that are kept: how often it was, percentiles, the most."""
         found: dict[str, dict[str, float]] = {}
-        for part, column in zip(self.parts, self.ring.rows().T, strict=True):
+        for part, column in zip(self.parts, self.rows().T, strict=True):
             if len(values := column[~np.isnan(column)]):
                 at = np.percentile(values, list(PERCENTILES.values())).tolist()
                 named = dict(zip(PERCENTILES, at, strict=True))

@@ -20,6 +20,8 @@ _ABOVE_MM = 0.3
 _PUSHES = 3
 _PUSH_MM: Final = (3.0, 8.0)
 _PUSH_EVERY_S: Final = (0.7, 1.4)
+_TISSUE: Final = ((0.9, 1.3), (0.5, 0.9), (0.9, 1.3), (0.2, 0.3), (0.1, 0.18), (2.0, 3.2))
+"""Between what each field of `Tissue` is drawn, in their order."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,7 @@ def draw_layout(seed: int, level: Level = "full", crosses_180: bool = False) -> 
         surfaces_mm=surface + np.concatenate([[0.0], _bounded_walk(rises)]),
         push_times_s=np.cumsum(lateral.uniform(*_PUSH_EVERY_S, pushes)),
         breath=(breath.uniform(0.03, 0.1), breath.uniform(0.2, 0.35), breath.uniform(0, 2 * np.pi)),
-        tissue=_tissue(depth),
+        tissue=Tissue(*(float(depth.uniform(*within)) for within in _TISSUE)),
         speed_mm_s=float(hand.uniform(6, 9)),
         brightness=float(look.uniform(0.94, 1.06)),
         oct_gain=float(look.uniform(0.92, 1.08)),
@@ -130,9 +132,3 @@ def _orientations(
         # Spin about the needle adds to r alone: start half the turn before 180°, end half after.
         upright[2] = 180.0 - turn[2] / 2
     return upright, upright + turn
-
-
-def _tissue(rng: np.random.Generator) -> Tissue:
-    """Drawn field by field, in their order."""
-    ranges = [(0.9, 1.3), (0.5, 0.9), (0.9, 1.3), (0.2, 0.3), (0.1, 0.18), (2.0, 3.2)]
-    return Tissue(*(float(rng.uniform(*within)) for within in ranges))

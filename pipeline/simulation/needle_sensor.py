@@ -34,6 +34,8 @@ _SPECKLE_CONTRAST, _SPECKLE_BINS = 0.3, 4
 _GAIN_DRIFT, _GAIN_DRIFT_HZ = 0.05, 0.11
 _FORCE_NOISE_N, _FORCE_DRIFT_N, _FORCE_DRIFT_HZ = 0.01, 0.02, 0.07
 _ORIGIN: Final = 2 * A_SCAN_BINS
+_OFFSETS: Final = np.arange(-_ORIGIN, 2 * A_SCAN_BINS + 1)
+"""Bins from a surface or a layer."""
 
 
 @dataclass(frozen=True)
@@ -124,15 +126,13 @@ def _speckle(rng: np.random.Generator) -> NDArray[np.float32]:
 
 
 def _peak(height: float, width_bins: float) -> NDArray[np.float32]:
-    offset = np.arange(-_ORIGIN, 2 * A_SCAN_BINS + 1)
-    return _scans_of(height * np.exp(-0.5 * (offset / width_bins) ** 2))
+    return _scans_of(height * np.exp(-0.5 * (_OFFSETS / width_bins) ** 2))
 
 
 def _scatter(height: float, decay_bins: float) -> NDArray[np.float32]:
     """Scattered light behind the surface."""
-    offset = np.arange(-_ORIGIN, 2 * A_SCAN_BINS + 1)
-    decay = height * np.exp(-np.maximum(offset, 0) / decay_bins)
-    return _scans_of(np.where(offset >= 0, decay, 0))
+    decay = height * np.exp(-np.maximum(_OFFSETS, 0) / decay_bins)
+    return _scans_of(np.where(_OFFSETS >= 0, decay, 0))
 
 
 _SCATTER: Final = _scatter(60.0, 180.0)

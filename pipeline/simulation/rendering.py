@@ -100,21 +100,22 @@ def _draw_side(draw: _Draw, scene: Scene) -> None:
 
 
 def _draw_above(draw: _Draw, scene: Scene) -> None:
-    _phantom(draw, _on_bench(np.zeros(2)), _on_bench(scene.target_mm), _BENCH_PX_MM)
-    tip, hub = _on_bench(scene.needle_mm), _on_bench(scene.needle_mm + scene.lean_mm)
+    _phantom(draw, np.zeros(2), scene.target_mm, _BENCH_PX_MM)
+    tip = _pixels(scene.needle_mm, _BENCH_PX_MM)
+    hub = _pixels(scene.needle_mm + scene.lean_mm, _BENCH_PX_MM)
     _line(draw, hub, np.array([hub[0], -1.0]), _BENCH_PX_MM * _ARM_MM, _ARM)
     _line(draw, tip, hub, _BENCH_PX_MM * _SHAFT_MM, _STEEL)
     _disc(draw, hub, _BENCH_PX_MM * _HUB_RADIUS_MM, _HUB)
 
 
 def _draw_from_hand(draw: _Draw, scene: Scene) -> None:
-    bench = _from_tip(-scene.needle_mm)
-    _phantom(draw, bench, _from_tip(scene.target_mm - scene.needle_mm), _HAND_PX_MM)
+    _phantom(draw, -scene.needle_mm, scene.target_mm - scene.needle_mm, _HAND_PX_MM)
     _line(draw, _MIDDLE, _SIZE.astype(np.float64), 2 * _HAND_PX_MM * _SHAFT_MM, _STEEL)
     _disc(draw, _MIDDLE, _HAND_PX_MM * _SHAFT_MM * 1.4, _HUB)
 
 
-def _phantom(draw: _Draw, middle: _Point, target: _Point, px_mm: float) -> None:
+def _phantom(draw: _Draw, middle_mm: _Point, target_mm: _Point, px_mm: float) -> None:
+    middle, target = _pixels(middle_mm, px_mm), _pixels(target_mm, px_mm)
     low, high = middle - px_mm * _PHANTOM_MM, middle + px_mm * _PHANTOM_MM
     draw.rounded_rectangle(
         (*low, *high), radius=px_mm * 1.5, fill=_SKIN, outline=_SKIN_EDGE, width=int(px_mm / 2)
@@ -123,14 +124,9 @@ def _phantom(draw: _Draw, middle: _Point, target: _Point, px_mm: float) -> None:
     _disc(draw, target, px_mm * _MARK_MM, _MARK)
 
 
-def _on_bench(place_mm: _Point) -> _Point:
-    """Pixels of View2: x to the right, y upwards, the bench's middle in the middle."""
-    return _MIDDLE + _BENCH_PX_MM * place_mm * [1.0, -1.0]
-
-
-def _from_tip(offset_mm: _Point) -> _Point:
-    """Pixels of View5: x to the right, y upwards, the needle's tip in the middle."""
-    return _MIDDLE + _HAND_PX_MM * offset_mm * [1.0, -1.0]
+def _pixels(place_mm: _Point, px_mm: float) -> _Point:
+    """Of a place counted from what stands in the middle: x to the right, y upwards."""
+    return _MIDDLE + px_mm * place_mm * [1.0, -1.0]
 
 
 def _disc(draw: _Draw, middle: _Point, radius: float, colour: _Colour) -> None:

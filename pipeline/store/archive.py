@@ -36,12 +36,7 @@ from pipeline.base.digests import file_digest
 from pipeline.base.durable import disk_full_named, put_in_place, sync
 from pipeline.base.errors import PipelineError, StoreIncomplete, StoreMismatch
 from pipeline.base.ownership import OutputKind, begin_folder, remove_folder
-from pipeline.store.border import (
-    Group,
-    Length,
-    StoreAttributes,
-    store_border,
-)
+from pipeline.store.border import Group, Length, StoreAttributes, store_border
 from pipeline.store.chunks import check_row_checksums, check_trailers, read_rows
 from pipeline.store.golden import GOLDEN, read_golden
 from pipeline.store.lock import build_lock
@@ -354,14 +349,14 @@ def _check_rebuilt(
 
 def _create_array(root: Path | dict[str, Any], spec: ArraySpec, level: int) -> "zarr.Array[Any]":
     """The array in an archive, without data."""
-    shard, inner = _chunks_a_shard(spec) * spec.chunk_rows, inner_rows(spec)
+    # As few shards as can be, all but the last of one size.
+    most = max(1, SHARD_BYTES // max(1, spec.chunk_bytes))
+    chunks = math.ceil(spec.chunk_count / max(1, math.ceil(spec.chunk_count / most))) or 1
+    shard, inner = chunks * spec.chunk_rows, inner_rows(spec)
     widths = tuple(max(1, size) for size in spec.shape[1:])
     codec = codec_for(spec.dtype, inner * spec.row_bytes, level)
     return spec.create(
-        root,
-        shards=(shard, *widths),
-        chunks=(inner, *widths),
-        compressors=[codec, Crc32cCodec()],
+        root, shards=(shard, *widths), chunks=(inner, *widths), compressors=[codec, Crc32cCodec()]
     )
 
 
@@ -389,12 +384,6 @@ def inner_rows(spec: ArraySpec) -> int:
     return spec.chunk_rows // next(part for part in count(parts) if not spec.chunk_rows % part)
 
 
-def _chunks_a_shard(spec: ArraySpec) -> int:
-    """As few shards as can be, all but the last of one size."""
-    most = max(1, SHARD_BYTES // max(1, spec.chunk_bytes))
-    return math.ceil(spec.chunk_count / max(1, math.ceil(spec.chunk_count / most))) or 1
-
-
 def _shards(root: Path, spec: ArraySpec, array: "zarr.Array[Any]") -> list[tuple[Path, range]]:
     """The file of each shard of an array with data, and the rows in it."""
     assert array.shards is not None, "an archive is sharded"
@@ -417,10 +406,8 @@ def _check_shard(shard: Path, array: "zarr.Array[Any]") -> None:
     if not shard.exists():
         return  # of zeros
     assert array.shards is not None, "an archive is sharded"
-    whole, pieces = (
-        math.prod(array.chunks) * array.dtype.itemsize,
-        array.shards[0] // array.chunks[0],
-    )
+    whole = math.prod(array.chunks) * array.dtype.itemsize
+    pieces = array.shards[0] // array.chunks[0]
     size = _BORDER.check_file(shard, (pieces + 1) * (whole + 64))  # zarr reads it whole
     with shard.open("rb") as file:
         file.seek(max(0, size - 16 * pieces - 4))

@@ -88,10 +88,8 @@ def read_rows(root: Path, spec: ArraySpec, start: int = 0, stop: int | None = No
     Raises `StoreIncomplete` where a chunk file is missing or ends before them.
     """
     stop = spec.shape[0] if stop is None else stop
-    border, chunks = (
-        store_border(root),
-        range(start // spec.chunk_rows, -(-stop // spec.chunk_rows)),
-    )
+    border = store_border(root)
+    chunks = range(start // spec.chunk_rows, -(-stop // spec.chunk_rows))
     for chunk in chunks if spec.row_bytes else ():  # before memory is taken for what is not there
         border.check_file(chunk_path(root, spec, chunk))
     rows = np.zeros((stop - start, *spec.shape[1:]), spec.dtype)

@@ -17,13 +17,7 @@ from numpy.typing import NDArray
 from pipeline.base.bfloat16 import widen
 from pipeline.base.golden import GoldenRow
 from pipeline.store.border import store_border
-from pipeline.store.episodes import (
-    Episode,
-    check_index,
-    check_positions,
-    episode_of,
-    read_episodes,
-)
+from pipeline.store.episodes import Episode, check_index, check_positions, episode_of, read_episodes
 from pipeline.store.golden import GoldenFrames, read_golden
 from pipeline.store.mapping import map_flat
 from pipeline.store.paths import read_attributes

@@ -53,12 +53,7 @@ from pipeline.store.schema import (
 MOST_LINES = 20
 """Of one kind that are shown; the rest is counted."""
 SOUND, UNREADABLE, CHANGED, NOT_FINITE = range(4)
-FAULTS = (
-    "",
-    "not in its file",
-    "its bytes do not give its checksum",
-    "NaN or infinity",
-)
+FAULTS = ("", "not in its file", "its bytes do not give its checksum", "NaN or infinity")
 """How a feature row is, in words."""
 _Error = partial(Issue, severity="error")
 
@@ -276,8 +271,7 @@ def strange_files(
         root / place / "zarr.json" for place in ("", *GROUPS, *ARRAY_NAMES)
     }
     expected |= {path for spec in specs.values() for path in chunk_paths(root, spec)}
-    not_told = [GOLDEN] if golden is None else []
-    unjudged = [*(name for name in ARRAY_NAMES if name not in specs), *not_told]
+    unjudged = {*ARRAY_NAMES} - {*specs} | ({GOLDEN} if golden is None else set[str]())
     prefixes = tuple(f"{root / name}/" for name in unjudged)
     files = (Path(folder) / file for folder, _, names in os.walk(root) for file in names)
     for path in sorted(files):

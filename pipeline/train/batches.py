@@ -9,6 +9,7 @@ import time
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from dataclasses import astuple, dataclass, replace
 from typing import Self
 
@@ -183,7 +184,7 @@ class _Buffer:
     copied: torch.cuda.Event | None = None
 
 
-class Prefetch(Iterator[tuple[BatchIndices, Batch]]):
+class Prefetch(Iterator[tuple[BatchIndices, Batch]], AbstractContextManager["Prefetch"]):
     """Hands out `(indices, batch)` for each entry of `plan`, in its order.
 
     The plan is consumed in a background thread, at most `buffers` batches ahead. On the CPU a
@@ -247,9 +248,6 @@ class Prefetch(Iterator[tuple[BatchIndices, Batch]]):
         self._in_use = None
         self._coming.clear()
         self._thread.shutdown(cancel_futures=True)
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *raised: object) -> None:
         self.close()

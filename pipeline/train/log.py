@@ -7,10 +7,10 @@ they lie beside the logs, which DVC hashes, not in them.
 import json
 import math
 from collections.abc import Generator, Iterable, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Any, Protocol
 from uuid import uuid4
 
 import torch
@@ -254,7 +254,7 @@ def speed_file(logs: Path) -> Path:
     return _beside(logs, "speed.tsv")
 
 
-class TrainingLog:
+class TrainingLog(AbstractContextManager["TrainingLog"]):
     """Hands the same rows to every logger, and keeps them.
 
     What came before a stop is given back as `earlier` and written again: DVC may have deleted the
@@ -291,9 +291,6 @@ class TrainingLog:
                 f"{pace.peak_memory / 2**20:.0f}\t{pace.trained_s:.3f}\n"
             )
             self._speed.flush()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, kind: type[BaseException] | None, *raised: object) -> None:
         with disk_full_named(self._folder), ExitStack() as closing:

@@ -70,11 +70,10 @@ class Trainer:
         self.store, self.params, self.split, self.run = store, params, split, run
         self.world = World.current()
         self.device = process_device(params.device)
-        if source is None:
-            source = FeatureSource(store, *choose_feed(params.feed, store, self.device))
-        self.source = source
-        self.golden = source.golden  # now: a damaged one stops a run before it begins
+        self.source = source or FeatureSource(store, *choose_feed(params.feed, store, self.device))
+        self.golden = self.source.golden  # now: a damaged one stops a run before it begins
         self.plan = Plan(store, params, split, self.world, run.section)
+        self.windows = Windows.of(params)
         self.step = 0
         if params.early_stopping is not None and not len(split.val):
             raise ConfigError(
@@ -96,8 +95,7 @@ class Trainer:
             self.stopping.best_error, self.stopping.stalled = state.best_error, state.stalled
             self.step, self._earlier, self._trained_s = state.step, state.rows, state.trained_s
         else:
-            windows = Windows.of(params)
-            fitted = partial(fit_normalization, store, split.train, windows)
+            fitted = partial(fit_normalization, store, split.train, self.windows)
             self.normalization = self.world.shared(fitted)
             self.shape = policy_shape(store, self.normalization)
             self._build()
@@ -141,11 +139,11 @@ class Trainer:
         written and `KeyboardInterrupt` raised.
         """
         steps, shown = range(self.step, self.params.max_steps), self.world.first
-        windows, resumed = Windows.of(self.params), self.run.status == "resumed"
+        resumed = self.run.status == "resumed"
         with (
             deferred_interrupt() as interrupted,
             open_log(self.params, resumed, self._earlier, self.world) as log,
-            self.source.feed(self.plan.parts_of(steps), windows, self.device) as feed,
+            self.source.feed(self.plan.parts_of(steps), self.windows, self.device) as feed,
             Progress(feed, self.device, steps, self._trained_s, shown) as progress,
         ):
             self.world.shared(self.run.begin)
@@ -283,15 +281,14 @@ class Trainer:
         ticks = evenly(self.split.val, self.source.eval_ticks or EVALUATION_TICKS)
         if not len(ticks):
             return {}
-        windows = Windows.of(self.params)
         predictions = predict(
             self.averaged,
             self.store,
             ticks,
-            windows,
+            self.windows,
             self.params.batch_size,
             samples=self.params.eval_samples,
-            feed=lambda plan: self.source.feed(plan, windows, self.device),
+            feed=lambda plan: self.source.feed(plan, self.windows, self.device),
         )
         comparison = compare(predictions, {}, action_space(self.store, self.normalization))
         metrics = {"val/error": comparison.overall("policy")} | {

@@ -4,8 +4,8 @@ import resource
 import sys
 import time
 from collections.abc import Generator
-from contextlib import contextmanager
-from typing import NamedTuple, NoReturn, Self
+from contextlib import AbstractContextManager, contextmanager
+from typing import NamedTuple, NoReturn
 
 import numpy as np
 import torch
@@ -36,7 +36,7 @@ class Pace(NamedTuple):
     """Seconds of training so far, over all starts of the run."""
 
 
-class Progress:
+class Progress(AbstractContextManager["Progress"]):
     """Counts steps on stderr, `shown` on one process of several: a bar, or a line a minute.
 
     And measures how fast they go: steps and their data, not evaluations and checkpoints.
@@ -106,9 +106,6 @@ class Progress:
         self._before, self._since = self.trained_s, None
         yield
         self._since = time.perf_counter()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *raised: object) -> None:
         self._bar.close()

@@ -186,8 +186,13 @@ class Plan:
         if self._variants > 1:
             rng = np.random.default_rng((seed, step, *_VARIANTS))
             variants = rng.integers(self._variants, size=len(ticks))
-        feature_lag, sensor_lag_s = self._draw_lags(step, len(ticks))
-        counts = self._count_valid(ticks)
+        late = np.random.default_rng((seed, step, *_LAGS))
+        feature_lag = late.integers(self._params.feature_lag + 1, size=len(ticks))
+        sensor_lag_s = late.uniform(0, self._params.sensor_lag_s, len(ticks))
+        # Of each chunk, the steps before its episode's end count; of one that stands still, all.
+        counts = np.full(len(ticks), self._params.horizon)
+        if not self._params.terminal_stop:
+            counts = np.minimum(counts, self._ends[ticks] - ticks)
         cuts = np.array_split(np.arange(len(ticks)), self.parts)
         return [
             StepPart(
@@ -203,15 +208,3 @@ class Plan:
     def parts_of(self, steps: range) -> Iterator[StepPart]:
         """This process's parts of these steps, one after the other."""
         return (part for step in steps for part in self.step(step))
-
-    def _draw_lags(self, step: int, ticks: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """How late features (in VL rows) and sensor (in s) are in each sample, drawn evenly."""
-        rng = np.random.default_rng((self._params.seed, step, *_LAGS))
-        rows = rng.integers(self._params.feature_lag + 1, size=ticks)
-        return rows, rng.uniform(0, self._params.sensor_lag_s, ticks)
-
-    def _count_valid(self, ticks: Ticks) -> NDArray[np.int64]:
-        """How many steps of each tick's chunk count in the loss: those before its episode's end."""
-        if self._params.terminal_stop:
-            return np.full(len(ticks), self._params.horizon)
-        return np.minimum(self._params.horizon, self._ends[ticks] - ticks)

@@ -36,10 +36,7 @@ _ARRAYS = {"tick": "tick/action", "vl": "vl/features"} | {
 
 
 def fit_normalization(
-    store: FeatureStore,
-    ticks: Ticks,
-    windows: Windows,
-    threads: int | None = None,
+    store: FeatureStore, ticks: Ticks, windows: Windows, threads: int | None = None
 ) -> Normalization:
     """Statistics per channel over the training `ticks` and what was known at them.
 

@@ -90,10 +90,7 @@ class Augmentation:
         (a, b), (d, e) = turn * self.side
         c, f = turn @ shift + centre + before
         return Image.fromarray(padded).transform(
-            (width, height),
-            Image.Transform.AFFINE,
-            (a, b, c, d, e, f),
-            Image.Resampling.BICUBIC,
+            (width, height), Image.Transform.AFFINE, (a, b, c, d, e, f), Image.Resampling.BICUBIC
         )
 
     def _coloured(self, image: Image.Image) -> Image.Image:

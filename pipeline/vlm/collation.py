@@ -87,7 +87,7 @@ class Collator:
         pixels = self._pinned((len(distinct), *self._settings.image_size, 3), torch.uint8)
         for place, image in zip(pixels.numpy(), distinct, strict=True):
             place[:] = image
-        device = self._device
+        device = self._model.device
         plan = self._tower.plan(len(distinct), device) if distinct else None
         shown = np.empty(0, np.int64)
         if plan is not None:
@@ -97,10 +97,6 @@ class Collator:
         return TokenBatch(
             arrangement, sent(token_ids, device), sent(pixels, device), plan, sent_shown
         )
-
-    @property
-    def _device(self) -> torch.device:
-        return self._model.device
 
     def _arrangement(self, layouts: tuple[TokenLayout, ...]) -> Arrangement:
         if layouts not in self._arrangements:
@@ -122,7 +118,7 @@ class Collator:
             [index * length + layout.image_tokens() for index, layout in enumerate(layouts)]
         )
         weights = batch_weights(self._places, layouts, length)
-        device = self._device
+        device = self._model.device
         return Arrangement(
             length,
             None if bool(real.all()) else sent(real, device),
@@ -148,7 +144,7 @@ class Collator:
 
     def _pinned(self, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
         """Memory that the device can copy from while both go on."""
-        return torch.empty(shape, dtype=dtype, pin_memory=self._device.type == "cuda")
+        return torch.empty(shape, dtype=dtype, pin_memory=self._model.device.type == "cuda")
 
 
 def unique(images: Sequence[NDArray[np.uint8]]) -> tuple[list[NDArray[np.uint8]], list[int]]:

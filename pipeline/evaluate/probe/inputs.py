@@ -51,10 +51,7 @@ class SlotName(Slot):
 
 
 def read_slots(
-    store: FeatureStore,
-    rows: Int64[np.ndarray, " row"],
-    fold: Folds,
-    slots: Sequence[int],
+    store: FeatureStore, rows: Int64[np.ndarray, " row"], fold: Folds, slots: Sequence[int]
 ) -> tuple[Inputs, Bool[np.ndarray, " row"]]:
     """These slots of the VL `rows` as inputs side by side, and where at least one is valid.
 

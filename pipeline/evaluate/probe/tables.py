@@ -29,10 +29,8 @@ def write_tables(folder: Path, study: ProbeStudy) -> list[Path]:
         "targets.csv": _target_rows(study),
     }
     write_document(folder / "metrics.json", metrics(study))
-    files = [folder / "metrics.json"]
-    for name, rows in tables.items():
-        files.append(Table.of(rows).write_csv(folder / name))
-    return files
+    files = (Table.of(rows).write_csv(folder / name) for name, rows in tables.items())
+    return [folder / "metrics.json", *files]
 
 
 def metrics(study: ProbeStudy) -> dict[str, Any]:
@@ -157,10 +155,8 @@ def _target_rows(study: ProbeStudy) -> list[dict[str, Any]]:
         named = {head: _row(study, result)[head] for head in ("layer", "norm", "pooling")}
         scores = {"alone": result.alone, "beside": result.beside, "known": study.baseline.score}
         for index, (step, channel) in enumerate(targets):
-            row = {**named, "step": step, "channel": channel}
-            for reading, score in scores.items():
-                row[f"r2_{reading}"] = score.by_target[index]
-            rows.append(row)
+            told = {f"r2_{reading}": score.by_target[index] for reading, score in scores.items()}
+            rows.append({**named, "step": step, "channel": channel, **told})
     return rows
 
 

@@ -24,7 +24,7 @@ def jitter(runs: Mapping[str, tuple[float, Timings]]) -> Figure:
     """
     figure, axes = panels(11, 1.2 + 2.3 * len(runs), len(runs), 2, squeeze=False, sharex="col")
     for (name, (hz, timings)), (shares, course) in zip(runs.items(), axes, strict=True):
-        rows = timings.ring.rows()
+        rows = timings.rows()
         for column, (part, style) in enumerate(zip(timings.parts, _styles(timings), strict=True)):
             if len(rows):
                 shares.ecdf(rows[:, column], complementary=True, lw=1.4, label=part, **style)

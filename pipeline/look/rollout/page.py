@@ -56,9 +56,7 @@ def rollout_report(rollouts: Rollouts) -> Report:
     )
 
 
-def worst_and_median(
-    episodes: Sequence[RolloutEpisode],
-) -> tuple[RolloutEpisode, RolloutEpisode]:
+def worst_and_median(episodes: Sequence[RolloutEpisode]) -> tuple[RolloutEpisode, RolloutEpisode]:
     """The worst episode, and that in the middle between it and the best.
 
     Those without success are worse than those with; among equals, the farther the tip was from
@@ -72,11 +70,7 @@ def worst_and_median(
 
 def _success(rollouts: Rollouts) -> list[Block]:
     """How often, and why not."""
-    return [
-        Text(_SUCCESS),
-        Text(_CONTROLLERS),
-        rollouts.summary(),
-    ]
+    return [Text(_SUCCESS), Text(_CONTROLLERS), rollouts.summary()]
 
 
 def _places(rollouts: Rollouts) -> list[Block]:

@@ -110,8 +110,7 @@ def _mark_limits(axes: Sequence[Axes]) -> None:
         axis.set_xlim(axes[0].get_xlim())
     layer.axhspan(-AT_LAYER_MM, AT_LAYER_MM, color=PALETTE[2], alpha=0.35, lw=0)
     rest = f"green: within {AT_LAYER_MM:g}, dashed: {OVERSHOOT_MM:g} beyond it"
-    words = f"tip to the layer [mm]; {rest}"
     sideways.set(title=f"sideways from the target [mm]; dashed: {MISS_MM:g}", ylim=(0, None))
     height.set_title("tip above the surface [mm]; dashed: the surface at rest")
-    layer.set_title(words)
+    layer.set_title(f"tip to the layer [mm]; {rest}")
     force.set(title=f"force [N]; dashed: {FORCE_LIMIT_N:g}", xlabel="time [s]", ylim=(0, None))

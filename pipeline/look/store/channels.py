@@ -83,9 +83,7 @@ def show_channels(statistics: Sequence[StreamSummary]) -> list[Block]:
     return blocks
 
 
-def find_profiles(
-    statistics: Sequence[StreamSummary],
-) -> Iterator[tuple[ChannelStatistics, ...]]:
+def find_profiles(statistics: Sequence[StreamSummary]) -> Iterator[tuple[ChannelStatistics, ...]]:
     """Runs of channels that make a profile, such as an A-scan."""
     for stream in statistics:
         runs = groupby(stream.channels, lambda channel: (unnumbered(channel.name), channel.unit))
