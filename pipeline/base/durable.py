@@ -42,7 +42,7 @@ RUN_FILES = Border(
 _DOCUMENT = dict[str, JsonValue]
 _MOST_BYTES = 64 * 2**20
 """Of a document: the normalisation of a wide policy's features takes 20 MB."""
-_MOST_WEIGHT = 4 * MOST_WEIGHT
+_MOST_WEIGHT = 2 * MOST_WEIGHT
 """Of a document with its digest: 80,000 episodes weigh 4 million, a million steps' rows 5."""
 
 

@@ -33,7 +33,11 @@ class Extractor:
     """
 
     def __init__(
-        self, model: Any, settings: PixelSettings, slots: tuple[Slot, ...], compiled: bool = False
+        self,
+        model: Any,
+        settings: PixelSettings,
+        slots: tuple[Slot, ...],
+        compiled: bool = False,
     ) -> None:
         """`model` may be cut after the last layer that a slot reads.
 
@@ -55,6 +59,13 @@ class Extractor:
             mode = "reduce-overhead" if model.device.type == "cuda" else None
             parts = (self._tower.__call__, self._read)
             self._compiled = tuple(torch.compile(p, dynamic=False, mode=mode) for p in parts)
+
+    def extract(
+        self, rows: Sequence[PreparedRow]
+    ) -> tuple[Float[Tensor, "batch slot dim"], Bool[Tensor, "batch slot"]]:
+        """Features of each row in float32 on the model's device; which are valid, on the CPU."""
+        batch = self.collate(rows)
+        return self.features(batch), self.valid(batch)
 
     def collate(self, rows: Sequence[PreparedRow]) -> TokenBatch:
         """The rows as `features` takes them, sent to the model's device without waiting."""

@@ -123,10 +123,9 @@ class LiveVLM(nn.Module):
         dtype's noise, whatever rows stand beside it. Computed in `vlm.dtype` whatever autocast
         the caller is in.
         """
-        batch = self._extractor.collate(rows)
         with self._precision():
-            features = self._extractor.features(batch)
-        return features, self._extractor.valid(batch).to(features.device)
+            features, valid = self._extractor.extract(rows)
+        return features, valid.to(features.device)
 
     def refuse_other_features(self, trained: Mapping[str, Any]) -> None:
         """Raise `CheckpointMismatch` where features of the spec `trained` are not what this gives.

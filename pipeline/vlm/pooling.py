@@ -41,8 +41,10 @@ def _tokens_of(slot: Slot, layout: TokenLayout) -> NDArray[np.int64]:
             return np.setdiff1d(every, layout.image_tokens())
         case "last":
             return every[-1:]
-        case _:  # of a view: view_mean and grid
+        case "view_mean" | "grid":
             return _view_tokens(slot, layout)
+        case unknown:
+            raise ValueError(f"unknown pooling {unknown!r}")
 
 
 def _view_tokens(slot: Slot, layout: TokenLayout) -> NDArray[np.int64]:
