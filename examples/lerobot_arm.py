@@ -24,7 +24,7 @@ def drive(robot: object, settings: RunSettings, folder: Path = Path("runs")) -> 
         limits = Limits.read(LIMITS, policy.metadata, settings.hz or policy.metadata["action_hz"])
         recorder = RunRecorder(folder, policy.metadata, settings.instruction, vars(settings))
         report = run_robot(arm, policy, settings, limits, recorder)
-        print(f"{report.ticks} ticks, {report.reason}: {report.recording}")
+        print(f"{report.ticks} ticks, {report.reason}: {report.recording or report.traceback}")
 
 
 if __name__ == "__main__":

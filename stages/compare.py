@@ -9,7 +9,7 @@ Takes every folder of `compare.reports` that stages.evaluate wrote, and passes o
 there, such as the logs of a training. Writes report.html, experiments.csv and experiments.png into
 `compare.output`; the tables as Markdown beside that folder.
 
-  python -m stages.compare                                   of dvc repro experiments/dvc.yaml
+  python -m stages.compare                                   of bash experiments/experts.sh
   python -m stages.compare --set compare.reports=reports     reports/evaluate, reports/blind, …
 """
 

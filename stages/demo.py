@@ -20,7 +20,14 @@ from pathlib import Path
 
 from pipeline.base.config import Params
 from pipeline.base.durable import recover_folder, replace_folder, write_document
-from pipeline.simulation.demo_recordings import DEMO, MARKER, refuse_foreign, write_demo_recordings
+from pipeline.simulation.demo_recordings import (
+    DEMO,
+    MARKER,
+    contents_digest,
+    refuse_changed_checkpoint,
+    refuse_foreign,
+    write_demo_recordings,
+)
 from pipeline.vlm.demo_checkpoint import write_demo_checkpoint
 
 
@@ -33,7 +40,9 @@ def main(params: Params) -> None:
 
     def write_marked(folder: Path) -> None:
         write_demo_checkpoint(folder, demo.seed)
-        write_document(folder / MARKER, {"seed": demo.seed})
+        contents = {"": contents_digest(folder)}
+        write_document(folder / MARKER, {"seed": demo.seed, "contents": contents})
 
+    refuse_changed_checkpoint(demo.checkpoint)
     replace_folder(demo.checkpoint, write_marked, DEMO)
     print(f"{demo.episodes} episodes a format in {demo.recordings}, checkpoint {demo.checkpoint}")

@@ -25,9 +25,10 @@ from pathlib import Path
 from pipeline.base.config import Params, RolloutParams
 from pipeline.base.device import resolve_device
 from pipeline.base.durable import write_document
-from pipeline.base.ownership import REPORT, begin_folder, claim, refuse_foreign
+from pipeline.base.ownership import REPORT, claim, refuse_foreign
 from pipeline.evaluate.rollouts import Rollouts, roll_out
 from pipeline.evaluate.served_rollouts import roll_out_served
+from pipeline.look.page.blocks import Report
 from pipeline.look.page.writing import write_report
 from pipeline.look.rollout.page import rollout_report
 from pipeline.policy.checkpoint import find_policy, load_policy
@@ -40,8 +41,7 @@ def main(params: Params) -> None:
     wanted = params.rollout
     refuse_foreign(wanted.output, REPORT)
     if wanted.environment is None:
-        begin_folder(wanted.output, REPORT)
-        write_document(wanted.output / "metrics.json", {"success": {}})
+        _write_nothing(wanted.output)
         print("nothing is rolled out, as rollout.environment is null")
         return
     say = partial(print, flush=True)
@@ -50,6 +50,15 @@ def main(params: Params) -> None:
     for line in rollouts.summary().text():
         print(line)
     print(f"{wanted.output}: {', '.join(file.name for file in files)}")
+
+
+def _write_nothing(folder: Path) -> None:
+    """A page that says so, in place of what earlier rollouts left."""
+    claim(folder, REPORT)
+    for name in ("settings.json", "episodes.csv", "beside.csv"):
+        (folder / name).unlink(missing_ok=True)
+    write_document(folder / "metrics.json", {"success": {}})
+    write_report(folder, Report("No rollouts", "`rollout.environment` is null.", (), ()))
 
 
 def _here(params: Params, say: Callable[[str], None]) -> Rollouts:

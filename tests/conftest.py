@@ -72,9 +72,8 @@ install_import_hook(
 from pipeline.simulation.insertion_formats import write_raw
 from pipeline.simulation.recorder import simulate_episode
 from pipeline.store import SCHEMA, FeatureStore, Sizes, StoreBuild, arrays, schema
-from pipeline.store.chunks import ChunkFiles, row_checksums
+from pipeline.store.chunks import ChunkFiles, read_rows, row_checksums, write_seal
 from pipeline.store.golden import GoldenFrames, write_golden
-from pipeline.store.metadata import note_metadata
 from pipeline.store.paths import read_attributes
 from pipeline.store.schema import read_specs
 from pipeline.vlm.demo_checkpoint import write_demo_checkpoint
@@ -191,16 +190,16 @@ def reseal() -> Callable[[Path], None]:
     """`reseal(store)` gives what a test planted in a finished store its checksums."""
 
     def seal(path: Path) -> None:
-        features = FeatureStore.open(path).array("vl/features")
-        sums = row_checksums(features)
+        specs = read_specs(path)
+        sums = row_checksums(read_rows(path, specs["vl/features"]))
         file = path / "vl" / "checksum" / "c" / "0"
         np.memmap(file, np.uint32, "r+", shape=sums.shape)[:] = sums
-        for spec in read_specs(path).values():
+        for spec in specs.values():
             with closing(ChunkFiles(path, spec)) as files:
                 for file in files.paths:
                     os.truncate(file, spec.chunk_bytes)  # a trailer that is there is compared
                 files.seal()
-        note_metadata(path)
+        write_seal(path)
 
     return seal
 

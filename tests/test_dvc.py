@@ -45,7 +45,7 @@ class Project:
             document[section] |= values
         path.write_text(yaml.safe_dump(document, sort_keys=False))
 
-    def dvc(self, *arguments: str) -> str:
+    def dvc(self, *arguments: str, code: int = 0) -> str:
         paths = [str(Path(sys.executable).parent), os.environ["PATH"]]
         done = subprocess.run(
             [sys.executable, "-m", "dvc", *arguments],
@@ -63,8 +63,8 @@ class Project:
                 "DVC_SITE_CACHE_DIR": str(self.folder.with_name(f"{self.folder.name}_dvc")),
             },
         )
-        assert done.returncode == 0, done.stdout + done.stderr
-        return done.stdout
+        assert done.returncode == code, done.stdout + done.stderr
+        return done.stdout + done.stderr * (code != 0)
 
     def stale(self) -> dict[str, list]:
         """The stages whose own params, code or data changed."""
@@ -85,6 +85,50 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
     made.set(**TINY)
     made.dvc("repro")
     return made
+
+
+def test_dvc_removes_no_output_that_a_param_names():
+    """Only the stage knows whether what lies there is its own."""
+    stages = yaml.safe_load((ROOT / "dvc.yaml").read_text())["stages"]
+    outs = [out for stage in stages.values() for out in stage["outs"]]
+    assert outs and all([*settings.values()] == [{"persist": True}] for settings in outs)
+
+
+def test_no_other_pipeline_claims_outputs():
+    """DVC collects every dvc.yaml of a repository, and `dvc exp run` removes what they claim."""
+    tracked = subprocess.run(
+        ["git", "ls-files", "*dvc.yaml", "*.dvc"], cwd=ROOT, capture_output=True, text=True
+    ).stdout
+    assert tracked.split() in ([], ["dvc.yaml"])
+
+
+@pytest.mark.parametrize(
+    ("stage", "values"),
+    [
+        ("evaluate", {"evaluate": {"output": "notes"}}),
+        ("train_head", {"train_head": {"output": "notes"}}),
+        ("rollout", {"rollout": {"output": "notes", "environment": None}}),
+        ("demo", {"demo": {"recordings": "notes", "checkpoint": "notes"}}),
+    ],
+)
+def test_a_folder_of_the_user_survives_a_param_that_names_it(project, stage, values):
+    before = (project.folder / "params.yaml").read_text()
+    thesis = project.folder / "notes/thesis.txt"
+    thesis.parent.mkdir(exist_ok=True)
+    thesis.write_text("mine")
+    try:
+        project.set(**values)
+        assert "move it away" in project.dvc("repro", "-s", stage, code=255)
+        assert thesis.read_text() == "mine"
+    finally:
+        (project.folder / "params.yaml").write_text(before)
+        shutil.rmtree(thesis.parent)
+
+
+def test_code_that_changed_trains_a_finished_run_again(project):
+    shown = project.dvc("repro", "-f", "-s", "train_head")
+    assert "holds this very run; it is replaced" in shown
+    assert "best and last checkpoint" in shown
 
 
 def test_what_is_judged_is_what_was_trained():

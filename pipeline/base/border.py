@@ -104,15 +104,11 @@ class Border:
         if weight > most:
             why = f"expected a document of weight {most:,} (a value 1, a key or a list 8)"
             raise self.refusal(where, f"{why}, found {weight:,}")
-        collects = gc.isenabled()
-        gc.disable()  # it would walk over what is parsed again and again, for most of the time
         try:
-            return _adapter(model).validate_json(raw)
+            with uncollected():
+                return _adapter(model).validate_json(raw)
         except ValidationError as error:
             raise self.refusal(where, told(error)) from None
-        finally:
-            if collects:
-                gc.enable()
 
     def read_json_lines(self, path: Path, model: type[T], most: int = 2**20) -> Iterator[T]:
         """The documents of a file with one a line, each of at most `most` bytes; empty lines are
@@ -172,6 +168,18 @@ class Border:
         finally:
             signal.setitimer(signal.ITIMER_REAL, 0)
             signal.signal(signal.SIGALRM, before)
+
+
+@contextmanager
+def uncollected() -> Generator[None]:
+    """Keep garbage collection from what is parsed: it would walk over it for most of the time."""
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()
 
 
 def told(error: ValidationError) -> str:

@@ -29,7 +29,7 @@ def resolve_device(name: str) -> "torch.device":
         raise ConfigError(
             f"device: {name}: expected auto, cpu or a device of this machine "
             f"(CUDA devices found: {torch.cuda.device_count()}): {str(error).splitlines()[0]}. "
-            "python -m stages.doctor says what this machine has and what to install"
+            "Set device to auto or cpu, or install what python -m stages.doctor says"
         ) from None
     return device
 

@@ -5,9 +5,11 @@ The ledger only saves reading: losing it costs time, never correctness.
 """
 
 import hashlib
+import os
 import sqlite3
 from collections.abc import Callable
 from contextlib import closing, suppress
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -27,7 +29,7 @@ _DAMAGED = {
     sqlite3.SQLITE_NOTADB,
 }
 """What SQLite says of a damaged ledger; of one in memory it may say anything."""
-_FILE = Border(RecordingError, "Copy it again, or leave its recording out.")
+_FILE = Border(RecordingError, "Copy the file again, or leave its recording out.")
 
 
 class ContentDigests:
@@ -71,7 +73,7 @@ class ContentDigests:
             self._database = sqlite3.connect(self._ledger or ":memory:", isolation_level=None)
         except sqlite3.OperationalError as error:
             raise self._unusable(error, error.sqlite_errorcode) from None
-        if self._ask("PRAGMA application_id") != (_APPLICATION,):
+        if self._ask("PRAGMA application_id") != [(_APPLICATION,)]:
             self._ask(f"PRAGMA application_id = {_APPLICATION}")
         self._ask("PRAGMA journal_mode = WAL")
         self._ask("PRAGMA synchronous = OFF")
@@ -86,10 +88,13 @@ class ContentDigests:
 
         Raises `RecordingError` when the file cannot be read.
         """
-        _FILE.check_file(path)
         with _FILE.foreign(path, "cannot be read"):
-            status = path.stat()
-            what = f"{status.st_size} {status.st_mtime_ns} {path.resolve()}"
+            try:
+                status = path.stat()
+            except FileNotFoundError:
+                raise _FILE.refusal(path, "no such file") from None
+            folder, name = os.path.split(path)
+            what = f"{status.st_size} {status.st_mtime_ns} {_real(folder)}/{name}"
             return self._found("file", what, lambda: file_digest(path))
 
     def note_rate(self, what: str, rows_per_s: float) -> None:
@@ -121,8 +126,7 @@ class ContentDigests:
 
     def _known(self, kind: str, what: str) -> str | None:
         key = joint_digest(kind, what)
-        row = self._ask("SELECT CAST(value AS BLOB) FROM known WHERE key = ?", key)
-        text = row[0].decode("utf-8", "surrogateescape") if row and row[0] else ""
+        text = (self._rows.get(key) or b"").decode("utf-8", "surrogateescape")
         checksum, value = text[:32], text[32:]
         return value if checksum == joint_digest(key, value) else None
 
@@ -130,13 +134,19 @@ class ContentDigests:
         """Remember a text by the digest of its name, with a checksum before it."""
         key = joint_digest(kind, what)
         text = (joint_digest(key, value) + value).encode("utf-8", "surrogateescape")
+        self._rows[key] = text
         self._ask("INSERT OR REPLACE INTO known VALUES (?, ?)", key, text)
 
-    def _ask(self, statement: str, *values: object) -> Any:
-        """The first row that a statement gives; None where there is none, or the ledger is damaged:
-        then another is begun in its place, in memory where this one may only be read."""
+    @cached_property
+    def _rows(self) -> dict[str, bytes]:
+        """All that is known, read at once: a query a file would take longer than its `stat`."""
+        return dict(self._ask("SELECT key, CAST(value AS BLOB) FROM known") or ())
+
+    def _ask(self, statement: str, *values: object) -> list[Any] | None:
+        """The rows that a statement gives; None where the ledger is damaged: then another is begun
+        in its place, in memory where this one may only be read."""
         try:
-            return self._database.execute(statement, values).fetchone()
+            return self._database.execute(statement, values).fetchall()
         except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
             code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT) & 0xFF
             if self._ledger is not None and code not in _DAMAGED:
@@ -159,6 +169,12 @@ class ContentDigests:
             f"{self._ledger}: cannot be written: {error}. Set extract.store to a folder that "
             "can be written to."
         )
+
+
+@lru_cache(maxsize=1024)
+def _real(folder: str) -> str:
+    """The path of a folder without symbolic links."""
+    return os.path.realpath(folder)
 
 
 def ledger_path(store: Path) -> Path:
@@ -193,7 +209,11 @@ def _refuse_foreign(ledger: Path) -> None:
 
 
 def file_digest(path: Path) -> str:
-    """The digest of a file's content, read anew: 32 hex digits of BLAKE2b."""
+    """The digest of a file's content, read anew: 32 hex digits of BLAKE2b.
+
+    Raises `RecordingError` for what is no regular file.
+    """
+    _FILE.check_file(path)
     with path.open("rb") as file:
         return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
 

@@ -1,10 +1,13 @@
 """Bytes, seconds and documents, as people read them."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import yaml
+
+MOST_LINES = 20
+"""Of one kind that are shown; the rest is counted."""
 
 
 def size(count: float) -> str:
@@ -21,6 +24,12 @@ def duration(seconds: float) -> str:
         return f"{seconds:.3g} s"
     minutes = seconds / 60
     return f"{minutes:.1f} min" if minutes < 120 else f"{minutes / 60:,.1f} h"
+
+
+def capped(lines: Sequence[str], kind: str, most: int = MOST_LINES) -> list[str]:
+    """The first lines, and how many more there are."""
+    more = len(lines) - most
+    return [*lines[:most], *([f"and {more} more {kind}"] if more > 0 else [])]
 
 
 def as_yaml(document: Mapping[str, Any]) -> str:

@@ -147,5 +147,6 @@ def _check_views(recordings: Sequence[FileRecording], views: Sequence[str]) -> N
     if unknown:
         raise RecordingError(
             f"data.views asks for {', '.join(unknown)}, which no recording has; "
-            f"there are {', '.join(sorted(there, key=natural_key)) or 'none'}"
+            f"there are {', '.join(sorted(there, key=natural_key)) or 'none'}. "
+            "Set data.views to some of these, or to null for all"
         )

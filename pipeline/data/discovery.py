@@ -74,8 +74,8 @@ def episode_folders(source: Source, root: Path) -> list[tuple[Path, FormatReader
     """
     found: dict[Path, tuple[Path, FormatReader]] = {}
     for pattern in source.paths:
-        _check_pattern(source, pattern)
         full = absolute(root / pattern)
+        _check_pattern(source, pattern, full)
         matches = _matches(full)
         if not matches:
             lost = "" if root.is_dir() else f": {root} is no folder; see python -m stages.doctor"
@@ -183,13 +183,18 @@ def _foreign(path: Path) -> str:
     return ""
 
 
-def _check_pattern(source: Source, pattern: str) -> None:
+def _check_pattern(source: Source, pattern: str, full: Path) -> None:
     parts = Path(pattern).parts
     too_long = len(parts) > 255 or max(map(len, parts), default=0) > 255
     if _ODD.search(pattern) or too_long or parts.count("**") > 2:
         raise RecordingError(
             f"source {source.name!r}: expected a path or glob of names that folders can have, "
             f"with at most two **, found {shown(pattern)}. Mend the source's path"
+        )
+    if full.parts[1:2] in ((), ("*",), ("**",)):
+        raise RecordingError(
+            f"source {source.name!r}: expected a folder to search for episodes, found {pattern!r}, "
+            "the whole file system. Set the source's path to the folder that holds the recordings"
         )
 
 

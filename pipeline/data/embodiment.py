@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from pipeline.base.border import named
 from pipeline.base.errors import StoreMismatch
 from pipeline.data.recording import Channels, Recording, Stream
 
@@ -68,6 +69,6 @@ def _seen(embodiment: Embodiment, stream: str) -> tuple[Channels, str]:
 
 def _shown(channels: Channels, kind: str) -> str:
     pairs = zip(channels.names, channels.units, strict=True)
-    named = [f"{name} ({unit})" if unit else name for name, unit in pairs]
-    listed = ", ".join(named if len(named) <= 12 else [*named[:4], "…", named[-1]])
-    return f"{len(named)} {kind} channels [{listed}]".replace("  ", " ")
+    names = [named(f"{name} ({unit})" if unit else name) for name, unit in pairs]
+    listed = ", ".join(names if len(names) <= 12 else [*names[:4], "…", names[-1]])
+    return f"{len(names)} {kind} channels [{listed}]".replace("  ", " ")

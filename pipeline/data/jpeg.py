@@ -2,8 +2,10 @@
 
 import math
 import os
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from filecmp import cmp
+from itertools import pairwise
 from pathlib import Path, PurePath
 from typing import TypeVar
 
@@ -14,7 +16,7 @@ from PIL import Image
 from pipeline.base.border import shown
 from pipeline.base.config import MediaLimits
 from pipeline.base.errors import RecordingError
-from pipeline.data.media import DEFAULT_LIMITS, FARTHEST_S, check_image_file, opened_image
+from pipeline.data.media import DEFAULT_LIMITS, FARTHEST_S, check_image_file, in_rgb, opened_image
 from pipeline.data.reader import entries, natural_key
 from pipeline.data.recording import CameraStream
 
@@ -24,7 +26,11 @@ THUMBNAIL = (32, 18)
 Frame = TypeVar("Frame")
 Seen = TypeVar("Seen")
 _EYES = ("left", "right")
-_SUFFIXES = (".jpg", ".jpeg")
+_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".gif", ".tif", ".tiff", ".webp")
+"""Of images: what the opener does not decode, it refuses by name."""
+_COUNTED = re.compile(r"0\d+")
+"""A number in place of a time: 000001."""
+_VIEW = re.compile(r"view(?=\d)", re.IGNORECASE)
 
 
 class JpegCamera(CameraStream):
@@ -33,8 +39,10 @@ class JpegCamera(CameraStream):
     def __init__(
         self, view: str, paths: Sequence[Path], limits: MediaLimits = DEFAULT_LIMITS
     ) -> None:
-        """Sorts the files by the time in their names; raises `RecordingError` on a name without."""
+        """Sorts the files by the time in their names; raises `RecordingError` on a name without,
+        and where they are of two cameras."""
         timed = sorted((frame_time(path), str(path)) for path in paths)
+        _check_one_camera(view, timed)
         self.view = view
         self.paths = [Path(path) for _, path in timed]
         self.time = np.array([time for time, _ in timed], np.float64)
@@ -75,16 +83,34 @@ def frame_time(path: PurePath) -> float:
         time = float(text)
     except ValueError:
         time = math.nan
-    if not abs(time) <= FARTHEST_S:
+    if not abs(time) <= FARTHEST_S or _COUNTED.fullmatch(text):
         raise RecordingError(
             f"{path}: expected a name that ends in the time in seconds, such as "
-            f"zed_left_1761551500.174.jpg, found {shown(text)}"
+            f"zed_left_1761551500.174.jpg, found {shown(text)}. Rename the frames by their times"
         )
     return time
 
 
+def _check_one_camera(view: str, timed: Sequence[tuple[float, str]]) -> None:
+    """Raise `RecordingError` where frames, by time, are of two cameras or in two forms.
+
+    Before the time in its name, each has that of its camera, or a number of its own.
+    """
+    names = {path: os.path.basename(path).rpartition("_")[0] for _, path in timed}  # noqa: PTH119
+    of_camera = {name: path for path, name in names.items()}
+    pairs = [(a, b) for (at, a), (then, b) in pairwise(timed) if at == then and a != b]
+    if 1 < len(of_camera) < len(names):
+        one, other, *_ = of_camera.values()
+        pairs.append((one, other))
+    for one, other in pairs[:1]:
+        raise RecordingError(
+            f"{one}: expected the frames of one camera in {view}, found also {other}. Move those "
+            "of another camera or form into a folder of their own"
+        )
+
+
 def list_views(folder: Path, prefix: str = "") -> dict[str, list[Path]]:
-    """JPEG files by view name, from the folders `<prefix>…` in `folder`; views without are absent.
+    """Images by view name, from the folders `<prefix>…` in `folder`; views without are absent.
 
     `left` is dropped unless both eyes exist; an eye is a subfolder, the end of the folder's name,
     or the part before the time in a file's name.
@@ -116,7 +142,8 @@ def name_views(found: Mapping[tuple[str, str], list[Frame]]) -> dict[str, list[F
 
 
 def split_eye(name: str) -> tuple[str, str]:
-    """`View1_left` -> (`View1`, `left`); no eye is ''."""
+    """`View1_left` and `view1_left` -> (`View1`, `left`); no eye is ''."""
+    name = _VIEW.sub("View", name, count=1) if _VIEW.match(name) else name
     base, _, eye = name.rpartition("_")
     return (base, eye) if base and eye in _EYES else (name, "")
 
@@ -126,7 +153,7 @@ def read_image(
 ) -> NDArray[np.uint8]:
     """The image (height, width, 3), RGB as stored (EXIF orientation is ignored)."""
     with opened_image(file, where, limits) as image:
-        return np.asarray(image.convert("RGB"))
+        return in_rgb(image)
 
 
 def image_size(file: Path, where: str, limits: MediaLimits = DEFAULT_LIMITS) -> tuple[int, int]:
@@ -152,18 +179,24 @@ def check_image(
 
 
 def _view_folders(folder: Path, prefix: str) -> list[Path]:
-    found = [Path(e.path) for e in _entries(folder) if e.name.startswith(prefix) and e.is_dir()]
-    return sorted(found, key=lambda view: natural_key(view.name))
+    there = [e for e in _entries(folder) if split_eye(e.name)[0].startswith(prefix) and e.is_dir()]
+    found = sorted((Path(entry.path) for entry in there), key=lambda view: natural_key(view.name))
+    for one, other in pairwise(sorted(found, key=lambda view: split_eye(view.name))):
+        if split_eye(one.name) == split_eye(other.name):
+            raise RecordingError(
+                f"{one}: expected one folder of this view, found {other}. Rename it"
+            )
+    return found
 
 
 def _frames(view: Path) -> Iterator[tuple[str, Path]]:
-    """(eye, file) of every JPEG of a view's folder."""
+    """(eye, file) of every image of a view's folder."""
     _, eye = split_eye(view.name)
     for entry in _entries(view):
         if entry.name in _EYES and entry.is_dir():
             inside = _entries(Path(entry.path))
-            yield from ((entry.name, Path(file.path)) for file in inside if _is_jpeg(file.name))
-        elif _is_jpeg(entry.name):
+            yield from ((entry.name, Path(file.path)) for file in inside if _is_image(file.name))
+        elif _is_image(entry.name):
             yield eye or _eye_of_file(entry.name), Path(entry.path)
 
 
@@ -172,7 +205,7 @@ def _entries(folder: Path) -> Iterable[os.DirEntry[str]]:
     return [entry for entry in listed if not entry.name.startswith(".")]
 
 
-def _is_jpeg(name: str) -> bool:
+def _is_image(name: str) -> bool:
     return name.lower().endswith(_SUFFIXES)
 
 

@@ -9,7 +9,8 @@ What has no home in LeRobot lies in this project's sidecars, beside the data set
 import json
 import os
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 
@@ -17,7 +18,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from pipeline.base.border import Text, shown
+from pipeline.base.border import Text, shown, uncollected
 from pipeline.base.config import MediaLimits, Source
 from pipeline.base.errors import RecordingError
 from pipeline.data.arrays import MOST_CHANNELS, member, read_npz
@@ -50,6 +51,7 @@ def is_root(folder: Path, names: Collection[str]) -> bool:
     return "meta" in names and (folder / MARKER).is_file()
 
 
+@uncollected()
 def open_data_set(
     root: Path, source: Source, views: Sequence[str] | None
 ) -> tuple[list["LeRobotRecording"], list[str]]:
@@ -64,19 +66,26 @@ def open_data_set(
             "there: a depth map is no picture that the model can be shown. Leave it out of "
             "data.views"
         )
+    layout.check_ends()
     recordings: list[LeRobotRecording] = []
     missing: list[str] = []
-    check = cache(RECORDINGS.check_file)
+    refusal = cache(_refusal)  # many episodes may be in one file
     for episode in layout.episodes:
         recording = LeRobotRecording(layout, episode, source, views)
-        try:
-            for path in recording.listed_files():
-                check(path)
-        except RecordingError as error:
-            missing.append(f"{source.name}: {root} lists {episode.id}, but {error}")
+        if why := next(filter(None, map(refusal, recording.listed_files())), ""):
+            missing.append(f"{source.name}: {root} lists {episode.id}, but {why}")
         else:
             recordings.append(recording)
     return recordings, missing
+
+
+def _refusal(path: Path) -> str:
+    """Why no episode can be in a file; empty where one can."""
+    try:
+        RECORDINGS.check_file(path)
+    except RecordingError as error:
+        return str(error)
+    return ""
 
 
 class LeRobotRecording(FileRecording):
@@ -101,10 +110,12 @@ class LeRobotRecording(FileRecording):
     def group(self) -> str | None:
         return self._episode.group_name
 
-    def listed_files(self) -> list[Path]:
+    def listed_files(self) -> Iterator[Path]:
         """The data file and the wanted views' videos, as `meta/` names them."""
-        keys = (key for key in self._wanted().values() if key in self._info.videos)
-        return [self._layout.data(self._episode), *(self._video(key).path for key in keys)]
+        yield self._layout.data(self._episode)
+        for key in self._wanted().values():
+            if key in self._info.videos:
+                yield self._video(key).path
 
     def _wanted(self) -> dict[str, str]:
         """Feature keys of the wanted views."""
@@ -153,7 +164,8 @@ class LeRobotRecording(FileRecording):
 
     def action(self) -> RecordedAction:
         if (feature := self._info.features.get(ACTION)) is None:
-            why = f"no feature {ACTION!r}; it has {shown([*self._info.features])}"
+            why = f"no feature {ACTION!r} (as a robot's run that stopped before its first action); "
+            why += f"it has {shown([*self._info.features])}"
             raise META.refusal(self.path / MARKER, why)
         stream, kind = self._stream(ACTION), self._overrides.action_kind
         if kind == "auto":
@@ -300,5 +312,8 @@ def _channels(
     units = units or ("",) * width
     if len(names) != width or len(units) != width:
         why = f"{width} values a reading, but {len(names)} names and {len(units)} units"
+        raise META.refusal(where, why)
+    if twins := [name for name, count in Counter(names).items() if count > 1]:
+        why = f"expected each channel name once, found {shown(twins)} more often"
         raise META.refusal(where, why)
     return Channels(names, units)

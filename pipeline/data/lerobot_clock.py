@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pipeline.base.errors import RecordingError
 from pipeline.data.lerobot_rows import CLOCK, ParquetRows, matrix
 from pipeline.data.media import RECORDINGS
-from pipeline.data.recording import check_clock, check_rising_clock
+from pipeline.data.recording import check_clock, check_resolution, check_rising_clock
 
 FRAME = "frame_index"
 NUMBERS = (CLOCK, FRAME)
@@ -33,6 +33,7 @@ def read_clock(table: pa.Table, fps: float, where: str) -> NDArray[np.float64]:
     """
     stored = stored_clock(table, where)
     check_clock(stored, f"{where}, {CLOCK!r}")
+    check_resolution(stored.astype(_stored_type(table)), f"{where}, {CLOCK!r}")
     _check_seconds(stored, fps, where)
     time = _exact(stored, _stored_type(table), _frames(table, where), fps)
     # Rows are chosen by time: of two at one time, the earlier would show the later's frame.

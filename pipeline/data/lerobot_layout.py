@@ -16,7 +16,7 @@ from pipeline.base.errors import RecordingError
 from pipeline.data.lerobot_meta import META, Episode, Info, Place, SharedEpisode, Span, Task
 from pipeline.data.parquet import ParquetTable
 from pipeline.data.reader import natural_key
-from pipeline.data.video import VideoSpan
+from pipeline.data.video import VideoSpan, frame_count
 
 T = TypeVar("T")
 
@@ -25,6 +25,8 @@ _INFO_BYTES = 8 * 2**20
 _MOST_ROWS = 500_000
 """Episodes or tasks of a data set; language_table has 440,000 episodes."""
 _EPISODE_COLUMNS = ("episode_index", "length", "tasks", "group")
+_OFF_FRAME = 0.1
+"""Of a frame, by which the sum of inexact durations may miss it."""
 _TASK_COLUMNS = ("task_index", "task", "__index_level_0__")
 
 
@@ -50,18 +52,36 @@ class LeRobotLayout:
         path = (self.info.video_path or "").format(video_key=key, **place)
         return VideoSpan(self.root / path, *episode.frames(key, self.info.fps))
 
+    def check_ends(self) -> None:
+        """Raise `RecordingError` where a video ends before its episodes, the first of which begins
+        after it does: the frames of all would be others.
+
+        With the first alone it may be of a trimmed copy, with the last alone it may be cut off.
+        """
+        for path, spans in self._spans.items():
+            first, stop = spans[0][0], spans[-1][0] + spans[-1][3].length
+            if first and 0 < (frames := frame_count(path, self.limits)) < stop:
+                why = f"expected from_timestamp and length for frames 0 to {frames - 1} of {path}, "
+                why += f"found {first} to {stop - 1}"
+                raise META.refusal(self.root / "meta" / "episodes", why)
+
     @cached_property
-    def rivals(self) -> Mapping[tuple[int, str], str]:
-        """By an episode's index and a feature key: another that some of its frames go to too."""
-        by_file: dict[Path, list[tuple[int, int, str, Episode]]] = defaultdict(list)
+    def _spans(self) -> Mapping[Path, list[tuple[int, int, str, Episode]]]:
+        """By video: the first frame, index and feature key of its episodes and these, in order."""
+        spans: dict[Path, list[tuple[int, int, str, Episode]]] = defaultdict(list)
         for episode in self.episodes:
             for key in self.info.videos:
                 span = self.video(episode, key)
-                by_file[span.path].append((span.first or 0, episode.index, key, episode))
+                spans[span.path].append((span.first or 0, episode.index, key, episode))
+        return {path: sorted(of_file, key=lambda span: span[:3]) for path, of_file in spans.items()}
+
+    @cached_property
+    def rivals(self) -> Mapping[tuple[int, str], str]:
+        """By an episode's index and a feature key: another that some of its frames go to too."""
         rivals: dict[tuple[int, str], str] = {}
-        for spans in by_file.values():
+        for spans in self._spans.values():
             until, last = 0, ("", spans[0][-1])
-            for first, index, key, episode in sorted(spans, key=lambda span: span[:3]):
+            for first, index, key, episode in spans:
                 if first < until:
                     rivals[index, key], rivals[last[1].index, last[0]] = last[1].id, episode.id
                 if first + episode.length > until:
@@ -103,7 +123,14 @@ def _shared_episodes(root: Path, info: Info, limits: MediaLimits) -> Iterator[Ep
                 reduce(lambda inner, parent: inner.setdefault(parent, {}), parents, row)[name] = (
                     cell
                 )
-            yield META.parse(row, SharedEpisode, where)
+            episode = META.parse(row, SharedEpisode, where)
+            for key, span in episode.videos.items():
+                frame = span.from_timestamp * info.fps
+                if abs(frame - round(frame)) > _OFF_FRAME:
+                    why = f"videos/{key}/from_timestamp: expected the time of a frame at fps "
+                    why += f"{info.fps:g}, found {span.from_timestamp:.6g} s, frame {frame:.2f}"
+                    raise META.refusal(where, why)
+            yield episode
 
 
 def _task_text(root: Path, shared: bool, limits: MediaLimits) -> dict[int, str]:

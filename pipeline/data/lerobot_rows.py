@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -16,7 +17,7 @@ from pipeline.data.lerobot_meta import META, Episode
 from pipeline.data.media import RECORDINGS
 from pipeline.data.parquet import ParquetTable
 from pipeline.data.reader import natural_key
-from pipeline.data.recording import CameraStream, check_clock
+from pipeline.data.recording import CameraStream, check_clock, check_resolution
 
 CLOCK = "timestamp"
 EPISODE = "episode_index"
@@ -99,7 +100,10 @@ class ParquetCamera(CameraStream):
                 f"{rows.path}: {len(time)} rows, but times {own.shape} of the images of {view!r} "
                 "in the sidecar frames/: they must agree"
             )
-        check_clock(own, f"{rows.path}, the times of the images of {view!r}")
+        where = f"{rows.path}, the times of the images of {view!r}"
+        check_clock(own, where)
+        if captured is not None:  # one image may stand in many rows: those times are repeated
+            check_resolution(time.astype(captured.dtype), where)
         if (late := np.flatnonzero(own > time + _SAME_S)).size:
             row = int(late[0])
             raise RecordingError(
@@ -172,13 +176,21 @@ def matrix(column: pa.ChunkedArray, width: int, where: str) -> NDArray[np.float6
         raise RECORDINGS.refusal(where, f"no value in row {int(np.argmax(array.is_null()))}")
     if isinstance(array, pa.ListArray | pa.LargeListArray | pa.FixedSizeListArray):
         fixed = isinstance(array, pa.FixedSizeListArray)
-        lengths = np.asarray([array.type.list_size] if fixed else array.value_lengths())
+        lengths = np.array([array.type.list_size]) if fixed else _numbers(array.value_lengths())
         if (lengths != width).any():
             row = int(np.argmax(lengths != width))
             why = f"{lengths[row]} values in row {row}, but its feature has {width}"
             raise RECORDINGS.refusal(where, why)
         array = array.flatten()
-    values = array.to_numpy(zero_copy_only=False)
+    values = _numbers(array)
     if values.size != len(column) * width:
         raise RECORDINGS.refusal(where, f"one number a row, but its feature has {width}")
     return values.astype(np.float64).reshape(len(column), width)
+
+
+def _numbers(array: pa.Array) -> NDArray[Any]:
+    """An array of numbers, NaN where there is none; `to_numpy` would import pandas."""
+    if array.null_count:
+        array = array.cast(pa.float64()).fill_null(np.nan)
+    dtype = np.dtype(array.type.to_pandas_dtype())
+    return np.frombuffer(array.buffers()[1], dtype, len(array), array.offset * dtype.itemsize)

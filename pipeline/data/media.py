@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import IO, Annotated, Any
 
 import av
+import numpy as np
 from av.container import InputContainer
 from av.video.stream import VideoStream
+from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 from pydantic import Field
 
@@ -31,6 +33,10 @@ Rate = Annotated[float, Field(ge=1e-3, le=1e6)]
 _ALWAYS_TAKEN = 256 * 2**20
 """Unpacked bytes that no ratio forbids: what stands still packs a thousandfold."""
 _IMAGES = ("JPEG", "PNG")
+_AS_RGB = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK")
+"""Modes of images that are shown in RGB as they are; what is transparent is opaque then."""
+_SIXTEEN_BITS = ("I;16", "I;16B", "I;16L", "I;16N")
+"""Modes of grey in 16 bits, of which the upper eight are shown."""
 _IMAGE_BYTES = 16 * 2**20
 """That an image may have beside one for each pixel of the limits; a good JPEG has half of that."""
 _SCAN, _MOST_SCANS = b"\xff\xda", 100
@@ -91,10 +97,22 @@ def opened_image(
             raise RECORDINGS.refusal(where, why) from None
         with image:
             check_limit(where, image.width * image.height, limits.pixels, "pixels", "pixels")
+            if image.mode not in _AS_RGB + _SIXTEEN_BITS:
+                why = f"expected pixels of 8 bits, or grey ones of 16, found mode {image.mode!r}"
+                raise INTACT.refusal(where, why)
             if (scans := _scans(image, stream)) > _MOST_SCANS:
                 why = f"expected at most {_MOST_SCANS} scans over the image, found {scans:,}"
                 raise INTACT.refusal(where, why)
             yield image
+
+
+def in_rgb(image: Image.Image) -> NDArray[np.uint8]:
+    """(height, width, 3), RGB, of an image of `opened_image`."""
+    if image.mode in _SIXTEEN_BITS:
+        upper = (np.asarray(image) >> 8).astype(np.uint8)
+        return np.repeat(upper[:, :, None], 3, axis=2)
+    image.info.pop("transparency", None)  # Pillow would warn of that of a palette
+    return np.asarray(image.convert("RGB"))
 
 
 @contextmanager

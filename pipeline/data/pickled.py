@@ -90,6 +90,8 @@ class PickledRecording(InsertionRecording):
         super().__init__(path, source, views)
         self._pickle = path / MARKER
         self._kept: _Content | None = None
+        self._located: dict[str, str] = {}
+        """By folder as recorded, the folder in which a frame of it lies."""
 
     def action(self) -> RecordedAction:
         content = self._content()
@@ -172,12 +174,17 @@ class PickledRecording(InsertionRecording):
 
     def _locate(self, recorded: str, where: str) -> Path:
         """The file as recorded, else the longest tail of its path under this folder."""
+        at = max(recorded.rfind("/"), recorded.rfind("\\")) + 1
+        known = self._located.get(recorded[:at])
+        if known is not None and os.path.isfile(place := f"{known}/{recorded[at:]}"):  # noqa: PTH113
+            return Path(place)
         # A few parts of it at most still stand under the episode's folder.
         parts = _pure(recorded).parts[-10:]
         for tail in (Path(recorded), *(Path(*parts[first:]) for first in range(len(parts)))):
             candidate = self.path / tail  # the tail alone, where it is absolute
             inside = tail.is_absolute() or ".." not in tail.parts
             if inside and os.path.isfile(candidate):  # noqa: PTH113, a name may be too long
+                self._located[recorded[:at]] = str(candidate.parent)
                 return candidate
         raise RecordingError(
             f"{where}: {recorded} is not there, nor is any tail of it under {self.path}; "

@@ -19,6 +19,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.base.clock import CLOCK_SLACK_S
 from pipeline.base.digests import joint_digest
 from pipeline.base.errors import RecordingError
 from pipeline.base.finite import first_non_finite, non_finite
@@ -66,9 +67,6 @@ class Nominal:
     """By clock: `sensor`, `state`, `action`, `view View1`, …"""
     streams: Mapping[str, str] = field(default_factory=dict[str, str])
     """What says that a stream was recorded, by its name: `state`: `robot_states_count 300`."""
-    views: tuple[str, ...] = ()
-    frames: int | None = None
-    """Of the view that has most."""
     where: str = ""
     """The file that says so."""
     mistakes: tuple[str, ...] = ()
@@ -182,14 +180,15 @@ class Recording(ABC):
 
 
 def checked_stream(
-    channels: Channels, time: NDArray[np.float64], values: NDArray[Any], where: str
+    channels: Channels, stored: NDArray[Any], values: NDArray[Any], where: str
 ) -> Stream:
-    """A `Stream` after checking what every stream must be.
+    """A `Stream` after checking what every stream must be; `stored` is its clock as in the file.
 
     Raises `RecordingError` (beginning with `where`) on differing lengths, a width other than the
-    channels', an empty stream, NaN or inf (row and channel named) and a clock that goes backwards.
+    channels', an empty stream, NaN or inf (row and channel named), a clock that goes backwards and
+    one that is too coarse.
     """
-    time = np.asarray(time, np.float64)
+    time = np.asarray(stored, np.float64)
     with np.errstate(over="ignore"):  # what float32 cannot hold becomes inf, which is refused
         values = np.asarray(values, np.float32)
     if values.ndim != 2 or values.shape[1] != len(channels.names):
@@ -203,6 +202,7 @@ def checked_stream(
     if not len(values):
         raise RecordingError(f"{where}: the stream is empty")
     check_clock(time, where)
+    check_resolution(stored, where)
     if (at := first_non_finite(values)) is not None:
         row, column = at
         raise RecordingError(
@@ -231,6 +231,24 @@ def check_clock(time: NDArray[np.float64], where: str) -> None:
         )
 
 
+def check_resolution(stored: NDArray[Any], where: str) -> None:
+    """Raise `RecordingError` where a clock, of the type in its file, is too coarse for its rate.
+
+    That is where steps of the type, or of decimals that all times were rounded to, are so long that
+    more than two entries share one on average.
+    """
+    time = stored.astype(np.float64)
+    apart = (time[-1] - time[0]) / (len(time) - 1) if len(time) > 1 else 1.0
+    rounded = next((10.0**-n for n in range(3) if (np.round(time, n) == time).all()), 0.0)
+    spacing = np.spacing(np.abs(stored).max()) if stored.dtype.kind == "f" else 0.0
+    if (step := max(rounded, float(spacing))) > max(2 * apart, CLOCK_SLACK_S):
+        raise RecordingError(
+            f"{where}: times of {stored.dtype} near {time[-1]:.0f} s go by steps of {step:g} s, "
+            f"too coarse for {len(time)} of them in {time[-1] - time[0]:g} s; expected float64, "
+            "not rounded. Export the recording again with such times, or leave it out"
+        )
+
+
 def check_rising_clock(time: NDArray[np.float64], where: str) -> None:
     """Raise `RecordingError` where a clock is not finite, goes backwards or stands still."""
     check_clock(time, where)
@@ -250,8 +268,12 @@ def content_digest(recording: Recording, digest_of: Callable[[Path], str]) -> st
     file cannot be read.
     """
     # Frame times stand in file names, so a name is content too; where the folder lies is not.
-    files = recording.files()
-    for file in files:
+    named: list[tuple[str, str]] = []
+    inside = f"{recording.path}/"
+    for file in recording.files():
+        name = str(file)
         RECORDINGS.check_file(file, _MOST_BYTES)
-    named = ((os.path.relpath(file, recording.path), digest_of(file)) for file in files)
+        below = name.startswith(inside)
+        name = name[len(inside) :] if below else os.path.relpath(file, recording.path)
+        named.append((name, digest_of(file)))
     return joint_digest(recording.identity(), json.dumps(sorted(named)))

@@ -6,6 +6,7 @@ clip: the whole file, or the part of a shared file that holds one episode.
 
 import sys
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from operator import itemgetter
@@ -126,6 +127,13 @@ class VideoClip(CameraStream):
                     "the episode out"
                 )
         return _FrameTable(*np.array(sorted(packets, key=itemgetter(0)), np.int64).reshape(-1, 3).T)
+
+
+def frame_count(path: Path, limits: MediaLimits) -> int:
+    """How many frames a video says it has; 0 where it does not say it or cannot be read."""
+    with suppress(RecordingError), opened_video(path, limits) as (_, stream):
+        return stream.frames
+    return 0
 
 
 def _packets(

@@ -22,9 +22,9 @@ from pipeline.data.insertion import (
     read_robot_states,
     robot_state_file,
 )
-from pipeline.data.jpeg import list_empty_views, list_views
+from pipeline.data.jpeg import list_empty_views, list_views, split_eye
 from pipeline.data.media import RECORDINGS, Grouped, Rate, Seconds
-from pipeline.data.recording import Nominal, Stream, check_clock, checked_stream
+from pipeline.data.recording import Nominal, Stream, check_clock, check_resolution, checked_stream
 from pipeline.data.windows import rebuild
 
 MARKER = "metadata.json"
@@ -83,7 +83,8 @@ class WindowedRecording(InsertionRecording):
         if not os.path.lexists(path):
             return None
         members = read_npz(path, ("timestamps", "data"), limits=self._overrides.limits)
-        ends = member(members, ("timestamps",), path).astype(np.float64)
+        stored = member(members, ("timestamps",), path)
+        ends = stored.astype(np.float64)
         windows = member(members, ("data",), path)
         if windows.ndim != 3 or windows.shape[2] != len(SENSOR.names) or not windows.shape[1]:
             raise RecordingError(
@@ -97,6 +98,7 @@ class WindowedRecording(InsertionRecording):
         if not len(windows):
             return None
         check_clock(ends, f"{path}, member 'timestamps'")
+        check_resolution(stored, f"{path}, member 'timestamps'")
         time, values = rebuild(ends, windows, self._metadata.sensor_hz, str(path))
         return checked_stream(SENSOR, time, values, str(path))
 
@@ -113,8 +115,6 @@ class WindowedRecording(InsertionRecording):
                 sensor=("sensor_windows_count", "sensor_hz"),
                 state=("robot_states_count", "robot_hz"),
             ),
-            views=told.camera_views or (),
-            frames=told.camera_frames_count,
             where=MARKER,
         )
 
@@ -130,7 +130,19 @@ class WindowedRecording(InsertionRecording):
             )
 
     def _view_files(self) -> Mapping[str, list[Path]]:
-        return list_views(self.path / "images")
+        views, told = list_views(self.path / "images"), self._metadata
+        there = {split_eye(view)[0] for view in views}
+        promised = {split_eye(view)[0] for view in told.camera_views or () if self._wants(view)}
+        most = max(map(len, views.values()), default=0)
+        if lost := sorted(promised - there):
+            what = f"camera_views has {', '.join(lost)}, and images/ no frame of it"
+        elif self._views is None and most < (told.camera_frames_count or 0):
+            what = f"camera_frames_count is {told.camera_frames_count}, and images/ has {most}"
+        else:
+            return views
+        raise RecordingError(
+            f"{self._metadata_file}: {what}. Copy the episode again, or correct the metadata"
+        )
 
     def _data_files(self) -> Sequence[Path | None]:
         return [self._metadata_file, self.path / _SENSOR_FILE, robot_state_file(self.path)]

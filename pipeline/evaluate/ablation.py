@@ -47,6 +47,8 @@ class Ablated:
     how: str
     """`zeroed`, `missing`, `shuffled` or `delayed 50 ms`."""
     comparison: Comparison
+    intact: Comparison
+    """With all streams, on the same ticks: those whose episode has this one."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,7 @@ class AblationStudy:
 
     def times_intact(self, ablated: Ablated) -> Figure | None:
         """The error with a stream ablated, in multiples of the intact one; None where that is 0."""
-        return times(ablated.comparison, self.intact)
+        return times(ablated.comparison, ablated.intact)
 
 
 def evaluate_ablation(
@@ -93,25 +95,36 @@ def evaluate_ablation(
     ] * (left_out > 0)
     ticks = evenly(settled, MOST_TICKS)
     windows, device = Windows.of(checkpoint.params), next(policy.parameters()).device
-    ways: list[tuple[str, str, FeedMaker | None]] = [("", "intact", None)]
+    ways: list[tuple[str, str, Ticks, FeedMaker | None]] = [("", "intact", ticks, None)]
     for stream in (stream for stream in FIELDS if stream in policy.encoders):
-        alterations, reasons = _alterations(checkpoint, store, ticks, stream)
+        having = ticks[_having(store, ticks, stream)]
+        if len(having) < len(ticks):
+            notes.append(
+                f"{stream}: judged on the {len(having)} of {len(ticks)} ticks whose episode has it"
+            )
+        if not len(having):
+            continue
+        if len(having) < len(ticks):
+            ways.append((stream, "intact", having, None))
+        alterations, reasons = _alterations(checkpoint, store, having, stream)
         notes += reasons
         for how, alter in alterations.items():
-            ways.append((stream, how, feed_maker(store, windows, device, alter=alter)))
+            ways.append((stream, how, having, feed_maker(store, windows, device, alter=alter)))
         for how, lags in delays(store, stream).items():
-            ways.append((stream, how, feed_maker(store, windows, device, lags)))
+            ways.append((stream, how, having, feed_maker(store, windows, device, lags)))
         notes += _emptied(windows, stream)
-    seen = (store, ticks, windows, batch_size, False, samples)
-    others, groups = baselines.act(ticks), groups_of(store, checkpoint, ticks)
     space = action_space(store, checkpoint.normalization)
-    bar = tqdm(ways, "ablating streams", unit="way", disable=None)
-    comparisons = [compare(predict(policy, *seen, feed), others, space, groups) for *_, feed in bar]
-    ablated = (
-        Ablated(stream, how, comparison)
-        for (stream, how, _), comparison in zip(ways[1:], comparisons[1:], strict=True)
-    )
-    return AblationStudy(comparisons[0], tuple(ablated), tuple(notes), samples)
+    intact: dict[str, Comparison] = {}
+    ablated: list[Ablated] = []
+    for stream, how, here, feed in tqdm(ways, "ablating streams", unit="way", disable=None):
+        predictions = predict(policy, store, here, windows, batch_size, False, samples, feed)
+        groups = groups_of(store, checkpoint, here)
+        comparison = compare(predictions, baselines.act(here), space, groups)
+        if how == "intact":
+            intact[stream] = comparison
+        else:
+            ablated.append(Ablated(stream, how, comparison, intact.get(stream, intact[""])))
+    return AblationStudy(intact[""], tuple(ablated), tuple(notes), samples)
 
 
 def feed_maker(
@@ -208,11 +221,8 @@ def donors_of(store: FeatureStore, ticks: Ticks, stream: str, seed: int = 0) -> 
     A tick whose episode lacks the stream gives it to nobody and keeps what it has. None where
     fewer than two episodes have the stream.
     """
-    episode = store.episode_of(ticks)
-    having = np.full(len(ticks), True)
-    if stream != "features":
-        having = np.diff(store.array(f"episode/{stream}_start"))[episode] > 0
-    episode = episode[having]
+    having = _having(store, ticks, stream)
+    episode = store.episode_of(ticks)[having]
     first = np.searchsorted(episode, episode, side="left")
     size = np.searchsorted(episode, episode, side="right") - first
     if len(episode) == 0 or (size == len(episode)).any():
@@ -223,6 +233,13 @@ def donors_of(store: FeatureStore, ticks: Ticks, stream: str, seed: int = 0) -> 
     donors = ticks.copy()
     donors[having] = ticks[having][drawn]
     return donors
+
+
+def _having(store: FeatureStore, ticks: Ticks, stream: str) -> NDArray[np.bool_]:
+    """(tick,) whether its episode has the stream."""
+    if stream == "features":
+        return np.full(len(ticks), True)
+    return np.diff(store.array(f"episode/{stream}_start"))[store.episode_of(ticks)] > 0
 
 
 def delays(store: FeatureStore, stream: str) -> dict[str, Lags]:

@@ -130,7 +130,7 @@ def read_experiments(reports: Path) -> tuple[Experiment, ...]:
         raise ConfigError(
             f"compare.reports: expected one folder for each experiment in {reports}, each with a "
             f"{JUDGED}, found none. Run stages.evaluate for each with its own evaluate.output "
-            "there, or dvc repro experiments/dvc.yaml."
+            "there, or bash experiments/experts.sh."
         )
     runs: dict[tuple[Any, ...], list[Experiment]] = {}
     for experiment in map(_read_experiment, folders):

@@ -372,7 +372,7 @@ def _ablation_errors(study: AblationStudy | None) -> Table:
         best = best_baseline(study.intact)
         for way in study.ablated:
             for group in (*study.intact.groups, None):
-                intact = (study.intact.error(method, group) for method in ("policy", best))
+                intact = (way.intact.error(method, group) for method in ("policy", best))
                 own = way.comparison.error("policy", group)
                 rows.append([way.stream, way.how, *_named(group).values(), own, *intact])
     errors = ("error", "intact_error", "best_baseline_error")

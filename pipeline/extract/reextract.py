@@ -16,12 +16,12 @@ from pipeline.base.config import Params
 from pipeline.base.differences import describe, differences
 from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.base.errors import StoreMismatch
+from pipeline.base.format import capped
 from pipeline.data.row_range import RowFrames
 from pipeline.extract.encoder import Encoder
 from pipeline.extract.engine import ReadyRow, RowPreparation
 from pipeline.extract.survey import survey
 from pipeline.store import FEATURES, FeatureStore
-from pipeline.store.verification import capped
 from pipeline.store.writer import environment_runs
 from pipeline.vlm.deviation import slot_deviations, tolerance_of
 from pipeline.vlm.preparation import Preparer

@@ -10,12 +10,14 @@ import numpy as np
 from pipeline.base.config import Params
 from pipeline.base.device import resolve_device
 from pipeline.base.digests import ContentDigests, ledger_path
+from pipeline.base.format import capped
 from pipeline.data.timeline import rate_notes
 from pipeline.extract.engine import ExtractionReport, fill
 from pipeline.extract.golden import keep_golden
 from pipeline.extract.layout import build_arrays, check_readable, check_space, lay_out
 from pipeline.extract.plan import Say, StorePlaces, count_known, plan_lines, row_sources
 from pipeline.extract.survey import (
+    MOST_EPISODES,
     CheckedEpisode,
     Survey,
     check_episodes,
@@ -24,7 +26,6 @@ from pipeline.extract.survey import (
     survey,
 )
 from pipeline.store import FEATURES, FeatureStore, RowSource, StoreBuild, build_lock, recover
-from pipeline.store.metadata import check_metadata
 from pipeline.store.paths import refuse_foreign_store
 
 
@@ -51,8 +52,7 @@ def extract(params: Params, say: Say) -> ExtractionReport | None:
             return _begin(surveyed, checked, places, digests, say)
         if places.begun == surveyed.plan:
             return _resume(surveyed, places, digests, say)
-        FeatureStore.open(places.target)  # refuses a store that files are missing from
-        check_metadata(places.target)
+        FeatureStore.open(places.target)  # refuses a store that is not as it was sealed
         say(f"{places.target}: up to date, nothing to do (stages.verify reads what it holds)")
         return None
 
@@ -142,13 +142,13 @@ def _survey_lines(surveyed: Survey) -> Iterator[str]:
         for path in source.paths:
             if Path(path).is_absolute():
                 yield f"source {source.name!r}: {path} is absolute, so DVC does not watch it"
-    for line in surveyed.missing:
-        yield f"not there: {line}"
+    missing = [f"not there: {line}" for line in surveyed.missing]
+    yield from capped(missing, "episodes that are not there", MOST_EPISODES)
     depth = {(one.source, view) for one in surveyed.recordings for view in one.depth_views()}
     for source, view in sorted(depth):
         yield f"source {source!r}: view {view} is a depth map, no picture, and is left out"
-    for bad in surveyed.bad:
-        yield f"skipped {bad.source}: {bad.reason}"
+    skipped = [f"skipped {bad.source}: {bad.reason}" for bad in surveyed.bad]
+    yield from capped(skipped, "skipped episodes", MOST_EPISODES)
 
 
 def _timeline_lines(surveyed: Survey, checked: Sequence[CheckedEpisode]) -> Iterator[str]:

@@ -19,6 +19,7 @@ from pipeline.base.border import Border
 from pipeline.base.config import DataParams, Params
 from pipeline.base.digests import ContentDigests, joint_digest
 from pipeline.base.errors import RecordingError, VLMError
+from pipeline.base.format import capped
 from pipeline.base.source import Streams
 from pipeline.data import BadEpisode, Recording, content_digest, open_recordings
 from pipeline.data.embodiment import Embodiment, common_embodiment
@@ -34,6 +35,9 @@ _STORED = Border(
     "No store could be read with it: rename or shorten it there, or leave the episode out.",
 )
 """How what a store is to say of an episode is refused, by the models that will read it."""
+
+MOST_EPISODES = 10
+"""That cannot be used and are shown; the rest is counted."""
 
 
 @dataclass(frozen=True)
@@ -203,13 +207,14 @@ def _checked(episode: SurveyedEpisode, surveyed: Survey, preparer: Preparer) -> 
 
 
 def _refuse_bad(bad: Sequence[BadEpisode], of: int) -> None:
-    """Raise one `RecordingError` that lists every bad episode."""
-    lines = [f"{len(bad)} of {of} episodes cannot be used:"]
+    """Raise one `RecordingError` that lists the first bad episodes."""
+    lines: list[str] = []
     for episode in bad:
         where = "" if str(episode.where) in episode.reason else f"{episode.where}: "
         lines.append(f"  {episode.source}: {where}{episode.reason}")
-    lines.append("Mend or remove them, or leave them out with --set data.on_bad_episode=skip.")
-    raise RecordingError("\n".join(lines))
+    head = f"{len(bad)} of {of} episodes cannot be used:"
+    mend = "Mend or remove them, or leave them out with --set data.on_bad_episode=skip."
+    raise RecordingError("\n".join([head, *capped(lines, "episodes", MOST_EPISODES), mend]))
 
 
 def _surveyed(

@@ -126,7 +126,7 @@ class RunRecorder:
         """Write what waits and make the recording; `run.json` says why the run ended.
 
         Returns its folder, a LeRobot data set. Raises `DiskFull` or `RecordingError` where it could
-        not be written, or no action was sent; then the `.part` is kept.
+        not be written, or nothing was observed; then the `.part` is kept.
         """
         self._queue.put(None)
         self._thread.join()

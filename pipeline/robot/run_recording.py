@@ -4,7 +4,8 @@ While a robot runs, its recorder appends to plain logs in `run_000003.part`, whi
 cut off: `<log>.bin`, rows of the types of `log_types`, and a PNG a frame. `finish_recording` makes
 `run_000003` of them, a LeRobot v3.0 data set with this project's sidecars:
 
-    data, meta             a row a tick in which an action was sent, images without loss
+    data, meta             a row a tick in which an action was sent, images without loss; a row
+                           every tick, without `action`, where none was sent in the whole run
     state, sensor          every reading, at the rate that it came
     frames                 when each row's images were captured
     features               which features each action was decided on: `row_key` and age
@@ -98,8 +99,8 @@ def finish_recording(part: Path, end: Mapping[str, Any]) -> Path:
     """Make the recording of a run's logs, in place of them; returns where it is.
 
     `end` is what `run.json` says of the end. Until all is written the logs are kept and nothing
-    looks like a recording. Raises `RecordingError` where no action was sent, and for any other
-    folder.
+    looks like a recording. A run in which no action was sent has a row a tick and no `action`.
+    Raises `RecordingError` where there is no tick, and for any other folder.
     """
     if part.suffix != ".part":
         raise RecordingError(f"{part}: expected what is left of a run, run_NNNNNN.part")
@@ -109,8 +110,8 @@ def finish_recording(part: Path, end: Mapping[str, Any]) -> Path:
     rows = _rows(logs)
     if not len(rows):
         raise RecordingError(
-            f"{part}: expected a tick with an action in it, found {len(logs['tick'])} ticks "
-            f"without: there is nothing to make a recording of. Look into {RUN}, and remove {part}"
+            f"{part}: expected a tick of the run, found none: the robot was never observed, so "
+            f"there is nothing to make a recording of. Look into {RUN}, and remove {part}"
         )
     root = part / ".recording"  # what begins with a dot is not searched for recordings
     begin_folder(root, _RUN)
@@ -136,13 +137,18 @@ def _read(part: Path, name: str, kind: "np.dtype[Any]") -> Log:
 
 
 def _rows(logs: Mapping[str, Log]) -> Log:
-    """The ticks that become rows: an action was sent, and all streams of the run had begun."""
+    """The ticks that become rows: an action was sent, and all their streams had begun.
+
+    Where none was sent in the whole run, any tick may be a row. A tick at which the robot's clock
+    had not moved on is none: a recording's clock rises.
+    """
     ticks = logs["tick"]
-    seen = (ticks["frame"] >= 0).any(axis=0)
-    begun = (ticks["frame"][:, seen] >= 0).all(axis=1)
-    if len(logs["state"]):
-        begun &= ticks["states"] > 0
-    return ticks[ticks["acted"] & begun]
+    if ticks["acted"].any():
+        ticks = ticks[ticks["acted"]]
+    ticks = ticks[np.isfinite(ticks["time"])]
+    ticks = ticks[np.diff(np.maximum.accumulate(ticks["time"]), prepend=-np.inf) > 0]
+    begun = np.column_stack([ticks["frame"] >= 0, ticks["states"] > 0])
+    return ticks[begun[:, begun.any(axis=0)].all(axis=1)]
 
 
 def _write_readings(
@@ -173,9 +179,11 @@ def _write_rows(
     streams: Mapping[str, Any] = metadata["streams"]
     views = dict(zip(streams["views"], rows["frame"].T, strict=True))
     views = {view: number for view, number in views.items() if number[0] >= 0}
-    columns = {ACTION: rows["action"], "timestamp": rows["time"] - start}
-    features = {ACTION: streams["action"]}
-    if len(logs["state"]):
+    columns: dict[str, NDArray[Any]] = {"timestamp": rows["time"] - start}
+    features: dict[str, Mapping[str, Any]] = {}
+    if rows["acted"][0]:
+        columns[ACTION], features[ACTION] = rows["action"], streams["action"]
+    if rows["states"][0]:
         columns[STATE] = logs["state"]["values"][rows["states"] - 1]
         features[STATE] = streams["state"]
     images: dict[str, list[Path]] = {}

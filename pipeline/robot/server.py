@@ -24,7 +24,7 @@ from typing import Final
 from urllib.parse import urlsplit
 
 from websockets.asyncio.server import Server, ServerConnection, serve
-from websockets.datastructures import Headers
+from websockets.datastructures import Headers, MultipleValuesError
 from websockets.exceptions import ConnectionClosed
 from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
@@ -235,16 +235,23 @@ class PolicyServer:
 
     async def _respond(self, connection: ServerConnection, request: Request) -> Response | None:
         """The answer to a request by HTTP; None where it opens a websocket."""
-        path, headers = urlsplit(request.path).path, request.headers
-        opens = path == "/" and headers.get("Upgrade", "").lower() == "websocket"
-        say = partial(_response, connection)
+        headers, say = request.headers, partial(_response, connection)
+        try:
+            path, foreign = urlsplit(request.path).path, self._is_foreign(headers)
+            authorized = self._authorized(headers)
+            opens = path == "/" and headers.get("Upgrade", "").lower() == "websocket"
+        except MultipleValuesError as error:
+            return say(HTTPStatus.BAD_REQUEST, f"expected the header {error} once, found several\n")
+        except ValueError as error:
+            said = f"expected addresses in the path, Host and Origin, found one without: {error}\n"
+            return say(HTTPStatus.BAD_REQUEST, said)
         if path == "/healthz":
             return say(HTTPStatus.OK, "OK\n")
-        if self._is_foreign(headers):
+        if foreign:
             return say(HTTPStatus.FORBIDDEN, "pages of other places are not served\n")
         if path == "/" and not opens:
             return say(HTTPStatus.OK, *page())
-        if not self._authorized(headers):
+        if not authorized:
             said = "expected the header Authorization: Api-Key <the server's token>\n"
             return say(HTTPStatus.UNAUTHORIZED, said, {"WWW-Authenticate": "Api-Key"})
         if path == "/status.json":

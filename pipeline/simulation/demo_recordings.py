@@ -2,8 +2,8 @@
 
     raw/<task>/data_collection_…   new/<task>/episode_…   old/<task>/recv_all_…   lerobot/
 
-`demo.json` says which seed and version wrote which sets, so that finished sets are kept, sets of
-other params are replaced, and nothing that the demo did not write is ever touched.
+`demo.json` says which seed and version wrote which sets and what is in them, so that finished sets
+are kept, sets of other params replaced, and nothing that the demo did not write is ever touched.
 """
 
 from collections.abc import Callable, Iterator
@@ -13,9 +13,12 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 import numpy as np
+from pydantic import Field
 from tqdm import tqdm
 
-from pipeline.base.border import Border, Document
+from pipeline.base import ownership
+from pipeline.base.border import Border, Document, Text
+from pipeline.base.digests import joint_digest
 from pipeline.base.durable import disk_full_named, write_document
 from pipeline.base.errors import ConfigError
 from pipeline.base.ownership import OutputKind, remove_folder, there
@@ -32,6 +35,7 @@ from pipeline.simulation.recorder import SimulatedEpisode, simulate_episode
 DEMO_VERSION: Final = 2
 """Goes up whenever the same seed gives other recordings."""
 MARKER: Final = "demo.json"
+_MARKERS: Final = {MARKER, ownership.MARKER}
 DEMO: Final = OutputKind("what the demo wrote", lambda folder: (folder / MARKER).is_file())
 _SET: Final = OutputKind("a set of the demo's", lambda folder: DEMO.is_one(folder.parent))
 TASK: Final = "Insert_the_needle_at_the_red_point"
@@ -50,7 +54,9 @@ class _Marker(Document):
     version: int = 0
     episodes: int = 0
     seed: int = 0
-    sets: tuple[Literal["raw", "new", "old", "lerobot"], ...]
+    sets: tuple[Literal["raw", "new", "old", "lerobot"], ...] = ()
+    contents: dict[Text, Text] = Field(default_factory=dict)
+    """By set, or "" for the checkpoint that it lies in: `contents_digest` as it was written."""
 
 
 Episodes = Iterator[SimulatedEpisode]
@@ -126,11 +132,34 @@ def _finished_sets(root: Path, wanted: dict[str, int]) -> list[str]:
             f"{root}: {MARKER} does not list {', '.join(strange)} as the demo's, so it is not "
             "replaced; move it away, or set demo.recordings to another folder"
         )
-    if marked.model_dump(exclude={"sets"}) == wanted:
+    if marked.model_dump(include={*wanted}) == wanted:
         return written
+    for name in written:
+        _refuse_changed(root / name, marked.contents.get(name))
     for name in written:
         remove_folder(root / name, _SET)
     return []
+
+
+def refuse_changed_checkpoint(folder: Path) -> None:
+    """Raise `ConfigError` where a demo's checkpoint holds other files than the demo wrote."""
+    if (folder / MARKER).exists():
+        _refuse_changed(folder, BORDER.read_json(folder / MARKER, _Marker).contents.get(""))
+
+
+def _refuse_changed(folder: Path, written: str | None) -> None:
+    if contents_digest(folder) != written:
+        raise ConfigError(
+            f"{folder}: expected the files that the demo wrote, found others or changed ones. It "
+            "was left as it is: move it away, or remove it"
+        )
+
+
+def contents_digest(folder: Path) -> str:
+    """Digest of names and sizes of the files below a folder, markers left out."""
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name not in _MARKERS)
+    named = (f"{path.relative_to(folder)} {path.stat().st_size}" for path in files)
+    return joint_digest(*sorted(named))
 
 
 def refuse_foreign(folder: Path, setting: str) -> None:
@@ -143,4 +172,5 @@ def refuse_foreign(folder: Path, setting: str) -> None:
 
 
 def _mark(root: Path, wanted: dict[str, int], finished: list[str]) -> None:
-    write_document(root / MARKER, {**wanted, "sets": finished})
+    contents = {name: contents_digest(root / name) for name in finished}
+    write_document(root / MARKER, {**wanted, "sets": finished, "contents": contents})

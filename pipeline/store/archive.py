@@ -6,8 +6,9 @@ without the whole. A shard holds whole chunk files of the store: both copies are
 once, in order, with a shard in memory at a time.
 
 Its root's attributes are those of the store and a manifest: the text of every `zarr.json` of the
-store and the checksum of each of its chunk files. That is what proves an archive and rebuilds the
-store to the byte. The manifest is written last: a folder that has one is a complete archive.
+store, among them its seal with the checksum of each chunk file. That is what proves an archive and
+rebuilds the store to the byte. The manifest is written last: a folder that has one is a complete
+archive.
 """
 
 import hashlib
@@ -37,14 +38,24 @@ from pipeline.base.durable import disk_full_named, put_in_place, sync
 from pipeline.base.errors import PipelineError, StoreIncomplete, StoreMismatch
 from pipeline.base.ownership import OutputKind, begin_folder, remove_folder
 from pipeline.store.border import Group, Length, StoreAttributes, store_border
-from pipeline.store.chunks import check_row_checksums, check_trailers, read_rows
+from pipeline.store.chunks import (
+    Seal,
+    check_row_checksums,
+    check_seal,
+    check_trailers,
+    read_rows,
+    sealed_trailer,
+    trailers,
+)
 from pipeline.store.golden import GOLDEN, read_golden
 from pipeline.store.lock import build_lock
 from pipeline.store.metadata import ATTRIBUTE as METADATA_DIGEST
+from pipeline.store.metadata import SEAL, metadata_damage
 from pipeline.store.paths import (
     STORE,
     group_attributes,
     inode_of,
+    laid_out_attributes,
     part_path,
     read_plan,
     recover,
@@ -58,6 +69,7 @@ from pipeline.store.schema import (
     FEATURES,
     GROUPS,
     KEYS,
+    TRAILER_BYTES,
     ArraySpec,
     array_of,
     check_agreement,
@@ -66,7 +78,7 @@ from pipeline.store.schema import (
 )
 from pipeline.store.writer import StoreBuild, sync_folders
 
-_SCHEMA = 1
+_SCHEMA = 2
 _ZARR_JSON = "zarr.json"
 _MANIFEST = "archive"
 """The attribute of the root that holds the manifest."""
@@ -75,7 +87,7 @@ SHARD_BYTES = 256 * 2**20
 `INNER_BYTES` part of the format: an archive of other sizes has another `_SCHEMA`."""
 INNER_BYTES = 4 * 2**20
 """Raw bytes of an inner chunk at most, where one row is not larger."""
-_OF_A_STORE = ("schema", "plan", METADATA_DIGEST)
+_OF_A_STORE = ("schema", "plan", METADATA_DIGEST, SEAL)
 """Attributes of the root that would be false of an archive."""
 
 
@@ -102,8 +114,6 @@ class ArchivedArray(Document):
     """Of its rows."""
     shard_bytes: list[Length]
     """Size of each shard's file; 0 where all is zero, for which zarr writes no file."""
-    crc32c: list[Length]
-    """Checksum of the data of each chunk file of the store, in order."""
     metadata: Text
     """Digest of this array's metadata in the archive."""
 
@@ -127,13 +137,10 @@ class Manifest(Document):
     def specs(self, archive: Path) -> dict[str, ArraySpec]:
         """The arrays of the store. Raises `StoreIncomplete` where their metadata are wrong."""
         specs: dict[str, ArraySpec] = {}
-        for name, record in self.arrays.items():
+        for name in self.arrays:
             found = self._parsed(archive, name, dict[str, Any])
-            spec = array_of(found, name, f"{archive}, {name}/zarr.json of the store", _BORDER)
-            if len(record.crc32c) != spec.chunk_count:
-                what = f"{name}: expected {spec.chunk_count:,} checksums"
-                raise _BORDER.refusal(archive / _ZARR_JSON, f"{what}, found {len(record.crc32c):,}")
-            specs[name] = spec
+            where = f"{archive}, {name}/zarr.json of the store"
+            specs[name] = array_of(found, name, where, _BORDER)
         check_agreement(archive, self.said(archive), specs, _BORDER)
         return specs
 
@@ -297,15 +304,14 @@ def _write_array(
         codec=f"zstd+{codec_for(spec.dtype, 0, level).shuffle.value}",
         raw_bytes=spec.data_bytes,
         shard_bytes=sizes,
-        crc32c=_trailers(store, spec),
         metadata=file_digest(part / spec.name / _ZARR_JSON),
     )
 
 
 def _rebuild(manifest: Manifest, archive: Path, target: Path, part: Path) -> None:
-    specs, plan = manifest.specs(archive), manifest.said(archive).plan
+    specs, said = manifest.specs(archive), manifest.said(archive)
     _write_metadata(part, {n: text for n, text in manifest.metadata.items() if n != _ZARR_JSON})
-    with closing(StoreBuild(target, specs, plan)) as build:
+    with closing(StoreBuild(target, specs, said.plan)) as build:
         build.allocate()
         with _progress("restore", manifest.raw_bytes) as progress:
             for name, record in manifest.arrays.items():
@@ -317,14 +323,17 @@ def _rebuild(manifest: Manifest, archive: Path, target: Path, part: Path) -> Non
                     build.write(name, rows.start, _read_shard(array, shard, rows))
                     progress.update(len(rows) * spec.row_bytes)
                 build.files(name).write_trailers()
-                _check_rebuilt(part, spec, record, shards)
+                _check_rebuilt(part, spec, said.seal, shards)
+        build.close()
         _copy_golden(archive, part, manifest.golden)
-        build.finish()
+        sync_folders(part)
         # With the root's attributes, which hold the plan, it is what an extraction would go on
         # with, or an earlier one have left, and so nothing that another restoration may remove.
         (part / _ZARR_JSON).write_text(manifest.metadata[_ZARR_JSON], encoding="utf-8")
         sync(part / _ZARR_JSON)
         sync(part)
+        if what := metadata_damage(part):
+            raise _damaged(archive / _ZARR_JSON, what)
         build.put_in_place()
 
 
@@ -337,11 +346,13 @@ def _read_shard(array: "zarr.Array[Any]", shard: Path, rows: range) -> NDArray[A
 
 
 def _check_rebuilt(
-    part: Path, spec: ArraySpec, record: ArchivedArray, shards: Sequence[tuple[Path, range]]
+    part: Path, spec: ArraySpec, seal: Seal | None, shards: Sequence[tuple[Path, range]]
 ) -> None:
-    """Raise `StoreIncomplete` naming the shard that gave other rows than were archived."""
-    for chunk, crc in enumerate(_trailers(part, spec)):
-        if crc != record.crc32c[chunk]:
+    """Raise `StoreIncomplete` naming the shard that gave other rows than were sealed."""
+    rebuilt = trailers(part, spec)
+    for chunk in range(spec.chunk_count):
+        trailer = rebuilt[chunk * TRAILER_BYTES :][:TRAILER_BYTES]
+        if trailer != sealed_trailer(seal, spec.name, chunk):
             rows = spec.chunk_rows_of(chunk)
             shard = next(path for path, inside in shards if rows.start in inside)
             raise _damaged(shard, f"rows {rows[0]} to {rows[-1]} of {spec.name} are other ones")
@@ -422,15 +433,14 @@ def _check_shard(shard: Path, array: "zarr.Array[Any]") -> None:
 
 
 def _holds(manifest: Manifest, store: Path) -> bool:
-    """Whether an archive is of this store, by metadata and trailers."""
-    if _read_metadata(store) != manifest.metadata:
+    """Whether an archive is of this store, by metadata and seal."""
+    if _read_metadata(store) != manifest.metadata or _golden_digests(store) != manifest.golden:
         return False
     try:
-        trailers = {name: _trailers(store, spec) for name, spec in read_specs(store).items()}
-    except (OSError, IndexError):
+        check_seal(store, laid_out_attributes(store).seal, read_specs(store))
+    except StoreIncomplete:
         return False
-    same = trailers == {name: array.crc32c for name, array in manifest.arrays.items()}
-    return same and _golden_digests(store) == manifest.golden
+    return True
 
 
 def _golden_digests(store: Path) -> dict[str, str]:
@@ -452,14 +462,6 @@ def _copy_golden(root: Path, to: Path, digests: Mapping[str, str]) -> None:
         if file_digest(to / name) != digests[name]:
             raise _damaged(root / name, "a golden frame is another one than was written")
         sync(to / name)
-
-
-def _trailers(store: Path, spec: ArraySpec) -> list[int]:
-    """The checksum at the end of each chunk file."""
-    paths = chunk_paths(store, spec)
-    if not all(path.is_file() for path in paths):
-        raise FileNotFoundError(store / spec.name)
-    return [int(np.fromfile(path, "<u4", 1, offset=spec.chunk_bytes)[0]) for path in paths]
 
 
 def _refuse_build(target: Path) -> None:

@@ -85,6 +85,8 @@ class StoreAttributes(SourceDocument):
     sources: Annotated[list[Text], Field(min_length=1)]
     environment: list[_Environment]
     golden: list[StoredGolden] = Field(default_factory=list, max_length=16)
+    seal: dict[Text, Annotated[str, Field(pattern="^([0-9a-f]{8})*$")]] | None = None
+    """By array, the trailers of its chunk files in order, in hex; None in a build."""
 
     @classmethod
     def of(

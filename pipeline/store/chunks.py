@@ -7,8 +7,9 @@ module, and neither a SIGBUS.
 import errno
 import os
 import shutil
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +21,23 @@ from tqdm import tqdm
 from pipeline.base.durable import disk_full_named, sync
 from pipeline.base.errors import StoreIncomplete
 from pipeline.store.border import store_border
-from pipeline.store.metadata import check_metadata
+from pipeline.store.metadata import SEAL, check_metadata, note_metadata
+from pipeline.store.paths import group_attributes, laid_out_attributes
 from pipeline.store.repair_hints import mend
-from pipeline.store.schema import TRAILER_BYTES, ArraySpec, chunk_path, chunk_paths, read_specs
+from pipeline.store.schema import (
+    CHECKSUMS,
+    FEATURES,
+    TRAILER_BYTES,
+    ArraySpec,
+    chunk_path,
+    chunk_paths,
+    read_spec,
+    read_specs,
+)
 
+Seal = Mapping[str, str]
+"""By array, the trailers of its chunk files in order, in hex."""
+UNSEALED = "expected a seal over metadata and chunks, found none: an earlier version wrote it"
 BLOCK_BYTES = 4 * 2**20
 """Read at a time: it is still in the processor's cache when it is checked."""
 _MOST_OPEN = 32
@@ -52,34 +66,100 @@ def check_row_checksums(
         )
 
 
+def trailers(root: Path, spec: ArraySpec) -> bytes:
+    """The trailers of an array's chunk files, in order; no other byte is read.
+
+    Raises `StoreIncomplete` where a file is missing or has another size than it must.
+    """
+    border, wanted, read = store_border(root), spec.chunk_bytes + TRAILER_BYTES, b""
+    for path in chunk_paths(root, spec):
+        if (actual := border.check_file(path)) != wanted:
+            raise border.refusal(path, f"expected {wanted:,} bytes, found {actual:,}")
+        with path.open("rb", buffering=0) as file:
+            read += os.pread(file.fileno(), TRAILER_BYTES, spec.chunk_bytes)
+    return read
+
+
+def write_seal(root: Path, **attributes: Any) -> None:
+    """Write the seal of a store that is complete, and these attributes, into its root."""
+    seal = {name: trailers(root, spec).hex() for name, spec in read_specs(root).items()}
+    note_metadata(root, {**group_attributes(root), **attributes, SEAL: seal})
+
+
+def check_seal(root: Path, seal: Seal | None, specs: Mapping[str, ArraySpec]) -> None:
+    """Raise `StoreIncomplete` where metadata or a chunk file of a finished store are not those that
+    were sealed: changed, in another's place, of another store or of an older copy.
+
+    Reads metadata and trailers only. That a chunk gives its trailer, `check_trailers` proves.
+    """
+    border = store_border(root)
+    if seal is None:
+        raise border.refusal(root / "zarr.json", UNSEALED)
+    check_metadata(root)
+    for name, spec in specs.items():
+        present = trailers(root, spec)
+        for chunk, path in enumerate(chunk_paths(root, spec)):
+            trailer = present[chunk * TRAILER_BYTES :][:TRAILER_BYTES]
+            if what := _unsealed(trailer, sealed_trailer(seal, name, chunk)):
+                raise border.refusal(path, what)
+
+
+def sealed_trailer(seal: Seal | None, array: str, chunk: int) -> bytes | None:
+    """The trailer of a chunk file as it was sealed; None where nothing is sealed yet."""
+    digits = 2 * TRAILER_BYTES
+    return None if seal is None else bytes.fromhex(seal.get(array, "")[chunk * digits :][:digits])
+
+
+def _unsealed(crc: bytes, sealed: bytes | None) -> str | None:
+    """What is wrong with a chunk file of this checksum where another was sealed."""
+    if sealed in (None, crc):
+        return None
+    return (
+        f"expected the crc32c {sealed[::-1].hex()} that was sealed for this place, found "
+        f"{crc[::-1].hex()}: the file is damaged, of another place, another store or an older copy"
+    )
+
+
 def check_trailers(root: Path, but: Collection[str] = ()) -> None:
     """Read a finished store once, every byte of it.
 
     The arrays named in `but` are left out. Raises `StoreIncomplete` where a chunk does not give the
-    checksum that was written behind it, or the metadata do not give their digest.
+    checksum that was sealed, a feature row not its own, or the metadata not their digest.
     """
-    check_metadata(root)
-    check_chunks(root, *(spec for name, spec in read_specs(root).items() if name not in but))
+    seal, specs = laid_out_attributes(root).seal, read_specs(root)
+    check_seal(root, seal, specs)
+    check_chunks(root, [spec for name, spec in specs.items() if name not in but], seal)
 
 
-def check_chunks(root: Path, *specs: ArraySpec) -> None:
-    """Raise `StoreIncomplete` where a chunk of a finished store does not give its trailer."""
-    if damage := find_damage(root, *specs):
+def check_chunks(root: Path, specs: Iterable[ArraySpec], seal: Seal | None) -> None:
+    """Raise `StoreIncomplete` where a chunk of a finished store is not as it was written."""
+    if damage := find_damage(root, specs, seal):
         raise StoreIncomplete(
             f"{damage}, so that nothing can be taken from this store. {mend(root)}"
         )
 
 
-def find_damage(root: Path, *specs: ArraySpec) -> str | None:
-    """The first chunk file of these arrays that does not give its trailer, and what is wrong.
+def find_damage(root: Path, specs: Iterable[ArraySpec], seal: Seal | None = None) -> str | None:
+    """The first chunk file of these arrays that does not give its trailer or the one in the seal,
+    and what is wrong. Raises `StoreIncomplete` where a feature row does not give its checksum.
 
     With a bar on a terminal where it takes longer than a second.
     """
-    files = [(path, spec) for spec in specs for path in chunk_paths(root, spec)]
-    for path, spec in tqdm(files, "checksums", unit="file", leave=False, disable=None, delay=1):
-        if damage := read_chunk(path, spec).damage:
+    files = [(spec, chunk) for spec in specs for chunk in range(spec.chunk_count)]
+    for spec, chunk in tqdm(files, "checksums", unit="file", leave=False, disable=None, delay=1):
+        path, sealed = chunk_path(root, spec, chunk), sealed_trailer(seal, spec.name, chunk)
+        compare = partial(_compare_rows, root, spec, chunk) if spec.name == FEATURES else _pass
+        if damage := read_chunk(path, spec, compare, sealed).damage:
             return f"{path}: {damage}"
     return None
+
+
+def _compare_rows(root: Path, spec: ArraySpec, chunk: int, first: int, rows: NDArray[Any]) -> None:
+    """Raise `StoreIncomplete` where feature rows of a chunk do not give their checksums."""
+    within = spec.chunk_rows_of(chunk)[first : first + len(rows)]
+    if within:  # the rest is padding
+        wanted = read_rows(root, read_spec(root, CHECKSUMS), within.start, within.stop)
+        check_row_checksums(root, spec, within, rows[: len(within)], wanted)
 
 
 def read_rows(root: Path, spec: ArraySpec, start: int = 0, stop: int | None = None) -> NDArray[Any]:
@@ -114,12 +194,17 @@ class ChunkState:
     """Expected and found; None where the file gives its trailer."""
 
 
+def _pass(first: int, rows: NDArray[Any]) -> None:
+    """Look at no row."""
+
+
 def read_chunk(
     path: Path,
     spec: ArraySpec,
-    visit: Callable[[int, NDArray[Any]], object] = lambda first, rows: None,
+    visit: Callable[[int, NDArray[Any]], object] = _pass,
+    sealed: bytes | None = None,
 ) -> ChunkState:
-    """Read a chunk file block by block.
+    """Read a chunk file block by block and compare it with its trailer, and with the `sealed` one.
 
     `visit` is given each block's first row within the chunk and its whole rows, which are valid
     until the next block.
@@ -148,8 +233,10 @@ def read_chunk(
         return ChunkState(
             done, crc, f"expected {spec.chunk_bytes + TRAILER_BYTES} bytes, found {size}"
         )
-    wrong = f"expected the crc32c {trailer[0]:08x} of its trailer, found {crc:08x}"
-    return ChunkState(done, crc, wrong if trailer[0] != crc else None)
+    if trailer[0] != crc:
+        wrong = f"expected the crc32c {trailer[0]:08x} of its trailer, found {crc:08x}"
+        return ChunkState(done, crc, wrong)
+    return ChunkState(done, crc, _unsealed(trailer.tobytes(), sealed))
 
 
 class ChunkFiles:

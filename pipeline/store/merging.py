@@ -27,7 +27,7 @@ from pipeline.store.episodes import Episode, index_arrays
 from pipeline.store.golden import GOLDEN, GoldenFrames, read_golden
 from pipeline.store.lock import build_lock
 from pipeline.store.metadata import ATTRIBUTE as METADATA_DIGEST
-from pipeline.store.metadata import check_metadata
+from pipeline.store.metadata import SEAL
 from pipeline.store.paths import (
     MERGED,
     Inode,
@@ -56,7 +56,7 @@ _COPIED = [
     name for name in ARRAY_NAMES if name.split("/")[0] in STREAMS and name not in INCREMENTAL
 ]
 _BLOCK_BYTES = 32 * 2**20
-_NOT_TAKEN = (METADATA_DIGEST, GOLDEN)
+_NOT_TAKEN = (METADATA_DIGEST, SEAL, GOLDEN)
 """Attributes of an input's root that would be false of the merged store."""
 
 
@@ -168,8 +168,7 @@ def merge(inputs: Sequence[Path], output: Path | None) -> MergedEpisodes | None:
         plan = merged.plan
         part = read_plan(part_path(output))
         if read_plan(output) == plan and part != plan:  # else a repair of it has begun
-            FeatureStore.open(output)  # refuses a store that files are missing from
-            check_metadata(output)
+            FeatureStore.open(output)  # refuses a store that is not as it was sealed
             print(f"{output}: up to date, nothing to do")
             return None
         _check_free(output, plan)

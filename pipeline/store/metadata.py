@@ -1,7 +1,8 @@
 """A digest of all that a store says of itself: an attribute has no checksum of its own.
 
 It covers the `zarr.json` of the root, of each group and of each array, as JSON of sorted keys; the
-root's without the digest itself. Written when a build is finished.
+root's without the digest itself. A finished store's root lists the checksum of every chunk file in
+its place (`SEAL`), so that this one digest binds all that the store holds.
 """
 
 import hashlib
@@ -18,6 +19,9 @@ from pipeline.store.paths import group_attributes
 from pipeline.store.schema import ARRAY_NAMES, GROUPS
 
 ATTRIBUTE = "metadata_digest"
+SEAL = "seal"
+"""The attribute of the root that holds, by array, the trailers of its chunk files in order, in hex.
+"""
 
 
 def note_metadata(root: Path, attributes: Mapping[str, Any] | None = None) -> None:
@@ -33,7 +37,7 @@ def metadata_damage(root: Path) -> str | None:
     Raises `StoreIncomplete` where they cannot be read.
     """
     actual, stored = _digests(root)
-    if stored is None or stored == actual:  # of an earlier version, which wrote none
+    if stored == actual:
         return None
     return f"the metadata were changed: expected their digest {shown(stored)}, found {actual}"
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pipeline.base.bfloat16 import widen
 from pipeline.base.golden import GoldenRow
-from pipeline.store.border import store_border
+from pipeline.store.chunks import check_seal
 from pipeline.store.episodes import Episode, check_index, check_positions, episode_of, read_episodes
 from pipeline.store.golden import GoldenFrames, read_golden
 from pipeline.store.mapping import map_flat
@@ -26,7 +26,6 @@ from pipeline.store.schema import (
     KEYS,
     POSITIONS,
     STREAMS,
-    TRAILER_BYTES,
     ArraySpec,
     check_agreement,
     chunk_paths,
@@ -70,6 +69,7 @@ class FeatureStore:
         root = Path(path)
         said, specs = read_attributes(root), read_specs(root)
         check_agreement(root, said, specs)
+        check_seal(root, said.seal, specs)
         arrays = {name: map_array(root, spec) for name, spec in specs.items()}
         check_index(root, arrays, rows_of(specs))
         return cls(root, said.raw, arrays)
@@ -287,10 +287,5 @@ def place(store: FeatureStore, stream: str, row: int) -> str:
 
 
 def map_array(root: Path, spec: ArraySpec) -> NDArray[Any]:
-    """The map of an array; `StoreIncomplete` where a chunk file has another size than it must."""
-    paths, border = chunk_paths(root, spec), store_border(root)
-    wanted = spec.chunk_bytes + TRAILER_BYTES
-    for path in paths:
-        if (actual := border.check_file(path)) != wanted:
-            raise border.refusal(path, f"expected {wanted:,} bytes, found {actual:,}")
-    return map_flat(paths, spec.chunk_bytes, spec.shape, spec.dtype)
+    """The map of an array whose chunk files were checked."""
+    return map_flat(chunk_paths(root, spec), spec.chunk_bytes, spec.shape, spec.dtype)

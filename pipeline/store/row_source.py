@@ -95,7 +95,7 @@ class RowSource:
         """Of each episode, in order. Equal `digest`, equal rows; equal `content`, equal streams."""
         index = [name for name in self.specs if name.startswith("episode/")]
         read = [self.specs[name] for name in ("vl/frame_time", *index)]
-        if not self._finished and find_damage(self.path, *read):
+        if not self._finished and find_damage(self.path, read):
             return []  # rows are known by their keys alone, frame by frame
         arrays = {name: self._read(name) for name in index}
         check_index(self.path, arrays, rows_of(self.specs))
@@ -110,6 +110,6 @@ class RowSource:
         """All of a small array, read once."""
         if name not in self._arrays:
             if self._finished:
-                check_chunks(self.path, self.specs[name])
+                check_chunks(self.path, [self.specs[name]], self.said.seal)
             self._arrays[name] = read_rows(self.path, self.specs[name])
         return self._arrays[name]

@@ -24,10 +24,18 @@ from zarr.storage import MemoryStore
 
 from pipeline.base.errors import StoreIncomplete
 from pipeline.base.finite import non_finite
-from pipeline.base.format import size
+from pipeline.base.format import capped, size
 from pipeline.base.issue import Issue
 from pipeline.store.border import StoreAttributes, store_border
-from pipeline.store.chunks import find_damage, read_chunk, read_rows, row_checksums
+from pipeline.store.chunks import (
+    UNSEALED,
+    Seal,
+    find_damage,
+    read_chunk,
+    read_rows,
+    row_checksums,
+    sealed_trailer,
+)
 from pipeline.store.episodes import check_index, check_positions
 from pipeline.store.golden import GOLDEN, golden_files, golden_issues
 from pipeline.store.metadata import metadata_damage
@@ -50,8 +58,6 @@ from pipeline.store.schema import (
     rows_of,
 )
 
-MOST_LINES = 20
-"""Of one kind that are shown; the rest is counted."""
 SOUND, UNREADABLE, CHANGED, NOT_FINITE = range(4)
 FAULTS = ("", "not in its file", "its bytes do not give its checksum", "NaN or infinity")
 """How a feature row is, in words."""
@@ -141,12 +147,15 @@ def verify(path: Path, threads: int, workers: int | str = 0) -> Verification:
         said = StoreAttributes.of(path, attributes)
         if not issues and (what := metadata_damage(path)):
             issues.append(_metadata_issue(path, what))
+        if said.seal is None:
+            issues.append(_metadata_issue(path, UNSEALED))
         if not issues:
             check_agreement(path, said, specs)
     except StoreIncomplete as error:
         issues.append(_metadata_issue(path, str(error)))
+    seal = said.seal if said else None
     checks = [
-        partial(check_chunk, path, specs, name, chunk)
+        partial(check_chunk, path, specs, name, chunk, seal)
         for name, spec in specs.items()
         for chunk in range(spec.chunk_count)
     ]
@@ -213,7 +222,9 @@ def read_arrays(root: Path) -> tuple[dict[str, ArraySpec], list[Issue]]:
     return specs, issues
 
 
-def check_chunk(root: Path, specs: Mapping[str, ArraySpec], array: str, chunk: int) -> ChunkReport:
+def check_chunk(
+    root: Path, specs: Mapping[str, ArraySpec], array: str, chunk: int, seal: Seal | None = None
+) -> ChunkReport:
     """Read a chunk file once, in blocks; runs in any process that sees the store."""
     spec, path = specs[array], chunk_path(root, specs[array], chunk)
     rows = spec.chunk_rows_of(chunk)
@@ -225,12 +236,11 @@ def check_chunk(root: Path, specs: Mapping[str, ArraySpec], array: str, chunk: i
             judged = _judge_rows(root, specs, rows.start + first, values)
             faults[first : first + len(values)] = judged
 
-    file = read_chunk(path, spec, judge)
-    by_checksum = faults == CHANGED
-    # Where their checksums are lost, those of a sound file are good.
-    if not file.damage and by_checksum.any():
-        lost = CHECKSUMS not in specs or find_damage(root, specs[CHECKSUMS])
-        faults[by_checksum & bool(lost)] = SOUND
+    file = read_chunk(path, spec, judge, sealed_trailer(seal, array, chunk))
+    # Where their checksums are lost, rows are as good as their file.
+    lost = CHECKSUMS not in specs or find_damage(root, [specs[CHECKSUMS]], seal)
+    if array == FEATURES and lost:
+        faults[np.isin(faults, (SOUND, CHANGED))] = CHANGED if file.damage else SOUND
     return ChunkReport(array, path, rows, file.bytes, file.damage, faults)
 
 
@@ -254,12 +264,6 @@ def _judge_rows(
     broken = (non_finite(features).any(axis=2) & (valid != 0)).any(axis=1)
     changed = checksums != row_checksums(features)
     return np.select([broken, changed], [NOT_FINITE, CHANGED], default=SOUND)
-
-
-def capped(lines: Sequence[str], kind: str) -> list[str]:
-    """The first lines, and how many more there are."""
-    more = len(lines) - MOST_LINES
-    return [*lines[:MOST_LINES], *([f"and {more} more {kind}"] if more > 0 else [])]
 
 
 def strange_files(

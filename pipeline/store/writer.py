@@ -25,7 +25,14 @@ from pipeline.base.durable import disk_full_named, put_in_place, sync
 from pipeline.base.errors import StoreIncomplete
 from pipeline.base.ownership import begin_folder
 from pipeline.store.border import store_border
-from pipeline.store.chunks import ChunkFiles, find_damage, read_chunk, read_rows, row_checksums
+from pipeline.store.chunks import (
+    ChunkFiles,
+    find_damage,
+    read_chunk,
+    read_rows,
+    row_checksums,
+    write_seal,
+)
 from pipeline.store.golden import GoldenFrames, write_golden
 from pipeline.store.metadata import metadata_damage, note_metadata
 from pipeline.store.paths import STORE, group_attributes, part_path
@@ -177,7 +184,7 @@ class StoreBuild:
         if what := metadata_damage(self.part):
             return f"{self.part / 'zarr.json'}: {what}"
         known = (spec for name, spec in self.specs.items() if name not in INCREMENTAL)
-        return find_damage(self.part, *known)
+        return find_damage(self.part, known)
 
     def missing(self) -> NDArray[np.int64]:
         """The feature rows that are not there, in order.
@@ -275,9 +282,8 @@ class StoreBuild:
                 "writes streams, ticks and episodes anew and keeps the feature rows."
             ) from None
         with disk_full_named(self.part):
-            if self._environments.noted:
-                ranges = {"environment": self._environments.ranges()}
-                note_metadata(self.part, group_attributes(self.part) | ranges)
+            noted = self._environments.noted
+            write_seal(self.part, **({"environment": self._environments.ranges()} if noted else {}))
             self._environments.remove()
         for partial in self.part.rglob("*.partial"):  # of a write that was killed
             partial.unlink()

@@ -131,12 +131,14 @@ def describe_data(
     """
     slots, dim = store.feature_shape
     sides = split_parts(store, split).values()
-    groups = [len({part.group for part in parts.values()}) for parts in sides]
+    groups = [{part.group for part in parts.values()} for parts in sides]
+    number = len(set[str]().union(*groups))
+    cut = f" ({number} in all, cut by time)" if number < sum(map(len, groups)) else ""
     lines = [
         f"store {store.path}: {len(store.episodes)} episodes, {store.ticks} ticks, "
         f"{slots} x {dim} features a VL row",
         f"split: {len(split.train)} training ticks, {len(split.val)} val, {len(split.test)} test "
-        f"of {' + '.join(map(str, groups))} groups",
+        f"of {' + '.join(str(len(names)) for names in groups)} groups{cut}",
     ]
     if not len(split.test):
         lines.append("split: nothing is test, so nothing is left for stages.evaluate to report on")

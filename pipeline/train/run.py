@@ -1,8 +1,7 @@
 """Where a training run lies on disk, what decides its numbers, and whether it goes on or is done.
 
 A run works in `<output>.part` (`run.json`, `best/`, `last/`) and renames it to `<output>` when it
-is finished. DVC deletes an output before it runs a stage, but not the `.part` beside it, so that a
-stopped run goes on under `dvc repro` too. Without torch, which takes over a second to import.
+is finished, so that a stopped run goes on. Without torch, which takes over a second to import.
 """
 
 import hashlib
@@ -52,6 +51,7 @@ TRAINER_VERSION = 4
 """Raised with every change of code that changes the numbers of a run: part of its identity, so
 that no run goes on under code other than it began with."""
 FREE_PARAMS = {
+    "anew",
     "device",
     "feed",
     "check_store",
@@ -160,8 +160,10 @@ def open_run(
     notes = []
     recover(output, RUN_FOLDER)
     if (output / RUN).exists():
-        if read_document(output / RUN, RunDocument)[1] != identity:
-            notes.append(f"{output} holds another run; it is replaced when this one is finished")
+        another = read_document(output / RUN, RunDocument)[1] != identity
+        if another or params.anew:
+            which = "another run" if another else "this very run"
+            notes.append(f"{output} holds {which}; it is replaced when this one is finished")
         else:
             try:
                 check_policy(output / BEST)
@@ -208,7 +210,8 @@ def finished_run(params: TrainHeadParams, path: Path) -> TrainingRun | None:
 
     What `open_run` gives, without torch; None where several processes train together.
     """
-    if int(os.environ.get("WORLD_SIZE", "1")) > 1 or not (params.output / RUN).exists():
+    together = int(os.environ.get("WORLD_SIZE", "1")) > 1
+    if together or params.anew or not (params.output / RUN).exists():
         return None
     with build_lock(params.output):
         run = open_run(params, FeatureStore.open(path))

@@ -196,9 +196,11 @@ class Comparison:
     def low_variance(self) -> dict[int, float]:
         """The dimensions that vary, but hardly: in `overall`, noise that counts like a motion.
 
-        Each with the usual training deviation of those alike.
+        Each with the usual training deviation of those alike, by name and unit or, as of joints
+        that are called after limbs, by unit alone.
         """
-        return hardly_moving(self.scale, self.names, self.units)
+        by_unit = hardly_moving(self.scale, [""] * len(self.names), self.units)
+        return by_unit | hardly_moving(self.scale, self.names, self.units)
 
     def without_low_variance(self) -> "Comparison":
         """The same, in which what is `low_variance` counts as not varying: it weighs nothing."""

@@ -65,7 +65,7 @@ def resolve_checkpoint(
         raise VLMError(
             f"{setting} {checkpoint:.200}: no such folder. Expected a folder in the hub's format "
             "(a JSON config and *.safetensors) or a hub id such as Qwen/Qwen2.5-VL-3B-Instruct. "
-            "The demo's checkpoint is written by `python -m stages.demo`."
+            f"Set {setting} to one; `python -m stages.demo` writes the demo's checkpoint."
         )
     return cached_checkpoint(checkpoint, revision) or _downloaded(checkpoint, revision, setting)
 

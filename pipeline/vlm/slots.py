@@ -85,6 +85,6 @@ def _resolved_layers(layers: Sequence[int], count: int) -> tuple[int, ...]:
     if not set(resolved) <= set(range(count)) or len(set(resolved)) < len(resolved):
         raise VLMError(
             f"vlm.layers: expected {-count} to {count - 1} for a model of {count} decoder layers, "
-            f"each layer once, found {list(layers)}"
+            f"each layer once, found {list(layers)}. Set vlm.layers to some of these"
         )
     return resolved

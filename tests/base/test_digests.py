@@ -142,7 +142,9 @@ def test_only_regular_files_are_read(tmp_path, kind):
     (tmp_path / "it").mkdir() if kind == "folder" else os.mkfifo(tmp_path / "it")
     with (
         closing(ContentDigests(None)) as digests,
-        pytest.raises(RecordingError, match=rf"it: expected a file, found a {kind}.*Copy it again"),
+        pytest.raises(
+            RecordingError, match=rf"it: expected a file, found a {kind}.*Copy the file again"
+        ),
     ):
         digests.of(tmp_path / "it")
 

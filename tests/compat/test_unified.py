@@ -1,5 +1,6 @@
 """Items are what the timeline and the store say, whichever door they come through."""
 
+import json
 import pickle
 from collections.abc import Callable
 from dataclasses import replace
@@ -163,6 +164,9 @@ class TestItems:
         first = sorted((folder / "Red_point").iterdir())[0]
         for image in (first / "images" / "View2").iterdir():
             image.unlink()
+        metadata = json.loads((first / "metadata.json").read_text())
+        metadata["camera_views"] = ["View1"]
+        (first / "metadata.json").write_text(json.dumps(metadata))
         (first / "sensor_data.npz").unlink()
         data = UnifiedVLADataset(folder)
         item, other = data[0], data[len(data) - 1]

@@ -97,3 +97,54 @@ def test_an_unreadable_image_is_found_by_check_and_by_read(tmp_path: Path, damag
     for attempt in (check_image, read_image):
         with pytest.raises(RecordingError, match=f"a_1.{suffix}"):
             attempt(path, str(path))
+
+
+@pytest.mark.parametrize("names", [("000001.jpg", "000002.jpg"), ("cam_000007.jpg",)])
+def test_numbers_of_frames_are_no_times(names):
+    with pytest.raises(RecordingError, match=r"ends in the time in seconds.*Rename the frames"):
+        JpegCamera("View1", [Path(name) for name in names])
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("zed_41182735_left_1.0.jpg", "zed_99999_left_1.1.jpg", "zed_41182735_left_1.2.jpg"),
+        ("1.0.jpg", "1.0.png"),
+    ],
+)
+def test_frames_of_two_cameras_are_not_interleaved(names):
+    with pytest.raises(RecordingError, match="expected the frames of one camera in View1"):
+        JpegCamera("View1", [Path(name) for name in names])
+
+
+def test_any_image_is_a_frame_and_view_names_differ_by_more_than_case(tmp_path):
+    for name in ("view1/1.0.png", "View2/2.0.bmp", "View3/Thumbs.db"):
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).touch()
+    assert [*list_views(tmp_path, prefix="View")] == ["View1", "View2"]
+    (tmp_path / "View1").mkdir()
+    with pytest.raises(RecordingError, match="expected one folder of this view"):
+        list_views(tmp_path, prefix="View")
+
+
+MODES = ("1", "L", "LA", "P", "RGB", "RGBA", "I;16")
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_pixels_of_a_png_are_shown_in_eight_bits(tmp_path, mode):
+    grey = np.full((4, 6), 200 * 256 + 9 if mode == "I;16" else 200)
+    made = Image.fromarray(grey.astype(np.uint16 if mode == "I;16" else np.uint8))
+    made.convert(mode).save(path := tmp_path / "1.0.png")
+    check_image(path, str(path))
+    pixels = read_image(path, str(path))
+    assert pixels.shape == (4, 6, 3)
+    assert mode == "1" or 190 <= pixels.min() <= pixels.max() <= 210
+    assert pixels.any()
+
+
+def test_a_mode_that_cannot_be_shown_is_refused_by_name(tmp_path, monkeypatch):
+    Image.fromarray(np.zeros((4, 6), np.uint8)).save(path := tmp_path / "1.0.png")
+    monkeypatch.setattr("pipeline.data.media._AS_RGB", ("RGB",))
+    for look in (check_image, read_image):
+        with pytest.raises(RecordingError, match="found mode 'L'"):
+            look(path, str(path))

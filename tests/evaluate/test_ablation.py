@@ -229,6 +229,26 @@ def test_an_episode_without_the_stream_gives_and_takes_nothing(
     assert set(donors[60:] // 30) == {0}
 
 
+@pytest.mark.parametrize(("lacking", "judged"), [([1], 54), ([0, 1, 2], 0)])
+def test_a_stream_is_ablated_where_the_episodes_have_it(
+    tiny_store: Callable[..., Path], tmp_path: Path, lacking: list[int], judged: int
+) -> None:
+    """Of three episodes with 27 ticks each, some lack the sensor."""
+    store = FeatureStore.open(tiny_store(tmp_path))
+    checkpoint, policy = trained(store, 1)
+    start = store.array("episode/sensor_start")
+    for episode in lacking:
+        start[episode + 1] = start[episode]
+    found = evaluate_ablation(checkpoint, policy, store, np.arange(90), rules(store), 64)
+    assert found is not None and found.intact.ticks == 81
+    assert {one.comparison.ticks for one in found.ablated if one.stream == "state"} == {81}
+    of_sensor = [one for one in found.ablated if one.stream == "sensor"]
+    assert {one.comparison.ticks for one in of_sensor} == ({judged} if judged else set())
+    assert all(one.intact.ticks == judged for one in of_sensor)
+    note = f"sensor: judged on the {judged} of 81 ticks whose episode has it"
+    assert note in found.notes
+
+
 def test_an_alteration_leaves_the_batch_and_the_other_streams_alone(store: FeatureStore) -> None:
     ticks, windows = np.arange(40, 44), Windows(2, 3, 3)
     draw, batch = BatchIndices(ticks), store.gather(ticks, 2, 3, 3)

@@ -125,7 +125,6 @@ def test_what_hardly_moves_beside_its_like_is_told_and_can_be_left_out(
 @pytest.mark.parametrize(
     "changed",
     [
-        {"names": ("x", "y", "z", "joint_3", "gripper")},
         {"units": ("mm", "mm", "mm", "rad", "rad")},
         {"scale": np.array([0.0, 0.0, 0.0, 1.0, 0.001])},
     ],
@@ -138,6 +137,14 @@ def test_what_has_no_like_is_not_still(
     still = joints(comparison, [1.0, 1.0, 1.0, 0.001, 0.001])
     assert still.low_variance().keys() == {3, 4}
     assert replace(still, **changed).low_variance() == {}
+
+
+def test_joints_that_are_called_after_limbs_are_alike_by_their_unit(
+    recorded: Recorded, compared: Compared
+) -> None:
+    still = joints(compared(recorded(np.arange(60))), [1.0, 1.0, 1.0, 1.0, 0.001])
+    names = ("kHip", "kKnee", "kAnkle", "kElbow", "kWrist")
+    assert replace(still, names=names).low_variance().keys() == {4}
 
 
 class FirstFeature(torch.nn.Module):

@@ -729,8 +729,11 @@ class TestRefusals:
         self, params, recordings, no_model_later, name
     ):
         no_model_later(images=False)
-        views = recordings / "Press/episode_3/images"
-        (views / "View2").rename(views / name)
+        episode = recordings / "Press/episode_3"
+        (episode / "images/View2").rename(episode / "images" / name)
+        metadata = json.loads((episode / "metadata.json").read_text())
+        metadata["camera_views"] = []
+        (episode / "metadata.json").write_text(json.dumps(metadata))
         with pytest.raises(RecordingError, match=r"1 of 3 .*\n.*episode_3: views\.0: .*found '"):
             run(params)
 

@@ -13,8 +13,8 @@ from pipeline.data.row_range import RowRange
 from pipeline.extract import extract
 from pipeline.extract.repair import repair
 from pipeline.store import FeatureStore, StoreBuild
+from pipeline.store.chunks import write_seal
 from pipeline.store.golden import GOLDEN
-from pipeline.store.metadata import note_metadata
 from pipeline.store.verification import verify
 from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.qwen import FrozenVLM
@@ -41,7 +41,7 @@ def forget_golden(params: Params) -> None:
     shutil.rmtree(params.extract.store / GOLDEN)
     group = zarr.open_group(params.extract.store, mode="r+")
     del group.attrs[GOLDEN]
-    note_metadata(params.extract.store)
+    write_seal(params.extract.store)
 
 
 def decode_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,6 +17,7 @@ from pipeline.base.errors import DiskFull, StoreIncomplete, StoreLocked, StoreMi
 from pipeline.extract import ExtractionReport, extract
 from pipeline.extract.repair import repair
 from pipeline.store import FeatureStore, build_lock, part_path
+from pipeline.store.chunks import write_seal
 from pipeline.store.schema import chunk_paths, read_spec
 from pipeline.store.verification import Verification, verify
 
@@ -153,6 +154,7 @@ def test_a_nan_that_was_stored_with_right_checksums_does_not_come_back(case):
         content[at : at + len(value)] = value
         trailer = google_crc32c.value(bytes(content)).to_bytes(4, "little")
         case.file(array).write_bytes(content + trailer)
+    write_seal(case.store)
     assert case.verified().bad_rows.tolist() == [7]
     _, report = case.mended()
     assert report.computed == 1

@@ -12,6 +12,7 @@ import pytest
 from pipeline.base.errors import StoreMismatch
 from pipeline.extract.repair import carry_rows, copy_layout, layout_is_sound, put_in_place
 from pipeline.store import FeatureStore, StoreBuild, part_path, read_plan
+from pipeline.store.chunks import write_seal
 from pipeline.store.schema import chunk_paths, read_spec, read_specs
 from pipeline.store.verification import verify
 
@@ -112,6 +113,7 @@ def test_a_nan_with_right_checksums_is_missing(original, store):
     content = bytearray(marks.read_bytes()[:-4])
     content[22 * 4 : 23 * 4] = google_crc32c.value(row).to_bytes(4, "little")
     marks.write_bytes(content + google_crc32c.value(bytes(content)).to_bytes(4, "little"))
+    write_seal(store)
     build = repaired(store)
     assert build.missing().tolist() == [22]
     assert contents(completed(build, original)) == contents(original)

@@ -21,6 +21,8 @@ TASK = "Touch_the_dot"
 REAL = ("real_raw", "real_new", "real_old")
 """Of the recorder itself, where they are at hand."""
 RECORDINGS = ("raw", "new", "old", "lerobot_v21", "lerobot_v30", "lerobot_images")
+BEGIN = 1762581311.75
+"""A quarter of a second before a clock of float32 goes 128 s on."""
 STORE, ARCHIVE, HEAD = "store.zarr", "archive.zarr", "head"
 
 
@@ -86,8 +88,10 @@ def params(root: Path, subject: str, case: Path) -> dict[str, Any]:
 def write_recordings(root: Path, seed: int) -> None:
     """An episode of each of the recorder's formats, and LeRobot data sets of three each."""
     truth = Truth(np.random.default_rng(seed))
+    for clock in (truth.state_time, truth.sensor_time, truth.frame_time):
+        clock += BEGIN - START
     write_raw(root / "raw" / TASK / "episode", truth)
-    group = {"end_time": START + 0.5, "group": "monday"}
+    group = {"start_time": BEGIN, "end_time": BEGIN + 0.5, "group": "monday"}
     write_new(root / "new" / TASK / "episode", truth, metadata=group)
     old = write_old(root / "old" / TASK / "episode", truth)
     np.savez(old / "robot_states.npz", robot_states=truth.state)

@@ -224,7 +224,7 @@ def _last(array: np.ndarray, value: object) -> np.ndarray:
     return changed
 
 
-_TYPES = ["c8", "U8", "S8", "?", "M8[s]", "O", "f2", "i8", "u1", "g", ">f8"]
+_TYPES = ["c8", "U8", "S8", "?", "M8[s]", "O", "f2", "i8", "u1", "g", ">f8", "f4"]
 ARRAYS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "no row": lambda a: a[:0],
     "a row less": lambda a: a[:-1],
@@ -310,7 +310,9 @@ def edit_parquet(rng: Random, data: bytes) -> Edited:
     name = rng.choice([name for name in names if not name.startswith("stats/")])
     rows, wrong = table[name].to_pylist(), rng.choice(CONSTANTS)
     match rng.choice(
-        ["all"] * 4 + ["last"] * 3 + ["of another", "drop", "twin", "rows", "row", "order", "lie"]
+        ["all"] * 4
+        + ["last"] * 3
+        + ["shift", "of another", "drop", "twin", "rows", "row", "order", "lie"]
     ):
         case "all":
             table = _with_column(table, name, [wrong] * len(rows))
@@ -320,6 +322,11 @@ def edit_parquet(rng: Random, data: bytes) -> Edited:
                 wrong = rng.choice([[wrong] * len(rows[-1]), rows[-1] * 2])
             table = _with_column(table, name, [*rows[:-1], wrong])
             what = f"column {name!r} ends with {wrong!r:.99}"
+        case "shift" if spans := [name for name in names if name.endswith("_timestamp")]:
+            by = rng.choice([0.02, 0.06, 0.1])  # of a second, at 10 fps
+            for name in spans:
+                table = _with_column(table, name, [row + by for row in table[name].to_pylist()])
+            what = f"all its spans of videos are {by} s late"
         case "of another":
             other = rng.choice(names)
             table = _with_column(table, name, table[other].to_pylist()[::-1])

@@ -81,6 +81,14 @@ def numbers(array: Any, width: int | None = None) -> np.ndarray:
     return array
 
 
+def resolved(array: np.ndarray) -> np.ndarray:
+    """Times whose type tells readings apart: steps of it are shorter than two readings."""
+    if array.dtype.kind == "f" and len(array) > 1:
+        apart = float(np.ptp(array)) / (len(array) - 1)
+        need(float(np.spacing(np.abs(array).max())) <= max(2 * apart, 1e-6), array.dtype)
+    return array
+
+
 def texts(value: Any, count: int) -> list[str]:
     """A list of so many texts."""
     need(type(value) is list and all(type(text) is str for text in value), value)
@@ -138,7 +146,7 @@ def raw(folder: Path) -> Episode:
     for path in folder.glob("sensor_data_*.npz"):
         read = npz(path, "timestamps forces alines")
         forces = read["forces"].reshape(len(read["alines"]), 1)
-        found["sensor.time"] = read["timestamps"]
+        found["sensor.time"] = resolved(read["timestamps"])
         found["sensor.values"] = np.concatenate([forces, read["alines"]], axis=1)
     return found | views(folder.glob("View*"))
 
@@ -167,7 +175,7 @@ def new(folder: Path) -> Episode:
         need(channels == 1026 and read["timestamps"].shape == (count,), read["data"].shape)
         told["sensor_windows_count"] = count
         time = np.full((count, width), np.nan)
-        time[:, -1] = read["timestamps"]
+        time[:, -1] = resolved(read["timestamps"])
         found["sensor.values"] = read["data"].reshape(count * width, channels)
         found["sensor.time"] = time.reshape(-1)
     for key, count in told.items():
@@ -310,7 +318,10 @@ def _lerobot_episode(root: Path, info: Any, row: Any, index: int, tasks: dict[An
         if (path := root / stream / f"episode_{index:06d}.npz").is_file():
             found = {k: v for k, v in found.items() if not k.startswith(f"{stream}.")}
             read = npz(path, "timestamps values")
-            found |= {f"{stream}.time": read["timestamps"], f"{stream}.values": read["values"]}
+            found |= {
+                f"{stream}.time": resolved(read["timestamps"]),
+                f"{stream}.values": read["values"],
+            }
             with np.load(path) as archive:
                 for word in {"names", "units"} & {*archive.files}:
                     need(archive[word].dtype.kind == "U", "words")
@@ -352,6 +363,7 @@ def _video(root: Path, info: Any, row: Any, key: str, where: Any, length: int) -
         where = {name: number(value, whole=True) for name, value in said.items()}
         begin, end = (number(row[f"videos/{key}/{n}_timestamp"]) for n in ("from", "to"))
         first = round(begin * info["fps"])
+        need(abs(begin * info["fps"] - first) <= 0.1, "the time of a frame")
         need(round((end - begin) * info["fps"]) == length, "as many frames as rows")
     path = _place(root, info["video_path"], video_key=key, **where)
     known = {"format_whitelist": "mov,mp4,matroska,webm,avi"}

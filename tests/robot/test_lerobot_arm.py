@@ -5,13 +5,14 @@ import json
 import threading
 from collections.abc import Mapping
 from pathlib import Path
+from types import MethodType
 from typing import Any
 
 import numpy as np
 import pytest
 
 from pipeline.base.config import Source
-from pipeline.base.errors import CheckpointMismatch, RecordingError
+from pipeline.base.errors import CheckpointMismatch
 from pipeline.data import open_recordings
 from pipeline.robot.client import refuse_other_robot
 from pipeline.robot.lerobot_arm import LeRobotArm, describe
@@ -324,12 +325,39 @@ def test_the_example_keeps_its_limits(
     monkeypatch.setattr(Policy, "far", far)
     robot = Filming()
     settings = RunSettings("Push", seconds=0.3, missed_in_a_row=1000)
-    try:
-        example.drive(robot, settings, tmp_path)
-    except RecordingError:
-        assert far == 90.0
+    example.drive(robot, settings, tmp_path)
     assert robot.sent[0]["shoulder_lift.pos"] <= most + 0.01
     assert (len(robot.sent) == 1) == (far == 90.0)
+
+
+def test_the_example_keeps_the_run_that_a_first_action_beyond_a_limit_stops(
+    example: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    monkeypatch.setattr(Policy, "far", 90.0)
+    robot = Filming()
+    example.drive(robot, RunSettings("Push", seconds=5.0, missed_in_a_row=1000), tmp_path)
+    assert len(robot.sent) == 1, "the stop alone"
+    root = tmp_path / "run_000000"
+    printed = capsys.readouterr().out.rstrip()
+    assert "step of shoulder" in printed and printed.endswith(f": {root}")
+    (recording,) = open_recordings([Source(name="runs", path=str(root))], tmp_path).recordings
+    state = recording.state()
+    assert state is not None and len(state.time) and list(recording.cameras()) == ["View1"]
+    assert "step of shoulder" in json.loads((root / "run.json").read_text())["reason"]
+
+
+def test_the_example_says_why_a_run_without_an_observation_is_not_recorded(
+    example: Any, tmp_path: Path, capsys: Any
+) -> None:
+    def fail(self: Filming) -> dict[str, Any]:
+        raise RuntimeError("bus error")
+
+    robot = Filming()
+    robot.get_observation = MethodType(fail, robot)
+    example.drive(robot, RunSettings("Push", seconds=5.0), tmp_path)
+    printed = capsys.readouterr().out
+    assert "None" not in printed and "bus error" in printed
+    assert f"{tmp_path / 'run_000000.part'}: expected a tick" in printed
 
 
 def test_the_example_refuses_a_policy_for_another_robot(example: Any, tmp_path: Path) -> None:

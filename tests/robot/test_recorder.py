@@ -362,11 +362,48 @@ def test_a_recording_is_one_episode(tmp_path: Path) -> None:
     assert action is not None and action.values[:, 0].tolist() == [0, 1, 2]
 
 
-def test_a_run_without_an_action_is_no_recording(tmp_path: Path) -> None:
+def test_a_run_that_stops_before_its_first_action_is_recorded(tmp_path: Path) -> None:
     recorder = RunRecorder(tmp_path, metadata_of(), "Push")
-    recorder.tick(observed_at(0), None)
-    with pytest.raises(RecordingError, match="found 1 ticks without"):
-        recorder.finish("safe stop: no features")
+    for tick in range(4):
+        state = {"state": np.full((1, 12), tick), "state_time": np.array([5 + tick / 10])}
+        if tick == 1:
+            recorder.frames({"View1": (5.1, image_of(7))})
+        recorder.tick(observed_at(tick, **state), None)
+    recorder.tick({"time": np.array([0.0])}, None)  # a clock that stopped the robot
+    path = recorder.finish("step of kLeftElbow would be 1.231, at most 0.2")
+    recording = opened(path)
+    state, camera = recording.state(), recording.cameras()["View1"]
+    assert state is not None and state.values[:, 0].tolist() == [0, 1, 2, 3]
+    assert [frame[0, 0, 0] for frame in camera.read(range(len(camera.time)))] == [7]
+    said = json.loads((path / "run.json").read_text())
+    assert (said["rows"], said["ticks"]) == (3, 5) and said["reason"].startswith("step of")
+    with pytest.raises(RecordingError, match="no feature 'action'"):
+        recording.action()
+
+
+def test_one_observation_that_a_kill_leaves_is_recovered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def kill(part: Path, end: Mapping[str, Any]) -> Path:
+        raise KeyboardInterrupt
+
+    recorder = RunRecorder(tmp_path, metadata_of(), "Push")
+    recorder.frames({"View1": (5.0, image_of(7))})
+    state = {"state": np.ones((2, 12)), "state_time": np.array([4.9, 5.0])}
+    recorder.tick(observed_at(0, **state), None)
+    with monkeypatch.context() as killed, pytest.raises(KeyboardInterrupt):
+        killed.setattr(recorder_module, "finish_recording", kill)
+        recorder.finish("never said")
+    recording = opened(recover(recorder.part))
+    found = recording.state()
+    assert found is not None and len(found.time) == 2
+    assert list(recording.cameras()) == ["View1"]
+
+
+def test_a_run_without_an_observation_is_no_recording(tmp_path: Path) -> None:
+    recorder = RunRecorder(tmp_path, metadata_of(), "Push")
+    with pytest.raises(RecordingError, match="the robot was never observed"):
+        recorder.finish("the robot's code failed")
     assert recorder.part.is_dir()
 
 

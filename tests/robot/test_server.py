@@ -238,6 +238,29 @@ def test_pages_of_other_places_are_refused(served_policy: Served, serving: Servi
     assert get(server, "/elsewhere")[0] == 404
 
 
+@pytest.mark.parametrize(
+    ("path", "headers", "said"),
+    [
+        ("/", ["Host: [::1"], "Invalid IPv6 URL"),
+        ("//[", ["Host: localhost"], "Invalid IPv6 URL"),
+        ("/", ["Host: localhost", "Origin: http://["], "Invalid IPv6 URL"),
+        ("/", ["Host: localhost", "Host: localhost"], "expected the header 'Host' once"),
+        ("/", ["Origin: null", "Origin: null"], "expected the header 'Origin' once"),
+        ("/status.json", ["Authorization: a", "Authorization: b"], "'Authorization' once"),
+    ],
+)
+def test_a_request_that_no_server_can_read_is_refused_with_a_reason(
+    served_policy: Served, serving: Serving, path: str, headers: list[str], said: str, capfd: Any
+) -> None:
+    server = serving(served_policy(), token="s3cret")
+    host, _, port = server.address.rpartition(":")
+    with socket.create_connection((host, int(port)), 20) as raw, raw.makefile("rb") as answer:
+        raw.sendall("\r\n".join([f"GET {path} HTTP/1.1", *headers, "", ""]).encode())
+        text = answer.read().decode()
+    assert text.startswith("HTTP/1.1 400 ") and said in text
+    assert "Traceback" not in capfd.readouterr().err
+
+
 def test_the_page_may_run_its_own_script_alone(served_policy: Served, serving: Serving) -> None:
     server = serving(served_policy())
     (status, text, headers), again = get(server, "/"), get(server, "/")

@@ -181,6 +181,16 @@ def test_other_params_replace_the_demos_own_sets(quick_sets: list[str], tmp_path
     assert (tmp_path / "mine").is_dir()
 
 
+def test_a_set_with_an_episode_of_the_users_is_left_alone(
+    quick_sets: list[str], tmp_path: Path
+) -> None:
+    write_demo_recordings(tmp_path, 2, 0)
+    (tmp_path / "raw/mine").touch()
+    with pytest.raises(ConfigError, match=f"{tmp_path / 'raw'}: expected the files that the demo"):
+        write_demo_recordings(tmp_path, 2, 1)
+    assert (tmp_path / "raw/mine").exists() and (tmp_path / "new/content").exists()
+
+
 def test_a_stopped_run_goes_on_with_the_unfinished_sets(
     quick_sets: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -90,3 +90,18 @@ def test_foreign_recordings_end_with_2_and_no_checkpoint(
     assert command.run("", demo.main, ["--params", str(params)]) == 2
     assert "demo.recordings" in capsys.readouterr().err
     assert not (tmp_path / "vlm").exists()
+
+
+def test_what_a_user_put_among_the_demos_files_is_left_alone(
+    params: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(demo, "write_demo_recordings", lambda *given: None)
+    monkeypatch.setattr(demo, "write_demo_checkpoint", write_weights)
+    assert command.run("", demo.main, ["--params", str(params)]) == 0
+    (tmp_path / "vlm/model.safetensors").write_text("mine", encoding="utf-8")
+    assert command.run("", demo.main, ["--params", str(params)]) == 2
+    assert f"{tmp_path / 'vlm'}: expected the files that the demo wrote" in capsys.readouterr().err
+    assert (tmp_path / "vlm/model.safetensors").read_text(encoding="utf-8") == "mine"

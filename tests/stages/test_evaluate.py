@@ -15,7 +15,7 @@ import yaml
 
 from pipeline.look.page.blocks import Picture, Report, Text
 from pipeline.store.archive import archive
-from pipeline.store.metadata import note_metadata
+from pipeline.store.chunks import write_seal
 from stages import evaluate, train_head
 from stages.command import run
 
@@ -172,7 +172,7 @@ def test_a_policy_outlives_the_renaming_of_its_source(
     document = json.loads((renamed / "zarr.json").read_text())
     document["attributes"]["sources"] = ["gauche", "droite"]
     (renamed / "zarr.json").write_text(json.dumps(document))
-    note_metadata(renamed)
+    write_seal(renamed)
     told = arguments(trained, tmp_path / "report", f"evaluate.store={renamed}")
     assert run("", evaluate.main, told) == 0
     assert "renamed since the training" in capsys.readouterr().out

@@ -1,15 +1,22 @@
 """`stages.extract` as a user meets it: exit codes and messages."""
 
 import json
+import re
 from pathlib import Path
 
+import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import yaml
 
+from pipeline.data import lerobot
 from pipeline.simulation.lerobot_format import write_lerobot
 from pipeline.simulation.recorder import simulate_episode
 from stages.command import run
 from stages.extract import main
+from tests.data.conftest import START, Truth, write_raw
+from tests.data.conftest import write_lerobot as write_small_lerobot
+from tests.data.test_lerobot import edit_v3
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -65,6 +72,180 @@ def test_a_depth_map_that_is_asked_for_as_a_view(capsys, params_file, tmp_path):
     options = ["--params", str(params_file), "--set", "extract.plan=true"]
     assert run("", main, options) == 0
     assert "source 'lab': view View2 is a depth map" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("by_s", "message"),
+    [
+        (
+            0.06,
+            r"meta/episodes/chunk-000/file-000\.parquet, row 0: videos/observation\.images\.top/"
+            r"from_timestamp: expected the time of a frame at fps 10, found 0\.06 s, frame 0\.60",
+        ),
+        (
+            0.1,
+            r"meta/episodes: expected from_timestamp and length for frames 0 to 11 of "
+            r"\S+file-000\.mp4, found 1 to 12",
+        ),
+    ],
+)
+def test_frames_that_all_begin_too_late_are_refused_with_skip_too(
+    capsys, params_file, tmp_path, by_s, message
+):
+    root = write_small_lerobot(tmp_path / "day1/run", "v3.0", file_of=(0, 0, 1))
+    span = "videos/observation.images.top/{}_timestamp"
+    starts, ends = np.array([0.0, 0.7, 0.0]) + by_s, np.array([0.7, 1.2, 0.9]) + by_s
+    edit_v3(root, **{span.format("from"): starts, span.format("to"): ends})
+    err = said(capsys, params_file, "data.on_bad_episode=skip", "extract.plan=true")
+    assert re.search(rf"source 'lab': {tmp_path}/day1/run/{message}.*\. Mend meta/", err)
+
+
+def test_a_trimmed_copy_is_read_without_the_episodes_before_and_behind(
+    capsys, params_file, tmp_path
+):
+    root = write_small_lerobot(tmp_path / "day1/run", "v3.0")
+    path = root / "meta/episodes/chunk-000/file-000.parquet"
+    pq.write_table(pq.ParquetFile(path).read().slice(1, 1), path)
+    options = ["--params", str(params_file), "--set", "extract.plan=true"]
+    assert run("", main, options) == 0, capsys.readouterr().err
+
+
+STEP_S = 1762581312.0
+"""At which a float32 clock goes 128 s on, from 1762581248 to 1762581376."""
+
+
+def write_clocks(folder: Path, dtype: str) -> Path:
+    """A raw episode of half a second around `STEP_S`, whose sensor has a clock of the type."""
+    truth = Truth()
+    for clock in (truth.state_time, truth.sensor_time, truth.frame_time):
+        clock += STEP_S - 0.25 - START
+    write_raw(folder, truth)
+    sensor = folder / "sensor_data_x.npz"
+    with np.load(sensor) as members:
+        changed = {**members, "timestamps": members["timestamps"].astype(dtype)}
+    np.savez(sensor, **changed)
+    return folder
+
+
+def test_a_clock_whose_type_is_too_coarse(capsys, params_file, tmp_path):
+    write_clocks(tmp_path / "day1/run/episode", "float32")
+    err = said(capsys, params_file, "extract.plan=true")
+    assert re.search(
+        r"sensor_data_x\.npz: times of float32 near 1762581376 s go by steps of 128 s, too coarse "
+        r"for 325 of them in 128 s; expected float64, not rounded\. Export",
+        err,
+    )
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float16"])
+@pytest.mark.parametrize("name", ["sensor", "state"])
+def test_the_clock_of_a_sidecar_may_be_narrow_where_it_begins_at_zero(
+    capsys, params_file, tmp_path, name, dtype
+):
+    root = write_small_lerobot(tmp_path / "day1/run", lengths=(7,))
+    (root / name).mkdir()
+    time = np.linspace(0, 0.8, 60)
+    for start, code in ((0.0, 0), (30_000.0, 0 if dtype == "float32" else 2)):
+        table = pq.read_table(data := root / "data/chunk-000/episode_000000.parquet")
+        clock = table.column_names.index("timestamp")
+        pq.write_table(table.set_column(clock, "timestamp", [np.arange(7) / 10 + start]), data)
+        values = np.random.default_rng(0).normal(size=(60, 2))
+        clock = (time + start).astype(dtype)
+        np.savez(root / name / "episode_000000.npz", timestamps=clock, values=values)
+        options = ["--params", str(params_file), "--set", "extract.plan=true"]
+        assert run("", main, options) == code, capsys.readouterr().err
+
+
+def test_the_clock_of_a_table_in_whole_seconds(capsys, params_file, tmp_path):
+    path = write_clocks(tmp_path / "day1/run/episode", "float64") / "robot_state_x.csv"
+    header, *rows = (line.split(",") for line in path.read_text().splitlines())
+    rows = [[row[0], str(round(float(row[1]))), *row[2:]] for row in rows]
+    path.write_text("\n".join(",".join(row) for row in (header, *rows)))
+    err = said(capsys, params_file, "extract.plan=true")
+    assert re.search(
+        r"robot_state_x\.csv: times of float64 near \d+ s go by steps of 1 s, too", err
+    )
+
+
+def test_channels_of_one_name(capsys, params_file, tmp_path):
+    write_small_lerobot(
+        tmp_path / "day1/run",
+        features={"action": {"dtype": "float32", "shape": [3], "names": ["dx", "dx", "gripper"]}},
+    )
+    err = said(capsys, params_file, "extract.plan=true")
+    assert "'action': expected each channel name once, found ['dx'] more often. Mend meta/" in err
+
+
+def test_the_first_ten_of_many_bad_episodes_are_listed(capsys, params_file, tmp_path):
+    for number in range(13):
+        (tmp_path / f"day1/run/{number}").mkdir(parents=True)
+        (tmp_path / f"day1/run/{number}/metadata.json").write_text("[]")
+    lengths = (7,) * 14
+    root = write_small_lerobot(tmp_path / "day2/run", lengths=lengths, tasks=["pick"] * 14)
+    for path in (root / "data/chunk-000").glob("episode_0000[01][1-9].parquet"):
+        path.unlink(missing_ok=True)
+    err = said(capsys, params_file, "extract.plan=true")
+    assert "\n  lab: " in err and err.count("metadata.json: ") == 10
+    assert "\nand 3 more episodes\nMend or remove them" in err
+    options = ["data.on_bad_episode=skip", "extract.plan=true"]
+    options = [part for option in options for part in ("--set", option)]
+    assert run("", main, ["--params", str(params_file), *options]) == 0
+    out = capsys.readouterr().out
+    assert out.count("\nskipped lab: ") == 10
+    assert "\nand 3 more skipped episodes" in out
+    assert out.count("not there: lab: ") == 10
+    assert "\nand 2 more episodes that are not there" in out
+
+
+def test_channel_names_of_two_embodiments_are_shown_without_control_characters(
+    capsys, params_file, tmp_path
+):
+    for day, name in (("day1", "force"), ("day2", "a\n\x1b[31m")):
+        root = write_small_lerobot(tmp_path / day / "run", lengths=(7,))
+        (root / "sensor").mkdir()
+        members = {"timestamps": np.arange(70) / 100, "values": np.arange(70.0)[:, None]}
+        np.savez(root / "sensor/episode_000000.npz", **members, names=[name], units=["N"])
+    sources = "[{name: one, path: day1/run}, {name: two, path: day2/run}]"
+    err = said(capsys, params_file, f"data.sources={sources}", "extract.plan=true")
+    assert "1 channels ['a\\n\\x1b[31m (N)']" in err
+    assert "\x1b" not in err
+
+
+@pytest.mark.parametrize("path", ["/", "/**", "/*", "../" * 30 + "**"])
+def test_a_path_that_is_the_whole_file_system(capsys, params_file, path):
+    err = said(capsys, params_file, f"data.sources=[{{name: lab, path: {path}}}]")
+    assert f"found '{path}', the whole file system. Set the source's path to the folder" in err
+
+
+def test_a_file_that_is_not_there_is_looked_for_once_for_all_its_episodes(
+    capsys, params_file, tmp_path, monkeypatch
+):
+    root = write_small_lerobot(tmp_path / "day1/run", "v3.0")
+    (root / "data/chunk-000/file-000.parquet").unlink()
+    looked: list[Path] = []
+    monkeypatch.setattr(
+        lerobot, "_refusal", lambda path, ask=lerobot._refusal: [looked.append(path), ask(path)][1]
+    )
+    assert "has none of the 3 episode(s)" in said(capsys, params_file, "extract.plan=true")
+    assert len(looked) == 1
+
+
+@pytest.mark.parametrize(
+    ("option", "mend"),
+    [
+        ("vlm.layers=[99]", "Set vlm.layers to some of these"),
+        ("data.views=[View9]", "Set data.views to some of these, or to null for all"),
+        (
+            "extract.device=xyz",
+            "Set device to auto or cpu, or install what python -m stages.doctor",
+        ),
+        ("vlm.checkpoint={file}", "no such folder.*Set vlm.checkpoint to one"),
+    ],
+)
+def test_what_to_set_instead_is_said(capsys, params_file, tmp_path, option, mend):
+    write_small_lerobot(tmp_path / "day1/run", lengths=(7,))
+    err = said(capsys, params_file, option.format(file=params_file), "extract.plan=true")
+    assert re.search(mend, err)
 
 
 def test_a_checkpoint_that_is_not_there(capsys, params_file, tmp_path, request):

@@ -11,6 +11,7 @@ import yaml
 import zarr
 
 from pipeline.store import FeatureStore
+from pipeline.store.chunks import write_seal
 from stages import probe
 from stages.command import run
 
@@ -25,6 +26,7 @@ def params(tiny_store: Callable[..., Path], tmp_path: Path) -> Path:
     place = {"layer": 3, "norm": True, "pooling": "grid", "view": "View1"}
     slots = [{"layer": 3, "norm": True, "pooling": "mean"}, *(place | {"cell": c} for c in cells)]
     zarr.open_group(path, mode="r+").attrs["slots"] = slots
+    write_seal(path)
     document = {
         "data": {"sources": [{"name": "left", "path": "a"}]},
         "vlm": {"checkpoint": "unused"},

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -264,6 +265,22 @@ def test_a_flipped_bit_is_refused_where_it_would_be_learnt_from(
     # A finished run reads no number of the store, and is the same run with the check as without.
     assert run("", train_head.main, arguments) == 0
     assert "nothing to do" in capsys.readouterr().out
+
+
+def test_features_of_another_store_are_refused_although_they_give_their_checksums(
+    write_params: Callable[..., Path],
+    tiny_store: Callable[..., Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    arguments = ["--params", str(write_params(max_steps=3))]
+    store, other = tmp_path / "params.zarr", tiny_store(tmp_path, name="other", seed=9)
+    shutil.copytree(other / "vl/features/c", store / "vl/features/c", dirs_exist_ok=True)
+    shutil.copytree(other / "vl/checksum/c", store / "vl/checksum/c", dirs_exist_ok=True)
+    assert run("", train_head.main, arguments) == 2
+    error = capsys.readouterr().err
+    assert f"{store}/vl/features/c/0/0/0: " in error
+    assert "stages.verify --repair" in error
 
 
 def test_progress_is_silent_where_there_is_no_terminal(

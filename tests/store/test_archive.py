@@ -20,6 +20,7 @@ import zarr
 from pipeline.base.errors import ConfigError, DiskFull, StoreIncomplete, StoreLocked, StoreMismatch
 from pipeline.store import FeatureStore, Sizes, StoreBuild, arrays, build_lock, part_path
 from pipeline.store.archive import archive, codec_for, is_archive, restore
+from pipeline.store.chunks import write_seal
 from pipeline.store.schema import INCREMENTAL, read_specs
 from tests.store.samples import TEXT, attributes_of, index_of
 
@@ -292,6 +293,7 @@ class TestDamagedStore:
         flip(path, 48 * 100 + 5)
         data = path.read_bytes()[:-4]
         path.write_bytes(data + google_crc32c.value(data).to_bytes(4, "little"))
+        write_seal(store)
         row = read_specs(store)["vl/features"].chunk_rows + 100
         self.refused(store, rf"c/1/0/0: rows {row} to {row} of vl/features.*stages\.verify")
 

@@ -11,10 +11,12 @@ from typing import Any
 import google_crc32c
 import numpy as np
 import pytest
+import zarr
 
 from pipeline.base.errors import PipelineError, StoreIncomplete
 from pipeline.store import FeatureStore, RowSource, part_path
 from pipeline.store.archive import archive, restore
+from pipeline.store.chunks import write_seal
 from pipeline.store.metadata import note_metadata
 from pipeline.store.schema import read_spec
 from pipeline.store.verification import verify
@@ -63,7 +65,7 @@ def entry(place: str, value: str) -> Harm:
 
 
 def values(array: str, row: int, value: object) -> Harm:
-    """A row of an array becomes this, with the right trailer behind."""
+    """A row of an array becomes this, with the right trailer behind, in a store sealed so."""
 
     def harm(root: Path) -> None:
         spec = read_spec(root, array)
@@ -72,6 +74,7 @@ def values(array: str, row: int, value: object) -> Harm:
         np.frombuffer(content, spec.dtype).reshape(-1, *spec.shape[1:])[row] = value
         crc = google_crc32c.value(bytes(content))
         path.write_bytes(bytes(content) + crc.to_bytes(4, "little"))
+        write_seal(root)
 
     return harm
 
@@ -217,7 +220,7 @@ class TestStores:
 
     def test_a_group_is_opened_as_zarr_opens_it_below_another(self, store):
         (store / "golden/zarr.json").write_text('{"zarr_format": 3, "attributes": {}}')
-        note_metadata(store)
+        write_seal(store)
         lines = verify(store, threads=1).lines()
         assert any("golden/zarr.json: zarr cannot open it" in line for line in lines), lines
 
@@ -290,7 +293,8 @@ ARCHIVES: dict[str, Harm] = {
     "rows": of_store("tick/time/zarr.json", "shape", "[1000000000000]"),
     "chunks": of_store("tick/time/zarr.json", "chunk_grid.configuration.chunk_shape", "[8192000]"),
     "rate": of_store("zarr.json", "attributes.action_hz", "0"),
-    "checksums": manifest(lambda said: said["arrays"]["tick/time"].update(crc32c=[1, 2])),
+    "forged": of_store("zarr.json", "attributes.action_hz", "30.0"),
+    "unsealed": of_store("zarr.json", "attributes.seal", "{}"),
     "root": text("", DEEP),
     "pipe": instead("tick/time/c/0", os.mkfifo),
     "terabyte": lambda root: os.truncate(root / "tick/time/c/0", 2**40),
@@ -309,6 +313,14 @@ class TestArchives:
         assert str(archived) in str(caught.value)
         assert "take another copy" in str(caught.value) or "Remove or rename" in str(caught.value)
         assert set(tmp_path.iterdir()) - {*before} <= {tmp_path / "back.zarr.lock"}
+
+    def test_other_rows_under_a_forged_manifest(self, archived, tmp_path):
+        zarr.open_array(archived, path="tick/action", mode="r+")[0] = 9.0
+        size = (archived / "tick/action/c/0/0").stat().st_size
+        of_array = {"shard_bytes": [size]}
+        manifest(lambda forged: forged["arrays"]["tick/action"].update(of_array))(archived)
+        with pytest.raises(StoreIncomplete, match="tick/action are other ones"):
+            restore(archived, tmp_path / "back.zarr", threads=1)
 
     def test_a_piece_that_unpacks_to_more_than_it_is(self, archived, tmp_path):
         shard = archived / "tick/time/c/0"

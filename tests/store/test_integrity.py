@@ -17,11 +17,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pipeline.base.errors import StoreIncomplete, StoreMismatch
-from pipeline.base.format import size
+from pipeline.base.format import MOST_LINES, size
 from pipeline.store import FeatureStore, check_trailers
 from pipeline.store.archive import archive
+from pipeline.store.chunks import write_seal
 from pipeline.store.schema import chunk_paths, read_spec
-from pipeline.store.verification import MOST_LINES, Verification, verify
+from pipeline.store.verification import Verification, verify
 
 TICKS, REUSE = 30, 3
 ROWS = TICKS // REUSE
@@ -48,12 +49,13 @@ def flip(path: Path, byte: int, bit: int = 0) -> None:
 
 
 def overwrite(store: Path, array: str, row: int, value: object) -> None:
-    """Put a value into a row, and the right trailer behind it, as wrong software would."""
+    """Put a value into a row and seal the store with it, as wrong software would."""
     spec, path = read_spec(store, array), chunk_file(store, array)
     content = bytearray(path.read_bytes()[:-4])
     values = np.frombuffer(content, spec.dtype).reshape(-1, *spec.shape[1:])
     values[row] = value
     path.write_bytes(bytes(content) + google_crc32c.value(bytes(content)).to_bytes(4, "little"))
+    write_seal(store)
 
 
 def nan_with_right_checksums(store: Path, row: int) -> None:
@@ -236,6 +238,55 @@ class TestFeatureRows:
         assert damaged_arrays(verification) == {"vl/checksum"}
 
 
+class TestSeal:
+    """A chunk that is sound by itself and stands in another's place, as after a botched copy."""
+
+    @pytest.fixture
+    def chunked(self, tiny_store, tmp_path, monkeypatch) -> Path:
+        monkeypatch.setattr("pipeline.store.schema.CHUNK_BYTES", 4096)
+        return tiny_store(tmp_path, ticks=1500)
+
+    def exchange(self, store: Path, other: Path) -> Path:
+        first, second = (chunk_file(store, "sensor/values", chunk) for chunk in (0, 1))
+        kept = first.read_bytes()
+        first.write_bytes(second.read_bytes())
+        second.write_bytes(kept)
+        return first
+
+    def link(self, store: Path, other: Path) -> Path:
+        first, second = (chunk_file(store, "sensor/values", chunk) for chunk in (0, 1))
+        second.unlink()
+        second.hardlink_to(first)
+        return second
+
+    def older_actions(self, store: Path, other: Path) -> Path:
+        return Path(shutil.copy(chunk_file(other, "tick/action"), chunk_file(store, "tick/action")))
+
+    def other_features(self, store: Path, other: Path) -> Path:
+        shutil.copy(chunk_file(other, "vl/checksum"), chunk_file(store, "vl/checksum"))
+        return Path(shutil.copy(chunk_file(other, "vl/features"), chunk_file(store, "vl/features")))
+
+    @pytest.mark.parametrize("harm", [exchange, link, older_actions, other_features])
+    def test_a_chunk_in_another_place(self, chunked, tiny_store, tmp_path, harm):
+        other = tiny_store(tmp_path, name="other", seed=7, ticks=1500)
+        path = harm(self, chunked, other)
+        array = path.relative_to(chunked).as_posix().split("/c/")[0]
+        assert array in damaged_arrays(verification := checked(chunked))
+        assert any("sealed for this place" in line for line in verification.lines())
+        for read in (FeatureStore.open, check_trailers):
+            with pytest.raises(StoreIncomplete, match=r"sealed for this place.*verify --repair"):
+                read(chunked)
+
+    def test_rows_of_another_prompt_are_not_carried(self, store, tiny_store, tmp_path):
+        self.other_features(store, tiny_store(tmp_path, name="other", seed=7))
+        assert checked(store).bad_rows.tolist() == list(range(60))
+
+    def test_a_feature_row_that_was_sealed_wrong(self, store):
+        overwrite(store, "vl/features", 3, 1.0)
+        with pytest.raises(StoreIncomplete, match="rows 3 to 3 of vl/features do not give their"):
+            check_trailers(store)
+
+
 class TestEveryArray:
     @settings(
         max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
@@ -321,13 +372,17 @@ class TestStructure:
         verification = checked(store)
         assert not verification.sound
         assert damaged_arrays(verification) >= {""} or "sensor" in place
-        with pytest.raises(StoreIncomplete, match=rf"metadata were changed.*verify.store={store}"):
+        what = "metadata were changed" if "sensor" not in place else "attributes.note"
+        with pytest.raises(StoreIncomplete, match=rf"{what}.*verify.store={store}"):
             check_trailers(store)
 
-    def test_metadata_without_a_digest(self, store):
-        """As earlier versions wrote them."""
-        edit(store / "zarr.json", lambda document: document["attributes"].pop("metadata_digest"))
-        assert checked(store).sound
+    @pytest.mark.parametrize("lost", ["metadata_digest", "seal"])
+    def test_metadata_without_a_digest_prove_nothing(self, store, lost):
+        edit(store / "zarr.json", lambda document: document["attributes"].update(action_hz=30.0))
+        edit(store / "zarr.json", lambda document: document["attributes"].pop(lost))
+        assert damaged_arrays(checked(store)) == {""}
+        with pytest.raises(StoreIncomplete, match=r"zarr\.json: .*verify --repair"):
+            FeatureStore.open(store)
 
     @pytest.mark.parametrize(
         ("text", "said"),

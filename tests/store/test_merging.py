@@ -16,8 +16,8 @@ from pipeline.base.errors import ConfigError, StoreIncomplete, StoreLocked, Stor
 from pipeline.base.tuned_on import TunedOn, TunedPart, of_store, store_attributes
 from pipeline.extract.repair import carry_rows, copy_layout, put_in_place
 from pipeline.store import FeatureStore, StoreBuild, build_lock, check_trailers
+from pipeline.store.chunks import write_seal
 from pipeline.store.merging import merge
-from pipeline.store.metadata import note_metadata
 from pipeline.store.schema import ARRAY_NAMES
 from pipeline.store.verification import verify
 
@@ -79,7 +79,7 @@ def renamed(store: Path, ids: Callable[[str], str], digests: Callable[[str], str
         array = zarr.open_array(store, path=name, mode="r+")
         array.resize(len(values))
         array[:] = values
-    note_metadata(store)
+    write_seal(store)
     return store
 
 
@@ -175,7 +175,7 @@ def test_rows_keep_the_environment_they_were_computed_in(tiny_store: Make, tmp_p
     group = zarr.open_group(second, mode="r+")
     noted = [{"rows": [0, 25], "torch": "old"}, {"rows": [25, 60], "torch": "test"}]
     group.attrs.put({**group.attrs.asdict(), "environment": noted})
-    note_metadata(second)
+    write_seal(second)
     merge([first, second], tmp_path / "both.zarr")
     assert FeatureStore.open(tmp_path / "both.zarr").attrs["environment"] == [
         {"rows": [0, 60], "torch": "test"},
@@ -193,7 +193,7 @@ def test_what_the_model_was_tuned_on_is_that_of_both(tiny_store: Make, tmp_path:
     paths = [tiny_store(tmp_path, name=name, seed=n) for n, name in enumerate(("one", "two"))]
     for path, tuned in zip(paths, told, strict=True):
         zarr.open_group(path, mode="r+").attrs.update(store_attributes(tuned))
-        note_metadata(path)
+        write_seal(path)
     merge(paths, tmp_path / "both.zarr")
     merged = of_store(FeatureStore.open(tmp_path / "both.zarr").attrs, tmp_path / "both.zarr")
     assert merged == TunedOn(train=(parts[0], parts[2]), val=(parts[1],))
@@ -273,6 +273,7 @@ class TestRefusals:
         attrs["feature_spec"] |= changed
         attrs["action_hz"] = 5.0
         group.attrs.put(attrs)
+        write_seal(inputs[1])
         with pytest.raises(StoreMismatch) as caught:
             merge(inputs, tmp_path / "both.zarr")
         assert 'feature spec.prompt: "{instruction}" -> "{images}"' in str(caught.value)

@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 
 from pipeline.base.errors import StoreIncomplete, StoreMismatch
 from pipeline.store import FeatureStore
+from pipeline.store.chunks import write_seal
 from pipeline.store.schema import ARRAY_NAMES
 
 
@@ -179,6 +180,7 @@ def varied(tiny_store, tmp_path_factory, request) -> FeatureStore:
     attrs = zarr.open_group(path, mode="r+").attrs
     spec = attrs.asdict()["feature_spec"]
     attrs["feature_spec"] = {**spec, "variants": 3}
+    write_seal(path)
     store = FeatureStore.open(path)
     valid = store.array("vl/slot_valid")
     valid[:] = np.random.default_rng(1).integers(0, 2, valid.shape)

@@ -11,6 +11,7 @@ import zarr
 
 from pipeline.base.config import TrainHeadParams
 from pipeline.store import Batch, FeatureStore
+from pipeline.store.chunks import write_seal
 from pipeline.train.batches import BatchIndices
 from pipeline.train.loop import Trainer
 from pipeline.train.run import open_run
@@ -94,6 +95,7 @@ def any_store(
         attrs = zarr.open_group(path, mode="r+").attrs
         spec = attrs.asdict()["feature_spec"]
         attrs["feature_spec"] = {**spec, "variants": 2}
+        write_seal(path)
     return FeatureStore.open(path)
 
 

@@ -13,6 +13,7 @@ import zarr
 
 from pipeline.base.config import TrainHeadParams
 from pipeline.store import Batch, FeatureStore
+from pipeline.store.chunks import write_seal
 from pipeline.train.batches import BatchIndices, Lags, Prefetch, Windows, cut_batches, evenly
 
 CPU = torch.device("cpu")
@@ -86,6 +87,7 @@ def test_variants_reach_the_store(tiny_store: Callable[..., Path], tmp_path: Pat
     attrs = zarr.open_group(path, mode="r+").attrs
     spec = attrs.asdict()["feature_spec"]
     attrs["feature_spec"] = {**spec, "variants": 2}
+    write_seal(path)
     store = FeatureStore.open(path)
     assert store.variants == 2
     wanted = plan(store, 4)

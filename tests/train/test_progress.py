@@ -159,6 +159,14 @@ def test_the_log_has_speed_memory_and_time_over_all_starts(
     assert said.endswith((" MiB", " GiB"))
 
 
+def test_groups_that_were_cut_by_time_count_once(store: FeatureStore, params: Make) -> None:
+    thirds = np.array_split(np.arange(30), 3)
+    named = {episode_name(episode): episode_name(episode) for episode in store.episodes}
+    shape = policy_shape(store, fit_normalization(store, thirds[0], WINDOWS))
+    lines = describe_data(store, shape, params(), Split(*thirds, named, None))
+    assert lines[1].endswith("of 1 + 1 + 1 groups (1 in all, cut by time)")
+
+
 @pytest.fixture
 def warnings(store: FeatureStore, params: Make) -> Callable[..., list[str]]:
     """`warnings(train, key=value, ...)`: of a training on these ticks, the others held out."""

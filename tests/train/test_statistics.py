@@ -11,6 +11,7 @@ import zarr
 from pipeline.base.errors import NumericsError
 from pipeline.policy.attention import right_aligned
 from pipeline.store import FeatureStore
+from pipeline.store.chunks import write_seal
 from pipeline.train.batches import Windows
 from pipeline.train.statistics import fit_normalization
 
@@ -57,6 +58,7 @@ def test_features_are_counted_over_all_variants(
     attrs = zarr.open_group(path, mode="r+").attrs
     spec = attrs.asdict()["feature_spec"]
     attrs["feature_spec"] = {**spec, "variants": 3}
+    write_seal(path)
     store = FeatureStore.open(path)
     store.array("vl/slot_valid")[10:13, [1, 3, 5]] = 0
     found = fit_normalization(store, np.arange(30, 60), WINDOWS).features
@@ -156,6 +158,7 @@ def test_angles_are_fitted_as_a_policy_takes_them(
     streams = dict(zarr.open_group(path, mode="r").attrs["streams"])
     streams["state"] |= {"units": ["deg"] * len(streams["state"]["names"])}
     zarr.open_group(path, mode="r+").attrs["streams"] = streams
+    write_seal(path)
     store = FeatureStore.open(path)
     store.array("state/values")[:, 0] += 360.0 * np.arange(len(store.array("state/values")))
     fitted = fit_normalization(store, np.arange(30, 60), WINDOWS).state

@@ -22,6 +22,7 @@ from pipeline.base.tuned_on import (
     write_tuned_on,
 )
 from pipeline.store import FeatureStore
+from pipeline.store.chunks import write_seal
 from pipeline.train.split import Split, split_by_episode
 from pipeline.train.tuned_episodes import refuse_tuned_episodes
 
@@ -42,6 +43,7 @@ def tuned_store(tiny_store: Make, tmp_path: Path) -> Callable[..., FeatureStore]
         attrs: Any = zarr.open_group(path, mode="r+").attrs
         spec = attrs["feature_spec"] | {"adapter": "a digest"}
         attrs.update({"feature_spec": spec, **store_attributes(tuned)})
+        write_seal(path)
         return FeatureStore.open(path)
 
     return make

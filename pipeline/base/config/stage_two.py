@@ -173,6 +173,9 @@ class TrainHeadParams(Section):
     check_store: bool = True
     """Read the store once before training or tuning, and refuse a chunk that does not give its
     checksum; false where that takes too long."""
+    anew: bool = False
+    """Train again where this very run is finished; one that was stopped goes on. `dvc repro` sets
+    it: DVC runs the stage where code has changed, too."""
     store: Place | None = None
     """The store to train from; `extract.store` where null. Another one DVC does not watch."""
     output: OwnFolder = Path("models/head")

@@ -188,7 +188,8 @@ def ranked(results: Sequence[ProbeResult]) -> list[ProbeResult]:
 def recommend(study: ProbeStudy) -> Recommendation | None:
     """Among the groups that gain; None where none does.
 
-    A group gains where it is better than what is known without features and than the mean action.
+    A group gains where the interval of its R^2 is above 0, and where it is better than what is
+    known without features and than the mean action.
     One is better than another where the interval of the difference is above 0. Two that gain are
     tied where the first is not better and the second keeps half of its gain: a wide interval of few
     recordings would tie anything.
@@ -199,7 +200,8 @@ def recommend(study: ProbeStudy) -> Recommendation | None:
         scores: dict[ProbeResult, ProbeScore] = {
             group: score
             for group in study.groups
-            if all(_is_better(score := getattr(group, reading), other) for other in floor)
+            if ((score := getattr(group, reading)).r2.low or 0) > 0
+            and all(_is_better(score, other) for other in floor)
         }
         if not scores:
             continue

@@ -13,7 +13,7 @@ from pipeline.evaluate.ablation import AblationStudy
 from pipeline.evaluate.baselines import METHODS
 from pipeline.evaluate.episode_frames import read_episode_frames, shown_ticks
 from pipeline.evaluate.evaluation import Evaluation, trained_on_too
-from pipeline.evaluate.figures import best_baseline, rivalry
+from pipeline.evaluate.figures import NO_INTERVAL, best_baseline, rivalry
 from pipeline.look.evaluation import pictures as plots
 from pipeline.look.page.blocks import Block, Document, Picture, Report, Section, Text
 from pipeline.look.page.writing import sentence
@@ -88,19 +88,23 @@ def _tiles(comparison: Comparison) -> list[tuple[str, str]]:
         value, _, ends = rivals.policy.text().partition(" ")
         tiles.append((f"{scope}: overall error [training std] {ends}", value))
         label = f"{scope}: {rivals.difference.text('+')} beside the best baseline ({best})"
-        tiles.append((label, rivals.verdict))
+        headline = rivals.verdict
+        if rivals.difference.resolved is None and rivals.ratio is not None:
+            label += f"; {NO_INTERVAL}"
+            headline = f"{rivals.ratio:.3g} times the error of {best}"
+        tiles.append((label, headline))
     return [*tiles, ("test episodes", f"{len(comparison.episodes)}")]
 
 
 def _executed(comparison: Comparison, rollout: str) -> list[Block]:
     title, _ = tables.titles(comparison)
     errors = tables.error_table(comparison.executed)
-    success = "Whether the task succeeds, recorded ticks do not tell: the rollouts do."
+    success = "Whether the task succeeds, recorded ticks do not tell"
     return [
         Text(f"{sentence(title)} {sentence(tables.verdicts(comparison))}"),
         replace(errors, caption=sentence(tables.FOOTNOTE)),
         _picture(plots.methods, comparison),
-        Text(success, rollout),
+        Text(f"{success}: the rollouts do." if rollout else f"{success}.", rollout),
     ]
 
 

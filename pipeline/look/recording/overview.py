@@ -191,7 +191,7 @@ def _beside_nominal(view: EpisodeView) -> Iterator[Issue]:
         yield view.issue("wrong metadata", "", mistake)
     yield from find_clock_issues(view, nominal)
     yield from _missing(view, nominal)
-    yield from _frame_counts(view, nominal)
+    yield from _frame_counts(view)
 
 
 def _missing(view: EpisodeView, nominal: Nominal) -> Iterator[Issue]:
@@ -214,20 +214,11 @@ def _missing(view: EpisodeView, nominal: Nominal) -> Iterator[Issue]:
         yield view.issue("missing", "cameras", message)
     for name in empty:
         yield view.issue("missing", f"view {name}", "its folder is there and holds no frame")
-    for name in {*nominal.views} - {*empty}:
-        if not any(other == name or other.startswith(f"{name}_") for other in recorded):
-            message = f"no frame; {nominal.where} lists {', '.join(nominal.views)}"
-            yield view.issue("missing", f"view {name}", message)
 
 
-def _frame_counts(view: EpisodeView, nominal: Nominal) -> Iterator[Issue]:
-    """Too few frames, by the metadata or beside another view of the same rate."""
+def _frame_counts(view: EpisodeView) -> Iterator[Issue]:
+    """Fewer frames than another view of the same rate has."""
     cameras = {name: (len(c.time), usual_step(c.time)) for name, c in view.cameras.items()}
-    most = max((count for count, _ in cameras.values()), default=0)
-    promised = nominal.frames or 0
-    if promised - most > max(2, COUNT_TOLERANCE * promised):
-        message = f"{most} frames in the view that has most, {nominal.where} says {promised}"
-        yield view.issue("frame count", "cameras", message)
     for name, (count, step) in cameras.items():
         # A rig can have a slow and a fast camera.
         alike = [n for n, at in cameras.values() if max(at, step) < OTHER_RATE * min(at, step)]

@@ -13,6 +13,7 @@ from pipeline.evaluate.probe.folds import ProbeFolds
 from pipeline.evaluate.probe.inputs import LIMIT, STILL
 from pipeline.evaluate.probe.ridge import ProbeScore
 from pipeline.store import FeatureStore
+from pipeline.store.chunks import write_seal
 
 
 @pytest.fixture(scope="session")
@@ -34,6 +35,7 @@ def renamed() -> Callable[..., FeatureStore]:
         attrs = zarr.open_group(path, mode="r+").attrs
         attrs["slots"] = slots
         attrs["feature_spec"] = {**dict(attrs["feature_spec"]), **spec}
+        write_seal(path)
         return FeatureStore.open(path)
 
     return rename

@@ -1,6 +1,7 @@
 """The slot that carries the action is found, and nothing that only looks as if it did."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -300,6 +301,15 @@ def test_nothing_is_recommended_that_is_worse_than_what_is_known() -> None:
     said = advice(study)
     assert said.startswith("no recommendation")
     assert "params.yaml" not in said
+
+
+def test_nothing_is_recommended_that_may_explain_nothing() -> None:
+    """Better than a mean action that is far off, and itself not to be told from 0."""
+    unclear = by_recording(0.2, -0.2, 0.1, -0.15, 0.12)
+    study = study_of(unclear, (1, unclear, unclear))
+    study = replace(study, mean_action=by_recording(-0.6, -0.9, -0.7, -0.9, -0.6))
+    assert study.groups[0].alone.gain(study.mean_action).resolved
+    assert recommend(study) is None
 
 
 def test_features_that_help_alone_are_said_to() -> None:

@@ -16,7 +16,7 @@ from pipeline.evaluate.curves import TrainingCurve, TrainingCurves
 from pipeline.evaluate.episode_frames import EpisodeFrames
 from pipeline.evaluate.evaluation import Evaluation, judged_document
 from pipeline.evaluate.figures import error, rivalry
-from pipeline.evaluate.tables import error_table
+from pipeline.evaluate.tables import HEADINGS, error_table
 from pipeline.look.evaluation import page as evaluation_page
 from pipeline.look.evaluation.page import evaluation_report
 from pipeline.look.page.blocks import Document, Picture, Report, Section
@@ -135,6 +135,25 @@ def test_the_page_of_rollouts_is_linked_where_there_is_one(
     assert f'<a href="../rollout/{PAGE}">' in page.read_text()
     assert_page_is_sound(page)
     assert f"rollout/{PAGE}" not in str(evaluation_report(bare))
+
+
+def test_a_headline_says_how_much_worse_where_there_is_no_interval(judgement: Evaluation) -> None:
+    cells = judgement.comparison.cells
+    one = replace(cells, group=np.full(len(cells.group), ""))
+    scores = {
+        way: replace(errors, cells=one) for way, errors in judgement.comparison.scores.items()
+    }
+    alone = replace(judgement.comparison, cells=one, scores=scores)
+    rivals = rivalry(alone)
+    label, headline = evaluation_report(replace(judgement, comparison=alone)).tiles[3]
+    assert headline == f"{rivals.ratio:.3g} times the error of {HEADINGS[rivals.best]}"
+    assert label.endswith("intervals take at least two groups of test recordings")
+
+
+def test_rollouts_are_named_where_there_are_some(judgement: Evaluation) -> None:
+    bare = replace(judgement, study=None)
+    assert "the rollouts do" not in str(evaluation_report(bare))
+    assert "the rollouts do" in str(evaluation_report(bare, "../rollout/report.html"))
 
 
 def test_dimensions_that_hardly_move_stand_at_the_top(judgement: Evaluation) -> None:

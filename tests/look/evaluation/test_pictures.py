@@ -294,7 +294,7 @@ def studied(*errors: float) -> AblationStudy:
 
     ways = (("sensor", "zeroed"), ("sensor", "delayed 50 ms"), ("features", "shuffled"))
     spoilt = tuple(
-        Ablated(stream, how, judged(error))
+        Ablated(stream, how, judged(error), judged(errors[0]))
         for (stream, how), error in zip(ways, errors[1:], strict=True)
     )
     return AblationStudy(judged(errors[0]), spoilt, (), 4)

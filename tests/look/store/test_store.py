@@ -19,7 +19,7 @@ from pipeline.look.store.episodes import EpisodeCoverage, find_episode_issues
 from pipeline.look.store.features import look_at_features, read_slot, sample_rows
 from pipeline.look.store.page import StoreView, inspect_store
 from pipeline.store import Episode, FeatureStore
-from pipeline.store.metadata import note_metadata
+from pipeline.store.chunks import write_seal
 
 ROWS = 10
 """VL rows of each of the six episodes of a tiny store."""
@@ -52,7 +52,7 @@ def attributes(path: Path, change: Callable[[dict[str, Any]], Any]) -> None:
     document = json.loads((path / "zarr.json").read_text())
     change(document["attributes"])
     (path / "zarr.json").write_text(json.dumps(document))
-    note_metadata(path)
+    write_seal(path)
 
 
 def look(path: Path, **params: Any) -> StoreView:
