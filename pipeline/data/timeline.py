@@ -82,7 +82,8 @@ def build_timeline(
 
     `state` and `sensor` are the recording's own streams, passed in because they are read once.
     Raises `RecordingError` when there are no actions, when no instant is covered by every stream,
-    when clocks are not in seconds or when a delta action would have to be resampled, and
+    when clocks are not in seconds or contradict the metadata's rate, or when a delta action would
+    have to be resampled, and
     `ConfigError` when pose-derived actions are asked for without a rate.
     """
     cameras = recording.cameras()
@@ -94,7 +95,7 @@ def build_timeline(
     rate: float | None = None
     if recorded is not None and not _redo_rotation(recorded, poses, action_rotation):
         clocks["action"] = recorded.time
-        rate = recorded.rate_hz or _hz(recorded.time) or 1.0
+        rate = _recorded_hz(recording, recorded)
         time, action = _recorded_ticks(recording, recorded, rate, clocks, action_hz)
         channels, kind = recorded.channels, recorded.kind
     elif poses is not None:
@@ -200,6 +201,21 @@ def _redo_rotation(
 def _pose_channels(action_rotation: ActionRotation) -> Channels:
     names = (*_TRANSLATION, *_ROTATION[action_rotation], "gripper")
     return Channels(names, ("mm",) * 3 + ("deg",) * 3 + ("",))
+
+
+def _recorded_hz(recording: Recording, recorded: RecordedAction) -> float:
+    """Rate of the recorded actions, in which metadata and clock agree."""
+    told, kept = recorded.rate_hz, _hz(recorded.time)
+    if told and kept:
+        # Jitter moves the median of a short episode, a gap moves the mean: both have to differ.
+        mean = (len(recorded.time) - 1) / float(recorded.time[-1] - recorded.time[0])
+        if all(abs(told - hz) > RATE_TOLERANCE * told for hz in (kept, mean)):
+            raise RecordingError(
+                f"{recording.path}: its metadata say {told:g} Hz (LeRobot: fps in meta/info.json), "
+                f"and its actions are {1 / kept:.4g} s apart, which is {kept:.4g} Hz. Correct "
+                "whichever is wrong: with both, no action has a known length"
+            )
+    return told or kept or 1.0
 
 
 def _recorded_ticks(

@@ -310,6 +310,12 @@ def _warnings(surveyed: Survey, before: RowSource | None, missing: int) -> Itera
             "store does not have. The model sees all views of a store at a time, so that every row "
             f"of every episode is computed again. To keep the rows: {kept}"
         )
+    if not views and params.data.views != ():
+        yield (
+            f"none of the {len(recordings)} episode(s) has a frame, so that every row will hold "
+            "the features of the instruction alone. Check data.views and the folders of images. "
+            "To say that it is meant: --set data.views=[]"
+        )
     without = [recording.source for recording in recordings if not recording.has_poses]
     if params.data.action_rotation == "auto" and 0 < len(without) < len(recordings):
         yield (

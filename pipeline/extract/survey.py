@@ -18,13 +18,13 @@ from tqdm import tqdm
 from pipeline.base.border import Border
 from pipeline.base.config import DataParams, Params
 from pipeline.base.digests import ContentDigests, joint_digest
-from pipeline.base.errors import RecordingError, VLMError
+from pipeline.base.errors import RecordingError, StoreMismatch, VLMError
 from pipeline.base.format import capped
 from pipeline.base.source import Streams
 from pipeline.data import BadEpisode, Recording, content_digest, open_recordings
 from pipeline.data.embodiment import Embodiment, common_embodiment
 from pipeline.data.episode import read_episode
-from pipeline.data.timeline import ActionRotation, choose_action_rotation
+from pipeline.data.timeline import RATE_TOLERANCE, ActionRotation, choose_action_rotation
 from pipeline.store.border import EpisodeText
 from pipeline.store.episodes import EpisodeRows
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
@@ -158,7 +158,7 @@ def check_episodes(
 
     Raises one `RecordingError` that lists all that cannot be used, unless
     `data.on_bad_episode: skip` allows to leave them out, and `StoreMismatch` when two sources are
-    not of one embodiment.
+    not of one embodiment, or not of one rate where `data.action_hz` is null.
     """
     preparer = Preparer(surveyed.params.vlm, surveyed.spec)
     sound: list[CheckedEpisode] = []
@@ -175,6 +175,8 @@ def check_episodes(
     if bad and (surveyed.params.data.on_bad_episode == "stop" or not sound):
         _refuse_bad(bad, of=len(sound) + len(bad))
     embodiment_of(sound)
+    if surveyed.params.data.action_hz is None:
+        _refuse_two_rates(sound)
     return sound, failed
 
 
@@ -186,6 +188,22 @@ def embodiment_of(checked: Sequence[CheckedEpisode]) -> Embodiment:
         "Extract them into two stores: one params file each, with its own data.sources and "
         "extract.store.",
     )
+
+
+def _refuse_two_rates(checked: Sequence[CheckedEpisode]) -> None:
+    """Raise `StoreMismatch` where actions of two rates would be ticks of one store."""
+    rates = sorted(
+        (one.ticks.recorded_hz or 0.0, f"{one.source!r} ({one.recording.path})")
+        for one in checked
+        if len(one.ticks.time) > 1
+    )
+    if rates and (fastest := rates[-1])[0] - (slowest := rates[0])[0] > RATE_TOLERANCE * fastest[0]:
+        raise StoreMismatch(
+            f"data.action_hz is null, and actions come at {slowest[0]:.4g} Hz in source "
+            f"{slowest[1]} and at {fastest[0]:.4g} Hz in source {fastest[1]}: a store has ticks of "
+            "one length. Set data.action_hz, or extract them into two stores: one params file "
+            "each, with its own data.sources and extract.store."
+        )
 
 
 def _checked(episode: SurveyedEpisode, surveyed: Survey, preparer: Preparer) -> CheckedEpisode:

@@ -369,3 +369,12 @@ def test_last_at_counts_an_equal_time_as_past():
         2,
         3,
     ]
+
+
+@pytest.mark.parametrize(("told", "kept"), [(10.0, 30.0), (30.0, 10.0)])
+@pytest.mark.parametrize("action_hz", [10.0, None])
+def test_a_rate_that_contradicts_the_clock_is_refused(told, kept, action_hz):
+    time = np.arange(20) / kept
+    recording = Made(recorded=recorded_at(time, "absolute", told))
+    with pytest.raises(RecordingError, match=rf"made: .* say {told:g} Hz .*which is {kept:g} Hz"):
+        build_timeline(recording, action_hz, 3, "euler_delta")

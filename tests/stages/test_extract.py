@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import yaml
@@ -14,7 +15,7 @@ from pipeline.simulation.lerobot_format import write_lerobot
 from pipeline.simulation.recorder import simulate_episode
 from stages.command import run
 from stages.extract import main
-from tests.data.conftest import START, Truth, write_raw
+from tests.data.conftest import START, Truth, edit_json, write_raw
 from tests.data.conftest import write_lerobot as write_small_lerobot
 from tests.data.test_lerobot import edit_v3
 
@@ -174,6 +175,43 @@ def test_channels_of_one_name(capsys, params_file, tmp_path):
     )
     err = said(capsys, params_file, "extract.plan=true")
     assert "'action': expected each channel name once, found ['dx'] more often. Mend meta/" in err
+
+
+def halved(root: Path) -> Path:
+    """The same set with its frames half as far apart; meta/ says nothing of it."""
+    for path in (root / "data").rglob("*.parquet"):
+        table = pq.ParquetFile(path).read()
+        column = table.schema.get_field_index("timestamp")
+        times = pa.array(table["timestamp"].to_numpy() / 2, table.schema.field(column).type)
+        pq.write_table(table.set_column(column, "timestamp", times), path)
+    return root
+
+
+def test_an_fps_that_contradicts_the_clock(capsys, params_file, tmp_path):
+    halved(write_small_lerobot(tmp_path / "day1/run"))
+    err = said(capsys, params_file, "data.action_hz=null", "extract.plan=true")
+    assert re.search(r"3 of 3 episodes .*\n.*say 10 Hz .*fps in meta/info\.json.* which is \d", err)
+
+
+def test_two_rates_in_one_store(capsys, params_file, tmp_path):
+    write_small_lerobot(tmp_path / "day1/run")
+    edit_json(halved(write_small_lerobot(tmp_path / "day2/run")) / "meta/info.json", fps=20)
+    sources = [{"name": day, "path": f"{tmp_path}/{day}/*"} for day in ("day1", "day2")]
+    options = (f"data.sources={json.dumps(sources)}", "extract.plan=true")
+    err = said(capsys, params_file, "data.action_hz=null", *options)
+    assert re.search(r"10 Hz in source 'day1' \(.*day1.*20 Hz in source 'day2' \(.*day2", err)
+
+
+def test_recordings_without_any_frame(capsys, params_file, tmp_path):
+    info = write_small_lerobot(tmp_path / "day1/run") / "meta/info.json"
+    features = json.loads(info.read_text())["features"]
+    blind = {name: feature for name, feature in features.items() if "images" not in name}
+    edit_json(info, features=blind)
+    options = ["--params", str(params_file), "--set", "extract.plan=true"]
+    assert run("", main, options) == 0, capsys.readouterr().err
+    assert "WARNING: none of the 3 episode(s) has a frame" in capsys.readouterr().out
+    assert run("", main, [*options, "--set", "data.views=[]"]) == 0
+    assert "has a frame" not in capsys.readouterr().out
 
 
 def test_the_first_ten_of_many_bad_episodes_are_listed(capsys, params_file, tmp_path):

@@ -397,8 +397,8 @@ class TestClocks:
         root = copied("lerobot")
         info = json.loads((root / "meta/info.json").read_text())
         (root / "meta/info.json").write_text(json.dumps(info | {"fps": 15}))
-        issue = next(issue for issue in issues_of(root, action_hz=None) if issue.kind == "rate")
-        assert "expected 15 by meta/info.json" in issue.message
+        issues = issues_of(root, action_hz=None)
+        assert any("say 15 Hz (LeRobot: fps in meta/info.json)" in one.message for one in issues)
 
     def test_ticks_lost_at_both_ends(self, copied: Copied, issues_of: Find, change_npz) -> None:
         folder = copied("raw")
