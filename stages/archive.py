@@ -68,7 +68,10 @@ def _places(params: Params) -> tuple[Path, Path]:
     store = params.archive.store or params.extract.store
     output = params.archive.output or store.with_name(f"{store.stem}.archive.zarr")
     if output.suffix != ".zarr":
-        raise ConfigError(f"archive.output: expected a name that ends in .zarr, found {output}")
+        raise ConfigError(
+            f"archive.output: expected a name that ends in .zarr, found {output}. "
+            f"Set archive.output={output.with_name(output.name + '.zarr')}"
+        )
     if output.resolve().is_relative_to(store.resolve()):
         raise ConfigError(
             f"archive.output: {output} is the store {store} itself or lies in it. Name another "

@@ -135,6 +135,7 @@ def test_every_problem_is_said_with_its_place(minimal):
         ("vlm.prompt='{images}{images}'", "may stand once"),
         ("extract.store=cache_store/demo", "ends in .zarr"),
         ("data.sources=[{name: a, path: x}, {name: a, path: y}]", "stands more than once"),
+        ("data.views=[View1, View1]", "names must differ; View1 stands more than once"),
         ("train_head.mixture={other: 1}", "mixture names other, but data.sources has"),
         ("extract.workers=-1", "extract.workers"),
         ("train_head.lr=yes", "train_head.lr: expected a number, found true or false"),

@@ -68,7 +68,8 @@ def test_the_archive_is_not_the_store(call, capsys):
 
 
 def test_an_archive_is_named_as_zarr(call, capsys, tmp_path):
-    assert "ends in .zarr" in refused(call, capsys, f"archive.output={tmp_path / 'kept'}")
+    output = f"archive.output={tmp_path / 'kept'}"
+    assert f"Set {output}.zarr" in refused(call, capsys, output)
 
 
 def test_something_else_in_its_place_is_left_alone(call, capsys, tmp_path):

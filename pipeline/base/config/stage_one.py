@@ -79,14 +79,16 @@ class DataParams(Section):
     on_bad_episode: Literal["stop", "skip"] = "stop"
     """Refuse to begin, or list bad episodes and leave them out."""
 
-    @field_validator("sources")
+    @field_validator("sources", "views")
     @classmethod
-    def _names_differ(cls, sources: tuple[Source, ...]) -> tuple[Source, ...]:
-        names = [source.name for source in sources]
+    def _names_differ(
+        cls, entries: tuple[Source | str, ...] | None
+    ) -> tuple[Source | str, ...] | None:
+        names = [entry if isinstance(entry, str) else entry.name for entry in entries or ()]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
-            raise ValueError(f"source names must differ; {', '.join(twice)} stands more than once")
-        return sources
+            raise ValueError(f"names must differ; {', '.join(twice)} stands more than once")
+        return entries
 
 
 class AugmentationParams(Section):
