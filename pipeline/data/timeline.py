@@ -83,8 +83,7 @@ def build_timeline(
     `state` and `sensor` are the recording's own streams, passed in because they are read once.
     Raises `RecordingError` when there are no actions, when no instant is covered by every stream,
     when clocks are not in seconds or contradict the metadata's rate, or when a delta action would
-    have to be resampled, and
-    `ConfigError` when pose-derived actions are asked for without a rate.
+    have to be resampled, and `ConfigError` when pose-derived actions are asked for without a rate.
     """
     cameras = recording.cameras()
     clocks = {f"view {view}": camera.covered for view, camera in cameras.items()}

@@ -146,19 +146,24 @@ def find_damage(root: Path, specs: Iterable[ArraySpec], seal: Seal | None = None
     With a bar on a terminal where it takes longer than a second.
     """
     files = [(spec, chunk) for spec in specs for chunk in range(spec.chunk_count)]
+    own = read_spec(root, CHECKSUMS) if any(spec.name == FEATURES for spec, _ in files) else None
     for spec, chunk in tqdm(files, "checksums", unit="file", leave=False, disable=None, delay=1):
         path, sealed = chunk_path(root, spec, chunk), sealed_trailer(seal, spec.name, chunk)
-        compare = partial(_compare_rows, root, spec, chunk) if spec.name == FEATURES else _pass
+        compare = _pass
+        if own and spec.name == FEATURES:
+            compare = partial(_compare_rows, root, own, spec, chunk)
         if damage := read_chunk(path, spec, compare, sealed).damage:
             return f"{path}: {damage}"
     return None
 
 
-def _compare_rows(root: Path, spec: ArraySpec, chunk: int, first: int, rows: NDArray[Any]) -> None:
-    """Raise `StoreIncomplete` where feature rows of a chunk do not give their checksums."""
+def _compare_rows(
+    root: Path, own: ArraySpec, spec: ArraySpec, chunk: int, first: int, rows: NDArray[Any]
+) -> None:
+    """Raise `StoreIncomplete` where feature rows of a chunk do not give `own`, their checksums."""
     within = spec.chunk_rows_of(chunk)[first : first + len(rows)]
     if within:  # the rest is padding
-        wanted = read_rows(root, read_spec(root, CHECKSUMS), within.start, within.stop)
+        wanted = read_rows(root, own, within.start, within.stop)
         check_row_checksums(root, spec, within, rows[: len(within)], wanted)
 
 

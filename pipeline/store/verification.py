@@ -237,9 +237,9 @@ def check_chunk(
             faults[first : first + len(values)] = judged
 
     file = read_chunk(path, spec, judge, sealed_trailer(seal, array, chunk))
-    # Where their checksums are lost, rows are as good as their file.
-    lost = CHECKSUMS not in specs or find_damage(root, [specs[CHECKSUMS]], seal)
-    if array == FEATURES and lost:
+    if array == FEATURES and (
+        CHECKSUMS not in specs or find_damage(root, [specs[CHECKSUMS]], seal)
+    ):  # where their checksums are lost, rows are as good as their file
         faults[np.isin(faults, (SOUND, CHANGED))] = CHANGED if file.damage else SOUND
     return ChunkReport(array, path, rows, file.bytes, file.damage, faults)
 
