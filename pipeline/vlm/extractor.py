@@ -99,11 +99,11 @@ class Extractor:
         only cost its memory and the fast causal kernel.
         """
         text = self.model.language_model
-        none = dict.fromkeys(("attention_mask", "past_key_values", "position_ids"))
-        given: dict[str, Any] = {"config": text.config, "inputs_embeds": embedded, **none}
-        masks: dict[str, Any] = {"full_attention": create_causal_mask(**given)}
+        # By position, as releases differ in a name: no padding mask, no cache, plain positions.
+        given = (text.config, embedded, None, None, None)
+        masks: dict[str, Any] = {"full_attention": create_causal_mask(*given)}
         if text.has_sliding_layers:
-            masks["sliding_attention"] = create_sliding_window_causal_mask(**given)
+            masks["sliding_attention"] = create_sliding_window_causal_mask(*given)
         return masks
 
     def _read(
