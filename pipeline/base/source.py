@@ -69,6 +69,10 @@ class ActionChannels(Channels):
     kind: Literal["absolute", "velocity", "delta"]
 
 
+RATE_TOLERANCE = 0.1
+"""Rates that differ by no more than this share of themselves are one."""
+
+
 class Streams(Document):
     """The channels of every stream, and the views."""
 

@@ -15,8 +15,13 @@ from pipeline.store import Episode, FeatureStore
 def check_store(
     store: FeatureStore, vlm_reuse_count: int, action_hz: float | None, action_rotation: str
 ) -> None:
-    """Raise `StoreMismatch` where a store's ticks are others than these settings ask for."""
-    expected: dict[str, object] = {"vlm_reuse_count": vlm_reuse_count, "action_hz": action_hz}
+    """Raise `StoreMismatch` where a store's ticks are others than these settings ask for.
+
+    An `action_hz` of None asks for no rate: a store says the rate of recorded rows too.
+    """
+    expected: dict[str, object] = {"vlm_reuse_count": vlm_reuse_count}
+    if action_hz is not None:
+        expected["action_hz"] = action_hz
     actual: dict[str, object] = {name: getattr(store, name) for name in expected}
     if action_rotation != "auto":
         rotations = {"rx": "rotvec", "da": "euler_delta"}

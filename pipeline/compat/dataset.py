@@ -41,7 +41,8 @@ class UnifiedVLADataset(Dataset[Sample]):
     frames; `stages.train_head` draws others too.
 
     `horizon` is in ticks, the windows in readings, none of them older than `sensor_window_s` and
-    `state_window_s` (None: of any age); `action_hz` None takes recorded rows as ticks.
+    `state_window_s` (None: of any age); `action_hz` None takes recorded rows as ticks, and whatever
+    ticks a store has.
     `recordings`, open already, may stand in the place of `data`; what they are read with stays.
     `instruction` replaces what those of `data` say. Old and new recordings in one data set have
     actions of one kind, `action_rotation`; `auto` is rotvec where every recording has poses.

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pipeline.data.embodiment import common_embodiment
 from pipeline.data.episode import ReadEpisode
 from pipeline.data.row_range import Frames, RowFrames
+from pipeline.data.timeline import tick_hz
 from pipeline.store import KEY_BYTES, SCHEMA, FeatureStore
 from pipeline.store.episodes import EpisodeRows, episode_arrays
 
@@ -40,7 +41,7 @@ def in_memory(
         "slots": [],
         "sources": sources,
         "streams": embodiment.document() | {"views": views},
-        "action_hz": action_hz,
+        "action_hz": tick_hz((e.timeline.recorded_hz for e in episodes), action_hz),
         "vlm_reuse_count": vlm_reuse_count,
         "environment": [],
     }

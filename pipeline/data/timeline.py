@@ -14,12 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.errors import ConfigError, RecordingError
+from pipeline.base.source import RATE_TOLERANCE
 from pipeline.data import Channels, RecordedAction, Recording, Stream
 
 ActionRotation = Literal["rotvec", "euler_delta"]
-
-RATE_TOLERANCE = 0.1
-"""Recorded rows are the ticks when `action_hz` differs from their rate by no more than this."""
 
 FINEST_S, COARSEST_S = 1e-9, 1e-3
 """Bounds of `rounding`: float64 seconds that are sums of steps are off by more than their last
@@ -45,7 +43,7 @@ class Timeline:
     action_channels: Channels
     action_kind: str
     recorded_hz: float | None
-    """Rate of the recorded actions; None where they are derived from poses."""
+    """Rate of the recorded actions; None of a single one, and of those derived from poses."""
     fastest_hz: float
     """Rate of the episode's fastest stream."""
     vl_row: NDArray[np.int64]
@@ -181,6 +179,17 @@ def rate_notes(
     return {source: f"ticks at {action_hz:g} Hz, {', '.join(why)}" for source, why in said.items()}
 
 
+def tick_hz(recorded_hz: Iterable[float | None], action_hz: float | None) -> float | None:
+    """Ticks a second: `action_hz`, or the median rate of the recordings where it is None.
+
+    `recorded_hz` is of each episode's timeline; None where none of them has a rate.
+    """
+    rates = [hz for hz in recorded_hz if hz]
+    if action_hz is not None or not rates:
+        return action_hz
+    return float(f"{np.median(rates):.5g}")  # what a clock in float32 tells of a rate
+
+
 def wrapped(degrees: NDArray[np.float64]) -> NDArray[np.float64]:
     """The same angles in [-180, 180)."""
     return (degrees + 180.0) % 360.0 - 180.0
@@ -202,8 +211,8 @@ def _pose_channels(action_rotation: ActionRotation) -> Channels:
     return Channels(names, ("mm",) * 3 + ("deg",) * 3 + ("",))
 
 
-def _recorded_hz(recording: Recording, recorded: RecordedAction) -> float:
-    """Rate of the recorded actions, in which metadata and clock agree."""
+def _recorded_hz(recording: Recording, recorded: RecordedAction) -> float | None:
+    """Rate of the recorded actions, in which metadata and clock agree; None of a single one."""
     told, kept = recorded.rate_hz, _hz(recorded.time)
     if told and kept:
         # Jitter moves the median of a short episode, a gap moves the mean: both have to differ.
@@ -214,25 +223,27 @@ def _recorded_hz(recording: Recording, recorded: RecordedAction) -> float:
                 f"and its actions are {1 / kept:.4g} s apart, which is {kept:.4g} Hz. Correct "
                 "whichever is wrong: with both, no action has a known length"
             )
-    return told or kept or 1.0
+    return told or kept or None
 
 
 def _recorded_ticks(
     recording: Recording,
     recorded: RecordedAction,
-    rate: float,
+    rate: float | None,
     clocks: _Clocks,
     action_hz: float | None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     start, stop = _covered(recording, clocks)
-    if action_hz is None or abs(action_hz - rate) <= RATE_TOLERANCE * rate:
+    if action_hz is None or (rate and abs(action_hz - rate) <= RATE_TOLERANCE * rate):
         slack = _slack(clocks)
         kept = (recorded.time >= start - slack) & (recorded.time <= stop + slack)
         return _some(recording, recorded.time[kept]), recorded.values[kept]
     if recorded.kind == "delta":
+        known = f"{rate:g} Hz" if rate else "a rate that a single row does not tell"
+        mend = f"data.action_hz to {rate:g} or null" if rate else "data.action_hz to null"
         raise RecordingError(
-            f"{recording.path}: its actions are differences recorded at {rate:g} Hz and cannot be "
-            f"held at data.action_hz={action_hz:g}. Set data.action_hz to {rate:g} or null."
+            f"{recording.path}: its actions are differences recorded at {known} and cannot be "
+            f"held at data.action_hz={action_hz:g}. Set {mend}."
         )
     time = _some(recording, _grid(recording, clocks, start, stop, action_hz))
     return time, recorded.values[last_at(recorded.time, time, _slack(clocks))]

@@ -17,7 +17,7 @@ from pipeline.base.finite import first_non_finite
 from pipeline.base.format import size
 from pipeline.base.tuned_on import store_attributes
 from pipeline.data import Stream
-from pipeline.data.timeline import Timeline
+from pipeline.data.timeline import Timeline, tick_hz
 from pipeline.extract.plan import store_bytes
 from pipeline.extract.survey import CheckedEpisode, Survey, embodiment_of
 from pipeline.store import SCHEMA, RowSource, Sizes, StoreBuild, arrays
@@ -170,7 +170,7 @@ def _attributes(checked: Sequence[CheckedEpisode], survey: Survey) -> dict[str, 
         "slots": survey.spec.document["slots"],
         "sources": [source.name for source in data.sources],
         "streams": embodiment_of(checked).document() | {"views": list(survey.spec.views)},
-        "action_hz": data.action_hz,
+        "action_hz": tick_hz((one.ticks.recorded_hz for one in checked), data.action_hz),
         "vlm_reuse_count": data.vlm_reuse_count,
         "environment": [],
         **store_attributes(tuned_on(survey.params.vlm)),

@@ -294,7 +294,9 @@ def _reasons(
         if name != FEATURES and before.specs[name].dtype != spec.dtype
     ]
     yield from dtypes
-    if not (lines or changed or gone or dtypes):
+    if unrated := before.said.action_hz is None:
+        yield "the store does not say the rate of its ticks"
+    if not (lines or changed or gone or dtypes or unrated):
         yield "the order of episodes, or how actions are derived, changed"
 
 

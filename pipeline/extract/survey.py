@@ -20,11 +20,11 @@ from pipeline.base.config import DataParams, Params
 from pipeline.base.digests import ContentDigests, joint_digest
 from pipeline.base.errors import RecordingError, StoreMismatch, VLMError
 from pipeline.base.format import capped
-from pipeline.base.source import Streams
+from pipeline.base.source import RATE_TOLERANCE, Streams
 from pipeline.data import BadEpisode, Recording, content_digest, open_recordings
 from pipeline.data.embodiment import Embodiment, common_embodiment
 from pipeline.data.episode import read_episode
-from pipeline.data.timeline import RATE_TOLERANCE, ActionRotation, choose_action_rotation
+from pipeline.data.timeline import ActionRotation, choose_action_rotation
 from pipeline.store.border import EpisodeText
 from pipeline.store.episodes import EpisodeRows
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
@@ -125,6 +125,7 @@ def survey(params: Params, digests: ContentDigests) -> Survey:
     plan = joint_digest(
         spec.digest,
         extract.sensor_dtype,
+        *(["rate"] if data.action_hz is None else []),  # which earlier stores did not keep
         repr([(source.name, source.action_kind) for source in data.sources]),
         *(episode.digest for episode in episodes),
     )
@@ -158,7 +159,7 @@ def check_episodes(
 
     Raises one `RecordingError` that lists all that cannot be used, unless
     `data.on_bad_episode: skip` allows to leave them out, and `StoreMismatch` when two sources are
-    not of one embodiment, or not of one rate where `data.action_hz` is null.
+    not of one embodiment, or have not one known rate where `data.action_hz` is null.
     """
     preparer = Preparer(surveyed.params.vlm, surveyed.spec)
     sound: list[CheckedEpisode] = []
@@ -176,7 +177,7 @@ def check_episodes(
         _refuse_bad(bad, of=len(sound) + len(bad))
     embodiment_of(sound)
     if surveyed.params.data.action_hz is None:
-        _refuse_two_rates(sound)
+        _refuse_rates(sound)
     return sound, failed
 
 
@@ -190,14 +191,20 @@ def embodiment_of(checked: Sequence[CheckedEpisode]) -> Embodiment:
     )
 
 
-def _refuse_two_rates(checked: Sequence[CheckedEpisode]) -> None:
-    """Raise `StoreMismatch` where actions of two rates would be ticks of one store."""
+def _refuse_rates(checked: Sequence[CheckedEpisode]) -> None:
+    """Raise `StoreMismatch` where recorded rows, as ticks of one store, have no or two rates."""
     rates = sorted(
-        (one.ticks.recorded_hz or 0.0, f"{one.source!r} ({one.recording.path})")
+        (one.ticks.recorded_hz, f"{one.source!r} ({one.recording.path})")
         for one in checked
-        if len(one.ticks.time) > 1
+        if one.ticks.recorded_hz
     )
-    if rates and (fastest := rates[-1])[0] - (slowest := rates[0])[0] > RATE_TOLERANCE * fastest[0]:
+    if not rates:
+        raise StoreMismatch(
+            f"data.action_hz is null, and {checked[0].recording.path} and all others have a single "
+            "action, which tells no rate: a policy of them could not be served. Set data.action_hz."
+        )
+    slowest, fastest = rates[0], rates[-1]
+    if fastest[0] - slowest[0] > RATE_TOLERANCE * fastest[0]:
         raise StoreMismatch(
             f"data.action_hz is null, and actions come at {slowest[0]:.4g} Hz in source "
             f"{slowest[1]} and at {fastest[0]:.4g} Hz in source {fastest[1]}: a store has ticks of "

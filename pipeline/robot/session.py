@@ -75,7 +75,8 @@ class ServedPolicy:
         if checkpoint.source["action_hz"] is None:
             raise CheckpointMismatch(
                 f"{folder}: the policy was trained on ticks as they were recorded (data.action_hz "
-                "null), so its rate is not known. Extract with data.action_hz and train it again."
+                "null), by a store that does not say their rate. Run stages.extract again, which "
+                "computes no row for it, and train it again."
             )
         target = resolve_device(device)
         policy = checkpoint.policy(target)

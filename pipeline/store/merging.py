@@ -21,6 +21,7 @@ from tqdm import tqdm
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import ConfigError, StoreMismatch
 from pipeline.base.golden import spread
+from pipeline.base.source import RATE_TOLERANCE
 from pipeline.base.tuned_on import joined, of_store, store_attributes
 from pipeline.store.chunks import check_row_checksums, check_trailers, read_rows
 from pipeline.store.episodes import Episode, index_arrays
@@ -218,6 +219,9 @@ def _check_alike(stores: Sequence[FeatureStore]) -> None:
     known: dict[str, Any] = {}
     for store in stores:
         form = _form(store)
+        hz, rate = known.get("action_hz"), form["action_hz"]
+        if hz and rate and abs(hz - rate) <= RATE_TOLERANCE * hz:  # recorded by clocks
+            form["action_hz"] = hz
         differing = differences({name: known.get(name, form[name]) for name in form}, form)
         if differing:
             raise StoreMismatch(

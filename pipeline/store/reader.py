@@ -107,7 +107,7 @@ class FeatureStore:
 
     @property
     def action_hz(self) -> float | None:
-        """Ticks a second; None where the recorded rows are the ticks."""
+        """Ticks a second; None in older stores of recorded rows, which do not say it."""
         return self.attrs["action_hz"]
 
     @property

@@ -242,7 +242,6 @@ class TestStore:
         ("settings", "said"),
         [
             ({"vlm_reuse_count": 5}, "vlm_reuse_count: 5 expected, found 3"),
-            ({"action_hz": None}, "action_hz: null expected, found 10"),
             ({"action_rotation": "euler_delta"}, '"euler_delta" expected, found "rotvec"'),
             ({"format": "lerobot"}, "'lerobot', found new, old"),
         ],

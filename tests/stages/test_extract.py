@@ -9,10 +9,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import yaml
+import zarr
 
 from pipeline.data import lerobot
 from pipeline.simulation.lerobot_format import write_lerobot
 from pipeline.simulation.recorder import simulate_episode
+from pipeline.store import FeatureStore
+from pipeline.store.chunks import write_seal
 from stages.command import run
 from stages.extract import main
 from tests.data.conftest import START, Truth, edit_json, write_raw
@@ -200,6 +203,31 @@ def test_two_rates_in_one_store(capsys, params_file, tmp_path):
     options = (f"data.sources={json.dumps(sources)}", "extract.plan=true")
     err = said(capsys, params_file, "data.action_hz=null", *options)
     assert re.search(r"10 Hz in source 'day1' \(.*day1.*20 Hz in source 'day2' \(.*day2", err)
+
+
+def test_a_store_of_recorded_rows_says_their_rate(capsys, params_file, tmp_path):
+    """And so does one that an earlier version wrote, which did not; no row is computed again."""
+    info = write_small_lerobot(tmp_path / "day1/run") / "meta/info.json"
+    store = tmp_path / "lab.zarr"
+    options = ["--params", str(params_file), "--set", "data.action_hz=null"]
+    assert run("", main, options) == 0, capsys.readouterr().err
+    assert json.loads(info.read_text())["fps"] == FeatureStore.open(store).action_hz == 10
+    group = zarr.open_group(store, mode="r+")
+    group.attrs.update(action_hz=None, plan="0" * 64)
+    write_seal(store)
+    assert run("", main, options) == 0, capsys.readouterr().err
+    told = capsys.readouterr().out
+    assert "why: the store does not say the rate of its ticks" in told
+    assert ", 0 to compute" in told
+    assert FeatureStore.open(store).action_hz == 10
+
+
+def test_recorded_rows_without_a_rate(capsys, params_file, tmp_path, monkeypatch):
+    """No format of today lacks it: a clock of one row, by a reader that knows no rate."""
+    monkeypatch.setattr("pipeline.data.timeline._recorded_hz", lambda *_: None)
+    write_small_lerobot(tmp_path / "day1/run")
+    err = said(capsys, params_file, "data.action_hz=null", "extract.plan=true")
+    assert re.search(r"day1/run.* a single action, which tells no rate.*Set data\.action_hz", err)
 
 
 def test_recordings_without_any_frame(capsys, params_file, tmp_path):

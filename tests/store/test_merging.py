@@ -278,6 +278,11 @@ class TestRefusals:
             merge(inputs, tmp_path / "both.zarr")
         assert 'feature spec.prompt: "{instruction}" -> "{images}"' in str(caught.value)
         assert "action_hz: 10.0 -> 5.0" in str(caught.value)
+        group.attrs.put(attrs | {"action_hz": 9.998})
+        write_seal(inputs[1])
+        with pytest.raises(StoreMismatch, match="cannot become one store") as caught:
+            merge(inputs, tmp_path / "both.zarr")
+        assert "action_hz" not in str(caught.value)
 
     def test_paths(self, tiny_store: Make, tmp_path: Path) -> None:
         a, b = (tiny_store(tmp_path, name=name, seed=seed) for seed, name in enumerate("ab"))

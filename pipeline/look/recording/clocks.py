@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from pipeline.base.config import Params
 from pipeline.base.issue import Issue
+from pipeline.base.source import RATE_TOLERANCE
 from pipeline.base.table import Table
 from pipeline.data.recording import Nominal
 from pipeline.data.timeline import Timeline
@@ -26,8 +27,6 @@ from pipeline.look.recording.episode import Draw, EpisodeView
 
 # Usual steps from which a step is a gap.
 GAP_FACTOR = 2.5
-# Share by which entries a second may differ from what the recording says.
-RATE_TOLERANCE = 0.1
 # Usual steps from which a camera's step has lost a frame.
 DROPPED_STEP = 1.5
 # How many such steps there are at least, and what share of the steps they have to exceed, as have
