@@ -38,6 +38,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from pipeline.base.commands import DEFAULT_PARAMS, running_with
 from pipeline.base.config import Params, described_keys, load_params
 from pipeline.base.errors import PipelineError
 
@@ -101,7 +102,8 @@ def run(
             params = load_params(options.params, [*options.overrides, *given])
             main = import_module(work).main if isinstance(work, str) else work
             _catch_signals()
-            main(params)
+            with running_with(options.params, options.overrides):
+                main(params)
         sys.stdout.flush()  # not at the interpreter's exit, where an error is said in any case
     except PipelineError as error:
         return _refuse(str(error))
@@ -129,7 +131,7 @@ def _parse(
     parser = argparse.ArgumentParser(
         description=summary, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--params", type=Path, default=Path("params.yaml"), metavar="FILE")
+    parser.add_argument("--params", type=Path, default=DEFAULT_PARAMS, metavar="FILE")
     parser.add_argument(
         "--set",
         action="append",

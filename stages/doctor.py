@@ -21,6 +21,7 @@ if __name__ == "__main__":  # here, for --help waits for no import below
         run(__doc__ or "", "stages.doctor", sections=("data", "vlm", "extract", "train_head"))
     )
 
+from pipeline.base.commands import command
 from pipeline.base.config import Params
 from pipeline.base.errors import PipelineError
 from pipeline.base.issue import Issue
@@ -37,9 +38,9 @@ def main(params: Params) -> None:
         subjects = ", ".join(dict.fromkeys(issue.kind for issue in lacking))
         raise PipelineError(
             f"{len(lacking)} thing(s) are missing: {subjects}. Do what stands behind -> there, "
-            "then run python -m stages.doctor again."
+            f"then run {command('doctor')} again."
         )
     print(
-        "nothing that was looked at is missing; python -m stages.extract --set extract.plan=true "
+        f"nothing that was looked at is missing; {command('extract', '--set extract.plan=true')} "
         "reads every episode"
     )

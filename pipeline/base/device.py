@@ -5,6 +5,7 @@ torch takes over a second to import: a command that finds nothing to do must not
 
 from typing import TYPE_CHECKING, Literal
 
+from pipeline.base.commands import command
 from pipeline.base.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ def resolve_device(name: str) -> "torch.device":
         raise ConfigError(
             f"device: {name}: expected auto, cpu or a device of this machine "
             f"(CUDA devices found: {torch.cuda.device_count()}): {str(error).splitlines()[0]}. "
-            "Set device to auto or cpu, or install what python -m stages.doctor says"
+            f"Set device to auto or cpu, or install what {command('doctor')} says"
         ) from None
     return device
 

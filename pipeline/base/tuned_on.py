@@ -14,9 +14,7 @@ TUNED_ON = "tuned_on.json"
 """In the folder of an adapter, or of a checkpoint that was tuned whole: no part of its digest."""
 _ATTRIBUTE = "tuned_on"
 """Of a store, where its model says it."""
-_STORE = Border(
-    StoreIncomplete, "Copy the store again, or extract it anew: python -m stages.extract."
-)
+_STORE = Border(StoreIncomplete, "Copy the store again, or extract it anew with stages.extract.")
 
 Tick = Annotated[int, Field(ge=0, le=10**12)]
 Side = Literal["train", "val", "test"]

@@ -10,6 +10,7 @@ from itertools import islice
 from pathlib import Path
 
 from pipeline.base.border import shown
+from pipeline.base.commands import command
 from pipeline.base.config import Source
 from pipeline.base.errors import RecordingError
 from pipeline.data import lerobot, pickled, raw, windowed
@@ -78,7 +79,7 @@ def episode_folders(source: Source, root: Path) -> list[tuple[Path, FormatReader
         _check_pattern(source, pattern, full)
         matches = _matches(full)
         if not matches:
-            lost = "" if root.is_dir() else f": {root} is no folder; see python -m stages.doctor"
+            lost = "" if root.is_dir() else f": {root} is no folder; see {command('doctor')}"
             files = glob.glob(str(full), recursive=True)  # noqa: PTH207
             hint = meant(Path(files[0]) if files else full) or _ON_THE_HUB
             raise RecordingError(

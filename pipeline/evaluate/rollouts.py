@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.stats import binomtest
 from tqdm import tqdm
 
+from pipeline.base.commands import command
 from pipeline.base.config import Level, RolloutAblation, RolloutParams
 from pipeline.base.errors import CheckpointMismatch, ConfigError
 from pipeline.base.table import Table
@@ -265,7 +266,7 @@ def refuse_other_robot(source: Mapping[str, Any], widths: Mapping[str, int]) -> 
             f"{', '.join(streams['views'])}, action {kind}, {channels}, action_hz {hz}, of the "
             f"phantom views {', '.join(VIEWS)}, action delta, action channels 7, state channels "
             f"12, sensor channels 1026, action_hz {TICK_HZ}. Judge it on its own recordings "
-            "(python -m stages.evaluate) and set rollout.environment to null, which leaves "
+            f"({command('evaluate')}) and set rollout.environment to null, which leaves "
             "rollouts out of dvc repro."
         )
 

@@ -173,7 +173,7 @@ def _repaired(store: Path) -> Path:
 
 def _completed_by(store: Path, plan: str) -> str:
     if plan.startswith(MERGED):
-        return f"the same python -m stages.store merge --into {quote(str(store))} that made it"
+        return f"the same stages.store merge --into {quote(str(store))} that made it"
     return extract_command(store)
 
 

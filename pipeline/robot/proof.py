@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from pipeline.base.commands import command
 from pipeline.base.errors import CheckpointMismatch
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.robot.features import LiveFeatures
@@ -72,7 +73,7 @@ def prove(checkpoint: PolicyCheckpoint, features: LiveFeatures, say: Callable[[s
                 "extraction."
             )
         lines.append(
-            "Compare with python -m stages.verify --checkpoint on the machine that trained the "
+            f"Compare with {command('verify', '--checkpoint')} on the machine that trained the "
             "head, or extract the store and train the head with the software of this one."
         )
         raise CheckpointMismatch("\n".join(lines))

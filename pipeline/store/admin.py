@@ -18,6 +18,7 @@ from typing import Literal
 
 import numpy as np
 
+from pipeline.base.commands import command
 from pipeline.base.digests import is_ledger
 from pipeline.base.durable import HELD, KEPT
 from pipeline.base.errors import ConfigError, PipelineError, StoreIncomplete, StoreLocked
@@ -188,7 +189,7 @@ def find_named(inventory: Inventory, paths: Sequence[Path]) -> list[Leftover]:
             why = leftover.why if leftover else "no leftover of a build"
             raise ConfigError(
                 f"stores.inputs: {path}: {why}. Nothing was removed; "
-                "python -m stages.store gc lists what may be."
+                f"{command('store', 'gc')} lists what may be."
             )
     return [leftover for leftover in named if leftover]
 

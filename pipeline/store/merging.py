@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from pipeline.base.commands import command
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import ConfigError, StoreMismatch
 from pipeline.base.golden import spread
@@ -194,7 +195,7 @@ def _checked_output(inputs: Sequence[Path], output: Path | None) -> Path:
         raise ConfigError(
             "stores.inputs: expected two or more stores, each named once, found "
             f"{', '.join(map(str, inputs)) or 'none'}. "
-            "Name them: python -m stages.store merge A.zarr B.zarr --into C.zarr"
+            f"Name them: {command('store', 'merge A.zarr B.zarr --into C.zarr')}"
         )
     if output is None or output.suffix != ".zarr" or output.resolve() in places:
         raise ConfigError(

@@ -7,6 +7,7 @@ import re
 import shlex
 from pathlib import Path
 
+from pipeline.base.commands import command
 from pipeline.base.config import setting
 
 _STORE = re.compile(
@@ -16,20 +17,20 @@ _STORE = re.compile(
 
 def extract_command(store: Path) -> str:
     """Makes a store, or completes the build of it."""
-    return f"python -m stages.extract {setting('extract.store', store)}"
+    return command("extract", setting("extract.store", store))
 
 
 def gc_command(path: Path) -> str:
     """Removes an unfinished build."""
-    return f"python -m stages.store gc {shlex.quote(str(path))} --remove"
+    return command("store", "gc", shlex.quote(str(path)), "--remove")
 
 
 def restore_command(archive: Path) -> str:
     """Makes a store from its archive, beside it."""
     name = archive.stem.removesuffix(".archive")
     store = archive.with_name(f"{name if name != archive.stem else name + '.restored'}.zarr")
-    places = f"{setting('archive.output', archive)} {setting('archive.store', store)}"
-    return f"python -m stages.archive --restore {places}"
+    places = setting("archive.output", archive), setting("archive.store", store)
+    return command("archive", "--restore", *places)
 
 
 def mend(path: Path) -> str:
@@ -37,10 +38,8 @@ def mend(path: Path) -> str:
     folder, store = _owner(path)
     if folder != store:
         return f"Remove it with {gc_command(folder)}, then run {extract_command(store)}."
-    return (
-        f"Run python -m stages.verify --repair {setting('verify.store', store)}, which keeps "
-        "what is sound, then what it says."
-    )
+    repair = command("verify", "--repair", setting("verify.store", store))
+    return f"Run {repair}, which keeps what is sound, then what it says."
 
 
 def start_over(path: Path) -> str:
@@ -50,8 +49,8 @@ def start_over(path: Path) -> str:
         return mend(path)
     return (
         "Without them its feature rows are of no use, and --repair cannot begin. Remove or rename "
-        f"{store}, then run {extract_command(store)}, which computes all of it, or python -m "
-        "stages.archive --restore, which takes it from an archive."
+        f"{store}, then run {extract_command(store)}, which computes all of it, or "
+        f"{command('archive', '--restore')}, which takes it from an archive."
     )
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.base.commands import command
 from pipeline.base.config import SplitParams
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import CheckpointMismatch, ConfigError, StoreMismatch
@@ -303,7 +304,7 @@ def check_store(checkpoint: PolicyCheckpoint, store: FeatureStore) -> None:
         raise CheckpointMismatch(
             f"the checkpoint does not fit {store.path} (the checkpoint -> the store):\n"
             f"{differing}\nName the store it was trained from in evaluate.store, extract with the "
-            "params it was trained with, or train again: python -m stages.train_head"
+            f"params it was trained with, or train again: {command('train_head')}"
         )
 
 

@@ -13,6 +13,7 @@ from pydantic import AliasChoices, Field, JsonValue, Strict, model_validator
 from safetensors import safe_open
 
 from pipeline.base.border import MOST_BYTES, Border, Document, Text, shown
+from pipeline.base.commands import command
 from pipeline.base.config import VLMParams
 from pipeline.base.errors import VLMError
 from pipeline.base.tuned_on import TunedOn, joined, read_tuned_on
@@ -65,7 +66,7 @@ def resolve_checkpoint(
         raise VLMError(
             f"{setting} {checkpoint:.200}: no such folder. Expected a folder in the hub's format "
             "(a JSON config and *.safetensors) or a hub id such as Qwen/Qwen2.5-VL-3B-Instruct. "
-            f"Set {setting} to one; `python -m stages.demo` writes the demo's checkpoint."
+            f"Set {setting} to one; `{command('demo')}` writes the demo's checkpoint."
         )
     return cached_checkpoint(checkpoint, revision) or _downloaded(checkpoint, revision, setting)
 
@@ -121,9 +122,9 @@ def _downloaded(checkpoint: str, revision: str | None, setting: str) -> Path:
         why = str(error).strip().splitlines()[0].rstrip(".")
         raise VLMError(
             f"{setting} {checkpoint:.200}: there is no folder of that name here; and as a hub id, "
-            f"it cannot be downloaded: {why}. If it is the demo's folder, run `python -m "
-            f"stages.demo`; if it is a hub id, run `hf download {checkpoint}` where there is "
-            f"network and set {setting} to the folder. `python -m stages.doctor` looks at the rest."
+            f"it cannot be downloaded: {why}. If it is the demo's folder, run "
+            f"`{command('demo')}`; if it is a hub id, run `hf download {checkpoint}` where there "
+            f"is network and set {setting} to the folder. `{command('doctor')}` looks at the rest."
         ) from error
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base import golden
+from pipeline.base.commands import command
 from pipeline.base.config import VLMParams
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import VLMError
@@ -127,7 +128,7 @@ def feature_shape(vlm: VLMParams, views: Sequence[str]) -> tuple[int, int]:
     if folder_here(str(Path(vlm.checkpoint).parent)) or not could_be_hub_id(vlm.checkpoint):
         raise VLMError(
             f"{vlm.checkpoint}: no such folder, and no hub id. The demo's checkpoint is written by "
-            "`python -m stages.demo`."
+            f"`{command('demo')}`."
         )
     return slots, _WIDTH_OF_3B
 

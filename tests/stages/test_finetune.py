@@ -1,6 +1,7 @@
 """`stages.finetune` as a user meets it: what it prints, how it stops, what it refuses."""
 
 import json
+import shlex
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -133,8 +134,8 @@ def test_it_tunes_and_says_how_to_go_on_and_that_works(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    params = str(write_params())
-    assert run("", finetune.main, ["--params", params]) == 0
+    params, seed = str(write_params()), "train_head.seed=1"
+    assert run("", finetune.main, ["--params", params, "--set", seed]) == 0
     captured = capsys.readouterr()
     assert captured.err == "", "no progress where there is no terminal"
     assert "vlm, learning" in captured.out
@@ -142,17 +143,19 @@ def test_it_tunes_and_says_how_to_go_on_and_that_works(
     assert "tuning: lora of rank 16 on the language and vision tower" in captured.out
     assert "step 4: train loss" in captured.out
     adapter, tuned = tmp_path / "tuned" / "best" / "adapter", extracted.parent / "made_tuned.zarr"
-    extracting = f"--set vlm.adapter={adapter} --set extract.store={tuned}"
     training = f"--set train_head.store={tuned}"
     apart = "--set train_head.output=models/made_tuned --set train_head.logs=reports/made_tuned"
-    assert f"python -m stages.extract {extracting}\n" in captured.out
-    assert f"python -m stages.train_head {training} {apart}_training\n" in captured.out
+    same = f"--params {params} --set {seed}"
+    assert f"python -m stages.train_head {training} {apart}_training {same}\n" in captured.out
     assert f"python -m stages.evaluate --set evaluate.store={tuned} " in captured.out
 
-    assert run("", finetune.main, ["--params", params]) == 0
+    assert run("", finetune.main, ["--params", params, "--set", seed]) == 0
     assert "nothing to do" in capsys.readouterr().out
 
-    assert run("", extract.main, ["--params", params, *extracting.split()]) == 0
+    _, _, printed = captured.out.partition("python -m stages.extract ")
+    assert run("", extract.main, shlex.split(printed.splitlines()[0])) == 0, "as it was printed"
+    spec = json.loads((tuned / "zarr.json").read_text())["attributes"]["feature_spec"]
+    assert spec["adapter"] is not None and adapter.is_dir()
     assert run("", train_head.main, ["--params", params, *training.split()]) == 0
     report = tmp_path / "report"
     judged = [f"evaluate.checkpoint={tmp_path / 'tuned'}", f"evaluate.output={report}"]

@@ -73,8 +73,8 @@ def test_a_damaged_store_says_what_is_wrong_and_what_to_run_next(verified, store
     err = capsys.readouterr().err
     assert err.startswith(f"error: {store}: the store is damaged:\n")
     assert "VL row 17: its bytes do not give its checksum; right/episode_001" in err
-    assert f"python -m stages.verify --repair --set verify.store={store}, which" in err
-    assert "which keeps what is sound, then what it says." in err
+    assert f"python -m stages.verify --repair --set verify.store={store} --params " in err
+    assert ", which keeps what is sound, then what it says." in err
 
 
 def test_repair_begins_a_build(verified, store, capsys):
@@ -82,7 +82,7 @@ def test_repair_begins_a_build(verified, store, capsys):
     assert verified("--repair") == 0
     said = capsys.readouterr().out
     assert "59 of 60 feature rows taken over, 1 to compute" in said
-    assert f"run next: python -m stages.extract --set extract.store={store}, which" in said
+    assert f"run next: python -m stages.extract --set extract.store={store} --params " in said
     assert part_path(store).is_dir()
     assert verified("--repair") == 2
     assert "a repair of it has begun" in capsys.readouterr().err

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import torch
 
+from pipeline.base.commands import command
 from pipeline.base.config import Params, VLMParams
 from pipeline.base.errors import VLMError
 from pipeline.base.format import size
@@ -65,7 +66,7 @@ def absent_checkpoint(params: Params) -> Issue:
     checkpoint, subject = params.vlm.checkpoint, "vlm.checkpoint"
     absent, remedy = f"{checkpoint}: not on this machine", f"hf download {checkpoint}"
     if Path(checkpoint) == params.demo.checkpoint:
-        return missing(subject, absent, "python -m stages.demo (or dvc repro)")
+        return missing(subject, absent, f"{command('demo')} (or dvc repro)")
     if not checkpoint_folder.could_be_hub_id(checkpoint):
         return missing(subject, f"{absent}, and no hub id", _EXAMPLE)
     return note(subject, f"{absent}; the first extraction downloads it", remedy)

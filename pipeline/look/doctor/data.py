@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
+from pipeline.base.commands import command
 from pipeline.base.config import MediaLimits, Params, Source
 from pipeline.base.errors import RecordingError
 from pipeline.base.issue import Issue
@@ -18,7 +19,7 @@ _VIDEOS = {".mp4", ".mkv", ".avi", ".mov", ".webm"}
 def check(params: Params) -> Iterator[Issue]:
     """`data.root` and each source; metadata is read, and one frame of a video."""
     data = params.data
-    demo = "python -m stages.demo (or dvc repro)" if data.root == params.demo.recordings else ""
+    demo = f"{command('demo')} (or dvc repro)" if data.root == params.demo.recordings else ""
     relative = any(not Path(path).is_absolute() for source in data.sources for path in source.paths)
     if relative and not data.root.is_dir():
         text = f"{data.root}: no such folder"

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.base.commands import command
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import RecordingError, StoreMismatch
 from pipeline.data.arrays import member, read_npz
@@ -33,7 +34,7 @@ def compare_keys(recording: str | Path, store: FeatureStore) -> str:
     if len(episodes) != 1:
         raise StoreMismatch(
             f"{store.path}: expected the one episode of {root}, found {len(episodes)} of "
-            f"{len(store.episodes)} at such a path. Extract the recording: python -m stages.extract"
+            f"{len(store.episodes)} at such a path. Extract the recording: {command('extract')}"
         )
     rows = slice(episodes[0].vl_rows.start, episodes[0].vl_rows.stop)
     known = {key.tobytes() for key in keys}

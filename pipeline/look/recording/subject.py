@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from shlex import quote
 
+from pipeline.base.commands import command
 from pipeline.base.config import InspectParams, Params, Source
 from pipeline.base.errors import ConfigError, RecordingError
 from pipeline.base.ownership import REPORT, refuse_foreign
@@ -69,7 +70,7 @@ def subject_of(params: Params) -> Subject:
     if stores and len(matches) > 1:
         raise ConfigError(
             f"inspect.path: {stores[0]} is a store, and {len(matches) - 1} more paths are named. "
-            f"Look at it alone: python -m stages.inspect {quote(str(stores[0]))}"
+            f"Look at it alone: {command('inspect', quote(str(stores[0])))}"
         )
     # The last part of the first path that is no pattern.
     parts = [part for part in Path(places[0]).absolute().parts if not glob.has_magic(part)]

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipeline.base.commands import command
 from pipeline.base.config import InspectParams, setting
 from pipeline.base.errors import StoreIncomplete
 from pipeline.base.format import duration, size
@@ -111,6 +112,6 @@ def _tiles(view: StoreView) -> list[tuple[str, str]]:
 def _checked(view: StoreView) -> Text:
     looked_at, total = len(view.features.sampled.rows), view.features.sampled.total
     which = f"all {total:,}" if looked_at == total else f"{looked_at:,} of {total:,}"
-    command = f"python -m stages.verify {setting('verify.store', view.store.path)}"
+    verify = command("verify", setting("verify.store", view.store.path))
     words = f"Metadata, clocks, offsets and the features of {which} VL rows give the checksums"
-    return Text(f"{words} that were written with them; `{command}` reads every byte.")
+    return Text(f"{words} that were written with them; `{verify}` reads every byte.")

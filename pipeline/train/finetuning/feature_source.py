@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 
+from pipeline.base.commands import command
 from pipeline.base.config import FinetuneParams, Params, TrainHeadParams, setting
 from pipeline.base.digests import file_digest
 from pipeline.base.durable import read_document, write_with_digest
@@ -160,7 +161,7 @@ def head_params(params: Params) -> TrainHeadParams:
         raise ConfigError(
             "finetune.tuning.method is none, so nothing of the vision-language model would learn. "
             "Set it to lora or full; a policy on the model as it is comes from the store alone: "
-            "python -m stages.train_head"
+            f"{command('train_head')}"
         )
     if not params.train_head.features_enabled:
         raise ConfigError(
@@ -197,16 +198,18 @@ def next_steps(finetune: FinetuneParams, store: FeatureStore) -> list[str]:
     """What to run with a tuned model, as lines for the user."""
     learned = finetune.output / "best" / learned_name(finetune)
     tuned = store.path.with_name(f"{store.path.stem}_tuned.zarr")
-    model = setting("vlm.adapter", learned)
+    model = [setting("vlm.adapter", learned)]
     if finetune.tuning.method == "full":
-        model = f"{setting('vlm.checkpoint', learned)} --set vlm.adapter=null"
+        model = [setting("vlm.checkpoint", learned), "--set vlm.adapter=null"]
     head, logs = Path("models", tuned.stem), Path("reports", f"{tuned.stem}_training")
-    return [
-        "next, extract the tuned model's features, train a head on them and evaluate it:",
-        f"  python -m stages.extract {model} {setting('extract.store', tuned)}",
-        f"  python -m stages.train_head {setting('train_head.store', tuned)} "
-        f"{setting('train_head.output', head)} {setting('train_head.logs', logs)}",
-        f"  python -m stages.evaluate {setting('evaluate.store', tuned)} "
-        f"{setting('evaluate.checkpoint', head)} "
-        f"{setting('evaluate.output', Path('reports', tuned.stem))}",
-    ]
+    report = Path("reports", tuned.stem)
+    places: dict[str, dict[str, Path]] = {
+        "extract": {"store": tuned},
+        "train_head": {"store": tuned, "output": head, "logs": logs},
+        "evaluate": {"store": tuned, "checkpoint": head, "output": report},
+    }
+    lines = ["next, extract the tuned model's features, train a head on them and evaluate it:"]
+    for stage, keys in places.items():
+        settings = [setting(f"{stage}.{key}", place) for key, place in keys.items()]
+        lines.append(f"  {command(stage, *(model if stage == 'extract' else ()), *settings)}")
+    return lines

@@ -5,6 +5,7 @@ from contextlib import closing
 
 from tqdm import tqdm
 
+from pipeline.base.commands import command
 from pipeline.base.config import Params
 from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.base.errors import RecordingError, StoreMismatch
@@ -14,7 +15,6 @@ from pipeline.train.split import list_differences
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 
 _SHOWN = 5
-_EXTRACT = "python -m stages.extract"
 
 
 def find_recordings(store: FeatureStore, params: Params) -> tuple[Recording, ...]:
@@ -67,7 +67,7 @@ def check_spec(store: FeatureStore, params: Params, digests: ContentDigests) -> 
             f"feature spec is not that of vlm (store -> vlm):\n"
             f"{list_differences(stored, spec.attrs())}\n"
             "Set vlm to what the store was extracted with, name another store in "
-            f"train_head.store, or extract one with these params: {_EXTRACT}"
+            f"train_head.store, or extract one with these params: {command('extract')}"
         )
     return spec
 
@@ -90,5 +90,5 @@ def _refuse(store: FeatureStore, wrong: Sequence[tuple[Episode, str]]) -> None:
         f"{store.path}: expected the recordings that the store was extracted from, but of its "
         f"{len(store.episodes)} episodes {len(wrong)} cannot be found as they were, the first:\n"
         f"{lines}\nPut the recordings back (data.root, data.sources), or extract a store of what "
-        f"is there now: {_EXTRACT}"
+        f"is there now: {command('extract')}"
     )
