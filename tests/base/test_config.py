@@ -231,6 +231,21 @@ def test_many_unknown_keys_and_what_cannot_be_printed_make_a_short_message(tmp_p
     assert len(str(caught.value)) < 20_000
 
 
+@pytest.mark.parametrize(
+    "key", ["extract.store", "data.root", "vlm.checkpoint", "vlm.adapter", "inspect.path"]
+)
+def test_a_home_is_to_be_written_out(key):
+    with pytest.raises(ConfigError, match=rf"{key}: ~ is not expanded; write {Path.home()}/x.zarr"):
+        load_params(ROOT / "params.yaml", [f"{key}=~/x.zarr"])
+
+
+@pytest.mark.parametrize("key", ["train_head.output", "evaluate.output", "archive.output"])
+def test_no_output_lies_inside_a_store(key):
+    for place in ("a.zarr/vl/head.zarr", "b/a.zarr.part/x.zarr"):
+        with pytest.raises(ConfigError, match=rf"{key}: must not lie inside a store"):
+            load_params(ROOT / "params.yaml", [f"{key}={place}"])
+
+
 def test_dates_are_texts_and_an_alias_has_a_value_of_its_own(tmp_path):
     path = tmp_path / "params.yaml"
     path.write_text(

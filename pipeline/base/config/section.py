@@ -2,7 +2,7 @@
 
 import os
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -17,24 +17,40 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 Seed = Annotated[int, Field(ge=0, lt=2**53)]
 
 
+_Paths = TypeVar("_Paths", Path, str, str | tuple[str, ...])
+
+
+def _without_home(paths: _Paths) -> _Paths:
+    """DVC takes `~` for a name, so it has no other meaning here either."""
+    for path in paths if isinstance(paths, tuple) else [str(paths)]:
+        if path.startswith("~") and (place := os.path.expanduser(path)) != path:  # noqa: PTH111
+            raise ValueError(f"~ is not expanded; write {place}")
+    return paths
+
+
 def _bounded(path: Path) -> Path:
     if len(str(path)) > 3000 or any(len(os.fsencode(part)) > 200 for part in path.parts):
         raise ValueError("expected a path of at most 3,000 characters, a name of at most 200 bytes")
     return path
 
 
-Place = Annotated[Path, AfterValidator(_bounded)]
+Place = Annotated[Path, AfterValidator(_without_home), AfterValidator(_bounded)]
 """A file or folder; its name leaves room for the endings of what is written beside it."""
+PathOrName = Annotated[str, AfterValidator(_without_home)]
+"""A path, or the id of something on the hub."""
+Globs = Annotated[str | tuple[str, ...], AfterValidator(_without_home)]
 
 
-def _has_a_name(path: Path) -> Path:
+def _is_apart(path: Path) -> Path:
     if not path.name:
         raise ValueError("must be a folder of its own")
+    if stores := [part for part in path.parts[:-1] if ".zarr" in Path(part).suffixes]:
+        raise ValueError(f"must not lie inside a store ({stores[0]})")
     return path
 
 
-OwnFolder = Annotated[Place, AfterValidator(_has_a_name)]
-"""One that is written beside its place and renamed."""
+Output = Annotated[Place, AfterValidator(_is_apart)]
+"""A folder that a command writes."""
 
 
 def _keeps_truth(given: Any, taken: Any) -> bool:

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator
 
-from pipeline.base.config.section import Place, Section, Seed
+from pipeline.base.config.section import Globs, Output, PathOrName, Place, Section, Seed
 from pipeline.base.config.stores import Workers
 
 RecordingFormat = Literal["auto", "raw", "new", "old", "lerobot"]
@@ -17,9 +17,9 @@ GridSide = Annotated[int, Field(ge=1, le=64)]
 class DemoParams(Section):
     """The simulated recordings and the small checkpoint that `stages.demo` writes."""
 
-    recordings: Place = Path("data/demo")
+    recordings: Output = Path("data/demo")
     """Folder of the four sets of recordings."""
-    checkpoint: Place = Path("models/demo_vlm")
+    checkpoint: Output = Path("models/demo_vlm")
     """Folder of a small Qwen2.5-VL with random weights."""
     episodes: int = Field(default=36, ge=2, le=10_000)
     """Episodes a format."""
@@ -44,7 +44,7 @@ class Source(Section):
 
     name: str = Field(min_length=1, max_length=200)
     """What `train_head.mixture` and reports call it."""
-    path: str | tuple[str, ...]
+    path: Globs
     """Globs or paths: episode folders, folders of such, or LeRobot roots; relative to data.root."""
     format: RecordingFormat = "auto"
     """`auto` goes by the files that are there."""
@@ -111,11 +111,11 @@ class AugmentationParams(Section):
 class VLMParams(Section):
     """Which frozen model says what about an image; all but `attention` is a feature's identity."""
 
-    checkpoint: str = Field(min_length=1, max_length=3000)
+    checkpoint: PathOrName = Field(min_length=1, max_length=3000)
     """A Qwen2.5-VL checkpoint folder or hub id."""
     revision: str | None = None
     """Of a hub id."""
-    adapter: str | None = None
+    adapter: PathOrName | None = None
     """Folder of a peft adapter, merged into the weights."""
     dtype: Dtype = "bfloat16"
     """What the model computes in."""
@@ -155,7 +155,7 @@ class VLMParams(Section):
 class ExtractParams(Section):
     """Where the store goes and how it is computed; only store and dtypes decide what it holds."""
 
-    store: Place = Path("cache_store/demo.zarr")
+    store: Output = Path("cache_store/demo.zarr")
     """Written once, then never modified."""
     dtype: Dtype = "float32"
     """Of stored features."""
@@ -188,7 +188,7 @@ class ExtractParams(Section):
 class InspectParams(Section):
     """What is looked at, and how much of it is shown."""
 
-    path: str | tuple[str, ...] | None = None
+    path: Globs | None = None
     """Recordings, folders or globs of them, or a store; the recordings of `data.sources` where
     null or none. Ticks, views and the feature spec follow the sections `data` and `vlm`."""
     format: RecordingFormat = "auto"
@@ -204,6 +204,6 @@ class InspectParams(Section):
     """VL rows of a store that pictures show at most, evenly spread."""
     seed: Seed = 0
     """Of the choice of samples."""
-    output: Place = Path("reports/inspect")
+    output: Output = Path("reports/inspect")
     """Folder of the page and its pictures. Where it is not given, what `path` names has a folder of
     its own in reports/inspect, so that one inspection leaves another's page alone."""

@@ -13,7 +13,7 @@ from pipeline.base.config.policy import (
     SensorEncoderParams,
     StateEncoderParams,
 )
-from pipeline.base.config.section import Fraction, OwnFolder, Place, Section, Seed
+from pipeline.base.config.section import Fraction, Output, Place, Section, Seed
 
 ModelType = Literal["regression", "diffusion", "flow_matching"]
 FusionStrategy = Literal["concat", "cross_attention", "gated", "none"]
@@ -178,9 +178,9 @@ class TrainHeadParams(Section):
     it: DVC runs the stage where code has changed, too."""
     store: Place | None = None
     """The store to train from; `extract.store` where null. Another one DVC does not watch."""
-    output: OwnFolder = Path("models/head")
+    output: Output = Path("models/head")
     """Folder of the best and the last checkpoint."""
-    logs: OwnFolder = Path("reports/train_head")
+    logs: Output = Path("reports/train_head")
     """Folder of the curves."""
     loggers: tuple[LoggerName, ...] = ()
     """Who shows the curves while it trains, beside the files that DVC plots: `tensorboard` event
@@ -200,7 +200,7 @@ class EvaluateParams(Section):
     checkpoint: Place | None = None
     """A training run's folder, or one checkpoint in it; `train_head.output` where null. Another one
     DVC does not watch."""
-    output: Place = Path("reports/evaluate")
+    output: Output = Path("reports/evaluate")
     """Folder of metrics, tables and pictures."""
     batch_size: int = Field(default=64, ge=1, le=2**16)
     """Ticks a forward pass."""
@@ -256,7 +256,7 @@ class RolloutParams(Section):
     as VLA_SERVE_TOKEN."""
     device: str = "auto"
     """auto, cpu, cuda or cuda:N."""
-    output: Place = Path("reports/rollout")
+    output: Output = Path("reports/rollout")
     """Folder of metrics, table and page."""
 
 
@@ -294,7 +294,7 @@ class ExportParams(Section):
 
     checkpoint: Place | None = None
     """A training run's folder, or one checkpoint in it; `train_head.output` where null."""
-    output: Place = Path("models/export")
+    output: Output = Path("models/export")
     """Folder of the files and their receipt."""
     formats: tuple[ExportFormat, ...] = Field(default=("onnx", "torch"), min_length=1)
     """onnx: `head.onnx`, for ONNX Runtime. torch: `head.pt2`, for `torch.export.load`."""
@@ -318,7 +318,7 @@ class CompareParams(Section):
 
     reports: Place = Path("reports/experiments")
     """Folder of evaluation folders, each named after its experiment."""
-    output: Place = Path("reports/comparison")
+    output: Output = Path("reports/comparison")
     """Folder of the table and the picture."""
 
 
@@ -367,7 +367,7 @@ class FinetuneParams(Section):
     """Steps between checkpoints."""
     decode_threads: int = Field(default=2, ge=1, le=256)
     """Threads that decode and resize while the model works."""
-    output: OwnFolder = Path("models/finetune")
+    output: Output = Path("models/finetune")
     """Folder of the best and the last checkpoint; the adapter is `best/adapter`."""
-    logs: OwnFolder = Path("reports/finetune")
+    logs: Output = Path("reports/finetune")
     """Folder of the curves."""

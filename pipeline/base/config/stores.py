@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
-from pipeline.base.config.section import Place, Section, Seed
+from pipeline.base.config.section import Output, Place, Section, Seed
 
 
 def _workers(value: Any) -> Any:
@@ -51,7 +51,7 @@ class ArchiveParams(Section):
 
     store: Place | None = None
     """`extract.store` where null."""
-    output: Place | None = None
+    output: Output | None = None
     """The archive; `<name>.archive.zarr` beside the store where null."""
     restore: bool = False
     """Make the store from the archive, bit for bit, instead."""
@@ -88,7 +88,7 @@ class ProbeParams(Section):
     check_store: bool = True
     """Read the store once before, and refuse a chunk that does not give its checksum; false where
     that takes too long."""
-    output: Place = Path("reports/probe")
+    output: Output = Path("reports/probe")
     """Folder of the table and the picture."""
 
 
@@ -103,7 +103,7 @@ class StoresParams(Section):
     """Folders of trained policies, which say what store they were trained on."""
     inputs: tuple[Place, ...] = ()
     """Of `merge`: the stores that become one."""
-    output: Place | None = None
+    output: Output | None = None
     """Of `merge`: the new store."""
     remove: bool = False
     """Of `gc`: remove what is listed; else it is only listed."""
