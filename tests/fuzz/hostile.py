@@ -1,4 +1,5 @@
-"""What somebody would write on purpose: each a change of a file of the corpus, in one table.
+"""What chance never does to one file: accidents of several files, and what somebody would write on
+purpose. Each is a change of a thing of the corpus, in one table.
 
 Nothing of it may run code, open what lies elsewhere, take gigabytes or go on for ever. What runs
 makes the file CANARY in the folder of the case, where commands are run.
@@ -18,9 +19,11 @@ from typing import Any
 
 import av
 import numpy as np
+import pyarrow.parquet as pq
+import zarr
 from PIL import Image
 
-from tests.fuzz.mutations import resized, rewrite
+from tests.fuzz.mutations import Permit, in_mode, resized, rewrite, with_column
 
 CANARY = "canary"
 Act = Callable[[Path], object]
@@ -180,6 +183,91 @@ def _manifest(store: dict[str, Any]) -> None:
     metadata["../../escaped/zarr.json"] = metadata["zarr.json"]
 
 
+def _frames(change: Callable[[int, Path], Path]) -> Act:
+    """Change every frame of a view and its name, in the pickle of the old format too."""
+
+    def act(path: Path) -> None:
+        frames = sorted(path.parent.iterdir())
+        names = {frame.name: change(n, frame).name for n, frame in enumerate(frames)}
+        for file in path.parents[2].glob("data.pkl"):
+            content = pickle.loads(file.read_bytes())
+            for paths in content["image"].values():
+                split = (path.rpartition("/") for path in paths)
+                paths[:] = [f"{folder}/{names[name]}" for folder, _, name in split]
+            rewrite(file, pickle.dumps(content))
+
+    return act
+
+
+def _png(_: int, frame: Path) -> Path:
+    with Image.open(frame) as picture:
+        picture.save(frame.with_suffix(".png"))
+    frame.unlink()
+    return frame.with_suffix(".png")
+
+
+def _numbered(number: int, frame: Path) -> Path:
+    return frame.rename(frame.with_name(f"{number + 1:06d}.jpg"))
+
+
+def _twin(_: int, frame: Path) -> Path:
+    """A frame of another camera, a tenth of a second later."""
+    time = float(frame.stem.rpartition("_")[2]) + 0.1
+    shutil.copy(frame, frame.with_name(f"zed_2_left_{time:.3f}.jpg"))
+    return frame
+
+
+def _lower(frame: Path) -> None:
+    frame.parent.rename(frame.parents[1] / frame.parent.name.lower())
+
+
+def _grey(path: Path) -> None:
+    rewrite(path, in_mode(path.read_bytes(), "I;16"))
+
+
+def _grey_cells(path: Path) -> None:
+    """Likewise of the images in the rows of a table."""
+    table, name = pq.ParquetFile(path).read(), "observation.images.top"
+    rows = [{**row, "bytes": in_mode(row["bytes"], "I;16")} for row in table[name].to_pylist()]
+    path.unlink()
+    pq.write_table(with_column(table, name, rows), path)
+
+
+def _in_place_of(other: str) -> Act:
+    """Link the chunk of another array of a store in the place of one's."""
+
+    def act(path: Path) -> None:
+        (path.parent / "c/0").unlink()
+        os.link(path.parents[2] / other / "c/0", path.parent / "c/0")
+
+    return act
+
+
+def _exchanged(other: str) -> Act:
+    """Exchange the chunks of two arrays of a store."""
+
+    def act(path: Path) -> None:
+        data = (path.parent / "c/0").read_bytes()
+        _in_place_of(other)(path)
+        rewrite(path.parents[2] / other / "c/0", data)
+
+    return act
+
+
+def _backwards(*arrays: str) -> Act:
+    """Have the rows of a store's arrays in reverse, in chunks that give their checksums."""
+
+    def act(path: Path) -> None:
+        for name in arrays:
+            folder = path.parents[2] / name
+            for chunk in (path for path in (folder / "c").rglob("*") if path.is_file()):
+                rewrite(chunk, chunk.read_bytes())
+            array: Any = zarr.open_array(folder, mode="r+")
+            array[:] = array[:][::-1]
+
+    return act
+
+
 # --- the tables ----------------------------------------------------------------------------------
 
 
@@ -226,7 +314,32 @@ _CONCAT = "ffconcat version 1.0\nfile {}\n"
 _INFO, _CONFIG, _TOKENS = "meta/info.json", "config.json", "tokenizer_config.json"
 _PIXELS, _WEIGHTS, _LORA = "preprocessor_config.json", "model.safetensors", "adapter_config.json"
 
-HOSTILE: list[tuple[str, str, str, Act]] = [
+ACCIDENTS: list[tuple[str, str, str, Act, Permit]] = [
+    *((name, "View1/*.jpg", "PNGs", _frames(_png), "same") for name in ("raw", "new")),
+    ("raw", "View5/*.jpg", "one PNG", _frames(lambda n, f: f if n else _png(n, f)), "same"),
+    ("old", "View1/left/*.jpg", "numbers", _frames(_numbered), "refuse"),
+    *((name, "View1/*.jpg", "two cameras", _frames(_twin), "refuse") for name in ("raw", "new")),
+    *((name, "View1/*.jpg", "view1/", _lower, "same") for name in ("raw", "new")),
+    ("new", "View2/*.jpg", "no View2", lambda path: shutil.rmtree(path.parent), "refuse"),
+    ("new", "View2/*.jpg", "no images/", lambda path: shutil.rmtree(path.parents[1]), "refuse"),
+    ("lerobot_v21", _INFO, "fps of 30", _set(fps=30), "refuse"),
+    ("lerobot_images", _INFO, "fps of 5", _set(fps=5), "refuse"),
+    ("raw", "*.jpg", "grey of 16 bits", _grey, "plain"),
+    ("lerobot_images", "data/*/*.parquet", "grey of 16 bits", _grey_cells, "plain"),
+    ("store", "sensor/time/zarr.json", "a link", _in_place_of("state/time"), "refuse"),
+    ("store", "sensor/time/zarr.json", "an exchange", _exchanged("state/time"), "refuse"),
+    ("store", "tick/action/zarr.json", "an older chunk", _backwards("tick/action"), "refuse"),
+    (
+        "store",
+        "vl/features/zarr.json",
+        "rows with checksums of their own",
+        _backwards("vl/features", "vl/checksum"),
+        "refuse",
+    ),
+]
+"""As below, and what each permits: the file is still one of its kind."""
+HOSTILE: list[tuple[str, str, str, Act] | tuple[str, str, str, Act, Permit]] = [
+    *ACCIDENTS,
     *(("old", "data.pkl", name, _put(data)) for name, data in PICKLES.items()),
     ("lerobot_v21", _INFO, "a path of 3 GB", _set(data_path="{episode_index:3000000000d}")),
     ("lerobot_v30", _INFO, "a path of 3 GB", _set(video_path="{file_index:03000000000d}.mp4")),
