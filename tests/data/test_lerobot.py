@@ -879,11 +879,8 @@ FILE_MEND = r".*Copy the file again, or leave the episode out"
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("[" * 100_000, "cannot be read as JSON: recursion limit"),
-        ('{"features":' + '{"a":' * 100_000, "cannot be read as JSON: recursion limit"),
         ('{"fps": 1' + "0" * 400 + "}", ".*fps: expected a finite number, found 1000"),
         ('{"codebase_version": "\\ud800"}', "cannot be read as JSON: .*hex escape"),
-        ('{"a": "' + "x" * 2**23 + '"}', "expected at most 8,388,608 bytes"),
         ("null", "expected an object, found None"),
     ],
 )

@@ -3,6 +3,8 @@
 import json
 import re
 import shutil
+import subprocess
+import sys
 from functools import partial
 from pathlib import Path
 
@@ -286,6 +288,23 @@ def test_recordings_without_any_frame(capsys, params_file, tmp_path):
     assert "WARNING: none of the 3 episode(s) has a frame" in capsys.readouterr().out
     assert run("", main, [*options, "--set", "data.views=[]"]) == 0
     assert "has a frame" not in capsys.readouterr().out
+
+
+def test_a_plan_of_known_files_asks_its_ledger_once_and_needs_no_pandas(params_file, tmp_path):
+    write_small_lerobot(tmp_path / "day1/run", "v3.0", image=True)
+    code = (
+        "import sys\nfrom pipeline.base.digests import ContentDigests\n"
+        "from stages.command import run\nask, asked = ContentDigests._ask, []\n"
+        "ContentDigests._ask = lambda own, *told: [asked.append(told[0]), ask(own, *told)][1]\n"
+        "for _ in range(2):\n    asked.clear()\n"
+        "    assert not run('', 'stages.extract', sys.argv[1:])\n"
+        "print(sum(told.startswith('SELECT') for told in asked), 'pandas' in sys.modules)"
+    )
+    command = [sys.executable, "-c", code, "--params", str(params_file)]
+    done = subprocess.run(
+        [*command, "--set", "extract.plan=true"], cwd=ROOT, capture_output=True, text=True
+    )
+    assert done.stdout.splitlines()[-1:] == ["1 False"], done.stderr
 
 
 def test_the_first_ten_of_many_bad_episodes_are_listed(capsys, params_file, tmp_path):
