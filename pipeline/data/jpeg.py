@@ -103,10 +103,14 @@ def _check_one_camera(view: str, timed: Sequence[tuple[float, str]]) -> None:
         one, other, *_ = of_camera.values()
         pairs.append((one, other))
     for one, other in pairs[:1]:
-        raise RecordingError(
-            f"{one}: expected the frames of one camera in {view}, found also {other}. Move those "
-            "of another camera or form into a folder of their own"
-        )
+        raise _two_cameras(view, one, other)
+
+
+def _two_cameras(view: str, one: str | Path, other: str | Path) -> RecordingError:
+    return RecordingError(
+        f"{one}: expected the frames of one camera in {view}, found also {other}. Move those "
+        "of another camera or form into a folder of their own"
+    )
 
 
 def list_views(folder: Path, prefix: str = "") -> dict[str, list[Path]]:
@@ -118,8 +122,13 @@ def list_views(folder: Path, prefix: str = "") -> dict[str, list[Path]]:
     found: dict[tuple[str, str], list[Path]] = {}
     for view in _view_folders(folder, prefix):
         base, _ = split_eye(view.name)
+        firsts: dict[str, Path] = {}
         for eye, path in _frames(view):
             found.setdefault((base, eye), []).append(path)
+            firsts.setdefault(eye, path)
+        if "" in firsts and len(firsts) > 1:
+            one, other, *_ = firsts.values()
+            raise _two_cameras(view.name, one, other)
     return name_views(found)
 
 

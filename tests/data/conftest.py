@@ -4,6 +4,7 @@ import json
 import pickle
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -185,11 +186,11 @@ def shade_of(index: int) -> int:
     return 20 + 11 * index % 200
 
 
-def png(shade: int) -> bytes:
-    from io import BytesIO
-
-    buffer = BytesIO()
-    Image.fromarray(shaded(shade)).save(buffer, "PNG")
+def png(shade: int, grey_of_16_bits: bool = False) -> bytes:
+    pixels, buffer = shaded(shade), BytesIO()
+    if grey_of_16_bits:
+        pixels = pixels[:, :, 0].astype(np.uint16) * 257
+    Image.fromarray(pixels).save(buffer, "PNG")
     return buffer.getvalue()
 
 

@@ -117,6 +117,14 @@ def test_frames_of_two_cameras_are_not_interleaved(names):
         JpegCamera("View1", [Path(name) for name in names])
 
 
+@pytest.mark.parametrize("name", ["zed_2_left_1.1.jpg", "right/1.0.jpg"])
+def test_frames_with_an_eye_are_of_another_camera_than_those_without(tmp_path, write, name):
+    for file in ("1.0.jpg", name):
+        write.jpeg(tmp_path / "View1" / file)
+    with pytest.raises(RecordingError, match="expected the frames of one camera in View1"):
+        list_views(tmp_path)
+
+
 def test_any_image_is_a_frame_and_view_names_differ_by_more_than_case(tmp_path):
     for name in ("view1/1.0.png", "View2/2.0.bmp", "View3/Thumbs.db"):
         (tmp_path / name).parent.mkdir()

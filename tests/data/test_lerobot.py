@@ -327,6 +327,17 @@ def test_images_in_rows_are_read_lazily(tmp_path, write, version):
     assert shades(camera.read(indices)) == [write.shade_of(12 + index) for index in indices]
 
 
+def test_grey_images_of_16_bits_in_rows_are_shown_in_eight(tmp_path, write):
+    cells = [{"bytes": write.png(shade, grey_of_16_bits=True), "path": None} for shade in (30, 200)]
+    root = write.lerobot(
+        tmp_path / "set", image=True, lengths=(7,), **{KEY: [*cells, *cells * 2, cells[0]]}
+    )
+    camera = opened(root).recordings[0].cameras()["top"]
+    camera.check([0, 1])
+    for frame, shade in zip(camera.read([0, 1]), (30, 200), strict=True):
+        np.testing.assert_array_equal(frame, write.shaded(shade))
+
+
 def test_a_spoilt_image_in_a_row_is_named(tmp_path, write):
     whole = write.png(50)
     cells = [{"bytes": whole, "path": None}] * 4 + [{"bytes": whole[:90], "path": None}]
@@ -868,11 +879,8 @@ FILE_MEND = r".*Copy the file again, or leave the episode out"
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("[" * 100_000, "cannot be read as JSON: recursion limit"),
-        ('{"features":' + '{"a":' * 100_000, "cannot be read as JSON: recursion limit"),
         ('{"fps": 1' + "0" * 400 + "}", ".*fps: expected a finite number, found 1000"),
         ('{"codebase_version": "\\ud800"}', "cannot be read as JSON: .*hex escape"),
-        ('{"a": "' + "x" * 2**23 + '"}', "expected at most 8,388,608 bytes"),
         ("null", "expected an object, found None"),
     ],
 )

@@ -171,13 +171,13 @@ class Case:
         if self.whole:
             return Change("nothing", self.place, "same")
         if self.kind == "hostile":
-            _, pattern, what, act = HOSTILE[self.turn % len(HOSTILE)]
+            _, pattern, what, act, *permitted = HOSTILE[self.turn % len(HOSTILE)]
             paths = sorted(path for path in self.folder.rglob(pattern) if path.is_file())
             path = self.rng.choice(paths)
             act(path)
-            permits = "plain" if what == "an AVI" else "refuse"
+            permits = permitted[0] if permitted else "plain" if what == "an AVI" else "refuse"
             sound = self.subject.kind != "recordings" and what != "a terabyte"
-            return Change(what, path, permits, sound=sound)
+            return Change(what, path, permits, sound=sound or bool(permitted))
         change = change_any(self.rng, self.place, self.corpus / "other" / self.subject.place)
         sealed = change.path.name in ("zarr.json", "policy.json") and change.path.is_file()
         if sealed and self.rng.random() < 0.6:

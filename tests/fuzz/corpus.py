@@ -103,12 +103,12 @@ def write_recordings(root: Path, seed: int) -> None:
 
 
 def _write_sidecars(root: Path, name: str, rows: int, rng: np.random.Generator) -> None:
-    clock = np.arange(8 * rows) / 80 - 0.02
     named = {
         "sensor": {"names": ["force", "depth"], "units": ["N", "mm"]},
         "state": {"names": ["a", "b", "c"], "units": ["deg", "deg", ""]},
     }
-    for folder, described in named.items():
+    for late, (folder, described) in enumerate(named.items()):
+        clock = np.arange(8 * rows) / 80 - 0.02 + 0.001 * late
         (root / folder).mkdir(exist_ok=True)
         np.savez(
             root / folder / name,

@@ -309,27 +309,33 @@ def edit_parquet(rng: Random, data: bytes) -> Edited:
     names = table.column_names
     name = rng.choice([name for name in names if not name.startswith("stats/")])
     rows, wrong = table[name].to_pylist(), rng.choice(CONSTANTS)
+    images = ["image"] * 20 * isinstance(table[name].type, pa.StructType)
     match rng.choice(
-        ["all"] * 4
+        images
+        + ["all"] * 4
         + ["last"] * 3
         + ["shift", "of another", "drop", "twin", "rows", "row", "order", "lie"]
     ):
+        case "image":
+            edited = edit_image(rng, rows[-1]["bytes"])
+            table = with_column(table, name, [*rows[:-1], rows[-1] | {"bytes": edited.data}])
+            what = f"the last image of {name!r} {edited.what}"
         case "all":
-            table = _with_column(table, name, [wrong] * len(rows))
+            table = with_column(table, name, [wrong] * len(rows))
             what = f"column {name!r} is of {wrong!r}"
         case "last":
             if isinstance(rows[-1], list):
                 wrong = rng.choice([[wrong] * len(rows[-1]), rows[-1] * 2])
-            table = _with_column(table, name, [*rows[:-1], wrong])
+            table = with_column(table, name, [*rows[:-1], wrong])
             what = f"column {name!r} ends with {wrong!r:.99}"
         case "shift" if spans := [name for name in names if name.endswith("_timestamp")]:
             by = rng.choice([0.02, 0.06, 0.1])  # of a second, at 10 fps
             for name in spans:
-                table = _with_column(table, name, [row + by for row in table[name].to_pylist()])
+                table = with_column(table, name, [row + by for row in table[name].to_pylist()])
             what = f"all its spans of videos are {by} s late"
         case "of another":
             other = rng.choice(names)
-            table = _with_column(table, name, table[other].to_pylist()[::-1])
+            table = with_column(table, name, table[other].to_pylist()[::-1])
             what = f"column {name!r} is {other!r} backwards"
         case "drop":
             table, what = table.drop_columns([name]), f"column {name!r} is dropped"
@@ -349,7 +355,7 @@ def edit_parquet(rng: Random, data: bytes) -> Edited:
     return Edited(buffer.getvalue(), what, key=name)
 
 
-def _with_column(table: pa.Table, name: str, rows: list[Any]) -> pa.Table:
+def with_column(table: pa.Table, name: str, rows: list[Any]) -> pa.Table:
     try:
         column = pa.array(rows)
     except (pa.ArrowException, TypeError):
@@ -373,21 +379,34 @@ def _lying_footer(data: bytes, rows: int) -> bytes:
 
 IMAGES = ("GIF", "BMP", "TIFF", "PPM", "ICO", "WEBP", "PCX", "TGA", "SGI", "EPS", "PDF", "DDS")
 IMAGES += ("PNG", "JPEG")
+MODES = {"L": "JPEG", "CMYK": "JPEG", "1": "PNG", "LA": "PNG", "P": "PNG", "I;16": "PNG"}
+MODES |= {"F": "TIFF"}
+"""Modes of pixels, and a format that holds them."""
 
 
 def edit_image(rng: Random, data: bytes) -> Edited:
-    """Another size in the header, or an image of another format under its name."""
-    kind = rng.choice(["size", *IMAGES, "L", "CMYK", "1x1"])
+    """Another size in a JPEG's header, or an image of another format or mode."""
+    sizes = ["size"] * data.startswith(b"\xff\xd8")
+    kind = rng.choice([*sizes, *IMAGES, *MODES, "1x1"])
     if kind == "size":
         size = rng.choice([(0, 0), (65500, 65500), (12500, 12500), (1, 1)])
         return Edited(resized(data, *size), f"says to have {size} pixels")
+    if kind in MODES:
+        return Edited(in_mode(data, kind), f"is of mode {kind}")
     picture, buffer = Image.open(io.BytesIO(data)).convert("RGB"), io.BytesIO()
-    if kind in ("L", "CMYK"):
-        picture = picture.convert(kind)
-    elif kind == "1x1":
+    if kind == "1x1":
         picture = picture.resize((1, 1))
     picture.save(buffer, kind if kind in IMAGES else "JPEG")
     return Edited(buffer.getvalue(), f"is {kind}")
+
+
+def in_mode(data: bytes, mode: str) -> bytes:
+    """The same image in another mode of pixels."""
+    picture, buffer = Image.open(io.BytesIO(data)).convert("RGB"), io.BytesIO()
+    if mode == "I;16":  # to which Pillow converts without using the upper eight bits
+        picture = Image.fromarray(np.asarray(picture.convert("L")).astype(np.uint16) * 257)
+    picture.convert(mode).save(buffer, MODES[mode])
+    return buffer.getvalue()
 
 
 def resized(data: bytes, height: int, width: int) -> bytes:

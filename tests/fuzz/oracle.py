@@ -21,6 +21,7 @@ from safetensors.numpy import load_file
 from pipeline.base.config import LimitsFile, Params, load_params, load_section
 from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.base.errors import StoreIncomplete
+from pipeline.data import RecordedAction
 from pipeline.extract.survey import check_episodes, sound_episodes, survey
 from pipeline.policy import checkpoint as checkpoints
 from pipeline.store import FeatureStore
@@ -60,6 +61,8 @@ def _episode(recording: Any, frames: bool) -> plain.Episode:
             episode |= {f"{name}.time": stream.time, f"{name}.values": stream.values}
             channels = stream.channels
             episode |= {f"{name}.names": channels.names, f"{name}.units": channels.units}
+            if isinstance(stream, RecordedAction):
+                episode["action.rate_hz"] = [stream.rate_hz]
     for view, camera in recording.cameras().items() if frames else ():
         episode[f"frames.{view}"] = list(camera.read(range(len(camera.time))))
         episode[f"frames.{view}.time"] = camera.time

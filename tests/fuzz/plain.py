@@ -103,8 +103,11 @@ def npz(path: Path, wanted: str) -> dict[str, np.ndarray]:
 
 
 def image(file: Path | BinaryIO) -> np.ndarray:
-    """The pixels of a JPEG or PNG."""
+    """The pixels of a JPEG or PNG, the upper eight bits of grey ones of sixteen."""
     with Image.open(file, formats=("JPEG", "PNG")) as picture:
+        if picture.mode == "I;16":
+            picture = Image.fromarray((np.asarray(picture) >> 8).astype(np.uint8))
+        need(picture.mode in ("1", "L", "LA", "P", "RGB", "RGBA", "CMYK"), picture.mode)
         return np.asarray(picture.convert("RGB"))
 
 
@@ -114,15 +117,24 @@ def views(folders: Iterable[Path]) -> Episode:
     for folder in folders:
         timed = []
         for path in folder.iterdir() if folder.is_dir() else ():
-            if path.suffix.lower() in (".jpg", ".jpeg") and not path.name.startswith("."):
-                word = path.stem.rsplit("_", 1)[-1]
-                need(NUMBER.fullmatch(word) and path.is_file(), path.name)
-                timed.append((float(word), str(path)))
-        episode |= _view(folder.name, sorted(timed))
+            if path.suffix.lower() in (".jpg", ".jpeg", ".png") and path.name[0] != ".":
+                timed.append(_timed(path))
+        episode |= _view(re.sub(r"^view(?=\d)", "View", folder.name), sorted(timed))
     return episode
 
 
+def _timed(path: Path) -> tuple[float, str]:
+    """A frame's time, which is not its number, and its path."""
+    word = path.stem.rsplit("_", 1)[-1]
+    need(NUMBER.fullmatch(word) and not re.fullmatch(r"0\d+", word) and path.is_file(), path.name)
+    return float(word), str(path)
+
+
 def _view(name: str, timed: list[tuple[float, str]]) -> Episode:
+    """The frames of one camera, whose names begin all alike or each in its own way."""
+    paths = {Path(path) for _, path in timed}
+    cameras = {path.stem.rpartition("_")[0] for path in paths}
+    need(len(cameras) in (0, 1, len(paths)), f"one camera: {cameras}")
     frames = {f"frames.{name}": [image(Path(path)) for _, path in timed]}
     return frames | {f"frames.{name}.time": np.array([t for t, _ in timed])} if timed else {}
 
@@ -148,7 +160,7 @@ def raw(folder: Path) -> Episode:
         forces = read["forces"].reshape(len(read["alines"]), 1)
         found["sensor.time"] = resolved(read["timestamps"])
         found["sensor.values"] = np.concatenate([forces, read["alines"]], axis=1)
-    return found | views(folder.glob("View*"))
+    return found | views(folder.glob("[Vv]iew*"))
 
 
 def _states(folder: Path, start: object, rate: object) -> Episode:
@@ -180,7 +192,10 @@ def new(folder: Path) -> Episode:
         found["sensor.time"] = time.reshape(-1)
     for key, count in told.items():
         need(said.get(key) is None or number(said[key]) == count or not count, key)
-    return found | views((folder / "images").glob("*"))
+    found |= views((folder / "images").glob("*"))
+    for view in said.get("camera_views") or ():
+        need(f"frames.{view}" in found, f"frames of {view}")
+    return found
 
 
 class _Plain(pickle.Unpickler):
@@ -213,11 +228,10 @@ def old(folder: Path) -> Episode:
     for view, paths in _given(said, "image", {}).items():
         need(type(paths) in (list, tuple) and type(view) is str, "paths")
         there = [_tail(folder, path) for path in paths]
-        timed = sorted((float(path.stem.rsplit("_", 1)[-1]), str(path)) for path in there)
-        found |= _view(view.removesuffix("_left"), timed)
+        found |= _view(view.removesuffix("_left"), sorted(map(_timed, there)))
     start = min((time[0] for key, time in found.items() if key.endswith(".time")), default=0.0)
     start = float(start)
-    found |= {"action.values": numbers(said["action"], 7)}
+    found |= {"action.values": numbers(said["action"], 7), "action.rate_hz": [tick]}
     if (sensor := said.get("sensor_data")) is not None:
         if type(sensor) is dict:
             force = np.asarray(sensor["force"]).reshape(-1, 1)
@@ -302,12 +316,18 @@ def _lerobot_episode(root: Path, info: Any, row: Any, index: int, tasks: dict[An
     table = table.take(mine)
     columns = {name: table[name] for name in table.column_names}
     clock = _vectors(columns["timestamp"], 1)[:, 0]
+    steps = np.diff(clock)
+    if "action" in info["features"] and (steps > 0).any():
+        rates = 1 / np.array([np.median(steps[steps > 0]), steps.mean()])
+        need(abs(rates / info["fps"] - 1).min() <= 0.1, f"{rates} Hz, as fps says")
     told = row.get("tasks") or []
     asked = {*columns["task_index"].to_pylist()} if "task_index" in columns else {None}
     if len(texts(told, len(told))) != 1:
         need(len(asked) == 1, "one task")
         told = [tasks[asked.pop()]]
     found: Episode = {"instruction": told[0]}
+    if "action" in info["features"]:
+        found["action.rate_hz"] = [info["fps"]]
     for stream, column in (("state", "observation.state"), ("action", "action")):
         if column in info["features"]:
             words = _words(info["features"][column])

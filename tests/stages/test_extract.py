@@ -2,6 +2,10 @@
 
 import json
 import re
+import shutil
+import subprocess
+import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 import yaml
 import zarr
+from PIL import Image
 
 from pipeline.data import lerobot
 from pipeline.simulation.lerobot_format import write_lerobot
@@ -18,7 +23,7 @@ from pipeline.store import FeatureStore
 from pipeline.store.chunks import write_seal
 from stages.command import run
 from stages.extract import main
-from tests.data.conftest import START, Truth, edit_json, write_raw
+from tests.data.conftest import START, Truth, edit_json, write_new, write_raw
 from tests.data.conftest import write_lerobot as write_small_lerobot
 from tests.data.test_lerobot import edit_v3
 
@@ -230,6 +235,49 @@ def test_recorded_rows_without_a_rate(capsys, params_file, tmp_path, monkeypatch
     assert re.search(r"day1/run.* a single action, which tells no rate.*Set data\.action_hz", err)
 
 
+def _png(frame: Path) -> None:
+    Image.open(frame).save(frame.with_suffix(".png"))
+    frame.unlink()
+
+
+@pytest.mark.parametrize("write", [write_new, partial(write_raw, views=("View1", "View2"))])
+@pytest.mark.parametrize("change", ["all PNGs", "PNGs in one view", "view2/"])
+def test_no_camera_vanishes(capsys, params_file, tmp_path, write, change):
+    folder = write(tmp_path / "day1/run/episode", Truth())
+    for frame in [*folder.rglob("View[12]/*.jpg")]:
+        if change == "all PNGs" or (change == "PNGs in one view" and frame.parent.name == "View2"):
+            _png(frame)
+    if change == "view2/":
+        (view,) = folder.rglob("View2")
+        view.rename(view.with_name("view2"))
+    options = ["extract.plan=true", "data.views=[View1, View2]"]
+    options = [part for option in options for part in ("--set", option)]
+    assert run("", main, ["--params", str(params_file), *options]) == 0, capsys.readouterr().err
+    assert "has a frame" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("lost", "message"),
+    [
+        ("images", "camera_views has View1, View2, and images/ no frame of it"),
+        ("images/View2", "camera_views has View2, and images/ no frame of it"),
+        ("images/View?/*.850.jpg", "camera_frames_count is 4, and images/ has 3"),
+    ],
+)
+def test_what_metadata_promise_and_files_lack(capsys, params_file, tmp_path, lost, message):
+    write_new(tmp_path / "day1/run/whole", Truth())
+    counted = {"camera_frames_count": 4}
+    folder = write_new(tmp_path / "day1/run/lacking", Truth(), metadata=counted)
+    for path in folder.glob(lost):
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    err = said(capsys, params_file, "extract.plan=true")
+    assert f"{folder}/metadata.json: {message}. Copy the episode again" in err
+    options = ["data.on_bad_episode=skip", "extract.plan=true"]
+    options = [part for option in options for part in ("--set", option)]
+    assert run("", main, ["--params", str(params_file), *options]) == 0
+    assert re.search(rf"skipped lab: .*lacking.*{message}", capsys.readouterr().out)
+
+
 def test_recordings_without_any_frame(capsys, params_file, tmp_path):
     info = write_small_lerobot(tmp_path / "day1/run") / "meta/info.json"
     features = json.loads(info.read_text())["features"]
@@ -240,6 +288,23 @@ def test_recordings_without_any_frame(capsys, params_file, tmp_path):
     assert "WARNING: none of the 3 episode(s) has a frame" in capsys.readouterr().out
     assert run("", main, [*options, "--set", "data.views=[]"]) == 0
     assert "has a frame" not in capsys.readouterr().out
+
+
+def test_a_plan_of_known_files_asks_its_ledger_once_and_needs_no_pandas(params_file, tmp_path):
+    write_small_lerobot(tmp_path / "day1/run", "v3.0", image=True)
+    code = (
+        "import sys\nfrom pipeline.base.digests import ContentDigests\n"
+        "from stages.command import run\nask, asked = ContentDigests._ask, []\n"
+        "ContentDigests._ask = lambda own, *told: [asked.append(told[0]), ask(own, *told)][1]\n"
+        "for _ in range(2):\n    asked.clear()\n"
+        "    assert not run('', 'stages.extract', sys.argv[1:])\n"
+        "print(sum(told.startswith('SELECT') for told in asked), 'pandas' in sys.modules)"
+    )
+    command = [sys.executable, "-c", code, "--params", str(params_file)]
+    done = subprocess.run(
+        [*command, "--set", "extract.plan=true"], cwd=ROOT, capture_output=True, text=True
+    )
+    assert done.stdout.splitlines()[-1:] == ["1 False"], done.stderr
 
 
 def test_the_first_ten_of_many_bad_episodes_are_listed(capsys, params_file, tmp_path):

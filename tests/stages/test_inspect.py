@@ -14,6 +14,7 @@ from pipeline.look.page.style import RC
 from pipeline.robot.recorder import RunRecorder
 from stages import inspect
 from stages.command import run
+from tests.data.conftest import Truth, png, write_raw
 
 PARAMS = Path(__file__).resolve().parents[2] / "params.yaml"
 
@@ -54,6 +55,19 @@ def test_recordings_and_a_damaged_one_are_a_page(
     assert out.splitlines()[-1].startswith(f"{page}: ")
     assert "error,unreadable," in page.with_name("findings.csv").read_text()
     assert page.is_file() and len(list(page.parent.glob("*.png"))) >= 3
+
+
+def test_grey_frames_of_16_bits_are_not_white(
+    looked: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    episode = write_raw(tmp_path / "lab/one", Truth(), views=("View1",))
+    for number, frame in enumerate(sorted(episode.rglob("*.jpg"))):
+        frame.with_suffix(".png").write_bytes(png(20 + 30 * number, grey_of_16_bits=True))
+        frame.unlink()
+    few = ("inspect.samples=1", "inspect.ticks=1")
+    assert looked("lab", *(word for one in few for word in ("--set", one))) == 0
+    out = capsys.readouterr().out
+    assert "cameras 1" in out and "of one colour" not in out
 
 
 @pytest.mark.parametrize("version", [2, 3])
