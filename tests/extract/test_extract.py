@@ -23,7 +23,7 @@ from pipeline.base.errors import (
     StoreMismatch,
 )
 from pipeline.data import Channels, RecordedAction, Stream, open_recordings
-from pipeline.data.lerobot_clock import stored_clock
+from pipeline.data.lerobot_rows import stored_clock
 from pipeline.data.timeline import build_timeline
 from pipeline.data.windowed import WindowedRecording
 from pipeline.extract import extract
