@@ -17,8 +17,7 @@ from pipeline.base.border import shown
 from pipeline.base.config import MediaLimits
 from pipeline.base.errors import RecordingError
 from pipeline.data.media import DEFAULT_LIMITS, FARTHEST_S, check_image_file, in_rgb, opened_image
-from pipeline.data.reader import entries, natural_key
-from pipeline.data.recording import CameraStream
+from pipeline.data.recording import CameraStream, entries, natural_key
 
 THUMBNAIL = (32, 18)
 """Width and height of what is seen of a JPEG that is checked."""

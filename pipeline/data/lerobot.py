@@ -36,13 +36,13 @@ from pipeline.data.lerobot_rows import (
     stored_clock,
 )
 from pipeline.data.media import RECORDINGS
-from pipeline.data.reader import FileRecording
 from pipeline.data.recording import (
     ActionKind,
     CameraStream,
     Channels,
     Nominal,
     RecordedAction,
+    Recording,
     Stream,
     checked_stream,
 )
@@ -96,7 +96,7 @@ def _refusal(path: Path) -> str:
     return ""
 
 
-class LeRobotRecording(FileRecording):
+class LeRobotRecording(Recording):
     """One episode of a LeRobot data set; `path` is the data set's root."""
 
     format = "lerobot"

@@ -21,8 +21,7 @@ from pipeline.base.errors import RecordingError
 from pipeline.base.source import is_view_name
 from pipeline.data.media import Grouped
 from pipeline.data.parquet import ParquetTable
-from pipeline.data.reader import natural_key
-from pipeline.data.recording import ActionKind
+from pipeline.data.recording import ActionKind, natural_key
 from pipeline.data.video import VideoSpan, frame_count
 
 T = TypeVar("T")

@@ -19,12 +19,12 @@ from pipeline.data.jpeg import check_image, read_image
 from pipeline.data.lerobot_meta import META, Entry, LeRobotMeta
 from pipeline.data.media import RECORDINGS
 from pipeline.data.parquet import ParquetTable
-from pipeline.data.reader import natural_key
 from pipeline.data.recording import (
     CameraStream,
     check_clock,
     check_resolution,
     check_rising_clock,
+    natural_key,
 )
 
 CLOCK = "timestamp"

@@ -51,10 +51,18 @@ class Made(Recording):
     path: Path = Path("made")
     instruction: str = "touch"
 
+    _views: None = None
+
     def files(self) -> list[Path]:
         return []
 
-    def cameras(self) -> Mapping[str, CameraStream]:
+    def all_views(self) -> Sequence[str]:
+        return list(self.camera_times)
+
+    def _recorded_instruction(self) -> str:
+        return "touch"
+
+    def _cameras(self) -> Mapping[str, CameraStream]:
         return {view: Camera(view, time) for view, time in self.camera_times.items()}
 
     def action(self) -> RecordedAction | None:
