@@ -8,7 +8,7 @@ from pathlib import Path, PurePath
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import StoreMismatch
 from pipeline.data import Recording
-from pipeline.data.reader import absolute
+from pipeline.data.recording import absolute
 from pipeline.store import Episode, FeatureStore
 
 

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data.embodiment import common_embodiment
-from pipeline.data.episode import ReadEpisode
+from pipeline.data.episode import ReadEpisode, common_embodiment
 from pipeline.data.row_range import Frames, RowFrames
 from pipeline.data.timeline import tick_hz
 from pipeline.store import KEY_BYTES, SCHEMA, FeatureStore

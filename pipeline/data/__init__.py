@@ -12,7 +12,6 @@ from pathlib import Path
 from pipeline.base.config import Source
 from pipeline.base.errors import RecordingError
 from pipeline.data.discovery import READERS, episode_folders, listing
-from pipeline.data.reader import FileRecording, absolute, natural_key
 from pipeline.data.recording import (
     ActionKind,
     CameraStream,
@@ -20,7 +19,9 @@ from pipeline.data.recording import (
     RecordedAction,
     Recording,
     Stream,
+    absolute,
     content_digest,
+    natural_key,
 )
 
 __all__ = [
@@ -68,11 +69,11 @@ def open_recordings(
     episode or not those of the source's `format`, where a LeRobot `meta/` is broken, and where no
     recording has a wanted view.
     """
-    recordings: list[FileRecording] = []
+    recordings: list[Recording] = []
     missing: list[str] = []
     bad: list[BadEpisode] = []
     for source in sources:
-        of_source: list[FileRecording] = []
+        of_source: list[Recording] = []
         for folder, reader in episode_folders(source, root):
             try:
                 found, absent = reader.open(folder, source, views)
@@ -114,7 +115,7 @@ def open_recording(
     return of_id[0]
 
 
-def _name_apart(recordings: Sequence[FileRecording]) -> None:
+def _name_apart(recordings: Sequence[Recording]) -> None:
     """Put parent folders before the ids that stand more than once in a source."""
     parts = [
         (*absolute(r.path).parts[1:], r.id) if r.format == "lerobot" else absolute(r.path).parts[1:]
@@ -133,7 +134,7 @@ def _name_apart(recordings: Sequence[FileRecording]) -> None:
         recording.id = name
 
 
-def _check_views(recordings: Sequence[FileRecording], views: Sequence[str]) -> None:
+def _check_views(recordings: Sequence[Recording], views: Sequence[str]) -> None:
     """Stops at the first recordings that have the views, and opens pickles last."""
     there: set[str] = set()
     for recording in sorted(recordings, key=lambda r: r.format == "old"):

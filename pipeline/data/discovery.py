@@ -14,9 +14,9 @@ from pipeline.base.commands import command
 from pipeline.base.config import Source
 from pipeline.base.errors import RecordingError
 from pipeline.data import lerobot, pickled, raw, windowed
-from pipeline.data.reader import FileRecording, absolute, entries, natural_key
+from pipeline.data.recording import Recording, absolute, entries, natural_key
 
-Found = tuple[Sequence[FileRecording], Sequence[str]]
+Found = tuple[Sequence[Recording], Sequence[str]]
 """Episodes, and lines about those that are not there."""
 
 
@@ -30,7 +30,7 @@ class FormatReader:
 
 
 def _one(
-    episode: Callable[[Path, Source, Sequence[str] | None], FileRecording],
+    episode: Callable[[Path, Source, Sequence[str] | None], Recording],
 ) -> Callable[[Path, Source, Sequence[str] | None], Found]:
     return lambda path, source, views: ([episode(path, source, views)], [])
 

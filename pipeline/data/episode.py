@@ -1,10 +1,43 @@
-"""A recording -> its streams and the ticks over them, read once."""
+"""An episode: a recording's streams and ticks, read once, and what its channels are."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from pipeline.data.embodiment import Embodiment
-from pipeline.data.recording import Recording, Stream
+from pipeline.base.border import named
+from pipeline.base.errors import StoreMismatch
+from pipeline.data.recording import Channels, Recording, Stream
 from pipeline.data.timeline import ActionRotation, Timeline, build_timeline
+
+_NO_CHANNELS = Channels((), ())
+
+
+@dataclass(frozen=True)
+class Embodiment:
+    """Channels of action, sensor and state; none where a stream is absent."""
+
+    action: Channels
+    action_kind: str
+    sensor: Channels = _NO_CHANNELS
+    state: Channels = _NO_CHANNELS
+
+    @classmethod
+    def of(
+        cls, action: Channels, action_kind: str, sensor: Stream | None, state: Stream | None
+    ) -> "Embodiment":
+        """That of a recording with these streams."""
+        there = {"sensor": sensor, "state": state}
+        channels = {name: one.channels for name, one in there.items() if one is not None}
+        return cls(action, action_kind, **channels)
+
+    def document(self) -> dict[str, dict[str, Any]]:
+        """Names and units by stream, and the kind of action, as a store keeps them."""
+        document: dict[str, dict[str, Any]] = {}
+        for stream in ("action", "sensor", "state"):
+            channels: Channels = getattr(self, stream)
+            document[stream] = {"names": list(channels.names), "units": list(channels.units)}
+        document["action"]["kind"] = self.action_kind
+        return document
 
 
 @dataclass(frozen=True)
@@ -47,3 +80,38 @@ def read_episode(
     state, sensor = recording.state(), recording.sensor()
     line = build_timeline(recording, action_hz, vlm_reuse_count, action_rotation, state, sensor)
     return ReadEpisode(recording, line, sensor, state)
+
+
+def common_embodiment(
+    found: Sequence[tuple[Recording, Embodiment]], of: str, remedy: str
+) -> Embodiment:
+    """The embodiment of all these recordings; streams that some lack are those of the others.
+
+    Raises `StoreMismatch` that names two that differ in channels, units or kind of action, says
+    that they are to be one `of` something, and ends with the `remedy`.
+    """
+    common: dict[str, Channels] = {}
+    for stream in ("action", "state", "sensor"):
+        having = [(one, _seen(all_of, stream)) for one, all_of in found]
+        having = [(one, seen) for one, seen in having if seen[0].names]
+        for one, seen in having[1:]:
+            first, expected = having[0]
+            if seen != expected:
+                raise StoreMismatch(
+                    f"one {of} holds one embodiment, but the {stream} of source {first.source!r} "
+                    f"({first.path}) is {_shown(*expected)} and that of source {one.source!r} "
+                    f"({one.path}) is {_shown(*seen)}. {remedy}"
+                )
+        common[stream] = having[0][1][0] if having else _NO_CHANNELS
+    return Embodiment(action_kind=found[0][1].action_kind, **common)
+
+
+def _seen(embodiment: Embodiment, stream: str) -> tuple[Channels, str]:
+    return getattr(embodiment, stream), embodiment.action_kind if stream == "action" else ""
+
+
+def _shown(channels: Channels, kind: str) -> str:
+    pairs = zip(channels.names, channels.units, strict=True)
+    names = [named(f"{name} ({unit})" if unit else name) for name, unit in pairs]
+    listed = ", ".join(names if len(names) <= 12 else [*names[:4], "…", names[-1]])
+    return f"{len(names)} {kind} channels [{listed}]".replace("  ", " ")

@@ -17,8 +17,14 @@ from pipeline.base.config import MediaLimits
 from pipeline.base.errors import RecordingError
 from pipeline.data.arrays import Numbers, csv_header, member, read_csv, read_npz
 from pipeline.data.jpeg import JpegCamera
-from pipeline.data.reader import FileRecording, absolute
-from pipeline.data.recording import CameraStream, Channels, Stream, checked_stream
+from pipeline.data.recording import (
+    CameraStream,
+    Channels,
+    Recording,
+    Stream,
+    absolute,
+    checked_stream,
+)
 
 _JOINTS = tuple(f"joint_{joint}" for joint in range(1, 7))
 _POSE = tuple(f"pose_{axis}" for axis in "xyzabr")
@@ -36,7 +42,7 @@ _CLOCK_TOLERANCE_S, _CLOCK_TOLERANCE = 0.5, 0.02
 share of the recording where that is more."""
 
 
-class InsertionRecording(FileRecording):
+class InsertionRecording(Recording):
     """An episode folder of the needle-insertion recorder."""
 
     @property

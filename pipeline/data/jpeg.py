@@ -17,8 +17,7 @@ from pipeline.base.border import shown
 from pipeline.base.config import MediaLimits
 from pipeline.base.errors import RecordingError
 from pipeline.data.media import DEFAULT_LIMITS, FARTHEST_S, check_image_file, in_rgb, opened_image
-from pipeline.data.reader import entries, natural_key
-from pipeline.data.recording import CameraStream
+from pipeline.data.recording import CameraStream, entries, natural_key
 
 THUMBNAIL = (32, 18)
 """Width and height of what is seen of a JPEG that is checked."""
@@ -28,7 +27,7 @@ Seen = TypeVar("Seen")
 _EYES = ("left", "right")
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".gif", ".tif", ".tiff", ".webp")
 """Of images: what the opener does not decode, it refuses by name."""
-_COUNTED = re.compile(r"0\d+")
+_PADDED = re.compile(r"0\d+")
 """A number in place of a time: 000001."""
 _VIEW = re.compile(r"view(?=\d)", re.IGNORECASE)
 
@@ -39,10 +38,14 @@ class JpegCamera(CameraStream):
     def __init__(
         self, view: str, paths: Sequence[Path], limits: MediaLimits = DEFAULT_LIMITS
     ) -> None:
-        """Sorts the files by the time in their names; raises `RecordingError` on a name without,
-        and where they are of two cameras."""
+        """Sorts the files by the time in their names.
+
+        Raises `RecordingError` on a name without a time, where names count the frames, and where
+        the frames are of two cameras.
+        """
         timed = sorted((frame_time(path), str(path)) for path in paths)
         _check_one_camera(view, timed)
+        _check_not_counted(timed)
         self.view = view
         self.paths = [Path(path) for _, path in timed]
         self.time = np.array([time for time, _ in timed], np.float64)
@@ -83,12 +86,25 @@ def frame_time(path: PurePath) -> float:
         time = float(text)
     except ValueError:
         time = math.nan
-    if not abs(time) <= FARTHEST_S or _COUNTED.fullmatch(text):
-        raise RecordingError(
-            f"{path}: expected a name that ends in the time in seconds, such as "
-            f"zed_left_1761551500.174.jpg, found {shown(text)}. Rename the frames by their times"
-        )
+    if not abs(time) <= FARTHEST_S or _PADDED.fullmatch(text):
+        raise _no_time(path, shown(text))
     return time
+
+
+def _check_not_counted(timed: Sequence[tuple[float, str]]) -> None:
+    """Raise `RecordingError` where the names of frames, by time, count from 0 or 1."""
+    first = timed[0][0] if len(timed) > 1 else -1
+    if first in (0, 1) and all(time == first + k for k, (time, _) in enumerate(timed)):
+        path = Path(timed[-1][1])
+        if path.stem.rpartition("_")[2].isdecimal():  # not 1.0, 2.0
+            raise _no_time(path, f"frames counted from {first:g} to {timed[-1][0]:g}")
+
+
+def _no_time(path: PurePath, found: str) -> RecordingError:
+    return RecordingError(
+        f"{path}: expected a name that ends in the time in seconds, such as "
+        f"zed_left_1761551500.174.jpg, found {found}. Rename the frames by their times"
+    )
 
 
 def _check_one_camera(view: str, timed: Sequence[tuple[float, str]]) -> None:

@@ -1,6 +1,6 @@
 """LeRobot data sets v2.0, v2.1 and v3.0: state and action from parquet, frames from video.
 
-Rows and frames pair by number; the `timestamp` column is the clock, as `lerobot_clock` reads it.
+Rows and frames pair by number; the `timestamp` column is the clock, as `lerobot_rows` reads it.
 What has no home in LeRobot lies in this project's sidecars, beside the data set's own folders:
 `sensor/episode_000003.npz` a high-rate sensor, `state/…` states that are faster than the rows,
 `frames/…` when the images in the rows were captured.
@@ -23,18 +23,26 @@ from pipeline.base.config import MediaLimits, Source
 from pipeline.base.errors import RecordingError
 from pipeline.data.arrays import MOST_CHANNELS, member, read_npz
 from pipeline.data.insertion import SENSOR
-from pipeline.data.lerobot_clock import NUMBERS, check_frames, read_clock, stored_clock
-from pipeline.data.lerobot_layout import MARKER, LeRobotLayout, read_layout
-from pipeline.data.lerobot_meta import META, Episode, Vector
-from pipeline.data.lerobot_rows import ParquetCamera, find_rows, matrix
+from pipeline.data.lerobot_meta import MARKER, META, Entry, LeRobotMeta, Vector, read_meta
+from pipeline.data.lerobot_rows import (
+    CLOCK,
+    FRAME,
+    ParquetCamera,
+    ParquetRows,
+    check_frames,
+    find_rows,
+    matrix,
+    read_clock,
+    stored_clock,
+)
 from pipeline.data.media import RECORDINGS
-from pipeline.data.reader import FileRecording
 from pipeline.data.recording import (
     ActionKind,
     CameraStream,
     Channels,
     Nominal,
     RecordedAction,
+    Recording,
     Stream,
     checked_stream,
 )
@@ -59,21 +67,21 @@ def open_data_set(
 
     Raises `RecordingError` where `meta/` is broken, and where `views` names a depth map.
     """
-    layout = read_layout(root, source.limits)
-    if asked := [view for view in layout.info.depth if view in (views or ())]:
+    meta = read_meta(root, source.limits)
+    if asked := [view for view in meta.info.depth if view in (views or ())]:
         raise RecordingError(
             f"{root / MARKER}: data.views asks for {', '.join(asked)}, but is_depth_map is true "
             "there: a depth map is no picture that the model can be shown. Leave it out of "
             "data.views"
         )
-    layout.check_ends()
+    meta.check_ends()
     recordings: list[LeRobotRecording] = []
     missing: list[str] = []
     refusal = cache(_refusal)  # many episodes may be in one file
-    for episode in layout.episodes:
-        recording = LeRobotRecording(layout, episode, source, views)
+    for entry in meta.entries:
+        recording = LeRobotRecording(meta, entry, source, views)
         if why := next(filter(None, map(refusal, recording.listed_files())), ""):
-            missing.append(f"{source.name}: {root} lists {episode.id}, but {why}")
+            missing.append(f"{source.name}: {root} lists {entry.id}, but {why}")
         else:
             recordings.append(recording)
     return recordings, missing
@@ -88,31 +96,35 @@ def _refusal(path: Path) -> str:
     return ""
 
 
-class LeRobotRecording(FileRecording):
+class LeRobotRecording(Recording):
     """One episode of a LeRobot data set; `path` is the data set's root."""
 
     format = "lerobot"
 
     def __init__(
         self,
-        layout: LeRobotLayout,
-        episode: Episode,
+        meta: LeRobotMeta,
+        entry: Entry,
         source: Source,
         views: Sequence[str] | None,
     ) -> None:
-        super().__init__(layout.root, source, views)
-        self.id = episode.id
-        self._layout = layout
-        self._info = layout.info
-        self._episode = episode
+        super().__init__(meta.root, source, views)
+        self.id = entry.id
+        self._meta = meta
+        self._info = meta.info
+        self._entry = entry
 
     @property
     def group(self) -> str | None:
-        return self._episode.group_name
+        return self._entry.group_name
+
+    @property
+    def _rows(self) -> ParquetRows:
+        return find_rows(self._meta, self._entry)
 
     def listed_files(self) -> Iterator[Path]:
         """The data file and the wanted views' videos, as `meta/` names them."""
-        yield self._layout.data(self._episode)
+        yield self._meta.data(self._entry)
         for key in self._wanted().values():
             if key in self._info.videos:
                 yield self._video(key).path
@@ -122,12 +134,12 @@ class LeRobotRecording(FileRecording):
         return {view: key for view, key in self._info.views.items() if self._wants(view)}
 
     def _video(self, key: str) -> VideoSpan:
-        return self._layout.video(self._episode, key)
+        return self._meta.video(self._entry, key)
 
     def files(self) -> list[Path]:
         _, *videos = self.listed_files()
         sidecars = [path for name in _SIDECARS if (path := self._sidecar(name)) is not None]
-        return sorted({find_rows(self._layout, self._episode).path, *videos, *sidecars})
+        return sorted({self._rows.path, *videos, *sidecars})
 
     def identity(self) -> str:
         """What `meta/info.json` decides, and where the shared files of v3.0 hold the episode.
@@ -155,7 +167,7 @@ class LeRobotRecording(FileRecording):
             return described
         videos = {v: key for v, key in self._info.views.items() if key in self._info.videos}
         frames = [f"{view}@{self._video(key).first}" for view, key in sorted(videos.items())]
-        return " ".join([described, f"{self._episode.id}+{self._episode.length}", *frames])
+        return " ".join([described, f"{self._entry.id}+{self._entry.length}", *frames])
 
     def state(self) -> Stream | None:
         if (path := self._sidecar("state")) is not None:
@@ -187,12 +199,12 @@ class LeRobotRecording(FileRecording):
 
     def _misplaced_rows(self) -> tuple[str, ...]:
         """What `meta/` says wrongly of the file of v3.0 that holds the rows."""
-        rows, named = find_rows(self._layout, self._episode).path, self._layout.data(self._episode)
+        rows, named = self._rows.path, self._meta.data(self._entry)
         if rows == named:
             return ()
         told, there = (path.relative_to(self.path).as_posix() for path in (named, rows))
         return (
-            f"meta/episodes says that the rows of {self._episode.id} lie in {told}, they lie in "
+            f"meta/episodes says that the rows of {self._entry.id} lie in {told}, they lie in "
             f"{there} and were read there; other readers may miss them. Correct its "
             "data/chunk_index and data/file_index, or convert the data set again with lerobot "
             "0.5.0 or later (up to 0.4.4 it wrote such entries)",
@@ -205,14 +217,14 @@ class LeRobotRecording(FileRecording):
         return sorted(view for view in self._info.depth if self._wants(view))
 
     def _recorded_instruction(self) -> str:
-        if self._episode.tasks and len(self._episode.tasks) == 1:
-            return self._episode.tasks[0]
-        rows = find_rows(self._layout, self._episode)
-        where, table = f"{rows.path}, {self._episode.id}", rows.columns(("task_index",))
+        if self._entry.tasks and len(self._entry.tasks) == 1:
+            return self._entry.tasks[0]
+        rows = self._rows
+        where, table = f"{rows.path}, {self._entry.id}", rows.columns(("task_index",))
         if not table.num_columns:
             raise META.refusal(where, "no column task_index, and meta/ names no one task")
         asked = np.unique(matrix(table["task_index"], 1, f"{where}, 'task_index'")).tolist()
-        texts = [self._layout.task_text.get(index) for index in asked]
+        texts = [self._meta.task_text.get(index) for index in asked]
         if len(texts) != 1 or texts[0] is None:
             raise RecordingError(
                 f"{where}: expected one task that meta/ knows, found task_index {shown(asked)}: "
@@ -225,7 +237,7 @@ class LeRobotRecording(FileRecording):
             return {}
         self._check_spans()
         _, _, time = self._numbers()
-        rows = find_rows(self._layout, self._episode)
+        rows = self._rows
         videos, fps, limits = self._info.videos, self._info.fps, self._overrides.limits
         path, rarer = self._sidecar("frames"), [v for v, key in wanted.items() if key not in videos]
         captured = {} if path is None or not rarer else read_npz(path, rarer, limits=limits)
@@ -250,12 +262,12 @@ class LeRobotRecording(FileRecording):
 
     def _check_spans(self) -> None:
         for key in self._wanted().values():
-            rival = self._layout.rivals.get((self._episode.index, key))
+            rival = self._meta.rivals.get((self._entry.index, key))
             if rival is not None:
                 span = self._video(key)
                 raise RecordingError(
                     f"{span.path}: meta/ gives frames of {key!r} from {span.first or 0} on to "
-                    f"{self._episode.id} and to {rival} too, so file_index or from_timestamp of "
+                    f"{self._entry.id} and to {rival} too, so file_index or from_timestamp of "
                     "one is wrong. Correct meta/episodes, write the data set again, or leave both "
                     "episodes or the view out (data.on_bad_episode: skip, data.views)"
                 )
@@ -264,16 +276,16 @@ class LeRobotRecording(FileRecording):
         self, streams: Sequence[str] = (STATE, ACTION)
     ) -> tuple[str, pa.Table, NDArray[np.float64]]:
         """The episode's rows of these streams, where they stand, and their clock."""
-        rows = find_rows(self._layout, self._episode)
-        table = rows.columns((*NUMBERS, *streams))
+        rows = self._rows
+        table = rows.columns((CLOCK, FRAME, *streams))
         check_frames(table, rows)
-        where = f"{rows.path}, {self._episode.id}"
+        where = f"{rows.path}, {self._entry.id}"
         return where, table, read_clock(table, self._info.fps, where)
 
     def _sidecar(self, name: str) -> Path | None:
         """The episode's file of that name, where there is one."""
         # Not `self.id`, before which parent folders may stand.
-        path = self.path / name / f"{self._episode.id}.npz"
+        path = self.path / name / f"{self._entry.id}.npz"
         return path if os.path.lexists(path) else None
 
 

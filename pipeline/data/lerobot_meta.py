@@ -1,23 +1,42 @@
-"""The documents in a LeRobot data set's `meta/`, as models: what they may say.
+"""A LeRobot data set's `meta/`: its documents as models, and where each episode's data lies.
 
-`group` of an episode, and `units` and `kind` of a feature are this project's extensions.
+v2.0 and v2.1 keep a file an episode, v3.0 many episodes a file. Only `meta/` is read here. `group`
+of an episode, and `units` and `kind` of a feature are this project's extensions.
 """
 
 import re
-from functools import cached_property
-from typing import Annotated, Any, Literal, Self
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, reduce
+from itertools import islice, pairwise
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import AliasChoices, BeforeValidator, Field, JsonValue, Strict, model_validator
 
 from pipeline.base.border import Border, Document, Text, shown
+from pipeline.base.config import MediaLimits
 from pipeline.base.errors import RecordingError
 from pipeline.base.source import is_view_name
 from pipeline.data.media import Grouped
-from pipeline.data.recording import ActionKind
+from pipeline.data.parquet import ParquetTable
+from pipeline.data.recording import ActionKind, natural_key
+from pipeline.data.video import VideoSpan, frame_count
+
+T = TypeVar("T")
 
 META = Border(
     RecordingError, "Mend meta/, or convert the data set with the lerobot release that wrote it."
 )
+MARKER = "meta/info.json"
+_INFO_BYTES = 8 * 2**20
+_MOST_ROWS = 500_000
+"""Episodes or tasks of a data set; language_table has 440,000 episodes."""
+_ENTRY_COLUMNS = ("episode_index", "length", "tasks", "group")
+_TASK_COLUMNS = ("task_index", "task", "__index_level_0__")
+_OFF_FRAME = 0.1
+"""Share of a frame by which a sum of inexact durations may miss the frame's time."""
 _VIEW_PREFIXES = ("observation.images.", "observation.")
 _PLACES = {"v2": "episode_chunk|episode_index", "v3": "chunk_index|file_index"}
 """Numbers that a path may name, as in `{episode_index:06d}`."""
@@ -39,7 +58,7 @@ def _flat_names(names: Any) -> Any:
     if not isinstance(names, list):
         return names
     lists = [name if isinstance(name, list) else [name] for name in names]
-    return tuple(name for each in lists for name in each)
+    return tuple(name for part in lists for name in part)
 
 
 class _VideoInfo(Document):
@@ -65,12 +84,12 @@ class Feature(Document):
     @property
     def is_depth_map(self) -> bool:
         """Whether its pictures are of depth, by any of the words for it."""
-        told = [info for info in (self.info, self.video_info) if info is not None]
-        return any(info.depth or info.video_depth for info in told)
+        infos = [info for info in (self.info, self.video_info) if info is not None]
+        return any(info.depth or info.video_depth for info in infos)
 
 
 class Vector(Document):
-    """What `info.json` says of the numbers of a column: judged only where it is read."""
+    """What `info.json` says of the numbers of a column; judged only where the column is read."""
 
     shape: Annotated[tuple[Index], Strict(False)]
     names: Annotated[tuple[Text, ...] | None, BeforeValidator(_flat_names)] = None
@@ -152,8 +171,8 @@ class Span(Place):
     to_timestamp: Seconds
 
 
-class Episode(Grouped):
-    """A line of `meta/episodes.jsonl`, a row of `meta/episodes/`."""
+class Entry(Grouped):
+    """An episode as a line of `meta/episodes.jsonl`: its files are its own."""
 
     index: Index = Field(alias="episode_index")
     length: Index
@@ -169,12 +188,12 @@ class Episode(Grouped):
         return {"episode_index": self.index, "episode_chunk": self.index // chunks_size}
 
     def frames(self, key: str, fps: float) -> tuple[int | None, int | None]:
-        """The first of its frames in the video of a feature and how many they are; None: all."""
+        """The number of its first frame in the video of a feature, and its count; None: all."""
         return None, None
 
 
-class SharedEpisode(Episode):
-    """An episode of v3.0, in files that it shares with others."""
+class SharedEntry(Entry):
+    """An episode as a row of v3.0's `meta/episodes/`: it shares its files with others."""
 
     data: Place
     videos: dict[str, Span]
@@ -195,3 +214,129 @@ class Task(Document):
     index: Index = Field(alias="task_index")
     # Up to lerobot 0.4.4 the column was an unnamed index of pandas.
     text: Text = Field(validation_alias=AliasChoices("task", "__index_level_0__"))
+
+
+@dataclass(frozen=True)
+class LeRobotMeta:
+    """A data set: what all its episodes share, and where each of them lies."""
+
+    root: Path
+    info: Info
+    entries: Sequence[Entry]
+    """By index."""
+    task_text: Mapping[int, str]
+    limits: MediaLimits
+    """Of its files."""
+
+    def data(self, entry: Entry) -> Path:
+        """The file of an episode's rows, as `meta/` says."""
+        return self.root / self.info.data_path.format(**entry.place(self.info.chunks_size))
+
+    def video(self, entry: Entry, key: str) -> VideoSpan:
+        """An episode's frames of the video of a feature."""
+        place = entry.place(self.info.chunks_size, key)
+        path = (self.info.video_path or "").format(video_key=key, **place)
+        return VideoSpan(self.root / path, *entry.frames(key, self.info.fps))
+
+    def check_ends(self) -> None:
+        """Raise `RecordingError` where a video ends before its episodes do and the first of them
+        does not begin with it: the frames of all would be those of others.
+
+        A video whose first episode begins with it may be cut off; one that reaches its last
+        episode's end may be of a trimmed copy.
+        """
+        for path, spans in self._spans.items():
+            first, stop = spans[0][0], spans[-1][0] + spans[-1][3].length
+            if first and 0 < (frames := frame_count(path, self.limits)) < stop:
+                why = f"expected from_timestamp and length for frames 0 to {frames - 1} of {path}, "
+                why += f"found {first} to {stop - 1}"
+                raise META.refusal(self.root / "meta" / "episodes", why)
+
+    @cached_property
+    def _spans(self) -> Mapping[Path, list[tuple[int, int, str, Entry]]]:
+        """By video, in order: (first frame, index, feature key, episode)."""
+        spans: dict[Path, list[tuple[int, int, str, Entry]]] = defaultdict(list)
+        for entry in self.entries:
+            for key in self.info.videos:
+                span = self.video(entry, key)
+                spans[span.path].append((span.first or 0, entry.index, key, entry))
+        return {path: sorted(of_file, key=lambda span: span[:3]) for path, of_file in spans.items()}
+
+    @cached_property
+    def rivals(self) -> Mapping[tuple[int, str], str]:
+        """By an episode's index and a feature key: another episode that shares some frames."""
+        rivals: dict[tuple[int, str], str] = {}
+        for spans in self._spans.values():
+            until, last = 0, ("", spans[0][-1])
+            for first, index, key, entry in spans:
+                if first < until:
+                    rivals[index, key], rivals[last[1].index, last[0]] = last[1].id, entry.id
+                if first + entry.length > until:
+                    until, last = first + entry.length, (key, entry)
+        return rivals
+
+
+def read_meta(root: Path, limits: MediaLimits) -> LeRobotMeta:
+    """The data set as its `meta/` describes it.
+
+    Raises `RecordingError` naming the file of `meta/` that is wrong, and the place in it: also
+    where two cameras would be one view, or an episode is listed twice.
+    """
+    info = META.read_json(root / MARKER, Info, _INFO_BYTES)
+    path = root / "meta" / ("episodes" if info.shared else "episodes.jsonl")
+    rows = _shared_entries(path, info, limits) if info.shared else META.read_json_lines(path, Entry)
+    entries = sorted(_bounded(rows, root), key=lambda entry: entry.index)
+    for before, entry in pairwise(entries):
+        if before.index == entry.index:
+            raise META.refusal(path, f"expected each episode once, found {entry.id} twice")
+    return LeRobotMeta(root, info, entries, _task_text(root, info.shared, limits), limits)
+
+
+def _shared_entries(folder: Path, info: Info, limits: MediaLimits) -> Iterator[Entry]:
+    files = sorted(folder.glob("chunk-*/file-*.parquet"), key=natural_key)
+    if not files:
+        raise META.refusal(folder, "expected chunk-000/file-000.parquet, found none")
+    columns = [*_ENTRY_COLUMNS, *(f"data/{name}" for name in Place.model_fields)]
+    columns += [f"videos/{key}/{name}" for key in info.videos for name in Span.model_fields]
+    for path in files:
+        for where, cells in ParquetTable(path, limits).rows(columns):
+            row: dict[str, Any] = {"videos": {key: {} for key in info.videos}}
+            for column, cell in cells.items():
+                *parents, name = column.split("/")  # no key has one
+                reduce(lambda inner, parent: inner.setdefault(parent, {}), parents, row)[name] = (
+                    cell
+                )
+            entry = META.parse(row, SharedEntry, where)
+            for key, span in entry.videos.items():
+                frame = span.from_timestamp * info.fps
+                if abs(frame - round(frame)) > _OFF_FRAME:
+                    why = f"videos/{key}/from_timestamp: expected the time of a frame at fps "
+                    why += f"{info.fps:g}, found {span.from_timestamp:.6g} s, frame {frame:.2f}"
+                    raise META.refusal(where, why)
+            yield entry
+
+
+def _task_text(root: Path, shared: bool, limits: MediaLimits) -> dict[int, str]:
+    """The tasks' texts by their index; none where there is no file of them."""
+    path = root / "meta" / ("tasks.parquet" if shared else "tasks.jsonl")
+    if not path.exists():
+        return {}
+    if shared:
+        rows = ParquetTable(path, limits).rows(_TASK_COLUMNS)
+        tasks = (META.parse(cells, Task, where) for where, cells in rows)
+    else:
+        tasks = META.read_json_lines(path, Task)
+    texts: dict[int, str] = {}
+    for task in _bounded(tasks, root):
+        if texts.setdefault(task.index, task.text) != task.text:
+            raise META.refusal(path, f"expected each task once, found {task.index} twice")
+    return texts
+
+
+def _bounded(rows: Iterable[T], root: Path) -> list[T]:
+    """These rows of `meta/`; refused where they are more than any data set has."""
+    some = list(islice(rows, _MOST_ROWS + 1))
+    if len(some) > _MOST_ROWS:
+        why = f"expected at most {_MOST_ROWS:,} episodes or tasks, found more"
+        raise RecordingError(f"{root / 'meta'}: {why}. Split the data set")
+    return some

@@ -1,67 +1,190 @@
-"""A LeRobot v3.0 data set of one episode, with this project's sidecars, as its reader opens it.
+"""LeRobot data sets and this project's sidecars beside them, as its own reader opens them.
 
-Images stand in the rows as they were encoded. Equal ones are stored once, by the dictionary of the
-parquet file, so that rows between two frames cost next to nothing.
+`write_v21` writes many episodes, with a video a view; `write_v30` writes one, with the images in
+its rows as they were encoded. `meta/info.json` comes last: until then the folder does not look like
+a recording. `units` and `kind` of a feature are this project's extension; other readers pass over
+them.
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal, NamedTuple
 
+import av
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from pipeline.data.lerobot import MARKER
+from pipeline.data.lerobot_meta import MARKER
 
-EPISODE: Final = "episode_000000"
+Columns = Mapping[str, NDArray[Any]]
+"""By feature key: (row,) or (row, channel), `timestamp` (s since the first row) among them."""
+Features = Mapping[str, Mapping[str, Any]]
+"""What `info.json` says of features beside their type and shape."""
+
+_DATA: Final = {
+    "v2.1": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
+    "v3.0": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+}
+_VIDEO: Final = "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"
+_NUMBERING: Final = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+_STATISTICS_EVERY: Final = 10
+"""Frames between those that image statistics are taken from."""
 _IMAGES_A_GROUP: Final = 64
 """Of the parquet file's rows: equal images are stored once a group, which is held in memory."""
 _DICTIONARY_BYTES: Final = 2**30
-_DATA: Final = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _FIRST: Final = {"chunk_index": 0, "file_index": 0}
 _IMAGE: Final = pa.struct(
     [("bytes", pa.dictionary(pa.int32(), pa.binary())), ("path", pa.string())]
 )
 
 
-def write_data_set(
+class FilmedRows(NamedTuple):
+    """The rows of one episode, and by feature key a frame (row, height, width, 3) RGB for each."""
+
+    columns: Columns
+    frames: Mapping[str, NDArray[np.uint8]]
+
+
+def write_v21(
     root: Path,
-    columns: Mapping[str, NDArray[Any]],
+    episodes: Iterable[FilmedRows],
+    features: Features,
+    task: str,
+    fps: int,
+    robot_type: str,
+) -> None:
+    """Write a whole data set; episodes are taken one at a time."""
+    lengths: list[int] = []
+    statistics: list[dict[str, Any]] = []
+    described: dict[str, dict[str, Any]] = {}
+    for index, (given, frames) in enumerate(episodes):
+        columns = _numbered(given, index, sum(lengths))
+        place = {"episode_chunk": 0, "episode_index": index}
+        data = root / _DATA["v2.1"].format(**place)
+        data.parent.mkdir(parents=True, exist_ok=True)
+        pq.write_table(_number_table(columns), data)
+        for key, film in frames.items():
+            _write_video(root / _VIDEO.format(video_key=key, **place), film, fps)
+        lengths.append(len(columns["timestamp"]))
+        statistics.append(_statistics(columns, frames))
+        cameras = {key: _video_feature(film, fps) for key, film in frames.items()}
+        described = _described(columns, cameras, features)
+    (root / "meta").mkdir()
+    told = {"tasks": [task]}
+    for name, rows in {
+        "tasks": [{"task_index": 0, "task": task}],
+        "episodes": [{"episode_index": i, **told, "length": n} for i, n in enumerate(lengths)],
+        "episodes_stats": [{"episode_index": i, "stats": s} for i, s in enumerate(statistics)],
+    }.items():
+        lines = "".join(json.dumps(row) + "\n" for row in rows)
+        (root / "meta" / f"{name}.jsonl").write_text(lines, encoding="utf-8")
+    videos = sum(feature["dtype"] == "video" for feature in described.values())
+    totals = {"total_videos": len(lengths) * videos, "total_chunks": 1}
+    _write_info(root, "v2.1", lengths, described, fps, robot_type, **totals)
+
+
+def write_v30(
+    root: Path,
+    columns: Columns,
     images: Mapping[str, Sequence[Path]],
-    features: Mapping[str, Mapping[str, Any]],
+    features: Features,
     task: str,
     fps: float,
 ) -> None:
-    """Write rows and `meta/`, that last: until then the folder does not look like a recording.
+    """Write a data set of one episode; `images` has by feature key the image file of each row.
 
-    `columns` (row, …) with `timestamp` (s since the first row), and by feature key the image file
-    of each row (paths repeat where images do). `features` adds to what `info.json` says of these.
+    Equal images are stored once, by the dictionary of the parquet file, so that rows between two
+    frames cost next to nothing.
     """
+    columns = _numbered(columns, 0, 0)
+    _write_rows(root / _DATA["v3.0"].format(**_FIRST), columns, images)
     rows = len(columns["timestamp"])
-    whole = {name: np.zeros(rows, np.int64) for name in ("episode_index", "task_index")}
-    columns = {**columns, **{name: np.arange(rows) for name in ("frame_index", "index")}, **whole}
-    _write_rows(root / _DATA.format(**_FIRST), columns, images)
-    told: dict[str, dict[str, Any]] = {
+    places = [f"{kind}/{name}" for kind in ("data", "meta/episodes") for name in _FIRST]
+    counts = {"episode_index": 0, **dict.fromkeys(places, 0), "length": rows, "tasks": [task]}
+    spans = {"dataset_from_index": 0, "dataset_to_index": rows}
+    folder = root / "meta" / "episodes" / "chunk-000"
+    folder.mkdir(parents=True)
+    pq.write_table(pa.Table.from_pylist([counts | spans]), folder / "file-000.parquet")
+    # LeRobot looks tasks up by the index that pandas makes of this column.
+    column = {"name": "task", "field_name": "task"}
+    column |= {"pandas_type": "unicode", "numpy_type": "object"}
+    index = {"index_columns": ["task"], "columns": [column], "column_indexes": []}
+    told = {"pandas": json.dumps(index)}
+    tasks = pa.table({"task_index": [0], "task": [task]}, metadata=told)
+    pq.write_table(tasks, root / "meta" / "tasks.parquet")
+    cameras = {key: {"dtype": "image", "names": ["height", "width", "channel"]} for key in images}
+    _write_info(root, "v3.0", [rows], _described(columns, cameras, features), fps)
+
+
+def sidecar(root: Path, name: str, index: int = 0) -> Path:
+    """Where an episode's file of what LeRobot has no place for lies, by its kind."""
+    return root / name / f"episode_{index:06d}.npz"
+
+
+def write_sidecar(
+    root: Path,
+    name: str,
+    members: Mapping[str, NDArray[Any]],
+    index: int = 0,
+    compressed: bool = False,
+) -> None:
+    """Write what LeRobot has no place for."""
+    path = sidecar(root, name, index)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    save = np.savez_compressed if compressed else np.savez
+    save(path, allow_pickle=False, **members)
+
+
+def _numbered(columns: Columns, episode: int, first: int) -> dict[str, NDArray[Any]]:
+    """The columns of an episode and, last, those by which LeRobot numbers its rows."""
+    time = columns["timestamp"]
+    numbers = [time, np.arange(len(time)), np.full(len(time), episode)]
+    numbers += [first + np.arange(len(time)), np.zeros(len(time), np.int64)]
+    own = {name: values for name, values in columns.items() if name != "timestamp"}
+    return own | dict(zip(_NUMBERING, numbers, strict=True))
+
+
+def _described(columns: Columns, cameras: Features, features: Features) -> dict[str, Any]:
+    """`features` of `info.json`."""
+    numbers: dict[str, dict[str, Any]] = {
         name: {"dtype": str(values.dtype), "shape": [*values.shape[1:]] or [1], "names": None}
         for name, values in columns.items()
     }
-    told |= {key: {"dtype": "image", "names": ["height", "width", "channel"]} for key in images}
-    described = {name: {**said, **features.get(name, {})} for name, said in told.items()}
-    _write_meta(root, rows, task, fps, described)
+    order = [*(name for name in columns if name not in _NUMBERING), *cameras, *_NUMBERING]
+    return {name: {**{**numbers, **cameras}[name], **features.get(name, {})} for name in order}
 
 
-def write_sidecar(root: Path, name: str, **members: NDArray[Any]) -> None:
-    """Write what LeRobot has no place for, as the episode's file in a folder of that name."""
-    (root / name).mkdir()
-    np.savez(root / name / f"{EPISODE}.npz", allow_pickle=False, **members)
+def _write_info(
+    root: Path,
+    version: Literal["v2.1", "v3.0"],
+    lengths: Sequence[int],
+    features: Features,
+    fps: float,
+    robot_type: str | None = None,
+    **totals: int,
+) -> None:
+    info = {
+        "codebase_version": version,
+        "robot_type": robot_type,
+        "total_episodes": len(lengths),
+        "total_frames": sum(lengths),
+        "total_tasks": 1,
+        **totals,
+        "chunks_size": 1000,
+        "fps": int(fps) if float(fps).is_integer() else fps,
+        "splits": {"train": f"0:{len(lengths)}"},
+        "data_path": _DATA[version],
+        "video_path": _VIDEO if version == "v2.1" else None,
+        "features": features,
+    }
+    (root / MARKER).write_text(json.dumps(info, indent=4), encoding="utf-8")
 
 
-def number_table(columns: Mapping[str, NDArray[Any]]) -> pa.Table:
-    """Columns (row,) and (row, channel) of numbers, as LeRobot records them."""
+def _number_table(columns: Columns) -> pa.Table:
     arrays = {
         name: pa.array(values)
         if values.ndim == 1
@@ -71,11 +194,61 @@ def number_table(columns: Mapping[str, NDArray[Any]]) -> pa.Table:
     return pa.table(arrays)
 
 
-def _write_rows(
-    path: Path, columns: Mapping[str, NDArray[Any]], images: Mapping[str, Sequence[Path]]
-) -> None:
+def _write_video(path: Path, frames: NDArray[np.uint8], fps: int) -> None:
+    """H.264 with a key frame every other frame, as LeRobot does; one thread, so same bytes."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(
+            "libx264", rate=fps, options={"crf": "18", "g": "2", "bf": "0", "threads": "1"}
+        )
+        stream.height, stream.width, stream.pix_fmt = *frames.shape[1:3], "yuv420p"
+        for frame in frames:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        container.mux(stream.encode())
+
+
+def _video_feature(frames: NDArray[np.uint8], fps: int) -> dict[str, Any]:
+    _, height, width, channels = frames.shape
+    info = {
+        "video.height": height,
+        "video.width": width,
+        "video.codec": "h264",
+        "video.pix_fmt": "yuv420p",
+        "video.is_depth_map": False,
+        "video.fps": fps,
+        "video.channels": channels,
+        "has_audio": False,
+    }
+    names, shape = ["height", "width", "channel"], [height, width, channels]
+    return {"dtype": "video", "shape": shape, "names": names, "info": info}
+
+
+def _statistics(columns: Columns, frames: Mapping[str, NDArray[np.uint8]]) -> dict[str, Any]:
+    """LeRobot's per-episode statistics; images in 0..1, a value a colour, shaped (3, 1, 1)."""
+    stats: dict[str, Any] = {
+        name: {**_of(values.reshape(len(values), -1)), "count": [len(values)]}
+        for name, values in columns.items()
+    }
+    for key, film in frames.items():
+        some = film[::_STATISTICS_EVERY]
+        colours = _of(some.reshape(-1, 3) / 255)
+        stats[key] = {name: np.reshape(colours[name], (3, 1, 1)).tolist() for name in colours}
+        stats[key]["count"] = [len(some)]
+    return stats
+
+
+def _of(rows: NDArray[Any]) -> dict[str, list[Any]]:
+    return {
+        "min": rows.min(0).tolist(),
+        "max": rows.max(0).tolist(),
+        "mean": rows.mean(0, dtype=np.float64).tolist(),
+        "std": rows.std(0, dtype=np.float64).tolist(),
+    }
+
+
+def _write_rows(path: Path, columns: Columns, images: Mapping[str, Sequence[Path]]) -> None:
     path.parent.mkdir(parents=True)
-    table = number_table(columns)
+    table = _number_table(columns)
     schema = pa.schema([*table.schema, *(pa.field(key, _IMAGE) for key in images)])
     changes = np.zeros(table.num_rows)
     for files in images.values():
@@ -99,33 +272,3 @@ def _cells(files: Sequence[Path]) -> pa.StructArray:
     rows = pa.array([place[encoded[file]] for file in files], pa.int32())
     images = pa.DictionaryArray.from_arrays(rows, pa.array(list(place), pa.binary()))
     return pa.StructArray.from_arrays([images, pa.nulls(len(files), pa.string())], _IMAGE.names)
-
-
-def _write_meta(
-    root: Path, rows: int, task: str, fps: float, features: Mapping[str, Mapping[str, Any]]
-) -> None:
-    places = [f"{kind}/{name}" for kind in ("data", "meta/episodes") for name in _FIRST]
-    counts = {"episode_index": 0, **dict.fromkeys(places, 0), "length": rows, "tasks": [task]}
-    spans = {"dataset_from_index": 0, "dataset_to_index": rows}
-    folder = root / "meta" / "episodes" / "chunk-000"
-    folder.mkdir(parents=True)
-    pq.write_table(pa.Table.from_pylist([counts | spans]), folder / "file-000.parquet")
-    # LeRobot looks tasks up by the index that pandas makes of this column.
-    column = {"name": "task", "field_name": "task"}
-    column |= {"pandas_type": "unicode", "numpy_type": "object"}
-    index = {"index_columns": ["task"], "columns": [column], "column_indexes": []}
-    told = {"pandas": json.dumps(index)}
-    tasks = pa.table({"task_index": [0], "task": [task]}, metadata=told)
-    pq.write_table(tasks, root / "meta" / "tasks.parquet")
-    totals = {"total_episodes": 1, "total_frames": rows, "total_tasks": 1, "chunks_size": 1000}
-    info = {
-        "codebase_version": "v3.0",
-        "robot_type": None,
-        **totals,
-        "fps": int(fps) if float(fps).is_integer() else fps,
-        "splits": {"train": "0:1"},
-        "data_path": _DATA,
-        "video_path": None,
-        "features": features,
-    }
-    (root / MARKER).write_text(json.dumps(info, indent=1), encoding="utf-8")

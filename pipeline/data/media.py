@@ -2,7 +2,7 @@
 
 from collections.abc import Generator
 from contextlib import contextmanager
-from io import BytesIO
+from io import SEEK_CUR, BytesIO
 from pathlib import Path
 from typing import IO, Annotated, Any
 
@@ -41,6 +41,8 @@ _IMAGE_BYTES = 16 * 2**20
 """That an image may have beside one for each pixel of the limits; a good JPEG has half of that."""
 _SCAN, _MOST_SCANS = b"\xff\xda", 100
 """A progressive JPEG has about ten; each goes over all pixels again."""
+_PNG, _MOST_CHUNKS = b"\x89PNG\r\n\x1a\n", 100_000
+"""Pillow takes 5 µs a chunk, even of no bytes; FFmpeg writes chunks of 4 KiB."""
 _CODECS = ("av1", "h264", "hevc", "mjpeg", "mpeg4", "vp8", "vp9")
 _AV1_DECODERS = frozenset({"libdav1d", "libaom-av1", "libgav1"})
 _CONTAINERS = {"format_whitelist": "mov,mp4,matroska,webm,avi", "protocol_whitelist": "file"}
@@ -89,6 +91,8 @@ def opened_image(
         RECORDINGS.foreign(where, unreadable),
         BytesIO(file) if isinstance(file, bytes) else file.open("rb") as stream,
     ):
+        if _chunks(stream) > _MOST_CHUNKS:
+            raise INTACT.refusal(where, f"expected a PNG of at most {_MOST_CHUNKS:,} chunks")
         try:
             image = Image.open(stream, formats=_IMAGES)
         except UnidentifiedImageError:
@@ -154,6 +158,17 @@ def check_limit(where: Path | str, found: int, most: int, name: str, what: str) 
             RecordingError,
             f"Leave the episode out, or if this is right, raise limits.{name} of its source.",
         ).refusal(where, f"expected at most {most:,} {what}, found {found:,}")
+
+
+def _chunks(stream: IO[bytes]) -> int:
+    """Chunks of a PNG, no more than one too many; 0 of another file. Ends at the beginning."""
+    count = 0
+    if stream.read(len(_PNG)) == _PNG:
+        while count <= _MOST_CHUNKS and len(head := stream.read(8)) == 8:
+            stream.seek(int.from_bytes(head[:4]) + 4, SEEK_CUR)
+            count += 1
+    stream.seek(0)
+    return count
 
 
 def _scans(image: Image.Image, stream: IO[bytes]) -> int:

@@ -10,9 +10,11 @@ Times are float64 seconds on the recording's own clock, never decreasing. Anythi
 
 import json
 import os
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.clock import CLOCK_SLACK_S
+from pipeline.base.config import Source
 from pipeline.base.digests import joint_digest
 from pipeline.base.errors import RecordingError
 from pipeline.base.finite import first_non_finite, non_finite
@@ -112,26 +115,59 @@ class CameraStream(ABC):
 
 
 class Recording(ABC):
-    """One episode on disk."""
+    """One episode on disk, with what the params say about its source."""
 
+    format: str
     id: str
     """Unique within its source: the episode folder relative to its source, or `episode_000003`."""
     source: str
-    format: str
     path: Path
-    instruction: str
+
+    def __init__(self, path: Path, source: Source, views: Sequence[str] | None) -> None:
+        """Of the views, only those in `views` are kept; all of them where it is None."""
+        self.path = path
+        self.id = path.name
+        self.source = source.name
+        self._overrides = source
+        self._views = None if views is None else frozenset(views)
+
+    # Read on first use: the old format keeps it in the pickle, which opening leaves closed.
+    @cached_property
+    def instruction(self) -> str:
+        """The source's instruction, else the recording's own."""
+        if self._overrides.instruction is not None:
+            return self._overrides.instruction
+        return self._recorded_instruction()
 
     @abstractmethod
     def files(self) -> list[Path]:
         """Every file whose bytes decide what this episode says, sorted."""
 
+    @abstractmethod
+    def all_views(self) -> Sequence[str]:
+        """Names of the views before the filter, without reading any numeric stream."""
+
+    @abstractmethod
+    def _recorded_instruction(self) -> str: ...
+
+    @abstractmethod
+    def _cameras(self) -> Mapping[str, CameraStream]:
+        """The views that have at least one frame; those that the filter leaves out may be there."""
+
+    def _wants(self, view: str) -> bool:
+        return self._views is None or view in self._views
+
     def identity(self) -> str:
         """What, beside its files, tells this episode from others in the same files; often ''."""
         return ""
 
-    @abstractmethod
     def cameras(self) -> Mapping[str, CameraStream]:
-        """The views that have at least one frame, by name."""
+        """The kept views that have at least one frame, by name."""
+        return {view: camera for view, camera in self._cameras().items() if self._wants(view)}
+
+    def view_names(self) -> Sequence[str]:
+        """Names of the kept views, without reading any numeric stream."""
+        return [view for view in self.all_views() if self._wants(view)]
 
     @property
     def group(self) -> str | None:
@@ -140,10 +176,6 @@ class Recording(ABC):
         Training holds out whole groups. None where it says nothing.
         """
         return None
-
-    def view_names(self) -> Sequence[str]:
-        """Names of `cameras()`, where the format allows it without reading a numeric stream."""
-        return list(self.cameras())
 
     def empty_views(self) -> Sequence[str]:
         """Views that have a place in the recording and no frame there."""
@@ -277,3 +309,20 @@ def content_digest(recording: Recording, digest_of: Callable[[Path], str]) -> st
         name = name[len(inside) :] if below else os.path.relpath(file, recording.path)
         named.append((name, digest_of(file)))
     return joint_digest(recording.identity(), json.dumps(sorted(named)))
+
+
+def entries(folder: Path) -> list[os.DirEntry[str]]:
+    """What is in a folder; `RecordingError` where it cannot be listed."""
+    with RECORDINGS.foreign(folder, "cannot be listed"), os.scandir(folder) as listed:
+        return list(listed)
+
+
+def absolute(path: Path) -> Path:
+    """The path made absolute without following symbolic links."""
+    return Path(os.path.abspath(path))
+
+
+def natural_key(text: str | Path) -> list[tuple[int, int, str]]:
+    """Sorts `View2` before `View10`."""
+    parts = re.split(r"(\d+)", str(text))
+    return [(0, int(part), part) if part.isdecimal() else (1, 0, part) for part in parts]

@@ -190,9 +190,9 @@ def tick_hz(recorded_hz: Iterable[float | None], action_hz: float | None) -> flo
     return float(f"{np.median(rates):.5g}")  # what a clock in float32 tells of a rate
 
 
-def wrapped(degrees: NDArray[np.float64]) -> NDArray[np.float64]:
+def wrapped_deg(angle: NDArray[np.float64]) -> NDArray[np.float64]:
     """The same angles in [-180, 180)."""
-    return (degrees + 180.0) % 360.0 - 180.0
+    return (angle + 180.0) % 360.0 - 180.0
 
 
 def _redo_rotation(
@@ -292,7 +292,7 @@ def _pose_actions(
         # The recorder's own branch of the angles, made continuous; slerp might leave it.
         angles = np.unwrap(pose[:, 3:], axis=0, period=360.0)
         at = np.stack([np.interp(edges, clock, angles[:, axis]) for axis in range(3)], axis=1)
-        rotation = wrapped(np.diff(at, axis=0))
+        rotation = wrapped_deg(np.diff(at, axis=0))
     gripper = np.ones((len(edges) - 1, 1))
     return np.concatenate([np.diff(place, axis=0), rotation, gripper], axis=1).astype(np.float32)
 

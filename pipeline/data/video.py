@@ -83,6 +83,7 @@ class VideoClip(CameraStream):
     def _frames(self, indices: Sequence[int]) -> Iterator[VideoFrame]:
         """The frames before their conversion to RGB; the same object where an index repeats."""
         table = self._table
+        start = table.pts[0] if len(table.pts) else 0
         with opened_video(self._span.path, self._limits) as (container, stream):
             decoded: Iterator[VideoFrame] = iter(())
             at, frame = -1, None
@@ -91,18 +92,26 @@ class VideoClip(CameraStream):
                 if frame is None or index != at:
                     # Whole groups of pictures between two frames are skipped, not decoded.
                     if frame is None or table.key_pts[index] > table.pts[at + 1]:
-                        container.seek(int(table.key_dts[index]), stream=stream)
-                        decoded = iter(container.decode(stream))
-                    frame = self._decode_until(decoded, index)
+                        # A new container stands at its first frame. A seek there may lead to a
+                        # later key frame of the same time.
+                        if frame is not None or self._span.first or table.key_pts[index] > start:
+                            container.seek(int(table.key_dts[index]), stream=stream)
+                        decoded, at = iter(container.decode(stream)), -1
+                    twins = index - max(at + 1, int(np.searchsorted(table.pts, table.pts[index])))
+                    frame = self._decode_until(decoded, index, twins)
                     at = index
                 yield frame
 
-    def _decode_until(self, decoded: Iterator[VideoFrame], index: int) -> VideoFrame:
+    def _decode_until(self, decoded: Iterator[VideoFrame], index: int, twins: int) -> VideoFrame:
+        """The frame, after so many others of the same time."""
         pts, key_pts, said = int(self._table.pts[index]), int(self._table.key_pts[index]), ""
         try:
             for frame in decoded:
                 if frame.pts == pts and not frame.is_corrupt:
-                    return frame
+                    if not twins:
+                        return frame
+                    twins -= 1
+                    continue
                 # A damaged frame since the key frame spoils those that are predicted from it.
                 spoilt = frame.is_corrupt and frame.pts is not None and frame.pts >= key_pts
                 if frame.pts is None or frame.pts >= pts or spoilt:
@@ -126,7 +135,11 @@ class VideoClip(CameraStream):
                     "pair by number, so the counts must agree. Copy the video again, or leave "
                     "the episode out"
                 )
-        return _FrameTable(*np.array(sorted(packets, key=itemgetter(0)), np.int64).reshape(-1, 3).T)
+        table = np.array(sorted(packets, key=itemgetter(0)), np.int64).reshape(-1, 3).T
+        # Frames of one time are counted from the first of them, so decoding starts before it.
+        first, stop = (np.searchsorted(table[0], table[0], side) for side in ("left", "right"))
+        before = np.where(stop - first > 1, np.maximum(first - 1, 0), np.arange(rows))
+        return _FrameTable(table[0], *table[1:, before])
 
 
 def frame_count(path: Path, limits: MediaLimits) -> int:

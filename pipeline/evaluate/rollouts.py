@@ -29,7 +29,7 @@ from pipeline.robot.loop import ControlLoop, SafeStop
 from pipeline.robot.memory import RobotMemory, SeenFeatures
 from pipeline.robot.proof import prove
 from pipeline.simulation.environment import InsertionEnvironment
-from pipeline.simulation.insertion import INSERTED, TICK_HZ, EpisodeTrace, NeedleInsertion
+from pipeline.simulation.insertion import INSERTED, TICK_HZ, InsertionTrace, NeedleInsertion
 from pipeline.simulation.insertion_formats import INSTRUCTION
 from pipeline.simulation.rendering import VIEWS, photograph
 
@@ -66,7 +66,7 @@ class RolloutEpisode:
     max_force_n: float
     time_s: float
     ticks: int
-    trace: EpisodeTrace
+    trace: InsertionTrace
     frames: Callable[[float], Mapping[str, NDArray[np.uint8]]]
     """What the cameras saw at a time in s: RGB (126, 224, 3) by view."""
 

@@ -18,7 +18,7 @@ from pipeline.base.durable import KEPT, free_bytes, previous_path
 from pipeline.base.errors import StoreIncomplete, StoreMismatch
 from pipeline.base.format import duration, size
 from pipeline.base.ownership import refuse_foreign, remove_folder
-from pipeline.data.embodiment import Embodiment
+from pipeline.data.episode import Embodiment
 from pipeline.extract.survey import CheckedEpisode, Survey
 from pipeline.store import FEATURES, RowSource, StoreBuild, part_path, read_plan
 from pipeline.store.paths import MERGED, STORE, is_store

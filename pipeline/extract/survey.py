@@ -22,8 +22,7 @@ from pipeline.base.errors import RecordingError, StoreMismatch, VLMError
 from pipeline.base.format import capped
 from pipeline.base.source import RATE_TOLERANCE, Streams
 from pipeline.data import BadEpisode, Recording, content_digest, open_recordings
-from pipeline.data.embodiment import Embodiment, common_embodiment
-from pipeline.data.episode import read_episode
+from pipeline.data.episode import Embodiment, common_embodiment, read_episode
 from pipeline.data.timeline import ActionRotation, choose_action_rotation
 from pipeline.store.border import EpisodeText
 from pipeline.store.episodes import EpisodeRows

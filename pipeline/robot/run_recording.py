@@ -29,7 +29,7 @@ from pipeline.base.errors import RecordingError
 from pipeline.base.finite import non_finite
 from pipeline.base.ownership import OutputKind, begin_folder, remove_folder, unmark
 from pipeline.data.lerobot import ACTION, STATE
-from pipeline.data.lerobot_writer import write_data_set, write_sidecar
+from pipeline.data.lerobot_writer import write_sidecar, write_v30
 from pipeline.data.media import RECORDINGS
 
 RUN: Final = "run.json"
@@ -167,8 +167,8 @@ def _write_readings(
             kept = np.delete(log, bad) if len(bad) else log
             channels = run.metadata["streams"][name]
             told = {key: np.array(channels[key], str) for key in ("names", "units")}
-            since = kept["time"] - start_s
-            write_sidecar(root, name, timestamps=since, values=kept["values"], **told)
+            readings = {"timestamps": kept["time"] - start_s, "values": kept["values"]}
+            write_sidecar(root, name, readings | told)
     return left_out
 
 
@@ -196,8 +196,8 @@ def _write_rows(
         came = rows["time"][np.searchsorted(number, number)]
         captured[view] = np.minimum(shown["time"][number], came) - start
     if captured:
-        write_sidecar(root, "frames", **captured)
+        write_sidecar(root, "frames", captured)
     digest = np.array([str(metadata.get("feature_spec_digest", ""))])
     told = {name: rows[name] for name in ("answer", "key", "age_s")}
-    write_sidecar(root, "features", **told, feature_spec_digest=digest)
-    write_data_set(root, columns, images, features, run.instruction, metadata["action_hz"])
+    write_sidecar(root, "features", told | {"feature_spec_digest": digest})
+    write_v30(root, columns, images, features, run.instruction, metadata["action_hz"])

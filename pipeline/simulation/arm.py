@@ -1,21 +1,20 @@
-"""The arm that carries the needle: its pose convention, how it moves, a stand-in for its joints.
+"""The arm that carries the needle: its pose convention, its motion, a stand-in for its joints.
 
 A pose is x y z of the needle's tip in mm and a b r in degrees, both in the base frame, with the
 rotation R = Rx(a)·Ry(b)·Rz(r) (mobile XYZ). The needle points down (-z) when the arm is upright.
 """
 
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-ActionRotation = Literal["rotvec", "euler_delta"]
-"""How an action's three rotation channels are meant, in degrees; DESIGN's names."""
+from pipeline.data.timeline import ActionRotation, wrapped_deg
 
 NOMINAL_POSE = np.array([82.0, 111.0, 253.0, -136.0, 38.0, -158.0])
-"""About where a Meca500 with this tool stands when it inserts."""
+"""Where a Meca500 with this tool stands, roughly, when it inserts."""
 
 _HOME_JOINTS_DEG = np.array([10.0, 20.0, -15.0, 5.0, 30.0, -60.0])
 _JOINTS_PER_POSE = np.array(
@@ -28,11 +27,6 @@ _JOINTS_PER_POSE = np.array(
         [0.03, 0.07, -0.04, -0.25, 0.17, 0.82],
     ]
 )
-
-
-def wrapped_deg(angle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The same angles in [-180, 180)."""
-    return (angle + 180.0) % 360.0 - 180.0
 
 
 def orientation(abr_deg: NDArray[np.float64]) -> Rotation:

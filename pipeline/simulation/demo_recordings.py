@@ -25,11 +25,11 @@ from pipeline.base.ownership import OutputKind, remove_folder, there
 from pipeline.simulation.insertion_formats import (
     ABUTTING,
     OVERLAPPING,
+    write_lerobot,
     write_new,
     write_old,
     write_raw,
 )
-from pipeline.simulation.lerobot_format import write_lerobot
 from pipeline.simulation.recorder import SimulatedEpisode, simulate_episode
 
 DEMO_VERSION: Final = 2

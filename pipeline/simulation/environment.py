@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.base.config import Level
 from pipeline.data.insertion import SENSOR, STATE
-from pipeline.simulation.arm import ActionRotation
+from pipeline.data.timeline import ActionRotation
 from pipeline.simulation.insertion import (
     INSERTED,
     MAX_TICKS,
@@ -30,6 +30,8 @@ _LARGEST_ACTION: Final = 5.0
 _STATES_PER_TICK: Final = STATE_HZ // TICK_HZ
 
 Readings = dict[str, NDArray[Any]]
+Shots = dict[str, tuple[float, NDArray[np.uint8]]]
+"""By view: when its newest frame was taken, in s, and the frame (height, width, 3), RGB."""
 
 
 class InsertionEnvironment(gymnasium.Env[Any, NDArray[np.floating[Any]]]):
@@ -51,9 +53,9 @@ class InsertionEnvironment(gymnasium.Env[Any, NDArray[np.floating[Any]]]):
         cameras: bool = True,
         render_mode: str | None = None,
     ) -> None:
-        """Without `cameras` frames are only drawn when `frames` asks for them.
+        """Without `cameras` frames are drawn only when `frames` is called.
 
-        Raises `ValueError` for a level or a convention of rotations that there is not.
+        Raises `ValueError` for an unknown level or convention of rotations.
         """
         for value, known in ((level, get_args(Level)), (action_rotation, get_args(ActionRotation))):
             if value not in known:
@@ -78,7 +80,7 @@ class InsertionEnvironment(gymnasium.Env[Any, NDArray[np.floating[Any]]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Readings, dict[str, Any]]:
-        """Begin the episode of `seed`, or of one that is drawn."""
+        """Begin the episode of `seed`, or of a drawn seed."""
         super().reset(seed=seed)
         drawn = int(self.np_random.integers(2**31)) if seed is None else seed
         self.insertion.reset(drawn, self.level)
@@ -93,9 +95,9 @@ class InsertionEnvironment(gymnasium.Env[Any, NDArray[np.floating[Any]]]):
     def step(
         self, action: NDArray[np.floating[Any]]
     ) -> tuple[Readings, float, bool, bool, dict[str, Any]]:
-        """Carry out one tick of 0.1 s; an action beyond the space is carried out as far as it goes.
+        """Carry out one tick of 0.1 s; the arm's limits bound an action beyond the space.
 
-        Raises `ResetNeeded` before the first and after the end of an episode, and `ValueError` for
+        Raises `ResetNeeded` before the first episode and after the end of one, and `ValueError` for
         an action that is not seven finite numbers.
         """
         if not hasattr(self, "_shots") or self.insertion.finished:
@@ -120,8 +122,8 @@ class InsertionEnvironment(gymnasium.Env[Any, NDArray[np.floating[Any]]]):
             readings |= {f"images/{view}": frame for view, (_, frame) in self.frames().items()}
         return readings
 
-    def frames(self) -> dict[str, tuple[float, NDArray[np.uint8]]]:
-        """What each camera took last: when, in s, and RGB (126, 224, 3) as a recording has it."""
+    def frames(self) -> Shots:
+        """The newest frame (126, 224, 3) of each camera, as a recording has it."""
         return {
             view: (time, through_jpeg(photograph(view, self.insertion, time)))
             for view, time in self._frame_times().items()

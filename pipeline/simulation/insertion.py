@@ -32,15 +32,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.config import Level
-from pipeline.simulation.arm import (
-    ActionRotation,
-    ArmMotion,
-    angles_deg,
-    moved,
-    orientation,
-    robot_state,
-    wrapped_deg,
-)
+from pipeline.data.timeline import ActionRotation, wrapped_deg
+from pipeline.simulation.arm import ArmMotion, angles_deg, moved, orientation, robot_state
 from pipeline.simulation.expert import REACTION_TICKS, Percept, expert_motion
 from pipeline.simulation.layout import InsertionLayout, draw_layout
 from pipeline.simulation.needle_sensor import READING_HZ, NeedleContact, NeedleSensor
@@ -55,17 +48,17 @@ ENCODER_NOISE: Final = 0.002
 """Of every joint and pose reading, mm and degrees."""
 
 MISS_MM: Final = 1.0
-"""Success asks for a puncture as near to the target as this,"""
+"""Largest distance from the target to the puncture, sideways."""
 AT_LAYER_MM: Final = 0.15
-"""for the tip to rest as near to the layer as this"""
+"""Largest distance from the layer to a tip that counts as resting at it."""
 HOLD_TICKS: Final = 6
-"""for so many ticks,"""
+"""Ticks for which the tip has to rest at the layer."""
 OVERSHOOT_MM: Final = 0.5
-"""for a tip that never goes farther beyond the layer,"""
+"""Farthest that the tip may go beyond the layer."""
 FORCE_LIMIT_N: Final = 2.5
-"""for never more force,"""
+"""Largest force on the needle."""
 MAX_TICKS: Final = 120
-"""and for all this in time: 12 s."""
+"""Ticks within which the needle has to be inserted: 12 s."""
 
 _PUSH_TICKS = 2
 _CLEAR_MM = 1.1
@@ -76,7 +69,7 @@ _SIDEWAYS_N_MM, _SIDEWAYS_FRICTION = 0.8, 0.3
 
 @dataclass(frozen=True)
 class Scene:
-    """All that the cameras can see, in the bench frame: nothing of heights.
+    """Everything that the cameras see, in the bench frame: no heights.
 
     `needle_mm` (2,) the tip, `lean_mm` (2,) how far the hub stands beside it, `target_mm` (2,).
     """
@@ -106,7 +99,7 @@ class Knot:
 
 @dataclass
 class Progress:
-    """How an episode goes: what success and failure are told by."""
+    """What decides whether an episode succeeds, fails or goes on."""
 
     puncture_mm: NDArray[np.float64] | None = None
     """(2,) from the target to the tip, sideways, when the surface was last punctured."""
@@ -115,7 +108,7 @@ class Progress:
     held_ticks: int = 0
 
     def outcome(self, ticks: int) -> str | None:
-        """Why it has ended after `ticks`, `INSERTED` for success; None where it goes on."""
+        """Why the episode ended after `ticks`, `INSERTED` for success; None where it goes on."""
         if self.max_force_n > FORCE_LIMIT_N:
             return "too much force"
         if self.puncture_mm is not None and np.hypot(*self.puncture_mm) > MISS_MM:
@@ -134,8 +127,8 @@ TIME_IS_UP: Final = "time is up"
 
 
 @dataclass(frozen=True)
-class EpisodeTrace:
-    """What happened, a row a tick.
+class InsertionTrace:
+    """The course of an insertion, one row a tick.
 
     `time_s` (tick,); `offset_mm` (tick, 2) from the target to the tip, sideways; `lateral_mm` (2,)
     that at the puncture, without one at the end; `height_mm`
@@ -154,10 +147,9 @@ class EpisodeTrace:
 class NeedleInsertion:
     """A needle insertion to step through: `reset`, then `step` until `finished`.
 
-    `state` (10, 12) and `sensor` (65, 1026), the readings of the tick that ends now, are what a
-    policy may see, and what cameras see is `rendering.photograph`. The same seed and actions give
-    the same readings, bit for bit. `action_rotation` says how the rotation channels of an action
-    are meant.
+    A policy may see `state` (10, 12) and `sensor` (65, 1026), the readings of the tick that ends
+    now, and what `rendering.photograph` shows. The same seed and actions give the same readings,
+    bit for bit. `action_rotation` is the convention of an action's rotation channels.
     """
 
     state: NDArray[np.float32]
@@ -174,7 +166,7 @@ class NeedleInsertion:
         self.start(draw_layout(seed, level))
 
     def start(self, layout: InsertionLayout) -> None:
-        """Begin this very episode: the arm has stood still for one tick."""
+        """Begin the episode of this layout: the arm stands still for one tick."""
         self.layout = layout
         self._upright = orientation(layout.upright_deg)
         self._sensor = NeedleSensor(layout.oct_gain, layout.seed)
@@ -255,12 +247,12 @@ class NeedleInsertion:
             brightness=self.layout.brightness,
         )
 
-    def trace(self) -> EpisodeTrace:
-        """What happened so far."""
+    def trace(self) -> InsertionTrace:
+        """The course of the episode so far."""
         knots = self.knots[1:]
         bench, puncture = self.layout.bench_mm, self.progress.puncture_mm
         offsets = np.stack([knot.pose[:2] - bench - knot.target_mm for knot in knots])
-        return EpisodeTrace(
+        return InsertionTrace(
             time_s=np.arange(1.0, len(self.knots)) * TICK_S,
             offset_mm=offsets,
             lateral_mm=offsets[-1] if puncture is None else puncture,

@@ -1,10 +1,12 @@
-"""Writers of the needle-insertion recorder's three formats: raw, new and old.
+"""Writers of simulated episodes: the needle-insertion recorder's three formats, and LeRobot v2.1.
 
-Each writes one episode into its task's folder, as that generation of the recorder left it.
+`write_raw`, `write_new` and `write_old` write one episode into its task's folder, as that
+generation of the recorder left it. `write_lerobot` writes a whole data set.
 """
 
 import json
 import pickle
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Final
 
@@ -13,9 +15,13 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipeline.data.insertion import CLOCK, STATE
+from pipeline.data.insertion import CLOCK, SENSOR, STATE
+from pipeline.data.lerobot import ACTION as ACTION_KEY
+from pipeline.data.lerobot import STATE as STATE_KEY
+from pipeline.data.lerobot_writer import FilmedRows, write_sidecar, write_v21
+from pipeline.data.pickled import ACTION
 from pipeline.simulation.arm import euler_actions
-from pipeline.simulation.insertion import STATE_HZ, TICK_HZ
+from pipeline.simulation.insertion import STATE_HZ, TICK_HZ, TICK_S
 from pipeline.simulation.needle_sensor import READING_HZ
 from pipeline.simulation.recorder import SimulatedEpisode
 from pipeline.simulation.rendering import JPEG_QUALITY, VIEWS
@@ -135,6 +141,45 @@ def write_old(task: Path, episode: SimulatedEpisode) -> None:
         },
     }
     (folder / "data.pkl").write_bytes(pickle.dumps(document, protocol=4))
+
+
+def write_lerobot(root: Path, episodes: Iterable[SimulatedEpisode]) -> None:
+    """Write a LeRobot v2.1 data set, with the sensor in sidecars; episodes are taken one at a time.
+
+    Rows are on LeRobot's own clock, k / fps from the first. The sidecars' times are on that clock
+    too; the sensor begins before the first row, at a negative time.
+    """
+    features = {
+        key: {"names": list(channels.names), "units": list(channels.units)}
+        for key, channels in ((STATE_KEY, STATE), (ACTION_KEY, ACTION))
+    }
+    rows = _lerobot_rows(root, episodes)
+    write_v21(root, rows, features, INSTRUCTION, TICK_HZ, "simulated_meca500")
+
+
+def _lerobot_rows(root: Path, episodes: Iterable[SimulatedEpisode]) -> Iterator[FilmedRows]:
+    """The rows of each episode, after its sidecar is written."""
+    for index, episode in enumerate(episodes):
+        begin = episode.epoch_s + TICK_S
+        rows = round((episode.duration_s - TICK_S) / TICK_S)
+        time = begin + np.arange(rows + 1, dtype=np.float64) * TICK_S
+        columns = {
+            STATE_KEY: episode.states(time[:-1]),
+            ACTION_KEY: euler_actions(episode.poses(time)),
+            "timestamp": (np.arange(rows) / TICK_HZ).astype(np.float32),
+        }
+        readings = {
+            "timestamps": episode.sensor_time - begin,
+            "values": episode.sensor,
+            "names": np.array(SENSOR.names),
+            "units": np.array(SENSOR.units),
+        }
+        write_sidecar(root, "sensor", readings, index, compressed=True)
+        frames = {
+            f"observation.images.{view}": np.stack([*episode.frames(view, time[:-1])])
+            for view in VIEWS
+        }
+        yield FilmedRows(columns, frames)
 
 
 def _write_state_csv(path: Path, episode: SimulatedEpisode, time: NDArray[np.float64]) -> None:

@@ -1,6 +1,6 @@
-"""One episode's hidden truth, and how it is drawn.
+"""The hidden parameters of an episode, and how they are drawn.
 
-Each concern draws from its own generator, so that changing one leaves the others as they were.
+Each group draws from its own generator, so that a change of one leaves the others as they were.
 """
 
 import math
@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.config import Level
-from pipeline.simulation.arm import NOMINAL_POSE, angles_deg, orientation, wrapped_deg
+from pipeline.data.timeline import wrapped_deg
+from pipeline.simulation.arm import NOMINAL_POSE, angles_deg, orientation
 
 WORKSPACE_MM: Final = np.array([6.5, 4.0])
 """Needle and target begin within plus or minus this of the bench's middle, x and y."""
@@ -21,7 +22,7 @@ _PUSHES = 3
 _PUSH_MM: Final = (3.0, 8.0)
 _PUSH_EVERY_S: Final = (0.7, 1.4)
 _TISSUE: Final = ((0.9, 1.3), (0.5, 0.9), (0.9, 1.3), (0.2, 0.3), (0.1, 0.18), (2.0, 3.2))
-"""Between what each field of `Tissue` is drawn, in their order."""
+"""Bounds between which each field of `Tissue` is drawn, in their order."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class Tissue:
 
 @dataclass(frozen=True)
 class InsertionLayout:
-    """What an episode is made of and no observation states outright.
+    """The hidden parameters of an episode.
 
     `bench_mm` (2,), `start_pose` (6,) and `surfaces_mm` (place,) are in the base frame,
     `targets_mm` (place, 2) in the bench frame. The phantom begins at place 0 and goes to the next

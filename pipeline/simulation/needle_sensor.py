@@ -1,9 +1,10 @@
 """What the needle measures: the force along it, and an OCT A-scan that looks ahead of its tip.
 
 An A-scan is 1,025 bins of 5 µm, counted from the tip, in whole counts of an 8-bit digitiser.
-Outside the tissue its surface is the strongest peak, at the tip-to-tissue distance, with light
-scattered behind it that decays exponentially; inside, the scatter begins at the tip. The target
-layer is a second, weaker peak. Beyond the last bin nothing is seen.
+Outside the tissue nothing is brighter than its surface, a peak at the tip-to-tissue distance, with
+light scattered behind it that decays exponentially; inside, the scatter begins at the tip. The
+target layer is a second, weaker peak, which saturates as the surface does where speckle is bright.
+Beyond the last bin nothing is seen.
 
 Scattered light carries speckle, a grain that is fixed to the tissue and drawn anew for each episode
 (Schmitt, Xiang, Yung, "Speckle in optical coherence tomography", J. Biomed. Opt. 4(1), 1999). The

@@ -1,9 +1,9 @@
 """The simulated arm in real time: a tick of the simulation an action, cameras on their own thread.
 
-The simulation knows ticks of 0.1 s alone. Run at another rate, its world goes that much faster than
-life: at 100 Hz ten simulated seconds pass in each of ours. All times that the robot tells are ours,
-so ages are true and its clock keeps pace with the monotonic one: a reading that comes 1.5 ms after
-another in the simulation then comes 0.15 ms after it.
+The simulation has ticks of 0.1 s only. At another rate its world goes faster than life: at 100 Hz
+ten simulated seconds pass in a real one. The robot gives all times in real seconds, so its clock
+keeps pace with the monotonic one: readings that are 1.5 ms apart in the simulation are then 0.15 ms
+apart.
 """
 
 import math
@@ -15,22 +15,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.simulation.environment import InsertionEnvironment, Readings
+from pipeline.simulation.environment import InsertionEnvironment, Readings, Shots
 from pipeline.simulation.insertion import TICK_HZ, TICK_S
 from pipeline.simulation.recorder import CAMERA_HZ
 
-Frames = dict[str, tuple[float, NDArray[np.uint8]]]
 _STREAMS = ("state", "sensor")
 _FRAME_S = 0.9 / CAMERA_HZ
-"""Cameras take no more than so many frames, however fast the world goes: each costs 6 ms."""
+"""Least time between two frames, however fast the world goes: each costs 6 ms."""
 
 
 class SimulatedRobot:
-    """One needle insertion as a robot that lives as fast as the clock goes.
+    """One needle insertion as a robot that keeps pace with a clock.
 
     In ticks without an action the arm stands still. Once the episode is over, `observe` says how it
-    `ended`. Close it: its cameras are a thread. They keep to the machine's time; ticks pass by
-    `clock`, s.
+    `ended`. Ticks pass by `clock`, in s; the cameras are a thread, by the machine's time: close the
+    robot to end it.
     """
 
     def __init__(
@@ -71,7 +70,7 @@ class SimulatedRobot:
             observed["ended"] = self.outcome
         return observed
 
-    def frames(self) -> Frames:
+    def frames(self) -> Shots:
         """What each camera took last."""
         return self._newest
 
@@ -102,7 +101,7 @@ class SimulatedRobot:
             self._newest = self._taken()
             time.sleep(max(0.0, due_s - time.monotonic()))
 
-    def _taken(self) -> Frames:
+    def _taken(self) -> Shots:
         frames = self._environment.frames().items()
         return {view: (self._told_s(taken_s), frame) for view, (taken_s, frame) in frames}
 

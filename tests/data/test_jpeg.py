@@ -99,10 +99,25 @@ def test_an_unreadable_image_is_found_by_check_and_by_read(tmp_path: Path, damag
             attempt(path, str(path))
 
 
-@pytest.mark.parametrize("names", [("000001.jpg", "000002.jpg"), ("cam_000007.jpg",)])
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("000001.jpg", "000002.jpg"),
+        ("cam_000007.jpg",),
+        ("0.jpg", "1.jpg", "2.jpg"),
+        tuple(f"zed_left_{number}.jpg" for number in range(1, 12)),
+    ],
+)
 def test_numbers_of_frames_are_no_times(names):
     with pytest.raises(RecordingError, match=r"ends in the time in seconds.*Rename the frames"):
         JpegCamera("View1", [Path(name) for name in names])
+
+
+def test_times_in_whole_seconds_are_no_numbers_of_frames():
+    names = [("0.jpg",), ("0.jpg", "1.jpg", "3.jpg"), ("0.0.jpg", "1.0.jpg"), ("5.jpg", "6.jpg")]
+    for some in names:
+        camera = JpegCamera("View1", [Path(name) for name in some])
+        assert camera.time.tolist() == [float(Path(name).stem) for name in some]
 
 
 @pytest.mark.parametrize(

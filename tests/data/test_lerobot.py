@@ -16,7 +16,7 @@ from pipeline.base.digests import file_digest
 from pipeline.base.errors import RecordingError
 from pipeline.data import content_digest, open_recording, open_recordings
 from pipeline.data.lerobot import action_kind
-from pipeline.data.lerobot_clock import read_clock
+from pipeline.data.lerobot_rows import read_clock
 from pipeline.data.timeline import build_timeline
 from pipeline.look.recording.episode import view_episode
 from pipeline.look.recording.overview import find_issues
@@ -1060,7 +1060,7 @@ def test_tables_that_unpack_to_more_than_the_limits_are_refused_unread(tmp_path,
 
 
 def test_a_list_of_episodes_that_never_ends_is_refused(tmp_path, write, monkeypatch):
-    monkeypatch.setattr("pipeline.data.lerobot_layout._MOST_ROWS", 2)
+    monkeypatch.setattr("pipeline.data.lerobot_meta._MOST_ROWS", 2)
     with pytest.raises(
         RecordingError, match=r"meta: expected at most 2 episodes .*Split the data set"
     ):

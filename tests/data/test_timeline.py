@@ -17,7 +17,7 @@ from pipeline.data.timeline import (
     choose_action_rotation,
     last_at,
     rounding,
-    wrapped,
+    wrapped_deg,
 )
 
 POSE = Channels(("x", "y", "z", "a", "b", "r"), ("mm",) * 3 + ("deg",) * 3)
@@ -51,10 +51,18 @@ class Made(Recording):
     path: Path = Path("made")
     instruction: str = "touch"
 
+    _views: None = None
+
     def files(self) -> list[Path]:
         return []
 
-    def cameras(self) -> Mapping[str, CameraStream]:
+    def all_views(self) -> Sequence[str]:
+        return list(self.camera_times)
+
+    def _recorded_instruction(self) -> str:
+        return "touch"
+
+    def _cameras(self) -> Mapping[str, CameraStream]:
         return {view: Camera(view, time) for view, time in self.camera_times.items()}
 
     def action(self) -> RecordedAction | None:
@@ -330,7 +338,7 @@ class TestActionRotation:
 
 @given(st.floats(-1e4, 1e4))
 def test_wrapped_is_the_same_angle(degrees):
-    inside = wrapped(np.array([degrees]))[0]
+    inside = wrapped_deg(np.array([degrees]))[0]
     assert -180 <= inside < 180
     assert np.isclose(np.cos(np.radians(inside)), np.cos(np.radians(degrees)), atol=1e-6)
 

@@ -63,6 +63,16 @@ def test_a_part_is_bit_identical_to_the_whole(path):
     assert all(np.array_equal(a, b) for a, b in zip(whole[20:30], part, strict=True))
 
 
+@pytest.mark.parametrize("group", [1, 4, 40])
+def test_frames_of_one_time_are_counted(tmp_path, write, group):
+    # Matroska counts milliseconds: three frames share each.
+    numbers = [20 + 11 * (frame % 18) for frame in range(36)]
+    path = write.video(tmp_path / "a.mkv", numbers, 3000, "libx264", group)
+    camera = clip(path, 36)
+    for indices in [*([index] for index in range(36)), [1, 2, 35], [4, 9, 11], range(36)]:
+        assert shades(camera.read(indices)) == [index % 18 for index in indices]
+
+
 def test_a_container_of_another_rate_pairs_by_number(tmp_path, write):
     path = write.video(tmp_path / "a.mp4", [20 + 11 * f for f in range(15)], fps=30)
     assert shades(clip(path, 15).read(range(15))) == list(range(15))

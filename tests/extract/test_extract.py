@@ -23,11 +23,11 @@ from pipeline.base.errors import (
     StoreMismatch,
 )
 from pipeline.data import Channels, RecordedAction, Stream, open_recordings
-from pipeline.data.lerobot_clock import stored_clock
+from pipeline.data.lerobot_rows import stored_clock
 from pipeline.data.timeline import build_timeline
 from pipeline.data.windowed import WindowedRecording
 from pipeline.extract import extract
-from pipeline.simulation.lerobot_format import write_lerobot
+from pipeline.simulation.insertion_formats import write_lerobot
 from pipeline.simulation.recorder import simulate_episode
 from pipeline.store import FeatureStore, StoreBuild, build_lock, part_path
 from pipeline.store.schema import ARRAY_NAMES, INCREMENTAL

@@ -17,7 +17,7 @@ import zarr
 from PIL import Image
 
 from pipeline.data import lerobot
-from pipeline.simulation.lerobot_format import write_lerobot
+from pipeline.simulation.insertion_formats import write_lerobot
 from pipeline.simulation.recorder import simulate_episode
 from pipeline.store import FeatureStore
 from pipeline.store.chunks import write_seal

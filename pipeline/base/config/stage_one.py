@@ -30,8 +30,9 @@ class DemoParams(Section):
 class MediaLimits(Section):
     """What a file of a recording may ask for; more is refused before memory is taken for it."""
 
-    pixels: int = Field(default=64_000_000, ge=1, le=10**12)
-    """Of one frame, its height times its width."""
+    pixels: int = Field(default=7680 * 4320, ge=1, le=10**12)
+    """Of one frame, its height times its width; by default that of 8K, which takes a second to
+    decode."""
     array_bytes: int = Field(default=16 * 2**30, ge=1, le=2**50)
     """Of one array or table, unpacked."""
     ratio: float = Field(default=100.0, ge=1, le=1e6)

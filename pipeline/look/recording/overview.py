@@ -19,8 +19,7 @@ from pipeline.base.config import Params
 from pipeline.base.errors import RecordingError, StoreMismatch
 from pipeline.base.issue import Issue
 from pipeline.data import Opened, Recording
-from pipeline.data.embodiment import Embodiment, common_embodiment
-from pipeline.data.reader import FileRecording
+from pipeline.data.episode import Embodiment, common_embodiment
 from pipeline.data.recording import Nominal
 from pipeline.data.timeline import ActionRotation, choose_action_rotation, rate_notes
 from pipeline.look.recording.channels import find_channel_issues
@@ -204,7 +203,7 @@ def _missing(view: EpisodeView, nominal: Nominal) -> Iterator[Issue]:
     for name in view.recording.depth_views():
         message = "a depth map by the metadata, no picture: it is no view, the VLM is not shown it"
         yield view.issue("depth view", f"view {name}", message)
-    if not isinstance(view.recording, FileRecording) or "cameras" in unread:
+    if "cameras" in unread:
         return
     # Those that `data.views` leaves out, too.
     recorded, empty = view.recording.all_views(), view.recording.empty_views()

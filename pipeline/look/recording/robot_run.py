@@ -8,7 +8,7 @@ from pipeline.base.commands import command
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import RecordingError, StoreMismatch
 from pipeline.data.arrays import member, read_npz
-from pipeline.data.lerobot_writer import EPISODE
+from pipeline.data.lerobot_writer import sidecar
 from pipeline.data.media import RECORDINGS
 from pipeline.robot.run_recording import RUN, RunDocument
 from pipeline.store import FeatureStore
@@ -26,7 +26,7 @@ def compare_keys(recording: str | Path, store: FeatureStore) -> str:
     more than once, an episode at the recording's path, `RecordingError` where it is no run.
     """
     root = Path(recording).resolve()
-    path = root / "features" / f"{EPISODE}.npz"
+    path = sidecar(root, "features")
     if not path.is_file():
         raise RecordingError(f"{root}: expected a recorded run, found no features/{path.name}")
     keys = member(read_npz(path, ("key",)), ("key",), path)

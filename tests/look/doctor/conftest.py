@@ -4,8 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.simulation.insertion_formats import ABUTTING, write_new, write_raw
-from pipeline.simulation.lerobot_format import write_lerobot
+from pipeline.simulation.insertion_formats import ABUTTING, write_lerobot, write_new, write_raw
 from pipeline.simulation.recorder import simulate_episode
 
 

@@ -19,8 +19,13 @@ from pipeline.look.page.style import RC
 from pipeline.look.recording.episode import EpisodeView, view_episode
 from pipeline.look.recording.overview import find_issues
 from pipeline.simulation import rendering
-from pipeline.simulation.insertion_formats import ABUTTING, write_new, write_old, write_raw
-from pipeline.simulation.lerobot_format import write_lerobot
+from pipeline.simulation.insertion_formats import (
+    ABUTTING,
+    write_lerobot,
+    write_new,
+    write_old,
+    write_raw,
+)
 from pipeline.simulation.recorder import simulate_episode
 
 EPOCH_S = 1.767e9 + 0.25

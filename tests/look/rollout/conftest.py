@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.evaluate.rollouts import EpisodeTrace, RolloutEpisode, Rollouts
+from pipeline.evaluate.rollouts import InsertionTrace, RolloutEpisode, Rollouts
 
 VIEWS = ("View1", "View2")
 ENDINGS = ("time is up", "punctured beside the target", "safe stop: the sensor stalled")
@@ -23,7 +23,7 @@ def rollout_episode(seed: int = 0, ticks: int = 60, **changed: Any) -> RolloutEp
     miss = 0.2 + 0.1 * (seed % 5)
     way = (6 * (1 - part) + miss)[:, None] * [np.cos(seed), np.sin(seed)]
     height = 4 - 6.5 * part
-    trace = EpisodeTrace(
+    trace = InsertionTrace(
         time_s=0.1 * np.arange(1, ticks + 1),
         offset_mm=way,
         lateral_mm=way[-1],

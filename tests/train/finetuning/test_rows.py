@@ -13,7 +13,7 @@ from pipeline.base.config import Params
 from pipeline.base.errors import RecordingError
 from pipeline.data.row_range import by_episode
 from pipeline.extract import extract
-from pipeline.simulation.lerobot_format import write_lerobot
+from pipeline.simulation.insertion_formats import write_lerobot
 from pipeline.simulation.recorder import simulate_episode
 from pipeline.store import FeatureStore
 from pipeline.train.finetuning.recordings import check_spec, find_recordings, known_digests

@@ -1,4 +1,4 @@
-"""The LeRobot set follows v2.1, as its own readers expect it."""
+"""The demo's LeRobot set follows v2.1, as its own readers expect it."""
 
 import json
 from pathlib import Path
