@@ -37,8 +37,8 @@ from pipeline.look.page.issues import FINDINGS, group_issues, place_of, places_o
 from pipeline.look.page.style import boxes
 from pipeline.look.page.writing import write_report
 from pipeline.look.recording.page import recordings_report
-from pipeline.look.recording.subject import Subject, subject_of
-from pipeline.look.store.page import inspect_store, store_report
+from pipeline.look.store import inspect_store, store_report
+from pipeline.look.subject import Subject, subject_of
 
 SHOWN = 8
 """Findings that the terminal shows."""

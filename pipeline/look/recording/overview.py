@@ -1,11 +1,11 @@
-"""Every recording looked over, one in memory at a time, and everything that looks wrong in it.
+"""Every recording read and checked, one in memory at a time.
 
-Each kind's rule and thresholds stand in `clocks`, `channels` and `frames`; what is not there at
-all, here. Most rules look for what is unlike the rest of the same episode, so that no expectation
-about the robot is needed.
+The rules and thresholds of most issues stand in `clocks`, `channels` and `cameras`; here are those
+of what is missing, and of several recordings. Most rules look for what is unlike the rest of the
+same episode, so they expect nothing of the robot.
 """
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -23,25 +23,19 @@ from pipeline.data.embodiment import Embodiment, common_embodiment
 from pipeline.data.reader import FileRecording
 from pipeline.data.recording import Nominal
 from pipeline.data.timeline import ActionRotation, choose_action_rotation, rate_notes
+from pipeline.look.recording.cameras import find_frame_issues
 from pipeline.look.recording.channels import find_channel_issues
-from pipeline.look.recording.clocks import find_clock_issues, usual_step
+from pipeline.look.recording.clocks import find_clock_issues
 from pipeline.look.recording.episode import EpisodeView, view_episode
-from pipeline.look.recording.frames import find_frame_issues
-
-# Share of its frames that a view may lack; two frames are never too few.
-COUNT_TOLERANCE = 0.1
-# Times as fast a camera is one of another kind, whose frames are not compared in number.
-OTHER_RATE = 1.8
 
 _warning = partial(Issue, severity="warning")
 
 
 @dataclass
-class EpisodeSummary:
-    """One episode in a line.
+class RecordingSummary:
+    """One recording in a line.
 
-    `counts` are entries by clock (`EpisodeView.clocks`), `digests` what its motion comes to
-    (`_digest_motion`).
+    `counts` are entries by clock (`EpisodeView.clocks`), `digests` those of its motion by stream.
     """
 
     source: str
@@ -58,18 +52,18 @@ class EpisodeSummary:
 
     @property
     def frames(self) -> dict[str, int]:
-        """How many there are by view."""
+        """Number of frames by view."""
         views = {name: count for name, count in self.counts.items() if name.startswith("view ")}
         return {name.removeprefix("view "): count for name, count in views.items()}
 
     @property
     def errors(self) -> int:
-        """How many of its issues are errors."""
+        """Number of errors among its issues."""
         return sum(issue.severity == "error" for issue in self.issues)
 
     @property
     def warnings(self) -> int:
-        """How many are not."""
+        """Number of warnings among its issues."""
         return len(self.issues) - self.errors
 
     def warn(self, kind: str, stream: str, message: str) -> None:
@@ -82,25 +76,25 @@ class EpisodeSummary:
 
 @dataclass(frozen=True)
 class RecordingsOverview:
-    """All recordings that were opened, and what is wrong with any of them.
+    """All recordings that were opened, and everything that is wrong with them.
 
-    `summaries` stand in the order in which recordings were opened; `common` are the issues of the
-    sources as a whole and of what could not be opened; `rotation` is what `data.action_rotation`
-    means for these recordings.
+    `summaries` stand in the order in which recordings were opened; `common` are the issues of whole
+    sources and of recordings that could not be opened; `rotation` is the kind of rotation that
+    `data.action_rotation` gives for these recordings.
     """
 
-    summaries: tuple[EpisodeSummary, ...]
+    summaries: tuple[RecordingSummary, ...]
     common: tuple[Issue, ...]
     rotation: ActionRotation
 
     @property
     def issues(self) -> tuple[Issue, ...]:
-        """Those of all, then episode by episode."""
+        """The common ones, then episode by episode."""
         return (*self.common, *(issue for summary in self.summaries for issue in summary.issues))
 
     @property
     def views(self) -> tuple[str, ...]:
-        """Of any recording, sorted."""
+        """The views of all recordings, sorted."""
         return tuple(sorted({view for summary in self.summaries for view in summary.frames}))
 
     def choose(self, count: int) -> tuple[int, ...]:
@@ -116,19 +110,19 @@ class RecordingsOverview:
         return tuple(sorted([*worst, *(sound[place] for place in spread)]))
 
 
-def worst_first(summaries: Sequence[EpisodeSummary]) -> list[int]:
+def worst_first(summaries: Sequence[RecordingSummary]) -> list[int]:
     """Their places, those with most errors, then most warnings, first."""
     counts = [(-summary.errors, -summary.warnings) for summary in summaries]
     return sorted(range(len(summaries)), key=counts.__getitem__)
 
 
 def survey_recordings(opened: Opened, params: Params) -> RecordingsOverview:
-    """Read and check every recording; none that is broken keeps another from being read.
+    """Read and check every recording; a broken one keeps no other from being read.
 
     Raises `ConfigError` where poses need `data.action_hz`.
     """
     rotation = choose_action_rotation(params.data.action_rotation, opened.recordings)
-    summaries: list[EpisodeSummary] = []
+    summaries: list[RecordingSummary] = []
     embodiments: list[tuple[Recording, Embodiment]] = []
     rates: list[tuple[str, float | None, float]] = []
     for recording in tqdm(opened.recordings, "inspecting", unit="episode", disable=None):
@@ -138,7 +132,6 @@ def survey_recordings(opened: Opened, params: Params) -> RecordingsOverview:
             kind = Embodiment.of(line.action_channels, line.action_kind, view.sensor, view.state)
             embodiments.append((recording, kind))
             rates.append((recording.source, line.recorded_hz, line.fastest_hz))
-    _warn_of_missing(summaries)
     _warn_of_duplicates(summaries)
     common = list(_not_opened(opened))
     try:
@@ -153,9 +146,9 @@ def survey_recordings(opened: Opened, params: Params) -> RecordingsOverview:
     return RecordingsOverview(tuple(summaries), tuple(common), rotation)
 
 
-def _summarise(view: EpisodeView) -> EpisodeSummary:
+def _summarise(view: EpisodeView) -> RecordingSummary:
     recording, line = view.recording, view.timeline
-    return EpisodeSummary(
+    return RecordingSummary(
         source=recording.source,
         episode=recording.id,
         format=recording.format,
@@ -179,30 +172,29 @@ def find_issues(view: EpisodeView) -> tuple[Issue, ...]:
 
 
 def _beside_nominal(view: EpisodeView) -> Iterator[Issue]:
-    """What is unlike what the recording says of itself, and what clocks show without that."""
+    """Issues of clocks and missing streams, by what the recording says of itself."""
     try:
         nominal = view.recording.nominal()
     except RecordingError as error:
         nominal = Nominal()
-        # What keeps a stream from being read, too, has been told with it.
+        # The same file may be the reason why a stream cannot be read.
         if str(error) not in {issue.message for issue in view.issues}:
             yield view.issue("unreadable", "metadata", str(error))
     for mistake in nominal.mistakes:
         yield view.issue("wrong metadata", "", mistake)
     yield from find_clock_issues(view, nominal)
     yield from _missing(view, nominal)
-    yield from _frame_counts(view)
 
 
 def _missing(view: EpisodeView, nominal: Nominal) -> Iterator[Issue]:
-    """Streams, cameras and views that are not there, or are no views."""
+    """Streams, cameras and views that are missing, and depth maps, which are no views."""
     unread = {name for issue in view.issues for name in issue.stream.split(", ")}
     for name, entry in nominal.streams.items():
         if name not in view.streams and name not in unread:
             message = f"no file holds it, but {nominal.where} says {entry}: copy the file, too"
             yield view.issue("missing", name, message)
     for name in view.recording.depth_views():
-        message = "a depth map by the metadata, no picture: it is no view, the VLM is not shown it"
+        message = "a depth map by the metadata, no picture: it is no view, the VLM does not see it"
         yield view.issue("depth view", f"view {name}", message)
     if not isinstance(view.recording, FileRecording) or "cameras" in unread:
         return
@@ -216,42 +208,11 @@ def _missing(view: EpisodeView, nominal: Nominal) -> Iterator[Issue]:
         yield view.issue("missing", f"view {name}", "its folder is there and holds no frame")
 
 
-def _frame_counts(view: EpisodeView) -> Iterator[Issue]:
-    """Fewer frames than another view of the same rate has."""
-    cameras = {name: (len(c.time), usual_step(c.time)) for name, c in view.cameras.items()}
-    for name, (count, step) in cameras.items():
-        # A rig can have a slow and a fast camera.
-        alike = [n for n, at in cameras.values() if max(at, step) < OTHER_RATE * min(at, step)]
-        expected = max(alike, default=0)
-        if expected - count > max(2, COUNT_TOLERANCE * expected):
-            message = f"{count} frames, another view of its rate has {expected}"
-            yield view.issue("frame count", f"view {name}", message)
-
-
-def _warn_of_missing(summaries: Sequence[EpisodeSummary]) -> None:
-    """Of what most of a source's episodes of that format have, and no issue says why it lacks."""
-    alike: dict[tuple[str, str], list[EpisodeSummary]] = defaultdict(list)
-    for summary in summaries:
-        alike[summary.source, summary.format].append(summary)
-    for group in alike.values():
-        held = Counter(name for summary in group for name in summary.counts)
-        usual = {name for name, count in held.items() if 2 * count > len(group)}
-        for summary in group:
-            explained = {name for issue in summary.issues for name in issue.stream.split(", ")}
-            if "cameras" in explained:
-                explained |= {name for name in usual if name.startswith("view ")}
-            if "state" in explained:
-                explained.add("poses")  # its columns
-            if lacking := sorted(usual - summary.counts.keys() - explained):
-                message = "not there; most episodes of this source have it"
-                summary.warn("missing", ", ".join(lacking), message)
-
-
 def _digest_motion(view: EpisodeView) -> dict[str, str]:
-    """What the values of state and action come to, those of the sensor without either.
+    """Digests of the values of state and action, or of the sensor without either.
 
-    Those that never change are left out: they can be equal by chance. Clocks are no part of it: two
-    formats give the same rows other times.
+    Streams that never change are left out: they can be equal by chance. So are clocks: two formats
+    give the same rows different times.
     """
     motion = {name: view.streams[name] for name in ("state", "action") if name in view.streams}
     streams = motion or ({} if view.sensor is None else {"sensor": view.sensor})
@@ -262,9 +223,9 @@ def _digest_motion(view: EpisodeView) -> dict[str, str]:
     }
 
 
-def _warn_of_duplicates(summaries: Sequence[EpisodeSummary]) -> None:
-    """Of episodes that were there before: they agree in all digests that both have, and in one."""
-    firsts: dict[tuple[str, str], list[EpisodeSummary]] = defaultdict(list)
+def _warn_of_duplicates(summaries: Sequence[RecordingSummary]) -> None:
+    """Warn of episodes whose streams have the values of an earlier one, where both have them."""
+    firsts: dict[tuple[str, str], list[RecordingSummary]] = defaultdict(list)
     for summary in summaries:
         for first in (first for digest in summary.digests.items() for first in firsts[digest]):
             common = sorted(summary.digests.keys() & first.digests.keys(), reverse=True)

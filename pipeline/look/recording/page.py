@@ -1,4 +1,4 @@
-"""Recordings -> their page: all in a table, what looks wrong, some of them in every detail."""
+"""The page of recordings: a table of all, what looks wrong, and some of them in every detail."""
 
 import re
 from collections.abc import Sequence
@@ -9,12 +9,12 @@ from pipeline.base.format import duration
 from pipeline.base.table import Table
 from pipeline.data import Opened
 from pipeline.look.page.blocks import Issues, Picture, Report, Section, Text
+from pipeline.look.recording.cameras import camera_blocks
 from pipeline.look.recording.channels import statistics_blocks
 from pipeline.look.recording.clocks import clock_blocks
 from pipeline.look.recording.episode import Draw, EpisodeView, view_episode
-from pipeline.look.recording.frames import camera_blocks
-from pipeline.look.recording.model_input import prompt_blocks, sample_blocks
 from pipeline.look.recording.overview import RecordingsOverview, survey_recordings, worst_first
+from pipeline.look.recording.samples import prompt_blocks, sample_blocks
 from pipeline.look.recording.streams import motion_blocks, sensor_blocks
 
 _TOPICS = {
@@ -25,16 +25,16 @@ _TOPICS = {
     "Statistics by channel": statistics_blocks,
 }
 NOTHING = "Nothing looks wrong: every episode was read and every check passed."
-# Episodes that the table of all shows at most: those with findings, then the first.
+# Most episodes in the table of all: those with issues, then the first.
 ROWS = 100
 
 
 def recordings_report(opened: Opened, params: Params, name: str) -> Report:
-    """The page of these recordings, which `name` is what a reader calls them.
+    """The page of these recordings, which the reader knows as `name`.
 
     Every recording is read and checked, one in memory at a time; `inspect.episodes` of them are
-    shown in detail. Pictures read their recording again when they are drawn. What cannot be shown
-    is a sentence on the page. Raises `ConfigError` where poses need `data.action_hz`.
+    shown in detail. Pictures read their recording again when they are drawn. A sentence stands in
+    for every part that cannot be shown. Raises `ConfigError` where poses need `data.action_hz`.
     """
     overview = survey_recordings(opened, params)
     summaries, chosen = overview.summaries, overview.choose(params.inspect.episodes)
@@ -49,7 +49,7 @@ def recordings_report(opened: Opened, params: Params, name: str) -> Report:
             f"{prefix}{name}", caption, lambda: draw(view_of(index))
         )
 
-    # Of the episodes shown, the one with fewest errors that has ticks: what a model would get.
+    # The model's input is shown for the episode with fewest errors that has ticks.
     model = min(chosen, key=lambda index: (not summaries[index].ticks, summaries[index].errors))
     sections = [
         Section("What looks wrong", [Issues(overview.issues, NOTHING)]),
@@ -109,12 +109,12 @@ def _episodes_table(overview: RecordingsOverview, chosen: Sequence[int]) -> Tabl
 def _episode_section(
     overview: RecordingsOverview, index: int, view: EpisodeView, draw: Draw, params: Params
 ) -> Section:
-    """Everything of one episode."""
+    """Every topic of one episode."""
     summary = overview.summaries[index]
     words = f"`{summary.path}`, format {summary.format}: “{summary.instruction or '–'}”"
     several = len({summary.source for summary in overview.summaries}) > 1
     title = f"{summary.source} / {summary.episode}" if several else summary.episode
-    absent = Text("This episode has nothing of this.")
+    absent = Text("The episode has none.")
     parts = {topic: blocks_of(view, draw, params) for topic, blocks_of in _TOPICS.items()}
     return Section(
         title, [Text(words)], [Section(topic, parts[topic] or [absent]) for topic in parts]

@@ -1,4 +1,4 @@
-"""What was felt and how the robot moved: contact, and the pictures of sensor, state and actions."""
+"""Sensor, state and actions over time: their pictures, with contact marked."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -23,7 +23,7 @@ from pipeline.look.recording.episode import Draw, EpisodeView
 CONTACT_COLOUR = "#E69F00"
 _LINES = cycler(ls=("-", "--", ":")) * cycler(color=PALETTE)
 _WIDTH_IN, _PANEL_IN, _IMAGE_IN = 10.0, 1.75, 2.6
-# Of the span of a group: where its channels move less than this, their changes are drawn.
+# A group whose channels move less than this share of its span is drawn as changes.
 _STANDS_STILL = 0.2
 # Readings from which a curve is a bitmap in the page, and columns of an image.
 _BITMAP, _COLUMNS = 5000, 1200
@@ -32,9 +32,9 @@ _LEAST_S = 1e-3
 
 
 class Group(NamedTuple):
-    """Channels that one panel shows: those of one unit, or one quantity over place.
+    """Channels that share a panel: those of one unit, or one quantity over place.
 
-    `profile` is what the names of the depths of an A-scan and the like have in common, else ''.
+    `profile` is the common name of the depths of an A-scan and the like, else ''.
     """
 
     profile: str
@@ -44,13 +44,13 @@ class Group(NamedTuple):
 
     @property
     def label(self) -> str:
-        """Name, where there is one for all, and unit as an axis says them."""
+        """The common name, if any, and the unit, for an axis."""
         name = self.profile or (self.names[0] if len(self.names) == 1 else "")
         return f"{name} [{self.unit}]".strip() if self.unit else name
 
 
 def group_channels(channels: Channels) -> list[Group]:
-    """The channels by unit, in the order in which they come; then profiles; grippers are apart."""
+    """The channels by unit, in their order; then profiles. Grippers are groups of their own."""
     kinds = list(zip(map(unnumbered, channels.names), channels.units, strict=True))
     counts = Counter(kinds)
     groups: dict[tuple[str, str, bool], Group] = {}
@@ -85,6 +85,18 @@ def motion_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
     return [draw("motion", caption, draw_motion)]
 
 
+def contacts(view: EpisodeView) -> tuple[Span, ...]:
+    """Spans in which the needle touches something, by the force alone; none without a force."""
+    sensor = view.sensor
+    columns = [] if sensor is None else force_columns(sensor.channels.names)
+    if sensor is None or not columns:
+        return ()
+    newton = {sensor.channels.units[column] for column in columns} == {"N"}
+    step_s = usual_step(sensor.time)
+    spans = contact_spans(sensor.time, sensor.values[:, columns], newton, step_s)
+    return tuple(Span(*span) for span in spans)
+
+
 def draw_sensor(view: EpisodeView) -> Figure:
     """Curves of the sensor by unit above, a profile such as the A-scan as an image below.
 
@@ -97,7 +109,7 @@ def draw_sensor(view: EpisodeView) -> Figure:
     for axis, group in zip(axes, groups, strict=True):
         if group.profile:
             _draw_profile(axis, view.sensor, group, view.zero)
-            # Over an image edges alone, which hide nothing of it.
+            # Edges alone, which hide nothing of the image.
             for edge in spans.ravel():
                 axis.axvline(edge, color=CONTACT_COLOUR, lw=1.4, ls="--")
             continue
@@ -112,8 +124,8 @@ def draw_sensor(view: EpisodeView) -> Figure:
 def draw_motion(view: EpisodeView) -> Figure:
     """State and poses in panels by unit, and below them the actions, held from tick to tick.
 
-    Where channels of a panel lie so far apart that none would be seen to move, it shows what they
-    changed since the first reading, and the legend where each began.
+    Where the channels of a panel lie so far apart that no motion would be seen, it shows their
+    change since the first reading, and the legend where each began.
     """
     shown = {name: stream for name, stream in view.shown.items() if name != "sensor"}
     drawn = named_groups(shown)
@@ -136,7 +148,7 @@ def plot_curves(
     labels: Sequence[str],
     held: bool = False,
 ) -> None:
-    """Values (point, channel) as a curve a channel, no two of the first 18 alike.
+    """Draw values (point, channel) as a curve a channel, the first 18 in different styles.
 
     `held` holds each value until the next. Long curves are a bitmap in the page.
     """
@@ -145,7 +157,7 @@ def plot_curves(
         time,
         values,
         lw=1.3,
-        # A label that begins with an underscore would drop out of the legend.
+        # Matplotlib leaves labels that begin with an underscore out of the legend.
         label=[f" {label}" if label.startswith("_") else label for label in labels],
         drawstyle="steps-post" if held else "default",
         # A single reading makes no line.
@@ -172,7 +184,7 @@ def _panels(groups: Sequence[Group]) -> tuple[Figure, list[Axes]]:
 def _draw_curves(
     axis: Axes, stream: Stream, group: Group, zero: float, held: bool = False, changes: bool = False
 ) -> None:
-    """Curves that break where the clock has a gap; of what moves little, its changes."""
+    """Curves that break at gaps of the clock; with `changes`, those that move little as changes."""
     values = stream.values[:, group.indices].astype(np.float64)
     labels, unit = group.names, group.label
     if changes and np.ptp(values, axis=0).max() < _STANDS_STILL * np.ptp(values):
@@ -185,9 +197,9 @@ def _draw_curves(
 
 
 def _draw_profile(axis: Axes, stream: Stream, group: Group, zero: float) -> None:
-    """A channel of the profile a line, the first on top, in colours that a few extremes keep.
+    """A channel of the profile a line, the first on top, in colours that ignore a few extremes.
 
-    A column shows the last reading before it, and nothing where the clock has a gap.
+    A column shows the last reading before it, and nothing at a gap of the clock.
     """
     clock = Clock("", "stream", stream.time)
     stop = max(stream.time[-1] + np.nan_to_num(clock.step_s), stream.time[0] + _LEAST_S)
@@ -200,19 +212,7 @@ def _draw_profile(axis: Axes, stream: Stream, group: Group, zero: float) -> None
     drawn = axis.imshow(image, vmin=low, vmax=high, aspect="auto", extent=extent)
     axis.grid(visible=False)
     axis.set_ylabel(f"depth: channel of {group.profile}")
-    # Beside the panel: taken from it, its time axis would no longer stand below the curves'.
+    # Beside the panel, so that its time axis stays below that of the curves.
     bar = axis.inset_axes((1.01, 0.0, 0.015, 1.0))
     unit = f"[{group.unit}]" if group.unit else "(no unit)"
     axis.figure.colorbar(drawn, cax=bar, label=f"{group.profile} {unit}", extend="both")
-
-
-def contacts(view: EpisodeView) -> tuple[Span, ...]:
-    """Spans in which the needle touches something, by the force alone; none without a force."""
-    sensor = view.sensor
-    columns = [] if sensor is None else force_columns(sensor.channels.names)
-    if sensor is None or not columns:
-        return ()
-    newton = {sensor.channels.units[column] for column in columns} == {"N"}
-    step_s = usual_step(sensor.time)
-    spans = contact_spans(sensor.time, sensor.values[:, columns], newton, step_s)
-    return tuple(Span(*span) for span in spans)

@@ -13,7 +13,7 @@ from pipeline.base.errors import RecordingError, VLMError
 from pipeline.base.table import Table
 from pipeline.look.page.blocks import Text, Tokens
 from pipeline.look.recording.episode import EpisodeView
-from pipeline.look.recording.model_input import (
+from pipeline.look.recording.samples import (
     LEDGER,
     describe_stretch,
     digest_ledger,
