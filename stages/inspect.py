@@ -13,8 +13,7 @@ is written, whatever it finds, and 2 where nothing could be looked at.
 
 The page of PATH goes into a folder of its own in reports/inspect, named after PATH; without PATH it
 goes into reports/inspect itself, and with --set inspect.output=FOLDER always into that one. Looking
-again replaces the page, its pictures and findings.csv there, and touches no other file. Digests of
-the checkpoint are remembered in reports/inspect/.files.sqlite, or where stages.extract does it.
+again replaces the page, its pictures and findings.csv there, and touches no other file.
 """
 
 from stages.command import Shorthand, run

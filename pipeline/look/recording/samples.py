@@ -1,10 +1,8 @@
 """What policy and model get of a recording: training samples, the batch, the prompt as tokens."""
 
 from collections.abc import Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from itertools import groupby
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,11 +12,9 @@ from numpy.typing import NDArray
 
 from pipeline.base.clock import CLOCK_SLACK_S
 from pipeline.base.config import Params, VLMParams
-from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.base.errors import PipelineError, RecordingError
-from pipeline.base.ownership import LEDGER_SUFFIX as LEDGER
 from pipeline.base.table import Table
-from pipeline.look.page.blocks import Block, Outline, Text, TokenRun, Tokens
+from pipeline.look.page.blocks import Block, Text, TokenRun, Tokens
 from pipeline.look.page.style import INK, draw_frame, panels
 from pipeline.look.recording.cameras import read_frames
 from pipeline.look.recording.episode import BROKEN, Draw, EpisodeView
@@ -195,14 +191,13 @@ def _sample_title(view: EpisodeView, tick: int) -> str:
 
 
 def prompt_blocks(view: EpisodeView, params: Params, views: Sequence[str]) -> list[Block]:
-    """The prompt of the episode's first VL row, and the feature spec for these views."""
-    spec: list[Block] = []
+    """The prompt of the episode's first VL row, or why it cannot be shown."""
     try:
-        remembered = remembered_spec(params, views)
-        spec = [Outline("Feature spec: all that decides the features", remembered.attrs())]
-        return [*show_prompt(view, params.vlm, remembered), *spec]
+        # The digest does not change the prompt, and takes long: it reads every weight.
+        spec = feature_spec(params.vlm, params.extract.dtype, views, lambda path: "")
+        return show_prompt(view, params.vlm, spec)
     except PipelineError as error:
-        return [Text(f"The prompt cannot be shown: {error}"), *spec]
+        return [Text(f"The prompt cannot be shown: {error}")]
 
 
 def show_prompt(view: EpisodeView, vlm: VLMParams, spec: FeatureSpec) -> list[Block]:
@@ -237,26 +232,6 @@ def show_prompt(view: EpisodeView, vlm: VLMParams, spec: FeatureSpec) -> list[Bl
         Tokens(fold_tokens(tokens)),
         Table(heads, rows, "Image tokens by view; sizes are height × width"),
     ]
-
-
-def remembered_spec(params: Params, views: Sequence[str]) -> FeatureSpec:
-    """The feature spec that `params` give for these views.
-
-    A checkpoint is read whole for its digest, which takes seconds a gigabyte, and later only where
-    a file of it has changed: `digest_ledger` keeps the digests. Raises `VLMError` where the
-    checkpoint is not there or incomplete.
-    """
-    with closing(ContentDigests.to_read(digest_ledger(params))) as digests:
-        return feature_spec(params.vlm, params.extract.dtype, views, digests.of)
-
-
-def digest_ledger(params: Params) -> Path:
-    """The ledger beside `extract.store` where extraction keeps one, else one in `inspect.output`.
-
-    No file is made beside stores: a reader may have no store, or may not write there.
-    """
-    shared = ledger_path(params.extract.store)
-    return shared if shared.is_file() else params.inspect.output / LEDGER
 
 
 def describe_stretch(recorded: tuple[int, ...], pixels: tuple[int, int]) -> str | None:

@@ -10,8 +10,8 @@ import pytest
 from pipeline.base.config import Params
 from pipeline.base.table import Table
 from pipeline.data import Channels, Stream
-from pipeline.look.recording.channels import describe_channels, statistics_blocks
 from pipeline.look.recording.episode import EpisodeView
+from pipeline.look.recording.streams import describe_channels, statistics_blocks
 
 Look = Callable[..., EpisodeView]
 PARAMS = Params.model_validate(

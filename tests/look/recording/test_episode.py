@@ -10,7 +10,7 @@ from pipeline.base.errors import RecordingError
 from pipeline.look.recording.cameras import read_frames, spread_ticks
 from pipeline.look.recording.clocks import read_clocks
 from pipeline.look.recording.episode import EpisodeView
-from pipeline.look.recording.overview import find_issues
+from pipeline.look.recording.page import find_issues
 
 Look = Callable[..., EpisodeView]
 

@@ -15,9 +15,9 @@ from pipeline.base.channels import named
 from pipeline.base.config import DataParams, Source
 from pipeline.base.issue import Issue
 from pipeline.data import open_recordings
-from pipeline.look.recording.channels import find_channel_issues
 from pipeline.look.recording.clocks import find_clock_issues
 from pipeline.look.recording.episode import EpisodeView, view_episode
+from pipeline.look.recording.streams import find_channel_issues
 
 Find = Callable[..., tuple[Issue, ...]]
 Copied = Callable[[str], Path]

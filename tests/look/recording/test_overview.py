@@ -13,7 +13,7 @@ import pytest
 from pipeline.base.config import Params, Source
 from pipeline.base.issue import Issue
 from pipeline.data import open_recordings
-from pipeline.look.recording.overview import RecordingsOverview, survey_recordings
+from pipeline.look.recording.page import RecordingsOverview, survey_recordings
 
 
 def survey(*sources: Source, views: Sequence[str] | None = None, **data: Any) -> RecordingsOverview:

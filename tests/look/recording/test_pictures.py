@@ -16,7 +16,6 @@ from pipeline.base.config import Params
 from pipeline.data import Channels, Stream
 from pipeline.look.page.blocks import Picture, Text
 from pipeline.look.recording.cameras import camera_blocks, draw_views
-from pipeline.look.recording.channels import statistics_blocks
 from pipeline.look.recording.clocks import Clock, clock_blocks, clock_table, draw_lanes
 from pipeline.look.recording.episode import EpisodeView
 from pipeline.look.recording.streams import (
@@ -26,6 +25,7 @@ from pipeline.look.recording.streams import (
     group_channels,
     motion_blocks,
     sensor_blocks,
+    statistics_blocks,
 )
 
 PARAMS = Params.model_validate(
