@@ -245,14 +245,11 @@ def find_coverage_issues(episodes: Sequence[Coverage]) -> Iterator[Issue]:
     there = {name for part in episodes for name, share in part.covered.items() if share}
     for part in episodes:
         # An episode without a tick has no stream to miss.
-        for name in there if len(part.episode.ticks) else ():
-            stream, share = (
-                name if name in ("sensor", "state") else f"view {name}",
-                part.covered[name],
-            )
-            if not share:
+        for name, share in part.covered.items() if len(part.episode.ticks) else ():
+            stream = name if name in ("sensor", "state") else f"view {name}"
+            if name in there and not share:
                 yield part.issue("missing", stream, "no tick sees it; other episodes have it")
-            elif share < 1:
+            elif 0 < share < 1:
                 yield part.issue("partly missing", stream, f"only {share:.0%} of the ticks see it")
         if not part.episode.instruction.strip():
             message = "the prompt names no task; set `instruction` of its data source"

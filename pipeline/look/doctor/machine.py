@@ -85,11 +85,9 @@ def check_gpus(gpus: Sequence[GPU], driver: bool, dtype: str) -> Iterator[Issue]
     if gpus:
         yield ok("build", build)
     elif driver:
-        text = f"{build}; this machine has a GPU driver, but torch sees none"
-        yield note("GPU", text, _SEE_GPU)
+        yield note("GPU", f"{build}; torch sees none, though there is a GPU driver", _SEE_GPU)
     else:
-        text = f"{build}; this machine has no GPU driver: the CPU does for the demo, not for more"
-        yield note("GPU", text)
+        yield note("GPU", f"{build}; no GPU driver here: the CPU does for the demo, not for more")
     for index, gpu in enumerate(gpus):
         text = f"{gpu.name}, {size(gpu.memory)}"
         if dtype != "bfloat16" or gpu.bfloat16:

@@ -85,6 +85,11 @@ class Clock:
         return _usual(self.time)[0]
 
     @cached_property
+    def longest_step_s(self) -> float:
+        """The longest step; 0 for fewer than two entries."""
+        return float(np.diff(self.time).max(initial=0))
+
+    @cached_property
     def shortest_gap_s(self) -> float:
         """`GAP_FACTOR` times the longest usual step.
 
@@ -178,7 +183,7 @@ def find_clock_issues(view: EpisodeView, nominal: Nominal) -> Iterator[Issue]:
                 yield view.issue(kind, clock.name, message, *gap)
         if clock.kind == "camera":
             yield from _dropped(view, clock)
-        for name in nominal.rates_hz.keys() & {*clock.name.split(", ")}:
+        for name in (name for name in clock.name.split(", ") if name in nominal.rates_hz):
             found_hz, expected_hz = clock.rate_hz, nominal.rates_hz[name]
             if abs(found_hz - expected_hz) > RATE_TOLERANCE * expected_hz:
                 message = f"found {found_hz:.4g} entries a second, "
@@ -204,7 +209,7 @@ def _ends_apart(clock: Clock, gap: Span, recorded: Sequence[Clock]) -> tuple[flo
     None where entries are missing: such a clock ends with the others, a clock that was set does not
     end with them, and would without the jump.
     """
-    ends = [c.time[-1] for c in recorded if np.diff(c.time).max(initial=0) < gap.length_s / 2]
+    ends = [c.time[-1] for c in recorded if c.longest_step_s < gap.length_s / 2]
     if not ends:
         return None
     end = float(clock.time[-1])
@@ -314,11 +319,11 @@ def draw_lanes(view: EpisodeView) -> Figure:
         axis.set_yticks(range(len(clocks)), [clock.name for clock in clocks])
         axis.set_ylim(len(clocks) - 0.2, -0.7)
     whole.axvspan(near[0] - view.zero, near[1] - view.zero, color=GRID, lw=0, zorder=0.3)
-    whole.set_title("the whole episode (grey: the part below)", loc="left", fontsize=10)
+    whole.set_title("the whole episode", loc="left", fontsize=10)
     if view.timeline is not None:
         lanes = {clock.name: lane for lane, clock in enumerate(clocks)}
         _draw_reuse(detail, view.timeline, view.zero, lanes, near)
-    detail.set_title(f"{near[1] - near[0]:.2f} s of it", loc="left", fontsize=10)
+    detail.set_title(f"the grey part: {near[1] - near[0]:.2f} s", loc="left", fontsize=10)
     detail.set_xlabel("time since the recording began [s]")
     return figure
 
