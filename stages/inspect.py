@@ -59,7 +59,7 @@ def summary(report: Report) -> Iterator[str]:
     """What the page says first, for a terminal."""
     yield report.title
     yield " · ".join(f"{label} {value}" for label, value in report.tiles)
-    # The first are those of all: those of single parts come later.
+    # The first block of issues holds those of the whole page.
     issues = next(report.blocks(Issues))
     groups = group_issues(issues.issues)
     if not groups:

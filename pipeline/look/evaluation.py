@@ -367,9 +367,9 @@ def draw_chunks(
         axis.label_outer()
     axes[-1].set_xlabel("time since the episode began [s]")
     figure.align_ylabels(axes)
-    error = comparison.overall_by_episode("policy")[comparison.episodes.index(episode.index)]
+    overall = comparison.overall_by_episode("policy")[comparison.episodes.index(episode.index)]
     name = shorten_middle(episode_name(episode), 14, 28)
-    finish(figure, axes[0], 3, f"{name}: overall error {error:.3f} [training std]")
+    finish(figure, axes[0], 3, f"{name}: overall error {overall:.3f} [training std]")
     return figure
 
 

@@ -17,9 +17,7 @@ from numpy.typing import NDArray
 
 from pipeline.base.config import Params
 from pipeline.base.issue import Issue
-from pipeline.base.source import RATE_TOLERANCE
 from pipeline.base.table import Table
-from pipeline.data.recording import Nominal
 from pipeline.data.timeline import Timeline
 from pipeline.look.page.blocks import Block
 from pipeline.look.page.style import GRID, INK, PALETTE, panels
@@ -169,11 +167,10 @@ def _merge_equal(clocks: Iterable[Clock]) -> list[Clock]:
     return [replace(same[0], name=", ".join(c.name for c in same)) for same in alike.values()]
 
 
-def find_clock_issues(view: EpisodeView, nominal: Nominal) -> Iterator[Issue]:
-    """Issues of kind gap, clock jump, rate, dropped frames and lost ticks.
+def find_clock_issues(view: EpisodeView) -> Iterator[Issue]:
+    """Issues of kind gap, clock jump, dropped frames and lost ticks.
 
-    `nominal` is what the recording says of itself. A gap shorter than a tick is no issue: no tick
-    loses a reading by it.
+    A gap shorter than a tick is no issue: no tick loses a reading by it.
     """
     recorded = [clock for clock in read_clocks(view) if clock.kind in ("camera", "stream")]
     for clock in _merge_equal(recorded):
@@ -183,12 +180,6 @@ def find_clock_issues(view: EpisodeView, nominal: Nominal) -> Iterator[Issue]:
                 yield view.issue(kind, clock.name, message, *gap)
         if clock.kind == "camera":
             yield from _dropped(view, clock)
-        for name in (name for name in clock.name.split(", ") if name in nominal.rates_hz):
-            found_hz, expected_hz = clock.rate_hz, nominal.rates_hz[name]
-            if abs(found_hz - expected_hz) > RATE_TOLERANCE * expected_hz:
-                message = f"found {found_hz:.4g} entries a second, "
-                message += f"expected {expected_hz:.4g} by {nominal.where}"
-                yield view.issue("rate", name, message)
     yield from _lost_ticks(view, recorded)
 
 

@@ -186,7 +186,7 @@ def find_issues(view: EpisodeView) -> tuple[Issue, ...]:
         if str(error) not in {issue.message for issue in issues}:
             issues.append(view.issue("unreadable", "metadata", str(error)))
     issues += [view.issue("wrong metadata", "", mistake) for mistake in nominal.mistakes]
-    issues += [*find_clock_issues(view, nominal), *_missing(view, nominal)]
+    issues += [*find_clock_issues(view), *_missing(view, nominal)]
     issues += [*find_channel_issues(view), *find_frame_issues(view)]
     issues.sort(key=lambda issue: (issue.severity != "error", issue.start_s or float("-inf")))
     return tuple(issues)

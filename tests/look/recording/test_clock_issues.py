@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from pipeline.base.issue import Issue
-from pipeline.data.recording import Nominal
 from pipeline.look.recording.clocks import find_clock_issues
 from pipeline.look.recording.episode import EpisodeView
 
@@ -45,7 +44,7 @@ def find(healthy: Path, look: Callable[..., EpisodeView]) -> Find:
         }
         absent = {"sensor": None, "state": None, "poses": None, "action": None}
         one = replace(view, timeline=None, cameras=cameras, zero=0.0, **absent | streams)
-        return tuple(find_clock_issues(one, Nominal()))
+        return tuple(find_clock_issues(one))
 
     return issues
 

@@ -200,11 +200,9 @@ def test_lines_lead_from_the_frame_to_its_row_and_from_there_to_its_ticks(
 ) -> None:
     assert view.timeline is not None
     line, (_, near) = view.timeline, draw_lanes(view).axes
-    *took, served = [
-        np.array(one.get_segments())[..., 0] + view.zero
-        for one in near.collections
-        if isinstance(one, LineCollection) and one.get_zorder() == 2 and len(one.get_colors()) == 1
-    ][-4:]
+    lines = [lines for lines in near.collections if isinstance(lines, LineCollection)]
+    # After the strokes of the lanes.
+    *took, served = [np.array(ends.get_segments())[..., 0] + view.zero for ends in lines[-4:]]
     for name, ends in zip(("View1", "View2", "View5"), took, strict=True):
         rows = np.searchsorted(line.vl_time, ends[:, 1] - 1e-6)
         assert ends[:, 0] == pytest.approx(line.frame_time[name][rows])
